@@ -33,7 +33,7 @@ _RESULTS = ("-result.h5", "-correlation.h5", "-fused.h5")
 _SHARD = re.compile("([0-9]{1,6})/([0-9]{1,6})")
 _ROWS = 12  # of files that have ended
 # What other commands have as options, a batch has in its settings.
-_OPTIONS = re.compile("--(dataset|motion|travel-step|travel-start|phase-step|pixel-size)(?![a-z-])")
+_OPTIONS = re.compile("--(dataset|motion|travel|travel-step|travel-start|phase-step|pixel-size)(?![a-z-])")
 
 
 def command(

@@ -40,6 +40,7 @@ class _Stack(Struct, frozen=True, rename="kebab"):
     motion: Motion | None = None
     travel_step: Annotated[str, _text("0.1mm")] | None = None
     travel_start: Annotated[str, _text("0mm")] | None = None
+    travel: Annotated[str, _text("stage.csv")] | None = None
     phase_step: Annotated[str, _text("45deg")] | None = None
     tilt: Annotated[str, _text("2.5deg")] | None = None
     pixel_size: Annotated[str, _text("0.03mm")] | None = None
@@ -115,6 +116,8 @@ def _opening(values: dict[str, Any], where: str) -> dict[str, Any]:
     dataset = {name: values.pop(name) for name in ("dataset",) if name in values}
     if "motion" in values:
         values["motion"] = MotionName(values["motion"])
+    if "travel" in values:
+        values["travel"] = Path(values["travel"])
     options = stack_options(**values, where=where)
     if "tilt" in options:
         _check_tilt(options["tilt"], f"{where}tilt")

@@ -66,7 +66,10 @@ def _travel(step: str | None, start: str | None, listed: Path | None, where: str
 
     if listed is not None:
         if step is not None or start is not None:
-            raise InputError("--travel gives the travel of all frames: leave --travel-step and -start out")
+            own = where.rpartition(" ")[2]
+            raise InputError(
+                f"{where}travel is that of all frames: leave {own}travel-step and {own}travel-start out"
+            )
         return {"travel": read_travel(listed)}
     if step is not None:
         first = length(start or "0mm", f"{where}travel-start")

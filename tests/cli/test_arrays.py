@@ -108,7 +108,7 @@ def test_the_travel_of_a_real_stage_places_heights():
         ),
         (["ball.npy", "--travel", "ball.npz"], "ball.npz is no text: write one length a frame in it"),
         (["ball.npy", "--travel", "t.txt"], "t.txt lists 2 travels for 12 frames: one a frame is needed"),
-        (["ball.npy", "--travel", "t.txt", *STEPS], "leave --travel-step and -start out"),
+        (["ball.npy", "--travel", "t.txt", *STEPS], "leave --travel-step and --travel-start out"),
         (["ball.npy", "--travel", "ball.npy"], "lists 2304 travels for 12 frames"),
         (["cut.npy", *STEPS], "cut.npy is no array of NumPy's"),
         (["cut.npz", *STEPS], "cut.npz is no array of NumPy's"),
@@ -198,6 +198,16 @@ def test_the_line_of_a_file_in_a_batch_names_levels_that_nobody_gave():
     Path("batch.toml").write_text('[stack]\ntravel-step = "0.1mm"\npixel-size = "0.4mm"\n')
     out = run("batch", "ball.npy", "-o", "out", "--settings", "batch.toml").out
     assert "; no dark and bright given: estimated as " in out
+
+
+def test_a_batch_takes_the_travel_of_a_file():
+    Path("t.txt").write_text(" ".join(map(str, TRAVEL)))
+    Path("batch.toml").write_text('[stack]\ntravel = "t.txt"\n')
+    words = ("batch", "ball.npy", "-o", "out", "--settings", "batch.toml")
+    assert "1 done" in run(*words).out
+    assert "1 kept" in run(*words).out
+    Path("t.txt").write_text(" ".join(map(str, 2 * TRAVEL)))
+    assert "1 done" in run(*words).out
 
 
 def test_levels_that_the_frames_do_not_show_are_warned_of():
