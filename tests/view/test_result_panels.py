@@ -155,14 +155,19 @@ def test_a_section_has_gaps_at_holes_and_what_was_filled_is_dashed():
     np.testing.assert_allclose(measured.get_xdata(), 0.1 * np.arange(60), atol=1e-9)
 
 
-def test_a_section_has_a_band_of_one_standard_deviation():
+def test_a_section_has_a_band_of_standard_deviations_that_can_be_seen():
     sheet, cut = cut_of(along())
     axes = panel_of(draw_section, sheet.result, cut)
+    (label,) = (name for name in named(axes) if name.endswith("sigma"))
+    times = int(label.split()[1])
+    assert 0.05 <= times * 0.01 / np.ptp(cut.height[np.isfinite(cut.height)]) < 0.17
     corners = np.concatenate([path.vertices for path in axes.collections[0].get_paths()])
     at_start = corners[np.isclose(corners[:, 0], 0), 1]
-    np.testing.assert_allclose([at_start.min(), at_start.max()], [-1.01, -0.99], atol=1e-6)
+    np.testing.assert_allclose(
+        [at_start.min(), at_start.max()], -1 + 0.01 * np.array([-times, times]), atol=1e-6
+    )
     assert not np.any((corners[:, 0] > 2.05) & (corners[:, 0] < 3.85))  # filled: nobody knows how well
-    assert named(axes) == {"measured", "highest measured", "filled", "± 1 sigma"}
+    assert named(axes) == {"measured", "highest measured", "filled", label}
 
 
 def test_the_highest_measured_point_is_marked():
@@ -339,3 +344,11 @@ def test_the_status_of_poses_has_its_own_words():
     axes = panel_of(draw_status, io.Result(status=status, zenith=np.zeros((2, 2), np.float32)))
     said = [text.get_text() for text in axes.get_legend().get_texts()]
     assert [text.splitlines()[0] for text in said] == ["normal", "none", "slope only"]
+
+
+def test_a_histogram_leaves_out_a_few_pixels_far_from_all_others():
+    height = np.linspace(-1, 0, 2000, dtype=np.float32).reshape(40, 50)
+    height[3, 4] = -9.0
+    axes = panel_of(draw_histogram, io.Result(height=height))
+    assert axes.get_xlim()[0] > -1.3
+    assert any("1 pixels beyond" in text.get_text() for text in axes.texts)

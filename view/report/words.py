@@ -7,7 +7,7 @@ from collections.abc import Mapping
 PICTURES: Mapping[str, tuple[str, str]] = {
     "height": (
         "Height, lit from the upper left. Blue has no answer, and orange was filled, not measured.",
-        "Map of the height in millimetres, hill-shaded, seen from above",
+        "Map of the height in millimetres, seen from above",
     ),
     "section": (
         "Cut along the line from A to B, with the standard deviation that is expected of it.",

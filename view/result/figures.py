@@ -47,10 +47,10 @@ MAPS = (
 """What can be drawn, where a result has it; besides, a user's own maps by their names."""
 
 _GRAPHS = "section", "histogram"  # which are no maps
-_IN_A_ROW = 3  # panels; more are put in two rows
+_IN_A_ROW = 3  # panels
 # Inches: of a map, at its sides, below and above it, and above all.
 _WIDTH, _HIGHEST = 3.5, 5.2
-_LEFT, _RIGHT, _BELOW, _ABOVE = 0.85, 1.45, 0.55, 0.5
+_LEFT, _RIGHT, _BELOW, _ABOVE = 0.95, 1.75, 0.6, 0.55
 _MARGIN, _GAP = 0.15, 0.2
 _NAME = 13  # points
 _LETTER, _LINE = 0.65 / 72, 1.45 / 72  # inches across and down that a letter takes, of a size of one point
@@ -171,7 +171,7 @@ def _cut(sheet: Sheet, ends: Ends | None) -> Section | None:
 
 def _figure(sheet: Sheet, panels: Sequence[_Panel], name: str) -> Figure:
     """Draw panels in rows, as high as the picture needs them, under one title."""
-    rows = 1 if len(panels) <= _IN_A_ROW else 2
+    rows = math.ceil(len(panels) / _IN_A_ROW)
     columns = math.ceil(len(panels) / rows)
     maps = any(panel.name not in _GRAPHS for panel in panels)
     high = min(max(_WIDTH / sheet.proportion if maps else 0.0, BOX * _WIDTH), _HIGHEST)

@@ -1,4 +1,4 @@
-"""Maps of a result: heights under a lamp, normals, expected errors, modulation, edges, status."""
+"""Maps of a result: heights, normals, expected errors, modulation, edges, status."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
-from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.io.result import unit_of
 from mirrorskin.io.types import Floats
 from mirrorskin.view.canvas import draw_classes, exceeded, explain_colours, filled_colours, round_length
@@ -27,14 +25,14 @@ _EDGE = 0.1  # of the picture's width: room for a letter
 
 
 def draw_height(axes: Axes, sheet: Sheet, cut: Section | None = None) -> None:
-    """Draw heights as a lit surface, with a scale bar, and where the section runs."""
+    """Draw heights by colour, with a scale bar, and where the section runs."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
     height = sheet.result.height
     assert height is not None
     ends = span(height)
-    draw_map(axes, sheet, shaded(height, sheet.filled, _pixel(sheet), ends), interpolation="antialiased")
+    draw_map(axes, sheet, height_picture(height, sheet.filled, ends), interpolation="antialiased")
     colours = ScalarMappable(Normalize(*_apart(*ends)), "viridis")
     explain_colours(axes, colours, f"{quantity(sheet)} (mm)", exceeded(height, *ends))
     if sheet.true_to_scale and sheet.unit == "mm" and height.size > 1:
@@ -64,11 +62,6 @@ def _notes(sheet: Sheet) -> Iterator[str]:
     if unknown is not None and unknown.any():
         pieces = "each piece" if unknown.all() else f"{np.count_nonzero(unknown)} of {unknown.size} pieces"
         yield "mean 0" if unknown.size == 1 else f"{pieces} about its mean"
-
-
-def _pixel(sheet: Sheet) -> tuple[float, float]:
-    left, right, bottom, top = sheet.place
-    return (right - left) / len(sheet.x), (top - bottom) / len(sheet.y)
 
 
 def _apart(low: float, high: float) -> tuple[float, float]:
@@ -127,51 +120,21 @@ def _draw_line(axes: Axes, sheet: Sheet, cut: Section) -> None:
         )
 
 
-_LAMP = 315.0, 45.0  # degrees: azimuth clockwise from above, which is the upper left, and elevation
-_SMOOTH = 1.0  # pixels, of the slopes that light falls on: steps of a press are no terraces
-_SHOWN_SLOPES = 98.0  # percentile of the slopes at full contrast
-_STEEPEST = 20.0  # greatest factor by which gentle slopes are steepened
-
-
-def shaded(
-    height: NDArray[np.float32],
-    filled: NDArray[np.bool_],
-    pixel: tuple[float, float],
-    span: tuple[float, float],
+def height_picture(
+    height: NDArray[np.float32], filled: NDArray[np.bool_], span: tuple[float, float]
 ) -> Colours:
-    """Return the colours of heights under a lamp at the upper left."""
+    """Return the colours of heights, (H, W, 3): those of the scale, and what was filled in orange."""
     from matplotlib import colormaps
-    from matplotlib.colors import LightSource, Normalize
+    from matplotlib.colors import Normalize
 
     known = np.isfinite(height)
-    if not known.any():
-        return np.broadcast_to(np.array(MISSING_RGB, np.uint8), (*height.shape, 3)).copy()
     level = Normalize(*span, clip=True)(np.where(known, height, span[0]))
     colours = np.where(
         filled[..., np.newaxis],
         filled_colours()(level, bytes=True)[..., :3],
         colormaps["viridis"](level, bytes=True)[..., :3],
     )
-    lamp = LightSource(*_LAMP)
-    light = _light(height, pixel, lamp.direction)
-    lit = lamp.blend_soft_light(colours.astype(np.float32) / 255, light[..., np.newaxis])
-    return np.asarray(np.where(known[..., np.newaxis], np.rint(255 * lit), MISSING_RGB), np.uint8)
-
-
-def _light(height: NDArray[np.float32], pixel: tuple[float, float], lamp: Floats) -> NDArray[np.float32]:
-    """Return the light on a surface, from 0 to 1; level ground has 0.5."""
-    whole = gaussian_filter(fill_with_nearest(height), _SMOOTH, mode="nearest")
-    dz_dx, dz_dy = _slope(whole, pixel[0], 1), -_slope(whole, pixel[1], 0)
-    change = (lamp[2] - lamp[0] * dz_dx - lamp[1] * dz_dy) / np.sqrt(1 + dz_dx**2 + dz_dy**2) - lamp[2]
-    usual = float(np.percentile(np.abs(change[np.isfinite(height)]), _SHOWN_SLOPES))
-    return np.asarray(np.clip(0.5 + change * min(0.5 / max(usual, 1e-9), _STEEPEST), 0, 1), np.float32)
-
-
-def _slope(height: NDArray[np.float32], step: float, axis: int) -> Floats:
-    """Return the change along an axis of the array, mm per mm; 0 along a single row or column."""
-    if height.shape[axis] == 1:
-        return np.zeros(height.shape)
-    return np.asarray(np.gradient(height.astype(np.float64), step, axis=axis))
+    return np.asarray(np.where(known[..., np.newaxis], colours, MISSING_RGB), np.uint8)
 
 
 _KEY = 129  # pixels of the key along a side

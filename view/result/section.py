@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.types import Floats
 from mirrorskin.view.canvas import BESIDE, round_length
-from mirrorskin.view.colours import FILLED
+from mirrorskin.view.colours import FILLED, span
 from mirrorskin.view.result.maps import outlined, quantity
 from mirrorskin.view.result.sheet import BOX, SMALL, TEXT, Sheet, entitle
 
@@ -19,11 +19,14 @@ if TYPE_CHECKING:
     from mirrorskin.engine.metrology import Section
 
 _ROOM = 1.15  # times the heights' range
+_TIMES = 1, 3, 10, 30, 100, 300, 1000  # standard deviations of a band
+_TAIL = 0.1  # of the colours' range, by which that of the histogram is wider
+_SEEN = 0.05  # share of the heights' range that a band can be seen at
 _NEAR = 0.1  # of the width: so near to the side words lean inwards
 
 
 def draw_section(axes: Axes, sheet: Sheet, cut: Section) -> None:
-    """Draw heights along a section, with a band of one standard deviation either way.
+    """Draw heights along a section, with a band of as many standard deviations as can be seen.
 
     What was filled is dashed; a hole is a gap; the highest measured point is marked.
     """
@@ -34,8 +37,9 @@ def draw_section(axes: Axes, sheet: Sheet, cut: Section) -> None:
     if cut.filled.any():
         axes.plot(cut.distance, _joined(cut), color=FILLED, ls=(0, (2, 1)), lw=1.5, label="filled")
     if np.isfinite(cut.sigma).any():
-        band = measured - cut.sigma, measured + cut.sigma
-        axes.fill_between(cut.distance, *band, color="tab:blue", alpha=0.25, lw=0, label="± 1 sigma")
+        times = _visible(cut)
+        band = measured - times * cut.sigma, measured + times * cut.sigma
+        axes.fill_between(cut.distance, *band, color="tab:blue", alpha=0.25, lw=0, label=f"± {times} sigma")
     scale = _scale(axes, sheet, cut)
     for name, end in (("A", 0), ("B", 1)):
         axes.annotate(
@@ -56,6 +60,12 @@ def draw_section(axes: Axes, sheet: Sheet, cut: Section) -> None:
     if np.isfinite(cut.height).any():
         axes.legend(fontsize=SMALL, **BESIDE)
     entitle(axes, "Section", f"{_ends(cut, sheet.unit)}{scale}")
+
+
+def _visible(cut: Section) -> int:
+    """Return how many standard deviations make a band that can be seen."""
+    spread, sigma = float(np.nanmax(cut.height) - np.nanmin(cut.height)), float(np.nanmedian(cut.sigma))
+    return next((times for times in _TIMES if times * sigma >= _SEEN * spread), _TIMES[-1])
 
 
 def _joined(cut: Section) -> Floats:
@@ -117,7 +127,9 @@ def draw_histogram(axes: Axes, sheet: Sheet) -> None:
     assert height is not None
     parts = [height[np.isfinite(height) & (sheet.filled == filled)] for filled in (False, True)]
     known = np.concatenate(parts)
-    bins = np.histogram_bin_edges(known, _BINS)
+    low, high = _shown(known)
+    beyond = int(np.count_nonzero((known < low) | (known > high)))
+    bins = np.histogram_bin_edges(known[(known >= low) & (known <= high)], _BINS)
     counts = [np.histogram(part, bins)[0] for part in parts]
     names = ("measured", "tab:blue"), ("filled", FILLED)
     below = np.zeros(_BINS)
@@ -137,4 +149,13 @@ def draw_histogram(axes: Axes, sheet: Sheet) -> None:
     notes = [f"median {np.median(known):.3f} mm"] if known.size else ["no answer"]
     if sigma is not None and np.isfinite(sigma).any():
         notes.append(f"median expected error {1e3 * np.nanmedian(sigma):.3g} \N{MICRO SIGN}m")
+    if beyond:
+        notes.append(f"{beyond} pixels beyond")
     entitle(axes, "Distribution of heights", "; ".join(notes))
+
+
+def _shown(known: Floats) -> tuple[float, float]:
+    """Return the range of heights but for a few pixels far from all others."""
+    low, high = span(known)
+    room = _TAIL * (high - low)
+    return low - room, high + room

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.image import AxesImage
 
-SMALL, TEXT, TITLE = 8, 9, 11
+SMALL, TEXT, TITLE = 9, 10.5, 12.5
 """Sizes of letters, points."""
 BOX = 0.62
 """Height over width of a panel that is no map."""
