@@ -191,22 +191,26 @@ class Hdf5File(Closing):
 
         ValueError if HDF5 would crash, hang, or take memory for more than there is.
         """
-        opened, kind = h5py.h5i.get_file_id(node), node.dtype
-        name = h5py.h5f.get_name(opened)
-        text = h5py.check_string_dtype(kind)
-        if kind.hasobject and text is None:
-            raise ValueError("neither numbers nor text")
-        if text is not None and text.length is None and name not in self._sound:
-            _check_heaps(h5py.File(opened))
-            self._sound.add(name)
-        if math.prod(node.shape) * kind.itemsize > opened.get_filesize() and text is not None:
-            raise ValueError("a text longer than its file")
+        kind = node.dtype
+        if kind.hasobject or kind.kind == "S":
+            self._check_text(node, h5py.check_string_dtype(kind))
         values: NDArray[Any] = np.empty(node.shape, kind)
         if isinstance(node, h5py.h5a.AttrID):
             node.read(values)
         else:
             node.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
         return values
+
+    def _check_text(self, node: h5py.h5d.DatasetID | h5py.h5a.AttrID, text: Any) -> None:
+        """Raise ValueError if this is no text, does not end, or is longer than its file."""
+        if text is None:
+            raise ValueError("neither numbers nor text")
+        opened = h5py.h5i.get_file_id(node)
+        if text.length is None and (name := h5py.h5f.get_name(opened)) not in self._sound:
+            _check_heaps(h5py.File(opened))
+            self._sound.add(name)
+        if math.prod(node.shape) * node.dtype.itemsize > opened.get_filesize():
+            raise ValueError("a text longer than its file")
 
     def count_step(self, node: Node) -> None:
         """Raise InputError if a file leads from place to place without end."""
