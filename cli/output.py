@@ -53,9 +53,10 @@ def _pieces(result: Result) -> dict[str, int]:
 def _words(components: int = 1, offset_unknown: int = 0) -> Iterator[str]:
     """Tell of pieces what is worth a word."""
     if components > 1:
-        yield f"in {components} components"
+        yield f"in {components} pieces"
     if offset_unknown:
-        yield "offset unknown" if offset_unknown == components else f"offset unknown of {offset_unknown}"
+        of = "" if offset_unknown == components else f" of {offset_unknown}"
+        yield f"absolute height unknown{of}"
 
 
 def printable(text: object) -> str:

@@ -37,6 +37,12 @@ _PIXELS_MAX = 200_000_000
 _MEMORY = 512_000_000  # bytes of light that a movement may keep
 _REACH_POSES = 16  # that tell how far an object reaches
 _ALL = 1e3  # travel that reaches all of any object, mm
+_IN_WORDS = {
+    "conform": "sheet takes the object's shape",
+    "elastic": "elastic body",
+    "ideal": "ideal optics",
+    "cylinder": "traced wall",
+}
 
 
 class Twin(Closing):
@@ -158,10 +164,10 @@ class Twin(Closing):
         else:
             dark, bright = ball_references(self._make_optics(Uniform()), self._sensor, self._view)
         gain, offset = self._zenith_scale() or (None, None)
-        contact, optics = self._names
+        how = ", ".join(_IN_WORDS[name] for name in self._names)
         return replace(
             self.movement.header(),
-            title=f"Digital twin, {self._thing.name}, {self.motion} motion, {contact}, {optics}",
+            title=f"Digital twin, {self._thing.name}, {self.motion} motion, {how}",
             pixel_size=self._view.pixel_size,
             dark=dark,
             bright=bright,

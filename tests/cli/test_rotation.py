@@ -67,7 +67,7 @@ def test_a_rotation_becomes_normals_that_are_scored():
     result = io.open_result("turn-result.h5")
     assert ended.out.startswith("turn-result.h5: normals at 99 of 99 pixels, zenith from ")
     lowest, highest = result.height.min(), result.height.max()
-    told = f"in contact at 99, relative height from {lowest:.3f} to {highest:.3f} mm, offset unknown"
+    told = f"in contact at 99, relative height from {lowest:.3f} to {highest:.3f} mm, absolute height unknown"
     assert ended.out.endswith(f", {told}\n")
     assert ended.out.count("\n") == 1
     assert np.max(errors(result)) < 2

@@ -88,7 +88,10 @@ def test_headers_tell_how_the_body_moves() -> None:
         twin = make_twin(name, pixel_size=(0.16, 0.2), dtype=np.uint8)
         header = twin.header
         assert header.motion == twin.motion == name
-        assert header.title == f"Digital twin, sphere, {name} motion, conform, ideal"
+        assert (
+            header.title
+            == f"Digital twin, sphere, {name} motion, sheet takes the object's shape, ideal optics"
+        )
         assert header.pixel_size == (0.16, 0.2)
         assert header.press == (None if name == "vertical" else PRESS)
         assert (header.tilt, header.pivot) == ((TILT, APEX) if name == "axial" else (None, None))
