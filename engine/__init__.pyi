@@ -2,6 +2,15 @@ from .errors import NotConverged
 from .estimator import run
 from .force.normal import Force, find_force
 from .force.tangential import TangentialForce, find_tangential_force
+from .fringes import (
+    FringeEstimator,
+    Fringes,
+    Unwrapped,
+    decode_gray,
+    fit_fringes,
+    unwrap_frequencies,
+    unwrap_gray,
+)
 from .fusion import fuse
 from .integration.camera import Camera
 from .integration.integration import Integrator, integrate
@@ -37,6 +46,8 @@ __all__ = [
     "Estimator",
     "Force",
     "Frequency",
+    "FringeEstimator",
+    "Fringes",
     "Growth",
     "Integrator",
     "Measures",
@@ -57,7 +68,9 @@ __all__ = [
     "Strokes",
     "Surface",
     "TangentialForce",
+    "Unwrapped",
     "correlate",
+    "decode_gray",
     "estimate_frequency",
     "estimate_normals",
     "estimate_pose",
@@ -69,6 +82,7 @@ __all__ = [
     "find_growth",
     "find_onset",
     "find_tangential_force",
+    "fit_fringes",
     "free_memory",
     "fuse",
     "integrate",
@@ -78,4 +92,6 @@ __all__ = [
     "run",
     "score",
     "stitch",
+    "unwrap_frequencies",
+    "unwrap_gray",
 ]
