@@ -6,11 +6,11 @@ from collections.abc import Mapping
 
 PICTURES: Mapping[str, tuple[str, str]] = {
     "height": (
-        "Height, lit from the upper left. Blue has no answer, and orange was filled, not measured.",
+        "Height. Blue has no answer, and orange was filled, not measured.",
         "Map of the height in millimetres, seen from above",
     ),
     "section": (
-        "Cut along the line from A to B, with the standard deviation that is expected of it.",
+        "Cut along the line from A to B; the band is as many expected standard deviations as it says.",
         "Cross-section: height along the line from A to B",
     ),
     "normals": (

@@ -167,7 +167,7 @@ def _draw_key(axes: Axes) -> None:
     key.set_axis_off()
     for name, x, y in (("x", 1.25, 0), ("y", 0, 1.25)):
         key.text(x, y, name, ha="center", va="center", fontsize=SMALL)
-    key.text(0, -1.2, "a ball's colours", ha="center", va="top", fontsize=SMALL)
+    key.text(0, -1.2, "on a ball", ha="center", va="top", fontsize=SMALL)
 
 
 _ARROWS = 12  # along a side
