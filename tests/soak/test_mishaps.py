@@ -6,7 +6,7 @@ import mishaps
 import pytest
 import soak
 
-ATTEMPTS = 3  # a machine that is busy with other things may be too late for the emulators
+ATTEMPTS = 5  # a machine that is busy with other things may be too late for the emulators
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
 
