@@ -25,6 +25,7 @@ class Controller:
     def __init__(self):
         self.way = [(0.0, -1.0, 0.0), (0.0, -1.0, 0.0)]  # time, travel; speed of what began last
         self.answers, self.silent, self.stopped, self.closed = [], False, 0, False
+        self.instead = {}  # a command to what it is answered instead
 
     def travel(self, at):
         (t0, a, _), (t1, b, _) = self.way
@@ -39,7 +40,8 @@ class Controller:
             self.stopped += 1
             self.way = [(now, self.travel(now), 0.0)] * 2
         state = "run" if now < self.way[1][0] else "idle"
-        self.answers.append(f"{self.travel(now):.5f} {state}" if words[0] == "WHERE?" else "ok")
+        answer = f"{self.travel(now):.5f} {state}" if words[0] == "WHERE?" else "ok"
+        self.answers.append(self.instead.get(words[0], answer))
 
     def readline(self):
         answer = self.answers.pop(0)
@@ -95,7 +97,7 @@ def test_what_it_cannot_do_is_refused_before_it_moves(lab):
     stage, line = lab
     with rig_of(stage, line) as rig:
         for plan, said in (
-            (VerticalPlan(0.0, 1.0, speed=101.0), "too fast"),
+            (VerticalPlan(0.0, 1.0, speed=101.0), "cannot go at 101 mm"),
             (VerticalPlan(0.0, 2.5, speed=1.0), "presses deeper"),
             (AxialPlan(1.0, 0.02, rate=0.5), "tilt"),
         ):
@@ -110,4 +112,46 @@ def test_silence_stops_it(lab):
     line.silent = True
     with pytest.raises(HardwareError, match="no longer answers"):
         stage.wait(timeout=5.0)
+    assert line.stopped
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, float("nan")])
+def test_a_speed_that_is_none_is_refused(lab, speed):
+    stage, line = lab
+    with pytest.raises(io.InputError, match="cannot go at"):
+        stage.move(Position(1.0), speed)
+    assert line.way[1][1] == -1.0
+
+
+def test_a_move_that_the_controller_refuses_stops_it(lab):
+    stage, line = lab
+    line.instead["MOVE"] = "error 7"
+    with pytest.raises(HardwareError, match="'error 7'"):
+        stage.move(Position(1.0), 0.5)
+    assert line.stopped
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [("garbage", "look at its cable"), ("nan run", "no place"), ("2.50000 run", "beyond its limits")],
+)
+def test_a_report_that_cannot_be_stops_it(lab, answer, said):
+    stage, line = lab
+    stage.move(Position(1.0), 0.5)
+    line.instead["WHERE?"] = answer
+    with pytest.raises(HardwareError, match=said):
+        stage.wait(timeout=5.0)
+    assert line.stopped
+
+
+def test_a_wait_that_is_interrupted_stops_it(lab, monkeypatch):
+    stage, line = lab
+    stage.move(Position(1.0), 0.5)
+
+    def interrupted():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(stage, "report", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        stage.wait()
     assert line.stopped
