@@ -208,17 +208,20 @@ class _Repeats:
         self._changes = self._alike = (
             0  # pictures that differ from the one before; those in a row that do not
         )
-        self._noisy = True  # no two were alike, but for those of this row
+        self._noisy = True  # no two were alike so far, but for those of this row
 
     def frozen(self, picture: NDArray[Any]) -> bool:
         """Take the next picture, whose memory stays as it is until the one after it was taken."""
+        if not self._noisy:
+            return False
         if self._last is not None and all(map(np.array_equal, picture, self._last)):  # row by row
             self._alike += 1
+            self._noisy = self._alike < _FROZEN or self._changes > _CHANGES
         else:
-            self._noisy &= self._alike == 0
+            self._noisy = self._alike == 0
             self._changes, self._alike = self._changes + 1, 0
         self._last = picture
-        return self._noisy and self._changes > _CHANGES and self._alike >= _FROZEN
+        return self._noisy and self._alike >= _FROZEN
 
 
 class _Pace:
