@@ -210,10 +210,15 @@ def test_a_terminated_simulation_leaves_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-CARELESS = """
+PROGRAM = """
 import signal, sys, time
 from mirrorskin.cli import info, main
-
+{command}
+info.command = command
+sys.argv = ["mirrorskin", "info"]
+main.main()
+"""
+CARELESS = """
 class Careless:
     def __del__(self):
         signal.raise_signal(signal.{name})  # what is raised here is lost
@@ -222,42 +227,21 @@ def command():
     Careless()
     time.sleep(30)
     print("went on")
-
-info.command = command
-sys.argv = ["mirrorskin", "info"]
-main.main()
 """
-
-
-@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 128 + signal.SIGTERM), ("SIGINT", 130)])
-def test_a_signal_that_comes_in_a_destructor_ends_the_command_too(name, code):
-    run = subprocess.run(
-        [sys.executable, "-c", CARELESS.format(name=name)], capture_output=True, text=True, timeout=60
-    )
-    assert (run.returncode, run.stdout, run.stderr) == (code, "", "")
-
-
 CONFUSED = """
-import signal, sys
-from mirrorskin.cli import info, main
-
 def command():
     try:
         signal.raise_signal(signal.{name})
     except BaseException:
         raise TypeError("as compiled libraries make of it") from None
-
-info.command = command
-sys.argv = ["mirrorskin", "info"]
-main.main()
 """
 
 
 @pytest.mark.parametrize(("name", "code"), [("SIGTERM", 128 + signal.SIGTERM), ("SIGINT", 130)])
-def test_a_signal_that_a_library_makes_another_error_of_ends_the_command(name, code):
-    run = subprocess.run(
-        [sys.executable, "-c", CONFUSED.format(name=name)], capture_output=True, text=True, timeout=60
-    )
+@pytest.mark.parametrize("command", [CARELESS, CONFUSED], ids=["lost", "made another error of"])
+def test_a_signal_ends_the_command_whatever_becomes_of_its_exception(command, name, code):
+    program = PROGRAM.format(command=command.format(name=name))
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
     assert (run.returncode, run.stdout, run.stderr) == (code, "", "")
 
 
