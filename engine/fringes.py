@@ -51,7 +51,7 @@ class Unwrapped(Shown):
     Attributes
     ----------
     phase : ndarray, (H, W), float64
-        Radians, of the finest fringes.
+        Radians, of the finest fringes; NaN where the phase, its standard error or the stripe is not known.
     sigma : ndarray, (H, W), float32
         Radians: its standard error if the order is right.
     order : ndarray, (H, W), int32
@@ -362,8 +362,11 @@ def _nearest(phase: Doubles, guess: Doubles) -> Doubles:
 
 def _unwrapped(wrapped: Doubles, whole: Doubles, sigma: Doubles, risk: Doubles) -> Unwrapped:
     order = np.nan_to_num(np.rint((whole - wrapped) / _TURN)).astype(np.int32)
-    missing = np.where(np.isfinite(whole), risk, np.nan)
-    return Unwrapped(whole, sigma.astype(np.float32), order, _probability(missing))
+    with np.errstate(over="ignore"):
+        error = sigma.astype(np.float32)
+    known = np.isfinite(whole) & np.isfinite(error)
+    phase, error, wrong = (np.where(known, one, np.nan) for one in (whole, error, risk))
+    return Unwrapped(phase, error.astype(np.float32), order, _probability(wrong))
 
 
 def _probability(sum_of_risks: Doubles) -> NDArray[np.float32]:

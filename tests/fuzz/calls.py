@@ -73,6 +73,15 @@ def calls() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
             "displacement": np.full((*SHAPE, 2), 0.01), "pixel_size": 0.1, "modulus": 0.1, "contact": disc,
         },
         "find_growth": {"frames": dither, "travel": wave, "dark": 0.0, "bright": 255.0},
+        "fit_fringes": {"frames": _rotation(phases), "shift": phases},
+        "unwrap_frequencies": {
+            "phase": np.stack([0.3 * _COLUMN, 2.4 * _COLUMN % math.tau]), "sigma": np.full((2, *SHAPE), 0.05),
+            "frequency": np.array([1.0, 8.0]),
+        },
+        "decode_gray": {"frames": _press(), "threshold": 100.0, "noise": 2.0},
+        "unwrap_gray": {
+            "phase": 0.3 * _COLUMN, "sigma": sure, "stripe": 0.3 * _COLUMN // math.pi, "risk": flat,
+        },
         "estimate_frequency": {"samples": wave, "time": 0.01 * np.arange(64)},
         "estimate_pose": {"first": result, "second": result, "pixel_size": 0.1},
         "stitch": {"results": [result, result], "pixel_size": 0.1},
@@ -106,11 +115,11 @@ def odd_values(sound: Any) -> Iterator[tuple[str, Any]]:
     yield "masked", np.ma.masked_array(sound, np.arange(array.size).reshape(array.shape) % 5 == 0)
     for name, value in (("infinite", math.inf), ("unknown", math.nan)):
         part = array.copy()
-        part.flat[3] = value
+        part.flat[-1] = value
         yield f"{name} in part", part.astype(np.float32)
     most = np.finfo(sound.dtype).max / 4 if sound.dtype.kind == "f" else np.iinfo(np.int64).max
     part = array.copy()
-    part.flat[3] = most
+    part.flat[-1] = most
     yield "huge in part", part.astype(sound.dtype if sound.dtype.kind == "f" else np.float64)
     yield "all huge", np.full_like(part, most)
     yield "transposed", np.asarray(sound).T
