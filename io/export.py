@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 from mirrorskin.io import pictures
 from mirrorskin.io.arguments import checked
 from mirrorskin.io.atomic import write_new
+from mirrorskin.io.frames import MCAP_SUFFIX
 from mirrorskin.io.mesh import Mesh, face_vectors, normals_around, surface_mesh
 from mirrorskin.io.os_errors import legible
 from mirrorskin.io.result import unit_of
 from mirrorskin.io.types import Floats, InputError, Result
 
-_SECTION, _ARRAYS, _ROS = ".csv", ".npz", ".mcap"
+_SECTION, _ARRAYS = ".csv", ".npz"
 _SOFTWARE, _DATE, _SOURCE = "software", "date", "source"
 _FROM_PROCESS = {_SOURCE: "source", _DATE: "date", "turn": "turn"}
 _NORMAL = "nx", "ny", "nz"
@@ -88,7 +89,7 @@ def export_result(
         units = {name: "mm" for name in section if name != "filled"}
         save_table(path, section, units, _notes_of(result))
         holds = f"{len(section['height'])} points of a cross-section"
-    elif suffix == _ROS:
+    elif suffix == MCAP_SUFFIX:
         from mirrorskin.io.mcap import save_messages
 
         holds = save_messages(result, path)
@@ -105,12 +106,17 @@ def export_result(
 
 def check_export(result: Result, path: str | Path) -> None:
     """Refuse what cannot be exported, before any work is done for it."""
-    suffix, known = Path(path).suffix.lower(), (*_FORMATS, _SECTION, _ROS)
+    suffix, known = Path(path).suffix.lower(), (*_FORMATS, _SECTION, MCAP_SUFFIX)
     if suffix not in known:
         wrong = f"{suffix} is no format" if suffix else "its name does not say a format"
         raise InputError(f"{path}: {wrong}: name a file that ends with one of {' '.join(known)}")
     if suffix == _ARRAYS:
         return
+    check_heights(result, path)
+
+
+def check_heights(result: Result, path: str | Path) -> None:
+    """Refuse a result without heights in millimetres."""
     remedy = f"or export its maps as {_ARRAYS}"
     if result.height is None:
         raise InputError(f"{path}: the result has no heights: reconstruct it again with them, {remedy}")
@@ -178,10 +184,10 @@ def _encode_ply(result: Result, points: bool = False) -> _Encoded:
     """Encode a surface of triangles, or points alone, as binary PLY."""
     notes = {"unit": "mm"} | _notes_of(result)
     if points:
-        columns = _points(result)
+        columns = points_of(result)
         return _Encoded(_ply(columns, None, notes), f"{len(columns['x'])} points")
     mesh = _surface(result)
-    columns = _points(result, mesh.pixels)
+    columns = points_of(result, mesh.pixels)
     if result.normals is not None:
         # Programs shade by them, and paint black what has none.
         missing = np.isnan(columns[_NORMAL[0]])
@@ -209,7 +215,7 @@ def _encode_stl(result: Result) -> _Encoded:
 
 def _encode_xyz(result: Result) -> _Encoded:
     """Encode points as text, one a line, after comments, of which the last names the columns."""
-    columns = _points(result)
+    columns = points_of(result)
     names = [f"{name}[{_POINT_UNITS[name]}]" if name in _POINT_UNITS else name for name in columns]
     head = [*(f"{name}: {note}" for name, note in _notes_of(result).items()), " ".join(names)]
     formats = ["%d" if values.dtype.kind == "u" else "%.6f" for values in columns.values()]
@@ -306,7 +312,8 @@ def _grid(result: Result) -> tuple[NDArray[np.float32], Floats, Floats]:
     return result.height, result.x, result.y
 
 
-def _points(result: Result, pixels: NDArray[np.int64] | None = None) -> dict[str, NDArray[Any]]:
+def points_of(result: Result, pixels: NDArray[np.int64] | None = None) -> dict[str, NDArray[Any]]:
+    """Return the columns of points, (n,), by name: of these pixels, or of all with a height."""
     height, x, y = _grid(result)
     chosen = np.flatnonzero(np.isfinite(height)) if pixels is None else pixels
     row, column = np.unravel_index(chosen, height.shape)

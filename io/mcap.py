@@ -14,12 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io.arguments import checked
 from mirrorskin.io.atomic import MAKE_ROOM, new_file
+from mirrorskin.io.export import check_heights, points_of
 from mirrorskin.io.frames import FrameSequence
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.pictures import quiet_opencv
 from mirrorskin.io.positions import Positions
 from mirrorskin.io.recording import Recording
-from mirrorskin.io.types import FRAME_DTYPES, Floats, Header, InputError, Result
+from mirrorskin.io.types import Floats, Header, InputError, Result
 
 if TYPE_CHECKING:
     from mcap_ros2.writer import Writer
@@ -146,18 +147,13 @@ def save_messages(given: Result | Recording, path: str | Path) -> str:
 
 
 def _put_result(file: _File, result: Result, path: str | Path) -> str:
-    if result.height is None or result.x is None or result.y is None or not np.isfinite(result.height).any():
-        raise InputError(
-            f"{path} needs heights in millimetres: reconstruct the result again with them, and --pixel-size"
-        )
+    check_heights(result, path)
+    assert result.height is not None
     stamp = _stamp(str(result.process.get("date", "")))
-    known = np.isfinite(result.height)
-    y, x = np.meshgrid(result.y, result.x, indexing="ij")
-    sigma = np.full_like(result.height, np.nan) if result.height_sigma is None else result.height_sigma
-    columns: dict[str, NDArray[Any]] = {"x": x, "y": y, "z": result.height, "sigma": sigma}
-    table: dict[str, NDArray[Any]] = {name: values[known] * _METRE for name, values in columns.items()}
-    if result.normals is not None:
-        table |= {f"normal_{name}": result.normals[known][:, axis] for axis, name in enumerate("xyz")}
+    columns = points_of(result)
+    unknown = np.full_like(columns["z"], np.nan)
+    table = {name: columns.get(name, unknown) * _METRE for name in ("x", "y", "z", "sigma")}
+    table |= {f"normal_{name}": columns[f"n{name}"] for name in "xyz" if f"n{name}" in columns}
     points = np.stack(list(table.values()), axis=1).astype("<f4")
     fields = [
         {"name": name, "offset": 4 * number, "datatype": _FLOAT32, "count": 1}
@@ -346,5 +342,4 @@ def _frame(message: Any, name: str) -> NDArray[Any]:
     if colours > 1:
         with quiet_opencv() as cv2:
             return np.asarray(cv2.cvtColor(frame, getattr(cv2, f"COLOR_{_COLOURS[message.encoding]}2GRAY")))
-    assert frame.dtype in FRAME_DTYPES
     return frame[:, :, 0]

@@ -199,6 +199,12 @@ class Link:
         with self.lock:
             return self._times.longest
 
+    @property
+    def longest_silence(self) -> float:
+        """Seconds without an answer that a move bears."""
+        with self.lock:
+            return max(self._silence, _TRIPS * self._times.usual)
+
     # What others call
 
     def begin(self) -> None:
@@ -413,7 +419,7 @@ class Link:
     def _limit(self) -> float:
         if self.patience is not None:
             return self.patience
-        return max(self._silence, _TRIPS * self._times.usual) if self._moving() else self._timeout
+        return self.longest_silence if self._moving() else self._timeout
 
     def _moving(self) -> bool:
         if self.window.busy or self.seen is None:

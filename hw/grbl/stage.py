@@ -139,6 +139,11 @@ class GrblStage(Closing):
         """Seconds of the longest of these of late; NaN before the first."""
         return self._link.longest_trip
 
+    @property
+    def longest_silence(self) -> float:
+        """Seconds without an answer that a move bears."""
+        return self._link.longest_silence
+
     def check_way(self, start: Position, place: Position, speed: float | None) -> None:
         """Refuse a straight move that is too fast, or too slow for the controller."""
         self.axes.check_way(start, place, speed)

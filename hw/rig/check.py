@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.hw.camera import Camera, Counts
 from mirrorskin.hw.grbl.stage import GrblStage
+from mirrorskin.hw.rig.rig import longest_wait
 from mirrorskin.hw.rig_file import Axis, CameraSettings, RigSettings, StageSettings
 from mirrorskin.hw.stage import Limits, Position, Report
 from mirrorskin.hw.video import VideoCamera
@@ -217,7 +218,7 @@ def _reports(stage: GrblStage, settings: StageSettings) -> Iterator[Finding]:
     if stage.round_trip > _ROUND_TRIP_MAX:
         remedy = "positions in motion are as uncertain as this is long; use a shorter or faster line"
     yield _rated("stage", "round trip of a report", f"{stage.round_trip * 1e3:.1f} ms", remedy)
-    yield _wait("stage", "longest round trip", stage.longest_trip, settings.silence, "stage.silence")
+    yield _wait("stage", "longest round trip", stage.longest_trip, stage.longest_silence, "stage.silence")
 
 
 def _wait(part: str, what: str, longest: float, limit: float, key: str) -> Finding:
@@ -261,7 +262,8 @@ def check_camera(camera: Camera, settings: CameraSettings) -> Iterator[Finding]:
     yield _rate(after, settings)
     yield _losses(dropped, after, before)
     longest = float(np.max(np.diff(times), initial=0.0))
-    yield _wait("camera", "longest wait for a frame", longest, settings.stall, "camera.stall")
+    bound = longest_wait(settings, 1 / after.rate if after.rate > 0 else 0.0)
+    yield _wait("camera", "longest wait for a frame", longest, bound, "camera.stall")
     yield _brightness(frames.pixels[-1].copy())
 
 

@@ -11,7 +11,7 @@ from types import TracebackType
 
 from mirrorskin.hw.camera import Camera, Frames
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.rig_file import RigSettings
+from mirrorskin.hw.rig_file import CameraSettings, RigSettings
 from mirrorskin.hw.stage import Position, Report, Stage
 from mirrorskin.io.types import Closing
 
@@ -207,12 +207,17 @@ class Rig(Closing):
                 f"{self.camera.name} was lost while the stage moved, which was stopped; it is back, and its"
                 " frames may be later than before: begin anew"
             )
-        if silence < max(self.settings.camera.stall, _STALL_PERIODS * self.period):
+        if silence < longest_wait(self.settings.camera, self.period):
             return None
         return HardwareError(
             f"{self.camera.name} gave no frame for {silence:.2f} s while the stage moved, which was stopped:"
             " look at its cable and its load"
         )
+
+
+def longest_wait(settings: CameraSettings, period: float) -> float:
+    """Return the seconds without a frame that a move bears, of a camera with a frame each period."""
+    return max(settings.stall, _STALL_PERIODS * period)
 
 
 def _paused(seconds: float) -> HardwareError:

@@ -72,6 +72,7 @@ class Stage:
 
     firmware = "Grbl 1.1h"
     round_trip = longest_trip = 0.004
+    longest_silence = 0.07
     clock = None
 
     def __init__(
@@ -300,6 +301,10 @@ def test_a_frame_that_came_late_asks_for_a_longer_stall():
     found = film(Camera(every=0.08))["longest wait for a frame"]
     assert (found.verdict, found.found) == ("warning", "80.0 ms, of 100 ms that a move bears")
     assert "set camera.stall = 0.24" in found.remedy
+
+
+def test_a_slow_camera_that_is_on_time_asks_for_nothing():
+    assert film(Camera(every=0.08, rate=12.5))["longest wait for a frame"].verdict == "ok"
 
 
 def test_lost_frames_and_reconnections_are_told():
