@@ -17,7 +17,7 @@ import msgspec
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.grbl.link import HOLDING, RESET, Link, TimedStatus, open_port
 from mirrorskin.hw.grbl.moves import Axes, Command
-from mirrorskin.hw.grbl.replies import Message, Setting, Status
+from mirrorskin.hw.grbl.replies import BUFFER, Message, Setting, Status
 from mirrorskin.hw.rig_file import StageSettings
 from mirrorskin.hw.stage import Position, Report
 from mirrorskin.io import InputError
@@ -39,6 +39,7 @@ _HOMING = 60.0  # seconds, where the settings do not say how long it takes
 _SLOWING = 1.25  # times the longest ramp, that a hold may take
 _SAME_STEPS = 1e-4  # relative, as $100 to $105 are told
 _LETTERS = "XYZABC"
+_ROTARY = 701  # grblHAL's setting of what a feed is where axes in degrees move as well
 _UNLOCK = "release it with 'mirrorskin rig unlock'"
 
 
@@ -47,6 +48,7 @@ class Controller:
     """What a controller is."""
 
     firmware: str  # its name and version, as it says them
+    axes: str  # their letters, as far as it says them
     settings: dict[int, float]  # those ``$`` settings that are numbers
 
     def on(self, number: int) -> bool:
@@ -309,9 +311,10 @@ class GrblStage(Closing):
 
     def _check(self, controller: Controller) -> None:
         """Refuse a controller that lacks an axis; go no faster, slower or farther than it does."""
-        known = (self._link.seen.status.machine or self._link.seen.status.work) if self._link.seen else None
+        status = self._link.seen.status if self._link.seen else None
+        known = controller.axes or (status and (status.machine or status.work))
         for motion, letter in self.axes.letters.items():
-            if known is not None and letter not in known:
+            if known and letter not in known:
                 raise InputError(f"{self.name}: the controller has no axis {letter}; correct the rig file")
             steps, rate, acceleration = (
                 controller.settings.get(number + _LETTERS.index(letter), 0.0) for number in (100, 110, 120)
@@ -460,6 +463,8 @@ def _greet(link: Link, name: str, timeout: float, unlock: bool) -> Controller:
     controller = _identity(link, name, timeout)
     if controller.on(13):
         raise InputError(f"{name}: it reports in inches; set $13=0")
+    if controller.on(_ROTARY):
+        raise InputError(f"{name}: it takes feeds for those of its linear axes alone; set ${_ROTARY}=0")
     return controller
 
 
@@ -494,14 +499,15 @@ def _identity(link: Link, name: str, timeout: float) -> Controller:
         raise InputError(f"{name}: it says that it is version {version or '?'}; GRBL 1.1 or later is needed")
     size = re.match(r"OPT:[^,]*,\d+,(\d+)", answers.get("OPT", ""))
     if size:
-        link.window.size = int(size[1])
+        link.window.size = min(BUFFER, int(size[1]))  # a question waits behind all lines that are on the way
     settings = {}
     for said in link.ask("$$", timeout):
         if isinstance(said, Setting) and re.fullmatch(r"-?\d+(\.\d*)?", said.value):
             settings[said.number] = float(said.value)
     kind = "grblHAL" if {"FIRMWARE", "NEWOPT"} & answers.keys() else "Grbl"
     firmware = link.banner.text.partition(" [")[0] if link.banner else f"{kind} {version}"
-    return Controller(firmware, settings)
+    axes = re.match(r"AXS:\d+:([A-Z]+)", answers.get("AXS", ""))
+    return Controller(firmware, axes[1] if axes else "", settings)
 
 
 def _leaning(travel: float, tilt: float, phase: float) -> Position:

@@ -48,12 +48,6 @@ def test_it_tells_where_it_is_and_who_it_is(opened):
     assert 0 < stage.round_trip < 5
 
 
-def test_grblhal_is_not_called_grbl(opened):
-    said = "[VER:1.1f.20250101:]\r\n[OPT:VNMSL,35,1024]\r\n[NEWOPT:ENUMS,RT+]\r\n[FIRMWARE:grblHAL]\r\nok"
-    stage, _ = opened(ScriptedGrbl(answers={"$I": said}))
-    assert stage.firmware == "grblHAL 1.1f.20250101"
-
-
 def test_reports_of_work_coordinates_are_turned_into_the_machines(opened):
     stage, _ = opened(ScriptedGrbl(place=(31.0, 40.0, 9.0), work=True))
     assert stage.report().position.travel == pytest.approx(1)
@@ -72,16 +66,19 @@ def test_it_goes_where_it_is_sent_in_the_machines_coordinates(opened):
     assert port.lines[-1].startswith("G53G1Z9"), "a move to where it stands needs no line"
 
 
-def test_a_precession_ends_where_it_began_and_streams_within_the_buffer(opened):
-    stage, port = opened()
+@pytest.mark.parametrize(
+    "size", [128, 1024]
+)  # of a large one no more is used: questions wait behind all of it
+def test_a_precession_ends_where_it_began_and_streams_within_the_buffer(opened, size):
+    stage, port = opened(ScriptedGrbl(size=size))
     stage.move(Position(1.0, LEAN))
     stage.wait()
-    stage.precess(LEAN, 3.0, 5.0)
+    stage.precess(LEAN, 6.0, 6.0)
     assert stage.report().state in ("run", "idle")
     report = stage.wait()
     assert report.state == "idle"
     assert report.position.pitch == pytest.approx(LEAN, abs=1e-4)
-    assert sum(line.startswith("G3") for line in port.lines) == 6
+    assert sum(line.startswith("G3") for line in port.lines) == 12
     assert 0 < port.fill <= 128
 
 

@@ -1,15 +1,21 @@
-"""The emulated controller answers as GRBL's own firmware did when the transcript was made."""
+"""The emulated controller answers as GRBL's own firmware did, and the driver knows grblHAL's answers."""
 
 import re
 from pathlib import Path
 
 import pytest
-from firmware import PROGRAM, Firmware
+from firmware import PROGRAM, Firmware, is_hal
+from scripted_grbl import ScriptedGrbl, stage_settings
 from transcript import REST, SETTINGS, play, read
 
 from mirrorskin.hw.emulator.port import GrblMachine
+from mirrorskin.hw.grbl.replies import parse
+from mirrorskin.hw.grbl.stage import GrblStage
+from mirrorskin.hw.rig_file import TwistAxis
+from mirrorskin.io import InputError
 
-FIRMWARE = read(Path(__file__).with_name("grbl-1.1h.txt"))
+GRBL, HAL = (read(Path(__file__).with_name(name)) for name in ("grbl-1.1h.txt", "grblhal-1.1f.txt"))
+FIRMWARE = HAL if is_hal(PROGRAM) else GRBL
 LATE = 0.2  # seconds: between looks at whether it rests, and of a program on a busy computer
 
 
@@ -25,11 +31,12 @@ def emulated():
 
 
 @pytest.fixture(scope="module", params=["emulator", *(["firmware"] if PROGRAM else [])])
-def answered(request, tmp_path_factory):
+def both(request, tmp_path_factory):
+    """What one answers, and what it should."""
     if request.param == "emulator":
-        return emulated()
+        return emulated(), GRBL
     with Firmware(PROGRAM, tmp_path_factory.mktemp("grbl"), SETTINGS) as firmware:
-        return list(play(firmware))
+        return list(play(firmware)), FIRMWARE
 
 
 def statuses(exchange):
@@ -43,30 +50,59 @@ def words(exchange):
     return [re.sub(r"(VER:\S+?)\..*", r"\1", line) for line in exchange.said if line[0] not in "<$"]
 
 
-def test_it_says_the_same(answered):
-    assert [(one.sent, words(one)) for one in answered] == [(one.sent, words(one)) for one in FIRMWARE]
+def test_it_says_the_same(both):
+    ours, theirs = ([(one.sent, words(one)) for one in played] for played in both)
+    assert ours == theirs
 
 
-def test_it_reports_the_same_states_and_places(answered):
-    for ours, theirs in zip(answered, FIRMWARE, strict=True):
+def test_it_reports_the_same_states_and_places(both):
+    for ours, theirs in zip(*both, strict=True):
         for (state, place), (expected, where) in zip(statuses(ours), statuses(theirs), strict=True):
             moved = 0.5 if (state, ours.sent) != ("Idle", REST) else 1e-3  # until it was stopped
             assert (ours.sent, state) == (theirs.sent, expected)
             assert place == pytest.approx(where, abs=moved)
 
 
-def test_its_settings_have_the_same_values(answered):
+def test_its_settings_have_the_same_values(both):
     ours, theirs = (
         {number: float(value) for line in one for number, value in re.findall(r"^\$(\d+)=([-\d.]+)", line)}
-        for one in (answered[2].said, FIRMWARE[2].said)
+        for one in (played[2].said for played in both)
     )
     assert len(ours) >= 20
     assert ours == {number: theirs[number] for number in ours}
 
 
-def test_moves_take_as_long(answered):
-    for last, exchange in enumerate(FIRMWARE):
+def test_moves_take_as_long(both):
+    for last, exchange in enumerate(both[1]):
         if exchange.sent == REST:
-            both = slice(last - 1, last + 1)  # the line of an arc is answered late, as its pieces find room
-            ours, theirs = (sum(one.seconds for one in played[both]) for played in (answered, FIRMWARE))
+            two = slice(last - 1, last + 1)  # the line of an arc is answered late, as its pieces find room
+            ours, theirs = (sum(one.seconds for one in played[two]) for played in both)
             assert ours == pytest.approx(theirs, abs=LATE)
+
+
+@pytest.mark.parametrize("played", [GRBL, HAL])
+def test_the_driver_reads_every_line(played):
+    assert [line for one in played for line in one.said if parse(line.encode()) is None] == []
+
+
+def hal(**answers):
+    """A controller that tells of itself what grblHAL does."""
+    told = {one.sent: "\r\n".join(one.said) for one in HAL if one.sent in ("$I", "$$")}
+    return ScriptedGrbl(answers=told | answers)
+
+
+def test_the_driver_knows_grblhal():
+    with GrblStage(stage_settings(), hal()) as stage:
+        assert stage.firmware == "grblHAL 1.1f.20260817"
+        assert stage.parameters[110] == 1200
+
+
+def test_axes_that_grblhal_calls_otherwise_are_missed():
+    told = "[VER:1.1f.20260817:]\r\n[AXS:6:XYZUVW]\r\n[FIRMWARE:grblHAL]\r\nok"
+    with pytest.raises(InputError, match="no axis C"):
+        GrblStage(stage_settings(twist=TwistAxis(letter="C", limits=(-9, 9), speed=9.0)), hal(**{"$I": told}))
+
+
+def test_feeds_of_linear_axes_alone_are_refused():
+    with pytest.raises(InputError, match=r"set \$701=0"):
+        GrblStage(stage_settings(), hal(**{"$$": "$701=1\r\nok"}))

@@ -1,4 +1,4 @@
-"""GRBL's own firmware, compiled as a program of this computer by grbl-sim, in an emulated machine's place.
+"""A real firmware, GRBL 1.1 or grblHAL, compiled as a program, in an emulated machine's place.
 
 It speaks on its standard streams, keeps its settings in the folder that it runs in, and writes its steps to a
 file; docs/rig.md says how it is built. It does not write its last steps before a halt: at rest its own report
@@ -24,18 +24,22 @@ from mirrorskin.io.types import Closing
 PROGRAM = os.environ.get("GRBL")
 """The program; `make test-hardware GRBL=PATH` gives it."""
 
-_INVERTED = {5: 1, 6: 1}  # its switches are all low, which means pressed unless they are inverted
+_INVERTED = {5: 1, 6: 1}  # GRBL's switches are all low, which means pressed unless they are inverted
 _STEPS = 250.0  # a mm, as GRBL has them unless told otherwise
+_PER_AXIS = range(100, 136)
 _TICK = 0.002  # seconds between looks at what it said, and between its lines of steps
 _START = 10.0
 _STILL = 0.05  # seconds without a step, after which it rests
 _REPORT = re.compile(rb"<([^|>]*)\|MPos:([-\d.,]+)[^>]*>")
 
 
+def is_hal(program: str | None) -> bool:
+    """Return whether a program is grblHAL."""
+    return program is not None and b"GrblHAL" in Path(program).read_bytes()
+
+
 class Firmware(Closing):
     """A controller that is a process, with the face of `GrblMachine`."""
-
-    axes = "XYZ"
 
     def __init__(self, program: str, folder: Path, settings: Mapping[int, float]) -> None:
         self._ended, self._lock = threading.Event(), threading.Lock()
@@ -52,11 +56,15 @@ class Firmware(Closing):
         )
         os.close(theirs)
         self._log = log
-        self._places: list[tuple[float, tuple[float, ...]]] = [(time.monotonic(), (0.0, 0.0, 0.0))]
+        hal = is_hal(program)
+        self.axes = "XYZABC" if hal else "XYZ"
+        self._places: list[tuple[float, tuple[float, ...]]] = [(time.monotonic(), (0.0,) * len(self.axes))]
         self._follower = threading.Thread(target=self._follow, name="steps", daemon=True)
         self._follower.start()
         self._expect(b"help]\r\n")
-        for number, value in sorted((_INVERTED | dict(settings)).items(), reverse=True):  # $22 before $20
+        given = {} if hal else _INVERTED
+        given |= {n: value for n, value in settings.items() if n not in _PER_AXIS or n % 10 < len(self.axes)}
+        for number, value in sorted(given.items(), reverse=True):  # $22 before $20
             self.receive(f"${number}={value:g}\n".encode())
             self._expect(b"ok\r\n")
 
@@ -151,5 +159,5 @@ class Firmware(Closing):
             now = time.monotonic()
             for line in whole:
                 if line and not line.startswith(b"#"):
-                    x, y, z = (float(part.rstrip(b",\r")) / _STEPS for part in line.split()[1:4])
-                    self._places.append((now, (x, y, z)))
+                    parts = line.split()[1 : 1 + len(self.axes)]
+                    self._places.append((now, tuple(float(part.rstrip(b",\r")) / _STEPS for part in parts)))

@@ -1,7 +1,7 @@
 """What goes wrong on a rig while it captures, and how that ends; run, it prints a table.
 
-``python tests/support/rig_faults.py [PROGRAM]`` has every fault on the emulated controller, and on GRBL's own
-firmware if its program is given.
+``python tests/support/rig_faults.py [PROGRAM ...]`` has every fault on the emulated controller, and on each
+real firmware whose program is given.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from firmware import Firmware
+from firmware import Firmware, is_hal
 from msgspec import structs
 
 from mirrorskin import io
@@ -80,12 +80,19 @@ FIRMWARE_ONLY = {
 
 SETTINGS: dict[str, tuple[dict[int, float], str]] = {
     "reports in inches ($13=1)": ({13: 1}, "set $13=0"),
-    "work position in reports ($10=0)": ({10: 0}, ""),
+    "work position in reports ($10)": ({10: 510}, ""),  # bits beyond the second are grblHAL's
     "axis slower than asked ($112)": ({112: 30}, "at most 0.5 mm/s"),
     "steps per mm changed ($102)": ({102: 500}, "$102 is 500 steps where the rig file has 250"),
     "axis shorter than asked ($132, $20)": ({22: 1, 20: 1, 132: 4}, "soft limits"),
 }
 """What is set in the controller before a rig is opened, and words of what is said; "" if it works."""
+
+HAL_SETTINGS: dict[str, tuple[dict[int, float], str]] = {
+    "no work offset in reports ($10=1)": ({10: 1}, "switch it on in $10"),
+    "feeds of linear axes alone ($701=1)": ({701: 1}, "set $701=0"),
+    "reports unasked, every 0.1 s ($481)": ({481: 100}, ""),
+}
+"""The same of grblHAL alone."""
 
 
 @dataclass
@@ -111,8 +118,7 @@ def _rig(controller: str, folder: Path, changed: Mapping[int, float]) -> Iterato
         if controller == "emulator":
             assert not changed
         else:
-            three = {number: value for number, value in MACHINE.items() if number < 110 or number % 10 < 3}
-            machine = stack.enter_context(Firmware(controller, folder, {**three, 20: 0, 22: 0, **changed}))
+            machine = stack.enter_context(Firmware(controller, folder, {**MACHINE, 20: 0, 22: 0, **changed}))
         emulated = EmulatedRig(shape=_SHAPE, pixel_size=0.2, rate=50.0, delay=0.01, machine=machine)
         stack.enter_context(emulated).camera.take(1, 30.0)
         yield emulated
@@ -176,13 +182,13 @@ def main() -> None:
         for controller in ["emulator", *programs]:
             if controller != "emulator" or fault not in FIRMWARE_ONLY:
                 _print(fault, controller, try_capture(fault, controller))
-    for fault, (changed, _) in SETTINGS.items():
-        for program in programs:
+    for program in programs:
+        for fault, (changed, _) in (SETTINGS | (HAL_SETTINGS if is_hal(program) else {})).items():
             _print(fault, program, try_capture("none", program, changed))
 
 
 def _print(fault: str, controller: str, ending: Ending) -> None:
-    name = "emulator" if controller == "emulator" else "firmware"
+    name = controller if controller == "emulator" else "grblHAL" if is_hal(controller) else "GRBL"
     said = "stopped by the user" if isinstance(ending.error, KeyboardInterrupt) else str(ending.error or "-")
     said = re.sub(r"stage /dev/\S+: | \(device reports.*\?\)\)", "", said)
     times = f"{ending.moved:.2f} s | {ending.told:.2f} s" if ending.count else "- | -"

@@ -1,4 +1,4 @@
-"""What GRBL's own firmware answers, kept as a transcript that the emulated controller is held to.
+"""What real firmwares answer, as transcripts: the emulated controller is held to GRBL's, the driver to both.
 
 ``python tests/support/transcript.py PROGRAM > tests/hw/grbl-1.1h.txt`` makes it anew; docs/rig.md tells how
 the program is built.
@@ -119,6 +119,6 @@ def read(path: Path) -> list[Exchange]:
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as folder, Firmware(sys.argv[1], Path(folder), SETTINGS) as firmware:
-        print("# What GRBL 1.1h's firmware answers: > sent, < said, = seconds until it was done with.")
+        print("# What the firmware answers: > sent, < said, = seconds until it was done with.")
         for line in write(play(firmware)):
             print(line, flush=True)
