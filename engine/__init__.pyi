@@ -1,5 +1,6 @@
 from .errors import NotConverged
 from .estimator import run
+from .focus import Focus, FocusEstimator, find_focus
 from .force.normal import Force, find_force
 from .force.tangential import TangentialForce, find_tangential_force
 from .fringes import (
@@ -17,6 +18,7 @@ from .integration.integration import Integrator, integrate
 from .integration.laplacian import invert_laplacian
 from .integration.surface import Surface
 from .metrology.measures import Measures, measure
+from .photometric import Lambertian, PhotometricStereo, photometric_stereo
 from .pose.pose import Pose, estimate_pose
 from .pose.stitching import Stitch, stitch
 from .pose.tracker import PoseTracker
@@ -44,18 +46,22 @@ __all__ = [
     "Correlator",
     "Displacement",
     "Estimator",
+    "Focus",
+    "FocusEstimator",
     "Force",
     "Frequency",
     "FringeEstimator",
     "Fringes",
     "Growth",
     "Integrator",
+    "Lambertian",
     "Measures",
     "NormalEstimator",
     "Normals",
     "NotConverged",
     "Onset",
     "OnsetSearch",
+    "PhotometricStereo",
     "Pose",
     "PoseEstimator",
     "PoseNormals",
@@ -78,6 +84,7 @@ __all__ = [
     "find_change_point",
     "find_displacement",
     "find_edges",
+    "find_focus",
     "find_force",
     "find_growth",
     "find_onset",
@@ -88,6 +95,7 @@ __all__ = [
     "integrate",
     "invert_laplacian",
     "measure",
+    "photometric_stereo",
     "reconstruct",
     "run",
     "score",

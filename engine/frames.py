@@ -90,6 +90,18 @@ def estimate_noise(first: NDArray[np.float64], second: NDArray[np.float64], inte
     return float(max(noise, QUANTUM) if integer else noise)
 
 
+def noise_of_residual(residual: NDArray[Any], freedom: ArrayLike) -> float:
+    """Return the standard deviation of a sample by the residuals of fits; NaN where there is none.
+
+    Of samples' residuals with some degrees of freedom n each, scalar or a map, the median is that of
+    sqrt(chi^2 / n), by Wilson and Hilferty (PNAS 17, 1931).
+    """
+    degrees = np.broadcast_to(np.asarray(freedom, np.float64), residual.shape)
+    known = (degrees > 0) & np.isfinite(residual)
+    ratio = (1 - 2 / (9 * degrees[known])) ** 1.5
+    return float(np.median(residual[known] / ratio)) if known.any() else float("nan")
+
+
 def reference_maps(
     dark: ArrayLike | None, bright: ArrayLike | None, shape: tuple[int, int], dtype: np.dtype[Any]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 from scipy.special import expit, ndtr
 
+from mirrorskin.engine.frames import noise_of_residual
 from mirrorskin.engine.rotation.correlation import Correlation, Correlator, correlate
 from mirrorskin.engine.rotation.design_matrix import Doubles, fit_matrix
 from mirrorskin.io import InputError
@@ -339,10 +340,8 @@ def _fringes_of(fit: Correlation, shift: Doubles, noise: ArrayLike | None) -> Fr
     if noise is None:
         if fit.frames < 4:
             raise InputError("3 frames leave no residual to tell the noise from: give noise, in counts")
-        # Of the median of chi^2 / n, by Wilson and Hilferty.
-        ratio = (1 - 2 / (9 * (fit.frames - 3))) ** 1.5
         strong = fit.modulation >= np.nanmedian(fit.modulation)
-        counts = np.asarray(np.median(fit.residual[strong]) / ratio)
+        counts = np.asarray(noise_of_residual(fit.residual[strong], fit.frames - 3))
     else:
         counts = _map(noise, fit.mean.shape, "noise")
     matrix, phase = fit_matrix(shift), fit.azimuth

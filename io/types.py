@@ -317,7 +317,7 @@ class Result(Shown):
         0 invalid input, 1 onset, 2 never light, 3 light at start; of a release: 0 invalid input, 1 release,
         2 dark at start, 3 light to the end. Of a body with a tilt of each frame: 1 normal, 2 none, 4 only the
         slope along one direction. Of a slide or a twist: 0 unknown, 1 slipped, 2 sticks, 3 no contact, 4 no
-        texture.
+        texture. Of a focus stack: 0 invalid input, 1 in focus, 2 no peak, 3 peak at an end of the stack.
     hysteresis, hysteresis_sigma : ndarray, (H, W), float32
         Millimetres by which the release is higher than the onset, and the standard deviation of that.
     strokes : ndarray, (H, W), uint16

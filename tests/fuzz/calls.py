@@ -82,6 +82,11 @@ def calls() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
         "unwrap_gray": {
             "phase": 0.3 * _COLUMN, "sigma": sure, "stripe": 0.3 * _COLUMN // math.pi, "risk": flat,
         },
+        "find_focus": {
+            "frames": np.exp(-((np.arange(8) - 3.3) ** 2) / 6)[:, None, None].astype(np.float32) * _texture(),
+            "travel": np.arange(8.0), "noise": 0.1,
+        },
+        "photometric_stereo": {"frames": _rotation(phases), "light": phases, "zenith": 0.6, "dark": flat},
         "estimate_frequency": {"samples": wave, "time": 0.01 * np.arange(64)},
         "estimate_pose": {"first": result, "second": result, "pixel_size": 0.1},
         "stitch": {"results": [result, result], "pixel_size": 0.1},

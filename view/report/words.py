@@ -56,7 +56,8 @@ MAPS: Mapping[str, tuple[str, str]] = {
         "",
         "0 invalid input, 1 onset, 2 never light, 3 light at start; of a release: 1 release, "
         "2 dark at start, 3 light to the end; of a tilt of each frame: 1 normal, 2 none, 4 only a slope; "
-        "of a slide or a twist: 0 unknown, 1 slipped, 2 sticks, 3 no contact, 4 no texture",
+        "of a slide or a twist: 0 unknown, 1 slipped, 2 sticks, 3 no contact, 4 no texture; "
+        "of a focus stack: 1 in focus, 2 no peak, 3 peak at an end of the stack",
     ),
     "hysteresis": ("mm", "by how much the release is higher than the onset, in a press that oscillates"),
     "hysteresis_sigma": ("mm", "the standard deviation that is expected of the hysteresis"),

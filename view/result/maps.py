@@ -279,6 +279,7 @@ def _draw_positive(
 _ONSET = "invalid input", "onset", "never light", "light at start"
 _RELEASE = "invalid input", "release", "dark at start", "light to the end"
 _POSES = "invalid input", "normal", "none", "", "slope only"
+_FOCUS = "invalid input", "in focus", "no peak", "peak at an end"
 _SLIP = "unknown", "slipped", "sticks", "no contact", "no texture"
 _UNKNOWN = "unknown number"
 _STATUS_COLOURS = "#d55e00", "#009e73", "0.25", "#f0e442", "white"
@@ -317,6 +318,8 @@ def draw_status(axes: Axes, sheet: Sheet) -> None:
         names, colours = _SLIP, _SLIP_COLOURS
     elif sheet.result.zenith is not None:
         names, colours = _POSES, _POSE_COLOURS
+    elif "sharpness" in sheet.result.own_maps:
+        names = _FOCUS
     classes = np.minimum(status, len(names)).astype(np.uint8)
     _draw_shares(axes, sheet, classes, colours, (*names, _UNKNOWN))
     entitle(axes, "Status")

@@ -1,0 +1,127 @@
+"""Focus variation: the height of a texture that defocus blurs, and its standard error as the scatter."""
+
+import re
+
+import numpy as np
+import pytest
+
+from mirrorskin import engine, io
+
+SHAPE = (48, 48)
+TRAVEL = np.arange(0, 9, 0.5)
+PITCH = 0.12  # cycles per pixel
+
+
+def textured(travel=TRAVEL, sharpest=4.2, seed=0, waves=None, contrast=30.0):
+    """Frames of waves in all directions, blurred by a Gaussian whose width is |travel - sharpest| pixels.
+
+    Of waves as long as each other the contrast is a Gaussian over the travel; ``sharpest`` may be a map.
+    """
+    generator = np.random.default_rng(seed)
+    row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    frames = np.full((len(travel), *SHAPE), 120.0)
+    width = np.abs(travel[:, None, None] - sharpest)
+    for pitch in [PITCH] * 40 if waves is None else waves(generator):
+        angle, phase = generator.uniform(0, 2 * np.pi, 2)
+        wave = np.cos(2 * np.pi * pitch * (np.cos(angle) * column + np.sin(angle) * row) + phase)
+        frames += contrast * np.sqrt(2 / 40) * np.exp(-2 * (np.pi * pitch * width) ** 2) * wave
+    return frames
+
+
+def noisy(frames, noise, seed):
+    return (frames + noise * np.random.default_rng(seed).normal(size=frames.shape)).astype(np.float32)
+
+
+@pytest.mark.parametrize("reach", [1, 2, 4])
+@pytest.mark.parametrize("sharpest", [4.0, 4.1, 4.25])
+def test_waves_of_one_length_are_exact_without_noise(reach, sharpest):
+    frames = textured(sharpest=sharpest).astype(np.float32)
+    found = engine.find_focus(frames, TRAVEL, noise=0, reach=reach)
+    np.testing.assert_allclose(found.height, -sharpest, atol=2e-4)
+
+
+def test_steps_may_be_uneven_and_go_up():
+    travel = np.cumsum(np.random.default_rng(1).uniform(0.2, 0.8, 18))[::-1]
+    found = engine.find_focus(textured(travel).astype(np.float32), travel, noise=0)
+    np.testing.assert_allclose(found.height, -4.2, atol=2e-4)
+
+
+def test_texture_of_all_lengths_is_right_to_a_twentieth_of_a_step():
+    frames = textured(waves=lambda generator: np.sqrt(generator.uniform(0.02**2, 0.3**2, 200)))
+    found = engine.find_focus(frames.astype(np.float32), TRAVEL, noise=0)
+    assert abs(np.median(found.height) + 4.2) < 0.5 / 20
+
+
+def test_a_slope_is_followed():
+    slope = 4 + 0.02 * (np.arange(SHAPE[1]) - 23.5)
+    found = engine.find_focus(textured(sharpest=slope).astype(np.float32), TRAVEL, noise=0)
+    error = (found.height + slope)[:, 6:-6]
+    assert np.sqrt(np.mean(error**2)) < 0.03
+
+
+@pytest.mark.parametrize(("noise", "reach"), [(0.5, 2), (3.0, 2), (1.0, 1)])
+def test_the_standard_error_is_the_scatter(noise, reach):
+    frames, square = textured(), []
+    for seed in range(40):
+        found = engine.find_focus(noisy(frames, noise, seed), TRAVEL, noise=noise, reach=reach)
+        sound = found.status == 1
+        assert sound.mean() > 0.9
+        square.append(np.mean(((found.height + 4.2) / found.height_sigma)[sound] ** 2))
+    assert np.mean(square) == pytest.approx(1, abs=0.1)
+
+
+def test_sharpness_is_the_contrast_without_the_noise():
+    found = engine.find_focus(noisy(textured(sharpest=4.0), 3.0, 0), TRAVEL, noise=3.0)
+    clean = engine.find_focus(textured(sharpest=4.0).astype(np.float32), TRAVEL, noise=0)
+    assert np.mean(found.sharpness**2) == pytest.approx(np.mean(clean.sharpness**2), rel=0.01)
+
+
+def test_a_picture_without_texture_has_no_peak():
+    found = engine.find_focus(noisy(np.full((18, *SHAPE), 100.0), 2.0, 0), TRAVEL, noise=2.0)
+    assert (found.status != 1).mean() > 0.999
+    assert np.isnan(found.height[found.status != 1]).all()
+
+
+def test_a_peak_at_the_end_of_the_stack_is_said():
+    found = engine.find_focus(textured(sharpest=9.5).astype(np.float32), TRAVEL, noise=0)
+    assert (found.status == 3).all()
+    assert np.isnan(found.height).all()
+
+
+def test_a_missing_sample_is_left_out_and_a_missing_pixel_invalid():
+    frames = textured().astype(np.float32)
+    frames[6, 9, 9] = np.nan
+    frames[:, 30, 30] = np.nan
+    found = engine.find_focus(frames, TRAVEL, noise=0)
+    assert found.height[9, 9] == pytest.approx(-4.2, abs=1e-3)
+    assert found.status[30, 30] == found.status[26, 34] == 0
+    assert found.status[25, 30] == 1
+
+
+def test_frames_that_come_one_by_one_give_the_same():
+    frames = noisy(textured(), 2.0, 0).clip(0, 255).astype(np.uint8)
+    whole = engine.find_focus(frames, TRAVEL, noise=2.0)
+    focus = engine.FocusEstimator(SHAPE, "uint8", noise=2.0)
+    focus.push(frames[3:9], travel=TRAVEL[3:9])
+    result = engine.run(list(frames), focus, travel=TRAVEL)  # which resets it
+    np.testing.assert_array_equal(result.height, whole.height)
+    np.testing.assert_array_equal(result.height_sigma, whole.height_sigma)
+    np.testing.assert_array_equal(result.status, whole.status)
+
+
+FRAMES = textured().astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        ({"noise": -1}, "noise -1"),
+        ({"radius": 0}, "radius 0"),
+        ({"reach": 51}, "reach 51"),
+        ({"travel": TRAVEL[1:]}, "travel"),
+        ({"frames": FRAMES[0]}, "frames have shape (48, 48)"),
+    ],
+)
+def test_bad_input_is_one_line(arguments, line):
+    with pytest.raises(io.InputError, match=re.escape(line)):
+        engine.find_focus(**{"frames": FRAMES, "travel": TRAVEL, "noise": 1, **arguments})

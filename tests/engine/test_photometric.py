@@ -1,0 +1,123 @@
+"""Photometric stereo: normals of a ball exactly without noise, at the Cramer-Rao bound with it."""
+
+import re
+
+import numpy as np
+import pytest
+
+from mirrorskin import engine, io
+
+AZIMUTH = np.arange(12) * 2 * np.pi / 12
+ROW, COLUMN = np.mgrid[1:-1:60j, -1:1:60j]
+BALL = np.dstack([COLUMN, ROW, np.sqrt(np.maximum(1 - ROW**2 - COLUMN**2, 0))])
+INSIDE = BALL[..., 2] > 0.1
+LAMPS = np.random.default_rng(3).normal(size=(8, 3)) * 0.4 + [0, 0, 1]
+ALBEDO = 100 + 40 * COLUMN
+
+
+def round_lamps(zenith, azimuth=AZIMUTH):
+    out = np.full(len(azimuth), np.sin(zenith))
+    return np.column_stack(
+        [out * np.cos(azimuth), out * np.sin(azimuth), np.full(len(azimuth), np.cos(zenith))]
+    )
+
+
+def lit(lamps, dtype="float32", noise=0.0, seed=0, dark=0.0):
+    """Frames of the ball; a sample is 0 in attached shadow, and clipped by an integer type."""
+    light = dark + ALBEDO * np.maximum(np.einsum("hwk,tk->thw", BALL, lamps), 0)
+    light += noise * np.random.default_rng(seed).normal(size=light.shape)
+    return light.astype(dtype) if dtype == "float32" else np.rint(light).clip(0, 255).astype(dtype)
+
+
+def angle(found):
+    return np.arccos(np.clip(np.sum(found * BALL, axis=-1), -1, 1))[INSIDE]
+
+
+def bound(lamps):
+    """The RMS angle of the Cramer-Rao bound at each pixel lit by all lamps, for noise 1, by two angles."""
+    along = np.dstack([BALL[..., 2], 0 * ROW, -BALL[..., 0]])
+    along /= np.linalg.norm(along, axis=-1, keepdims=True)
+    slopes = np.stack([ALBEDO[..., None] * along, ALBEDO[..., None] * np.cross(BALL, along), BALL], axis=-1)
+    information = np.einsum("hwki,tk,tl,hwlj->hwij", slopes, lamps, lamps, slopes)[INSIDE]
+    return np.sqrt(np.trace(np.linalg.inv(information)[:, :2, :2], axis1=1, axis2=2))
+
+
+@pytest.mark.parametrize("lamps", [round_lamps(0.3), LAMPS], ids=["round", "anywhere"])
+def test_a_ball_is_exact_without_noise(lamps):
+    found = engine.photometric_stereo(lit(lamps), lamps)
+    np.testing.assert_allclose(found.normals[INSIDE], BALL[INSIDE], atol=2e-6)
+    np.testing.assert_allclose(found.albedo[INSIDE], ALBEDO[INSIDE], rtol=2e-6)
+
+
+def test_shadows_and_highlights_are_left_out():
+    frames = lit(round_lamps(1.0), "uint8", dark=160.0)  # to 300 counts
+    found = engine.photometric_stereo(frames, round_lamps(1.0), dark=160)
+    known = INSIDE & (found.samples > 4)
+    assert known.mean() > 0.5
+    assert (found.samples[known] < 12).mean() > 0.6
+    assert np.degrees(angle(found.normals)[known[INSIDE]]).max() < 1.5
+
+
+def test_too_few_lamps_are_no_answer():
+    found = engine.photometric_stereo(lit(LAMPS[:2]), LAMPS[:2], noise=1)
+    flat = engine.photometric_stereo(lit(LAMPS[[0, 1, 0, 1]]), LAMPS[[0, 1, 0, 1]])
+    assert np.isnan([found.normals, flat.normals]).all()
+
+
+def test_the_standard_error_is_the_cramer_rao_bound():
+    lamps = round_lamps(0.3)
+    lamps = lamps * np.linspace(0.5, 1.5, 12)[:, None]
+    lit_by_all = np.all(np.einsum("hwk,tk->thw", BALL, lamps) > 0, axis=0)[INSIDE]
+    found = engine.photometric_stereo(lit(lamps), lamps, noise=2)
+    np.testing.assert_allclose(
+        found.normal_sigma[INSIDE][lit_by_all], 2 * bound(lamps)[lit_by_all], rtol=1e-4
+    )
+
+
+def test_the_standard_errors_are_the_scatter():
+    lamps = round_lamps(0.5)
+    found = engine.photometric_stereo(lit(lamps, noise=0.5), lamps, shadow=2)
+    assert found.noise == pytest.approx(0.5, rel=0.03)
+    assert np.mean((angle(found.normals) / found.normal_sigma[INSIDE]) ** 2) == pytest.approx(1, abs=0.07)
+    error = (found.albedo - ALBEDO)[INSIDE] / found.albedo_sigma[INSIDE]
+    assert np.mean(error**2) == pytest.approx(1, abs=0.07)
+
+
+def test_a_lamp_that_goes_round_is_the_correlation_of_a_rotation():
+    frames = lit(round_lamps(0.3), noise=0.5) + 30  # nowhere dark
+    wave = engine.correlate(frames, AZIMUTH)
+    vector = np.dstack([wave.cosine / np.sin(0.3), wave.sine / np.sin(0.3), wave.mean / np.cos(0.3)])
+    found = engine.photometric_stereo(frames, AZIMUTH, zenith=0.3)
+    np.testing.assert_allclose(found.normals * found.albedo[..., None], vector, atol=2e-3)
+    np.testing.assert_allclose(found.residual, wave.residual, rtol=1e-3)
+
+
+def test_frames_that_come_one_by_one_give_the_same():
+    frames, lamps = lit(round_lamps(0.4), "uint8", 2), round_lamps(0.4)
+    whole = engine.photometric_stereo(frames, lamps, shadow=8)
+    stereo = engine.PhotometricStereo(frames.shape[1:], "uint8", shadow=8)
+    stereo.push(frames[:5], light=lamps[:5])
+    result = engine.run(list(frames), stereo, light=lamps)  # which resets it
+    np.testing.assert_array_equal(result.normals, whole.normals)
+    np.testing.assert_array_equal(result.normal_sigma, whole.normal_sigma)
+    np.testing.assert_array_equal(result.own_maps["albedo"], whole.albedo)
+
+
+FRAMES = lit(LAMPS)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        ({"light": AZIMUTH[:8]}, "give their zenith"),
+        ({"light": AZIMUTH[:8], "zenith": 2.0}, "zenith 2.0"),
+        ({"light": LAMPS[:3]}, "light has shape (3, 3)"),
+        ({"light": 0 * LAMPS}, "light has lengths 0 to 0"),
+        ({"light": LAMPS, "dark": [1, 2]}, "dark has shape (2,)"),
+        ({"light": LAMPS, "noise": -1}, "noise"),
+        ({"light": LAMPS, "shadow": -1.0}, "shadow -1.0"),
+    ],
+)
+def test_bad_input_is_one_line(arguments, line):
+    with pytest.raises(io.InputError, match=re.escape(line)):
+        engine.photometric_stereo(FRAMES, **arguments)
