@@ -16,9 +16,9 @@ from mirrorskin.cli.groups import Argument, Group, Option
 from mirrorskin.cli.output import print_json, print_table
 
 if TYPE_CHECKING:
-    from mirrorskin.hw.grbl.stage import GrblStage
     from mirrorskin.hw.rig.check import Finding
     from mirrorskin.hw.rig_file import RigSettings
+    from mirrorskin.hw.stage import Stage
 
 app = Group(
     help="Look at a stage and a camera before they are used, and move it by hand.", no_args_is_help=True
@@ -166,14 +166,14 @@ def unlock(rig: RigFile) -> None:
 
 
 @contextmanager
-def _opened(rig: Path, unlock: bool = False) -> Iterator[GrblStage]:
+def _opened(rig: Path, unlock: bool = False) -> Iterator[Stage]:
     """Open the stage alone; say in the end where it stands."""
-    from mirrorskin.hw.grbl.stage import GrblStage
     from mirrorskin.hw.rig.check import in_words
+    from mirrorskin.hw.rig.rig import open_stage
     from mirrorskin.hw.rig_file import load_rig
 
     settings = load_rig(rig)
-    with GrblStage(settings.stage, unlock=unlock) as stage:
+    with closing(open_stage(settings.stage, unlock=unlock)) as stage:
         yield stage
         report = stage.report()
         where = in_words(report.position, settings.stage)

@@ -169,6 +169,14 @@ class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
     """How the stage is reached, and what it may do: the table ``[stage]`` of ``docs/rig.md``."""
 
     port: Annotated[Text, Meta(description="a serial port or a URL, in quotes,", examples=["/dev/ttyUSB0"])]
+    firmware: Annotated[
+        str,
+        Meta(
+            pattern=r"^(grbl|marlin|[\w.]+:[\w.]+)\Z",
+            description='"grbl", "marlin", or a class as "module:Class",',
+            examples=["grbl"],
+        ),
+    ] = "grbl"
     baud: Annotated[
         int,
         Meta(
@@ -386,6 +394,7 @@ name = "bench"
 
 [stage]
 port = "/dev/ttyUSB0"           # or COM3, socket://192.168.0.7:23, rfc2217://host:port
+# firmware = "grbl"             # or "marlin", or a class of your own (docs/stages.md)
 # baud = 115200
 home = true                     # the stage has switches, and must home before it moves
 # timeout = 2.0                 # s that an answer may take

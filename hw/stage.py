@@ -187,8 +187,11 @@ class Stage(Protocol):
     def history(self, since: float = -math.inf) -> list[Report]:
         """Return the reports later than a time, oldest first; those of the last minutes are kept."""
 
+    def home(self) -> None:
+        """Find the switches of its axes; asked for only where the rig file says that it has some."""
+
     def check_way(self, start: Position, place: Position, speed: float | None) -> None:
-        """Refuse a straight move that it cannot do at a speed, mm/s or rad/s."""
+        """Refuse a sweep that it cannot do at a speed, mm/s or rad/s."""
 
     def check_turns(self, tilt: float, turns: float, rate: float) -> None:
         """Refuse a precession of a half-angle, radians, at a rate, turns a second."""

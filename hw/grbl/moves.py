@@ -36,9 +36,10 @@ class Command:
 class Axes:
     """The axes of a stage, as the rig file gives them: which letter moves what."""
 
-    def __init__(self, settings: StageSettings, name: str) -> None:
+    def __init__(self, settings: StageSettings, name: str, straight: str = _STRAIGHT) -> None:
         self._axes = settings.axes
         self._name = name
+        self._straight = straight  # what a line of a straight move begins with
         self.speeds = {motion: axis.top_speed for motion, axis in self._axes.items()}
         self._steps = dict.fromkeys(self.letters.values(), math.inf)
 
@@ -73,8 +74,8 @@ class Axes:
     def straight(self, start: Position, place: Position, speed: float | None) -> Command | None:
         """Return the straight move from one place to another, None if it is none.
 
-        The speed is in mm/s, or rad/s if the body only turns; None for the greatest. The line names the
-        machine's coordinates, whatever the work coordinates are.
+        The speed is in mm/s, or rad/s if the body only turns; None for the greatest. The line of GRBL names
+        the machine's coordinates, whatever the work coordinates are.
         """
         before, after = self.machine(start), self.machine(place)
         length = math.dist(list(before.values()), list(after.values()))
@@ -84,7 +85,7 @@ class Axes:
         feed = self._feed(length / duration)
         steps = max(self._steps[letter] * abs(after[letter] - before[letter]) for letter in after)
         self._check_steps(steps / duration, length / duration)
-        return Command(f"{_STRAIGHT}{_words(after)}{feed}", duration)
+        return Command(f"{self._straight}{_words(after)}{feed}", duration)
 
     def check_way(self, start: Position, place: Position, speed: float | None) -> None:
         """Refuse a straight move that is too fast, or too slow for the controller; see ``straight``."""
@@ -203,7 +204,7 @@ class Axes:
         """Return the feed word of a speed in machine units a second."""
         if speed * 60 < SLOWEST:
             raise InputError(
-                f"{self._name}: GRBL goes no slower than {SLOWEST:g} mm (or degree) a minute, and "
+                f"{self._name}: the controller goes no slower than {SLOWEST:g} mm (or degree) a minute, and "
                 f"{speed * 60:.4g} was asked for; go faster, or in steps"
             )
         return f"F{speed * 60:.4f}"

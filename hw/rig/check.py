@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.hw.camera import Camera, Counts
-from mirrorskin.hw.grbl.stage import GrblStage
-from mirrorskin.hw.rig.rig import longest_wait
+from mirrorskin.hw.rig.rig import longest_wait, open_stage
 from mirrorskin.hw.rig_file import Axis, CameraSettings, RigSettings, StageSettings
-from mirrorskin.hw.stage import Limits, Position, Report
+from mirrorskin.hw.stage import Limits, Position, Report, Stage
 from mirrorskin.hw.video import VideoCamera
 from mirrorskin.io import InputError
 
@@ -58,7 +57,7 @@ def check_rig(
     settings: RigSettings,
     *,
     move: bool = False,
-    open_stage: Callable[[StageSettings], GrblStage] = GrblStage,
+    open_stage: Callable[[StageSettings], Stage] = open_stage,
     open_camera: Callable[[CameraSettings], Camera] = VideoCamera,
 ) -> Generator[Finding, None, None]:
     """Open the stage and the camera, and yield what is found, one thing at a time.
@@ -101,19 +100,33 @@ def _logged_warnings() -> Iterator[list[str]]:
 # The stage at rest: what it says of itself, against what the rig file says of it
 
 
-def check_stage(stage: GrblStage, settings: StageSettings) -> Iterator[Finding]:
+def check_stage(stage: Stage, settings: StageSettings) -> Iterator[Finding]:
     """Look at a stage that was opened, for about a second; nothing moves."""
-    yield Finding("stage", "firmware", stage.firmware)
-    report, parameters = stage.report(), stage.parameters
+    yield Finding("stage", "firmware", getattr(stage, "firmware", settings.firmware))
+    report = stage.report()
     yield _state(report, settings)
     yield _position(report, stage, settings)
-    yield _homing(parameters, settings)
+    yield from _reports(stage, settings)
+    if settings.firmware == "grbl":
+        yield from _controller(stage, settings)
+    if not getattr(stage, "homing_stops", True):
+        remedy = "build the firmware with EMERGENCY_PARSER, or stand by with the switch"
+        yield Finding("stage", "stop of homing", "impossible", "warning", remedy)
+
+
+def _controller(stage: Any, settings: StageSettings) -> Iterator[Finding]:
+    """Compare what a GRBL controller was set to with the rig file."""
+    yield _homing(stage.parameters, settings)
     for name, axis in settings.axes.items():
-        yield _length(name, axis, parameters)
-        yield _speed(name, axis, parameters)
+        yield _length(name, axis, stage.parameters)
+        yield _speed(name, axis, stage.parameters)
     if settings.pitch and settings.roll:
         yield _arcs(settings.pitch, settings.roll)
-    yield from _reports(stage, settings)
+    remedy = ""
+    if stage.round_trip > _ROUND_TRIP_MAX:
+        remedy = "positions in motion are as uncertain as this is long; use a shorter or faster line"
+    yield _rated("stage", "round trip of a report", f"{stage.round_trip * 1e3:.1f} ms", remedy)
+    yield _wait("stage", "longest round trip", stage.longest_trip, stage.longest_silence, "stage.silence")
 
 
 def _rated(part: str, what: str, found: str, remedy: str = "", verdict: Verdict = "warning") -> Finding:
@@ -138,7 +151,7 @@ def _state(report: Report, settings: StageSettings) -> Finding:
     return Finding("stage", "state", report.state, "failed", f"it cannot move from this; {remedy}")
 
 
-def _position(report: Report, stage: GrblStage, settings: StageSettings) -> Finding:
+def _position(report: Report, stage: Stage, settings: StageSettings) -> Finding:
     found = in_words(report.position, settings)
     if settings.home:
         return Finding("stage", "position", f"{found} (before homing)")
@@ -203,7 +216,7 @@ def _arcs(pitch: Axis, roll: Axis) -> Finding:
     return _rated("stage", "arcs", f"in {pitch.letter} and {roll.letter}", remedy)
 
 
-def _reports(stage: GrblStage, settings: StageSettings) -> Iterator[Finding]:
+def _reports(stage: Stage, settings: StageSettings) -> Iterator[Finding]:
     """Measure how often reports come, and how long one takes."""
     times, asked = _listen(stage, settings), settings.report_rate
     if len(times) < 2:
@@ -215,10 +228,6 @@ def _reports(stage: GrblStage, settings: StageSettings) -> Iterator[Finding]:
         remedy = f"the line is slow; set stage.report_rate = {max(1, round(rate))}, or raise stage.baud"
     yield _rated("stage", "reports", f"{rate:.1f} Hz, asked {asked:g} Hz", remedy)
     remedy = ""
-    if stage.round_trip > _ROUND_TRIP_MAX:
-        remedy = "positions in motion are as uncertain as this is long; use a shorter or faster line"
-    yield _rated("stage", "round trip of a report", f"{stage.round_trip * 1e3:.1f} ms", remedy)
-    yield _wait("stage", "longest round trip", stage.longest_trip, stage.longest_silence, "stage.silence")
 
 
 def _wait(part: str, what: str, longest: float, limit: float, key: str) -> Finding:
@@ -229,7 +238,7 @@ def _wait(part: str, what: str, longest: float, limit: float, key: str) -> Findi
     return _rated(part, what, f"{longest * 1e3:.1f} ms, of {limit * 1e3:.0f} ms that a move bears", remedy)
 
 
-def _listen(stage: GrblStage, settings: StageSettings) -> list[float]:
+def _listen(stage: Stage, settings: StageSettings) -> list[float]:
     """Return the times of the reports of a second, or of the first two."""
     begun = time.monotonic()
     time.sleep(_PERIOD)
@@ -303,7 +312,7 @@ def _brightness(picture: NDArray[Any]) -> Finding:
 # Moves: each axis a little, there and back
 
 
-def check_moves(stage: GrblStage, settings: StageSettings) -> Iterator[Finding]:
+def check_moves(stage: Stage, settings: StageSettings) -> Iterator[Finding]:
     """Home the stage if the file says so, set it upright within its limits, and move each axis from there.
 
     For x, y and twist the body is lifted first, so that it is not dragged over anything.
@@ -331,7 +340,7 @@ def _step(limits: Limits, name: str, unit: str, value: float) -> float:
     return step if value - step < low else -step
 
 
-def _there_and_back(stage: GrblStage, settings: StageSettings, name: str, home: Position) -> Finding:
+def _there_and_back(stage: Stage, settings: StageSettings, name: str, home: Position) -> Finding:
     axis, value = settings.axes[name], getattr(home, name)
     step, off = _step(stage.limits, name, axis.unit, value), 0.0
     for place in (value + step, value):

@@ -619,6 +619,8 @@ def check_plan(plan: Plan, settings: StageSettings, name: str, stage: Stage | No
         limits.check(place, name)
     if plan.in_steps:  # moves between steps go as fast as the axes do
         return
+    if stage is None and settings.firmware != "grbl":  # it tells once it is open
+        return
     able = Axes(settings, name) if stage is None else stage
     if isinstance(plan, AxialPlan):  # one turn is as possible as many
         able.check_turns(plan.tilt, min(plan.turns, 1.0), plan.rate or 0.0)

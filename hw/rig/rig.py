@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import pkgutil
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -11,8 +13,9 @@ from types import TracebackType
 
 from mirrorskin.hw.camera import Camera, Frames
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.rig_file import CameraSettings, RigSettings
+from mirrorskin.hw.rig_file import CameraSettings, RigSettings, StageSettings
 from mirrorskin.hw.stage import Position, Report, Stage
+from mirrorskin.io import InputError
 from mirrorskin.io.types import Closing
 
 _TICK = 0.02  # seconds from one look of the guard to the next
@@ -227,6 +230,34 @@ def _paused(seconds: float) -> HardwareError:
     )
 
 
+def open_stage(settings: StageSettings, unlock: bool = False) -> Stage:
+    """Open the stage that a rig file describes, of whatever firmware.
+
+    With `unlock`, a GRBL controller's alarm, hold or open door is ended; InputError for others, which have
+    none, and if there is no such class or stage, or it is not what the file says.
+    """
+    firmware = settings.firmware
+    if firmware == "grbl":
+        from mirrorskin.hw.grbl.stage import GrblStage
+
+        return GrblStage(settings, unlock=unlock)
+    if unlock:
+        raise InputError(f"stage {settings.port}: only GRBL is unlocked; switch this one off and on")
+    if firmware == "marlin":
+        from mirrorskin.hw.marlin.stage import MarlinStage
+
+        return MarlinStage(settings)
+    sys.path.insert(0, "")  # modules of the working folder
+    try:
+        made = pkgutil.resolve_name(firmware)
+    except (ImportError, AttributeError) as error:
+        raise InputError(f'stage.firmware = "{firmware}": {error}; name a class as "module:Class"') from error
+    finally:
+        sys.path.remove("")
+    stage: Stage = made(settings)
+    return stage
+
+
 def open_rig(settings: RigSettings) -> Rig:
     """Open the stage and the camera that a rig file describes, and wait for the first frame.
 
@@ -234,14 +265,13 @@ def open_rig(settings: RigSettings) -> Rig:
     or was only unlocked. InputError if one of them is missing, busy, or not what the file says; HardwareError
     if no frame came.
     """
-    from mirrorskin.hw.grbl.stage import GrblStage
     from mirrorskin.hw.video import VideoCamera
 
     with ExitStack() as opening:
         camera = VideoCamera(settings.camera)
         opening.callback(camera.close)
         camera.take(1, _PATIENCE)
-        stage = GrblStage(settings.stage)
+        stage = open_stage(settings.stage)
         opening.callback(stage.close)
         if settings.stage.home:
             stage.home()

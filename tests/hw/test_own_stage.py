@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import run
 from rig_fakes import FakeCamera, settings
 
 from mirrorskin import io
@@ -14,8 +15,12 @@ from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.scan import StepScan
 from mirrorskin.hw.rig.sweep import SweepScan
+from mirrorskin.hw.rig_file import StageSettings, TravelAxis
 from mirrorskin.hw.stage import Position
 
+STAGE = StageSettings(
+    port="/dev/ttyUSB0", press=2.0, travel=TravelAxis(letter="Z", limits=(-10.0, 3.0), speed=100.0)
+)
 PAGE = Path(__file__).parents[2] / "docs" / "stages.md"
 
 
@@ -59,8 +64,7 @@ def lab(monkeypatch):
     example = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[0]
     made = {"__name__": __name__}
     exec(example, made)
-    made["LabStage"].fastest = 100.0  # mm/s
-    stage = made["LabStage"]("/dev/ttyUSB0")
+    stage = made["LabStage"](STAGE)
     yield stage, line
     stage.close()
     assert line.closed
@@ -73,6 +77,33 @@ def rig_of(stage, line):
         rate=50.0,
     )
     return Rig(stage, camera, settings((4, 4), delay=0.0, dark=5.0))
+
+
+def test_commands_move_it(lab, tmp_path, monkeypatch):
+    example = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[0]
+    (tmp_path / "lab_stage.py").write_text(example)
+    (tmp_path / "rig.toml").write_text("""
+[stage]
+firmware = "lab_stage:LabStage"
+port = "/dev/ttyUSB0"
+press = 2.0
+travel = {letter = "Z", limits = [-10.0, 3.0], speed = 5.0}
+[camera]
+source = 0
+size = [4, 4]
+pixel_size = 0.1
+""")
+    monkeypatch.chdir(tmp_path)
+    moved = run("rig", "jog", "rig.toml", "travel", "--by", "0.25mm")
+    assert (moved.code, moved.out) == (0, "rig: travel -0.750 mm\n")
+    refused = run("rig", "unlock", "rig.toml")
+    assert refused.code == 2
+    assert "only GRBL is unlocked" in refused.said
+    file = tmp_path / "rig.toml"
+    file.write_text(file.read_text().replace(":LabStage", ":Lab"))
+    refused = run("rig", "home", "rig.toml")
+    assert refused.code == 2
+    assert "has no attribute 'Lab'" in refused.said
 
 
 def test_steps_and_sweeps_are_recorded(lab, tmp_path):

@@ -34,6 +34,7 @@ name = "bench 2"
 
 [stage]
 port = "socket://localhost:23"
+firmware = "lab:Stage"
 baud = 9600
 home = false
 timeout = 1
@@ -241,7 +242,7 @@ WRONG = [
     ),
     ('port = "socket://localhost:23"', "", 'stage.port is missing: add port = "/dev/ttyUSB0" in [stage]'),
     ("baud = 9600", "baud = true", "stage.baud is true: a number of bits a second, from 300 to 10000000, is"),
-    ("baud = 9600", '"\\u0007" = 9', r"stage.'\x07' is not known: there are port, baud, home"),
+    ("baud = 9600", '"\\u0007" = 9', r"stage.'\x07' is not known: there are port, firmware, baud, home"),
     ("home = false", 'home = "no"', 'stage.home is "no": true or false is needed; write e.g. home = true'),
     ("timeout = 1", "timeout = 0", "stage.timeout is 0: a time from 0.1 to 60 s is needed"),
     ("timeout = 1", "timeout = inf", "stage.timeout is inf: a time"),

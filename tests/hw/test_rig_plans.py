@@ -218,9 +218,9 @@ def test_a_slide_or_a_twist_that_cannot_be_is_refused(make, wrong):
     ("plan", "said"),
     [
         (VerticalPlan(0.0, 1.0, speed=20.1), "axis of travel is too fast"),
-        (VerticalPlan(0.0, 1.0, speed=0.016), "GRBL goes no slower"),
+        (VerticalPlan(0.0, 1.0, speed=0.016), "the controller goes no slower"),
         (AxialPlan(1.0, 0.04, rate=80.0), "more than pitch and roll go"),
-        (AxialPlan(1.0, 0.04, turns=1e4, rate=1e-4), "GRBL goes no slower"),
+        (AxialPlan(1.0, 0.04, turns=1e4, rate=1e-4), "the controller goes no slower"),
         (AxialPlan(1.0, 0.11, rate=1.0), "beyond"),
         (VerticalPlan(0.0, 2.5, speed=1.0), "deeper"),
         (VerticalPlan(0.0, 2.5, step=1.0), "deeper"),

@@ -1,0 +1,1 @@
+"""Stages behind printers' controllers: Marlin."""

@@ -1,0 +1,330 @@
+"""A stage behind a Marlin controller, such as a printer's; it goes in steps."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+import statistics
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, NoReturn
+
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.grbl.link import close_port, open_port
+from mirrorskin.hw.grbl.moves import Axes
+from mirrorskin.hw.grbl.replies import Splitter
+from mirrorskin.hw.rig.plans import Trapezoid
+from mirrorskin.hw.rig_file import StageSettings
+from mirrorskin.hw.stage import Position, Report
+from mirrorskin.io import InputError
+from mirrorskin.io.types import Closing
+
+if TYPE_CHECKING:
+    import serial
+
+_BOOT = 12.0  # seconds that a controller may take to start; many do so when the port is opened
+_KNOCK = 1.0  # seconds after which it is asked again who it is
+_QUIET = 0.3  # seconds without an answer, after which none is still to come
+_PREPARE = ("G21", "G90", "M84 S0")  # millimetres, absolute places, motors that are never let go at rest
+_WATCH = 0.1  # seconds from one sign of life to the next in motion
+_TICK = 0.01
+_BUSY = 10.0  # seconds that it may be busy without saying so; it says so every two
+_HOMING = 180.0  # seconds
+_TRIPS = 4  # usual round trips at least, that an answer may take in motion
+_ARRIVED = 0.02  # mm or degrees: places are told to 0.01
+_REPORTS_MAX = 1 << 17
+_STOP, _KILL = b"\nM410\n", b"\nM112\n"
+_PLACE = re.compile(r"([A-Z]):(-?\d+\.?\d*)")
+_WORD = re.compile(r"([A-Z])(\d+\.?\d*)")
+_FAULTS = re.compile(r"Error:|!!|Resend:|echo:Unknown command|echo:Home |//action:(cancel|disconnect|kill)")
+
+
+class MarlinStage(Closing):
+    """A stage that a Marlin controller moves; see `mirrorskin.hw.stage.Stage`.
+
+    Marlin answers one line at a time, and does not tell where it is while it moves: the body goes in steps,
+    and sweeps and precessions are refused. It is asked for a sign of life ten times a second meanwhile, with
+    no line pending that would keep it from a stop. Homing is stopped by killing the controller, which must
+    be switched off and on then; without ``EMERGENCY_PARSER`` homing cannot be stopped.
+
+    Parameters
+    ----------
+    settings : StageSettings
+        Where it is plugged in, its axes and limits.
+    port : serial.Serial, optional
+        What to speak through instead of opening ``settings.port``; it is closed with the stage.
+
+    Raises
+    ------
+    InputError
+        No such port, one in use, one behind which there is no Marlin, or a machine that prints.
+
+    Examples
+    --------
+    >>> with MarlinStage(load_rig("rig.toml").stage) as stage:  # doctest: +SKIP
+    ...     stage.home()
+    ...     stage.move(Position(travel=1.0))
+    ...     stage.wait().position.travel
+    1.0
+    """
+
+    def __init__(self, settings: StageSettings, port: serial.Serial | None = None) -> None:
+        self.name, self.limits = f"stage {settings.port}", settings.limits
+        self.error: HardwareError | None = None
+        self.axes = Axes(settings, self.name, "G1")
+        self._settings = settings
+        self._port = open_port(settings.port, settings.baud, self.name) if port is None else port
+        self._lock, self._ended = threading.RLock(), threading.Event()
+        self._splitter = Splitter()
+        self._trips: deque[float] = deque([0.0], maxlen=15)
+        self._reports: deque[Report] = deque(maxlen=_REPORTS_MAX)
+        self._target: Position | None = None
+        self._due: float | None = None  # when a move that was begun should end
+        self._homing = False
+        self._acceleration = 1e6  # of the slowest axis, machine units/s^2
+        try:
+            self.firmware = self._open()
+        except BaseException as error:
+            close_port(self._port)
+            if isinstance(error, HardwareError):
+                raise InputError(str(error)) from error
+            raise
+        self._thread = threading.Thread(target=self._watch, name=f"{self.name}: watch")
+        self._thread.start()
+
+    def check_way(self, start: Position, place: Position, speed: float | None) -> NoReturn:
+        """Refuse a sweep: nobody could say where the body was in its frames."""
+        raise InputError(f"{self.name}: Marlin does not tell where it is while it moves; go in steps")
+
+    def check_turns(self, tilt: float, turns: float, rate: float) -> NoReturn:
+        """Refuse a precession, as a sweep."""
+        raise InputError(f"{self.name}: Marlin does not tell where it is while it turns; go in steps")
+
+    def precess(self, tilt: float, turns: float, rate: float, start: float = 0.0) -> NoReturn:
+        """Refuse a precession, as a sweep."""
+        self.check_turns(tilt, turns, rate)
+
+    def home(self) -> None:
+        """Find the switches of the rig's axes; returns when they are found."""
+        with self._guarded(), self._lock:
+            self._homing = True  # also after a failure: the stop of homing depends on it
+            self._ask(f"G28 {' '.join(sorted(self.axes.letters.values()))}", _HOMING)
+            self._homing = False
+            self._target = self._locate().position
+
+    def move(self, place: Position, speed: float | None = None) -> None:
+        """Begin to go to a place in a straight line; see ``Stage.move``."""
+        self.follow([place], speed)
+
+    def follow(self, places: Sequence[Position], speed: float | None = None) -> None:
+        """Begin to go to some places, one after the other; see ``Stage.follow``."""
+        for place in places:
+            self.limits.check(place, self.name)
+        with self._guarded(), self._lock:
+            ways = list(itertools.pairwise([self._target or self.report().position, *places]))
+            commands = [self.axes.straight(*way, speed) for way in ways]  # all, before any is sent
+            for way, command in zip(ways, commands, strict=True):
+                self._target = way[1]
+                if command is not None:
+                    length = self.axes.distance(*way)
+                    path = Trapezoid(length, length / command.duration, self._acceleration)
+                    self._due = max(self._due or 0.0, time.monotonic()) + path.duration
+                    self._ask(command.line, self._settings.timeout + self._due - time.monotonic())
+
+    def wait(self, timeout: float | None = None) -> Report:
+        """Wait until the body rests where it was sent, and return the report of it; see ``Stage.wait``."""
+        began = time.monotonic()
+        due = began if self._due is None else self._due
+        limit = 0.25 * (due - began) + self._settings.timeout if timeout is None else began + timeout - due
+        with self._guarded():
+            while (left := due - time.monotonic()) > 0:  # no line pends, so that a stop is heeded at once
+                self._check()
+                time.sleep(min(left, _TICK))
+            with self._lock:
+                self._ask("M400", limit)
+                self._due = None
+                report = self._locate()
+            if self._target is not None:
+                off = self.axes.distance(report.position, self._target)
+                if off > _ARRIVED:
+                    self._fail(f"it rests {off:.3g} mm or degrees from where it was sent; look at its limits")
+        return report
+
+    def report(self) -> Report:
+        """Return what it said last: where it rested."""
+        self._check()
+        return self._reports[-1]
+
+    def history(self, since: float = -math.inf) -> list[Report]:
+        """Return the reports later than a time, oldest first: of rest alone."""
+        return [report for report in list(self._reports) if report.time > since]
+
+    def stop(self) -> None:
+        """Stop the body at once. Any thread may call it, as often as it likes; raises nothing."""
+        if self.error is None:
+            self.error = HardwareError(f"{self.name}: the stage was stopped; open it again to go on")
+        with suppress(Exception):  # pyserial raises many kinds on a port that is gone
+            self._port.write(_KILL if self._homing else _STOP)
+
+    def close(self) -> None:
+        """Stop the body if it moves, and let the port go."""
+        if self._due is not None or self._homing:
+            self.stop()
+        self._ended.set()
+        self._thread.join()
+        if self.error is None:
+            self.error = HardwareError(f"{self.name}: the stage is closed; open it again")
+        with suppress(Exception):
+            self._port.flush()
+        close_port(self._port)
+
+    def _open(self) -> str:
+        """Find out that Marlin answers and prints nothing, learn its speeds, and return its name."""
+        name = self._greet()
+        capabilities = self._ask("M115")
+        self.homing_stops = any(line.strip() == "Cap:EMERGENCY_PARSER:1" for line in capabilities)
+        if any(line.startswith("SD printing byte") for line in self._ask("M27", lenient=True)):
+            raise InputError(f"{self.name}: it prints from its card; let that end, or stop it there")
+        for line in _PREPARE:
+            self._ask(line)
+        self._learn(self._ask("M503", lenient=True))
+        self._locate()
+        return name
+
+    def _greet(self) -> str:
+        """Ask who is there until it answers, and return the name of its firmware."""
+        until, heard = time.monotonic() + _BOOT, False
+        while time.monotonic() < until:
+            self._write("M115")
+            for line in self._listen(_KNOCK, lambda line: "FIRMWARE_NAME:" in line):
+                heard = True
+                _, found, name = line.partition("FIRMWARE_NAME:")
+                if not found:
+                    continue
+                name = re.split(r" [A-Z_]+:", name)[0].strip()
+                if "marlin" not in name.lower():
+                    raise InputError(f"{self.name}: it is {name}, not Marlin; correct stage.firmware")
+                while list(self._listen(_QUIET, lambda _line: True)):
+                    pass
+                return name
+        what = "what answers is not Marlin" if heard else f"nothing answers within {_BOOT:g} s"
+        raise InputError(f"{self.name}: {what}; look at firmware, port, the baud rate and the power")
+
+    def _listen(self, seconds: float, enough: Callable[[str], bool]) -> Iterator[str]:
+        """Yield the lines that come in some seconds, or until one is enough."""
+        until = time.monotonic() + seconds
+        while time.monotonic() < until:
+            for line in self._read():
+                yield line
+                if enough(line):
+                    return
+
+    def _learn(self, settings: list[str]) -> None:
+        """Go no faster than it does: ``M203`` has its speeds, ``M201`` and ``M204`` its accelerations."""
+        told: dict[str, dict[str, float]] = {}
+        for line in settings:
+            code, _, words = line.removeprefix("echo:").strip().partition(" ")
+            told.setdefault(code, {letter: float(number) for letter, number in _WORD.findall(words)})
+        for motion, letter in self.axes.letters.items():
+            rate, acceleration = (told.get(code, {}).get(letter, 0.0) for code in ("M203", "M201"))
+            acceleration = min(acceleration, told.get("M204", {}).get("T", acceleration))
+            if rate > 0:
+                self.axes.limit(motion, rate)
+            if acceleration > 0:
+                self._acceleration = min(self._acceleration, acceleration)
+
+    def _locate(self) -> Report:
+        """Ask where it is, at rest, and keep the report."""
+        asked = time.monotonic()
+        said = next((line for line in self._ask("M114") if line.startswith("X:")), "")
+        places = {letter: float(value) for letter, value in _PLACE.findall(said.partition("Count")[0])}
+        missing = sorted(set(self.axes.letters.values()) - set(places))
+        if missing:
+            raise HardwareError(f"{self.name}: the controller has no axis {missing[0]}; correct the rig file")
+        report = Report((asked + time.monotonic()) / 2, self.axes.place(places), "idle")
+        self._reports.append(report)
+        return report
+
+    def _watch(self) -> None:
+        """Ask it for a sign of life all the time; whatever goes wrong stops it."""
+        while not self._ended.wait(1 / self._settings.report_rate if self._due is None else _WATCH):
+            try:
+                if not threading.main_thread().is_alive():  # the program ended and left us
+                    raise HardwareError(f"{self.name}: the program ended")
+                with self._lock:
+                    if self._due is None:
+                        self._locate()
+                    else:  # a line that waits for no move, unlike M114
+                        usual = _TRIPS * statistics.median(self._trips)
+                        self._ask("M110", max(self._settings.silence, usual))
+            except Exception as error:
+                self.error = self.error or HardwareError(str(error))
+                self.stop()
+                return
+
+    def _ask(self, line: str, timeout: float | None = None, *, lenient: bool = False) -> list[str]:
+        """Send a line, and return what was said until it was taken; a busy controller may take longer."""
+        with self._lock:
+            self._check()
+            self._write(line)
+            asked = heard = time.monotonic()
+            limit, said = self._settings.timeout if timeout is None else timeout, list[str]()
+            while True:
+                late = time.monotonic() - heard > limit  # before what came meanwhile is read
+                for text in self._read():
+                    heard, late = time.monotonic(), False
+                    if re.match(r"ok\b", text):
+                        self._trips.append(heard - asked)
+                        return [*said, text[2:].strip()]  # some answer in the same line
+                    if text == "start":
+                        self._fail("the controller was reset; it has lost its place: home it")
+                    if _FAULTS.match(text) and not lenient:
+                        self._fail(f"it answers {line} with {text!r}")
+                    if "busy:" in text:
+                        limit = _BUSY
+                    said.append(text)
+                self._check()
+                if late:
+                    self._fail(
+                        "it no longer answers; the stage may move on: look at the plug, and switch it off"
+                    )
+
+    def _read(self) -> list[str]:
+        """Return the lines that are there, after a short wait for the first."""
+        try:
+            data = self._port.read(max(1, self._port.in_waiting))
+        except Exception as error:  # pyserial raises many kinds on a port that is gone
+            self._lost(error)
+        lines = self._splitter.feed(data, time.monotonic())
+        return [line.decode("ascii", "replace").strip() for line, _ in lines]
+
+    def _write(self, line: str) -> None:
+        try:
+            self._port.write(f"{line}\n".encode("ascii"))
+        except Exception as error:  # as in _read
+            self._lost(error)
+
+    def _lost(self, error: Exception) -> NoReturn:
+        self._fail(f"the line is lost ({error}); the stage may move on: switch it off, and look at the plug")
+
+    def _fail(self, why: str) -> NoReturn:
+        self.error = self.error or HardwareError(f"{self.name}: {why}")
+        self.stop()
+        raise self.error.with_traceback(None)
+
+    def _check(self) -> None:
+        if self.error is not None:
+            raise self.error.with_traceback(None)
+
+    @contextmanager
+    def _guarded(self) -> Iterator[None]:
+        """Stop the body on whatever goes wrong inside, Ctrl-C too."""
+        try:
+            yield
+        except BaseException:
+            self.stop()
+            raise

@@ -1,0 +1,169 @@
+"""A stage behind a controller that speaks as Marlin goes in steps, and stops on faults."""
+
+import threading
+import time
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+from fake_marlin import FakeMarlin
+from rig_fakes import FakeCamera, settings
+
+from mirrorskin import io
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.marlin.stage import MarlinStage
+from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
+from mirrorskin.hw.rig.rig import Rig, open_stage
+from mirrorskin.hw.rig.scan import StepScan
+from mirrorskin.hw.rig.sweep import SweepScan
+from mirrorskin.hw.stage import Position
+
+RIG = settings((4, 4), delay=0.0, dark=5.0)
+STAGE = msgspec.structs.replace(RIG.stage, firmware="marlin", x=None, y=None, twist=None)
+RIG = replace(RIG, stage=STAGE)  # travel is Z, pitch and roll are X and Y
+
+
+@pytest.fixture
+def line():
+    return FakeMarlin()
+
+
+@pytest.fixture
+def stage(line):
+    with MarlinStage(STAGE, line) as stage:
+        stage.home()
+        yield stage
+    assert line.closed
+
+
+def test_steps_are_recorded(stage, line, tmp_path):
+    camera = FakeCamera(
+        lambda at: Position(line.now()["Z"]),
+        lambda place: np.full((4, 4), 20 + 100 * (place.travel > 0.25), np.uint8),
+        rate=50.0,
+    )
+    rig = Rig(stage, camera, RIG)
+    with (
+        rig,
+        io.StreamRecorder(StepScan(rig, VerticalPlan(0.0, 0.5, step=0.25)), tmp_path / "p.h5") as recorder,
+    ):
+        while recorder.read() is not None:
+            pass
+    with io.open_recording(tmp_path / "p.h5") as recording:
+        block = recording.read(np.empty((3, 4, 4), np.uint8))
+        assert block.travel.tolist() == [0.0, 0.25, 0.5]
+        assert block.frames[:, 0, 0].tolist() == [20, 20, 120]
+
+
+def test_it_goes_no_faster_than_the_controller(stage, line):
+    stage.move(Position(-1.0))
+    stage.wait()
+    assert [said for said in line.log if said.startswith("G1")] == [
+        "G1Z-1.00000X0.00000Y0.00000F480.0000"  # 8 mm/s of M203
+    ]
+
+
+@pytest.mark.parametrize("plan", [VerticalPlan(0.0, 0.5, speed=0.5), AxialPlan(1.0, 0.04, turns=1, rate=0.5)])
+def test_sweeps_and_turns_are_refused(stage, plan):
+    rig = Rig(stage, FakeCamera(lambda at: Position(), lambda place: np.zeros((4, 4), np.uint8)), RIG)
+    with rig, pytest.raises(io.InputError, match=r"does not tell where it is while it \w+; go in steps"):
+        SweepScan(rig, plan)
+
+
+def begin_slow(stage):
+    """Begin a move of ten seconds, and let it go on for a while."""
+    stage.move(Position(-5.0), speed=0.5)
+    time.sleep(0.3)
+
+
+def rests_soon(line):
+    """Return whether it has come to rest, on its way, within 0.2 s."""
+    time.sleep(0.2)
+    line.in_waiting  # noqa: B018 - lets the controller go on
+    return not line.moving and -1.0 < line.now()["Z"] < 0.0
+
+
+@pytest.mark.parametrize("emergency", [True, False])
+def test_a_stop_in_motion_comes_at_once(emergency):
+    line = FakeMarlin(emergency, home=(0.0, 0.0, 0.0))
+    with MarlinStage(STAGE, line) as stage:
+        stage.home()
+        begin_slow(stage)
+        stage.stop()
+        assert rests_soon(line)
+        with pytest.raises(HardwareError, match="the stage was stopped; open it again"):
+            stage.wait()
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        (lambda line: setattr(line, "silent", True), "no longer answers"),
+        (lambda line: line.pull(), "the line is lost"),
+        (lambda line: line.say("start"), "was reset; it has lost its place"),
+        (lambda line: line.say("Error:Heating failed, system stopped!"), "Heating failed"),
+    ],
+)
+def test_faults_in_motion_stop_it(stage, line, fault, message):
+    begin_slow(stage)
+    fault(line)
+    with pytest.raises(HardwareError, match=message):
+        stage.wait()
+    assert line.pulled or rests_soon(line)
+
+
+def test_ctrl_c_in_motion_stops_it(stage, line, monkeypatch):
+    begin_slow(stage)
+
+    def interrupted(_seconds):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("mirrorskin.hw.marlin.stage.time.sleep", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            stage.wait()
+    assert rests_soon(line)
+
+
+def test_homing_is_stopped_by_killing_the_controller(line):
+    line.homing = 5.0
+    with MarlinStage(STAGE, line) as stage:
+        threading.Timer(0.2, stage.stop).start()
+        with pytest.raises(HardwareError, match="was stopped"):
+            stage.home()
+        assert line.killed
+
+
+def test_a_place_that_the_controller_clips_is_noticed(stage, line):
+    line.ends = -0.5
+    stage.move(Position(-1.0))
+    with pytest.raises(HardwareError, match=r"rests 0\.5 mm or degrees from where it was sent"):
+        stage.wait()
+
+
+@pytest.mark.parametrize(
+    ("instead", "message"),
+    [
+        ({"M115": "FIRMWARE_NAME:Klipper FIRMWARE_VERSION:v0.12"}, "it is Klipper, not Marlin"),
+        ({"M115": "Grbl 1.1h ['$' for help]"}, "what answers is not Marlin"),
+        ({"M27": "SD printing byte 12/34\nok"}, "prints from its card"),
+        ({"M114": "X:0.00 Y:0.00 E:0.00\nok"}, "has no axis Z"),
+        ({"M503": "nothing\nok", "G90": "Error:checksum mismatch"}, "answers G90 with 'Error:checksum"),
+    ],
+)
+def test_what_is_no_stage_is_refused(line, monkeypatch, instead, message):
+    monkeypatch.setattr("mirrorskin.hw.marlin.stage._BOOT", 0.2)
+    line.instead = instead
+    with pytest.raises(io.InputError, match=message):
+        MarlinStage(STAGE, line)
+    assert line.closed
+
+
+def test_the_rig_file_chooses_it(line, monkeypatch):
+    monkeypatch.setattr("mirrorskin.hw.marlin.stage.open_port", lambda *_: line)
+    stage = open_stage(STAGE)
+    stage.close()
+    assert stage.firmware == "Marlin 2.1.2 (Nov 24 2026)"
+    with pytest.raises(io.InputError, match="only GRBL is unlocked"):
+        open_stage(STAGE, unlock=True)
