@@ -309,6 +309,11 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
         return self.size[1], self.size[0]
 
     @property
+    def streamed(self) -> bool:
+        """Whether it is a stream, whose delay is another one at each connection."""
+        return isinstance(self.source, str) and "://" in self.source
+
+    @property
     def pixel_sides(self) -> tuple[float, float] | None:
         """Width and height of a pixel at the sheet, mm."""
         side = self.pixel_size
@@ -371,7 +376,7 @@ def load_rig(path: Path | str) -> RigSettings:
         for name in ("dark", "bright")
         if isinstance(given := getattr(camera, name), str)
     }
-    if isinstance(camera.source, str) and "://" not in camera.source:
+    if isinstance(camera.source, str) and not camera.streamed:
         beside["source"] = _beside(path, camera.source)
     camera = msgspec.structs.replace(camera, **beside)
     check_references(camera, str(path))
@@ -467,7 +472,7 @@ size = [640, 480]               # columns, rows
 # gain = 1.0
 # rate = 60.0                   # Hz
 # stall = 0.1                   # s without a frame, in motion, after which the stage is stopped
-# delay = 0.03                  # s from the middle of the exposure to the frame's arrival, if it is known
+# delay = 0.03                  # s from the middle of the exposure to the arrival; a stream's is measured
 pixel_size = 0.03               # mm at the sheet
 # dark = 12                     # counts without light, or a picture's file
 # bright = "bright.tif"         # counts in full light, or a picture's file

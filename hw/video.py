@@ -347,9 +347,6 @@ def _configure(video: Any, source: VideoSource, settings: CameraSettings) -> boo
         asked = [name for name in ("fourcc", "exposure", "gain") if getattr(settings, name) is not None]
         if asked:
             _log.warning("%s: %s can only be set where it is sent from", source.name, " and ".join(asked))
-        if source.kind == "stream" and settings.delay is not None:
-            what = "delay is that of another connection: leave it out, and each sweep measures its own"
-            _log.warning("%s: %s", source.name, what)
         raw = _is_grey(video, source)
     _check_size(video, source, settings)
     if raw:

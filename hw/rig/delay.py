@@ -31,7 +31,7 @@ _EVEN_RATIO = 1.3  # ratio of residuals of one line to lines near each frame, of
 _SPEED_MARGIN = 0.9  # of an axis's greatest speed; as much above its least
 
 # The estimate
-_REMEDY = "measure it otherwise and write it into the rig file as 'delay' of the camera"
+_REMEDY = "go in steps, or, if this is no stream, write it into the rig file as 'delay' of the camera"
 _BLOCKS = 16  # along either side of the picture
 _COMPONENTS = 6  # of the picture's change that count
 _RANGE = (-0.05, 0.6)  # seconds

@@ -23,7 +23,7 @@ from mirrorskin.io.types import Block, Closing, Floats, Header, InputError
 
 _DARK_FRAMES = 16
 
-UNKNOWN_DELAY = 0.2  # seconds that a camera's frames are taken to be late at most, where it is not known
+_UNKNOWN_DELAY = 0.2  # seconds that frames are taken to be late at most, where it is not known
 
 
 class Scan(Closing):
@@ -75,7 +75,7 @@ class Scan(Closing):
         bright = read_reference(settings.camera, "bright", settings.path)
         lifted = self.lift()
         if dark is None:
-            late = max(UNKNOWN_DELAY, settings.camera.delay or 0.0) + self.rig.period
+            late = max(_UNKNOWN_DELAY, settings.camera.delay or 0.0) + self.rig.period
             dark = take_dark(self.rig, lifted.time + late)
         self._prepare()
         return replace(header, dark=dark, bright=bright)
@@ -188,7 +188,7 @@ class StepScan(Scan):
     """Stands still for each of its frames; see ``Scan``.
 
     Frames count whose exposure began after the body had settled: they arrive later by the camera's delay,
-    which is taken as 0.2 s where the rig file does not say, and half an exposure.
+    0.2 s where the rig file does not say and at least that of a stream, and half an exposure.
 
     Parameters
     ----------
@@ -242,7 +242,9 @@ class StepScan(Scan):
         rest = self.rig.go(place)
         _check_there(rest, place, self.rig.stage.name)
         camera = self.rig.settings.camera
-        delay = UNKNOWN_DELAY if camera.delay is None else camera.delay
+        delay = camera.delay or 0.0
+        if camera.delay is None or camera.streamed:
+            delay = max(_UNKNOWN_DELAY, delay)
         exposure = self.rig.period if camera.exposure is None else camera.exposure
         self._since = rest.time + self.settle + delay + exposure / 2
         self._left = self.frames

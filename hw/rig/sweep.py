@@ -26,8 +26,8 @@ class SweepScan(Scan):
 
     The live position of a frame is that of the planned way, locked to the latest reports, at the frame's
     arrival less the camera's delay. Afterwards ``positions`` has it better: from all reports, and from
-    the even times at which a camera exposes. A delay that the rig file does not give is measured first, by a
-    short move there and back.
+    the even times at which a camera exposes. A delay that the rig file does not give, and that of a stream,
+    is measured first, by a short move there and back.
 
     Parameters
     ----------
@@ -89,8 +89,10 @@ class SweepScan(Scan):
     @functools.cached_property
     def delay(self) -> Delay:
         """How late the camera's frames come: as the rig file says, or measured when it is asked for."""
-        said = self.rig.settings.camera.delay
-        return measure_delay(self.rig, self.plan) if said is None else Delay(said, 0.0)
+        camera = self.rig.settings.camera
+        if camera.delay is None or camera.streamed:
+            return measure_delay(self.rig, self.plan)
+        return Delay(camera.delay, 0.0)
 
     def positions(self) -> Mapping[str, Floats]:
         """Return where the body was in the frames, from all reports once it has come to the end."""

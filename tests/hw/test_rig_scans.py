@@ -219,9 +219,10 @@ def hurry(monkeypatch):
 
 
 @pytest.mark.usefixtures("hurry")
-def test_a_delay_that_nobody_told_is_measured():
+@pytest.mark.parametrize("camera", [{}, {"source": "http://camera/video", "delay": 0.03}])
+def test_a_delay_that_nobody_told_and_that_of_a_stream_are_measured(camera):
     with make_rig(spreading((24, 24)), 100.0, delay=0.05, jitter=0.005, late=0.002) as rig:
-        rig.settings = settings((24, 24), dark=5.0)
+        rig.settings = settings((24, 24), dark=5.0, **camera)
         scan = SweepScan(rig, VerticalPlan(0.0, 1.0, speed=1.0))
         delay = scan.delay
     assert delay.seconds == pytest.approx(0.05, abs=0.003)

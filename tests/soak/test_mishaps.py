@@ -38,7 +38,7 @@ def served(tmp_path_factory):
     with mishaps.make_rig(0, rate=20.0) as rig, rig.serve() as server:
         rig.camera.take(1, 30)
         file = rig.write(tmp_path_factory.mktemp("rig"), server.url)
-        file.write_text(file.read_text() + "delay = 0.0\n")  # not to be measured each time
+        file.write_text(file.read_text() + "delay = 0.0\n")  # not to be measured each time; see mishaps.Child
         yield rig, file
 
 

@@ -136,7 +136,8 @@ class Child:
 
     def __init__(self, folder: Path, rig_file: Path, words: list[str], limit: int | None = None) -> None:
         self.recording = folder / "cut.h5"
-        program = "from mirrorskin.cli.main import main; main()"
+        unmeasured = "from mirrorskin.hw.rig_file import CameraSettings; CameraSettings.streamed = False"
+        program = f"{unmeasured}; from mirrorskin.cli.main import main; main()"
         if limit is not None:
             program = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit},) * 2); {program}"
         self.process = subprocess.Popen(

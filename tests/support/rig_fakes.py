@@ -46,7 +46,7 @@ def settings(shape=(8, 8), **camera):
         y=ShiftAxis(letter="B", limits=(-1.0, 1.0), speed=20.0),
         twist=TwistAxis(letter="C", limits=(-math.degrees(0.5), math.degrees(0.5)), speed=600.0),
     )
-    eye = CameraSettings(source=0, size=shape[::-1], **camera)
+    eye = CameraSettings(**{"source": 0, "size": shape[::-1], **camera})
     return RigSettings(Path("rig.toml"), "fake", stage, eye)
 
 

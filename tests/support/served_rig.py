@@ -13,6 +13,7 @@ from mirrorskin.hw.emulator import rig as emulators
 from mirrorskin.hw.emulator.rig import EmulatedRig
 from mirrorskin.hw.grbl import link as links
 from mirrorskin.hw.rig import rig as rigs
+from mirrorskin.hw.rig_file import CameraSettings
 
 
 def allow_delays(patch: pytest.MonkeyPatch, seconds: float = 5.0) -> None:
@@ -34,6 +35,7 @@ def served_rig(
         rig.serve() as server,
     ):
         allow_delays(patch)
+        patch.setattr(CameraSettings, "streamed", False)  # so that the delay need not be measured
         file = rig.write(folder, server.url)
         text = file.read_text().replace("[camera]", f"[camera]\ndelay = {delay}\ndark = 16")
         file.write_text(text.replace("report_rate = 20.0", "report_rate = 50.0"))
