@@ -123,18 +123,24 @@ def _shard(text: str | None) -> tuple[int, int]:
 def _find(words: Sequence[str], folder: Path) -> list[Path]:
     """Find the recordings; results that lie among them are left out."""
     from mirrorskin.io import InputError
+    from mirrorskin.io.url import Url, is_zarr, path_of
+    from mirrorskin.io.zarr import find_stores
 
     found: list[Path] = []
     for word in words:
-        if os.path.lexists(word) or not glob.has_magic(word):
-            found.append(Path(word))
+        path = path_of(word)
+        if os.path.lexists(path) or not glob.has_magic(word):
+            found.append(path)
+            continue
+        if isinstance(path, Url):
+            found += find_stores(path)
             continue
         every = map(Path, sorted(glob.glob(word, recursive=True)))  # noqa: PTH207  # paths may be absolute
-        answers = [path for path in every if path.is_file()]
+        answers = [path for path in every if path.is_file() or is_zarr(path)]
         if not answers:
             raise InputError(f"{word}: no file answers to that: name recordings")
         found += answers
-    if not any(map(os.path.lexists, found)):
+    if not any(isinstance(path, Url) or os.path.lexists(path) for path in found):
         raise InputError(f"{found[0]}: no such file")
     recordings = [path for path in found if not _is_result(path, folder)]
     if not recordings:

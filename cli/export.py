@@ -19,7 +19,7 @@ Point = tuple[float, float]
 
 
 def command(
-    result: Annotated[Path, Argument(metavar="RES.h5", help="Result, or for .mcap a recording.")],
+    result: Annotated[Path, Argument(metavar="RES.h5", help="Result, or for .mcap and .zarr a recording.")],
     output: Annotated[
         list[Path],
         Option(
@@ -27,7 +27,8 @@ def command(
             "-o",
             metavar="FILE",
             help="File to write, more than once if you like: a mesh .ply or .stl, points .xyz, heights in"
-            " 16 bits .png or .tif, a cross-section .csv, arrays .npz, ROS 2 messages .mcap.",
+            " 16 bits .png or .tif, a cross-section .csv, arrays .npz, ROS 2 messages .mcap, the same as Zarr"
+            " .zarr, also at an address such as s3://bucket/NAME.zarr.",
         ),
     ],
     turn: options.Turn = None,
@@ -36,6 +37,7 @@ def command(
 ) -> None:
     """Write a result as meshes, points, pictures, tables or arrays."""
     from mirrorskin import io
+    from mirrorskin.cli.output import progress
     from mirrorskin.cli.quantity import segment
     from mirrorskin.io.export import check_export
     from mirrorskin.io.frames import MCAP_SUFFIX
@@ -46,21 +48,37 @@ def command(
         if given and suffix not in suffixes:
             raise io.InputError(f"{option} is for a {suffix} file: name one with -o, or leave {option} out")
     ends = None if section is None else segment(section, "--section")
-    for number, path in enumerate(output):
-        if path.resolve() in (other.resolve() for other in output[:number]):
-            raise io.InputError(f"{path} is to be written twice: name another output with -o")
+    stores, output = _part(output, turn)
+    for path in output:
         io.check_output(path, result)
-    if suffixes == {MCAP_SUFFIX} and is_recording(result):
+    if all(path.suffix.lower() == MCAP_SUFFIX for path in output) and is_recording(result):
         with io.open_recording(result) as recording:
             for path in output:
                 click.echo(f"{path}: {io.save_messages(recording, path)}")
-        return
-    found = io.select_turn(io.open_result(result), turn)
-    for path in output:
-        check_export(found, path)
-    columns = _section(found, ends) if ".csv" in suffixes else None
-    for path in output:
-        click.echo(f"{path}: {io.export_result(found, path, section=columns, points=points)}")
+    elif output:
+        found = io.select_turn(io.open_result(result), turn)
+        for path in output:
+            check_export(found, path)
+        columns = _section(found, ends) if ".csv" in suffixes else None
+        for path in output:
+            click.echo(f"{path}: {io.export_result(found, path, section=columns, points=points)}")
+    for path in stores:
+        with progress("exporting", None) as show:
+            click.echo(f"{path}: {io.save_zarr(result, path, show)}")
+
+
+def _part(output: list[Path], turn: int | None) -> tuple[list[Path], list[Path]]:
+    """Return what is to be written as Zarr, and the rest."""
+    from mirrorskin.io import InputError
+    from mirrorskin.io.url import is_zarr
+
+    for number, path in enumerate(output):
+        if path.resolve() in (other.resolve() for other in output[:number]):
+            raise InputError(f"{path} is to be written twice: name another output with -o")
+    stores = [path for path in output if is_zarr(path)]
+    if stores and turn is not None:
+        raise InputError(f"{stores[0]} takes all turns: leave --turn out")
+    return stores, [path for path in output if path not in stores]
 
 
 def _section(result: Result, ends: tuple[Point, Point] | None) -> dict[str, NDArray[Any]]:

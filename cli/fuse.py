@@ -93,12 +93,12 @@ def _open(path: Path, place: Motion, dataset: str | None, known: StackOptions, l
     """Open a recording; a file in another layout has the motion of its place on the command line."""
     from mirrorskin import io
     from mirrorskin.io.arrays import NUMPY_SUFFIXES
-    from mirrorskin.io.hdf5 import Hdf5File
     from mirrorskin.io.layout import MARK
+    from mirrorskin.io.zarr import open_file
 
     ours = False
     if path.suffix.lower() not in NUMPY_SUFFIXES:
-        with Hdf5File(path) as file:
+        with open_file(path) as file:
             ours = file.marked(MARK)
     mine = known if ours else {**known, "motion": place}
     return io.open_recording(path, dataset=None if ours else dataset, memory_limit=limit, **mine)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import keyword
+import os
 from collections.abc import Callable, Iterator, Mapping
 from enum import StrEnum
 from importlib import import_module
@@ -110,12 +111,25 @@ class _Missing(click.ClickException):
     exit_code = 2
 
 
-class _ExistingPath(click.Path):
+class _AnyPath(click.Path):
+    """A path, or an address."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        from mirrorskin.io.url import path_of
+
+        return path_of(os.fsdecode(super().convert(value, param, ctx)))
+
+
+class _ExistingPath(_AnyPath):
     """What a command reads: one that is not there is told before anything heavy is imported."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        from mirrorskin.io.url import Url, path_of
+
+        path = path_of(value)
         try:
-            Path(value).stat()
+            if not isinstance(path, Url):  # the command says whether there is something at an address
+                path.stat()
         except (FileNotFoundError, NotADirectoryError):
             raise _Missing(f"{value}: no such file") from None
         except OSError:  # the command says more of it
@@ -198,7 +212,7 @@ def _type(kind: Any, bounds: dict[str, Any], written: bool) -> Any:
     if bounds:
         return (click.IntRange if kind is int else click.FloatRange)(**bounds)
     if kind is Path:
-        return (click.Path if written else _ExistingPath)(path_type=Path)
+        return (_AnyPath if written else _ExistingPath)()
     return _Words(kind) if issubclass(kind, StrEnum) else kind
 
 

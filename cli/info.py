@@ -11,7 +11,7 @@ from mirrorskin.cli.output import print_fields, print_json
 
 
 def command(
-    file: Annotated[Path, Argument(metavar="FILE", help="Recording, result, or any HDF5 file.")],
+    file: Annotated[Path, Argument(metavar="FILE", help="Recording, result, or any file of HDF5 or Zarr.")],
     verify: Annotated[
         bool, Option("--verify", help="Read all frames, and compare them with their checksums.")
     ] = False,

@@ -74,7 +74,7 @@ _REMEDIES = {"zenith": "--zenith-gain", "height": "--pixel-size"}
 
 def command(
     context: click.Context,
-    recording: Annotated[Path, Argument(metavar="REC.h5", help="Frames in HDF5, NPY or NPZ.")],
+    recording: Annotated[Path, Argument(metavar="REC.h5", help="Frames in HDF5, Zarr, NPY or NPZ.")],
     output: Annotated[
         Path | None,
         Option("--output", "-o", metavar="RES.h5", help="Result to write.", show_default="REC-result.h5"),

@@ -21,7 +21,7 @@ Settings = Annotated[
 
 def command(
     estimator: Own,
-    recording: Annotated[Path, Argument(metavar="REC.h5", help="Frames in HDF5, NPY or NPZ.")],
+    recording: Annotated[Path, Argument(metavar="REC.h5", help="Frames in HDF5, Zarr, NPY or NPZ.")],
     output: Annotated[
         Path | None,
         Option("--output", "-o", metavar="RES.h5", help="Result to write.", show_default="REC-CLASS.h5"),

@@ -69,7 +69,7 @@ def feed(
     """Push frames of a source into an estimator.
 
     A device that shares the host's memory works on frames where they were read or lie. For one with memory of
-    its own, the next frames are read and decoded while those before are copied and worked on.
+    its own, and of frames in Zarr, the next are read and decoded while those before are copied and worked on.
 
     Parameters
     ----------
@@ -92,7 +92,8 @@ def feed(
         done += len(block.frames)
         if progress:
             progress(done)
-    read = _read_ahead if not shared else _lent_or_read if long else _read_in_place
+    ahead = not shared or getattr(source, "read_ahead", False)
+    read = _read_ahead if ahead else _lent_or_read if long else _read_in_place
     with ThreadPoolExecutor(1, "mirrorskin-fingerprint") as beside:
         # It is needed for the result, and is there by then.
         known = beside.submit(source.fingerprint) if hasattr(source, "fingerprint") else None

@@ -33,6 +33,7 @@ from .types import (
     Truth,
     pixel_axes,
 )
+from .zarr import save_zarr
 
 __all__ = [
     "Block",
@@ -71,6 +72,7 @@ __all__ = [
     "save_messages",
     "save_result",
     "save_table",
+    "save_zarr",
     "select_turn",
     "surface_mesh",
     "update_calibration",

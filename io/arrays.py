@@ -50,8 +50,6 @@ class ArrayRecording(Recording):
         Frames, positions or header cannot be used.
     """
 
-    left_out: tuple[str, ...] = ()
-
     def __init__(
         self,
         frames: NDArray[Any],

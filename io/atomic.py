@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.os_errors import as_input_error, legible
 from mirrorskin.io.types import Closing, InputError, ProcessValue
+from mirrorskin.io.url import is_zarr
 
 MAKE_ROOM = "make room, or choose another place with -o"
 """What to do where a disk did not take all."""
@@ -64,6 +65,8 @@ def check_output(path: Path, *keep: Path | None) -> None:
     >>> check_output(Path("result.h5"), Path("press.h5"))  # doctest: +SKIP
     """
     with as_input_error(f"{path} cannot be written", "choose another place with -o"):
+        if is_zarr(path):
+            raise InputError(f"{path}: this is written as HDF5: name a local file, .h5, with -o")
         if path.is_dir():
             raise InputError(f"{path} is a folder: name a file in it")
         if not path.parent.is_dir():

@@ -11,12 +11,13 @@ from mirrorskin.io.arrays import NUMPY_SUFFIXES, list_arrays
 from mirrorskin.io.calibration.file import MARK as CALIBRATION_MARK
 from mirrorskin.io.calibration.file import open_calibration, words_of
 from mirrorskin.io.calibration.types import GROUPS, Calibration
-from mirrorskin.io.hdf5 import Hdf5File
 from mirrorskin.io.layout import MARK, TRUTH_UNITS
 from mirrorskin.io.recording import Recording, open_recording
 from mirrorskin.io.result import MARK as RESULT_MARK
 from mirrorskin.io.result import open_result
 from mirrorskin.io.types import Result
+from mirrorskin.io.url import is_zarr, path_of
+from mirrorskin.io.zarr import open_file
 
 
 def describe(path: str | Path) -> dict[str, str]:
@@ -37,10 +38,10 @@ def describe(path: str | Path) -> dict[str, str]:
     >>> describe("press.h5")["motion"]  # doctest: +SKIP
     'vertical'
     """
-    path = Path(path)
+    path = path_of(path)
     if path.suffix.lower() in NUMPY_SUFFIXES:
         return {"kind": "array of NumPy's", **list_arrays(path)}
-    with Hdf5File(path) as file:
+    with open_file(path) as file:
         ours, result = file.marked(MARK), file.marked(RESULT_MARK)
         calibration = file.marked(CALIBRATION_MARK)
         stacks = {} if ours or result or calibration else file.stacks()
@@ -51,7 +52,8 @@ def describe(path: str | Path) -> dict[str, str]:
             return _recording(recording)
     if result:
         return _result(open_result(path))
-    return {"kind": "HDF5 file of another layout", "stacks": str(len(stacks)), **stacks}
+    kind = "Zarr" if is_zarr(path) else "HDF5 file"
+    return {"kind": f"{kind} of another layout", "stacks": str(len(stacks)), **stacks}
 
 
 def _recording(recording: Recording) -> dict[str, str]:

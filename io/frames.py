@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io.arrays import NUMPY_SUFFIXES, ArrayRecording, open_array
+from mirrorskin.io.arrays import NUMPY_SUFFIXES, open_array
 from mirrorskin.io.pictures import (
     PICTURE_SUFFIXES,
     TIFF_SUFFIXES,
@@ -25,7 +25,9 @@ from mirrorskin.io.pictures import (
     read_picture,
 )
 from mirrorskin.io.positions import Positions, Steps, along, check_phase, check_strokes
+from mirrorskin.io.recording import Recording, open_recording
 from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, block_memory
+from mirrorskin.io.url import is_zarr, path_of
 
 MCAP_SUFFIX = ".mcap"
 # OpenCV takes these from the environment only: no messages, and no frame of which the end is missing.
@@ -39,8 +41,8 @@ def open_frames(
     phase: ArrayLike | Positions | None = None,
     topic: str | None = None,
     progress: Callable[[int], None] | None = None,
-) -> FrameSequence | ArrayRecording:
-    """Open numbered pictures, a TIFF of many pages, a video, NumPy's arrays, or ROS 2 messages in MCAP.
+) -> FrameSequence | Recording:
+    """Open numbered pictures, a TIFF, a video, NumPy's arrays, a stack in Zarr, or ROS 2 messages in MCAP.
 
     Parameters
     ----------
@@ -56,7 +58,7 @@ def open_frames(
 
     Returns
     -------
-    FrameSequence or ArrayRecording
+    FrameSequence or Recording
         A source that can be rewound.
 
     Raises
@@ -69,7 +71,7 @@ def open_frames(
     >>> open_frames("pictures", Header("vertical"), travel=Steps(0.1)).shape  # doctest: +SKIP
     (240, 480, 640)
     """
-    path = Path(path)
+    path = path_of(path)
     messages = path.suffix.lower() == MCAP_SUFFIX
     if topic is not None and not messages:
         raise InputError(f"{path}: only an MCAP file has topics: leave --topic out")
@@ -77,6 +79,11 @@ def open_frames(
         where = {"travel": travel, "phase": phase}
         known = {"tilt": header.tilt, "pixel_size": header.pixel_size, "title": header.title}
         return open_array(path, None, where, known, header.motion, None, None)
+    if is_zarr(path):
+        size = header.pixel_size
+        return open_recording(
+            path, motion=header.motion, travel=travel, phase=phase, tilt=header.tilt, pixel_size=size
+        )
     for motion, name, positions, options in (
         ("vertical", "travel", travel, "--travel-step or --travel"),
         ("axial", "phase", phase, "--phase-step or --phases"),

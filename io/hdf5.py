@@ -30,13 +30,13 @@ _MOST_STEPS = 100_000  # along links, and to the sources of virtual datasets
 class Hdf5File(Closing):
     """An HDF5 file to read, and the files in its own folder that it refers to."""
 
-    def __init__(self, path: Path, memory_limit: int | None = None) -> None:
+    def __init__(self, path: Path, memory_limit: int | None = None, root: h5py.File | None = None) -> None:
         self.path = path
         self.memory_limit = memory_limit
         real = os.path.realpath(path)
         self._home = Path(real).parent
         with as_input_error(str(path)):
-            self.root = _open_file(path, real)
+            self.root = _open_file(path, real) if root is None else root
         self._files: dict[str, h5py.File] = {real: self.root}
         self._groups: dict[str, Node | None] = {"": self.root}
         self._steps = 0
@@ -104,6 +104,14 @@ class Hdf5File(Closing):
         with as_input_error(str(self.path)):
             self.root.visititems(visit)
         return dict(sorted(found.items()))
+
+    def check_frames(self, stack: h5py.Dataset, count: int) -> None:
+        """Refuse frames that HDF5 could not deliver, or would make up."""
+        check_storage(self, stack, frames=count)
+
+    def storage(self, stack: h5py.Dataset) -> str:
+        """Tell how a stack is stored, for people."""
+        return describe_storage(stack)
 
     def read(
         self,

@@ -1,4 +1,4 @@
-"""Recordings: frame stacks in HDF5, our own NeXus layout or anyone's; and heights known from a file."""
+"""Recordings: frame stacks in HDF5 or Zarr, our own NeXus layout or anyone's; and heights from a file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mirrorskin.io.arguments import checked
 from mirrorskin.io.calibration.file import carried_by
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.fingerprint import check_unchanged, fingerprint, modified, origins
-from mirrorskin.io.hdf5 import Hdf5File, check_storage, describe_storage
+from mirrorskin.io.hdf5 import Hdf5File
 from mirrorskin.io.layout import CHECKSUM, MARK, SERIES, STACK, Layout, RecordingState, read_state
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.positions import Positions, along
@@ -38,6 +38,8 @@ from mirrorskin.io.types import (
     Truth,
     block_memory,
 )
+from mirrorskin.io.url import path_of
+from mirrorskin.io.zarr import ZarrFile, open_file
 
 
 class Recording(Closing):
@@ -72,9 +74,13 @@ class Recording(Closing):
         Which frames of the whole stack these are, for people.
     storage : str
         How the frames are stored, for people.
+    read_ahead : bool
+        Whether reading is worth a thread of its own: of Zarr.
     """
 
     rewindable = True
+    read_ahead = False
+    left_out: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -98,8 +104,9 @@ class Recording(Closing):
         self.displacement, self.twist = positions.get("displacement"), positions.get("twist")
         self.tilt = positions.get("tilt")
         self.which = f"{cut.frames[0]}:{cut.frames[1]}{', used live' if live else ''}"
-        self.storage = describe_storage(dataset)
-        self._file, self._dataset, self._origins = file, dataset, origins(file, dataset)
+        self.storage, self._file, self._dataset = file.storage(dataset), file, dataset
+        self._origins = file.origins() if isinstance(file, ZarrFile) else origins(file, dataset)
+        self.read_ahead = isinstance(file, ZarrFile)
         self._stack, self._next = stack, 0
 
     def __repr__(self) -> str:
@@ -155,6 +162,8 @@ class Recording(Closing):
 
     @functools.cached_property
     def _fingerprint(self) -> str:
+        if isinstance(self._file, ZarrFile):
+            return self._file.fingerprint(self._dataset)
         return fingerprint(self._file, self._dataset, self._origins, self.full_shape[0])
 
     def find_damage(self) -> NDArray[np.intp] | None:
@@ -186,8 +195,8 @@ class Recording(Closing):
 
     @property
     def modified(self) -> str:
-        """When the file, or one that frames lie in, was written last: ISO 8601, UTC, to the nanosecond."""
-        return modified(self._origins)
+        """When the file, or one that frames lie in, was written last: ISO 8601, UTC; empty of an address."""
+        return modified(self._origins) if self._origins else ""
 
     def close(self) -> None:
         """Close the file; frames that were lent live on."""
@@ -212,11 +221,12 @@ def open_recording(
     live: bool = False,
     override_motion: bool = False,
 ) -> Recording:
-    """Open a stack of frames in HDF5, or in an array that ``numpy.save`` or ``numpy.savez`` wrote.
+    """Open a stack of frames in HDF5, Zarr, or an array that ``numpy.save`` or ``numpy.savez`` wrote.
 
     Parameters
     ----------
     path : str or Path
+        Of Zarr a folder ``NAME.zarr``, that in a ``.zip``, or an address such as ``s3://bucket/NAME.zarr``.
     dataset : str, optional
         Name of the stack, or of an archive's array; needed where the file is not a recording of ours and
         holds several.
@@ -256,17 +266,16 @@ def open_recording(
     ...     print(recording.motion, recording.shape)
     vertical (240, 480, 640)
     """
-    if Path(path).suffix.lower() in (".npy", ".npz"):
+    path = path_of(path)
+    if path.suffix.lower() in (".npy", ".npz"):
         from mirrorskin.io.arrays import open_array
 
         if live:
             raise InputError(f"{path} is no recording of a live run: leave --live out")
         known = {"tilt": tilt, "pixel_size": pixel_size}
-        return open_array(
-            Path(path), dataset, {"travel": travel, "phase": phase}, known, motion, region, frames
-        )
+        return open_array(path, dataset, {"travel": travel, "phase": phase}, known, motion, region, frames)
     with ExitStack() as opening:
-        file = opening.enter_context(Hdf5File(Path(path), memory_limit))
+        file = opening.enter_context(open_file(path, memory_limit))
         ours = file.marked(MARK)
         file.check_layout(MARK)
         stack, state = _find_stack(file, dataset, ours)
@@ -282,7 +291,8 @@ def open_recording(
         else:
             given = {"vertical": travel, "axial": phase}.get(header.motion)
             positions = layout.positions(header.motion, along(given, shape[0]))
-        frames_of = Stack(stack, str(path), shape[0], numbers, cut.region, memory_limit, threads)
+        opened = file.frames(stack) if isinstance(file, ZarrFile) else None
+        frames_of = Stack(stack, str(path), shape[0], numbers, cut.region, memory_limit, threads, opened)
         recording = Recording(file, stack, frames_of, cut, header, positions, truth, state, live)
         opening.pop_all()  # from here on the recording closes its file
     return recording
@@ -347,13 +357,13 @@ def _find_stack(file: Hdf5File, dataset: str | None, ours: bool) -> tuple[h5py.D
     state = read_state(file, ours and dataset == STACK, stack)
     if state.count < 2:
         raise InputError(f"{where} holds {state.count} frames: at least 2 are needed; record more")
-    check_storage(file, stack, frames=state.count)
+    file.check_frames(stack, state.count)
     return stack, state
 
 
 def is_recording(path: str | Path) -> bool:
-    """Return whether a file of HDF5 is one of our recordings."""
-    with Hdf5File(Path(path)) as file:
+    """Return whether a file of HDF5 or Zarr is one of our recordings."""
+    with open_file(path) as file:
         return file.marked(MARK)
 
 
@@ -396,8 +406,8 @@ def open_heights(path: str | Path, source: Recording | None = None) -> NDArray[n
     >>> open_heights("press-result.h5").shape  # doctest: +SKIP
     (480, 640)
     """
-    path = Path(path)
-    with Hdf5File(path) as file:
+    path = path_of(path)
+    with open_file(path) as file:
         ours = file.marked(MARK)
     if ours:
         with open_recording(path) as recording:

@@ -16,6 +16,8 @@ from mirrorskin.io.atomic import Item, fixed_text, process_items, write_file
 from mirrorskin.io.calibration.file import CARRIED, calibration_items, carried_by
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape, read_process
 from mirrorskin.io.types import NO_MAPS, SCALARS, SERIES, InputError, ProcessValue, Result
+from mirrorskin.io.url import path_of
+from mirrorskin.io.zarr import open_file
 
 MARK = "mirrorskin_result"
 UNITS = (
@@ -191,7 +193,7 @@ def open_result(path: str | Path) -> Result:
     >>> open_result("press-result.h5").height.shape  # doctest: +SKIP
     (480, 640)
     """
-    with _opened(Path(path)) as file:
+    with _opened(path_of(path)) as file:
         maps: dict[str, Any] = {}
         for name, (node, shape) in _find_maps(file).items():
             values = file.read(node, shape, remedy=_AGAIN)
@@ -220,7 +222,7 @@ def open_process(path: str | Path, *names: str) -> dict[str, ProcessValue]:
 
     What is not there is missing. See ``open_result``.
     """
-    with _opened(Path(path)) as file:
+    with _opened(path_of(path)) as file:
         for node, shape in _find_maps(file).values():
             if getattr(node, "shape", None) != shape:
                 raise InputError(f"{file.where(node)} is not of shape {shape}: {_AGAIN}")
@@ -229,7 +231,7 @@ def open_process(path: str | Path, *names: str) -> dict[str, ProcessValue]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Hdf5File]:
-    with Hdf5File(path) as file:
+    with open_file(path) as file:
         if not file.marked(MARK):
             raise InputError(f"{path} is no result: 'mirrorskin reconstruct' makes one from a recording")
         file.check_layout(MARK)

@@ -26,6 +26,7 @@ from mirrorskin.io.chunks import Chunks, chunk_index, find_codecs
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.selection import Place, Region, Span
 from mirrorskin.io.types import Closing, InputError
+from mirrorskin.io.zarr import ZarrFrames
 
 _log = logging.getLogger("mirrorskin.io")
 
@@ -144,6 +145,7 @@ class Stack:
         region: Region,
         memory_limit: int | None,
         threads: int | None,
+        frames: ZarrFrames | None = None,
     ) -> None:
         self.shape, self.dtype = (len(numbers), *region.shape), dataset.dtype.newbyteorder("=")
         self._place, self._limit = Place(path, str(dataset.name)), memory_limit or _LIMIT
@@ -151,7 +153,7 @@ class Stack:
         self._first, self._end = int(numbers[0]), int(numbers[-1]) + 1
         self._whole = region.shape == dataset.shape[1:]
         with as_input_error(f"{path}: {dataset.name}"):
-            self._frames = _open(dataset, self._place, count, self._limit, threads)
+            self._frames = frames or _open(dataset, self._place, count, self._limit, threads)
         self._kept: Span = (0, 0)
         self._unpacked: NDArray[Any] | None = None
         self._memory: mmap.mmap | None = None

@@ -23,6 +23,7 @@ from mirrorskin.engine.slip.search import MOTIONS as SLIP_MOTIONS
 from mirrorskin.engine.slip.slip import reconstruct_slip
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Motion, Result
+from mirrorskin.io.url import Url
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +77,7 @@ def _distinct_names(sources: Sequence[Path]) -> list[str]:
 
 def _absolute(path: Path) -> Path:
     """Return the whole path, without '..', but with the links that lead there."""
-    return Path(os.path.normpath(path.absolute()))
+    return Path(os.path.normpath(f"/{path}" if isinstance(path, Url) else path.absolute()))
 
 
 def _check(sources: Sequence[Path], targets: Iterable[Path]) -> None:

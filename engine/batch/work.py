@@ -20,6 +20,7 @@ from mirrorskin.io import InputError, Recording
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.result import open_process
 from mirrorskin.io.types import ProcessValue
+from mirrorskin.io.url import Url
 from mirrorskin.kernels.device import Device, open_device
 from mirrorskin.kernels.errors import DeviceError
 
@@ -49,7 +50,8 @@ def find_settled(job: Job, plan: Plan) -> Outcome | None:
 
     Its result is there already, or its recording is not.
     """
-    if os.path.exists(job.source) and not os.path.exists(job.target):  # noqa: PTH110  # which never raise
+    there = isinstance(job.source, Url) or os.path.exists(job.source)  # noqa: PTH110  # which never raises
+    if there and not os.path.exists(job.target):  # noqa: PTH110
         return None
     start = time.perf_counter()
     try:

@@ -29,6 +29,7 @@ from mirrorskin.io.calibration.types import (
 )
 from mirrorskin.io.hdf5 import Hdf5File, Node, read_process
 from mirrorskin.io.types import FRAME_DTYPES, InputError, ProcessValue
+from mirrorskin.io.zarr import open_file
 
 MARK, VERSION = "mirrorskin_calibration", 1
 """The attribute of the group that holds a calibration, and the layout that is written and read here."""
@@ -54,7 +55,7 @@ def open_calibration(path: str | Path) -> Calibration:
     >>> open_calibration("left.h5").lens.pixel_size  # doctest: +SKIP
     (0.03, 0.03)
     """
-    with Hdf5File(Path(path)) as file:
+    with open_file(path) as file:
         if file.marked(MARK):
             return _read(file, ENTRY, str(path))
         carried = carried_by(file)

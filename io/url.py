@@ -1,0 +1,54 @@
+"""Addresses of stacks in object stores, as paths that keep their two slashes."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path, PosixPath
+
+ZARR_SUFFIX = ".zarr"
+_SCHEME = re.compile("([a-z][a-z0-9+.-]+):/+")
+
+
+class Url(PosixPath):
+    """An address, such as ``s3://bucket/press.zarr``, wherever a path is taken.
+
+    Names and endings are those of a path. No local file is meant, so ``exists`` is false.
+
+    Examples
+    --------
+    >>> str(Url("s3://bucket/monday/press.zarr")), Url("s3://bucket/press.zarr").stem
+    ('s3://bucket/monday/press.zarr', 'press')
+    """
+
+    def __str__(self) -> str:
+        return _SCHEME.sub(r"\1://", super().__str__(), count=1)
+
+    def absolute(self) -> Url:
+        """Return itself."""
+        return self
+
+    def resolve(self, strict: bool = False) -> Url:
+        """Return itself."""
+        return self
+
+
+def path_of(text: str | os.PathLike[str]) -> Path:
+    """Return an address as a ``Url``, and anything else as a plain path.
+
+    Examples
+    --------
+    >>> type(path_of("memory://press.zarr")).__name__, str(path_of("file:///data/press.zarr"))
+    ('Url', '/data/press.zarr')
+    """
+    said = os.fspath(text)
+    found = _SCHEME.match(said)
+    if found is None:
+        return Path(said)
+    return Path("/", said[found.end() :]) if found[1] == "file" else Url(said)
+
+
+def is_zarr(path: str | Path) -> bool:
+    """Tell whether a path is that of a Zarr store: an address, ``NAME.zarr``, or that in a ``.zip``."""
+    known = path_of(path)
+    return isinstance(known, Url) or known.name.lower().endswith((ZARR_SUFFIX, f"{ZARR_SUFFIX}.zip"))

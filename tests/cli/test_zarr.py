@@ -1,0 +1,93 @@
+"""Stacks in Zarr on the command line: at addresses as in folders; refusals of one line."""
+
+from __future__ import annotations
+
+import pytest
+from commands import run
+from stacks import record, sphere
+
+from mirrorskin import io
+
+pytest.importorskip("zarr")
+fsspec = pytest.importorskip("fsspec")
+
+ADDRESS = "memory://bucket/press.zarr"
+
+
+@pytest.fixture
+def bucket(tmp_path, monkeypatch):
+    """A store in memory, where a recording is exported to from the working directory."""
+    monkeypatch.chdir(tmp_path)
+    record(sphere(), tmp_path / "press.h5", truth=sphere().truth)
+    store = fsspec.filesystem("memory")
+    assert run("export", "press.h5", "-o", ADDRESS).code == 0
+    yield store
+    store.rm("/bucket", recursive=True)
+
+
+def test_a_command_reads_an_address_as_a_file(bucket, tmp_path):
+    assert run("reconstruct", ADDRESS, "-o", "zarr.h5").code == 0
+    assert run("reconstruct", "press.h5", "-o", "hdf5.h5").code == 0
+    found = [io.open_result(name).height for name in ("zarr.h5", "hdf5.h5")]
+    assert found[0].tobytes() == found[1].tobytes()
+
+
+def test_info_differs_in_the_storage_alone(bucket):
+    first, second = (run("info", name).out.splitlines() for name in ("press.h5", ADDRESS))
+    different = [pair for pair in zip(first, second, strict=True) if pair[0] != pair[1]]
+    assert len(different) == 1
+    assert different[0][1].split() == ["storage", "Zarr,", "chunks", "(8,", "5,", "7),", "Blosc"]
+
+
+def test_a_batch_takes_addresses_and_keeps_what_is_made(bucket):
+    assert "1 done" in run("batch", "memory://bucket/*.zarr", "-o", "results").out
+    assert "1 kept" in run("batch", ADDRESS, "-o", "results").out
+
+
+def test_a_batch_mixes_files_and_addresses(bucket):
+    assert "2 done" in run("batch", ADDRESS, "press.h5", "-o", "results").out
+
+
+def test_verify_reads_all_frames(bucket):
+    assert "all 8 frames are as they were recorded" in run("info", "--verify", ADDRESS).out
+
+
+def test_import_makes_hdf5_of_an_address(bucket):
+    assert run("import", ADDRESS, "--motion", "vertical", "-o", "back.h5").code == 0
+    with io.open_recording("back.h5") as recording, io.open_recording("press.h5") as first:
+        assert recording.frame(5).tolist() == first.frame(5).tolist()
+        assert recording.travel.tolist() == first.travel.tolist()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("reconstruct", "memory://bucket/nothing.zarr"), "memory://bucket/nothing.zarr: there is no Zarr"),
+        (
+            ("reconstruct", ADDRESS),
+            "memory://bucket/press-result.h5: this is written as HDF5: name a local file",
+        ),
+        (("info", "gone.zarr"), "gone.zarr: no such file"),
+        (("info", "unheard://of"), "unheard://of: Protocol not known: unheard: check the address"),
+        (("export", "press.h5", "-o", ADDRESS), f"{ADDRESS} is there already: remove it, or name another"),
+        (("simulate", "vertical", "-o", "new.zarr"), "new.zarr: this is written as HDF5: name a local file"),
+        (("batch", "memory://bucket/x*", "-o", "r"), "memory://bucket/x*: nothing answers to that"),
+    ],
+)
+def test_what_cannot_be_is_one_line_with_its_address(bucket, words, said):
+    ended = run(*words)
+    assert (ended.code, ended.out) == (2, "")
+    assert said in ended.said
+    assert len(ended.said.splitlines()) == 1
+
+
+def test_a_chunk_that_is_lost_in_the_middle_leaves_nothing(bucket, tmp_path):
+    bucket.pipe("/bucket/press.zarr/entry/instrument/detector/data/c/0/0/0", b"damaged")
+    before = sorted(tmp_path.iterdir())
+    ended = run("reconstruct", ADDRESS, "-o", "zarr.h5")
+    assert ended.code == 2
+    assert (
+        f"{ADDRESS}: frames 0 to 7 of /entry/instrument/detector/data cannot be read: it is damaged"
+        in ended.said
+    )
+    assert sorted(tmp_path.iterdir()) == before

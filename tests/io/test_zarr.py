@@ -1,0 +1,232 @@
+"""Zarr: the same recordings and results as in HDF5, from folders, zips and stores with addresses."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+
+import h5py
+import numpy as np
+import pytest
+from stacks import SHAPE, random_stack, read_all, record, sphere
+
+from mirrorskin import engine, io
+from mirrorskin.io.url import Url, path_of
+
+zarr = pytest.importorskip("zarr")
+
+STACK = "entry/instrument/detector/data"
+GIVEN = {"motion": "vertical", "travel": io.Steps(0.3)}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("made")
+    io.save_zarr(record(sphere(), folder / "press.h5", truth=sphere().truth), folder / "press.zarr")
+    return folder
+
+
+@pytest.fixture
+def pair(made, tmp_path):
+    """A recording of a simulated press, and the same in Zarr."""
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "press.h5", tmp_path / "press.zarr"
+
+
+@pytest.fixture
+def memory(pair):
+    """The same at an address."""
+    import fsspec
+
+    store = fsspec.filesystem("memory")
+    io.save_zarr(pair[0], "memory://bucket/press.zarr")
+    yield store
+    store.rm("/bucket", recursive=True)
+
+
+def bare(path, frames, **settings):
+    zarr.create_array(path, data=frames, **settings)
+    return path
+
+
+def line(path, **options):
+    """Return what is said of a stack that is refused, without its name."""
+    with pytest.raises(io.InputError) as caught, io.open_recording(path, **options) as recording:
+        read_all(recording, 3)
+    said = str(caught.value)
+    assert "\n" not in said
+    assert said.startswith(str(path))
+    return said.removeprefix(str(path))
+
+
+def edit(folder, name, **changes):
+    """Change the metadata of an array, and leave no copy of it elsewhere."""
+    place = folder / name / "zarr.json"
+    place.write_text(json.dumps(json.loads(place.read_text()) | changes))
+    root = folder / "zarr.json"
+    head = json.loads(root.read_text())
+    head.pop("consolidated_metadata", None)
+    root.write_text(json.dumps(head))
+    return folder
+
+
+def test_all_that_hdf5_holds_is_there_again(pair):
+    with io.open_recording(pair[0]) as first, io.open_recording(pair[1]) as second:
+        assert second.header.pixel_size == first.header.pixel_size
+        assert (second.header.title, second.header.start_time) == (
+            first.header.title,
+            first.header.start_time,
+        )
+        assert second.travel.tolist() == first.travel.tolist()
+        assert second.time.tolist() == first.time.tolist()
+        np.testing.assert_array_equal(second.header.bright, first.header.bright)
+        np.testing.assert_array_equal(second.truth.height, first.truth.height)
+        np.testing.assert_array_equal(read_all(second, 3).frames, read_all(first, 3).frames)
+
+
+def test_attributes_are_those_of_hdf5(pair):
+    with h5py.File(pair[0]) as file:
+        group = zarr.open_group(pair[1], mode="r")
+        assert group["entry"].attrs["mirrorskin_recording"] == 1
+        assert group["entry/instrument/stage/travel"].attrs["units"] == "mm"
+        assert group["entry/instrument"].attrs["NX_class"] == file["entry/instrument"].attrs["NX_class"]
+
+
+def test_results_are_the_same_bit_for_bit(pair):
+    found = []
+    for path in pair:
+        with io.open_recording(path) as recording:
+            found.append(engine.reconstruct(recording))
+    for name, values in found[0].maps().items():
+        assert values.tobytes() == found[1].maps()[name].tobytes(), name
+
+
+def test_an_address_is_a_recording_like_any_other(pair, memory):
+    with io.open_recording(pair[0]) as first, io.open_recording("memory://bucket/press.zarr") as second:
+        assert str(second.path) == second.name == "memory://bucket/press.zarr"
+        np.testing.assert_array_equal(read_all(second, 3).frames, read_all(first, 3).frames)
+
+
+def test_a_zip_is_read(pair, tmp_path):
+    shutil.make_archive(str(tmp_path / "zipped.zarr"), "zip", pair[1])
+    with io.open_recording(pair[0]) as first, io.open_recording(tmp_path / "zipped.zarr.zip") as second:
+        np.testing.assert_array_equal(read_all(second, 3).frames, read_all(first, 3).frames)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", ">u2", "float32"])
+@pytest.mark.parametrize("chunks", [(3, 4, 7), SHAPE, (1, 5, 7)])
+def test_stacks_of_others_need_what_they_do_not_say(tmp_path, dtype, chunks):
+    frames = random_stack(np.dtype(dtype).newbyteorder("=")).astype(dtype)
+    path = bare(tmp_path / "x.zarr", frames, chunks=chunks)
+    assert "does not say how the sensor moved: give --motion" in line(path)
+    with io.open_recording(path, **GIVEN) as recording:
+        np.testing.assert_array_equal(read_all(recording, 3).frames, frames)
+
+
+def test_a_region_and_some_frames_are_cut_out(pair):
+    part = io.Region((1, 4), (2, 7))
+    with io.open_recording(pair[0]) as whole, io.open_recording(pair[1], region=part, frames=(2, 7)) as cut:
+        np.testing.assert_array_equal(read_all(cut, 3).frames, read_all(whole, 3).frames[2:7, 1:4, 2:7])
+
+
+def test_results_are_read_and_exported(pair, tmp_path):
+    with io.open_recording(pair[0]) as recording:
+        result = engine.reconstruct(recording)
+    io.save_result(result, tmp_path / "res.h5")
+    io.save_zarr(tmp_path / "res.h5", tmp_path / "res.zarr")
+    again = io.open_result(tmp_path / "res.zarr")
+    assert again.process == result.process
+    for name, values in result.maps().items():
+        np.testing.assert_array_equal(again.maps()[name], values)
+
+
+def test_a_fingerprint_tells_recordings_apart(pair, tmp_path):
+    other = record(sphere("uint16"), tmp_path / "other.h5")
+    io.save_zarr(other, tmp_path / "other.zarr")
+    io.save_zarr(pair[0], tmp_path / "again.zarr")
+    prints = []
+    for path in (pair[1], tmp_path / "again.zarr", tmp_path / "other.zarr"):
+        with io.open_recording(path) as recording:
+            prints.append(recording.fingerprint())
+    assert prints[0] == prints[1] != prints[2]
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"shape": [8, 5]}, "it is damaged"),
+        ({"shape": [1 << 40, 5, 7]}, "claims 1099511627776 frames: it is damaged"),
+        ({"shape": [-8, 5, 7]}, "it is damaged"),
+        ({"shape": [800, 5, 7]}, "is missing: it was cut short; copy it again"),
+        ({"data_type": "float64"}, "is of type float64: frames are uint8, uint16 or float32"),
+        ({"codecs": [{"name": "unheard-of"}]}, "it is damaged"),
+        ({"node_type": "sheep"}, ""),
+    ],
+)
+def test_metadata_that_cannot_be_is_refused(pair, changes, said):
+    assert said in line(edit(pair[1], STACK, **changes))
+
+
+def test_broken_json_is_refused(pair):
+    (pair[1] / "zarr.json").write_text("{")
+    assert "it is damaged" in line(pair[1])
+
+
+def test_positions_that_are_no_numbers_are_refused(pair):
+    travel = zarr.open_array(pair[1], path="entry/instrument/stage/travel", mode="r+")
+    travel[3] = np.nan
+    assert "stage/travel" in line(pair[1])
+
+
+def test_a_claim_of_more_than_memory_holds_is_refused(pair):
+    edit(pair[1], "entry/instrument/detector/dark", shape=[1 << 20, 1 << 20])
+    assert "it is damaged: copy it again" in line(pair[1])
+
+
+@pytest.mark.parametrize(
+    ("harm", "said"),
+    [(lambda place: place.write_bytes(b"abc" * 9), "it is damaged"), (os.remove, "is missing")],
+)
+def test_a_damaged_chunk_is_named_by_its_frames(tmp_path, harm, said):
+    path = bare(tmp_path / "x.zarr", random_stack(), chunks=(2, 5, 7))
+    harm(path / "c/1/0/0")
+    found = line(path, **GIVEN)
+    assert ": frames 2 to 3 of /data cannot be read" in found
+    assert said in found
+
+
+def test_what_is_not_there_is_told_with_its_address(memory):
+    assert "there is no Zarr array or group" in line(Url("memory://bucket/nothing.zarr"))
+
+
+def test_a_store_that_does_not_answer_is_told_with_its_address():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"http://127.0.0.1:{free.getsockname()[1]}/press.zarr"
+    assert "the store does not answer" in line(Url(address))
+
+
+def test_what_is_there_is_not_written_over(pair, memory):
+    for target in (pair[1], Url("memory://bucket/press.zarr")):
+        with pytest.raises(io.InputError, match="is there already: remove it"):
+            io.save_zarr(pair[0], target)
+
+
+@pytest.mark.parametrize("remote", [False, True])
+def test_nothing_is_left_of_what_could_not_be_read(pair, memory, tmp_path, remote):
+    with h5py.File(pair[0], "r+") as file:
+        del file["entry/instrument/stage/motion"]
+        file["entry/instrument/stage/motion"] = "sideways"
+    target = Url("memory://bucket/new.zarr") if remote else tmp_path / "new.zarr"
+    before = sorted(tmp_path.iterdir()), memory.find("/bucket")
+    with pytest.raises(io.InputError, match="sideways"):
+        io.save_zarr(pair[0], target)
+    assert (sorted(tmp_path.iterdir()), memory.find("/bucket")) == before
+
+
+def test_a_path_keeps_the_slashes_of_an_address():
+    url = path_of("s3://bucket/monday/press.zarr")
+    assert str(url.with_name("b.zarr")) == "s3://bucket/monday/b.zarr"
+    assert str(path_of("press.zarr")) == "press.zarr"
