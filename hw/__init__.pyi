@@ -3,6 +3,7 @@ from .camera import Camera
 from .camera_thread import ThreadedCamera
 from .emulator.rig import EmulatedRig
 from .errors import HardwareError
+from .genicam import GenicamCamera
 from .grbl.stage import GrblStage
 from .rig.plans import AxialPlan, HorizontalPlan, RockPlan, TwistPlan, VerticalPlan
 from .rig.rig import Rig, open_rig
@@ -17,6 +18,7 @@ __all__ = [
     "AxialPlan",
     "Camera",
     "EmulatedRig",
+    "GenicamCamera",
     "GrblStage",
     "HardwareError",
     "HorizontalPlan",

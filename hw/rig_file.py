@@ -25,6 +25,9 @@ _STEEPEST = 90.0  # degrees
 _ROUND = 360.0  # degrees
 _CELL = 65535  # rows or columns
 
+GENICAM = "genicam:"
+"""How the source of a camera begins that speaks GigE Vision or USB3 Vision."""
+
 Text = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]*[^\s\x00-\x1f\x7f][^\x00-\x1f\x7f]*\Z")]
 Letter = Literal["X", "Y", "Z", "A", "B", "C"]
 _Side = Annotated[float, Meta(gt=0)]
@@ -253,7 +256,7 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
     source: Annotated[
         Annotated[int, Meta(ge=0, lt=1000)] | Text,
         Meta(
-            description="a camera's number from 0 on, or the path or URL of a stream in quotes,", examples=[0]
+            description="a camera's number from 0 on, or genicam:, a path or a URL in quotes,", examples=[0]
         ),
     ]
     size: Annotated[
@@ -263,8 +266,10 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
     name: Annotated[Text, Meta(description="what the camera is called, in quotes,", examples=["left"])] = ""
     dtype: Literal["uint8", "uint16", "float32"] = "uint8"
     fourcc: Annotated[
-        Annotated[str, Meta(pattern=r"^[!-~]{2,4} {0,2}\Z", max_length=4)] | None,
-        Meta(description="a format of two to four letters, in quotes,", examples=["GREY"]),
+        Annotated[str, Meta(pattern=r"^((?!.{5})[!-~]{2,4} {0,2}|Mono(8|10|12|14|16))\Z")] | None,
+        Meta(
+            description="a format of two to four letters, or Mono8 to Mono16, in quotes,", examples=["GREY"]
+        ),
     ] = None
     exposure: Annotated[
         Annotated[float, Meta(gt=0)] | None,
@@ -295,6 +300,9 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
             msgspec.structs.force_setattr(self, "name", _USER.sub("//", str(self.source)))
         if self.fourcc is not None:
             msgspec.structs.force_setattr(self, "fourcc", self.fourcc.ljust(4))
+            if self.genicam != self.fourcc.startswith("Mono"):
+                known = "Mono8, Mono10, Mono12, Mono14, Mono16" if self.genicam else "two to four letters"
+                raise ValueError(f'fourcc is "{self.fourcc}", which a camera of this source has not: {known}')
         if self.zenith_gain == 0:
             raise ValueError("zenith_gain is 0: write the counts per degree, e.g. 5.7, or leave it out")
         if self.zenith_gain is None and self.zenith_offset is not None:
@@ -302,6 +310,11 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
                 "zenith_offset is given and zenith_gain is not: the one means nothing without the other; "
                 "add it, or leave both out"
             )
+
+    @property
+    def genicam(self) -> bool:
+        """Whether it is a camera by GigE Vision or USB3 Vision."""
+        return str(self.source).startswith(GENICAM)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -463,7 +476,7 @@ speed = 20.0
 # steps = 250.0
 
 [camera]
-source = 0                      # a camera's number, or a file or URL in quotes
+source = 0                      # a camera's number, or in quotes a file, a URL, or genicam:SERIAL
 size = [640, 480]               # columns, rows
 # name = "left"                 # what recordings and calibrations call it; without it, the source
 # dtype = "uint8"

@@ -6,7 +6,6 @@ import logging
 import math
 import os
 import re
-import threading
 import time as clock
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,17 +15,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.camera import Frames
-from mirrorskin.hw.camera_thread import ThreadedCamera
-from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.reopened import OPEN_TIMEOUT, READ_TIMEOUT, ReopenedCamera, warn_of_other
 from mirrorskin.hw.rig_file import CameraSettings
 from mirrorskin.io import InputError
 from mirrorskin.io.pictures import quiet_opencv
 
 _log = logging.getLogger("mirrorskin.hw")
-
-OPEN_TIMEOUT = 5.0  # seconds that a stream has for its opening
-READ_TIMEOUT = 2.0  # seconds without a picture after which a stream or camera counts as lost
 
 # OpenCV takes these from the environment only: no messages of FFmpeg's, and whole seconds for a camera.
 _ENVIRONMENT = {"OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT": f"{READ_TIMEOUT:.0f}"}
@@ -39,15 +33,11 @@ _EXPOSURE_UNIT = 1e-4  # seconds, V4L2's
 _STALEST = 0.5  # seconds: a camera's own time that is older is not a time of this clock
 _LONGEST_BACKLOG = 0.5  # seconds
 _USUAL_RATE = 25.0  # frames a second, of what does not say
-PATIENCE = 10.0  # seconds from the loss of a camera until it is given up
-_FIRST_FRAME = OPEN_TIMEOUT + READ_TIMEOUT  # seconds until the first frame
-_CLOSING = READ_TIMEOUT + 1.0  # seconds that the thread has for its end
-_PAUSES = (0.05, 1.0)  # seconds between two tries to have a camera back, at first and at most
 _DEVICES = Path("/dev")
 _CONVERSIONS = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}
 
 
-class VideoCamera(ThreadedCamera):
+class VideoCamera(ReopenedCamera):
     """A camera that OpenCV can open, as a ``mirrorskin.hw.camera.Camera``.
 
     A camera of this machine (V4L2) is given the format, size, rate, exposure and gain that the settings
@@ -59,9 +49,7 @@ class VideoCamera(ThreadedCamera):
     waited while it was opened are left out. A picture of another size counts as a loss, and so do five in a
     row without a changed pixel if no two were alike before.
 
-    A camera or stream that is lost is opened again, for at most 10 s; it is logged that it is lost, and
-    that it is back. Numbers then go on after as many as the time away had room for. ``error`` stays None
-    meanwhile; ``latest`` shows at once that nothing comes.
+    A camera or stream that is lost is opened again, for at most 10 s; see ``ReopenedCamera``.
 
     Parameters
     ----------
@@ -83,76 +71,17 @@ class VideoCamera(ThreadedCamera):
 
     def __init__(self, settings: CameraSettings, slots: int | None = None) -> None:
         self._source = find_source(settings.source)
-        self._settings = settings
-        super().__init__(self._source.name, settings.shape, settings.dtype, settings.rate, slots)
-        self._lost: float | None = None  # since when
-        self._pause = _PAUSES[0]
+        self._returns = self._source.kind != "file"
         self._repeats = _Repeats()
-        self._refusal: InputError | None = None
-        self._ready, self._stop = threading.Event(), threading.Event()
-        # OpenCV may hang in a driver: the program's end must not wait for that.
-        self._thread = threading.Thread(target=self._drain, name=self.name, daemon=True)
-        self._thread.start()
-        try:
-            if not self._ready.wait(_FIRST_FRAME):
-                raise InputError(
-                    f"{self.name} gave no picture within {_FIRST_FRAME:.3g} s: see its cable and power"
-                )
-            if self._refusal is not None:
-                raise self._refusal
-        except BaseException:
-            self.close()
-            raise
-
-    def take(self, most: int, timeout: float) -> Frames:
-        """Take the oldest frames that wait, or wait for one; see ``Camera.take``."""
-        try:
-            return super().take(most, timeout)
-        except HardwareError as error:
-            lost = self._lost
-            if lost is None or self.error is not None:
-                raise
-            away = clock.monotonic() - lost
-            raise HardwareError(f"{self.name} was lost {away:.1f} s ago and is not back yet") from error
-
-    def close(self) -> None:
-        """Let the camera go; a driver that does not answer is left to itself after 3 s."""
-        self._stop.set()
-        self._fail(f"{self.name} is closed")
-        self._thread.join(_CLOSING)
-        if self._thread.is_alive():
-            _log.warning("%s does not let go: unplug it before it is used again", self.name)
+        super().__init__(self._source.name, settings, slots)
+        self._start()
 
     def _drain(self) -> None:
-        """Move frames to the ring until the end: what the thread does."""
         with quiet_opencv():
-            try:
-                self._keep_open()
-            except Exception as error:  # whatever it is, readers must not wait
-                _log.debug("%s failed", self.name, exc_info=error)
-                self._fail(f"{self.name} failed: {error}")
-            finally:
-                self._ready.set()
+            super()._drain()
 
-    def _keep_open(self) -> None:
-        """Open the source and follow it; again and again if it is lost."""
-        timeout = OPEN_TIMEOUT
-        while not self._stop.is_set():
-            try:
-                why = self._read_until_lost(Capture(self._source, self._settings, timeout))
-            except InputError as error:
-                why = str(error)
-            if not self._ready.is_set():
-                self._refusal = InputError(why)
-                return
-            if self._source.kind == "file":
-                self._fail(why)
-                return
-            if not self._stop.is_set():
-                timeout = self._wait_for_return(why)
-
-    def _read_until_lost(self, capture: Capture) -> str:
-        """Put frames into the ring as they come, and return why they do not come any more."""
+    def _read_until_lost(self, timeout: float) -> str:
+        capture = Capture(self._source, self._settings, timeout)
         pace = _Pace(capture.period) if self._source.kind == "file" else None
         try:
             while not self._stop.is_set():
@@ -166,38 +95,12 @@ class VideoCamera(ThreadedCamera):
                 if pace is not None:
                     self._stop.wait(pace.due(capture.position) - clock.monotonic())
                     time = clock.monotonic()
-                self._put(time, 0 if self._lost is None else self._came_back(time))
-                self._ready.set()
+                self._arrived(time)
         finally:
             capture.release()
         if self._source.kind == "file":
             return f"{self.name} has ended after {self._number} frames"
         return f"{self.name} gives no picture"
-
-    def _wait_for_return(self, why: str) -> float:
-        """Wait before a lost camera is tried again, or give it up; return the seconds left to try."""
-        now = clock.monotonic()
-        if self._lost is None:
-            self._lost = now
-            message = "%s: it was lost after %d frames, and is tried again for %.3g s"
-            _log.warning(message, why, self._number, PATIENCE)
-        left = self._lost + PATIENCE - now
-        if left <= 0:
-            self._fail(f"{why}: it was lost, and not back within {PATIENCE:.3g} s; see its cable and power")
-            self._stop.set()
-        self._stop.wait(min(self._pause, max(left, 0.0)))
-        self._pause = min(2 * self._pause, _PAUSES[1])
-        return min(OPEN_TIMEOUT, max(left, 0.1))
-
-    def _came_back(self, time: float) -> int:
-        """Log that the camera is back, and return how many frames it would have given meanwhile."""
-        away = time - self.latest
-        rate = self._counter.counts().rate
-        missing = max(1, round(away * rate) - 1) if math.isfinite(rate) else 1
-        self._lost, self._pause = None, _PAUSES[0]
-        self._reconnects += 1
-        _log.warning("%s is back after %.2f s; about %d frames are missing", self.name, away, missing)
-        return missing
 
 
 class _Repeats:
@@ -386,12 +289,10 @@ def _set_up(video: Any, source: VideoSource, settings: CameraSettings) -> None:
     for name, asked, code, unit, symbol in numbers:
         got = float(video.get(code)) * unit
         if asked is not None and not math.isclose(asked, got, rel_tol=0.01, abs_tol=0.5 * _EXPOSURE_UNIT):
-            what = f"{name} {asked:g}{symbol} was asked for, the camera set {got:g}{symbol}"
-            _log.warning("%s: %s", source.name, what)
+            warn_of_other(source.name, name, asked, got, symbol)
     got_format = _letters(video.get(cv2.CAP_PROP_FOURCC))
     if settings.fourcc is not None and got_format != settings.fourcc.ljust(4):
-        what = f"fourcc {settings.fourcc} was asked for, the camera set {got_format}"
-        _log.warning("%s: %s", source.name, what)
+        warn_of_other(source.name, "fourcc", settings.fourcc, got_format)
 
 
 def _check_size(video: Any, source: VideoSource, settings: CameraSettings) -> None:

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.hw.camera import Camera, Counts
-from mirrorskin.hw.rig.rig import longest_wait, open_stage
+from mirrorskin.hw.rig.rig import longest_wait, open_camera, open_stage
 from mirrorskin.hw.rig_file import Axis, CameraSettings, RigSettings, StageSettings
 from mirrorskin.hw.stage import Limits, Position, Report, Stage
-from mirrorskin.hw.video import VideoCamera
 from mirrorskin.io import InputError
 
 Verdict = Literal["ok", "warning", "failed"]
@@ -58,7 +57,7 @@ def check_rig(
     *,
     move: bool = False,
     open_stage: Callable[[StageSettings], Stage] = open_stage,
-    open_camera: Callable[[CameraSettings], Camera] = VideoCamera,
+    open_camera: Callable[[CameraSettings], Camera] = open_camera,
 ) -> Generator[Finding, None, None]:
     """Open the stage and the camera, and yield what is found, one thing at a time.
 

@@ -265,10 +265,8 @@ def open_rig(settings: RigSettings) -> Rig:
     or was only unlocked. InputError if one of them is missing, busy, or not what the file says; HardwareError
     if no frame came.
     """
-    from mirrorskin.hw.video import VideoCamera
-
     with ExitStack() as opening:
-        camera = VideoCamera(settings.camera)
+        camera = open_camera(settings.camera)
         opening.callback(camera.close)
         camera.take(1, _PATIENCE)
         stage = open_stage(settings.stage)
@@ -277,3 +275,14 @@ def open_rig(settings: RigSettings) -> Rig:
             stage.home()
         opening.pop_all()
     return Rig(stage, camera, settings)
+
+
+def open_camera(settings: CameraSettings) -> Camera:
+    """Open the camera that a rig file describes; InputError if it is not there, or not what the file says."""
+    if settings.genicam:
+        from mirrorskin.hw.genicam import GenicamCamera
+
+        return GenicamCamera(settings)
+    from mirrorskin.hw.video import VideoCamera
+
+    return VideoCamera(settings)

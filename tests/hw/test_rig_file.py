@@ -286,6 +286,7 @@ WRONG = [
         "camera.size is [64, 0]: a list of columns and rows, each from 1 to",
     ),
     ('dtype = "uint16"', 'dtype = "int8"', 'camera.dtype is "int8": one of "uint8", "uint16", "float32" is'),
+    ('fourcc = "Y16"', 'fourcc = "Mono12"', 'camera: fourcc is "Mono12", which a camera of this source has'),
     ('fourcc = "Y16"', 'fourcc = "GREYS"', 'camera.fourcc is "GREYS": a format of two to four letters, in'),
     ("exposure = 0.004", "exposure = 0", "camera.exposure is 0: a time above 0, in seconds, is needed"),
     ("gain = 2\n", "gain = nan\n", "camera.gain is nan: a finite number is needed"),

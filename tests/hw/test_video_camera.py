@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mirrorskin.hw import video
+from mirrorskin.hw import reopened, video
 from mirrorskin.hw.camera_thread import FrameCounter
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig_file import CameraSettings
@@ -277,7 +277,7 @@ def test_a_camera_that_is_lost_comes_back(driver, open_camera, caplog) -> None:
 
 
 def test_a_camera_that_does_not_come_back_is_given_up(driver, open_camera, monkeypatch) -> None:
-    monkeypatch.setattr(video, "PATIENCE", 0.3)
+    monkeypatch.setattr(reopened, "PATIENCE", 0.3)
     driver.pictures.put(noise(1)[0])
     opened = open_camera()
     opened.take(1, SOON)
@@ -350,8 +350,8 @@ def test_a_jpeg_that_is_cut_short_is_not_made_up(tmp_path) -> None:
 
 
 def test_a_driver_that_hangs_while_it_opens_does_not_hang_us(driver, open_camera, monkeypatch) -> None:
-    monkeypatch.setattr(video, "_FIRST_FRAME", 0.2)
-    monkeypatch.setattr(video, "_CLOSING", 0.2)
+    monkeypatch.setattr(reopened, "_FIRST_FRAME", 0.2)
+    monkeypatch.setattr(reopened, "_CLOSING", 0.2)
     driver.begins.clear()
     begun = time.monotonic()
     with pytest.raises(InputError, match=r"gave no picture within 0.2 s"):
@@ -362,7 +362,7 @@ def test_a_driver_that_hangs_while_it_opens_does_not_hang_us(driver, open_camera
 
 
 def test_a_driver_that_hangs_does_not_hang_the_closing(driver, open_camera, monkeypatch, caplog) -> None:
-    monkeypatch.setattr(video, "_CLOSING", 0.2)
+    monkeypatch.setattr(reopened, "_CLOSING", 0.2)
     driver.pictures.put(noise(1)[0])
     opened = open_camera()
     begun = time.monotonic()
