@@ -301,8 +301,8 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
         if self.fourcc is not None:
             msgspec.structs.force_setattr(self, "fourcc", self.fourcc.ljust(4))
             if self.genicam != self.fourcc.startswith("Mono"):
-                known = "Mono8, Mono10, Mono12, Mono14, Mono16" if self.genicam else "two to four letters"
-                raise ValueError(f'fourcc is "{self.fourcc}", which a camera of this source has not: {known}')
+                known = "Mono8 to Mono16" if self.genicam else "two to four letters"
+                raise ValueError(f'fourcc is "{self.fourcc}": this source needs {known}; or leave it out')
         if self.zenith_gain == 0:
             raise ValueError("zenith_gain is 0: write the counts per degree, e.g. 5.7, or leave it out")
         if self.zenith_gain is None and self.zenith_offset is not None:
