@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -78,26 +77,11 @@ def load_estimator(name: str, settings: list[str] | None = None) -> Any:
     """Return what makes the estimator that is named MODULE:CLASS or FILE.py:CLASS, with parameters set."""
     import ast
     import functools
-    import importlib
 
     from mirrorskin.io import InputError
+    from mirrorskin.io.own_class import load_class
 
-    place, _, kind = name.rpartition(":")
-    file = Path(place) if place.endswith(".py") else None
-    if not place or not kind.isidentifier():
-        raise InputError(f"{name}: name a class as MODULE:CLASS or FILE.py:CLASS")
-    folder, module = (Path(), place) if file is None else (file.parent, file.stem)
-    sys.path.insert(0, str(folder.resolve()))
-    try:
-        found = importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-            raise  # what the module itself imports
-        raise InputError(f"{name}: there is no {place} in {folder.resolve()}, nor installed") from error
-    made = getattr(found, kind, None)
-    if not callable(made):
-        own = [one for one, it in vars(found).items() if isinstance(it, type) and it.__module__ == module]
-        raise InputError(f"{name}: there is no class {kind} in {place}; it has {', '.join(own) or 'none'}")
+    made = load_class(name)
     values: dict[str, Any] = {}
     for setting in settings or ():
         parameter, equals, text = setting.partition("=")

@@ -175,8 +175,8 @@ class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
     firmware: Annotated[
         str,
         Meta(
-            pattern=r"^(grbl|marlin|[\w.]+:[\w.]+)\Z",
-            description='"grbl", "marlin", or a class as "module:Class",',
+            pattern=r"^(grbl|marlin|[^\x00-\x1f\x7f]+:[A-Za-z_]\w*)\Z",
+            description='"grbl", "marlin", or a class as "module:Class" or "file.py:Class",',
             examples=["grbl"],
         ),
     ] = "grbl"
@@ -393,7 +393,17 @@ def load_rig(path: Path | str) -> RigSettings:
         beside["source"] = _beside(path, camera.source)
     camera = msgspec.structs.replace(camera, **beside)
     check_references(camera, str(path))
-    return RigSettings(path, file.name or path.stem, file.stage, camera)
+    stage = msgspec.structs.replace(file.stage, firmware=_own_stage(path, file.stage.firmware))
+    return RigSettings(path, file.name or path.stem, stage, camera)
+
+
+def _own_stage(path: Path, name: str) -> str:
+    """Return the name of a stage's class, as a file's if its module lies beside the rig file."""
+    place, _, kind = name.rpartition(":")
+    if not place:
+        return name
+    file = _beside(path, place if place.endswith(".py") else f"{place.replace('.', '/')}.py")
+    return f"{file}:{kind}" if Path(file).is_file() else name
 
 
 def _beside(path: Path, name: str) -> str:

@@ -619,6 +619,8 @@ def check_plan(plan: Plan, settings: StageSettings, name: str, stage: Stage | No
         limits.check(place, name)
     if plan.in_steps:  # moves between steps go as fast as the axes do
         return
+    if stage is None and settings.firmware == "marlin":  # lest it is homed for nothing
+        raise InputError(f"{name}: Marlin does not tell where it is while it moves; go in steps")
     if stage is None and settings.firmware != "grbl":  # it tells once it is open
         return
     able = Axes(settings, name) if stage is None else stage

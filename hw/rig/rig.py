@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import inspect
 import math
-import pkgutil
-import sys
 import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from types import TracebackType
+from typing import cast
 
 from mirrorskin.hw.camera import Camera, Frames
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig_file import CameraSettings, RigSettings, StageSettings
 from mirrorskin.hw.stage import Position, Report, Stage
 from mirrorskin.io import InputError
+from mirrorskin.io.own_class import load_class
 from mirrorskin.io.types import Closing
 
 _TICK = 0.02  # seconds from one look of the guard to the next
@@ -247,15 +248,27 @@ def open_stage(settings: StageSettings, unlock: bool = False) -> Stage:
         from mirrorskin.hw.marlin.stage import MarlinStage
 
         return MarlinStage(settings)
-    sys.path.insert(0, "")  # modules of the working folder
+    return _open_own(settings)
+
+
+def _open_own(settings: StageSettings) -> Stage:
+    """Open a stage of the user's own class."""
+    name = settings.firmware
+    made = load_class(name)
     try:
-        made = pkgutil.resolve_name(firmware)
-    except (ImportError, AttributeError) as error:
-        raise InputError(f'stage.firmware = "{firmware}": {error}; name a class as "module:Class"') from error
-    finally:
-        sys.path.remove("")
-    stage: Stage = made(settings)
-    return stage
+        inspect.signature(made).bind(settings)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}(settings) cannot be made: {error}; see docs/stages.md") from error
+    try:
+        stage = made(settings)
+    except OSError as error:  # a SerialException is one
+        raise InputError(f"{name}: cannot be opened: {error}; look at stage.port") from error
+    lacking = [one for one in vars(Stage) if one[0] != "_" and not hasattr(stage, one)]
+    if lacking:
+        if hasattr(stage, "close"):
+            stage.close()
+        raise InputError(f"{name} has no {', no '.join(lacking)}: see docs/stages.md")
+    return cast("Stage", stage)
 
 
 def open_rig(settings: RigSettings) -> Rig:

@@ -1,6 +1,7 @@
 """The stage of docs/stages.md, in front of a controller that is made up, moves a rig and stops on faults."""
 
 import re
+import sys
 import time
 from pathlib import Path
 
@@ -22,6 +23,7 @@ STAGE = StageSettings(
     port="/dev/ttyUSB0", press=2.0, travel=TravelAxis(letter="Z", limits=(-10.0, 3.0), speed=100.0)
 )
 PAGE = Path(__file__).parents[2] / "docs" / "stages.md"
+EXAMPLE = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[0]
 
 
 class Controller:
@@ -61,9 +63,8 @@ def lab(monkeypatch):
     """The page's class, opened on a controller."""
     line = Controller()
     monkeypatch.setattr("serial.serial_for_url", lambda *_words, **_named: line)
-    example = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[0]
     made = {"__name__": __name__}
-    exec(example, made)
+    exec(EXAMPLE, made)
     stage = made["LabStage"](STAGE)
     yield stage, line
     stage.close()
@@ -77,33 +78,6 @@ def rig_of(stage, line):
         rate=50.0,
     )
     return Rig(stage, camera, settings((4, 4), delay=0.0, dark=5.0))
-
-
-def test_commands_move_it(lab, tmp_path, monkeypatch):
-    example = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[0]
-    (tmp_path / "lab_stage.py").write_text(example)
-    (tmp_path / "rig.toml").write_text("""
-[stage]
-firmware = "lab_stage:LabStage"
-port = "/dev/ttyUSB0"
-press = 2.0
-travel = {letter = "Z", limits = [-10.0, 3.0], speed = 5.0}
-[camera]
-source = 0
-size = [4, 4]
-pixel_size = 0.1
-""")
-    monkeypatch.chdir(tmp_path)
-    moved = run("rig", "jog", "rig.toml", "travel", "--by", "0.25mm")
-    assert (moved.code, moved.out) == (0, "rig: travel -0.750 mm\n")
-    refused = run("rig", "unlock", "rig.toml")
-    assert refused.code == 2
-    assert "only GRBL is unlocked" in refused.said
-    file = tmp_path / "rig.toml"
-    file.write_text(file.read_text().replace(":LabStage", ":Lab"))
-    refused = run("rig", "home", "rig.toml")
-    assert refused.code == 2
-    assert "has no attribute 'Lab'" in refused.said
 
 
 def test_steps_and_sweeps_are_recorded(lab, tmp_path):
@@ -186,3 +160,68 @@ def test_a_wait_that_is_interrupted_stops_it(lab, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         stage.wait()
     assert line.stopped
+
+
+RIG = """
+[stage]
+firmware = "my_stage:LabStage"
+port = "/dev/ttyUSB0"
+home = false
+press = 2.0
+[stage.travel]
+letter = "Z"
+limits = [-10.0, 3.0]
+speed = 50.0
+[camera]
+source = "film.y4m"
+size = [8, 6]
+rate = 50
+dark = 0
+delay = 0
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A rig file, the page's class beside it, a film of 20 s, and the controller behind the port."""
+    line = Controller()
+    monkeypatch.setattr("serial.serial_for_url", lambda *_words, **_named: line)
+    monkeypatch.delitem(sys.modules, "my_stage", raising=False)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "my_stage.py").write_text(EXAMPLE)
+    (tmp_path / "rig.toml").write_text(RIG)
+    film = b"YUV4MPEG2 W8 H6 F50:1 Ip A1:1 Cmono\n" + (b"FRAME\n" + bytes(range(48))) * 1000
+    (tmp_path / "film.y4m").write_bytes(film)
+    return tmp_path
+
+
+def test_commands_move_it_from_a_rig_file(folder):
+    rig, recording = folder / "rig.toml", folder / "steps.h5"
+    checked = run("rig", "check", rig, "--move")
+    assert checked.code == 0, checked
+    assert re.search(r"firmware .*my_stage\.py:LabStage", checked.out)
+    assert "$" not in checked.out
+    moved = run(*f"capture vertical --stop 0.4mm --step 0.2mm --settle 0s --rig {rig} -o {recording}".split())
+    assert moved.code == 0, moved
+    with io.open_recording(recording) as steps:
+        np.testing.assert_allclose(steps.travel, [0.0, 0.2, 0.4])
+
+
+@pytest.mark.parametrize(
+    ("words", "change", "said"),
+    [
+        ("home", ("def home(", "def seek("), "my_stage.py:LabStage has no home: see docs/stages.md"),
+        ("unlock", ("", ""), "only GRBL is unlocked"),
+        ("lift", (":LabStage", ":NoStage"), "there is no class NoStage"),
+        ("lift", ("my_stage:", "no_stage:"), "there is no no_stage in"),
+        ("lift", ("my_stage:LabStage", "collections:namedtuple"), "namedtuple(settings) cannot be made"),
+        ("lift", ("my_stage:LabStage", "copy:copy"), "copy:copy has no name, no error"),
+        ("check", ("def precess(", "def spin("), "my_stage.py:LabStage has no precess: see docs/stages.md"),
+    ],
+)
+def test_what_a_class_lacks_is_refused_in_a_line(folder, words, change, said):
+    for file in ("rig.toml", "my_stage.py"):
+        (folder / file).write_text((folder / file).read_text().replace(*change))
+    ended = run("rig", words, folder / "rig.toml")
+    assert (ended.code, ended.said.count("\n")) == (2, 1), ended
+    assert said in ended.said
