@@ -93,18 +93,18 @@ class Plan:
     series: ClassVar[str]  # what a recording says of each frame: travel, phase, displacement, twist or tilt
 
     @property
-    def in_steps(self) -> bool:
-        """Whether the body halts for each frame."""
+    def step(self) -> float | None:
+        """From place to place, mm or radians, where the body halts for each frame."""
         raise NotImplementedError
 
     @property
-    def ways(self) -> Floats:
-        """How far along it is at each step, (n,)."""
+    def speed(self) -> float | None:
+        """Of the way without a halt, mm/s or rad/s."""
         raise NotImplementedError
 
     @property
-    def path(self) -> Trapezoid:
-        """The way without a halt."""
+    def length(self) -> float:
+        """How long the way is, mm or radians."""
         raise NotImplementedError
 
     def place(self, way: float) -> Position:
@@ -119,9 +119,31 @@ class Plan:
         """Return how far along a place is; of those that look alike, the one next to what is expected."""
         raise NotImplementedError
 
+    @property
+    def in_steps(self) -> bool:
+        """Whether the body halts for each frame."""
+        return self.step is not None
+
+    @property
+    def ways(self) -> Floats:
+        """How far along it is at each step, (n,)."""
+        assert self.step is not None
+        return np.asarray(self.step * np.arange(_whole(self.length / self.step) + 1), np.float64)
+
+    @property
+    def path(self) -> Trapezoid:
+        """The way without a halt."""
+        assert self.speed is not None
+        return Trapezoid.planned(self.length, self.speed)
+
+    @property
+    def ends(self) -> list[Position]:
+        """Where the body goes straight to, one after the other, where it does not halt."""
+        return [self.place(self.length)]
+
     def begin(self, stage: Stage) -> None:
         """Tell a stage that stands at the first place to go the way without a halt."""
-        raise NotImplementedError
+        stage.follow(self.ends, self.speed)
 
     @property
     def period(self) -> float:
@@ -148,45 +170,6 @@ class Plan:
         """Where the body stands at each step."""
         return [self.place(float(way)) for way in self.ways]
 
-
-class _Straight(Plan):
-    """A plan whose way is straight; it has a step or a speed."""
-
-    __slots__ = ()
-    step: float | None
-    speed: float | None
-
-    @property
-    def length(self) -> float:
-        """How long the way is, mm or radians."""
-        raise NotImplementedError
-
-    @property
-    def in_steps(self) -> bool:
-        """Whether the body halts for each frame."""
-        return self.step is not None
-
-    @property
-    def ways(self) -> Floats:
-        """How far along it is at each step, (n,)."""
-        assert self.step is not None
-        return np.asarray(self.step * np.arange(_whole(self.length / self.step) + 1), np.float64)
-
-    @property
-    def path(self) -> Trapezoid:
-        """The way without a halt."""
-        assert self.speed is not None
-        return Trapezoid.planned(self.length, self.speed)
-
-    @property
-    def ends(self) -> list[Position]:
-        """Where the body goes straight to, one after the other, where it does not halt."""
-        return [self.place(self.length)]
-
-    def begin(self, stage: Stage) -> None:
-        """Tell a stage that stands at the first place to go straight to the ends."""
-        stage.follow(self.ends, self.speed)
-
     def _check(self, unit: str) -> None:
         _check_one_of(("step", self.step, unit), ("speed", self.speed, f"{unit}/s"))
         if self.step is not None:
@@ -194,7 +177,7 @@ class _Straight(Plan):
 
 
 @dataclass(frozen=True, slots=True)
-class VerticalPlan(_Straight):
+class VerticalPlan(Plan):
     """Lower the body from one travel to another, and then up and down between them, if it is to oscillate.
 
     Values that cannot be are an `InputError`.
@@ -284,7 +267,7 @@ class VerticalPlan(_Straight):
 
 
 @dataclass(frozen=True, slots=True)
-class HorizontalPlan(_Straight):
+class HorizontalPlan(Plan):
     """Press, wait, and slide: along a straight line from where it was pressed.
 
     Values that cannot be are an `InputError`.
@@ -351,7 +334,7 @@ class HorizontalPlan(_Straight):
 
 
 @dataclass(frozen=True, slots=True)
-class TwistPlan(_Straight):
+class TwistPlan(Plan):
     """Press, wait, and turn the body about its own axis; values that cannot be are an `InputError`.
 
     Attributes
@@ -447,12 +430,22 @@ class AxialPlan(Plan):
             raise InputError(f"{self.turns:g} turns are too many: go round {_TURNS_MAX} times at most")
         _check_one_of(("phase step", self.phase_step, "radians"), ("rate", self.rate, "turns/s"))
         if self.phase_step is not None:
-            _check_steps(math.tau * self.turns / self.phase_step, 3)
+            _check_steps(self.length / self.phase_step, 3)
 
     @property
-    def in_steps(self) -> bool:
-        """Whether the body halts for each frame."""
-        return self.phase_step is not None
+    def step(self) -> float | None:
+        """The phase step, radians."""
+        return self.phase_step
+
+    @property
+    def speed(self) -> float | None:
+        """The rate in rad/s."""
+        return None if self.rate is None else math.tau * self.rate
+
+    @property
+    def length(self) -> float:
+        """Of all turns, radians."""
+        return math.tau * self.turns
 
     @property
     def period(self) -> float:
@@ -464,14 +457,13 @@ class AxialPlan(Plan):
         """Phase of each step, (n,), radians."""
         assert self.phase_step is not None
         # The end of whole turns is their beginning; a step that ends short of it is taken.
-        count = math.ceil(math.tau * self.turns / self.phase_step - _ROUNDING)
+        count = math.ceil(self.length / self.phase_step - _ROUNDING)
         return np.asarray(self.phase_step * np.arange(count), np.float64)
 
     @property
-    def path(self) -> Trapezoid:
-        """The way without a halt, from phase 0, radians."""
-        assert self.rate is not None
-        return Trapezoid.planned(math.tau * self.turns, math.tau * self.rate)
+    def ends(self) -> list[Position]:
+        """None: it goes round."""
+        return []
 
     def begin(self, stage: Stage) -> None:
         """Tell a stage that leans at phase 0 to go round."""
@@ -506,7 +498,7 @@ class AxialPlan(Plan):
 
 
 @dataclass(frozen=True, slots=True)
-class RockPlan(_Straight):
+class RockPlan(Plan):
     """Press, lean, and rock about one axis: from a tilt on one side to the same on the other.
 
     Values that cannot be are an `InputError`.
@@ -614,8 +606,7 @@ def check_plan(plan: Plan, settings: StageSettings, name: str, stage: Stage | No
     from mirrorskin.hw.grbl.moves import Axes
 
     limits = settings.limits if stage is None else stage.limits
-    ends = plan.ends if isinstance(plan, _Straight) else []
-    for place in (plan.first, *ends):
+    for place in (plan.first, *plan.ends):
         limits.check(place, name)
     if plan.in_steps:  # moves between steps go as fast as the axes do
         return
@@ -626,5 +617,5 @@ def check_plan(plan: Plan, settings: StageSettings, name: str, stage: Stage | No
     able = Axes(settings, name) if stage is None else stage
     if isinstance(plan, AxialPlan):  # one turn is as possible as many
         able.check_turns(plan.tilt, min(plan.turns, 1.0), plan.rate or 0.0)
-    elif isinstance(plan, _Straight):
-        able.check_way(plan.first, ends[0], plan.speed)
+    else:
+        able.check_way(plan.first, plan.ends[0], plan.speed)
