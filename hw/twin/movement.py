@@ -45,10 +45,16 @@ class Movement:
         Greatest travel, mm.
     presses : bool
         Whether travel differs from frame to frame.
+    steepest : float
+        Greatest tilt to either side, radians.
+    pivot : (float, float, float)
+        About which the body tilts, from the rest sheet's centre, mm, in the body's frame.
     """
 
     motion: Motion
     presses = False
+    steepest = 0.0
+    pivot = (0.0, 0.0, 0.0)
     _recorded_as: str
 
     def __init__(self, positions: Floats, name: str, deepest: float) -> None:
@@ -64,8 +70,13 @@ class Movement:
         self.deepest = float(deepest)
 
     def rise(self, radius: float, /) -> float:
-        """Bound how far an object of a radius about the origin can rise above the rest plane, mm."""
-        return self.deepest
+        """Bound how far an object of a radius about the origin can rise above the rest plane, mm.
+
+        To the press comes what tilting about the pivot and the object's own width can raise.
+        """
+        x, y, z = self.pivot
+        lowered = z + (self.deepest - z) * math.cos(self.steepest)
+        return lowered + (radius + math.hypot(x, y)) * math.sin(self.steepest)
 
     def reduced(self, path: Floats, /) -> Floats:
         """Make places on the path equal where they are the same."""
@@ -74,6 +85,17 @@ class Movement:
     def pose(self, place: Floats, /) -> Pose:
         """Return where the object is when the body is at a place, one item of the path."""
         raise NotImplementedError
+
+    def pose_at(self, frame: int, late: float = 0.0) -> Pose:
+        """Return where the object is so many frames after a frame's middle, or before if negative.
+
+        The velocity is constant between two frames, and that of the nearest interval before the first and
+        after the last.
+        """
+        first = frame - 1 if late < 0 else frame
+        first = max(0, min(first, len(self.path) - 2))
+        step = self.path[first + 1] - self.path[first] if len(self.path) > 1 else 0 * self.path[0]
+        return self.pose(self.reduced(self.path[frame] + late * step))
 
     def header(self) -> Header:
         """Return what holds for the whole movement."""
@@ -192,14 +214,8 @@ class Axial(Movement):
                 f"tilt {math.degrees(tilt):g} degrees cannot be: give more than 0 and at most"
                 f" {math.degrees(TILT_MAX):g} degrees"
             )
-        if np.shape(pivot) != (3,) or not np.isfinite(pivot).all():
-            raise InputError(f"pivot {pivot} cannot be: give x, y and z in mm")
-        self.tilt = tilt
-        self.pivot = pivot
-
-    def rise(self, radius: float, /) -> float:
-        """Add to the press what tilting about the pivot and the object's own width can raise."""
-        return _rise(radius, self.deepest, self.tilt, self.pivot)
+        self.tilt = self.steepest = tilt
+        self.pivot = _check_pivot(pivot)
 
     def reduced(self, path: Floats, /) -> Floats:
         """Drop whole turns, and what of the phase rounding may differ by."""
@@ -211,8 +227,7 @@ class Axial(Movement):
 
     def header(self) -> Header:
         """Return motion, press, tilt and pivot."""
-        x, y, z = map(float, self.pivot)
-        return Header(self.motion, press=self.deepest, tilt=self.tilt, pivot=(x, y, z))
+        return Header(self.motion, press=self.deepest, tilt=self.tilt, pivot=self.pivot)
 
 
 class Leaning(Movement):
@@ -251,14 +266,10 @@ class Leaning(Movement):
             raise InputError(f"tilt and travel: one number, or {len(alpha)} as of the phase") from None
         super().__init__(np.column_stack([alpha, lean, depth]), "pose", depth.max(initial=-math.inf))
         self.path = np.column_stack([np.unwrap(alpha), lean, depth])
-        if not (np.abs(lean) <= TILT_MAX).all():
+        self.steepest = float(np.max(np.abs(lean)))
+        if not self.steepest <= TILT_MAX:
             raise InputError(f"tilt cannot be: give {math.degrees(TILT_MAX):g} degrees at most")
-        self.presses, self.pivot = bool(np.ptp(depth) > 0), pivot
-
-    def rise(self, radius: float, /) -> float:
-        """Do as a precession of the greatest tilt."""
-        tilt = float(np.max(np.abs(self.positions[:, 1])))
-        return _rise(radius, self.deepest, tilt, self.pivot)
+        self.presses, self.pivot = bool(np.ptp(depth) > 0), _check_pivot(pivot)
 
     def reduced(self, path: Floats, /) -> Floats:
         """Drop whole turns."""
@@ -273,8 +284,7 @@ class Leaning(Movement):
 
     def header(self) -> Header:
         """Return motion, pivot, and the press if there is one."""
-        x, y, z = map(float, self.pivot)
-        return Header(self.motion, press=None if self.presses else self.deepest, pivot=(x, y, z))
+        return Header(self.motion, press=None if self.presses else self.deepest, pivot=self.pivot)
 
     def mark(self, block: Block, /) -> Block:
         """Add phases and tilts, and travels that differ."""
@@ -342,10 +352,11 @@ class Twist(Movement):
         return Pose(_about_z(-float(place)), np.array([0.0, 0.0, self.deepest]))
 
 
-def _rise(radius: float, deepest: float, tilt: float, pivot: tuple[float, float, float]) -> float:
-    """Bound how far an object of a radius can rise when the body leans by a tilt, mm."""
-    x, y, z = pivot
-    return z + (deepest - z) * math.cos(tilt) + (radius + math.hypot(x, y)) * math.sin(tilt)
+def _check_pivot(pivot: tuple[float, float, float]) -> tuple[float, float, float]:
+    if np.shape(pivot) != (3,) or not np.isfinite(pivot).all():
+        raise InputError(f"pivot {pivot} cannot be: give x, y and z in mm")
+    x, y, z = map(float, pivot)
+    return x, y, z
 
 
 def _within_turn(phase: Floats) -> Floats:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from tempfile import TemporaryFile
 from typing import NamedTuple
 
 import numpy as np
@@ -115,6 +116,16 @@ class SkinHistory:
         reached[:, open_] = np.nan
         return reached - rest
 
+    def displacements(self) -> NDArray[np.float32]:
+        """Return how far the skin has moved along itself in each frame, (T, H, W, 2), mm; on the disk."""
+        moved: Floats = np.zeros_like(self._skin.places)
+        with TemporaryFile() as file:
+            maps = np.memmap(file, np.float32, "w+", shape=(len(self._path), *moved.shape[1:], 2))
+        for frame, kept in enumerate(maps):
+            moved = self.displacement(frame, moved)
+            kept[...] = np.moveaxis(moved, 0, -1)
+        return maps
+
     @functools.cached_property
     def _course(self) -> _Course:
         """All frames in their order."""
@@ -130,11 +141,11 @@ class SkinHistory:
             loads[frame], forces[frame] = friction.traction[:, *window], friction.force
         return _Course(window, loads, forces, slide.onset)
 
-    def _between(self, frame: float) -> tuple[int, int, float]:
+    def _between(self, frame: float) -> tuple[int, int, np.float64]:
         """Return the frames before and after a moment, and its share of the way between."""
         last = len(self._steps) - 1
         before = min(max(math.floor(frame), 0), max(last - 1, 0))
-        return before, min(before + 1, last), frame - before
+        return before, min(before + 1, last), np.float64(frame - before)  # float would keep loads in float32
 
     def _place(self, frame: float) -> Floats:
         before, after, share = self._between(frame)

@@ -184,7 +184,7 @@ class DraggedCoat:
         self._state: SkinState | None = None
         self._twists = False
 
-    def shade(self, light: Light, height: Floats, pose: Pose) -> Light:
+    def shade(self, light: Light, height: Floats, pose: Pose, _: float) -> Light:
         """Return what pixels show that get a light from the mirror, in the pose after those before."""
         rotation, travel = pose.rotation, float(pose.shift[2])
         x, y, _ = -rotation.T @ pose.shift

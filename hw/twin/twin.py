@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,22 +16,21 @@ from mirrorskin.hw.twin.body import Body
 from mirrorskin.hw.twin.camera import Camera, Sensor
 from mirrorskin.hw.twin.catalogue import check_fits, make_object
 from mirrorskin.hw.twin.movement import Horizontal, Movement, Pose, Twist, Vertical, pose_at_press
-from mirrorskin.hw.twin.objects import Object, Shifted
+from mirrorskin.hw.twin.objects import Object, Shifted, zenith_azimuth
+from mirrorskin.hw.twin.obstacle import meet
 from mirrorskin.hw.twin.optics import Ideal, Wall
 from mirrorskin.hw.twin.pattern import Linear, Pattern, Uniform, make_pattern
-from mirrorskin.hw.twin.scene import CachedScene, Imprint, PoseScene, Press, Scene
+from mirrorskin.hw.twin.references import ReferenceName, ball_references, exact_references
+from mirrorskin.hw.twin.scene import Imprint, Scene, Shade, Witness
 from mirrorskin.hw.twin.skin import Conform, Elastic, Sheet
 from mirrorskin.hw.twin.slip import SkinHistory
 from mirrorskin.hw.twin.texture import Coat, DraggedCoat, SheetTexture
-from mirrorskin.hw.twin.truth import REFERENCES, ReferenceName, ball_references, exact_references, make_truth
 from mirrorskin.hw.twin.view import View
 from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, Truth
 from mirrorskin.kernels.device import Device, open_device
 
 ContactName = Literal["conform", "elastic"]
-CONTACTS: tuple[ContactName, ...] = get_args(ContactName)
 OpticsName = Literal["ideal", "cylinder"]
-OPTICS: tuple[OpticsName, ...] = get_args(OpticsName)
 
 _CAMERA = "twin"
 _PIXELS_MAX = 200_000_000
@@ -121,9 +121,13 @@ class Twin(Closing):
     ) -> None:
         field = _check_shape(shape)
         pixel = _check_pixel_size(pixel_size)
-        _check_choice(contact, CONTACTS, "contact")
-        _check_choice(optics, OPTICS, "optics")
-        _check_choice(references, REFERENCES, "references")
+        for name, value, kind in (
+            ("contact", contact, ContactName),
+            ("optics", optics, OpticsName),
+            ("references", references, ReferenceName),
+        ):
+            if value not in get_args(kind):
+                raise InputError(f"{name} {value!r} is unknown: take {', '.join(get_args(kind))}")
         self._body = body or Body()
         self._camera = camera or Camera()
         self._names, self._references, self._texture = (contact, optics), references, texture
@@ -153,6 +157,7 @@ class Twin(Closing):
         self._skin = self._make_skin()
         self._history = self._make_history()
         self._optics = self._make_optics(self._pattern)
+        self._witness = Witness(self._skin, field)
         self._scene = self._make_scene()
         self._next = 0
 
@@ -178,21 +183,54 @@ class Twin(Closing):
 
     @functools.cached_property
     def truth(self) -> Truth:
-        """The object as it is under the upright body, and what the movement does to the sheet.
+        """The object as the upright body stands on it, and what touches, sticks and slips.
+
+        Under an oblique view, what a pixel sees depends on the depth. Then the maps of a vertical movement
+        are those of the point at which its ray meets the rest plane, and those of another of the point that
+        it sees of the object pressed, NaN where the object does not reach the rest plane. The azimuth is NaN
+        where the surface is level. Contact is that at the greatest travel of a movement that presses, and
+        what lasts through all frames of another. Slip and displacement are known of horizontal movements and
+        twists in elastic contact, the force of all elastic contact.
 
         Computed at the first access; after the last frame most of it is known.
         """
-        film = self._scene if isinstance(self._scene, CachedScene) else None
-        touched = None if film is None or self.movement.presses else film.touched_throughout()
-        pressing = film.forces() if film is not None and isinstance(self._skin, Elastic) else None
-        return make_truth(
-            self._thing, self.movement, self._skin, self._view, self._history, touched, pressing
+        vertical, view, movement = isinstance(self.movement, Vertical), self._view, self.movement
+        pressed = pose_at_press(movement.deepest)
+        if vertical or view.orthographic:
+            height, slopes = self._thing.height(view.x, view.y), self._thing.slope(view.x, view.y)
+        else:
+            obstacle = meet(self._thing, pressed, view)
+            height, slopes = obstacle.height - movement.deepest, (obstacle.dz_dx, obstacle.dz_dy)
+        zenith, azimuth = zenith_azimuth(*slopes)
+        frames = range(self.shape[0])
+        if movement.presses:
+            contact = self._skin.drape(pressed).contact
+        else:
+            for frame, late in itertools.product(frames, self._scene.moments):
+                self._witness.force(movement.pose_at(frame, late))
+            contact = self._witness.touched
+        force = slip = onset = displacement = None
+        if isinstance(self._skin, Elastic):
+            force = np.zeros((len(frames), 3))
+            force[:, 2] = [self._witness.force(movement.pose_at(frame)) for frame in frames]
+            if self._history is not None:
+                force[:, :2], onset = self._history.force, self._history.slip_onset.astype(np.float32)
+                slip = np.isfinite(onset).astype(np.uint8)
+                displacement = self._history.displacements()
+        return Truth(
+            height=height.astype(np.float32),
+            zenith=zenith.astype(np.float32),
+            azimuth=azimuth.astype(np.float32),
+            contact=contact.astype(np.uint8),
+            slip=slip,
+            force=force,
+            displacement=displacement,
+            slip_onset=onset,
         )
 
     def sheet(self, frame: int) -> Sheet:
         """Return how the sheet lies at the middle of a frame's exposure, computed anew."""
-        place = self.movement.reduced(self.movement.path[frame])
-        return self._skin.drape(self.movement.pose(place))
+        return self._skin.drape(self.movement.pose_at(frame))
 
     def rewind(self) -> None:
         """Go back to the first frame."""
@@ -232,7 +270,8 @@ class Twin(Closing):
         if len(frames) == 0:
             return None
         for k, frame in enumerate(frames, start=first):
-            self._sensor.expose(self._scene.light(k), k, frame)
+            light = self._scene.light(functools.partial(self.movement.pose_at, k), k)
+            self._sensor.expose(light, k, frame)
         self._next = first + len(frames)
         time = np.arange(first, self._next) / self._camera.frame_rate
         return self.movement.mark(Block(frames, index=first, time=time))
@@ -257,11 +296,11 @@ class Twin(Closing):
         self._sensor.expose(self._anywhere.light(pose_at), number, out)
 
     @functools.cached_property
-    def _anywhere(self) -> PoseScene:
+    def _anywhere(self) -> Scene:
         coat, skin, optics, shade = self._optics, self._skin, self._optics, None
         if isinstance(coat, Coat) and isinstance(skin, Elastic):
             optics, shade = coat.optics, DraggedCoat(coat, skin, self._body.friction).shade
-        return PoseScene(skin, optics, self._imprint, self._camera.exposure, shade)
+        return Scene(skin, optics, self._camera.exposure, imprint=self._imprint, shade=shade)
 
     @functools.cached_property
     def _imprint(self) -> Imprint | None:
@@ -313,12 +352,14 @@ class Twin(Closing):
 
     def _make_scene(self) -> Scene:
         share = self._camera.exposure * self._camera.frame_rate
-        if isinstance(self.movement, Vertical) and self._imprint is not None:
-            return Press(self._imprint, self.movement.positions, share)
-        coat, optics, shade = self._optics, self._optics, None
-        if isinstance(coat, Coat) and self._history is not None:
-            optics, shade = coat.optics, functools.partial(coat.shade, history=self._history)
-        return CachedScene(self._skin, optics, self.movement, share, self._view.shape, _MEMORY, shade)
+        coat, history, optics = self._optics, self._history, self._optics
+        shade: Shade | None = None
+        if isinstance(coat, Coat) and history is not None:
+            optics, shade = coat.optics, lambda light, z, _, frame: coat.shade(light, z, frame, history)
+        each = (np.dtype(np.float64).itemsize if shade else 0) + np.dtype(np.float32).itemsize
+        room = _MEMORY // (each * self._view.x.size)
+        imprint = self._imprint if isinstance(self.movement, Vertical) else None
+        return Scene(self._witness, optics, share, room, imprint, shade)
 
     def _zenith_scale(self) -> tuple[Floats, Floats] | None:
         """Return counts per radian of zenith and at zenith 0, where brightness is linear in it."""
@@ -356,8 +397,3 @@ def _check_pixel_size(pixel_size: float | tuple[float, float]) -> tuple[float, f
         raise InputError(f"pixel size {pixel_size} cannot be: give one positive number of mm, or x and y")
     along_x, along_y = np.broadcast_to(sizes, 2)
     return float(along_x), float(along_y)
-
-
-def _check_choice(value: str, known: tuple[str, ...], name: str) -> None:
-    if value not in known:
-        raise InputError(f"{name} {value!r} is unknown: take {', '.join(known)}")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -10,14 +12,13 @@ from mirrorskin.hw.twin import Axial, Body, Horizontal, Sphere, Twist, Vertical
 from mirrorskin.hw.twin.movement import Movement, Pose, pose_at_press
 from mirrorskin.hw.twin.optics import Ideal
 from mirrorskin.hw.twin.pattern import Uniform
-from mirrorskin.hw.twin.scene import CachedScene, Imprint, Press
+from mirrorskin.hw.twin.scene import Imprint, Optics, Scene, Skin, Witness
 from mirrorskin.hw.twin.skin import Conform, Sheet
 from mirrorskin.hw.twin.view import View
 
 Map = NDArray[np.float64]
 
 SHAPE, PIXEL = (41, 52), 0.2
-PLACE_BYTES = 4 * SHAPE[0] * SHAPE[1]  # float32 light
 PLENTY = 10**9
 VIEW = View(SHAPE, (PIXEL, PIXEL), Body())
 BALL = Sphere()
@@ -53,18 +54,42 @@ def tell(pose: Pose) -> float:
     return float(np.sum(pose.rotation * weights) + pose.shift @ [0.7, 0.4, 0.9])
 
 
-def recalling(movement: Movement, share: float = 0.0, limit: int = PLENTY) -> tuple[CachedScene, Recall]:
+class Film:
+    """The scene of a movement, and what touches in all of its poses."""
+
+    def __init__(
+        self,
+        skin: Skin,
+        optics: Optics,
+        movement: Movement,
+        share: float = 0.0,
+        room: int = PLENTY,
+        imprint: Imprint | None = None,
+    ) -> None:
+        self.movement, self.witness = movement, Witness(skin, SHAPE)
+        self.scene = Scene(self.witness, optics, share, room, imprint)
+
+    def light(self, frame: int) -> NDArray[np.float32]:
+        return self.scene.light(partial(self.movement.pose_at, frame), frame)
+
+    def touched_throughout(self) -> NDArray[np.bool_]:
+        for frame in range(len(self.movement.path)):
+            for late in self.scene.moments:
+                self.witness.force(self.movement.pose_at(frame, late))
+        return self.witness.touched
+
+
+def recalling(movement: Movement, share: float = 0.0, room: int = PLENTY) -> tuple[Film, Recall]:
     contact = Recall()
-    return CachedScene(contact, contact, movement, share, SHAPE, limit), contact
+    return Film(contact, contact, movement, share, room), contact
 
 
-def real(movement: Movement, share: float = 0.0, limit: int = PLENTY) -> CachedScene:
-    contact, optics = Conform(BALL, VIEW), Ideal(Body(), Uniform())
-    return CachedScene(contact, optics, movement, share, SHAPE, limit)
+def real(movement: Movement, share: float = 0.0, room: int = PLENTY) -> Film:
+    return Film(Conform(BALL, VIEW), Ideal(Body(), Uniform()), movement, share, room)
 
 
-def all_light(scene: CachedScene | Press, movement: Movement) -> NDArray[np.float32]:
-    return np.array([scene.light(frame).copy() for frame in range(len(movement.path))])
+def all_light(film: Film) -> NDArray[np.float32]:
+    return np.array([film.light(frame).copy() for frame in range(len(film.movement.path))])
 
 
 def turns(count: int, per_turn: int, start: float = 0.0) -> Axial:
@@ -77,7 +102,7 @@ def test_places_of_a_rotation_are_worked_out_once_in_the_order_of_their_first_ti
 ) -> None:
     movement = turns(3, per_turn, start=0.4)
     film, contact = recalling(movement, share)
-    light = all_light(film, movement)
+    light = all_light(film)
     blur = 1 if share == 0 else 5
     # The first frame's exposure begins before any place of the path.
     offsets = 2 * np.pi / per_turn * share * (np.arange(blur) - (blur - 1) / 2) / blur
@@ -90,41 +115,41 @@ def test_places_of_a_rotation_are_worked_out_once_in_the_order_of_their_first_ti
     assert len({float(frame[0, 0]) for frame in light}) == per_turn
 
 
-@pytest.mark.parametrize(("limit", "count"), [(10 * PLACE_BYTES, 10), (10 * PLACE_BYTES - 1, 30)])
-def test_light_is_kept_as_long_as_there_is_room(limit: int, count: int) -> None:
-    film, contact = recalling(MOVEMENTS["axial"], limit=limit)
-    all_light(film, MOVEMENTS["axial"])
+@pytest.mark.parametrize(("room", "count"), [(10, 10), (9, 30)])
+def test_light_is_kept_as_long_as_there_is_room(room: int, count: int) -> None:
+    film, contact = recalling(MOVEMENTS["axial"], room=room)
+    all_light(film)
     assert len(contact.poses) == count
-    all_light(film, MOVEMENTS["axial"])
+    all_light(film)
     assert len(contact.poses) == (count if count == 10 else 2 * count)
 
 
 @pytest.mark.parametrize(
-    ("name", "share", "limit"),
+    ("name", "share", "room"),
     [("vertical", 0.0, 0), ("axial", 0.7, PLENTY), ("axial", 0.0, 0), ("horizontal", 0.7, PLENTY)],
 )
-def test_light_is_the_same_whatever_else_was_asked(name: str, share: float, limit: int) -> None:
+def test_light_is_the_same_whatever_else_was_asked(name: str, share: float, room: int) -> None:
     movement = MOVEMENTS[name]
-    whole = all_light(recalling(movement, share, limit)[0], movement)
-    film, _ = recalling(movement, share, limit)
-    np.testing.assert_array_equal(all_light(film, movement), whole)
+    whole = all_light(recalling(movement, share, room)[0])
+    film, _ = recalling(movement, share, room)
+    np.testing.assert_array_equal(all_light(film), whole)
     for frame in range(3):
         film.light(frame)
-    np.testing.assert_array_equal(all_light(film, movement), whole)
-    film, _ = recalling(movement, share, limit)
+    np.testing.assert_array_equal(all_light(film), whole)
+    film, _ = recalling(movement, share, room)
     for frame in reversed(range(len(whole))):
         np.testing.assert_array_equal(film.light(frame), whole[frame])
-    film, _ = recalling(movement, share, limit)
+    film, _ = recalling(movement, share, room)
     for frame in range(len(whole)):  # contact is asked for when some frames have been seen
         if frame == 2:
             film.touched_throughout()
         np.testing.assert_array_equal(film.light(frame), whole[frame])
 
 
-@pytest.mark.parametrize("limit", [0, PLENTY])
-def test_contact_is_asked_of_the_places_not_yet_seen_and_without_light(limit: int) -> None:
+@pytest.mark.parametrize("room", [0, PLENTY])
+def test_contact_is_asked_of_the_places_not_yet_seen_and_without_light(room: int) -> None:
     movement = MOVEMENTS["axial"]
-    film, contact = recalling(movement, limit=limit)
+    film, contact = recalling(movement, room=room)
     for frame in (0, 3, 13):  # the third is the second, a turn later
         film.light(frame)
     lit = contact.lit
@@ -136,13 +161,13 @@ def test_contact_is_asked_of_the_places_not_yet_seen_and_without_light(limit: in
 
 
 @pytest.mark.parametrize(
-    ("name", "share", "limit"), [("axial", 1.0, 0), ("axial", 0.0, PLENTY), ("horizontal", 1.0, PLENTY)]
+    ("name", "share", "room"), [("axial", 1.0, 0), ("axial", 0.0, PLENTY), ("horizontal", 1.0, PLENTY)]
 )
-def test_what_lasts_is_the_contact_in_every_pose(name: str, share: float, limit: int) -> None:
+def test_what_lasts_is_the_contact_in_every_pose(name: str, share: float, room: int) -> None:
     movement = MOVEMENTS[name]
     if name == "axial":
         movement = Axial([0.0, 0.7, 1.9], 0.2, 1.0, (0.0, 0.0, 4.0))
-    film = real(movement, share, limit)
+    film = real(movement, share, room)
     contact = Conform(BALL, VIEW)
     expected = np.ones(SHAPE, bool)
     for place in exposed(movement, share, 5) if share else movement.path:
@@ -179,12 +204,12 @@ def test_an_exposure_is_the_mean_over_the_poses_that_the_body_passes(name: str) 
         ]
         return np.mean(np.reshape(light, (-1, count, *SHAPE)), axis=1, dtype=np.float64)
 
-    found = all_light(real(movement, share), movement)
+    found = all_light(real(movement, share))
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, mean(5), atol=1e-6)
     np.testing.assert_allclose(found.mean(axis=(1, 2)), mean(25).mean(axis=(1, 2)), rtol=0.01)
     if name != "twist":  # a ball does not show that it is turned
-        still = all_light(real(movement), movement)
+        still = all_light(real(movement))
         assert np.abs(found - still).max() > 0.1
 
 
@@ -205,8 +230,9 @@ STROKES: dict[str, list[float]] = {
 }
 
 
-def press(travel: list[float], share: float) -> Press:
-    return Press(Imprint(HEIGHT, AFTER, BEFORE), np.asarray(travel, np.float64), share)
+def press(movement: Movement, share: float, imprint: Imprint) -> Film:
+    contact = Recall()
+    return Film(contact, contact, movement, share, imprint=imprint)
 
 
 @pytest.mark.parametrize(
@@ -220,7 +246,7 @@ def test_a_press_is_exposed_as_a_fine_grid_of_times_says(stroke: str, share: flo
         passed = exposed(Vertical(travel), share, moments).reshape(len(travel), moments)
     else:
         passed = np.full((1, moments), travel[0])
-    scene = press(travel, share)
+    scene = press(Vertical(travel), share, Imprint(HEIGHT, AFTER, BEFORE))
     for frame, way in enumerate(passed):
         # Of the sorted depths those from the height's on are in contact; none where there is no object.
         missed = np.searchsorted(np.sort(way), -np.nan_to_num(HEIGHT, nan=-9.0))
@@ -237,15 +263,15 @@ def test_a_film_of_a_press_is_the_press(stroke: str) -> None:
     touched, untouched = (optics.light(contact.drape(pose_at_press(depth))) for depth in (10.0, -10.0))
     height = BALL.height(VIEW.x, VIEW.y)
 
-    def make(share: float) -> Press:
-        return Press(Imprint(height, touched, untouched), movement.positions, share)
+    def make(share: float) -> Film:
+        return press(movement, share, Imprint(height, touched, untouched))
 
-    film = all_light(real(movement), movement)
-    np.testing.assert_array_equal(film, all_light(make(0.0), movement))
+    film = all_light(real(movement))
+    np.testing.assert_array_equal(film, all_light(make(0.0)))
     assert film.max() > 0.9
     for share in (0.4, 1.0):
-        blurred = all_light(real(movement, share), movement)
-        exact = all_light(make(share), movement)
+        blurred = all_light(real(movement, share))
+        exact = all_light(make(share))
         # Five poses tell time to a tenth of an exposure's.
         np.testing.assert_allclose(blurred, exact, atol=0.1 + 1e-6)
         np.testing.assert_allclose(blurred.mean(axis=(1, 2)), exact.mean(axis=(1, 2)), atol=0.01)

@@ -1,85 +1,22 @@
-"""What a simulation knows: the object as it is, and the references that a camera would have."""
+"""The references of a twin: each pixel's own levels, or what a camera finds of them in a lab."""
 
 from __future__ import annotations
 
 import math
-from tempfile import TemporaryFile
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.hw.twin.camera import Sensor
-from mirrorskin.hw.twin.movement import Movement, Pose, Vertical, pose_at_press
-from mirrorskin.hw.twin.objects import Object, Sphere, zenith_azimuth
-from mirrorskin.hw.twin.obstacle import meet
+from mirrorskin.hw.twin.movement import Pose, pose_at_press
+from mirrorskin.hw.twin.objects import Sphere
 from mirrorskin.hw.twin.optics import Ideal, Wall
-from mirrorskin.hw.twin.skin import Conform, Elastic
-from mirrorskin.hw.twin.slip import SkinHistory
+from mirrorskin.hw.twin.skin import Conform
 from mirrorskin.hw.twin.texture import Coat
 from mirrorskin.hw.twin.view import View
-from mirrorskin.io.types import Floats, Truth
-
-
-def make_truth(
-    thing: Object,
-    movement: Movement,
-    skin: Conform | Elastic,
-    view: View,
-    history: SkinHistory | None,
-    touched: NDArray[np.bool_] | None,
-    pressing: Floats | None,
-) -> Truth:
-    """Return what the upright body stands on, and what touches, sticks and slips.
-
-    Under an oblique view, what a pixel sees depends on the depth. Then the maps of a vertical movement are
-    those of the point at which its ray meets the rest plane, and those of another of the point that it sees
-    of the object pressed, NaN where the object does not reach the rest plane. The azimuth is NaN where the
-    surface is level. Contact is that at the greatest travel of a vertical movement, and what lasts through
-    all frames of another (``touched``). Slip and displacement are known where there is a history: of
-    horizontal movements and twists in elastic contact. Of elastic contact the force is known, whose normal
-    part of each frame is ``pressing``, N.
-    """
-    vertical = isinstance(movement, Vertical)
-    pressed = pose_at_press(movement.deepest)
-    if vertical or view.orthographic:
-        height, slopes = thing.height(view.x, view.y), thing.slope(view.x, view.y)
-    else:
-        obstacle = meet(thing, pressed, view)
-        height, slopes = obstacle.height - movement.deepest, (obstacle.dz_dx, obstacle.dz_dy)
-    zenith, azimuth = zenith_azimuth(*slopes)
-    contact = skin.drape(pressed).contact if vertical or touched is None else touched
-    force = None if pressing is None else np.stack([0 * pressing, 0 * pressing, pressing], axis=1)
-    slip = onset = displacement = None
-    if history is not None and force is not None:
-        force[:, :2], onset = history.force, history.slip_onset.astype(np.float32)
-        slip = np.isfinite(onset).astype(np.uint8)
-        displacement = _displacements(history, len(force), view.shape)
-    return Truth(
-        height=height.astype(np.float32),
-        zenith=zenith.astype(np.float32),
-        azimuth=azimuth.astype(np.float32),
-        contact=contact.astype(np.uint8),
-        slip=slip,
-        force=force,
-        displacement=displacement,
-        slip_onset=onset,
-    )
-
-
-def _displacements(history: SkinHistory, frames: int, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Return how far the skin has moved along itself in each frame, (T, H, W, 2), mm; it lies on the disk."""
-    with TemporaryFile() as file:
-        maps = np.memmap(file, np.float32, "w+", shape=(frames, *shape, 2))
-    moved: Floats = np.zeros((2, *shape))
-    for frame, kept in enumerate(maps):
-        moved = history.displacement(frame, moved)
-        kept[...] = np.moveaxis(moved, 0, -1)
-    return maps
-
 
 ReferenceName = Literal["exact", "ball"]
-REFERENCES: tuple[ReferenceName, ...] = get_args(ReferenceName)
 
 _Counts = NDArray[np.float32]
 
