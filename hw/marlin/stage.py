@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
+import operator
 import re
 import statistics
 import threading
@@ -16,7 +18,7 @@ from typing import TYPE_CHECKING, NoReturn
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.grbl.link import close_port, open_port
 from mirrorskin.hw.grbl.moves import Axes
-from mirrorskin.hw.grbl.replies import Splitter
+from mirrorskin.hw.grbl.replies import Noise, Splitter
 from mirrorskin.hw.rig.plans import Trapezoid
 from mirrorskin.hw.rig_file import StageSettings
 from mirrorskin.hw.stage import Position, Report
@@ -32,10 +34,12 @@ _QUIET = 0.3  # seconds without an answer, after which none is still to come
 _PREPARE = ("G21", "G90", "M84 S0")  # millimetres, absolute places, motors that are never let go at rest
 _WATCH = 0.1  # seconds from one sign of life to the next in motion
 _TICK = 0.01
+_HUSH = 0.3  # seconds in motion that an answer may take at least: it draws on its display between two
 _BUSY = 10.0  # seconds that it may be busy without saying so; it says so every two
 _HOMING = 180.0  # seconds
 _TRIPS = 4  # usual round trips at least, that an answer may take in motion
 _ARRIVED = 0.02  # mm or degrees: places are told to 0.01
+_SAME_STEPS = 1e-3  # relative, as M92 tells them
 _REPORTS_MAX = 1 << 17
 _STOP, _KILL = b"\nM410\n", b"\nM112\n"
 _PLACE = re.compile(r"([A-Z]):(-?\d+\.?\d*)")
@@ -48,8 +52,9 @@ class MarlinStage(Closing):
 
     Marlin answers one line at a time, and does not tell where it is while it moves: the body goes in steps,
     and sweeps and precessions are refused. It is asked for a sign of life ten times a second meanwhile, with
-    no line pending that would keep it from a stop. Homing is stopped by killing the controller, which must
-    be switched off and on then; without ``EMERGENCY_PARSER`` homing cannot be stopped.
+    no line pending that would keep it from a stop. Lines have a number and a checksum, lest noise changes a
+    place. Homing is stopped by killing the controller, which must be switched off and on then; without
+    ``EMERGENCY_PARSER`` that is not certain.
 
     Parameters
     ----------
@@ -79,7 +84,8 @@ class MarlinStage(Closing):
         self._settings = settings
         self._port = open_port(settings.port, settings.baud, self.name) if port is None else port
         self._lock, self._ended = threading.RLock(), threading.Event()
-        self._splitter = Splitter()
+        self._splitter, self._noise = Splitter(), Noise()
+        self._number: int | None = None  # of the last line; None as long as nobody knows who is there
         self._trips: deque[float] = deque([0.0], maxlen=15)
         self._reports: deque[Report] = deque(maxlen=_REPORTS_MAX)
         self._target: Position | None = None
@@ -143,15 +149,14 @@ class MarlinStage(Closing):
         with self._guarded():
             while (left := due - time.monotonic()) > 0:  # no line pends, so that a stop is heeded at once
                 self._check()
+                if timeout is not None and time.monotonic() - began > timeout:
+                    self._fail(f"did not come to rest within {timeout:g} s")
                 time.sleep(min(left, _TICK))
             with self._lock:
                 self._ask("M400", limit)
                 self._due = None
                 report = self._locate()
-            if self._target is not None:
-                off = self.axes.distance(report.position, self._target)
-                if off > _ARRIVED:
-                    self._fail(f"it rests {off:.3g} mm or degrees from where it was sent; look at its limits")
+                self._check_place(report.position, "look at its limits (M211) and for who else moves it")
         return report
 
     def report(self) -> Report:
@@ -185,6 +190,8 @@ class MarlinStage(Closing):
     def _open(self) -> str:
         """Find out that Marlin answers and prints nothing, learn its speeds, and return its name."""
         name = self._greet()
+        self._number = 0
+        self._ask("M110 N0")
         capabilities = self._ask("M115")
         self.homing_stops = any(line.strip() == "Cap:EMERGENCY_PARSER:1" for line in capabilities)
         if any(line.startswith("SD printing byte") for line in self._ask("M27", lenient=True)):
@@ -236,6 +243,18 @@ class MarlinStage(Closing):
                 self.axes.limit(motion, rate)
             if acceleration > 0:
                 self._acceleration = min(self._acceleration, acceleration)
+            steps, expected = told.get("M92", {}).get(letter), self._settings.axes[motion].steps
+            if steps and expected and abs(steps / expected - 1) > _SAME_STEPS:
+                raise InputError(
+                    f"{self.name}: M92 {letter} is {steps:g} steps where the rig file has {expected:g}:"
+                    f" it goes {steps / expected:.3g} times as far; correct one of them"
+                )
+
+    def _check_place(self, place: Position, remedy: str) -> None:
+        """Stop it if it rests elsewhere than it was sent."""
+        off = 0.0 if self._target is None else self.axes.distance(place, self._target)
+        if off > _ARRIVED:
+            self._fail(f"it rests {off:.3g} mm or degrees from where it was sent; {remedy}")
 
     def _locate(self) -> Report:
         """Ask where it is, at rest, and keep the report."""
@@ -257,10 +276,10 @@ class MarlinStage(Closing):
                     raise HardwareError(f"{self.name}: the program ended")
                 with self._lock:
                     if self._due is None:
-                        self._locate()
+                        self._check_place(self._locate().position, "let nobody else move it")
                     else:  # a line that waits for no move, unlike M114
                         usual = _TRIPS * statistics.median(self._trips)
-                        self._ask("M110", max(self._settings.silence, usual))
+                        self._ask(f"M110 N{self._number}", max(self._settings.silence, _HUSH, usual))
             except Exception as error:
                 self.error = self.error or HardwareError(str(error))
                 self.stop()
@@ -270,28 +289,51 @@ class MarlinStage(Closing):
         """Send a line, and return what was said until it was taken; a busy controller may take longer."""
         with self._lock:
             self._check()
-            self._write(line)
+            for text in self._read() if self._has_unread() else ():
+                self._judge(text, "nothing")
+                if re.match(r"ok\b", text):
+                    self._fail("it answered a line that nobody here sent: let no other program speak to it")
+            self._write(self._numbered(line))
             asked = heard = time.monotonic()
             limit, said = self._settings.timeout if timeout is None else timeout, list[str]()
             while True:
                 late = time.monotonic() - heard > limit  # before what came meanwhile is read
                 for text in self._read():
-                    heard, late = time.monotonic(), False
                     if re.match(r"ok\b", text):
-                        self._trips.append(heard - asked)
+                        self._trips.append(time.monotonic() - asked)
                         return [*said, text[2:].strip()]  # some answer in the same line
-                    if text == "start":
-                        self._fail("the controller was reset; it has lost its place: home it")
-                    if _FAULTS.match(text) and not lenient:
-                        self._fail(f"it answers {line} with {text!r}")
+                    if not lenient:
+                        self._judge(text, line)
+                    if lenient or "busy:" in text:  # anything else may come without end
+                        heard, late = time.monotonic(), False
                     if "busy:" in text:
                         limit = _BUSY
                     said.append(text)
                 self._check()
-                if late:
+                if late or time.monotonic() - asked > max(limit, _HOMING):
                     self._fail(
                         "it no longer answers; the stage may move on: look at the plug, and switch it off"
                     )
+
+    def _numbered(self, line: str) -> str:
+        """Return a line with its number and the checksum of both; M110 begins to count from its own."""
+        assert self._number is not None  # it is known who is there
+        self._number += not line.startswith("M110")
+        text = f"N{self._number} {line}"
+        return f"{text}*{functools.reduce(operator.xor, text.encode('ascii'))}"
+
+    def _judge(self, text: str, line: str) -> None:
+        """Stop it if what it says is no good."""
+        if text == "start":
+            self._fail("the controller was reset; it has lost its place: home it")
+        if _FAULTS.match(text):
+            self._fail(f"it answers {line} with {text!r}")
+
+    def _has_unread(self) -> bool:
+        try:
+            return bool(self._port.in_waiting)
+        except Exception as error:  # as in _read
+            self._lost(error)
 
     def _read(self) -> list[str]:
         """Return the lines that are there, after a short wait for the first."""
@@ -299,8 +341,14 @@ class MarlinStage(Closing):
             data = self._port.read(max(1, self._port.in_waiting))
         except Exception as error:  # pyserial raises many kinds on a port that is gone
             self._lost(error)
-        lines = self._splitter.feed(data, time.monotonic())
-        return [line.decode("ascii", "replace").strip() for line, _ in lines]
+        now, lines = time.monotonic(), []
+        for line, _ in self._splitter.feed(data, now):
+            text = line.decode("ascii", "replace").strip()
+            if text.isascii() and text.replace("\t", " ").isprintable():
+                lines.append(text)
+            elif self._noise.add(len(line), now) and self._number is not None:
+                self._fail("what it says is garbled; look at the cable, its shield and the baud rate")
+        return lines
 
     def _write(self, line: str) -> None:
         try:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from commands import run
 from fake_marlin import FakeMarlin
 from rig_fakes import FakeCamera, settings
 
@@ -102,6 +103,9 @@ def test_a_stop_in_motion_comes_at_once(emergency):
         (lambda line: setattr(line, "silent", True), "no longer answers"),
         (lambda line: line.pull(), "the line is lost"),
         (lambda line: line.say("start"), "was reset; it has lost its place"),
+        (lambda line: line.say("ok"), "answered a line that nobody here sent"),
+        (lambda line: line.say(*["\x01\xe9\x7f" * 40] * 5), "what it says is garbled"),
+        (lambda line: setattr(line, "noise", lambda said: said.replace("M110", "M111")), "checksum mismatch"),
         (lambda line: line.say("Error:Heating failed, system stopped!"), "Heating failed"),
     ],
 )
@@ -167,3 +171,107 @@ def test_the_rig_file_chooses_it(line, monkeypatch):
     assert stage.firmware == "Marlin 2.1.2 (Nov 24 2026)"
     with pytest.raises(io.InputError, match="only GRBL is unlocked"):
         open_stage(STAGE, unlock=True)
+
+
+def test_chatter_without_an_answer_is_silence(stage, line):
+    begin_slow(stage)
+    line.silent = True
+    since = time.monotonic()
+    talk = threading.Timer(0.0, lambda: [line.chat("T:20.0 /0.0") or time.sleep(0.02) for _ in range(100)])
+    talk.start()
+    with pytest.raises(HardwareError, match="no longer answers"):
+        stage.wait()
+    assert time.monotonic() - since < 1.5
+    talk.join()
+
+
+def test_a_word_that_noise_changed_does_not_move_it(stage, line):
+    line.noise = lambda said: said.replace("Z-1.0", "Z-9.0")
+    with pytest.raises(HardwareError, match="checksum mismatch"):
+        stage.move(Position(-1.0))
+    assert not line.moving
+    assert not any(said.startswith("G1") for said in line.log)
+
+
+def test_a_wait_ends_in_time(stage, line):
+    begin_slow(stage)
+    with pytest.raises(HardwareError, match=r"did not come to rest within 0\.1 s"):
+        stage.wait(timeout=0.1)
+    assert rests_soon(line)
+
+
+def test_who_else_moves_it_is_noticed(stage, line):
+    line.put(0.5)
+    time.sleep(0.5)
+    with pytest.raises(HardwareError, match=r"rests 0\.5 mm .* let nobody else move it"):
+        stage.report()
+
+
+def test_other_steps_than_the_rig_file_s_are_refused(line):
+    line.instead = {"M503": "echo:  M92 X80.00 Y80.00 Z200.00\nok"}
+    travel = msgspec.structs.replace(STAGE.travel, steps=400.0)
+    with pytest.raises(io.InputError, match=r"M92 Z is 200 steps where the rig file has 400: it goes 0\.5"):
+        MarlinStage(msgspec.structs.replace(STAGE, travel=travel), line)
+
+
+RIG_FILE = """
+[stage]
+firmware = "marlin"
+port = "socket://nowhere:1"
+press = 2.0
+[stage.travel]
+letter = "Z"
+limits = [-5.0, 3.0]
+speed = 8.0
+[camera]
+source = "film.y4m"
+size = [8, 6]
+rate = 50
+dark = 0
+delay = 0
+"""
+
+
+@pytest.fixture
+def capture(line, tmp_path, monkeypatch):
+    """Run commands on a rig file: the controller is the fake one, and the camera a film of 20 s."""
+    monkeypatch.setattr("mirrorskin.hw.marlin.stage.open_port", lambda *_: line)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.toml").write_text(RIG_FILE)
+    film = b"YUV4MPEG2 W8 H6 F50:1 Ip A1:1 Cmono\n" + (b"FRAME\n" + bytes(range(48))) * 1000
+    (tmp_path / "film.y4m").write_bytes(film)
+    return lambda words: run("capture", "vertical", *words.split(), "--rig", "rig.toml", "-o", "press.h5")
+
+
+def test_a_rig_file_captures_in_steps(capture, tmp_path):
+    ended = capture("--stop 0.4mm --step 0.2mm --settle 0s")
+    assert ended.code == 0, ended
+    with io.open_recording(tmp_path / "press.h5") as recording:
+        np.testing.assert_allclose(recording.travel, [0.0, 0.2, 0.4])
+    checked = run("rig", "check", "rig.toml", "--move")
+    assert checked.code == 0, checked
+    assert "Marlin 2.1.2" in checked.out
+    assert "$" not in checked.out
+
+
+def test_a_sweep_is_refused_before_it_homes(capture, line):
+    ended = capture("--stop 0.4mm --speed 0.2mm/s")
+    assert (ended.code, line.log) == (2, [])
+    assert "Marlin does not tell where it is while it moves; go in steps" in ended.said
+
+
+@pytest.mark.parametrize("fault", [lambda line: line.pull(), lambda line: setattr(line, "silent", True)])
+def test_a_fault_ends_the_capture_with_a_line(capture, line, fault):
+    begun = threading.Event()
+
+    def noticed(said):
+        if "G1Z2.0" in said:
+            begun.set()
+        return said
+
+    line.noise = noticed
+    worker = threading.Thread(target=lambda: begun.wait(10.0) and (time.sleep(0.05), fault(line)))
+    worker.start()
+    ended = capture("--start 0mm --stop 2mm --step 2mm --settle 0s")
+    worker.join()
+    assert (ended.code, ended.said.count("\n")) == (1, 1), ended

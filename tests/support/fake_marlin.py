@@ -3,6 +3,8 @@
 Written after the firmware's documentation of its G-codes: lines wait for moves where the firmware's do.
 """
 
+import functools
+import operator
 import re
 import threading
 import time
@@ -20,6 +22,8 @@ class FakeMarlin:
         self.ends = 0.0  # soft limit, below which it clips places; 0 for none
         self.homing = 0.0  # seconds that it takes
         self.killed = False
+        self.noise = str  # what becomes of the words on their way
+        self._number = 0  # of the last line
         self._home = dict(zip(letters, home, strict=True))
         self._legs = [(0.0, 0.0, dict.fromkeys(letters, 20.0), dict.fromkeys(letters, 20.0))]
         self._out, self._lock = bytearray(), threading.Condition()
@@ -49,7 +53,7 @@ class FakeMarlin:
     def write(self, data):
         with self._lock:
             self._work()
-            for line in data.decode().split("\n"):
+            for line in self.noise(data.decode()).split("\n"):
                 if line and not self.killed:
                     self._take(line)
             self._work()
@@ -64,8 +68,13 @@ class FakeMarlin:
         self.closed = True
 
     def say(self, *lines):
+        if not self.silent:
+            self.chat(*lines)
+
+    def chat(self, *lines):
+        """Say lines that answer nothing, also while it is silent otherwise."""
         with self._lock:
-            self._out += b"" if self.silent else "".join(f"{line}\n" for line in lines).encode()
+            self._out += "".join(f"{line}\n" for line in lines).encode("latin-1")
 
     # As a machine
 
@@ -78,12 +87,28 @@ class FakeMarlin:
                 return {letter: a[letter] + part * (b[letter] - a[letter]) for letter in a}
         raise AssertionError("before the first")
 
+    def put(self, value):
+        """Move all axes, as by its display."""
+        place = dict.fromkeys(self.letters, value)
+        self._legs.append((time.monotonic(), 0.0, place, place))
+
     @property
     def moving(self):
         began, duration, _, _ = self._legs[-1]
         return time.monotonic() < began + duration
 
     def _take(self, line):
+        if line.startswith("N"):
+            text, _, check = line.rpartition("*")
+            number, line = text[1:].split(" ", 1)
+            right = int(check) == functools.reduce(operator.xor, text.encode())
+            if not right or (int(number) != self._number + 1 and not line.startswith("M110")):
+                self.say(
+                    f"Error:{'Line Number' if right else 'checksum mismatch'}, Last Line: {self._number}"
+                )
+                self.say(f"Resend: {self._number + 1}", "ok")
+                return
+            self._number = int(number)
         code = line.partition(" ")[0]
         if self.emergency and code in ("M410", "M112"):
             self._halt()
