@@ -24,6 +24,7 @@ from mirrorskin.view.canvas import (
     round_length,
     save_figure,
 )
+from mirrorskin.view.colours import DIVERGING, ERROR, SEQUENTIAL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,7 +43,7 @@ def new_sheet(width: float, height: float) -> Figure:
 
 
 def draw_pixels(
-    axes: Axes, values: ArrayLike, title: str, label: str, colours: str = "viridis", even: bool = False
+    axes: Axes, values: ArrayLike, title: str, label: str, colours: str = SEQUENTIAL, even: bool = False
 ) -> None:
     """Draw a map of all pixels, with its colours explained."""
     shown = np.asarray(values, np.float64)
@@ -78,8 +79,8 @@ def draw_references(references: References) -> Figure:
     draw_pixels(axes[0, 0], references.dark, "dark: without light", "counts")
     draw_pixels(axes[0, 1], references.bright, "bright: in full light", "counts")
     draw_pixels(axes[0, 2], light, "light: bright less dark", "counts")
-    draw_pixels(axes[1, 0], references.dark_sigma, "standard error of dark", "counts", "magma")
-    draw_pixels(axes[1, 1], references.bright_sigma, "standard error of bright", "counts", "magma")
+    draw_pixels(axes[1, 0], references.dark_sigma, "standard error of dark", "counts", ERROR)
+    draw_pixels(axes[1, 1], references.bright_sigma, "standard error of bright", "counts", ERROR)
     _draw_defects(axes[1, 2], references.defects)
     return figure
 
@@ -116,13 +117,13 @@ def draw_lens(lens: Lens) -> Figure:
     ideal = np.stack([columns, rows], axis=-1)
     moved = _distort(ideal, lens) - ideal
     extent = (-0.5, lens.shape[1] - 0.5, lens.shape[0] - 0.5, -0.5)
-    draw_pixels(axes[1], np.hypot(moved[..., 0], moved[..., 1]), "distortion", "px", "viridis")
+    draw_pixels(axes[1], np.hypot(moved[..., 0], moved[..., 1]), "distortion", "px", SEQUENTIAL)
     draw_pixels(
         axes[2],
         100 * (_sizes(ideal, lens) - 1),
         "size of a pixel on the sheet",
         "% from the map's",
-        "RdBu_r",
+        DIVERGING,
         even=True,
     )
     for one in axes[1:]:
@@ -304,7 +305,7 @@ def check_figure(check: Check, title: str, path: Path) -> None:
 
 def _draw(axes: Axes, name: str, errors: Errors, check: Check, worst: float) -> None:
     place, label = extent(check.x, check.y), f"found - true ({errors.unit})"
-    draw_image(axes, errors.error, place, label, cmap="RdBu_r", vmin=-worst, vmax=worst)
+    draw_image(axes, errors.error, place, label, cmap=DIVERGING, vmin=-worst, vmax=worst)
     digits = 3 if errors.unit == "deg" else 4
     rms, bias = (round(float(value), digits) + 0.0 for value in (errors.whole.rms, errors.whole.bias))
     summary = f"RMS {rms:.{digits}f}, bias {bias:+.{digits}f} {errors.unit}"

@@ -14,7 +14,7 @@ from mirrorskin.io import Gel, Stiffness, WallResponse
 from mirrorskin.io.types import Floats
 from mirrorskin.view.calibration import draw_pixels, new_sheet
 from mirrorskin.view.canvas import explain_colours
-from mirrorskin.view.colours import MISSING
+from mirrorskin.view.colours import DIVERGING, ERROR, MISSING
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -70,9 +70,9 @@ def draw_response(response: WallResponse) -> Figure:
     polar.set_title("zenith of half light, by azimuth")
     _draw_shade(figure.add_subplot(grid[0, 2]), response)
     zenith, azimuth = (figure.add_subplot(grid[1, column]) for column in range(2))
-    draw_pixels(zenith, np.degrees(response.zenith_sigma), "standard error of zenith", "deg", "magma")
+    draw_pixels(zenith, np.degrees(response.zenith_sigma), "standard error of zenith", "deg", ERROR)
     title = "standard error of azimuth times sin(zenith)"
-    draw_pixels(azimuth, np.degrees(response.azimuth_sigma), title, "deg", "magma")
+    draw_pixels(azimuth, np.degrees(response.azimuth_sigma), title, "deg", ERROR)
     _draw_correlation(figure.add_subplot(grid[1, 2]), response)
     return figure
 
@@ -137,7 +137,7 @@ def _draw_shade(axes: Axes, response: WallResponse) -> None:
     reach = max(float(np.nanmax(np.abs(shade))), 0.01)
     picture = axes.imshow(
         shade,
-        cmap="RdBu_r",
+        cmap=DIVERGING,
         vmin=-reach,
         vmax=reach,
         extent=(-radius, radius, -radius, radius),
@@ -167,7 +167,7 @@ def _draw_correlation(axes: Axes, response: WallResponse) -> None:
     covariance = response.covariance[np.ix_(free, free)]
     sigma = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(sigma, sigma)
-    picture = axes.imshow(correlation, cmap="RdBu_r", vmin=-1, vmax=1, interpolation="nearest")
+    picture = axes.imshow(correlation, cmap=DIVERGING, vmin=-1, vmax=1, interpolation="nearest")
     explain_colours(axes, picture, "correlation")
     left = math.degrees(response.error)
     axes.set_title(f"errors of the {len(sigma)} parameters\nleft on the balls: {left:.3f}° RMS")

@@ -21,6 +21,15 @@ FILLED_SHADES = "#331a00", "#ffb266"
 EDGE_RGB = (0, 0, 0)
 """Colour of edges, as red, green and blue."""
 
+SEQUENTIAL = "viridis"
+"""Matplotlib's name of the colours of heights, lengths and all else that goes from small to large."""
+ERROR = "magma"
+"""The same of errors and their standard deviations."""
+DIVERGING = "coolwarm"
+"""The same of what may be negative: blue below 0, red above."""
+CYCLIC = "twilight"
+"""The same of angles all the way round."""
+
 Colours = NDArray[np.uint8]
 
 _SHOWN = 0.2, 99.8  # percentiles at the ends of the colour scale

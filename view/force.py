@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io import InputError, Result
 from mirrorskin.view.canvas import draw_image, extent, new_figure, save_figure
+from mirrorskin.view.colours import SEQUENTIAL
 
 _KILO = 1e3  # kPa in a MPa
 
@@ -51,7 +52,7 @@ def force_figure(
     grid = figure.add_gridspec(2, 3, height_ratios=[2, 1])
     axes = figure.add_subplot(grid[:, 0])
     found, true = _KILO * shown.pressure, _KILO * pressure
-    draw_image(axes, found, extent(shown.x, shown.y), "pressure (kPa)", cmap="viridis", vmin=0)
+    draw_image(axes, found, extent(shown.x, shown.y), "pressure (kPa)", cmap=SEQUENTIAL, vmin=0)
     axes.axhline(0, color="tab:red", lw=0.8, ls=":")
     axes.set(xlabel="x (mm)", ylabel="y (mm)", title=last)
     axes = figure.add_subplot(grid[:, 1])

@@ -14,6 +14,7 @@ from mirrorskin.engine.pose.pose import Pose
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.types import Floats
 from mirrorskin.view.canvas import draw_image, extent, new_figure, save_figure
+from mirrorskin.view.colours import SEQUENTIAL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -84,7 +85,7 @@ def pose_figure(found: Followed, title: str, path: Path) -> None:
 def _draw_object(axes: Axes, found: Followed, result: Result, name: str) -> None:
     if result.height is None or result.x is None or result.y is None:
         raise InputError("a figure of motion needs results with a height and a pixel size")
-    draw_image(axes, result.height, extent(result.x, result.y), "height (mm)", cmap="viridis")
+    draw_image(axes, result.height, extent(result.x, result.y), "height (mm)", cmap=SEQUENTIAL)
     path = np.array([pose.translation for pose in found.poses])
     axes.plot(found.shifts[:, 0], found.shifts[:, 1], color="w", lw=2, label="truth")
     axes.plot(path[:, 0], path[:, 1], "o", ms=4, color="tab:red", label="found")

@@ -13,6 +13,7 @@ from mirrorskin.engine.slip.search import Slip
 from mirrorskin.io import InputError, Truth
 from mirrorskin.io.types import Floats
 from mirrorskin.view.canvas import draw_image, extent, new_figure, save_figure
+from mirrorskin.view.colours import DIVERGING, ERROR, SEQUENTIAL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -104,7 +105,7 @@ def _draw_displacement(axes: NDArray[np.object_], slid: Slipped) -> None:
         _MICRO * np.linalg.norm(part, axis=-1) for part in (slid.found.displacement, slid.displacement_error)
     )
     place = extent(slid.x, slid.y)
-    draw_image(axes[0], moved, place, "displacement (µm)", cmap="viridis", vmin=0)
+    draw_image(axes[0], moved, place, "displacement (µm)", cmap=SEQUENTIAL, vmin=0)
     step = max(1, len(slid.x) // _ARROWS)
     some = np.s_[step // 2 :: step]
     across, up = np.moveaxis(slid.found.displacement[some, some], -1, 0)
@@ -113,7 +114,7 @@ def _draw_displacement(axes: NDArray[np.object_], slid: Slipped) -> None:
     )
     axes[0].set(title="slide: displacement of the skin, found")
     draw_image(
-        axes[1], error, place, "error (µm)", "max", cmap="magma", vmin=0, vmax=np.nanpercentile(error, 99)
+        axes[1], error, place, "error (µm)", "max", cmap=ERROR, vmin=0, vmax=np.nanpercentile(error, 99)
     )
     axes[1].set(title=f"its error: RMS {np.sqrt(np.nanmean(error**2)):.1f} µm")
     for one in axes[:2]:
@@ -121,7 +122,7 @@ def _draw_displacement(axes: NDArray[np.object_], slid: Slipped) -> None:
 
 
 def _draw_onset(axes: Axes, slid: Slipped, onset: NDArray[np.floating], unit: str, title: str) -> None:
-    draw_image(axes, onset, extent(slid.x, slid.y), f"way ({unit})", cmap="viridis", vmin=0)
+    draw_image(axes, onset, extent(slid.x, slid.y), f"way ({unit})", cmap=SEQUENTIAL, vmin=0)
     axes.set(title=title)
     _outline(axes, slid)
 
@@ -130,7 +131,7 @@ def _draw_onset_error(axes: Axes, slid: Slipped, scale: float, unit: str) -> Non
     error = scale * slid.onset_error
     side = float(np.nanpercentile(np.abs(error), 99))
     draw_image(
-        axes, error, extent(slid.x, slid.y), f"error ({unit})", "both", cmap="RdBu", vmin=-side, vmax=side
+        axes, error, extent(slid.x, slid.y), f"error ({unit})", "both", cmap=DIVERGING, vmin=-side, vmax=side
     )
     axes.set(title=f"its error: RMS {np.sqrt(np.nanmean(error**2)):.2g} {unit}")
     _outline(axes, slid)

@@ -14,7 +14,7 @@ from mirrorskin.engine.scoring import angle_between, true_normals
 from mirrorskin.io import InputError, Result, Truth
 from mirrorskin.io.types import Floats
 from mirrorskin.view.canvas import draw_image, exceeded, extent, filled_colours, new_figure, save_figure
-from mirrorskin.view.colours import FILLED, span
+from mirrorskin.view.colours import DIVERGING, ERROR, FILLED, SEQUENTIAL, span
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -93,10 +93,10 @@ def _level(result: Result, height: NDArray[np.float32], truth: NDArray[np.float3
 
 
 def draw_map(axes: Axes, name: str, relief: Relief, limits: Range | None = None) -> None:
-    """Draw heights between limits by brightness, filled ones in shades of orange."""
+    """Draw heights between limits by colour, filled ones in shades of orange."""
     lowest, highest = limits or span(relief.height)
     beyond = exceeded(relief.height, lowest, highest)
-    shades: list[str | Colormap] = ["gray", filled_colours()]
+    shades: list[str | Colormap] = [SEQUENTIAL, filled_colours()]
     for filled in (False, True) if relief.filled.any() else (False,):
         shown, place = np.where(relief.filled == filled, relief.height, np.nan), extent(relief.x, relief.y)
         label = "" if filled else "height (mm)"
@@ -125,7 +125,7 @@ def _colours(height: NDArray[np.float32], filled: NDArray[np.bool_], limits: Ran
     from matplotlib import colormaps
     from matplotlib.colors import Normalize, to_rgba
 
-    colours = np.array(colormaps["viridis"](Normalize(*limits)(np.nan_to_num(height))))
+    colours = np.array(colormaps[SEQUENTIAL](Normalize(*limits)(np.nan_to_num(height))))
     colours[filled] = to_rgba(FILLED)
     return colours
 
@@ -195,7 +195,7 @@ def height_figure(
     path : Path
         PNG to write.
     surface : bool
-        Draw surfaces in space, as Fig. 5 (a) of the paper, instead of height by brightness, as its Fig. 6:
+        Draw surfaces in space, as Fig. 5 (a) of the paper, instead of maps, as its Fig. 6:
         on one vertical scale, the first also without what was filled.
     detail : (float, float), optional
         Heights, mm, between which maps and cuts are drawn a second time, on a scale of their own.
@@ -374,7 +374,7 @@ def _draw_angles(axes: Axes, result: Result, error: Floats, shared: NDArray[np.b
     )
     if common.size:
         note = f"median {np.median(common):.2f} deg of the {common.size} px that all answer\n{note}"
-    draw_image(axes, error, extent(x, y), "angle to the truth (deg)", "max", cmap="magma", vmin=0, vmax=worst)
+    draw_image(axes, error, extent(x, y), "angle to the truth (deg)", "max", cmap=ERROR, vmin=0, vmax=worst)
     axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{note}; blue: no answer")
 
 
@@ -430,7 +430,7 @@ def _draw_height_errors(axes: Axes, relief: Relief, truth: Truth) -> None:
     worst = float(np.percentile(np.abs(known), _WORST)) if known.size else 1.0
     note = f"RMS {np.sqrt(np.mean(known**2)):.1f} \N{MICRO SIGN}m" if known.size else "no pixel answered"
     place, label = extent(relief.x, relief.y), "height - truth (\N{MICRO SIGN}m)"
-    draw_image(axes, error, place, label, cmap="RdBu_r", vmin=-worst, vmax=worst)
+    draw_image(axes, error, place, label, cmap=DIVERGING, vmin=-worst, vmax=worst)
     if relief.filled.any():
         marks = relief.filled.astype(float)
         axes.contour(relief.x, relief.y, marks, levels=[0.5], colors=FILLED, linewidths=1)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.types import Floats
 from mirrorskin.view.canvas import draw_image, extent, new_figure, save_figure
+from mirrorskin.view.colours import DIVERGING, SEQUENTIAL
 
 _MICRO = 1e3  # um in a mm
 _WIDE = 4.0  # standard deviations that histograms show
@@ -126,17 +127,17 @@ def vibration_figure(found: Vibration, title: str, path: Path) -> None:
     touched = np.where(rocked.contact == 1, rocked.slope, np.nan)
     place, side = extent(rocked.x, rocked.y), float(np.nanmax(np.abs(found.slope)))
     axes = figure.add_subplot(grid[1, 0])
-    draw_image(axes, touched, place, "slope along it", cmap="RdBu", vmin=-side, vmax=side)
+    draw_image(axes, touched, place, "slope along it", cmap=DIVERGING, vmin=-side, vmax=side)
     axes.set(xlabel="x (mm)", ylabel="y (mm)", title="a body that rocks: slope along one direction")
     axes = figure.add_subplot(grid[1, 1])
     wrong = touched - found.slope
     side = 4 * float(np.nanstd(wrong))
-    draw_image(axes, wrong, place, "error of the slope", "both", cmap="RdBu", vmin=-side, vmax=side)
+    draw_image(axes, wrong, place, "error of the slope", "both", cmap=DIVERGING, vmin=-side, vmax=side)
     axes.set(xlabel="x (mm)", title=f"less the truth: RMS {np.sqrt(np.nanmean(wrong**2)):.3f}")
 
     axes = figure.add_subplot(grid[1, 2])
     place, most = extent(dithered.x, dithered.y), float(np.nanpercentile(dithered.growth, 99.5))
-    draw_image(axes, dithered.growth, place, "growth (1/mm)", "max", cmap="viridis", vmin=0, vmax=most)
+    draw_image(axes, dithered.growth, place, "growth (1/mm)", "max", cmap=SEQUENTIAL, vmin=0, vmax=most)
     area = float(dithered.process.get("area_growth", np.nan))
     axes.set(xlabel="x (mm)", title=f"dither: light grows by {area:.2f} mm²/mm, truth {found.growth:.2f}")
     save_figure(figure, title, path)

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 
 from mirrorskin.io import Result, pixel_axes
 from mirrorskin.io.types import Floats
-from mirrorskin.view.colours import FILLED_RGB, span
+from mirrorskin.view.colours import FILLED_RGB, SEQUENTIAL, span
 
 MOST_EXAGGERATED = 20
 """Times that heights are drawn larger than they are, at most."""
 
 _RELIEF = 0.25  # of the picture's width, that heights should span on the screen
-_MAP = "viridis"
 _STOPS = 16  # samples of the colour map for the script
 _CODES = 65535
 _PIECES = 0x7FFF  # numbers of pieces that a mark has room for
@@ -71,7 +70,7 @@ def _colours() -> list[list[float]]:
     """Return colours along the map of the pictures, red, green and blue from 0 to 1."""
     from matplotlib import colormaps
 
-    return [[round(part, 4) for part in colormaps[_MAP](k / (_STOPS - 1))[:3]] for k in range(_STOPS)]
+    return [[round(part, 4) for part in colormaps[SEQUENTIAL](k / (_STOPS - 1))[:3]] for k in range(_STOPS)]
 
 
 MOST = 400

@@ -11,7 +11,17 @@ from numpy.typing import NDArray
 from mirrorskin.io.result import unit_of
 from mirrorskin.io.types import Floats
 from mirrorskin.view.canvas import draw_classes, exceeded, explain_colours, filled_colours, round_length
-from mirrorskin.view.colours import MISSING, MISSING_RGB, Colours, normal_colours, span
+from mirrorskin.view.colours import (
+    CYCLIC,
+    DIVERGING,
+    ERROR,
+    MISSING,
+    MISSING_RGB,
+    SEQUENTIAL,
+    Colours,
+    normal_colours,
+    span,
+)
 from mirrorskin.view.result.sheet import SMALL, TEXT, Sheet, draw_map, entitle, lay_out, percent
 
 if TYPE_CHECKING:
@@ -33,7 +43,7 @@ def draw_height(axes: Axes, sheet: Sheet, cut: Section | None = None) -> None:
     assert height is not None
     ends = span(height)
     draw_map(axes, sheet, height_picture(height, sheet.filled, ends), interpolation="antialiased")
-    colours = ScalarMappable(Normalize(*_apart(*ends)), "viridis")
+    colours = ScalarMappable(Normalize(*_apart(*ends)), SEQUENTIAL)
     explain_colours(axes, colours, f"{quantity(sheet)} (mm)", exceeded(height, *ends))
     if sheet.true_to_scale and sheet.unit == "mm" and height.size > 1:
         _draw_scale(axes, sheet)
@@ -132,7 +142,7 @@ def height_picture(
     colours = np.where(
         filled[..., np.newaxis],
         filled_colours()(level, bytes=True)[..., :3],
-        colormaps["viridis"](level, bytes=True)[..., :3],
+        colormaps[SEQUENTIAL](level, bytes=True)[..., :3],
     )
     return np.asarray(np.where(known[..., np.newaxis], colours, MISSING_RGB), np.uint8)
 
@@ -181,7 +191,7 @@ def draw_height_sigma(axes: Axes, sheet: Sheet) -> None:
     assert sheet.result.height_sigma is not None
     sigma = _MICROMETRES * sheet.result.height_sigma.astype(np.float64)
     _draw_positive(
-        axes, sheet, sigma, "Expected error of heights", "standard deviation", "\N{MICRO SIGN}m", "magma"
+        axes, sheet, sigma, "Expected error of heights", "standard deviation", "\N{MICRO SIGN}m", ERROR
     )
 
 
@@ -189,7 +199,7 @@ def draw_normal_sigma(axes: Axes, sheet: Sheet) -> None:
     """Draw the angular error that is expected of normals, in degrees."""
     assert sheet.result.normal_sigma is not None
     sigma = np.degrees(sheet.result.normal_sigma.astype(np.float64))
-    _draw_positive(axes, sheet, sigma, "Expected error of normals", "RMS angle", "deg", "magma")
+    _draw_positive(axes, sheet, sigma, "Expected error of normals", "RMS angle", "deg", ERROR)
 
 
 def draw_modulation(axes: Axes, sheet: Sheet) -> None:
@@ -202,7 +212,7 @@ def draw_modulation(axes: Axes, sheet: Sheet) -> None:
         "Modulation",
         "swing of the light",
         "counts",
-        "viridis",
+        SEQUENTIAL,
     )
 
 
@@ -212,7 +222,7 @@ def draw_slip_onset(axes: Axes, sheet: Sheet) -> None:
     assert onset is not None
     turned = unit_of("slip_onset", sheet.result.process) == "rad"
     unit, scale = ("deg", np.degrees(1.0)) if turned else ("\N{MICRO SIGN}m", _MICROMETRES)
-    draw_map(axes, sheet, scale * onset.astype(np.float64), f"way of the body ({unit})", cmap="viridis")
+    draw_map(axes, sheet, scale * onset.astype(np.float64), f"way of the body ({unit})", cmap=SEQUENTIAL)
     entitle(axes, "Onset of slip", "blue: no slip, or no answer")
 
 
@@ -222,7 +232,7 @@ def draw_displacement(axes: Axes, sheet: Sheet) -> None:
     assert moved is not None
     last = _MICROMETRES * (moved if moved.ndim == 3 else moved[-1]).astype(np.float64)
     length = np.sqrt(np.sum(last**2, axis=-1))
-    draw_map(axes, sheet, length, "length (\N{MICRO SIGN}m)", cmap="viridis")
+    draw_map(axes, sheet, length, "length (\N{MICRO SIGN}m)", cmap=SEQUENTIAL)
     rows, columns = (slice(step // 2, None, step) for step in (max(1, n // _ARROWS) for n in length.shape))
     x, y = np.meshgrid(sheet.x[columns], sheet.y[rows])
     arrows = last[rows, columns]
@@ -237,14 +247,14 @@ def draw_signed(axes: Axes, sheet: Sheet, name: str) -> None:
     known = np.abs(values[np.isfinite(values)])
     side = float(np.percentile(known, _SPAN)) if known.any() else 1.0
     ends = exceeded(values, -side, side)
-    draw_map(axes, sheet, values, label, extend=ends, cmap="RdBu", vmin=-side, vmax=side)
+    draw_map(axes, sheet, values, label, extend=ends, cmap=DIVERGING, vmin=-side, vmax=side)
     entitle(axes, title.capitalize())
 
 
 def draw_own(axes: Axes, sheet: Sheet, name: str) -> None:
     """Draw a map of a user's own estimator."""
     values = sheet.result.own_maps[name].astype(np.float64)
-    draw_map(axes, sheet, values, name, cmap="viridis")
+    draw_map(axes, sheet, values, name, cmap=SEQUENTIAL)
     entitle(axes, name, "" if np.isfinite(values).all() else "blue: no answer")
 
 
@@ -252,7 +262,7 @@ def draw_azimuth(axes: Axes, sheet: Sheet) -> None:
     """Draw the azimuth of the normal, in degrees, in colours that go round as it does."""
     assert sheet.result.azimuth is not None
     azimuth = np.degrees(np.angle(np.exp(1j * sheet.result.azimuth.astype(np.float64))))
-    draw_map(axes, sheet, azimuth, "azimuth (deg)", cmap="twilight", vmin=-180, vmax=180)
+    draw_map(axes, sheet, azimuth, "azimuth (deg)", cmap=CYCLIC, vmin=-180, vmax=180)
     axes.child_axes[0].set_yticks(range(-180, 181, 90))
     entitle(axes, "Azimuth of the normal", "0: to the right; 90: up")
 
