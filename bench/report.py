@@ -21,8 +21,8 @@ LEGEND = (
 )
 
 _ABOUT = (
-    "What `mirrorskin bench` measured. `mirrorskin bench report` made this page of the runs named below: "
-    "make it anew rather than change it."
+    "What `mirrorskin bench` measured. `mirrorskin bench report` made this page of the runs named at its "
+    "end: make it anew rather than change it."
 )
 _COMMANDS = """```sh
 pip install '.[bench]'                            # peers: Numba, PyTorch, pyamg, besides NumPy, SciPy, OpenCV
@@ -123,13 +123,14 @@ def as_table(head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: boo
 
 
 def as_markdown(run: Data) -> str:
-    """Return a run with all its tables and notes as a page."""
-    parts = [f"# {as_title(run)}", as_versions(run), LEGEND]
+    """Return a run with all its tables and notes as a page, and at its end what it was made with."""
+    parts = [f"# Benchmarks, run of {run['date'][:10]}", LEGEND]
     for case in run["cases"]:
         parts.append(f"## {case['name']}: {case['title']}")
         for head, rows, numbers in ((HEAD, as_rows(case), True), (TARGET_HEAD, as_targets(case), False)):
             parts += [as_table(head, rows, numbers=numbers)] if rows else []
         parts += as_notes(case)
+    parts += ["## Machine", f"{as_title(run)}.", f"{as_versions(run)}."]
     return "\n\n".join(parts) + "\n"
 
 
@@ -177,7 +178,6 @@ def as_page(runs: Mapping[Path, Run], *, pictured: bool) -> str:
     """Return the page of some runs; `pictured` says whether there is a picture."""
     machines = gather(runs.values())
     parts = ["# Benchmarks", _ABOUT, "## How to measure", _COMMANDS, _METHOD]
-    parts += ["## Machine and runs", _runs(runs)]
     for title, about, describe in (
         ("Aims", _AIMS, _aims),
         ("Calls", _CALLS, _calls),
@@ -188,6 +188,7 @@ def as_page(runs: Mapping[Path, Run], *, pictured: bool) -> str:
     if pictured:
         parts += ["## Roofline", f"![Roofline]({PICTURE.as_posix()})", _ROOF]
     parts += _topic("Accuracy", _ACCURACY, machines, _accuracy)
+    parts += ["## Machine and runs", _runs(runs)]
     return "\n\n".join(parts) + "\n"
 
 
