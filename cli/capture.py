@@ -53,7 +53,7 @@ def command(
     plan = scans.make_plan(context.params, settings)  # from the options above
     io.check_output(output, rig_file, calibration)
     known = scans.open_calibration(calibration, settings)
-    with open_rig(settings) as rig:
+    with open_rig(settings, plan.in_steps) as rig:
         # Normals are told from so many frames of a turn; more would be of no use to 'reconstruct'.
         scan = scans.make_scan(rig, plan, settle, frames, turn_frames=WINDOW)
         recorder = io.StreamRecorder(scan, output, compression.value, calibration=known)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time as clock
 from collections import deque
 from collections.abc import Iterator
@@ -17,6 +18,7 @@ from mirrorskin.io import InputError
 _BUFFERS = 16  # frames that Aravis may fill before they are read
 _LOOK = 0.2  # seconds that one waits for a frame before it looks whether to end
 _FORMATS = {"uint8": ("Mono8",), "uint16": ("Mono16", "Mono14", "Mono12", "Mono10")}  # the first is preferred
+_INPUT = "Line0"  # that triggers it, unless another is given
 _WRAP = 65535  # the greatest frame number of GigE Vision 1; then comes 1
 _SPAN = 5.0  # seconds that the least delay is looked for in; clocks drift by some 0.1 ms meanwhile
 _REMEDY = (
@@ -69,6 +71,7 @@ class GenicamCamera(ReopenedCamera):
             for _ in range(_BUFFERS):
                 stream.push_buffer(self._aravis.Buffer.new_allocate(size))
             device.start_acquisition()
+        self._opened()
         why = f"{self.name} gives no picture"
         try:
             self._read(stream)
@@ -82,7 +85,8 @@ class GenicamCamera(ReopenedCamera):
         """Put frames into the ring until there are none for 2 s."""
         times, last, silent_since = DeviceClock(), None, clock.monotonic()
         dtype = self.dtype.newbyteorder("<")
-        while not self._stop.is_set() and clock.monotonic() - silent_since < READ_TIMEOUT:
+        patience = READ_TIMEOUT if self._settings.trigger is None else math.inf
+        while not self._stop.is_set() and clock.monotonic() - silent_since < patience:
             buffer = stream.timeout_pop_buffer(round(1e6 * _LOOK))
             if buffer is None:
                 continue
@@ -108,10 +112,13 @@ class GenicamCamera(ReopenedCamera):
         if not wanted and not found:
             raise InputError(f"{self.name}: there is none; see its cable, power and network")
         try:
-            return aravis.Camera.new(found[0] if found else wanted)
+            opened = aravis.Camera.new(found[0] if found else wanted)
         except self._failure as error:
             known = f"; there are {', '.join(sorted(there))}" if there else "; none is found here"
             raise InputError(f"{self.name} cannot be opened: {error.message}{known}") from error
+        if opened.is_gv_device() and not opened.get_device().is_controller():
+            raise InputError(f"{self.name} is used by another program: close that, and wait some seconds")
+        return opened
 
     def _configure(self, device: Any) -> None:
         """Set what is asked for, and log what was not taken."""
@@ -143,6 +150,8 @@ class GenicamCamera(ReopenedCamera):
                 device.set_gain_auto(off)
             device.set_gain(asked.gain)
             self._compare("gain", asked.gain, device.get_gain())
+        if asked.trigger is not None:  # last: a rate switches it off
+            device.set_trigger(asked.trigger_input or _INPUT)
 
     def _compare(self, what: str, asked: float, got: float, unit: str = "") -> None:
         if not np.isclose(asked, got, rtol=0.01):
@@ -167,7 +176,7 @@ class DeviceClock:
 
     def __init__(self) -> None:
         self._least: deque[tuple[float, float]] = deque()  # when read and difference, which both increase
-        self._stamp = self._last = float("-inf")
+        self._stamp = self._last = -math.inf
 
     def arrival(self, stamp: float, now: float) -> float:
         """Return when a frame arrived that was stamped so and read now; never decreasing, nor after now."""

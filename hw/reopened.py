@@ -60,7 +60,7 @@ class ReopenedCamera(ThreadedCamera):
         raise NotImplementedError
 
     def _start(self) -> None:
-        """Begin to drain, and wait for the first frame; InputError if none comes within 7 s."""
+        """Begin to drain, and wait for the first frame unless it is triggered; InputError after 7 s."""
         self._thread.start()
         try:
             if not self._ready.wait(_FIRST_FRAME):
@@ -72,6 +72,11 @@ class ReopenedCamera(ThreadedCamera):
         except BaseException:
             self.close()
             raise
+
+    def _opened(self) -> None:
+        """Say that the source is open; of one that waits for a trigger that is enough."""
+        if self._settings.trigger is not None:
+            self._ready.set()
 
     def _arrived(self, time: float, lost: int = 0) -> None:
         """Let readers have what is in the slot, which arrived at a time, after so many lost frames."""

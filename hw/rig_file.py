@@ -29,6 +29,9 @@ GENICAM = "genicam:"
 """How the source of a camera begins that speaks GigE Vision or USB3 Vision."""
 
 Text = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]*[^\s\x00-\x1f\x7f][^\x00-\x1f\x7f]*\Z")]
+Line = Literal["coolant", "spindle"]
+"""A line of the controller that can be switched on and off."""
+
 Letter = Literal["X", "Y", "Z", "A", "B", "C"]
 _Side = Annotated[float, Meta(gt=0)]
 _Pixels = Annotated[int, Meta(ge=1, le=_CELL)]
@@ -279,6 +282,10 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
     rate: Annotated[
         Annotated[float, Meta(gt=0)] | None, Meta(description="a rate above 0, in Hz,", examples=[60.0])
     ] = None
+    trigger: Line | None = None
+    trigger_input: Annotated[
+        Text | None, Meta(description="what the camera calls it, in quotes,", examples=["Line0"])
+    ] = None
     delay: Annotated[
         Annotated[float, Meta(ge=0, le=10)] | None,
         Meta(description="a time from 0 to 10 s", examples=[0.03]),
@@ -303,6 +310,8 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
             if self.genicam != self.fourcc.startswith("Mono"):
                 known = "Mono8 to Mono16" if self.genicam else "two to four letters"
                 raise ValueError(f'fourcc is "{self.fourcc}": this source needs {known}; or leave it out')
+        if self.trigger_input is not None and self.trigger is None:
+            raise ValueError("trigger_input is given and trigger is not: add that, or leave both out")
         if self.zenith_gain == 0:
             raise ValueError("zenith_gain is 0: write the counts per degree, e.g. 5.7, or leave it out")
         if self.zenith_gain is None and self.zenith_offset is not None:
@@ -494,6 +503,8 @@ size = [640, 480]               # columns, rows
 # exposure = 0.004              # s
 # gain = 1.0
 # rate = 60.0                   # Hz
+# trigger = "coolant"           # or "spindle": the controller's line that triggers it, or a lamp, in steps
+# trigger_input = "Line0"       # the input of a genicam: camera that the line is wired to
 # stall = 0.1                   # s without a frame, in motion, after which the stage is stopped
 # delay = 0.03                  # s from the middle of the exposure to the arrival; a stream's is measured
 pixel_size = 0.03               # mm at the sheet

@@ -32,6 +32,7 @@ _MANUAL = 1.0  # V4L2's "manual exposure"
 _EXPOSURE_UNIT = 1e-4  # seconds, V4L2's
 _STALEST = 0.5  # seconds: a camera's own time that is older is not a time of this clock
 _LONGEST_BACKLOG = 0.5  # seconds
+_WAITED = 0.9  # of the time after which OpenCV says that there is no picture
 _USUAL_RATE = 25.0  # frames a second, of what does not say
 _DEVICES = Path("/dev")
 _CONVERSIONS = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}
@@ -71,6 +72,12 @@ class VideoCamera(ReopenedCamera):
 
     def __init__(self, settings: CameraSettings, slots: int | None = None) -> None:
         self._source = find_source(settings.source)
+        if settings.trigger is not None and self._source.kind != "device":
+            raise InputError(f"{self._source.name} cannot be triggered: leave camera.trigger out")
+        if settings.trigger_input is not None:
+            raise InputError(
+                f"{self._source.name}: its input is set by its own tools; leave trigger_input out"
+            )
         self._returns = self._source.kind != "file"
         self._repeats = _Repeats()
         super().__init__(self._source.name, settings, slots)
@@ -82,11 +89,16 @@ class VideoCamera(ReopenedCamera):
 
     def _read_until_lost(self, timeout: float) -> str:
         capture = Capture(self._source, self._settings, timeout)
+        self._opened()
         pace = _Pace(capture.period) if self._source.kind == "file" else None
         try:
             while not self._stop.is_set():
+                began = clock.monotonic()
                 time = capture.grab()
                 if time is None:
+                    waited = clock.monotonic() - began > _WAITED * READ_TIMEOUT
+                    if waited and self._settings.trigger is not None:
+                        continue
                     break
                 slot = self._slot()
                 capture.retrieve(slot)

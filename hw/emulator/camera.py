@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +18,8 @@ from mirrorskin.hw.stage import Position
 from mirrorskin.hw.twin import Twin
 from mirrorskin.hw.twin.movement import Pose, Twist, pose_at_lean, pose_at_press
 from mirrorskin.io.types import InputError
+
+_LOOK = 0.002  # seconds from one look at the trigger to the next
 
 
 def pose_at(place: Position, pivot: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Pose:
@@ -45,6 +48,9 @@ class TwinCamera(ThreadedCamera):
     camera's clock: what a busy machine is late with adds nothing to it. A frame that cannot be worked out
     until a period after its arrival is lost and counted, as in a camera that cannot keep up.
 
+    With a `trigger`, which tells when a line went on, off, on, ..., a frame is exposed from each time that it
+    goes on, and none else.
+
     `where` gives the body's `Position` at a past time of `time.monotonic`; the twin's movement only bounds
     how far it may go. `delay` and `jitter` are seconds; the body turns about `pivot`, mm from the centre of
     the undeformed sheet.
@@ -59,6 +65,7 @@ class TwinCamera(ThreadedCamera):
         jitter: float = 0.0,
         seed: int = 0,
         pivot: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        trigger: Callable[[], list[float]] | None = None,
     ) -> None:
         rate = twin.frame_rate
         for name, value in (("delay", delay), ("jitter", jitter)):
@@ -66,6 +73,7 @@ class TwinCamera(ThreadedCamera):
                 raise InputError(f"{name} {value} of the emulated camera cannot be: give seconds, 0 or more")
         super().__init__(twin.name, twin.shape[1:], twin.dtype, rate)
         self._twin, self._where, self._pivot = twin, where, pivot
+        self._trigger = trigger
         self._rate, self._delay, self._jitter = rate, delay, jitter
         self._random = np.random.default_rng(seed)
         self._in_transit: deque[_Frame] = deque()
@@ -106,18 +114,16 @@ class TwinCamera(ThreadedCamera):
         """Render each frame when its exposure is over, or pass it over if it would come too late."""
         # A device's first launch takes longer than later ones.
         self._twin.look(lambda late: pose_at_press(0.0), 0, np.empty(self.shape, self.dtype))
-        start, period = time.monotonic(), 1 / self._rate
-        number = lost = 0
-        last = -math.inf
-        while True:
-            middle = start + number * period
+        period, lost, last = 1 / self._rate, 0, -math.inf
+        for number, middle in enumerate(self._exposures(period)):
             exposure_end = middle + self._twin.exposure / 2
             arrival = max(
                 exposure_end, last, middle + self._delay + self._jitter * self._random.standard_normal()
             )
             if self._wait_until(exposure_end):
                 return
-            if self._stalled.is_set() or time.monotonic() > arrival + period:
+            late = self._trigger is None and time.monotonic() > arrival + period
+            if self._stalled.is_set() or late:
                 lost += 1
             else:
                 pixels = self._render(middle, number)
@@ -125,7 +131,18 @@ class TwinCamera(ThreadedCamera):
                     self._in_transit.append(_Frame(pixels, arrival, lost))
                     self._change.notify_all()
                 last, lost = arrival, 0
-            number += 1
+
+    def _exposures(self, period: float) -> Iterator[float]:
+        """Yield the middle of each exposure, some of them before their time."""
+        if self._trigger is None:
+            start = time.monotonic()
+            yield from (start + number * period for number in itertools.count())
+            return
+        seen = 0
+        while not self._ended.wait(_LOOK):
+            for went_on in self._trigger()[::2][seen:]:
+                seen += 1
+                yield went_on + self._twin.exposure / 2
 
     def _render(self, middle: float, number: int) -> NDArray[Any]:
         pixels = np.empty(self.shape, self.dtype)

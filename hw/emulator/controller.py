@@ -4,9 +4,10 @@ It obeys and answers as the firmware does: lines wait in a receive buffer of 128
 are lost; moves wait in a planner of 15, and the answer to a line comes once its move has found room there;
 realtime bytes are obeyed at once. Machine coordinates are 0 at the homing switches and negative elsewhere.
 
-It has what the stage's driver uses: moves (``gcode.py``), ``$$``, ``$I``, ``$X``, ``$H``, hold, resume and
-reset. Soft limits are looked at for a whole arc before it begins; homing moves one axis at a time and slows
-down before the switch; a line takes a millisecond to be read, whatever it says.
+It has what the stage's driver uses: moves (``gcode.py``), coolant and spindle as lines that are on or off,
+``$$``, ``$I``, ``$X``, ``$H``, hold, resume and reset. Soft limits are looked at for a whole arc before it
+begins; homing moves one axis at a time and slows down before the switch; a line takes a millisecond to be
+read, whatever it says.
 """
 
 from __future__ import annotations
@@ -26,6 +27,12 @@ LINE_TIME = 1e-3  # seconds that a line takes to be read
 HARD_LIMIT, SOFT_LIMIT, ABORTED, HOMING_ABORTED, NO_SWITCH = 1, 2, 3, 6, 9
 
 _RESET, _QUERY, _HOLD, _RESUME = 0x18, ord("?"), ord("!"), ord("~")
+_SWITCHES: Mapping[str, tuple[str, bool]] = {
+    "M8": ("coolant", True),
+    "M9": ("coolant", False),
+    "M3S1000": ("spindle", True),
+    "M5": ("spindle", False),
+}
 _LINE_MAX = 79  # characters of a line, without spaces
 _WCO_EVERY = 10  # reports, of which one has the work offset
 _SEEK_TRAVELS = 1.5  # travels within which a homing switch must be found
@@ -63,10 +70,14 @@ class Controller:
         self._out = bytearray()
         self._powered_off = False
         self._locked = bool(self._settings[22])
+        self.switched: dict[str, list[float]] = {
+            line: [] for line, _ in _SWITCHES.values()
+        }  # on, off, on, ...
         self._boot()
 
     def _boot(self) -> None:
         """Begin anew, as after a reset; an alarm stays."""
+        self._switch_off()
         self._received.clear()
         self._program.reset(self._own_place())
         self._homing = self._needs_reset = self._limit_reached = self._executing = False
@@ -139,6 +150,7 @@ class Controller:
     def die(self) -> None:
         """Stop dead for good."""
         self.planner.halt(self._now)
+        self._switch_off()
         self._powered_off = True
         self._out.clear()
 
@@ -193,6 +205,7 @@ class Controller:
 
     def _lock_until_reset(self, code: int) -> None:
         self.planner.halt(self._now)
+        self._switch_off()
         self._needs_reset = self._locked = True
         self._limit_reached = self._homing = False
         self._say(f"ALARM:{code}")
@@ -246,12 +259,23 @@ class Controller:
             elif line:
                 if self._locked:
                     raise GrblError(9)
-                if (drive := self._program.run(line)) is not None:
+                if line in _SWITCHES:
+                    yield lambda: not self.planner.busy
+                    self._switch(*_SWITCHES[line])
+                elif (drive := self._program.run(line)) is not None:
                     yield from self._drive(*drive)
         except GrblError as error:
             self._say(str(error))
         else:
             self._say("ok")
+
+    def _switch(self, line: str, on: bool) -> None:
+        if on != len(self.switched[line]) % 2:
+            self.switched[line].append(self._now)
+
+    def _switch_off(self) -> None:
+        for line in self.switched:
+            self._switch(line, False)
 
     def _drive(self, path: Path, feed: float) -> _Steps:
         """Wait for room in the planner, and put a move there; not beyond the soft limits, if they are on."""

@@ -80,6 +80,11 @@ class GrblMachine:
             planner = self._current().planner
             return planner.speed(self._clock() if at is None else at)
 
+    def switched(self, line: str) -> list[float]:
+        """Return when coolant or spindle went on, off, on, ... on the clock; it is off at first."""
+        with self._lock:
+            return [*self._current().switched[line]]
+
     @property
     def state(self) -> str:
         """The state as a report has it: Idle, Run, Hold:0, Hold:1, Alarm or Home."""

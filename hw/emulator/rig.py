@@ -21,6 +21,7 @@ from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
 from mirrorskin.hw.emulator.server import FrameServer
 from mirrorskin.hw.rig_file import (
     CameraSettings,
+    Line,
     RigFile,
     RigSettings,
     ShiftAxis,
@@ -85,6 +86,8 @@ class EmulatedRig:
         Of noise and jitter.
     pivot : (float, float, float)
         What the body turns about, from the rest sheet's centre, mm.
+    trigger : str, optional
+        The controller's line that triggers the camera, coolant or spindle; else it runs freely.
     home : bool
         Whether the machine has switches, and must find them before it moves.
     machine : GrblMachine, optional
@@ -113,6 +116,7 @@ class EmulatedRig:
         jitter: float = 0.0,
         seed: int = 0,
         pivot: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        trigger: Line | None = None,
         home: bool = False,
         machine: GrblMachine | None = None,
         **scene: Any,
@@ -120,7 +124,7 @@ class EmulatedRig:
         self._levels = replace(camera or Camera(), frame_rate=rate, seed=seed)
         of_twin: dict[str, Any] = {"shape": (240, 320), "pixel_size": 0.05, **scene}
         self._make = functools.partial(Twin, object=object, camera=self._levels, **of_twin)
-        self._pivot, self._home = pivot, home
+        self._pivot, self._home, self._trigger = pivot, home, trigger
         self._seen = self._make(movement=_Anywhere(pivot))
         self._axes = _axes(home, _AXES if machine is None else machine.axes)
         start = {axis.letter: axis.zero for axis in self._axes.values()}
@@ -129,6 +133,9 @@ class EmulatedRig:
         self._make_camera = functools.partial(
             TwinCamera, self._seen, self.where, delay=delay, jitter=jitter, seed=seed, pivot=pivot
         )
+        if trigger is not None:
+            switched = functools.partial(self.machine.switched, trigger)
+            self._make_camera = functools.partial(self._make_camera, trigger=switched)
         self._leaving = ExitStack()
 
     def __enter__(self) -> Self:
@@ -211,6 +218,7 @@ class EmulatedRig:
             dtype=cast(Literal["uint8", "uint16", "float32"], self._seen.dtype.name),
             rate=self._seen.frame_rate,
             stall=_STALL,
+            trigger=self._trigger,
             pixel_size=header.pixel_size,
             bright=self._levels.bright,
             zenith_gain=None if gain is None else gain * math.radians(1.0),

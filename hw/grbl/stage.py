@@ -18,7 +18,7 @@ from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.grbl.link import HOLDING, RESET, Link, TimedStatus, open_port
 from mirrorskin.hw.grbl.moves import Axes, Command
 from mirrorskin.hw.grbl.replies import BUFFER, Message, Setting, Status
-from mirrorskin.hw.rig_file import StageSettings
+from mirrorskin.hw.rig_file import Line, StageSettings
 from mirrorskin.hw.stage import Position, Report
 from mirrorskin.io import InputError
 from mirrorskin.io.types import Closing
@@ -26,6 +26,12 @@ from mirrorskin.io.types import Closing
 if TYPE_CHECKING:
     import serial
 
+_SWITCHES: dict[tuple[Line, bool], str] = {
+    ("coolant", True): "M8",
+    ("coolant", False): "M9",
+    ("spindle", True): "M3S1000",  # an output that dims is full on at the greatest speed, $30
+    ("spindle", False): "M5",
+}
 _PREPARE = "G21G90G94"  # millimetres, absolute places, feeds a minute
 _OLDEST = (1, 1)
 _OFFSET_TIMEOUT = 2.0  # seconds in which a report gives the work offset, at 20 questions a second
@@ -221,6 +227,11 @@ class GrblStage(Closing):
                 f"at the phase {math.degrees(start):.4g} degrees; move there first"
             )
         self._send(commands, end)
+
+    def switch(self, line: Line, on: bool) -> None:
+        """Switch a line of the controller, at rest; a stop, which resets the controller, switches it off."""
+        with self._guarded():
+            self._link.ask(_SWITCHES[line, on], self._settings.timeout)
 
     def wait(self, timeout: float | None = None) -> Report:
         """Wait until the body rests and every command is done, and return the report of it.

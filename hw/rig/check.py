@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.hw.camera import Camera, Counts
 from mirrorskin.hw.rig.rig import longest_wait, open_camera, open_stage
+from mirrorskin.hw.rig.trigger import Trigger
 from mirrorskin.hw.rig_file import Axis, CameraSettings, RigSettings, StageSettings
 from mirrorskin.hw.stage import Limits, Position, Report, Stage
 from mirrorskin.io import InputError
@@ -32,6 +34,7 @@ _SPARE = 3.0  # times the longest wait seen, that a limit should be; told if it 
 _ROUNDING = 1e-6  # how far numbers of the controller may be beyond ours by rounding
 
 _FRAME_TIMEOUT = 5.0  # seconds that a camera may take to its first frame
+_TRIGGERED = 3  # frames
 _BATCH = 64  # frames taken at once
 _RATE_TOLERANCE = 0.05  # share that a rate may differ from the one asked
 _SATURATED_MAX = 0.01  # share of the pixels that may be
@@ -72,7 +75,8 @@ def check_rig(
             sound &= finding.verdict != "failed"
             yield finding
         with _logged_warnings() as logged, closing(open_camera(settings.camera)) as camera:
-            yield from check_camera(camera, settings.camera)
+            looked = check_camera if settings.camera.trigger is None else partial(check_trigger, stage)
+            yield from looked(camera, settings.camera)
         yield from (Finding("camera", "message", line, "warning", "see docs/camera.md") for line in logged)
         if move and sound:
             yield from check_moves(stage, settings.stage)
@@ -273,6 +277,18 @@ def check_camera(camera: Camera, settings: CameraSettings) -> Iterator[Finding]:
     bound = longest_wait(settings, 1 / after.rate if after.rate > 0 else 0.0)
     yield _wait("camera", "longest wait for a frame", longest, bound, "camera.stall")
     yield _brightness(frames.pixels[-1].copy())
+
+
+def check_trigger(stage: Stage, camera: Camera, settings: CameraSettings) -> Iterator[Finding]:
+    """Trigger a camera that was opened, at rest."""
+    rows, columns = camera.shape
+    yield Finding("camera", "pictures", f"{columns} x {rows} {camera.dtype.name}")
+    trigger = Trigger(stage, camera, settings, lambda: None)
+    frames = [trigger.expose() for _ in range(_TRIGGERED)]
+    trigger.check(wait=True)
+    found = f"{_TRIGGERED} frames, at most {1e3 * trigger.longest:.0f} ms after '{settings.trigger}' went on"
+    yield Finding("camera", "trigger", found)
+    yield _brightness(frames[-1].pixels[-1].copy())
 
 
 def _rate(counts: Counts, settings: CameraSettings) -> Finding:

@@ -13,6 +13,7 @@ from typing import cast
 
 from mirrorskin.hw.camera import Camera, Frames
 from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.rig.trigger import Trigger
 from mirrorskin.hw.rig_file import CameraSettings, RigSettings, StageSettings
 from mirrorskin.hw.stage import Position, Report, Stage
 from mirrorskin.io import InputError
@@ -86,6 +87,9 @@ class Rig(Closing):
         self.name = settings.name
         self._move: Move | None = None
         self._fault: HardwareError | None = None
+        self.trigger: Trigger | None = None  # what takes frames one by one, if the rig file says so
+        if settings.camera.trigger is not None:
+            self.trigger = Trigger(stage, camera, settings.camera, self.check)
         self._looked = -math.inf  # when the guard last did
         self._closing = threading.Event()
         self._guard = threading.Thread(target=self._watch, name=f"{self.name}: guard")
@@ -122,7 +126,7 @@ class Rig(Closing):
     def begin(self, move: Callable[[], None], timed: bool = False) -> Move:
         """Tell the stage to move by calling `move`, and return while it does; see `Move`."""
         self.check()
-        if self.camera.latest == -math.inf:
+        if self.trigger is None and self.camera.latest == -math.inf:
             self.take(1)  # a camera that is still starting is not missed later
         began, reconnects = time.monotonic(), self.camera.counts.reconnects
         move()
@@ -145,7 +149,12 @@ class Rig(Closing):
         return self.end(self.begin(lambda: self.stage.move(place, speed)))
 
     def take(self, most: int) -> Frames:
-        """Take the frames that wait, or wait for one, as ``Camera.take``; HardwareError if the rig failed."""
+        """Take the frames that wait, or wait for one, as ``Camera.take``; HardwareError if the rig failed.
+
+        Of a rig with a trigger, one frame is triggered.
+        """
+        if self.trigger is not None:
+            return self.trigger.expose()
         until = time.monotonic() + _PATIENCE
         while True:
             self.check()
@@ -211,7 +220,7 @@ class Rig(Closing):
                 f"{self.camera.name} was lost while the stage moved, which was stopped; it is back, and its"
                 " frames may be later than before: begin anew"
             )
-        if silence < longest_wait(self.settings.camera, self.period):
+        if self.trigger is not None or silence < longest_wait(self.settings.camera, self.period):
             return None
         return HardwareError(
             f"{self.camera.name} gave no frame for {silence:.2f} s while the stage moved, which was stopped:"
@@ -271,23 +280,37 @@ def _open_own(settings: StageSettings) -> Stage:
     return cast("Stage", stage)
 
 
-def open_rig(settings: RigSettings) -> Rig:
+def open_rig(settings: RigSettings, steps: bool = False) -> Rig:
     """Open the stage and the camera that a rig file describes, and wait for the first frame.
+
+    With a trigger in the rig file there is none yet: `steps` promises that only a ``StepScan`` follows.
 
     A stage that the file says to have switches is homed, since a controller does not tell whether it was,
     or was only unlocked. InputError if one of them is missing, busy, or not what the file says; HardwareError
     if no frame came.
     """
+    if settings.camera.trigger is not None and not steps:
+        raise untriggered(settings)
     with ExitStack() as opening:
         camera = open_camera(settings.camera)
         opening.callback(camera.close)
-        camera.take(1, _PATIENCE)
+        if settings.camera.trigger is None:
+            camera.take(1, _PATIENCE)
         stage = open_stage(settings.stage)
         opening.callback(stage.close)
         if settings.stage.home:
             stage.home()
+        rig = Rig(stage, camera, settings)
         opening.pop_all()
-    return Rig(stage, camera, settings)
+    return rig
+
+
+def untriggered(settings: RigSettings) -> InputError:
+    """Return the refusal of what needs frames all the time."""
+    return InputError(
+        f"{settings.path}: camera.trigger takes frames of a capture in steps, and of nothing else: give"
+        " --step or --phase-step, or leave it out"
+    )
 
 
 def open_camera(settings: CameraSettings) -> Camera:

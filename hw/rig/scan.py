@@ -153,8 +153,9 @@ class Scan(Closing):
         first = self.plan.first
         rests = self._visit(Position(first.travel), first).time
         if isinstance(self.plan, HorizontalPlan | TwistPlan):
-            while self.rig.take(1).time[-1] < rests + self.plan.wait:
+            while self.rig.trigger is None and self.rig.take(1).time[-1] < rests + self.plan.wait:
                 pass
+            _sleep_until(rests + self.plan.wait)
 
     def _known(self) -> Header:
         """Return what is known before anything moves."""
@@ -188,7 +189,8 @@ class StepScan(Scan):
     """Stands still for each of its frames; see ``Scan``.
 
     Frames count whose exposure began after the body had settled: they arrive later by the camera's delay,
-    0.2 s where the rig file does not say and at least that of a stream, and half an exposure.
+    0.2 s where the rig file does not say and at least that of a stream, and half an exposure. With a trigger
+    in the rig file each frame is exposed when that goes on, once the body has settled.
 
     Parameters
     ----------
@@ -228,6 +230,8 @@ class StepScan(Scan):
     def _next(self, most: int, origin: float) -> Block | None:
         if self._left == 0:
             if self._step + 1 == len(self._values):
+                if self.rig.trigger is not None:
+                    self.rig.trigger.check(wait=True)
                 return None
             self._go_on()
         frames, arrival, dropped = self._take(min(most, self._left))
@@ -241,13 +245,17 @@ class StepScan(Scan):
         place = self._places[self._step]
         rest = self.rig.go(place)
         _check_there(rest, place, self.rig.stage.name)
+        self._left = self.frames
+        if self.rig.trigger is not None:
+            self._since = -math.inf
+            _sleep_until(rest.time + self.settle)
+            return
         camera = self.rig.settings.camera
         delay = camera.delay or 0.0
         if camera.delay is None or camera.streamed:
             delay = max(_UNKNOWN_DELAY, delay)
         exposure = self.rig.period if camera.exposure is None else camera.exposure
         self._since = rest.time + self.settle + delay + exposure / 2
-        self._left = self.frames
         self.rig.camera.flush()
 
     def _take(self, most: int) -> tuple[NDArray[Any], Floats, int]:
@@ -258,6 +266,10 @@ class StepScan(Scan):
             if new < len(taken.time):
                 first = self._left == self.frames
                 return taken.pixels[new:], taken.time[new:], 0 if first else taken.dropped
+
+
+def _sleep_until(due: float) -> None:
+    time.sleep(max(0.0, due - time.monotonic()))
 
 
 def _check_there(rest: Report, place: Position, name: str) -> None:
@@ -277,6 +289,8 @@ def take_dark(rig: Rig, since: float, count: int = _DARK_FRAMES) -> NDArray[np.f
     """Return the mean of some frames that arrived after a time, (H, W): the sheet must touch nothing."""
     total = np.zeros(rig.camera.shape)
     left = count
+    if rig.trigger is not None:
+        since = -math.inf
     rig.camera.flush()
     while left:
         frames = rig.take(left)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mirrorskin.hw.camera import Frames
 from mirrorskin.hw.rig.delay import Delay, measure_delay
 from mirrorskin.hw.rig.plans import AxialPlan, Plan, Trapezoid
-from mirrorskin.hw.rig.rig import Move, Rig
+from mirrorskin.hw.rig.rig import Move, Rig, untriggered
 from mirrorskin.hw.rig.scan import Scan
 from mirrorskin.hw.rig.track import LiveTrack, Progress, Track, even_times
 from mirrorskin.io.types import Block, Floats
@@ -46,6 +46,8 @@ class SweepScan(Scan):
     """
 
     def __init__(self, rig: Rig, plan: Plan, turn_frames: int | None = None) -> None:
+        if rig.trigger is not None:
+            raise untriggered(rig.settings)
         self._path = plan.path
         super().__init__(rig, plan)
         self._turn_frames = turn_frames

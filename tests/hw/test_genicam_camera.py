@@ -122,6 +122,38 @@ def test_packets_become_frames_without_a_gap_also_where_its_counter_wraps(served
     assert np.median(np.diff(times)) == pytest.approx(1 / 200, rel=0.02)
 
 
+def test_one_that_another_program_uses_is_refused(served) -> None:
+    with (
+        served("MS4"),
+        GenicamCamera(settings("genicam:MS4")),
+        pytest.raises(InputError, match=r"^camera genicam:MS4 is used by another program: close that"),
+    ):
+        GenicamCamera(settings("genicam:MS4"))
+
+
+def test_one_that_is_triggered_gives_a_frame_each_time_and_is_not_lost_meanwhile(served, monkeypatch) -> None:
+    monkeypatch.setattr(genicam, "READ_TIMEOUT", 0.2)
+    devices = []
+    opening = GenicamCamera._open
+    monkeypatch.setattr(GenicamCamera, "_open", lambda self: devices.append(opening(self)) or devices[-1])
+    asked = settings("genicam:MS5", trigger="coolant", trigger_input="Software", rate=200.0)
+    with served("MS5"), GenicamCamera(asked) as camera:
+        for number in range(3):
+            time.sleep(0.4)
+            assert camera.counts.frames == number
+            devices[0].software_trigger()
+            assert camera.take(1, SOON).number.tolist() == [number]
+        assert (camera.counts.dropped, camera.counts.reconnects) == (0, 0)
+        devices.clear()
+
+
+def test_an_input_that_it_has_not_is_refused(fake) -> None:
+    with pytest.raises(
+        InputError, match=r"cannot be set as the rig file says: \[TriggerSource\] 'Line7' not"
+    ):
+        GenicamCamera(settings(fake, trigger="coolant", trigger_input="Line7"))
+
+
 def test_frames_that_lose_packets_are_counted_as_lost(served) -> None:
     with served("MS2", "-r", "100"), GenicamCamera(settings("genicam:MS2", rate=200.0), slots=300) as camera:
         numbers, _ = take(camera, 50)
@@ -134,7 +166,7 @@ def test_a_camera_that_is_lost_comes_back_and_its_numbers_go_on(served, monkeypa
     monkeypatch.setattr(genicam, "READ_TIMEOUT", 0.5)
     with served("MS3") as process:
         camera = GenicamCamera(settings("genicam:MS3", rate=50.0), slots=300)
-        take(camera, 20)
+        take(camera, 60)
         process.kill()
         wait_until(lambda: "gives no picture: it was lost after" in caplog.text)
         frames, latest = camera.counts.frames, camera.latest
@@ -145,7 +177,7 @@ def test_a_camera_that_is_lost_comes_back_and_its_numbers_go_on(served, monkeypa
         back = camera.take(1, SOON)
         assert (camera.counts.reconnects, camera.error) == (1, None)
     missing = back.number[0] - frames
-    assert missing == pytest.approx(50 * (back.time[0] - latest), rel=0.1)
+    assert missing == pytest.approx(50 * (back.time[0] - latest), rel=0.25)
     assert camera.counts.dropped == missing
 
 

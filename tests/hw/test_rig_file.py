@@ -108,6 +108,8 @@ gain = 2
 rate = 60
 delay = 0.03
 stall = 0.2
+trigger = "spindle"
+trigger_input = "Line2"
 pixel_size = [0.03, 0.04]
 dark = 12
 bright = 4000.5
@@ -286,6 +288,16 @@ WRONG = [
         "camera.size is [64, 0]: a list of columns and rows, each from 1 to",
     ),
     ('dtype = "uint16"', 'dtype = "int8"', 'camera.dtype is "int8": one of "uint8", "uint16", "float32" is'),
+    (
+        'trigger = "spindle"',
+        'trigger = "lamp"',
+        'camera.trigger is "lamp": one of "coolant", "spindle" is needed',
+    ),
+    (
+        'trigger = "spindle"',
+        "",
+        "[camera] trigger_input is given and trigger is not: add that, or leave both",
+    ),
     ('fourcc = "Y16"', 'fourcc = "Mono12"', '[camera] fourcc is "Mono12": this source needs'),
     (
         'fourcc = "Y16"',

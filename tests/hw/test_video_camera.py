@@ -276,6 +276,30 @@ def test_a_camera_that_is_lost_comes_back(driver, open_camera, caplog) -> None:
     assert ["was lost after 1 frames" in told[0], "is back after" in told[1]] == [True, True]
 
 
+def test_a_camera_that_waits_for_a_trigger_is_not_lost(driver, open_camera, monkeypatch) -> None:
+    monkeypatch.setattr(video, "READ_TIMEOUT", 0.1)
+    opened = open_camera(trigger="coolant")
+    assert opened.latest == -np.inf
+    time.sleep(0.3)  # what OpenCV waits, without a picture
+    driver.pictures.put(None)
+    driver.pictures.put(noise(1)[0])
+    assert opened.take(1, SOON).number.tolist() == [0]
+    assert (driver.opened, opened.counts.reconnects) == (1, 0)
+
+
+def test_a_film_cannot_be_triggered(tmp_path) -> None:
+    write_y4m(tmp_path / "film.y4m", noise(2), 50)
+    with pytest.raises(InputError, match=r"film\.y4m cannot be triggered: leave camera\.trigger out$"):
+        VideoCamera(settings(str(tmp_path / "film.y4m"), SMALL, trigger="coolant"))
+
+
+def test_the_input_of_a_trigger_is_not_ours_to_set(open_camera) -> None:
+    with pytest.raises(
+        InputError, match=r"video0: its input is set by its own tools; leave trigger_input out$"
+    ):
+        open_camera(trigger="coolant", trigger_input="Line0")
+
+
 def test_a_camera_that_does_not_come_back_is_given_up(driver, open_camera, monkeypatch) -> None:
     monkeypatch.setattr(reopened, "PATIENCE", 0.3)
     driver.pictures.put(noise(1)[0])

@@ -1,0 +1,94 @@
+"""Frames one by one: a line of the stage's controller goes on for each, and triggers the camera or a lamp."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+from mirrorskin.hw.camera import Camera, Frames
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.rig_file import CameraSettings
+from mirrorskin.hw.stage import Stage
+from mirrorskin.io import InputError
+
+_PATIENCE = 2.0  # seconds that a frame may take, besides exposure and delay
+_SLICE = 0.05
+
+
+class Trigger:
+    """Takes exactly one frame each time that a line of the controller is switched on.
+
+    The line is on until the frame has arrived, and off afterwards whatever happens, as long as the controller
+    obeys: a stop of the stage resets that, which switches it off, too.
+
+    Parameters
+    ----------
+    stage : Stage
+        At rest; with a method ``switch``, as `GrblStage` has.
+    camera : Camera
+        In its triggered mode.
+    settings : CameraSettings
+        With the line to switch as ``trigger``.
+    check : callable
+        Raises what went wrong with the rig, if anything did.
+    """
+
+    def __init__(
+        self, stage: Stage, camera: Camera, settings: CameraSettings, check: Callable[[], None]
+    ) -> None:
+        switch = getattr(stage, "switch", None)
+        if switch is None:
+            raise InputError(f"{stage.name}: camera.trigger needs a GRBL controller; leave it out")
+        self._switch, self._line = switch, settings.trigger
+        self._camera, self._check = camera, check
+        self._patience = _PATIENCE + (settings.exposure or 0.0) + (settings.delay or 0.0)
+        self._before: int | None = None  # frames that had come before the first trigger
+        self._given = 0
+        self.longest = 0.0  # seconds from a trigger to its frame, at most
+
+    def expose(self) -> Frames:
+        """Trigger the camera once, and return the frame; HardwareError if none or another one came."""
+        self.check()
+        if self._before is None:
+            self._camera.flush()
+            self._before = self._camera.counts.frames
+        began = time.monotonic()
+        try:
+            self._switch(self._line, True)
+            frames = self._take()
+        finally:
+            with suppress(HardwareError):  # of a stage that was stopped, which switches the line off
+                self._switch(self._line, False)
+        self._given += 1
+        self.longest = max(self.longest, time.monotonic() - began)
+        return frames
+
+    def check(self, wait: bool = False) -> None:
+        """HardwareError if there were more frames than triggers; `wait` for one that is on its way."""
+        if wait:
+            time.sleep(self.longest)
+        self._check()
+        if self._before is None:
+            return
+        more = self._camera.counts.frames - self._before - self._given
+        if more > 0:
+            raise HardwareError(
+                f"{self._camera.name} gave {more} frames more than it was triggered for: see that it is in"
+                " its triggered mode, that one edge of the line triggers it, and that this does not bounce"
+            )
+
+    def _take(self) -> Frames:
+        until = time.monotonic() + self._patience
+        while True:
+            self._check()
+            try:
+                return self._camera.take(1, _SLICE)
+            except HardwareError:
+                if self._camera.error is not None:
+                    raise
+                if time.monotonic() > until:
+                    raise HardwareError(
+                        f"{self._camera.name} gave no frame within {self._patience:.3g} s of its trigger: see"
+                        f" the controller's line '{self._line}', its wiring, and the camera's triggered mode"
+                    ) from None

@@ -1,0 +1,186 @@
+"""A line of the emulated controller triggers the emulated camera, frame by frame."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+from commands import run
+from rig_fakes import FakeCamera, FakeStage, settings
+from served_rig import allow_delays
+
+from mirrorskin import io
+from mirrorskin.hw.emulator.rig import EmulatedRig
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.grbl.stage import GrblStage
+from mirrorskin.hw.rig import rig as rigs
+from mirrorskin.hw.rig import trigger as triggers
+from mirrorskin.hw.rig.check import check_rig
+from mirrorskin.hw.rig.plans import VerticalPlan
+from mirrorskin.hw.rig.rig import Rig, open_rig
+from mirrorskin.hw.rig.scan import StepScan
+from mirrorskin.hw.rig.sweep import SweepScan
+from mirrorskin.io import InputError
+
+SCENE = {"shape": (24, 32), "pixel_size": 0.2, "rate": 40.0}
+STEPS = ("--stop", "1mm", "--step", "500um", "--settle", "0s", "--frames", "2")
+
+
+@pytest.fixture
+def emulated(monkeypatch):
+    """A rig whose camera is triggered by the coolant's line, or a freely running one as if it were."""
+    allow_delays(monkeypatch)
+    monkeypatch.setattr(triggers, "_PATIENCE", 20.0)  # for a busy machine
+    opened = []
+
+    def make(line="coolant", free=False):
+        rig = EmulatedRig("sphere", trigger=None if free else line, delay=0.02, **SCENE).__enter__()
+        opened.append(rig)
+        camera = msgspec.structs.replace(rig.settings.camera, trigger=line, dark=16)
+        monkeypatch.setattr(rigs, "open_camera", lambda settings: rig.camera)
+        return rig, replace(rig.settings, camera=camera)
+
+    yield make
+    for rig in opened:
+        rig.__exit__(None, None, None)
+
+
+def is_on(rig, line="coolant"):
+    return len(rig.machine.switched(line)) % 2 == 1
+
+
+def drain(scan):
+    """Return the travels of all frames."""
+    travel = []
+    while (block := scan.read()) is not None:
+        travel += block.travel.tolist()
+    return travel
+
+
+def wait_until_off(rig):
+    until = time.monotonic() + 5.0
+    while is_on(rig):
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize("line", ["coolant", "spindle"])
+def test_each_frame_of_steps_is_triggered_once_at_rest(emulated, line):
+    rig, told = emulated(line)
+    plan = VerticalPlan(0.0, 1.0, step=0.5)
+    with open_rig(told, steps=True) as opened, StepScan(opened, plan, settle=0.0, frames=2) as scan:
+        travel = drain(scan)
+    switched = rig.machine.switched(line)
+    assert travel == [0, 0, 0.5, 0.5, 1, 1]
+    assert len(switched) == 12  # on and off, for each
+    assert not any(rig.machine.moving(at) for at in switched)
+    assert [rig.where(at).travel for at in switched[::2]] == pytest.approx(travel)
+    assert rig.camera.counts.frames == 6
+
+
+def test_a_capture_in_steps_is_triggered_from_the_command_line(emulated, tmp_path):
+    rig, _ = emulated()
+    file = rig.write(tmp_path / "rig", "genicam:")
+    ended = run("capture", "vertical", "--rig", file, "-o", tmp_path / "press.h5", *STEPS)
+    assert ended.code == 0, ended.said
+    with io.open_recording(tmp_path / "press.h5") as recording:
+        assert (recording.shape, recording.state) == ((6, 24, 32), "complete")
+        assert recording.header.dark is not None
+    assert rig.camera.counts.frames == 16 + 6  # the dark reference, too
+    assert not is_on(rig)
+
+
+def test_a_missing_frame_ends_a_capture_in_one_line_and_the_line_is_off(emulated, tmp_path, monkeypatch):
+    monkeypatch.setattr(triggers, "_PATIENCE", 0.3)
+    rig, _ = emulated()
+    file = rig.write(tmp_path / "rig", "genicam:")
+    rig.camera.stall()
+    ended = run("capture", "vertical", "--rig", file, "-o", tmp_path / "press.h5", *STEPS)
+    assert ended.code == 1
+    assert "gave no frame within 0.3 s of its trigger: see the controller's line 'coolant', its" in ended.said
+    assert len(rig.machine.switched("coolant")) == 2
+
+
+def test_a_camera_that_runs_freely_is_a_fault(emulated):
+    _, told = emulated(free=True)
+    with (
+        open_rig(told, steps=True) as opened,
+        StepScan(opened, VerticalPlan(0.0, 1.0, step=0.5), settle=0.0) as scan,
+        pytest.raises(HardwareError, match=r"gave \d+ frames more than it was triggered for: see that it is"),
+    ):
+        drain(scan)
+
+
+def test_a_surplus_frame_after_the_last_trigger_is_a_fault(emulated):
+    rig, told = emulated()
+    with (
+        GrblStage(told.stage) as stage,
+        Rig(stage, rig.camera, told) as opened,
+        StepScan(opened, VerticalPlan(0.0, 1.0, step=1.0), settle=0.0) as scan,
+    ):
+        for _ in range(2):
+            scan.read()
+        stage.switch("coolant", True)
+        with pytest.raises(HardwareError, match="gave 1 frames more than it was triggered for"):
+            scan.read()
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_the_line_is_off_whatever_interrupts(emulated, monkeypatch, error):
+    rig, told = emulated()
+    seen = []
+
+    def interrupt(most, timeout):
+        seen.append(is_on(rig))
+        raise error
+
+    with pytest.raises(error), open_rig(told, steps=True) as opened:  # noqa: PT012
+        monkeypatch.setattr(opened.camera, "take", interrupt)
+        opened.take(1)
+    assert seen == [True]
+    assert not is_on(rig)
+
+
+def test_a_stop_of_the_stage_switches_the_line_off(emulated):
+    rig, told = emulated()
+    with GrblStage(told.stage) as stage:
+        stage.switch("coolant", True)
+        stage.stop()
+        wait_until_off(rig)
+
+
+def test_what_needs_frames_all_the_time_is_refused(emulated, tmp_path):
+    rig, told = emulated()
+    file = rig.write(tmp_path / "rig", "genicam:")
+    words = ("--rig", file, "--stop", "1mm", "--speed", "1mm/s")
+    for ended in (
+        run("capture", "vertical", "-o", tmp_path / "press.h5", *words),
+        run("rig", "probe", file, "--from", "-1mm"),
+    ):
+        assert ended.code == 2
+        assert "camera.trigger takes frames of a capture in steps, and of nothing else: give" in ended.said
+    with (
+        GrblStage(told.stage) as stage,
+        Rig(stage, rig.camera, told) as opened,
+        pytest.raises(InputError, match=r"camera\.trigger takes frames of a capture in steps"),
+    ):
+        SweepScan(opened, VerticalPlan(0.0, 1.0, speed=1.0))
+
+
+def test_a_stage_that_has_no_line_is_refused():
+    camera = FakeCamera(lambda at: None, lambda place: np.zeros((8, 8), np.uint8))
+    with pytest.raises(
+        InputError, match=r"^fake stage: camera.trigger needs a GRBL controller; leave it out$"
+    ):
+        Rig(FakeStage(), camera, settings(trigger="coolant"))
+
+
+def test_rig_check_triggers_a_few_frames(emulated):
+    rig, told = emulated()
+    found = {one.what: one for one in check_rig(told, open_camera=lambda settings: rig.camera)}
+    assert found["trigger"].found.startswith("3 frames, at most ")
+    assert found["brightness"].verdict == "ok"
+    assert not is_on(rig)
