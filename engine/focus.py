@@ -63,6 +63,8 @@ class FocusEstimator:
     -3.7
     """
 
+    device: Device
+
     def __init__(
         self,
         shape: tuple[int, int],

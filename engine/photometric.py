@@ -73,6 +73,8 @@ class PhotometricStereo:
     0.5145
     """
 
+    device: Device
+
     def __init__(
         self,
         shape: tuple[int, int],

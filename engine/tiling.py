@@ -82,6 +82,9 @@ class Band:
         Frames that there is room for.
     """
 
+    rows: slice
+    pixels: int
+
     def __init__(
         self,
         device: Device,
@@ -96,18 +99,18 @@ class Band:
         self._device, self._kinds, self._dtype = device, maps, dtype
         self.rows, self.pixels = rows, shape[0] * shape[1]
         word = _LINE // dtype.itemsize
-        self.stride = -(-self.pixels // word) * word
+        self.stride: int = -(-self.pixels // word) * word
         if self.stride > _MOST_PIXELS:
             raise DeviceMemoryError(
                 f"kernels number pixels to {_MOST_PIXELS}; {self.pixels} are too many at once"
             )
-        self.maps = _Maps(self._make, maps)
+        self.maps: dict[str, Array] = _Maps(self._make, maps)
         self._most = device.max_allocation // (
             self.pixels * dtype.itemsize
         )  # frames that kernels see at once
         if self._most < least:
             raise DeviceMemoryError(f"{device.info.title} has no room for {least} frames")
-        self.length = min(length, self._most)
+        self.length: int = min(length, self._most)
         self._places = [] if device.info.shares_memory else _places(device, self.length, least, shape, dtype)
         self._borrowed: BorrowedBuffer | None = None
         self._only = True  # band of the picture

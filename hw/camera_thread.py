@@ -40,6 +40,9 @@ class ThreadedCamera(Closing):
         Frames that may wait; see ``mirrorskin.hw.ring.usual_slots``.
     """
 
+    shape: tuple[int, int]
+    dtype: np.dtype[Any]
+
     def __init__(
         self,
         name: str,

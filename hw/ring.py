@@ -46,7 +46,7 @@ class Ring:
         if slots < 1:
             raise ValueError(f"a ring has at least 1 slot, not {slots}")
         self.name = name
-        self.dropped = 0  # frames lost so far, here or before they came here
+        self.dropped: int = 0  # frames lost so far, here or before they came here
         self.error: HardwareError | None = None
         # Besides: one is being written to; and while one is lent and one copied, one can wait.
         places = max(slots + 2, 4)

@@ -50,6 +50,24 @@ class ArrayRecording(Recording):
         Frames, positions or header cannot be used.
     """
 
+    path: Path
+    name: str
+    dataset: str
+    region: Region
+    origin: tuple[int, int]
+    first_frame: int
+    time: None
+    travel: None
+    phase: None
+    displacement: None
+    twist: None
+    tilt: None
+    truth: None
+    used: None
+    dropped: None
+    state: str
+    storage: str
+
     def __init__(
         self,
         frames: NDArray[Any],
@@ -69,13 +87,13 @@ class ArrayRecording(Recording):
             )
         self.path, self.name, self.dataset, self._files = Path(name), name, "", dict(origins or {})
         self.motion, series = _motion(name, positions, motion)
-        self.full_shape = frames.shape[0], frames.shape[1], frames.shape[2]
+        self.full_shape: tuple[int, int, int] = frames.shape[0], frames.shape[1], frames.shape[2]
         cut = cut_out(name, self.full_shape, wanted, region)
         self.region, self.origin, self.first_frame = cut.region, cut.region.origin, cut.frames[0]
-        self.which = f"{cut.frames[0]}:{cut.frames[1]}"
+        self.which: str = f"{cut.frames[0]}:{cut.frames[1]}"
         self._frames = frames[slice(*cut.frames), *cut.region.slices]
-        self.shape = self._frames.shape[0], self._frames.shape[1], self._frames.shape[2]
-        self.dtype = self._frames.dtype
+        self.shape: tuple[int, int, int] = self._frames.shape[0], self._frames.shape[1], self._frames.shape[2]
+        self.dtype: np.dtype[Any] = self._frames.dtype
         self.time = self.travel = self.phase = self.displacement = self.twist = self.tilt = None
         given = along(positions[series], self.full_shape[0])
         assert given is not None
@@ -87,7 +105,7 @@ class ArrayRecording(Recording):
         size = header.get("pixel_size")
         if size is not None and not all(1e-9 < one < 1e6 for one in size):
             raise InputError(f"{name}: pixel size {size} mm: give one above zero: 1e-9 to 1e6")
-        self.header = Header(self.motion, **{"title": self.path.stem, **header, **known})
+        self.header: Header = Header(self.motion, **{"title": self.path.stem, **header, **known})
         self.truth, self.used, self.dropped, self.state = None, None, None, COMPLETE
         self.storage, self._next, self._hash = "one piece", 0, ""
 

@@ -99,7 +99,7 @@ class NewHdf5(Closing):
     def __init__(self, path: Path, descriptor: int) -> None:
         self._path = path
         self._disk = _Disk(descriptor, "w+b", closefd=False)
-        self.root = h5py.File(self._disk, "w", libver=VERSIONS, **_ALIGNED)
+        self.root: Any = h5py.File(self._disk, "w", libver=VERSIONS, **_ALIGNED)
 
     def check(self) -> None:
         """Raise InputError if the disk did not take all that was written so far."""

@@ -89,6 +89,8 @@ class Chunks:
     wanted is copied there. The file's descriptor is closed at the latest with the last reference to this.
     """
 
+    length: int
+
     def __init__(
         self,
         file: int,
@@ -101,9 +103,9 @@ class Chunks:
     ) -> None:
         self.length, self._shape, self._dtype = index.shape[0], index.shape, dtype
         self._size = math.prod(index.shape) * dtype.itemsize
-        self.scratch_bytes = threads * self._size
+        self.scratch_bytes: int = threads * self._size
         by = "one thread" if threads == 1 else f"{threads} threads"
-        self.how = f"chunks {'decoded' if codecs else 'read'} by {by}"
+        self.how: str = f"chunks {'decoded' if codecs else 'read'} by {by}"
         self._frames, self._file, self._place = frames, file, place
         self._index, self._codecs, self._threads = index, codecs, threads
         self._close_file = weakref.finalize(self, os.close, file)

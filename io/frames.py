@@ -103,6 +103,12 @@ def open_frames(
 class FrameSequence(Closing, ABC):
     """A source of other people's frames, read in order and rewindable."""
 
+    name: str
+    header: Header
+    shape: tuple[int, int, int]
+    dtype: np.dtype[Any]
+    left_out: tuple[str, ...]
+
     rewindable = True
 
     def __init__(
@@ -123,7 +129,9 @@ class FrameSequence(Closing, ABC):
         self._lost = lost or [0] * shape[0]
         self._time = time
         travel, phase = self._along(travel), self._along(phase)
-        self.travel = None if travel is None else check_strokes(travel, shape[0], f"{name}: travel")
+        self.travel: NDArray[np.float64] | None = (
+            None if travel is None else check_strokes(travel, shape[0], f"{name}: travel")
+        )
         self._phase = None if phase is None else check_phase(phase, shape[0], f"{name}: phase")
         self._next = 0
 

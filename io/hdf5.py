@@ -36,7 +36,7 @@ class Hdf5File(Closing):
         real = os.path.realpath(path)
         self._home = Path(real).parent
         with as_input_error(str(path)):
-            self.root = _open_file(path, real) if root is None else root
+            self.root: Any = _open_file(path, real) if root is None else root
         self._files: dict[str, h5py.File] = {real: self.root}
         self._groups: dict[str, Node | None] = {"": self.root}
         self._steps = 0

@@ -21,7 +21,7 @@ MARK = "mirrorskin_recording"
 STACK = "/entry/instrument/detector/data"
 DETECTOR, STAGE, TRUTH = "/entry/instrument/detector", "/entry/instrument/stage", "/entry/truth"
 # What a simulation's truth holds, and its units.
-TRUTH_UNITS = {
+TRUTH_UNITS: dict[str, str | None] = {
     "height": "mm",
     "zenith": "rad",
     "azimuth": "rad",

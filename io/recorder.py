@@ -118,6 +118,8 @@ _Source = TypeVar("_Source", bound=Source)
 class TeeSource(Generic[_Source]):
     """A source whose frames are written as they go by."""
 
+    name: str
+
     rewindable = False
 
     def __init__(
@@ -125,7 +127,7 @@ class TeeSource(Generic[_Source]):
     ) -> None:
         check_compression(compression)
         self.source = source
-        self.path = Path(path)
+        self.path: Path = Path(path)
         self.name, self.motion = source.name, source.motion
         self._compression: Compression = compression
         self._calibration = calibration
@@ -171,6 +173,10 @@ class Recorder(TeeSource[Source]):
     >>> with Recorder(source, "press.h5") as recorder:  # doctest: +SKIP
     ...     recorder.drain(print)
     """
+
+    header: Header
+    shape: tuple[int, int, int]
+    dtype: np.dtype[Any]
 
     def __init__(
         self,

@@ -78,6 +78,26 @@ class Recording(Closing):
         Whether reading is worth a thread of its own: of Zarr.
     """
 
+    path: Path
+    name: str
+    dataset: str
+    header: Header
+    truth: Truth | None
+    shape: tuple[int, int, int]
+    dtype: np.dtype[Any]
+    region: Region
+    origin: tuple[int, int]
+    first_frame: int
+    state: str
+    used: NDArray[np.bool_] | None
+    dropped: NDArray[np.int32] | None
+    time: Floats | None
+    travel: Floats | None
+    phase: Floats | None
+    displacement: Floats | None
+    twist: Floats | None
+    storage: str
+
     rewindable = True
     read_ahead = False
     left_out: tuple[str, ...] = ()
@@ -98,12 +118,12 @@ class Recording(Closing):
         self.header, self.motion, self.truth = header, header.motion, truth
         self.shape, self.dtype = stack.shape, stack.dtype
         self.region, self.origin, self.first_frame = cut.region, cut.region.origin, cut.frames[0]
-        self.full_shape = (state.count, *_shape(dataset)[1:])
+        self.full_shape: tuple[int, int, int] = (state.count, *_shape(dataset)[1:])
         self.state, self.used, self.dropped = state.state, state.used, state.dropped
         self.time, self.travel, self.phase = (positions.get(name) for name in ("time", "travel", "phase"))
         self.displacement, self.twist = positions.get("displacement"), positions.get("twist")
-        self.tilt = positions.get("tilt")
-        self.which = f"{cut.frames[0]}:{cut.frames[1]}{', used live' if live else ''}"
+        self.tilt: Floats | None = positions.get("tilt")
+        self.which: str = f"{cut.frames[0]}:{cut.frames[1]}{', used live' if live else ''}"
         self.storage, self._file, self._dataset = file.storage(dataset), file, dataset
         self._origins = file.origins() if isinstance(file, ZarrFile) else origins(file, dataset)
         self.read_ahead = isinstance(file, ZarrFile)

@@ -43,6 +43,10 @@ class MappedFrames:
     them again and again must find them there.
     """
 
+    length: int
+    how: str
+    scratch_bytes: int
+
     length, how, scratch_bytes = 1, "mapped", 0
 
     def __init__(
@@ -113,10 +117,12 @@ class MappedFrames:
 class Hdf5Frames(Closing):
     """A dataset that HDF5 itself reads, in one thread; ``why`` says what keeps us from doing so."""
 
+    scratch_bytes: int
+
     def __init__(self, dataset: h5py.Dataset, place: Place, why: str) -> None:
         chunk = dataset.chunks or (1, *dataset.shape[1:])
         self.length, self.scratch_bytes = chunk[0], math.prod(chunk) * dataset.dtype.itemsize
-        self.how = f"through HDF5 ({why})"
+        self.how: str = f"through HDF5 ({why})"
         self._dataset, self._place = dataset, place
 
     def lend(self, start: int, stop: int) -> None:
@@ -135,6 +141,9 @@ class Stack:
     unpacked once: frames of chunks that hold more of them than are read at a time are kept, in memory of so
     many bytes or on disk.
     """
+
+    shape: tuple[int, int, int]
+    dtype: np.dtype[Any]
 
     def __init__(
         self,

@@ -107,6 +107,9 @@ class StreamRecorder(TeeSource[LiveSource]):
     ...         print(block.index)
     """
 
+    count: int
+    written: int
+
     def __init__(
         self,
         source: LiveSource,
@@ -358,7 +361,7 @@ class GrowingRecording(Closing):
         calibration: Calibration | None,
         series: Collection[str],
     ) -> None:
-        self.count = 0
+        self.count: int = 0
         self._raw = compression == "raw"
         self._frame = math.prod(shape[1:]) * dtype.itemsize
         # Indices of chunks and the like lie in one piece before the frames, not among them.
@@ -459,7 +462,7 @@ class GrowingRecording(Closing):
         }
         self._dropped = Column(file, DROPPED, None, np.int32(0), expected)
         self._checksums = Column(file, CHECKSUM, None, np.uint32(0), expected)
-        self.used = Column(file, USED, None, np.uint8(1), expected)
+        self.used: Column = Column(file, USED, None, np.uint8(1), expected)
 
     def _flush(self) -> None:
         """Do so; the room that was reserved last is enough for it."""

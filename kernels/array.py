@@ -72,6 +72,8 @@ class Array:
         The last kernel that took it as an argument.
     """
 
+    shape: tuple[int, ...]
+
     def __init__(
         self, device: Device, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], zeroed: bool
     ) -> None:
@@ -84,7 +86,7 @@ class Array:
         self._mapped: cl.MemoryMap | None = None
         self._buffer: cl.Buffer | None = None
         self.shape, self._dtype, self._zeroed = shape, dtype, zeroed
-        self.nbytes = math.prod(shape) * dtype.itemsize
+        self.nbytes: int = math.prod(shape) * dtype.itemsize
         if self.nbytes > device.max_allocation:
             raise DeviceMemoryError(_no_room(device, name, self.nbytes))
         # A device that shares memory sees it from its first kernel on, with what the host wrote before.
@@ -253,6 +255,9 @@ class BorrowedBuffer:
     ``name``, ``host``, ``buffer``, ``arrived`` and ``last_use`` are as of an `Array`; nothing is ever copied.
     """
 
+    name: str
+    host: NDArray[Any]
+
     arrived = None
 
     def __init__(self, device: Device, name: str, values: NDArray[Any]) -> None:
@@ -261,7 +266,7 @@ class BorrowedBuffer:
         flags = cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR
         loaded = as_strided(values.reshape(-1).view(np.uint8), (values.nbytes + SLACK,))
         with _naming(device, name, values.nbytes):
-            self.buffer = cl.Buffer(device.context, flags, hostbuf=loaded)
+            self.buffer: cl.Buffer = cl.Buffer(device.context, flags, hostbuf=loaded)
 
     def __del__(self) -> None:
         with suppress(DeviceError):

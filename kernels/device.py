@@ -25,7 +25,7 @@ from mirrorskin.kernels import embedded, memory
 from mirrorskin.kernels.array import Array, BorrowedBuffer, Operand, can_be_borrowed, failed, pinned
 from mirrorskin.kernels.disk_cache import keep, recall
 from mirrorskin.kernels.errors import DeviceError, UnknownDeviceError
-from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT
+from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT, Layout
 from mirrorskin.kernels.profile import Profile
 from mirrorskin.kernels.signature import Signature, read_signatures
 
@@ -155,15 +155,20 @@ class Device:
         What callers keep on it from one call to the next, taken out while in use.
     """
 
+    info: DeviceInfo
+    process: int
+    queue: cl.CommandQueue
+    copies: cl.CommandQueue
+
     def __init__(self, device: cl.Device) -> None:
         self.info, self.process = _describe(device), os.getpid()
         if _is_pocl(device):
             embedded.verify(device)
-        self.profile = Profile()
-        self.max_allocation = self.info.max_allocation
-        self.layout = CPU_LAYOUT if self.info.kind == "cpu" else GPU_LAYOUT
+        self.profile: Profile = Profile()
+        self.max_allocation: int = self.info.max_allocation
+        self.layout: Layout = CPU_LAYOUT if self.info.kind == "cpu" else GPU_LAYOUT
         try:
-            self.context = cl.Context([device])
+            self.context: cl.Context = cl.Context([device])
             self.queue, self.copies = _queues(self.context)
         except cl.Error as error:
             raise failed(self, "be used", error) from error
@@ -396,9 +401,9 @@ class Kernel:
         self._device = device
         self._kernel = kernel
         self._signature = signature
-        self.arguments = tuple(name for name, _ in signature)
+        self.arguments: tuple[str, ...] = tuple(name for name, _ in signature)
         self._names = frozenset(self.arguments)
-        self.group = _group_of(kernel, device.context.devices[0], device.layout.group)
+        self.group: int = _group_of(kernel, device.context.devices[0], device.layout.group)
 
     def __call__(
         self,

@@ -209,36 +209,49 @@ def add_turn(before: Answer, now: Answer, turns: int) -> Answer:
 class Samples:
     """Samples as zeniths, and their fit with one wave a turn."""
 
+    offset: NDArray[Any]
+    low: NDArray[Any]
+    high: NDArray[Any]
+    turn: Doubles
+    freedom: NDArray[Any]
+    under: NDArray[np.bool_]
+    over: NDArray[np.bool_]
+    mean: NDArray[Any]
+    cosine: NDArray[Any]
+    sine: NDArray[Any]
+
     def __init__(self, frames: Array, turn: Doubles, scale: Doubles, noise: Variance) -> None:
         count, pixels = frames.shape
         self.offset, per_count, self.low, self.high = np.broadcast_to(scale.reshape(4, -1), (4, pixels))
         self.per_count = per_count
         self.turn, self.freedom = turn, count - 3
         raw = frames.astype(np.float64)
-        self.zenith = (raw - self.offset) * per_count
-        self.missing = np.isnan(raw)
+        self.zenith: NDArray[Any] = (raw - self.offset) * per_count
+        self.missing: NDArray[np.bool_] = np.isnan(raw)
         known = np.maximum((~self.missing).sum(axis=0), 1)
         level = np.where(self.missing, 0.0, raw).sum(axis=0) / known
-        self.error = np.sqrt(np.maximum(noise.base + noise.slope * level, noise.least)) * np.abs(per_count)
+        self.error: NDArray[Any] = np.sqrt(
+            np.maximum(noise.base + noise.slope * level, noise.least)
+        ) * np.abs(per_count)
         self.under, self.over = np.zeros((2, count, pixels), bool)
-        self.top = np.inf
+        self.top: float = np.inf
         if frames.dtype.kind == "u":
             self.top = float(np.iinfo(frames.dtype).max)
             self.under, self.over = raw <= 0, raw >= self.top
-        self.each = self.error / turn[2][:, np.newaxis]  # standard deviation of each sample
+        self.each: NDArray[Any] = self.error / turn[2][:, np.newaxis]  # standard deviation of each sample
         margin = _MARGIN * self.each
         usable = (self.zenith > self.low + margin) & (self.zenith < self.high - margin)
-        self.whole = usable & ~self.under & ~self.over
+        self.whole: NDArray[Any] = usable & ~self.under & ~self.over
         self.keep(np.ones_like(self.whole))
         self.mean, self.cosine, self.sine = turn[3:] @ self.zenith
         wave = self.mean + np.multiply.outer(turn[0], self.cosine) + np.multiply.outer(turn[1], self.sine)
-        self.square = np.sum((turn[2][:, np.newaxis] * (self.zenith - wave)) ** 2, axis=0)
+        self.square: NDArray[Any] = np.sum((turn[2][:, np.newaxis] * (self.zenith - wave)) ** 2, axis=0)
 
     def keep(self, there: NDArray[np.bool_]) -> None:
         """Take all samples but those that are there, (N, n), for missing."""
         self.missing = self.missing | ~there
-        self.usable = (self.whole & there).sum(axis=0)
-        self.irregular = self.usable < len(there)
+        self.usable: NDArray[Any] = (self.whole & there).sum(axis=0)
+        self.irregular: NDArray[Any] = self.usable < len(there)
 
 
 def conclude(normal: Doubles, sums: Sums, samples: Samples, usable: Array, tilt: float, limits: Limits,

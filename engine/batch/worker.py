@@ -41,6 +41,10 @@ class Share:
 class Enlist(WorkerPlugin):
     """Finds out whether a worker can take part: those that are there, and those that come later."""
 
+    program: str
+    sizes: Mapping[Path, int]
+    trace: Path
+
     def __init__(self, program: str, sizes: Mapping[Path, int], trace: Path) -> None:
         self.program, self.sizes, self.trace = program, sizes, trace
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -66,7 +66,7 @@ class LinearBrightness:
             ends = [(_per_pixel(level, shape) - offset) / gain for level in (header.dark, header.bright)]
         return cls(offset, gain, np.fmin(*ends), np.fmax(*ends))
 
-    depth_sigma = 0.0  # light shows no depths here
+    depth_sigma: ClassVar[float] = 0.0  # light shows no depths here
 
     def sight(self, pixels: Pixels) -> Doubles:
         """Look straight down."""

@@ -34,9 +34,16 @@ class Moments:
     Sums are of differences from the first frame, in float64: for integers they are exact.
     """
 
+    lowest: NDArray[Any]
+    highest: NDArray[Any]
+    sum: NDArray[Any]
+    count: NDArray[Any]
+    at_lowest: NDArray[Any]
+    at_highest: NDArray[Any]
+
     def __init__(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
-        self.integer = dtype.kind == "u"
-        self.frames = 0
+        self.integer: bool = dtype.kind == "u"
+        self.frames: int = 0
         self.count, self.at_lowest, self.at_highest = np.zeros((3, *shape), np.int32)
         self.lowest, self.highest = np.full(shape, np.inf), np.full(shape, -np.inf)
         self.sum, self._squares = np.zeros((2, *shape))

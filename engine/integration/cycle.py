@@ -35,6 +35,10 @@ class Cycle:
     that is one pass, whose groups keep a tile of the level in local memory; all small levels are one.
     """
 
+    b: Array
+    x: Array
+    spare: Array
+
     def __init__(self, hierarchy: Hierarchy, lanes: int = 1) -> None:
         h, self._lanes = hierarchy, lanes
         self._h = h
@@ -47,7 +51,7 @@ class Cycle:
         )
         tiles = [self._tiles(one) for one in h.levels[: self._tail]]
         self._first_tile = np.cumsum([0, *tiles])
-        self.parts = h.array("parts", self._tiles(h.levels[0]), lanes=lanes)
+        self.parts: Array = h.array("parts", self._tiles(h.levels[0]), lanes=lanes)
         self._live = h.array("live", max(1, int(self._first_tile[-1])), dtype=np.uint8)
 
     def prepare(self) -> None:

@@ -53,6 +53,9 @@ class PixelGraph:
     about 1.
     """
 
+    device: Device
+    shape: tuple[int, int]
+
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
         self.device, self.shape = device, shape
         self.known_heights: Mapping[str, Operand] = {}
@@ -84,8 +87,8 @@ class PixelGraph:
     ) -> None:
         self._inputs, self._slopes, self._weights = inputs, slopes, weights
         self.known_heights = heights or {}
-        self.scale = inputs.pixel_size[0] * inputs.pixel_size[1] / inputs.typical_weight
-        self.flags = self.array("flags", np.uint8)
+        self.scale: float = inputs.pixel_size[0] * inputs.pixel_size[1] / inputs.typical_weight
+        self.flags: Array = self.array("flags", np.uint8)
         uncut = self.array("uncut", np.uint8) if edges else self.flags
         maps = {**slopes, **(mask or {}), **weights, **self.known_heights}
         self._run("links_flags", {"MASK": int(bool(mask))}, **maps, flags=uncut)

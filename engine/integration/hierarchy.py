@@ -80,20 +80,25 @@ class Hierarchy:
     theirs, ``moves`` how many aggregates of each level are therefore no blocks, and ``changed`` which.
     """
 
+    device: Device
+    anchored: bool
+    to: Array
+    changed: Array
+
     def __init__(self, shape: tuple[int, int], anchored: bool, device: Device) -> None:
         self.device, self.anchored = device, anchored
-        self.levels = cut_levels(shape)
-        self.nodes = self.levels[-1].end + _BEYOND
+        self.levels: list[Level] = cut_levels(shape)
+        self.nodes: int = self.levels[-1].end + _BEYOND
         self.graph: dict[str, Any] = {
             name: self.array(name) for name in ("right", "down", "falling", "rising")
         }
         self.graph["anchor"] = self.array("anchor") if anchored else device.given("anchor", [])
-        self.inverse = self.array("inverse")
+        self.inverse: Array = self.array("inverse")
         self._parts, self._wanted, self.to = (
             self.array(name, dtype=np.uint8) for name in ("parts", "wanted", "to")
         )
         self._touched, self.changed = (self.array(name, dtype=np.int32) for name in ("touched", "changed"))
-        self.moves = np.zeros(len(self.levels), np.int32)
+        self.moves: NDArray[np.int32] = np.zeros(len(self.levels), np.int32)
         self._splits, self._counts, self._changes = (
             self.array(name, len(self.levels), dtype=np.int32) for name in ("splits", "moves", "changes")
         )

@@ -114,6 +114,8 @@ class Rectangle:
     thread at a time.
     """
 
+    shape: tuple[int, ...]
+
     def __init__(
         self, shape: tuple[int, ...], pixel_size: tuple[float, float], device: Device, scale: float = 1.0
     ) -> None:

@@ -34,10 +34,12 @@ class WarmStartIntegrator:
         How far heights were from the solution before the last step that was looked at; NaN before the first.
     """
 
+    gap: float
+
     def __init__(self, device: Device, shape: tuple[int, int], pixel_size: ArrayLike) -> None:
         self._device, self._shape, self._pixel_size = device, shape, check_pixel_size(pixel_size)
         self._graph = PixelGraph(device, shape)
-        self.maps = {name: self._graph.array(inside) for name, inside in MAPS.items()}
+        self.maps: dict[str, Array] = {name: self._graph.array(inside) for name, inside in MAPS.items()}
         self._levelling = Levelling(self._graph)
         self._multigrid: Multigrid | None = None
         self._height: Floats | None = None

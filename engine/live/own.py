@@ -41,7 +41,7 @@ class LiveOwn:
 
     def __init__(self, source: LiveSource, estimator: Estimator | Maker) -> None:
         self._source, self._shape = source, source.shape[1:]
-        self.position = POSITIONS[source.motion]
+        self.position: str = POSITIONS[source.motion]
         self.room: NDArray[Any] = np.empty((_ROOM, *self._shape), source.dtype)
         self._estimator = prepare(estimator, self._shape, source.dtype)
         self.device: Any = getattr(self._estimator, "device", None)

@@ -40,6 +40,9 @@ class LivePress:
         The source is of another motion, or parameters cannot be used.
     """
 
+    device: Device
+    room: NDArray[Any]
+
     position = "travel"
     every = 1
     most_updates = _UPDATES

@@ -57,7 +57,7 @@ class LiveRocking:
         self._source, self._frames = source, 0
         options = options_from(header, "exact", noise, None, device)
         self._estimator = PoseEstimator(source.shape[1:], source.dtype, **options)
-        self.device = self._estimator.device
+        self.device: Device = self._estimator.device
 
     @property
     def room(self) -> NDArray[Any]:

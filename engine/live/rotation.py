@@ -96,8 +96,10 @@ class LiveRotation:
         The source is of another motion, or parameters cannot be used.
     """
 
+    every: int
+
     position = "phase"
-    most_updates = math.inf
+    most_updates: float = math.inf
 
     def __init__(
         self,
@@ -128,7 +130,7 @@ class LiveRotation:
         else:
             self._window = Correlator(shape, source.dtype, window=window, device=device)
         self._normals = self._window if isinstance(self._window, NormalWindow) else None
-        self.device = self._window.device
+        self.device: Device = self._window.device
         self._edges = SpareEdges(self.device, shape) if edges and known else None
         self._heights = None
         if integrate and known and header.pixel_size is not None:

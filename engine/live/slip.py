@@ -42,6 +42,9 @@ class LiveSlip:
         The source is of another motion, or parameters cannot be used.
     """
 
+    position: str
+    device: Device
+
     every = 1
     most_updates = _UPDATES
 
@@ -67,7 +70,7 @@ class LiveSlip:
             device=device,
         )
         self.position, self.device = self._search.position, self._search.device
-        self.room = self._search.room
+        self.room: NDArray[Any] = self._search.room
 
     def warm(self) -> None:
         """Push a few frames of a texture, and forget them."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,23 +49,26 @@ class Equations:
         Median of that over the blocks, which a dent in the object does not change.
     """
 
+    heights: NDArray[np.float64]
+    normals: NDArray[np.float64]
+
     def __init__(self, sums: NDArray[np.float32], size: float, beside: bool) -> None:
         scale = np.repeat([1 / size, 1.0], 3)
         parts = np.split(sums.astype(np.float64), PARTS[1:-1], axis=1)
         upper, scores, chi, expected, self.heights, self.normals, whole = parts
-        self.normal_matrix = np.zeros((6, 6))
+        self.normal_matrix: NDArray[Any] = np.zeros((6, 6))
         self.normal_matrix[_UPPER] = upper.sum(axis=0)
         self.normal_matrix += np.triu(self.normal_matrix, 1).T
         self.normal_matrix *= np.outer(scale, scale)
         own = whole.sum(axis=0).reshape(6, 6) * np.outer(scale, scale)
-        self.unbiased = own if beside else self.normal_matrix
-        self.scores = scores * scale
-        self.right = self.scores.sum(axis=0)
-        self.pixels = max(float(self.normals.sum()), float(self.heights.sum()))
-        self.compared = float(expected.sum())
-        self.chi_square = float(chi.sum()) / max(self.compared, 1e-9)
+        self.unbiased: NDArray[Any] = own if beside else self.normal_matrix
+        self.scores: NDArray[np.float64] = scores * scale
+        self.right: NDArray[Any] = self.scores.sum(axis=0)
+        self.pixels: float = max(float(self.normals.sum()), float(self.heights.sum()))
+        self.compared: float = float(expected.sum())
+        self.chi_square: float = float(chi.sum()) / max(self.compared, 1e-9)
         used = expected > 0
-        self.typical = float(np.median(chi[used] / expected[used])) if used.any() else math.inf
+        self.typical: float = float(np.median(chi[used] / expected[used])) if used.any() else math.inf
 
     def free(self, noise: float | None = None) -> Doubles:
         """Return orthonormal directions, (6, k), about which the maps say nothing.
@@ -85,7 +89,7 @@ class Equations:
         its size but hardly its form, which is then more that of independent errors.
         """
         ways = complement(free)
-        count, alone = np.count_nonzero(self.normals + self.heights), ways.T @ self.normal_matrix @ ways
+        count, alone = int(np.count_nonzero(self.normals + self.heights)), ways.T @ self.normal_matrix @ ways
         scatter = ways.T @ self.scores.T @ self.scores @ ways * count / max(count - 6, 1)
         size = np.trace(np.linalg.solve(alone, scatter)) / len(alone)
         middle = (count * scatter + _BLOCKS * size * alone) / (count + _BLOCKS)
@@ -100,6 +104,10 @@ def complement(free: Doubles) -> Doubles:
 
 class PairFit:
     """Two maps on a device, and the motion between them."""
+
+    first: PoseMap
+    second: PoseMap
+    device: Device
 
     def __init__(self, first: PoseMap, second: PoseMap, device: Device) -> None:
         self.first, self.second, self.device = first, second, device

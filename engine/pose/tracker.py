@@ -55,7 +55,7 @@ class PoseTracker:
     """
 
     def __init__(self, pixel_size: ArrayLike | None = None, *, device: str | Device | None = None) -> None:
-        self.keys = 0
+        self.keys: int = 0
         self._pixel_size, self._device = pixel_size, open_device(device)
         self._key: PoseMap | None = None
         self._key_pose = Pose(np.zeros(3), np.zeros(3), np.zeros((6, 6)), 1.0, 0, np.zeros((0, 6)))

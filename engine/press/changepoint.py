@@ -148,7 +148,7 @@ class ChangePointSearch:
         self._release, self._hold = check_event(event) == "release", hold
         self._noise = Noise(noise, self._dtype.kind == "u")
         self.passes = 2 if dark is None or bright is None else 1
-        self.device = open_device(device)
+        self.device: Device = open_device(device)
         self._length = max(1, memory_limit // (2 * shape[0] * shape[1] * self._dtype.itemsize))
         self._bands = cut_into_bands(self.device, shape, self._dtype, self._maps(), self._length)
         # A release is a change as well, from bright to dark: its first level is the bright one.

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from mirrorskin.engine.frames import estimate_noise, thin_out
 from mirrorskin.engine.press.onset import Onset, OnsetSearch
 from mirrorskin.io import Source
+from mirrorskin.kernels.device import Device
 
 _FEWEST = 16  # pixels that must have turned light
 _SURELY = 8.0  # sigmas by which they must have become brighter
@@ -108,7 +109,7 @@ class EstimatedLevelSearch:
         **options: Any,
     ) -> None:
         self._search = OnsetSearch(shape, dtype, threshold=threshold, device=device, **options)
-        self.device = self._search.device
+        self.device: Device = self._search.device
         lower = max(0.0, threshold - levels.sigma(threshold))
         self._lower = OnsetSearch(shape, dtype, threshold=lower, device=self.device, **options)
 

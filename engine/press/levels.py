@@ -114,7 +114,7 @@ class LevelSearch:
         **options: Any,
     ) -> None:
         first = OnsetSearch(shape, dtype, threshold=thresholds[0], device=device, **options)
-        self.device = first.device
+        self.device: Device = first.device
         others = (
             OnsetSearch(shape, dtype, threshold=share, device=first.device, **options)
             for share in thresholds[1:]

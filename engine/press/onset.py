@@ -167,7 +167,7 @@ class OnsetSearch:
         self._release, self._subframe = check_event(event) == "release", subframe
         self._hold = min(hold, _LONGEST)
         self._noise = Noise(noise, self._dtype.kind == "u")
-        self.device = open_device(device)
+        self.device: Device = open_device(device)
         self._length = max(1, memory_limit // (2 * shape[0] * shape[1] * self._dtype.itemsize))
         self._bands = cut_into_bands(self.device, shape, self._dtype, self._planes(), self._length)
         self._travel = _TravelTable(self.device)

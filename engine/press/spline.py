@@ -146,8 +146,11 @@ class CellSplines:
             [self._values(np.arange(float(count)), axis, order) for order in (0, 1)]
             for axis, count in enumerate(shape)
         )
-        self.basis = sparse.csr_matrix(sparse.kron(y, x))
-        self.slopes = sparse.csr_matrix(sparse.kron(down, x)), sparse.csr_matrix(sparse.kron(y, across))
+        self.basis: sparse.csr_matrix = sparse.csr_matrix(sparse.kron(y, x))
+        self.slopes: tuple[sparse.csr_matrix, sparse.csr_matrix] = (
+            sparse.csr_matrix(sparse.kron(down, x)),
+            sparse.csr_matrix(sparse.kron(y, across)),
+        )
 
     def surface(self, factors: Doubles) -> Doubles:
         """Return a surface at the cells, (H, W), mm."""

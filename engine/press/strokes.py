@@ -87,6 +87,8 @@ class StrokeSearch:
     (8, True)
     """
 
+    device: Device
+
     position = "travel"
 
     def __init__(

@@ -195,7 +195,7 @@ class Correlator:
         dtype = np.dtype(dtype)
         self._harmonic = check_harmonic(harmonic)
         check_dtype(dtype)
-        self.device = open_device(device)
+        self.device: Device = open_device(device)
         length = max(1, memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))
         self._shape, self._dtype = shape, dtype
         self._sums: TurnSums | WindowSums
@@ -273,7 +273,7 @@ class _Sums:
         self._step = _STEPS.get(dtype.itemsize, 1)
         self._macros: dict[str, str | int] = {"FRAME": C_TYPES[dtype.name], "BITS": 8 * dtype.itemsize}
         answers = dict.fromkeys(_ANSWERS.values(), np.float32)
-        self.bands = cut_into_bands(device, shape, dtype, {**maps, **answers}, length, least)
+        self.bands: list[Band] = cut_into_bands(device, shape, dtype, {**maps, **answers}, length, least)
         self._length = length
         self._place = device.array("place", (_BATCH,), np.int32)
         self._steps = device.array("basis", (3 * _BATCH,), np.int32)
@@ -472,7 +472,7 @@ class WindowSums(_Sums):
     def reset(self) -> None:
         """Forget the frames so far."""
         self._phase, self._weight = np.zeros((2, self._window))  # the oldest frame first; weight 0 for none
-        self.oldest = 0
+        self.oldest: int = 0
 
     def push(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool = False) -> None:
         """Move the window on; of a block that is longer than it, only the end is ever in it."""

@@ -270,7 +270,7 @@ class NormalEstimator:
         self._shape, self._dtype = shape, np.dtype(dtype)
         self._longest, self._per_turn = min(longest, LONGEST), per_turn
         self._kernel = NormalKernel(shape, self._dtype, **options, poses=self._width > 0)
-        self.device = self._kernel.device
+        self.device: Device = self._kernel.device
         length = max(self._longest + 1, memory_limit // (2 * shape[0] * shape[1] * self._dtype.itemsize))
         planes = self._kernel.planes
         self._bands = cut_into_bands(self.device, shape, self._dtype, planes, length, self._longest + 1)

@@ -127,14 +127,14 @@ class NormalKernel:
         self._noise = None if noise is None else _even_noise(noise)
         self._dtype, self._method, self._step = dtype, method, thinning(shape)
         self._scale = response or make_scale(gain, offset, dark, bright, shape)
-        self.device = open_device(device)
+        self.device: Device = open_device(device)
         if not self._scale.per_pixel:
             self._one_scale = self.device.given("scale", self._scale.planes)
         self._wall = None if response is None else self.device.given("wall", response.table)
         # Turns whose tables the device has at once, at most.
         planes = _POSE_PLANES if poses else _TURN_PLANES
         self._poses = poses
-        self.tables_at_once = max(1, min(_TABLES, self.device.max_allocation // (4 * planes * LONGEST)))
+        self.tables_at_once: int = max(1, min(_TABLES, self.device.max_allocation // (4 * planes * LONGEST)))
         self._tables = self.device.array("turns", (self.tables_at_once, planes, LONGEST), np.float32)
         self._places: dict[TurnFit | PoseFit, int] = {}
 

@@ -260,7 +260,7 @@ class SlopeKernels:
         self._squares: dict[str, Any] = {name: device.array(name, shape, np.float32) for name in names}
         for array in self._squares.values():
             array.upload()
-        self.typical = math.nan
+        self.typical: float = math.nan
 
     def find(self, tilt: float, normals: Mapping[str, Array], to: Mapping[str, Array]) -> None:
         """Put the work on the device's queue; the first time, wait for `typical`.

@@ -16,6 +16,7 @@ from mirrorskin.engine.tiling import Band, join_rows
 from mirrorskin.io import InputError
 from mirrorskin.io.positions import check_phase
 from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.device import Device
 
 _ROOM = 16  # frames that may be pushed at once without a copy
 
@@ -30,6 +31,8 @@ class NormalWindow:
     The window has 3 to 64 frames; other options are those of `mirrorskin.engine.estimate_normals`.
     """
 
+    count: int
+
     position = "phase"
 
     def __init__(
@@ -37,7 +40,7 @@ class NormalWindow:
     ) -> None:
         self._shape, self._dtype, self._window = shape, np.dtype(dtype), window
         self._kernel = NormalKernel(shape, self._dtype, **options)
-        self.device = self._kernel.device
+        self.device: Device = self._kernel.device
         planes = self._kernel.planes
         self._sums = WindowSums(self.device, shape, self._dtype, _ROOM, window, planes)
         for band in self.bands:

@@ -72,6 +72,10 @@ class Registered:
         That of the source, if it knows its phases beforehand.
     """
 
+    name: str
+    header: Header
+    shape: tuple[int, int, int]
+
     dtype = _FRAME
 
     def __init__(
@@ -89,9 +93,9 @@ class Registered:
         height = check_heights(heights, source.shape[1:])
         self.name, self.header, self.shape = source.name, header, source.shape
         self.motion: Motion = source.motion
-        self.rewindable = source.rewindable
+        self.rewindable: bool = source.rewindable
         self.phase: NDArray[np.float64] | None = getattr(source, "phase", None)
-        self.device = open_device(device)
+        self.device: Device = open_device(device)
         self._source = source
         rows, columns = self.shape[1:]
         offset, gain = _levels(header, (rows, columns))

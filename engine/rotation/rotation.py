@@ -571,7 +571,7 @@ class FirstTurn(FrameSequence):
                 break
             frames.extend(block.frames.copy())
         self._frames = np.stack(frames) if frames else np.empty((0, *source.shape[1:]), source.dtype)
-        self.phase = phase[: len(frames)]
+        self.phase: NDArray[np.float64] = phase[: len(frames)]
         super().__init__(source.name, source.header, self._frames.shape, source.dtype, phase=self.phase)
 
     def _fill(self, start: int, out: NDArray[Any]) -> None:

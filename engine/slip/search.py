@@ -136,6 +136,9 @@ class SlipSearch:
     ([-0.3, 0.0], 2)
     """
 
+    window: int
+    step: int
+
     def __init__(
         self,
         shape: tuple[int, int],
@@ -157,7 +160,7 @@ class SlipSearch:
         check_windows(shape, window, step)
         check_noise(noise)
         self.position = "displacement" if motion == "horizontal" else "twist"
-        self.device = open_device(device)
+        self.device: Device = open_device(device)
         self._shape, self._dtype, self._size = shape, check_dtype(dtype), check_pixel_size(pixel_size)
         self._contact = None if contact is None else check_contact(contact, shape)
         self._centre, self.window, self.step = centre, window, step

@@ -82,7 +82,7 @@ class Tracker:
         self._make = partial(_Level, window=window, step=step, device=device)
         self._least = 2 * window
         self._reference = reference
-        self.finest = self._make(reference)
+        self.finest: _Level = self._make(reference)
         self._fields = [self.finest.rest, self.finest.rest]
 
     @cached_property
@@ -175,6 +175,9 @@ class Tracker:
 class _Level:
     """The reference at one resolution, and what the device keeps of it."""
 
+    step: int
+    measured: Doubles
+
     def __init__(self, reference: NDArray[Any], window: int, step: int, device: Device) -> None:
         self._device, self._window, self.step = device, window, step
         self._frame_type = C_TYPES[reference.dtype.name]
@@ -182,9 +185,9 @@ class _Level:
         self.shape: tuple[int, int] = reference.shape
         rows, columns = self.shape
         self._first, self._halo = (step - window) // 2, 2 * window + 8
-        self.start = self._first + (window - 1) / 2
-        self.grid = -(-rows // step), -(-columns // step)
-        self.rest = np.zeros((2, *self.grid))
+        self.start: float = self._first + (window - 1) / 2
+        self.grid: tuple[int, int] = -(-rows // step), -(-columns // step)
+        self.rest: NDArray[Any] = np.zeros((2, *self.grid))
         padded = rows + 2 * MARGIN, columns + 2 * MARGIN
         self._maps = {
             "padded": device.array("padded", padded, np.float32),
@@ -203,8 +206,8 @@ class _Level:
         inverse, self.measured = self._invert_normals(planes)
         self._maps["inverse"] = device.given("inverse", inverse.transpose(1, 2, 0))
         # Of the displacement alone, whatever the other parameters are.
-        self.information = np.linalg.inv(inverse[:, :2, :2]).reshape(*self.grid, 2, 2)
-        self.usable = np.isfinite(self.information[..., 0, 0])
+        self.information: NDArray[Any] = np.linalg.inv(inverse[:, :2, :2]).reshape(*self.grid, 2, 2)
+        self.usable: NDArray[np.bool_] = np.isfinite(self.information[..., 0, 0])
         trust = 1 / np.trace(inverse[:, :2, :2], axis1=1, axis2=2).reshape(self.grid)
         self._trust = np.nan_to_num(trust)
         self._trust += 1e-9 * self._trust.max() + np.finfo(float).tiny

@@ -63,7 +63,7 @@ class Controller:
         self._settings = {**_SETTINGS, **axis_settings, **settings}
         self._axes = len(axes)
         self._now = now
-        self.planner = Planner(place, memory)
+        self.planner: Planner = Planner(place, memory)
         self._offset = place  # true coordinates less the controller's own
         self._program = Interpreter(axes, self._own_place())
         self._received: deque[int] = deque()

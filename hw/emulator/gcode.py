@@ -44,7 +44,7 @@ class Interpreter:
 
     def reset(self, place: Place) -> None:
         """Begin anew at a place, as after a reset."""
-        self.place = place
+        self.place: Place = place
         self._modes = {"motion": "G0", "plane": "G17", "distance": "G90"}
         self._feed = 0.0  # a minute
 

@@ -122,7 +122,7 @@ class GrblPort(Closing):
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
-        self.url = os.ttyname(self._slave)
+        self.url: str = os.ttyname(self._slave)
         self._pipe = [*os.pipe()]  # wakes the thread
         os.set_blocking(self._pipe[1], False)
         self._sending, self._noise = bytearray(), bytearray()

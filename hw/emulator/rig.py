@@ -129,7 +129,9 @@ class EmulatedRig:
         self._axes = _axes(home, _AXES if machine is None else machine.axes)
         start = {axis.letter: axis.zero for axis in self._axes.values()}
         start[self._axes["travel"].letter] += _LIFT
-        self.machine = machine or GrblMachine({**MACHINE, 20: home, 22: home}, axes=_AXES, start=start)
+        self.machine: GrblMachine = machine or GrblMachine(
+            {**MACHINE, 20: home, 22: home}, axes=_AXES, start=start
+        )
         self._make_camera = functools.partial(
             TwinCamera, self._seen, self.where, delay=delay, jitter=jitter, seed=seed, pivot=pivot
         )

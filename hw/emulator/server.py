@@ -50,7 +50,7 @@ class FrameServer(Closing):
         except (OSError, OverflowError) as error:
             raise InputError(f"port {port} cannot be listened on: {error}; take another, or 0") from None
         self._door.settimeout(_LOOK)
-        self.url = f"tcp://127.0.0.1:{self._door.getsockname()[1]}"
+        self.url: str = f"tcp://127.0.0.1:{self._door.getsockname()[1]}"
         self._threads = [threading.Thread(target=work) for work in (self._admit, self._take)]
         for thread in self._threads:
             thread.start()

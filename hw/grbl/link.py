@@ -80,7 +80,7 @@ class Stopping:
 
     def __init__(self) -> None:
         self.holding = HOLDING  # seconds that it waits for rest before it resets
-        self.over = False
+        self.over: bool = False
         self._began = self._reset = math.inf
 
     @property
@@ -156,13 +156,13 @@ class Link:
         on_report: Callable[[TimedStatus], None],
     ) -> None:
         self.error: HardwareError | None = None  # what went wrong, first of all
-        self.lock = threading.Condition()
-        self.window = Window()
-        self.noise = Noise()
+        self.lock: threading.Condition = threading.Condition()
+        self.window: Window = Window()
+        self.noise: Noise = Noise()
         self.seen: TimedStatus | None = None  # the newest report
-        self.rests = 0  # reports of rest in a row, all asked for after the last line was taken
+        self.rests: int = 0  # reports of rest in a row, all asked for after the last line was taken
         self.banner: Banner | None = None  # what it said when it started, since the last reset
-        self.gone = False  # whether the port is lost
+        self.gone: bool = False  # whether the port is lost
         self.locked = False  # whether an alarm is no error, because the stage is to be homed first
         self.patience: float | None = None  # seconds that it may be silent while it homes
         self._port = port
@@ -177,7 +177,7 @@ class Link:
         self._refused: Refusal | None = None
         self._active = False
         self._last_line = -math.inf  # when a line was last sent or answered
-        self.stopping = Stopping()
+        self.stopping: Stopping = Stopping()
         self._deaf = False  # what comes is noise, and was reported as such
         self._closing = False
         self._threads = [

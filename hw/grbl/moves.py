@@ -40,7 +40,7 @@ class Axes:
         self._axes = settings.axes
         self._name = name
         self._straight = straight  # what a line of a straight move begins with
-        self.speeds = {motion: axis.top_speed for motion, axis in self._axes.items()}
+        self.speeds: dict[str, float] = {motion: axis.top_speed for motion, axis in self._axes.items()}
         self._steps = dict.fromkeys(self.letters.values(), math.inf)
 
     @property

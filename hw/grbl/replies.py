@@ -234,7 +234,7 @@ class Noise:
     """Counts the bytes that cannot be understood: a little of it is borne."""
 
     def __init__(self) -> None:
-        self.total = 0
+        self.total: int = 0
         self._heard: deque[tuple[float, int]] = deque()
         self._recent = 0
 
@@ -253,7 +253,7 @@ class Window:
 
     def __init__(self, size: int = BUFFER) -> None:
         self.size = size  # bytes of the controller's buffer
-        self.done = 0  # lines answered
+        self.done: int = 0  # lines answered
         self._waiting: deque[bytes] = deque()
         self._sent: deque[bytes] = deque()
         self._filled = 0

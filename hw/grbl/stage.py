@@ -19,7 +19,7 @@ from mirrorskin.hw.grbl.link import HOLDING, RESET, Link, TimedStatus, open_port
 from mirrorskin.hw.grbl.moves import Axes, Command
 from mirrorskin.hw.grbl.replies import BUFFER, Message, Setting, Status
 from mirrorskin.hw.rig_file import Line, StageSettings
-from mirrorskin.hw.stage import Position, Report
+from mirrorskin.hw.stage import Limits, Position, Report
 from mirrorskin.io import InputError
 from mirrorskin.io.types import Closing
 
@@ -97,10 +97,10 @@ class GrblStage(Closing):
     def __init__(
         self, settings: StageSettings, port: serial.Serial | None = None, *, unlock: bool = False
     ) -> None:
-        self.name = f"stage {settings.port}"
-        self.limits = settings.limits
+        self.name: str = f"stage {settings.port}"
+        self.limits: Limits = settings.limits
         self._settings = settings
-        self.axes = Axes(settings, self.name)
+        self.axes: Axes = Axes(settings, self.name)
         self._offset: Mapping[str, float] | None = None
         self._reports: deque[Report] = deque(maxlen=_REPORTS_MAX)
         self._latest: Report | None = None

@@ -34,6 +34,11 @@ class Move:
     Of one that is `timed`, frames' arrivals tell where the body was.
     """
 
+    timed: bool
+    reconnects: int
+    began: float
+    ended: float
+
     def __init__(self, stage: Stage, began: float, timed: bool, reconnects: int) -> None:
         self._stage, self.timed, self.reconnects = stage, timed, reconnects
         self.began, self.ended = began, math.inf  # when it was known to rest, seconds of time.monotonic
@@ -82,9 +87,13 @@ class Rig(Closing):
     ...     rig.go(Position(travel=1.0))
     """
 
+    stage: Stage
+    camera: Camera
+    settings: RigSettings
+
     def __init__(self, stage: Stage, camera: Camera, settings: RigSettings) -> None:
         self.stage, self.camera, self.settings = stage, camera, settings
-        self.name = settings.name
+        self.name: str = settings.name
         self._move: Move | None = None
         self._fault: HardwareError | None = None
         self.trigger: Trigger | None = None  # what takes frames one by one, if the rig file says so

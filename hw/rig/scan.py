@@ -34,12 +34,18 @@ class Scan(Closing):
     move, or by an error, it stops the stage. Whoever opened the rig closes it.
     """
 
+    rig: Rig
+    plan: Plan
+    name: str
+    count: int
+    dropped: int
+
     rewindable = False
 
     def __init__(self, rig: Rig, plan: Plan) -> None:
         self.rig, self.plan = rig, plan
         self.name, self.motion = rig.name, plan.motion
-        self.dtype = rig.camera.dtype
+        self.dtype: np.dtype[Any] = rig.camera.dtype
         self.count = self.dropped = 0  # frames given so far, and lost between them
         self._origin: float | None = None
         self._complete = False
@@ -209,6 +215,9 @@ class StepScan(Scan):
     ...         scan.read().travel
     array([0.])
     """
+
+    settle: float
+    frames: int
 
     def __init__(self, rig: Rig, plan: Plan, settle: float = 0.1, frames: int = 1) -> None:
         if not 0 <= settle < np.inf:

@@ -98,14 +98,17 @@ class Track:
     standard deviation of the reports about the result, mm or radians.
     """
 
+    began: float
+    path: Trapezoid
+
     def __init__(self, times: ArrayLike, ways: ArrayLike, path: Trapezoid) -> None:
         time, way = np.asarray(times, np.float64), np.asarray(ways, np.float64)
         self.began, self.path = _fit(time, way, path)
         residual = way - self.path.place(time - self.began)
         self._extra = _smooth_residual(residual)
         self._time = time
-        self.reports = len(time)
-        self.spread = _robust_sigma(residual - self._extra)
+        self.reports: int = len(time)
+        self.spread: float = _robust_sigma(residual - self._extra)
 
     @property
     def ended(self) -> float:

@@ -114,11 +114,15 @@ class Sensor:
     and in full light.
     """
 
+    camera: Camera
+    dtype: np.dtype[Any]
+    offset: NDArray[np.float32]
+
     def __init__(self, camera: Camera, shape: tuple[int, int], device: str | Device | None = None) -> None:
         self.camera, self.dtype = camera, camera.dtype
-        self.device = open_device(device)
+        self.device: Device = open_device(device)
         self.offset, span = _levels(camera, shape)
-        self.full = self.offset + span
+        self.full: NDArray[Any] = self.offset + span
         self.offset.flags.writeable = self.full.flags.writeable = False
         self._shape, self._pixels = shape, shape[0] * shape[1]
         self._quarter = -(-self._pixels // 4)  # the generator makes four numbers at a time

@@ -39,7 +39,7 @@ class Friction:
     """
 
     def __init__(self, space: HalfSpace, pressure: Floats, coefficient: float) -> None:
-        self.traction = np.zeros((2, *space.shape))
+        self.traction: Floats = np.zeros((2, *space.shape))
         self._pixel_area = space.pixel_area
         self._contact = pressure > 0
         if self._contact.any():

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.hw.twin.twin import Twin
-from mirrorskin.io.types import Block, Closing, InputError
+from mirrorskin.io.types import Block, Closing, Header, InputError
 
 _QUEUE = 8  # frames that wait for a late reader, as in a camera's driver
 
@@ -42,6 +42,12 @@ class Live(Closing):
     InputError
         The rate is not above zero.
     """
+
+    name: str
+    header: Header
+    motion: str
+    shape: tuple[int, int, int]
+    dtype: np.dtype[Any]
 
     rewindable = False
 

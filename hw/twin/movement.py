@@ -51,10 +51,11 @@ class Movement:
         About which the body tilts, from the rest sheet's centre, mm, in the body's frame.
     """
 
+    path: Floats
     motion: Motion
     presses = False
-    steepest = 0.0
-    pivot = (0.0, 0.0, 0.0)
+    steepest: float = 0.0
+    pivot: tuple[float, float, float] = (0.0, 0.0, 0.0)
     _recorded_as: str
 
     def __init__(self, positions: Floats, name: str, deepest: float) -> None:
@@ -67,7 +68,7 @@ class Movement:
         if not math.isfinite(deepest):
             raise InputError(f"press {deepest} mm cannot be: give how far the body is lowered")
         self.positions = self.path = positions
-        self.deepest = float(deepest)
+        self.deepest: float = float(deepest)
 
     def rise(self, radius: float, /) -> float:
         """Bound how far an object of a radius about the origin can rise above the rest plane, mm.
@@ -143,7 +144,7 @@ class Vertical(Movement):
         The travel is empty or not finite; the compliance is negative.
     """
 
-    motion = "vertical"
+    motion: Motion = "vertical"
     presses = True
     _recorded_as = "travel"
 
@@ -201,14 +202,14 @@ class Axial(Movement):
         A value cannot be.
     """
 
-    motion = "axial"
+    motion: Motion = "axial"
     _recorded_as = "phase"
 
     def __init__(
         self, phase: ArrayLike, tilt: float, press: float, pivot: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ) -> None:
         super().__init__(check_phase(phase, _count(phase), "phase"), "phase", press)
-        self.path = np.unwrap(self.positions)
+        self.path: Floats = np.unwrap(self.positions)
         if not (math.isfinite(tilt) and 0 < tilt <= TILT_MAX):
             raise InputError(
                 f"tilt {math.degrees(tilt):g} degrees cannot be: give more than 0 and at most"
@@ -250,7 +251,7 @@ class Leaning(Movement):
         A value cannot be.
     """
 
-    motion = "axial"
+    motion: Motion = "axial"
 
     def __init__(
         self,
@@ -308,7 +309,7 @@ class Horizontal(Movement):
         A value cannot be.
     """
 
-    motion = "horizontal"
+    motion: Motion = "horizontal"
     _recorded_as = "displacement"
 
     def __init__(self, displacement: ArrayLike, press: float) -> None:
@@ -338,7 +339,7 @@ class Twist(Movement):
         A value cannot be.
     """
 
-    motion = "twist"
+    motion: Motion = "twist"
     _recorded_as = "twist"
 
     def __init__(self, twist: ArrayLike, press: float) -> None:

@@ -86,7 +86,7 @@ class Elastic:
             )
         self._grid = View(shape, view.pixel_size, body)
         self._field = np.s_[grow_y : grow_y + rows, grow_x : grow_x + columns]
-        self.space = HalfSpace(shape, view.pixel_size, body.modulus, body.sheet)
+        self.space: HalfSpace = HalfSpace(shape, view.pixel_size, body.modulus, body.sheet)
 
     def solve(self, pose: Pose) -> Contact:
         """Return pressure and force in a pose, on the grown grid."""

@@ -139,6 +139,9 @@ class Coat:
         The reflectance that pixels see of the sheet at rest.
     """
 
+    texture: SheetTexture
+    optics: Ideal | Wall
+
     def __init__(self, texture: SheetTexture, optics: Ideal | Wall, view: View) -> None:
         if texture.size < _PIXELS_MIN * max(view.pixel_size):
             raise InputError(
@@ -146,7 +149,7 @@ class Coat:
                 f" make it {_PIXELS_MIN:g} pixels or more"
             )
         self.texture, self.optics, self._view = texture, optics, view
-        self.rest = texture.reflectance(np.stack([view.x, view.y]), view.pixel_size)
+        self.rest: Floats = texture.reflectance(np.stack([view.x, view.y]), view.pixel_size)
 
     def levels(self, dark: ArrayLike, bright: ArrayLike) -> tuple[Floats, Floats]:
         """Return what pixels count with no light from the mirror and with all, by the camera's own levels."""

@@ -100,6 +100,9 @@ class Twin(Closing):
         A value cannot be, the object is unknown or too large, or its file unusable.
     """
 
+    frame_rate: float
+    exposure: float
+
     rewindable = True
 
     def __init__(
@@ -137,12 +140,12 @@ class Twin(Closing):
                 raise InputError(f"object shift {object_shift} cannot be: give two finite numbers of mm")
             self._thing = Shifted(self._thing, object_shift)
 
-        self.name = f"twin: {self._thing.name}"
+        self.name: str = f"twin: {self._thing.name}"
         self.movement = movement
         self.motion = movement.motion
-        self.travel = movement.positions if isinstance(movement, Vertical) else None
-        self.shape = (len(movement.positions), *field)
-        self.dtype = self._camera.dtype
+        self.travel: Floats | None = movement.positions if isinstance(movement, Vertical) else None
+        self.shape: tuple[int, int, int] = (len(movement.positions), *field)
+        self.dtype: np.dtype[Any] = self._camera.dtype
         self.frame_rate, self.exposure = self._camera.frame_rate, self._camera.exposure
 
         check_fits(self._thing, self._body.radius)

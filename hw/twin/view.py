@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mirrorskin.hw.twin.body import Body
 from mirrorskin.io.types import Floats, InputError, pixel_axes
@@ -33,6 +34,13 @@ class View:
     orthographic : whether all slopes are zero
     """
 
+    shape: tuple[int, int]
+    pixel_size: tuple[float, float]
+    x: Floats
+    y: Floats
+    slope_x: Floats
+    slope_y: Floats
+
     def __init__(
         self, shape: tuple[int, int], pixel_size: tuple[float, float], body: Body, distance: float = math.inf
     ) -> None:
@@ -43,8 +51,8 @@ class View:
             )
         self.shape, self.pixel_size = shape, pixel_size
         self.x, self.y = np.meshgrid(*pixel_axes(shape, pixel_size))
-        self.on_body = np.hypot(self.x, self.y) <= body.radius
-        self.orthographic = math.isinf(distance)
+        self.on_body: NDArray[np.bool_] = np.hypot(self.x, self.y) <= body.radius
+        self.orthographic: bool = math.isinf(distance)
         self.slope_x, self.slope_y = np.zeros((2, *shape))
         if not self.orthographic:
             away = np.sqrt(self.x**2 + self.y**2)

@@ -119,6 +119,11 @@ class Calibrated:
     part of it was made with another pixel size.
     """
 
+    source: Source
+    whole: Calibration
+    name: str
+    rewindable: bool
+
     def __init__(self, source: Source, calibration: Calibration) -> None:
         self.source, self.whole = source, calibration
         self.name, self.motion, self.rewindable = source.name, source.motion, source.rewindable
