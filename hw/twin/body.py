@@ -55,25 +55,28 @@ class Body:
 
     def __post_init__(self) -> None:
         rules = {
-            "diameter": (self.diameter > 0, "mm, more than 0"),
-            "height": (self.height > 0, "mm, more than 0"),
-            "index": (self.index >= 1, "a refractive index, 1 or more"),
-            "sheet": (self.sheet >= 0, "mm, 0 or more"),
-            "modulus": (self.modulus > 0, "N/mm^2, more than 0"),
-            "friction": (self.friction >= 0, "a coefficient, 0 or more"),
+            "diameter": (0 < self.diameter < math.inf, "mm, more than 0"),
+            "height": (0 < self.height < math.inf, "mm, more than 0"),
+            "index": (1 <= self.index < math.inf, "a refractive index, 1 or more"),
+            "sheet": (0 <= self.sheet < math.inf, "mm, 0 or more"),
+            "modulus": (0 < self.modulus < math.inf, "N/mm^2, more than 0"),
+            "friction": (0 <= self.friction < math.inf, "a coefficient, 0 or more"),
             "scatter": (0 <= self.scatter <= _SCATTER_MAX, "radians, 0 to those of 20 degrees"),
-            "air_gap": (self.air_gap >= 0, "mm, 0 or more"),
+            "air_gap": (0 <= self.air_gap < math.inf, "mm, 0 or more"),
             "asymmetry": (0 <= self.asymmetry <= 1, "a share, 0 to 1"),
-            "asymmetry_azimuth": (True, "radians"),
+            "asymmetry_azimuth": (math.isfinite(self.asymmetry_azimuth), "radians"),
         }
-        for name, (holds, range_) in rules.items():
-            value = getattr(self, name)
-            if not (math.isfinite(value) and holds):
-                raise InputError(
-                    f"{name.replace('_', ' ')} {value} of the sensor's body cannot be: give {range_}"
-                )
+        check_values(self, "sensor's body", rules)
 
     @property
     def radius(self) -> float:
         """Half the diameter, mm."""
         return self.diameter / 2
+
+
+def check_values(owner: object, what: str, rules: dict[str, tuple[bool, str]]) -> None:
+    """Raise InputError for the first attribute that cannot be; rules tell whether it can, and what can."""
+    for name, (holds, remedy) in rules.items():
+        if not holds:
+            value = getattr(owner, name)
+            raise InputError(f"{name.replace('_', ' ')} {value} of the {what} cannot be: give {remedy}")

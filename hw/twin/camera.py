@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from mirrorskin.hw.twin.body import check_values
 from mirrorskin.io.types import FRAME_DTYPES, InputError
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
 
@@ -84,7 +85,23 @@ class Camera:
             raise InputError(f"frames of {kind.name} cannot have {bits} bits: {remedy}")
         object.__setattr__(self, "dtype", kind)
         object.__setattr__(self, "bits", bits)
-        _check(self)
+        period = 1 / self.frame_rate if self.frame_rate > 0 else 0.0
+        whole = isinstance(self.seed, int | np.integer)
+        rules = {
+            "noise": (0 <= self.noise <= _NOISE_MAX, "its standard deviation in counts, 0 to 65536"),
+            "seed": (whole and 0 <= self.seed < _WORD, "a whole number, 0 or more, of 64 bits"),
+            "electrons": (self.electrons >= _ELECTRONS_MIN, "those of a count of light, 0.001 or more"),
+            "gain_deviation": (
+                0 <= self.gain_deviation < 1,
+                "a share of the gain, 0 or more and less than 1",
+            ),
+            "offset_deviation": (0 <= self.offset_deviation <= _NOISE_MAX, "counts, 0 to 65536"),
+            "frame_rate": (0 < self.frame_rate < math.inf, "frames in a second, more than 0"),
+            "exposure": (0 <= self.exposure <= period, f"seconds, 0 to a frame's {period:.6g}"),
+            "point_spread": (0 <= self.point_spread <= _SPREAD_MAX, "pixels, 0 to 100"),
+            "distance": (self.distance > 0, "millimetres above the sheet, more than 0"),
+        }
+        check_values(self, "camera", rules)
 
     @property
     def dark(self) -> float:
@@ -145,31 +162,15 @@ class Sensor:
         self._light.claim()
         self._light.host[: self._pixels].reshape(self._shape)[...] = self._spread(light)
         self._light.upload()
-        self._launch(frame)
-        out[...] = self._counts.download()[: self._pixels].reshape(self._shape)
-
-    def _spread(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Blur light by the lens; beyond the picture's edge it goes on as it ends."""
-        if self.camera.point_spread == 0:
-            return light
-        import cv2
-
-        sigma = self.camera.point_spread
-        edge = cv2.BORDER_REPLICATE
-        return np.asarray(
-            cv2.GaussianBlur(light, (0, 0), sigmaX=sigma, sigmaY=sigma, borderType=edge), light.dtype
-        )
-
-    def _launch(self, frame: int) -> None:
         camera, quarter = self.camera, self._quarter
-        expose = self.device.kernel(
+        kernel = self.device.kernel(
             "exposure",
             "expose",
             FRAME=C_TYPES[self.dtype.name],
             WHOLE=int(camera.bits is not None),
             SHOT=int(math.isfinite(camera.electrons)),
         )
-        expose(
+        kernel(
             -(-quarter // self.device.layout.tile),
             light=self._light,
             offset=self._offset,
@@ -182,6 +183,19 @@ class Sensor:
             top=camera.top,
             counts=self._counts,
             moved=self._pixels * (3 * 4 + self.dtype.itemsize),
+        )
+        out[...] = self._counts.download()[: self._pixels].reshape(self._shape)
+
+    def _spread(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Blur light by the lens; beyond the picture's edge it goes on as it ends."""
+        if self.camera.point_spread == 0:
+            return light
+        import cv2
+
+        sigma = self.camera.point_spread
+        edge = cv2.BORDER_REPLICATE
+        return np.asarray(
+            cv2.GaussianBlur(light, (0, 0), sigmaX=sigma, sigmaY=sigma, borderType=edge), light.dtype
         )
 
 
@@ -203,23 +217,3 @@ def _levels(camera: Camera, shape: tuple[int, int]) -> tuple[NDArray[np.float32]
     offset = camera.dark + camera.offset_deviation * generator.standard_normal(shape)
     span = (camera.bright - camera.dark) * np.maximum(gain, _LEAST_GAIN)
     return offset.astype(np.float32), span.astype(np.float32)
-
-
-def _check(camera: Camera) -> None:
-    period = 1 / camera.frame_rate if camera.frame_rate > 0 else 0.0
-    whole = isinstance(camera.seed, int | np.integer)
-    rules = {
-        "noise": (0 <= camera.noise <= _NOISE_MAX, "its standard deviation in counts, 0 to 65536"),
-        "seed": (whole and 0 <= camera.seed < _WORD, "a whole number, 0 or more, of 64 bits"),
-        "electrons": (camera.electrons >= _ELECTRONS_MIN, "those of a count of light, 0.001 or more"),
-        "gain_deviation": (0 <= camera.gain_deviation < 1, "a share of the gain, 0 or more and less than 1"),
-        "offset_deviation": (0 <= camera.offset_deviation <= _NOISE_MAX, "counts, 0 to 65536"),
-        "frame_rate": (0 < camera.frame_rate < math.inf, "frames in a second, more than 0"),
-        "exposure": (0 <= camera.exposure <= period, f"seconds, 0 to a frame's {period:.6g}"),
-        "point_spread": (0 <= camera.point_spread <= _SPREAD_MAX, "pixels, 0 to 100"),
-        "distance": (camera.distance > 0, "millimetres above the sheet, more than 0"),
-    }
-    for name, (holds, remedy) in rules.items():
-        if not holds:
-            value = getattr(camera, name)
-            raise InputError(f"{name.replace('_', ' ')} {value} of the camera cannot be: give {remedy}")

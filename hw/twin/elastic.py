@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.types import Floats
 
+Spectrum = NDArray[np.complex64]
+
 _WORKERS = 2
 
 
@@ -282,22 +284,24 @@ def _step(
 
 
 def _inverse(space: HalfSpace) -> Callable[[Floats], Floats]:
-    """Return a rough inverse of the half-space's response, by its spectrum: 2 E q / 3 at wavenumber q.
+    """Return a rough inverse of the half-space's response, by its spectrum: 2 E q / 3 at wavenumber q."""
+    padded, _, _, q = wavenumbers(space)
+    stiffness = (2 * space.modulus / 3 * q).astype(np.float32)
+    return lambda values: filter_roughly(values, padded, lambda spectrum: stiffness * spectrum)
 
-    The grid comes round on itself here, and single precision will do: it only steers the search.
+
+def filter_roughly(
+    values: Floats, padded: tuple[int, int], multiply: Callable[[Spectrum], Spectrum]
+) -> Floats:
+    """Change the spectra of maps, (..., H, W), on a grid that comes round on itself.
+
+    Single precision will do: this only steers a search.
     """
     from scipy import fft
 
-    (rows, columns), _, _, q = wavenumbers(space)
-    stiffness = (2 * space.modulus / 3 * q).astype(np.float32)
-
-    def apply(values: Floats) -> Floats:
-        spectrum = fft.rfft2(values.astype(np.float32), (rows, columns), workers=2, overwrite_x=True)
-        spectrum *= stiffness
-        back: Floats = fft.irfft2(spectrum, (rows, columns), workers=2, overwrite_x=True)
-        return back[: space.shape[0], : space.shape[1]]
-
-    return apply
+    spectrum = fft.rfft2(values.astype(np.float32), padded, workers=_WORKERS, overwrite_x=True)
+    back: Floats = fft.irfft2(multiply(spectrum), padded, workers=_WORKERS, overwrite_x=True)
+    return back[..., : values.shape[-2], : values.shape[-1]]
 
 
 def wavenumbers(space: HalfSpace) -> tuple[tuple[int, int], Floats, Floats, Floats]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin.elastic import HalfSpace, inner, rectangle, wavenumbers
+from mirrorskin.hw.twin.elastic import HalfSpace, Spectrum, filter_roughly, inner, rectangle, wavenumbers
 from mirrorskin.io.types import Floats
 
 TOLERANCE = 1e-3
@@ -142,24 +142,18 @@ class _Limited:
 def _inverse(space: HalfSpace) -> Callable[[Floats], Floats]:
     """Return a rough inverse of Cerruti's response, by its spectrum.
 
-    At wavenumber q a traction is softened by 1 / (2 G q) along q, and twice as much across. The grid comes
-    round on itself here, and single precision will do: it only steers the search.
+    At wavenumber q a traction is softened by 1 / (2 G q) along q, and twice as much across.
     """
-    from scipy import fft
-
     padded, q_x, q_y, q = wavenumbers(space)
     along_x, along_y, stiff = q_x / q, q_y / q, q / (4 * np.pi * space.softness)
     xx, xy, yy = (
         (stiff * part).astype(np.float32) for part in (1 + along_x**2, along_x * along_y, 1 + along_y**2)
     )
 
-    def apply(values: Floats) -> Floats:
-        spectrum = fft.rfft2(values.astype(np.float32), padded, workers=2, overwrite_x=True)
-        along = np.stack([xx * spectrum[0] + xy * spectrum[1], xy * spectrum[0] + yy * spectrum[1]])
-        back: Floats = fft.irfft2(along, padded, workers=2, overwrite_x=True)
-        return back[:, : space.shape[0], : space.shape[1]]
+    def stiffen(along: Spectrum) -> Spectrum:
+        return np.stack([xx * along[0] + xy * along[1], xy * along[0] + yy * along[1]])
 
-    return apply
+    return lambda values: filter_roughly(values, padded, stiffen)
 
 
 def _limited(traction: Floats, lag: Floats, limit: Floats) -> _Limited:

@@ -52,7 +52,16 @@ class Ideal:
     """
 
     def __init__(self, body: Body, pattern: Pattern) -> None:
-        _check(body, pattern)
+        unfit = {
+            "a picture as pattern": not isinstance(pattern, Uniform | Linear),
+            "an air gap": body.air_gap != 0,
+            "lamps that light one side more": body.asymmetry != 0,
+        }
+        for what, present in unfit.items():
+            if present:
+                raise InputError(
+                    f"the ideal optics know of zenith alone, not of {what}: take the optics 'cylinder'"
+                )
         self._body, self._pattern = body, pattern
 
     def light(self, sheet: Sheet) -> NDArray[np.float32]:
@@ -92,19 +101,6 @@ def design_range(body: Body) -> tuple[float, float]:
     """
     first, last = zenith_window(body)
     return first + body.scatter / 2, last - body.scatter / 2
-
-
-def _check(body: Body, pattern: Pattern) -> None:
-    unfit = {
-        "a picture as pattern": not isinstance(pattern, Uniform | Linear),
-        "an air gap": body.air_gap != 0,
-        "lamps that light one side more": body.asymmetry != 0,
-    }
-    for what, present in unfit.items():
-        if present:
-            raise InputError(
-                f"the ideal optics know of zenith alone, not of {what}: take the optics 'cylinder'"
-            )
 
 
 def _ramp_response(zenith: Floats, pattern: Linear, scatter: float) -> Floats:
@@ -250,10 +246,6 @@ class Wall:
         for plane, values in zip(self._sheet.host, (sheet.height, sheet.dz_dx, sheet.dz_dy), strict=True):
             plane[:] = values
         self._sheet.upload()
-        self._launch()
-        return self._light.download().copy()
-
-    def _launch(self) -> None:
         body, pixels = self._body, self._light.host.size
         rows, columns = self._table.host.shape
         lean = body.asymmetry_azimuth
@@ -278,6 +270,7 @@ class Wall:
             light=self._light,
             moved=sum(array.host.nbytes for array in (self._sheet, self._places, self._light)),
         )
+        return self._light.download().copy()
 
 
 def scatter_rays(scatter: float) -> Floats:

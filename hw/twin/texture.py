@@ -10,6 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mirrorskin.hw.twin.body import check_values
 from mirrorskin.hw.twin.movement import Pose
 from mirrorskin.hw.twin.optics import Ideal, Wall
 from mirrorskin.hw.twin.scene import Light
@@ -80,9 +81,7 @@ class SheetTexture:
             "diffuse": (0 <= self.diffuse <= 1, "a share, 0 to 1"),
             "seed": (isinstance(self.seed, int | np.integer) and self.seed >= 0, "a whole number, 0 or more"),
         }
-        for name, (holds, range_) in rules.items():
-            if not holds:
-                raise InputError(f"{name} {getattr(self, name)} of the texture cannot be: give {range_}")
+        check_values(self, "texture", rules)
 
     def reflectance(self, places: Floats, pixel_size: tuple[float, float] = (0.0, 0.0)) -> Floats:
         """Return the share of the light that the sheet reflects around points, by x and y, (2, ...), mm.
