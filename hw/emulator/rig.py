@@ -45,6 +45,7 @@ SHIFT, TURN = 2.0, 45.0
 """Greatest displacement along x and y, mm, and greatest twist, degrees, either way."""
 
 _SILENCE, _STALL = 0.07, 0.1  # seconds that the emulators may be silent in motion
+_SERVED = 0.5  # the same of other processes', which share the computer with them
 _LIFT = 4.0  # how far above the object the body begins, mm
 _HIGHEST = 4.5  # and how far it can be lifted
 # GRBL's settings of homing, in units a minute, ms and units; and of its axes X, Y, Z, A, B and C, which are
@@ -192,8 +193,10 @@ class EmulatedRig:
         The folder is made where it is missing; files of an emulated rig that was there before are replaced.
         """
         path, picture = folder / "rig.toml", folder / "bright.npy"
-        camera = msgspec.structs.replace(self._camera_settings(), source=source, bright=picture.name)
-        file = RigFile(name=self.settings.name, stage=self.settings.stage, camera=camera)
+        settings, change = self.settings, msgspec.structs.replace
+        camera = change(settings.camera, source=source, bright=picture.name, stall=max(_STALL, _SERVED))
+        stage = change(settings.stage, silence=max(_SILENCE, _SERVED))
+        file = RigFile(name=settings.name, stage=stage, camera=camera)
         text = "\n".join(_toml(msgspec.to_builtins(file)))
         try:
             if path.exists() and not path.read_text(errors="replace").startswith(_FIRST):

@@ -124,6 +124,7 @@ _TRIPS = 4  # usual round trips at least, that a question may be open in motion
 _OPENING_PERIOD = 0.05  # seconds between questions at most, until `begin`
 _MOVING_PERIOD = 0.025  # the same in motion and during a stop: how soon a silence shows
 _ANSWER_LOST = 0.5  # seconds at rest after which an answer that is out will not come
+_STUCK = 1.0  # seconds after which a read that does not return is none
 _SLICE = 0.05  # seconds of one wait
 _CHUNK = 1024  # bytes that are heard at a time, before others have their turn
 _INTERRUPTED = ("hold", "door", "sleep", "check")  # states that we did not ask for
@@ -176,6 +177,7 @@ class Link:
         self._replies: list[Reply] = []
         self._refused: Refusal | None = None
         self._active = False
+        self._heard = time.monotonic()  # when it was last listened to
         self._last_line = -math.inf  # when a line was last sent or answered
         self.stopping: Stopping = Stopping()
         self._deaf = False  # what comes is noise, and was reported as such
@@ -316,6 +318,7 @@ class Link:
 
     def _hear(self, data: bytes, since: float, now: float) -> None:
         with self.lock:
+            self._heard = now
             self._times.listened(since, now)
             for line, began in self._splitter.feed(data, now):
                 reply, noise = parse(line), 0
@@ -327,6 +330,7 @@ class Link:
                     self._deaf = True
                     self.halt("what it says is garbled; look at the cable, its shield and the baud rate")
                     break
+            self._check_answers(now)  # here, where no answer can be read and not yet taken
             self.lock.notify_all()
 
     def _handle(self, reply: Reply, began: float) -> None:
@@ -390,7 +394,8 @@ class Link:
             time.sleep(_TICK)
             now = time.monotonic()
             with self.lock:
-                self._check_answers(now)
+                if now - self._heard > _STUCK:
+                    self._check_answers(now)
                 if self.stopping.begun:
                     self._advance_stop(now)
                 self._times.period = self._poll_period()
@@ -401,6 +406,8 @@ class Link:
                 if self.stopping.begun and not self.stopping.resetting:  # lest one was lost, or undone
                     self.send(HOLD)
                 self.send(ASK)
+                with self.lock:
+                    self._times.sent(time.monotonic())
             if not threading.main_thread().is_alive():  # the program ended and left us
                 if not self.stopping.begun:
                     self.halt("the program ended")

@@ -42,6 +42,7 @@ class ReportTimes:
         self._wider = 0.0
         self._resume = 0.0  # when no answers to earlier questions are to be expected any more
         self._open: list[float] = []
+        self._out = 0.0  # when the first of the open questions was on its way
         self._unsure = False
         self._silence = 0.0
         self._trips: deque[float] = deque(maxlen=_MEDIAN_OF)
@@ -60,12 +61,12 @@ class ReportTimes:
         """Note that somebody listened for `SLICE` seconds at most; an answer is noted afterwards."""
         if self._open:
             delayed = now - began > _DELAYED
-            self._silence += _PART * SLICE if delayed else max(0.0, now - max(began, self._open[0]))
+            self._silence += _PART * SLICE if delayed else max(0.0, now - max(began, self._out))
 
     def silence(self, now: float) -> float:
         """Return for how long a question has been open, as far as somebody listened for an answer."""
-        if self._open and now - self._open[0] > _SURELY:
-            return now - self._open[0]
+        if self._open and now - self._out > _SURELY:
+            return now - self._out
         return self._silence
 
     def due(self, now: float) -> bool:
@@ -76,10 +77,17 @@ class ReportTimes:
         return now - self._open[-1] >= max(wait, self._wider)
 
     def ask(self, now: float) -> None:
-        """Note that the question was sent."""
+        """Note that the question is about to be sent."""
         self._unsure = bool(self._open)
         self._open.append(now)
         self._quiet = now
+        if not self._unsure:
+            self._out = now
+
+    def sent(self, now: float) -> None:
+        """Note that it was sent, which a busy computer may do late: there was no silence before."""
+        if not self._unsure:
+            self._out, self._silence = now, 0.0
 
     def answer(self, now: float) -> Answer:
         """Note that an answer came: it was so in the middle between question and answer.

@@ -34,7 +34,8 @@ _SWITCHES: dict[tuple[Line, bool], str] = {
 }
 _PREPARE = "G21G90G94"  # millimetres, absolute places, feeds a minute
 _OLDEST = (1, 1)
-_OFFSET_TIMEOUT = 2.0  # seconds in which a report gives the work offset, at 20 questions a second
+_LACKING = 40  # reports, of which one has the work offset
+_OFFSET_TIMEOUT = 10.0  # seconds in which they come, on a busy computer as well
 _REPORTS_MAX = 1 << 17  # reports: an hour of motion
 _ARRIVED = (
     0.01  # machine units from the target and the rounding to its steps, at which the body has come to it
@@ -102,6 +103,7 @@ class GrblStage(Closing):
         self._settings = settings
         self.axes: Axes = Axes(settings, self.name)
         self._offset: Mapping[str, float] | None = None
+        self._lacking = 0  # reports that did not tell it, so far
         self._reports: deque[Report] = deque(maxlen=_REPORTS_MAX)
         self._latest: Report | None = None
         self._target: Position | None = None
@@ -311,14 +313,13 @@ class GrblStage(Closing):
 
     def _await_offset(self) -> None:
         """Wait until a report has the offset at which the work coordinates begin."""
-        try:
-            self._link.until(
-                lambda: self._offset, max(self._settings.timeout, _OFFSET_TIMEOUT), "report its work offset"
-            )
-        except HardwareError as error:
-            raise InputError(
-                f"{self.name}: its reports lack the work offset (WCO); switch it on in $10"
-            ) from error
+        self._link.until(
+            lambda: self._offset is not None or self._lacking > _LACKING or None,
+            max(self._settings.timeout, _OFFSET_TIMEOUT),
+            "report its work offset",
+        )
+        if self._offset is None:
+            raise InputError(f"{self.name}: its reports lack the work offset (WCO); switch it on in $10")
 
     def _check(self, controller: Controller) -> None:
         """Refuse a controller that lacks an axis; go no faster, slower or farther than it does."""
@@ -353,6 +354,8 @@ class GrblStage(Closing):
         """Take a report; the link's lock is held."""
         if seen.status.offset is not None:
             self._take_offset(seen.status.offset, seen.working)
+        elif self._offset is None:
+            self._lacking += 1
         place = self._place(seen.status)
         if place is None:
             return

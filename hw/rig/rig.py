@@ -23,6 +23,7 @@ from mirrorskin.io.types import Closing
 _TICK = 0.02  # seconds from one look of the guard to the next
 _PAUSE = 0.5  # seconds that the guard may be late: frames that come meanwhile have no time
 _STALL_PERIODS = 3  # without a frame, that a move bears at least
+_UNTIMED = 3  # times as long a silence is borne where it does not matter when frames came
 _SLICE = 0.05  # seconds that the reader waits before it looks whether all is well
 _PATIENCE = 5.0  # seconds that a camera may take for its first frame
 _JOIN = 5.0
@@ -77,7 +78,8 @@ class Rig(Closing):
     While a move is under way a thread looks fifty times a second whether frames still arrive and whether
     stage and camera are well. If not, it stops the stage, also while everyone else is busy, and whoever asks
     the rig for anything gets the reason. Frames are missed after ``camera.stall`` or three periods, whichever
-    is longer; a computer that is too busy to look that often gives the camera more time. If it does not look
+    is longer, and after three times that where it does not matter when they came, in steps and on the
+    way; a computer that is too busy to look that often gives the camera more time. If it does not look
     for 0.5 s in a timed move, when frames came is not known, and the move ends. Only moves that the rig
     begins are guarded.
 
@@ -229,7 +231,8 @@ class Rig(Closing):
                 f"{self.camera.name} was lost while the stage moved, which was stopped; it is back, and its"
                 " frames may be later than before: begin anew"
             )
-        if self.trigger is not None or silence < longest_wait(self.settings.camera, self.period):
+        bound = longest_wait(self.settings.camera, self.period) * (1 if move.timed else _UNTIMED)
+        if self.trigger is not None or silence < bound:
             return None
         return HardwareError(
             f"{self.camera.name} gave no frame for {silence:.2f} s while the stage moved, which was stopped:"

@@ -177,8 +177,9 @@ def test_the_rig_file_says_what_the_settings_say(tmp_path: Path) -> None:
         path = rig.write(tmp_path / "a new one", "tcp://127.0.0.1:1234")
         found, said = load_rig(path), rig.settings
     bright = str(path.parent / "bright.npy")
-    assert (found.name, found.stage) == (said.name, said.stage)
-    assert found.camera == structs.replace(said.camera, source="tcp://127.0.0.1:1234", bright=bright)
+    assert (found.name, found.stage) == (said.name, structs.replace(said.stage, silence=0.5))
+    camera = structs.replace(said.camera, source="tcp://127.0.0.1:1234", bright=bright, stall=0.5)
+    assert found.camera == camera
     assert (found.camera.shape, found.camera.dtype, found.camera.rate) == (SMALL["shape"], "uint16", 100.0)
     header = rig.twin(Vertical([0.0])).header
     assert found.camera.pixel_sides == header.pixel_size

@@ -58,6 +58,17 @@ def test_silence_is_what_somebody_listened_to_while_a_question_was_open():
     assert watch.silence(1.07) == 0
 
 
+def test_a_question_that_was_not_sent_yet_hears_no_silence():
+    watch = ReportTimes(0.05)
+    watch.ask(1.0)
+    for k in range(50):
+        watch.listened(1.0 + 0.01 * k, 1.01 + 0.01 * k)
+    watch.sent(1.5)
+    assert watch.silence(1.5) == 0
+    watch.listened(1.5, 1.52)
+    assert watch.silence(1.52) == pytest.approx(0.02)
+
+
 def test_a_reader_who_sleeps_hears_no_silence():
     watch = ReportTimes(0.05)
     watch.ask(1.0)
