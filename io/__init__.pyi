@@ -33,7 +33,7 @@ from .types import (
     Truth,
     pixel_axes,
 )
-from .zarr import save_zarr
+from .zarr_export import save_zarr
 
 __all__ = [
     "Block",

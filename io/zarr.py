@@ -10,11 +10,9 @@ import hashlib
 import json
 import math
 import secrets
-import shutil
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -37,10 +35,8 @@ Array: TypeAlias = "zarr.Array[Any]"
 
 _DEEP, _MOST_NODES, _MOST_FRAMES = 8, 10_000, 1 << 26
 _LARGEST = 1 << 30  # bytes of an array that is no stack of frames
-_CHUNK, _BLOCK = 4 << 20, 64 << 20  # bytes of frames, unpacked: of a chunk, and written at a time
-_AT_ONCE = 16  # requests
+AT_ONCE = 16  # requests
 _SAMPLE = 16  # frames that a fingerprint takes where there are no checksums
-_WHOLE: Any = {"write_empty_chunks": True}
 _METADATA = "zarr.json", ".zarray", ".zgroup", ".zattrs", ".zmetadata"
 _REFUSED = {"PermissionError", "NoCredentialsError", "CredentialRetrievalError"}
 _UNREACHABLE = {"ConnectionError", "TimeoutError", "ClientError", "BotoCoreError", "FSTimeoutError"}
@@ -53,7 +49,7 @@ def open_file(path: str | Path, memory_limit: int | None = None) -> Hdf5File:
 
 
 @contextmanager
-def _naming(what: str) -> Iterator[None]:
+def naming(what: str) -> Iterator[None]:
     """Turn what Zarr and the libraries of stores say, in errors of many kinds, into a line with a remedy."""
     try:
         yield
@@ -102,19 +98,31 @@ def _whole() -> Callable[[Any], Any]:
     return Whole
 
 
-def _store(path: Path, read_only: bool) -> Any:
+@contextmanager
+def opened_store(path: Path, read_only: bool = True) -> Iterator[Any]:
+    """Open a store of Zarr; leaving it closes its connections, which fsspec leaves to whoever has them."""
+    from zarr.core.sync import sync
     from zarr.storage import FsspecStore, LocalStore, ZipStore
 
     if isinstance(path, Url):
-        return FsspecStore.from_url(str(path), read_only=read_only)
-    if read_only and not path.exists():
+        store = FsspecStore.from_url(str(path), {"skip_instance_cache": True}, read_only)
+    elif read_only and not path.exists():
         raise InputError(f"{path}: no such file")
-    return ZipStore(path, mode="r") if path.is_file() else LocalStore(path, read_only=read_only)
+    else:
+        store = ZipStore(path, mode="r") if path.is_file() else LocalStore(path, read_only=read_only)
+    try:
+        yield store
+    finally:
+        store.close()
+        for name in ("_s3", "_session"):
+            client = getattr(getattr(store, "fs", None), name, None)
+            if client is not None:
+                sync(client.close())
 
 
 def find_stores(pattern: Url) -> list[Path]:
     """Return the addresses that answer to a pattern such as ``s3://bucket/*.zarr``."""
-    with _naming(str(pattern)):
+    with naming(str(pattern)):
         from fsspec.core import url_to_fs
 
         system, place = url_to_fs(str(pattern))
@@ -128,29 +136,24 @@ class ZarrFile(Hdf5File):
     """A Zarr group, or an array alone as ``/data``, of which all but the frames is read at once."""
 
     def __init__(self, path: Path, memory_limit: int | None = None) -> None:
-        with _naming(str(path)):
+        with ExitStack() as opening, naming(str(path)):
             import zarr
 
-            node = zarr.open(_whole()(_store(path, read_only=True)), mode="r")
+            store = opening.enter_context(opened_store(path))
+            node = zarr.open(_whole()(store), mode="r")
             found = dict(node.members(max_depth=_DEEP)) if isinstance(node, zarr.Group) else {"data": node}
-        if len(found) > _MOST_NODES:
-            raise InputError(
-                f"{path} holds more than {_MOST_NODES} groups and arrays: copy out what is wanted"
-            )
-        groups = {f"/{name}": one for name, one in found.items() if isinstance(one, zarr.Group)}
-        self.arrays = {f"/{name}": one for name, one in found.items() if not isinstance(one, zarr.Group)}
-        root = h5py.File(secrets.token_hex(8), "w", driver="core", backing_store=False)
-        super().__init__(path, memory_limit, root)
-        with self._closing_on_error(), _naming(str(path)):
+            if len(found) > _MOST_NODES:
+                raise InputError(f"{path} holds over {_MOST_NODES} groups and arrays: copy what is wanted")
+            groups = {f"/{name}": one for name, one in found.items() if isinstance(one, zarr.Group)}
+            self.arrays = {f"/{name}": one for name, one in found.items() if f"/{name}" not in groups}
+            root = h5py.File(secrets.token_hex(8), "w", driver="core", backing_store=False)
+            super().__init__(path, memory_limit, opening.enter_context(root))
             self._fill(groups)
+            self._opened = opening.pop_all()
 
-    @contextmanager
-    def _closing_on_error(self) -> Iterator[None]:
-        try:
-            yield
-        except BaseException:
-            self.close()
-            raise
+    def close(self) -> None:
+        """Close what is in memory, and all connections."""
+        self._opened.close()
 
     def _fill(self, groups: Mapping[str, Any]) -> None:
         """Copy attributes, and values if the group is one of ours; of others, only shapes and types."""
@@ -162,7 +165,7 @@ class ZarrFile(Hdf5File):
                 raise InputError(
                     f"{self.path}: {name} claims {one.nbytes} bytes: it is damaged: copy it again"
                 )
-        with ThreadPoolExecutor(_AT_ONCE, "mirrorskin-zarr") as pool:
+        with ThreadPoolExecutor(AT_ONCE, "mirrorskin-zarr") as pool:
             values = dict(
                 zip(wanted, pool.map(lambda one: np.asarray(one[...]), wanted.values()), strict=True)
             )
@@ -204,7 +207,7 @@ class ZarrFile(Hdf5File):
             )
         if count > _MOST_FRAMES:
             raise InputError(f"{where} claims {count} frames: it is damaged: copy it again")
-        with _naming(where):
+        with naming(where):
             from zarr.core.sync import sync
 
             pieces = array.shards or array.chunks
@@ -242,7 +245,7 @@ class ZarrFile(Hdf5File):
         if self.find(CHECKSUM) is None:
             array = self.arrays[str(stack.name)]
             for number in range(0, array.shape[0], -(-array.shape[0] // _SAMPLE)):
-                with _naming(self.where(stack)):
+                with naming(self.where(stack)):
                     digest.update(np.asarray(array[number]).tobytes())
         return digest.hexdigest()
 
@@ -263,7 +266,7 @@ class ZarrFrames(Closing):
 
     def __init__(self, array: Array, place: Place) -> None:
         self.length = array.chunks[0]
-        self.scratch_bytes = _AT_ONCE * math.prod(array.chunks) * array.dtype.itemsize
+        self.scratch_bytes = AT_ONCE * math.prod(array.chunks) * array.dtype.itemsize
         self._array, self._place = array, place
 
     def lend(self, start: int, stop: int) -> None:
@@ -274,146 +277,6 @@ class ZarrFrames(Closing):
         from zarr.core.buffer.cpu import NDBuffer
 
         what = f"{self._place.path}: frames {frames[0]} to {frames[1] - 1} of {self._place.dataset}"
-        with _naming(f"{what} cannot be read"):
+        with naming(f"{what} cannot be read"):
             room = NDBuffer.from_numpy_array(out)
             self._array.get_basic_selection((slice(*frames), *region.slices), out=room)
-
-
-def save_zarr(source: str | Path, path: str | Path, progress: Callable[[int], None] | None = None) -> str:
-    """Write a recording or a result of HDF5 as Zarr, version 3; a folder exists whole or not at all.
-
-    Parameters
-    ----------
-    source : str or Path
-        A recording or a result.
-    path : str or Path
-        What to write: ``NAME.zarr``, or an address such as ``s3://bucket/NAME.zarr``.
-    progress : callable, optional
-        Called with the number of frames so far.
-
-    Returns
-    -------
-    str
-        What was written, in a few words.
-
-    Raises
-    ------
-    InputError
-        It is neither, it is damaged, there is something of that name already, or it cannot be written there.
-
-    Examples
-    --------
-    >>> from mirrorskin import io
-    >>> io.save_zarr("press.h5", "press.zarr")  # doctest: +SKIP
-    'Zarr, chunks (13, 480, 640), Blosc'
-    """
-    from mirrorskin.io.recording import is_recording, open_recording
-
-    target = path_of(path)
-    with open_file(source) as file:
-        if not any(file.marked(f"mirrorskin_{kind}") for kind in ("recording", "result")):
-            raise InputError(
-                f"{source} is no recording or result of ours: 'mirrorskin import' makes recordings"
-            )
-        with _new_store(target) as store, _naming(f"{target} cannot be written"):
-            _write_nodes(file, store)
-            if is_recording(source):
-                with open_recording(source, memory_limit=_BLOCK) as recording:
-                    _write_frames(recording, store, progress or (lambda count: None))
-            _finish(file, store)
-    with ZarrFile(target) as written:
-        stack = written.find(STACK)
-        return written.storage(stack) if isinstance(stack, h5py.Dataset) else "Zarr"
-
-
-@contextmanager
-def _new_store(target: Path) -> Iterator[Any]:
-    """Make a store; what was written of it is removed after an error."""
-    if isinstance(target, Url):
-        with _naming(f"{target} cannot be written"):
-            from zarr.core.sync import sync
-
-            store = _store(target, read_only=False)
-            if not sync(store.is_empty("")):
-                raise InputError(f"{target} is there already: remove it, or name another output with -o")
-        try:
-            yield store
-        except BaseException:
-            sync(store.delete_dir(""))
-            raise
-        return
-    if target.exists():
-        raise InputError(f"{target} is there already: remove it, or name another output with -o")
-    if not target.parent.is_dir():
-        raise InputError(f"{target}: there is no folder {target.parent}: make it first")
-    part = target.with_name(f".mirrorskin-{secrets.token_hex(8)}.part")
-    try:
-        with _naming(f"{target} cannot be written"):
-            store = _store(part, read_only=False)
-        yield store
-        part.rename(target)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-
-
-def _write_nodes(file: Hdf5File, store: Any) -> None:
-    """Write all datasets but the frames; links are left out."""
-    import zarr
-
-    nodes: list[h5py.Dataset] = []
-    file.root.visititems(lambda _, node: nodes.append(node) if isinstance(node, h5py.Dataset) else None)
-    for node in nodes:
-        if node.name == STACK:
-            continue
-        if node.dtype.kind in "biuf":
-            values = file.read(node, node.shape)
-            chunks = values.shape if values.size else "auto"
-            made = zarr.create_array(store, name=node.name, data=values, chunks=chunks, config=_WHOLE)
-        else:
-            texts = file.texts(node, "it is damaged") if node.ndim else file.value(node)
-            made = zarr.create_array(store, name=node.name, shape=node.shape, dtype=str, config=_WHOLE)
-            made[...] = np.array(texts, np.dtypes.StringDType())
-        made.attrs.update(_attributes(file, node))
-
-
-def _attributes(file: Hdf5File, node: Node) -> dict[str, Any]:
-    found = {name: file.attribute(str(node.name), name) for name in node.attrs}
-    return {name: value for name, value in found.items() if isinstance(value, str | bool | int | float)}
-
-
-def _write_frames(recording: Any, store: Any, progress: Callable[[int], None]) -> None:
-    import zarr
-    from zarr.codecs import BloscCodec
-
-    frame = math.prod(recording.shape[1:]) * recording.dtype.itemsize
-    length = min(max(1, _CHUNK // frame), recording.shape[0])
-    array = zarr.create_array(
-        store,
-        name=STACK,
-        shape=recording.shape,
-        dtype=recording.dtype,
-        chunks=(length, *recording.shape[1:]),
-        compressors=BloscCodec(cname="lz4", shuffle="bitshuffle"),
-        attributes={"interpretation": "image", "units": "counts"},
-        config=_WHOLE,
-    )
-    room = np.empty((length * max(1, _BLOCK // (length * frame)), *recording.shape[1:]), recording.dtype)
-    while (block := recording.read(room)) is not None:
-        array[block.index : block.index + len(block.frames)] = block.frames
-        progress(block.index + len(block.frames))
-
-
-def _finish(file: Hdf5File, store: Any) -> None:
-    """Write what the groups say, which makes it one of ours, and all metadata in one place."""
-    import zarr
-
-    groups: list[h5py.Group] = [file.root["/"]]
-    file.root.visititems(lambda _, node: groups.append(node) if isinstance(node, h5py.Group) else None)
-    root = zarr.open_group(store, mode="a")
-    for group in groups:
-        root.require_group(str(group.name)).attrs.update(
-            _attributes(file, group)
-        ) if group.name != "/" else None
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # other programs of version 3 need not read it, and lose nothing
-        zarr.consolidate_metadata(store)

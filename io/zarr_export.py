@@ -1,0 +1,164 @@
+"""Recordings and results of HDF5 written as Zarr; see ``mirrorskin.io.zarr``."""
+
+from __future__ import annotations
+
+import math
+import secrets
+import shutil
+import warnings
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from mirrorskin.io.hdf5 import Hdf5File, Node
+from mirrorskin.io.layout import STACK
+from mirrorskin.io.recording import is_recording, open_recording
+from mirrorskin.io.types import InputError, Source
+from mirrorskin.io.url import Url, path_of
+from mirrorskin.io.zarr import AT_ONCE, ZarrFile, naming, open_file, opened_store
+
+_WHOLE: Any = {"write_empty_chunks": True}
+_CHUNK, _BLOCK = 4 << 20, 64 << 20  # bytes of frames, unpacked: of a chunk, and written at a time
+
+
+def save_zarr(source: str | Path, path: str | Path, progress: Callable[[int], None] | None = None) -> str:
+    """Write a recording or a result of HDF5 as Zarr, version 3; a folder exists whole or not at all.
+
+    Parameters
+    ----------
+    source : str or Path
+        A recording or a result.
+    path : str or Path
+        What to write: ``NAME.zarr``, or an address such as ``s3://bucket/NAME.zarr``.
+    progress : callable, optional
+        Called with the number of frames so far.
+
+    Returns
+    -------
+    str
+        What was written, in a few words.
+
+    Raises
+    ------
+    InputError
+        It is neither, it is damaged, there is something of that name already, or it cannot be written there.
+
+    Examples
+    --------
+    >>> from mirrorskin import io
+    >>> io.save_zarr("press.h5", "press.zarr")  # doctest: +SKIP
+    'Zarr, chunks (13, 480, 640), Blosc'
+    """
+    target = path_of(path)
+    with open_file(source) as file:
+        if not any(file.marked(f"mirrorskin_{kind}") for kind in ("recording", "result")):
+            raise InputError(
+                f"{source} is no recording or result of ours: 'mirrorskin import' makes recordings"
+            )
+        with _new_store(target) as store:
+            _write_nodes(file, store)
+            if is_recording(source):
+                with open_recording(source, memory_limit=_BLOCK) as recording:
+                    _write_frames(recording, store, progress or (lambda count: None))
+            _finish(file, store)
+    with ZarrFile(target) as written:
+        stack = written.find(STACK)
+        return written.storage(stack) if isinstance(stack, h5py.Dataset) else "Zarr"
+
+
+@contextmanager
+def _new_store(target: Path) -> Iterator[Any]:
+    """Make a store; what was written of it is removed after an error."""
+    if target.exists():
+        raise InputError(f"{target} is there already: remove it, or name another output with -o")
+    if isinstance(target, Url):
+        from zarr.core.sync import sync
+
+        with naming(f"{target} cannot be written"), opened_store(target, read_only=False) as store:
+            if not sync(store.is_empty("")):
+                raise InputError(f"{target} is there already: remove it, or name another output with -o")
+            try:
+                yield store
+            except BaseException:
+                sync(store.delete_dir(""))
+                raise
+        return
+    if not target.parent.is_dir():
+        raise InputError(f"{target}: there is no folder {target.parent}: make it first")
+    part = target.with_name(f".mirrorskin-{secrets.token_hex(8)}.part")
+    try:
+        with naming(f"{target} cannot be written"), opened_store(part, read_only=False) as store:
+            yield store
+        part.rename(target)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _write_nodes(file: Hdf5File, store: Any) -> None:
+    """Write all datasets but the frames, several at once; links are left out."""
+    import zarr
+
+    nodes: list[h5py.Dataset] = []
+    file.root.visititems(lambda _, node: nodes.append(node) if isinstance(node, h5py.Dataset) else None)
+
+    def write(node: h5py.Dataset) -> None:
+        about: dict[str, Any] = {"name": node.name, "attributes": _attributes(file, node), "config": _WHOLE}
+        if node.dtype.kind in "biuf":
+            values = file.read(node, node.shape)
+            chunks = values.shape if values.size else "auto"
+            zarr.create_array(store, data=values, chunks=chunks, **about)
+        else:
+            texts = file.texts(node, "it is damaged") if node.ndim else file.value(node)
+            made = zarr.create_array(store, shape=node.shape, dtype=str, **about)
+            made[...] = np.array(texts, np.dtypes.StringDType())
+
+    with ThreadPoolExecutor(AT_ONCE, "mirrorskin-zarr") as pool:
+        list(pool.map(write, (node for node in nodes if node.name != STACK)))
+
+
+def _attributes(file: Hdf5File, node: Node) -> dict[str, Any]:
+    found = {name: file.attribute(str(node.name), name) for name in node.attrs}
+    return {name: value for name, value in found.items() if isinstance(value, str | bool | int | float)}
+
+
+def _write_frames(recording: Source, store: Any, progress: Callable[[int], None]) -> None:
+    import zarr
+    from zarr.codecs import BloscCodec
+
+    frame = math.prod(recording.shape[1:]) * recording.dtype.itemsize
+    length = min(max(1, _CHUNK // frame), recording.shape[0])
+    array = zarr.create_array(
+        store,
+        name=STACK,
+        shape=recording.shape,
+        dtype=recording.dtype,
+        chunks=(length, *recording.shape[1:]),
+        compressors=BloscCodec(cname="lz4", shuffle="bitshuffle"),
+        attributes={"interpretation": "image", "units": "counts"},
+        config=_WHOLE,
+    )
+    room = np.empty((length * max(1, _BLOCK // (length * frame)), *recording.shape[1:]), recording.dtype)
+    while (block := recording.read(room)) is not None:
+        array[block.index : block.index + len(block.frames)] = block.frames
+        progress(block.index + len(block.frames))
+
+
+def _finish(file: Hdf5File, store: Any) -> None:
+    """Write what the groups say, which makes it one of ours, and all metadata in one place."""
+    import zarr
+
+    groups: list[h5py.Group] = [file.root["/"]]
+    file.root.visititems(lambda _, node: groups.append(node) if isinstance(node, h5py.Group) else None)
+    root = zarr.open_group(store, mode="a")
+    for group in groups:
+        root.require_group(str(group.name)).attrs.update(
+            _attributes(file, group)
+        ) if group.name != "/" else None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # other programs of version 3 need not read it, and lose nothing
+        zarr.consolidate_metadata(store)

@@ -1,0 +1,107 @@
+"""Zarr in an object store that speaks S3: moto's server, where 'moto[server]' is installed."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+
+import pytest
+from commands import run
+from stacks import record, sphere
+
+from mirrorskin import io
+
+pytest.importorskip("s3fs", reason="needs 'mirrorskin[s3]'")
+pytest.importorskip("moto.server", reason="needs 'moto[server]'")
+
+ADDRESS = "s3://presses/press.zarr"
+
+
+@pytest.fixture(scope="module")
+def endpoint():
+    """A server in a process of its own, which takes a free port and says which."""
+    code = (
+        "import sys, moto.server, werkzeug.serving as w;"
+        "s = w.make_server('127.0.0.1', 0, moto.server.DomainDispatcherApplication("
+        "moto.server.create_backend_app), threaded=True); print(s.port, flush=True); s.serve_forever()"
+    )
+    server = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    with server:
+        assert server.stdout is not None
+        yield f"http://127.0.0.1:{int(server.stdout.readline())}"
+        server.terminate()
+
+
+@pytest.fixture(scope="module")
+def press(endpoint, tmp_path_factory):
+    """A recording, which is also in the store."""
+    path = record(sphere(), tmp_path_factory.mktemp("made") / "press.h5", truth=sphere().truth)
+    with pytest.MonkeyPatch.context() as patch:
+        connect(patch, endpoint).mkdir("presses")
+        assert run("export", path, "-o", ADDRESS).code == 0
+    return path
+
+
+def connect(patch, endpoint):
+    import s3fs
+
+    patch.setenv("AWS_ENDPOINT_URL", endpoint)
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        patch.setenv(name, "testing")
+    s3fs.S3FileSystem.clear_instance_cache()
+    return s3fs.S3FileSystem(use_listings_cache=False)
+
+
+@pytest.fixture
+def bucket(press, endpoint, tmp_path, monkeypatch):
+    """The store, with the recording's file in the working directory."""
+    shutil.copy(press, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    return connect(monkeypatch, endpoint)
+
+
+def test_results_are_those_of_the_file_bit_for_bit(bucket):
+    for name, result in ((ADDRESS, "s3.h5"), ("press.h5", "file.h5")):
+        assert run("reconstruct", name, "-o", result).code == 0
+    found = [io.open_result(name).maps() for name in ("s3.h5", "file.h5")]
+    assert {name: values.tobytes() for name, values in found[0].items()} == {
+        name: values.tobytes() for name, values in found[1].items()
+    }
+
+
+def refused(*words):
+    ended = run(*words)
+    assert ended.code == 2
+    assert len(ended.said.splitlines()) == 1
+    return ended.said
+
+
+def test_a_bucket_that_is_not_there(bucket):
+    assert "s3://nowhere/press.zarr: there is no Zarr" in refused("info", "s3://nowhere/press.zarr")
+
+
+def test_a_store_that_is_gone(bucket, monkeypatch):
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    assert f"{ADDRESS}: the store does not answer" in refused("info", ADDRESS)
+
+
+def test_credentials_that_are_missing(bucket, monkeypatch, tmp_path):
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(tmp_path / "none"))
+    assert f"{ADDRESS}: access is refused" in refused("info", ADDRESS)
+
+
+def test_a_chunk_that_is_gone_leaves_no_result(bucket, tmp_path):
+    bucket.copy("presses/press.zarr/", "presses/short.zarr/", recursive=True)
+    bucket.rm("presses/short.zarr/entry/instrument/detector/data/c/0/0/0")
+    before = sorted(tmp_path.iterdir())
+    said = refused("reconstruct", "s3://presses/short.zarr", "-o", "s3.h5")
+    assert "data/c/0/0/0, is missing: it was cut short" in said
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_pattern_names_all_that_answer(bucket):
+    assert "1 done" in run("batch", "s3://presses/pre*.zarr", "-o", "results").out
