@@ -65,9 +65,11 @@ Shape = tuple[int, int, int]
 KERNEL, IN_MEMORY = f"{OURS}, onset kernel in memory", f"{OURS}, onset kernel and maps in memory"
 READ, H5PY = f"{OURS}, frames read", "h5py, frames read"
 PLAIN = f"{PATH}, equation 4"
+_ZARR_PATH = f"{PATH}, from Zarr"
 
 _QUICK, _QUICK_TURNS = (12, 48, 64), (64, 48, 64)
 _PRESS, _TURNS, _LAB, _BUDGET = (1907, 1024, 1024), (16_000, 240, 320), (256, 1080, 1920), (6_500, 480, 640)
+_ZARR = (480, 480, 640)
 _PAGE = 4096
 _CACHED, _REPEATS = 4 * STEPS, 16  # frames that stay in the cache, and how often they are taken
 _LIMIT_SHARE = 0.7
@@ -125,6 +127,40 @@ def run_press(name: str, compression: Literal["raw", "bitshuffle"], device: Devi
     target = ratio_target(PATH, bound, rows[PATH], rows[other], than, faster=False)
     stored = "contiguous" if compression == "raw" else "bitshuffle-LZ4, one chunk a frame"
     title = f"full default, references of each pixel; {_size(shape)}, {stored}"
+    return Case(name, title, limits + list(rows.values()), {}, notes, () if quick else (target,))
+
+
+def run_zarr(device: Device, quick: bool) -> Case:
+    """Time the path of a press in Zarr beside that in HDF5, packed alike; results must be the same bits."""
+    name, shape = "file-zarr", _QUICK if quick else _ZARR
+    title = f"full default, references of each pixel; {_size(shape)}, bitshuffle-LZ4 in a local folder"
+    if absent := missing("zarr"):
+        return Case(name, title, [], absent)
+    size, extra, rounds = math.prod(shape), MAPS * math.prod(shape[1:]), 1 if quick else ROUNDS
+    check_memory(name, 3 * size + MEMORY_LIMIT + extra)
+    with new_folder(name, 3 * size + 2 * rounds * extra) as folder:
+        path, copy = folder / "press.h5", folder / "press.zarr"
+        record(make_press(shape), path, "bitshuffle")
+        storage = io.save_zarr(path, copy)
+        with io.open_recording(path) as first, io.open_recording(copy) as second:
+            works: dict[str, Work] = {
+                PATH: to_new_results(path, folder / "hdf5.h5", device),
+                _ZARR_PATH: to_new_results(copy, folder / "zarr.h5", device),
+                READ: partial(_fetch, first, _room(first)),
+                f"{READ} from Zarr": partial(_fetch, second, _room(second)),
+            }
+
+            def check(results: dict[str, Any]) -> None:
+                maps = results[PATH].maps()
+                if any(
+                    maps[one].tobytes() != got.tobytes() for one, got in results[_ZARR_PATH].maps().items()
+                ):
+                    raise DisagreementError(f"{_ZARR_PATH}: not the bits of HDF5")
+
+            limits, measured = beside_limits(works, size, device, quick, check, rounds=rounds)
+            notes = (f"HDF5: {first.storage}; {first.how}", f"Zarr: {storage}; {second.how}")
+    rows = {work: Row(work, measured[work], size, shape[0]) for work in works}
+    target = ratio_target(_ZARR_PATH, 1.5, rows[_ZARR_PATH], rows[PATH], "HDF5, packed alike", faster=False)
     return Case(name, title, limits + list(rows.values()), {}, notes, () if quick else (target,))
 
 
@@ -432,6 +468,7 @@ CASES: Cases = {
     "file-turns-wave": partial(run_turns, "file-turns-wave", "wave"),
     "file-lab": run_lab,
     "file-budget": run_budget,
+    "file-zarr": run_zarr,
 }
 
 if __name__ == "__main__":

@@ -69,7 +69,7 @@ def _reason(error: Exception) -> str:
     if "rotocol not known" in said:
         return f"{said}: check the address"
     if isinstance(error, FileNotFoundError):
-        return f"there is no Zarr array or group ({said}): check the address"
+        return "there is no Zarr array or group, or no such bucket: check the address"
     if kinds & _REFUSED or getattr(error, "status", None) in (401, 403):
         return f"access is refused ({said}): give the store's credentials, of S3 in AWS_PROFILE or the like"
     if kinds & _UNREACHABLE:
@@ -105,7 +105,9 @@ def opened_store(path: Path, read_only: bool = True) -> Iterator[Any]:
     from zarr.storage import FsspecStore, LocalStore, ZipStore
 
     if isinstance(path, Url):
-        store = FsspecStore.from_url(str(path), {"skip_instance_cache": True}, read_only)
+        # An object is fetched in one request, not after another for its size.
+        single = {"max_concurrency": 1} if path.parts[0] in ("s3:", "s3a:") else {}
+        store = FsspecStore.from_url(str(path), {"skip_instance_cache": True, **single}, read_only)
     elif read_only and not path.exists():
         raise InputError(f"{path}: no such file")
     else:

@@ -43,6 +43,7 @@ QUICK = (
     "file-press",
     "file-turns",
     "file-lab",
+    "file-zarr",
     "batch-small",
     "live-vertical-vga",
     "scaling-frames",
