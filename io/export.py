@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from io import BytesIO, StringIO
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,8 +20,9 @@ from mirrorskin.io.atomic import write_new
 from mirrorskin.io.frames import MCAP_SUFFIX
 from mirrorskin.io.mesh import Mesh, face_vectors, normals_around, surface_mesh
 from mirrorskin.io.os_errors import legible
-from mirrorskin.io.result import unit_of
+from mirrorskin.io.result import save_result, unit_of
 from mirrorskin.io.types import Floats, InputError, Result
+from mirrorskin.io.url import ZARR_SUFFIX, path_of
 
 _SECTION, _ARRAYS = ".csv", ".npz"
 _SOFTWARE, _DATE, _SOURCE = "software", "date", "source"
@@ -55,7 +57,7 @@ def export_result(
         Its suffix chooses the format: ``.ply`` and ``.stl``, a surface of triangles; ``.xyz``, points as
         text; ``.png``, ``.tif`` and ``.tiff``, heights as counts of 16 bits with their scale, and 0 for no
         answer; ``.npz``, all maps as plain arrays; ``.csv``, a cross-section; ``.mcap``, ROS 2 messages, as
-        ``save_messages`` writes them.
+        ``save_messages`` writes them; ``.zarr``, all that a result's file holds, as ``save_zarr`` does.
     section : mapping of ndarray, (n,), optional
         The cross-section, by name; lengths are mm, and ``filled`` is 1 where a height was not measured.
     points : bool, optional
@@ -78,7 +80,7 @@ def export_result(
     >>> io.export_result(io.open_result("coin.h5"), "coin.ply")  # doctest: +SKIP
     '1860 triangles between 961 points, 3 x 3 x 0.5 mm'
     """
-    path = Path(path)
+    path = path_of(path)
     check_export(result, path)
     suffix = path.suffix.lower()
     if suffix == _SECTION:
@@ -93,6 +95,12 @@ def export_result(
         from mirrorskin.io.mcap import save_messages
 
         holds = save_messages(result, path)
+    elif suffix == ZARR_SUFFIX:
+        from mirrorskin.io.zarr_export import save_zarr
+
+        with TemporaryDirectory() as folder:
+            save_result(result, Path(folder, "result.h5"))
+            holds = save_zarr(Path(folder, "result.h5"), path)
     else:
         try:
             with_points = {"points": True} if points and suffix == ".ply" else {}
@@ -100,17 +108,21 @@ def export_result(
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
         write_new(path, parts)
-    relative = suffix != _ARRAYS and result.offset_unknown is not None and result.offset_unknown.any()
+    relative = (
+        suffix not in (_ARRAYS, ZARR_SUFFIX)
+        and result.offset_unknown is not None
+        and result.offset_unknown.any()
+    )
     return f"{holds}, heights {_height_datum(result)}" if relative else holds
 
 
 def check_export(result: Result, path: str | Path) -> None:
     """Refuse what cannot be exported, before any work is done for it."""
-    suffix, known = Path(path).suffix.lower(), (*_FORMATS, _SECTION, MCAP_SUFFIX)
+    suffix, known = Path(path).suffix.lower(), (*_FORMATS, _SECTION, MCAP_SUFFIX, ZARR_SUFFIX)
     if suffix not in known:
         wrong = f"{suffix} is no format" if suffix else "its name does not say a format"
         raise InputError(f"{path}: {wrong}: name a file that ends with one of {' '.join(known)}")
-    if suffix == _ARRAYS:
+    if suffix in (_ARRAYS, ZARR_SUFFIX):
         return
     check_heights(result, path)
 

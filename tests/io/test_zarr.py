@@ -142,6 +142,13 @@ def test_results_are_read_and_exported(pair, tmp_path):
         np.testing.assert_array_equal(again.maps()[name], values)
 
 
+def test_a_result_in_memory_is_exported(pair, tmp_path):
+    with io.open_recording(pair[0]) as recording:
+        result = engine.reconstruct(recording)
+    io.export_result(result, tmp_path / "res.zarr")
+    np.testing.assert_array_equal(io.open_result(tmp_path / "res.zarr").height, result.height)
+
+
 def test_a_fingerprint_tells_recordings_apart(pair, tmp_path):
     other = record(sphere("uint16"), tmp_path / "other.h5")
     io.save_zarr(other, tmp_path / "other.zarr")

@@ -30,7 +30,9 @@ def refused(result, path, **options):
 def test_a_suffix_that_is_unknown_names_those_that_are_known(slope, tmp_path, name, wrong):
     line = refused(slope, tmp_path / name)
     assert wrong in line
-    assert line.endswith("name a file that ends with one of .ply .stl .xyz .png .tif .tiff .npz .csv .mcap")
+    assert line.endswith(
+        "name a file that ends with one of .ply .stl .xyz .png .tif .tiff .npz .csv .mcap .zarr"
+    )
 
 
 @pytest.mark.parametrize("name", IN_MILLIMETRES[:2])
