@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import socket
+import threading
 
 import h5py
 import numpy as np
@@ -14,6 +15,7 @@ from stacks import SHAPE, random_stack, read_all, record, sphere
 
 from mirrorskin import engine, io
 from mirrorskin.io.url import Url, path_of
+from mirrorskin.io.zarr import ZarrFrames
 
 zarr = pytest.importorskip("zarr")
 
@@ -101,6 +103,19 @@ def test_results_are_the_same_bit_for_bit(pair):
             found.append(engine.reconstruct(recording))
     for name, values in found[0].maps().items():
         assert values.tobytes() == found[1].maps()[name].tobytes(), name
+
+
+def test_frames_are_fetched_beside_the_kernels(pair, monkeypatch):
+    threads, fetch = set(), ZarrFrames.fetch
+
+    def noted(self, *what):
+        threads.add(threading.current_thread().name.rpartition("_")[0])
+        fetch(self, *what)
+
+    monkeypatch.setattr(ZarrFrames, "fetch", noted)
+    with io.open_recording(pair[1]) as recording:
+        engine.reconstruct(recording)
+    assert "mirrorskin-read" in threads
 
 
 def test_an_address_is_a_recording_like_any_other(pair, memory):
