@@ -1,10 +1,10 @@
-# make [demo|test|test-all|test-browser|test-hardware|docs|lint|types|fuzz|bench|portability|gpu-check|gpu|clean]; each sets up what it needs in .venv first.
+# make [demo|test|test-all|test-browser|test-cameras|test-hardware|docs|lint|types|fuzz|bench|portability|gpu-check|gpu|clean]; each sets up what it needs in .venv first.
 # PYTHON=/path/to/python3.12 chooses the interpreter (3.11 or newer).
 
 SHELL := /bin/sh
 .SHELLFLAGS := -ec
 .ONESHELL:
-.PHONY: demo test test-all test-browser test-hardware docs lint types fuzz bench portability gpu-check gpu clean
+.PHONY: demo test test-all test-browser test-cameras test-hardware docs lint types fuzz bench portability gpu-check gpu clean
 
 PYTHON ?= $(shell for python in python3.13 python3.12 python3.11 python3; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
@@ -40,6 +40,10 @@ test-hardware: $(READY)
 	@test -x "$(GRBL)" || { echo 'make test-hardware GRBL=PATH: PATH must be a program (docs/rig.md)' >&2; exit 1; }
 	GRBL="$(realpath $(GRBL))" $(BIN)/python -m pytest tests/hw/test_transcript.py tests/hw/test_rig_faults.py tests/hw/test_grbl_emulated.py
 	PYTHONPATH=tests/support $(BIN)/python tests/support/rig_faults.py "$(realpath $(GRBL))"
+
+# Aravis' fake cameras by GigE Vision; docs/camera.md tells what the system must bring.
+test-cameras: .venv/.genicam
+	@$(BIN)/python -m pytest tests/hw/test_genicam_camera.py
 
 # The site, in site/; warnings are errors.
 docs: .venv/.docs
@@ -110,6 +114,6 @@ $(READY): pyproject.toml
 	touch $@
 
 # What only some need comes with the first of them.
-.venv/.browser .venv/.docs .venv/.ptxas: $(READY)
+.venv/.browser .venv/.docs .venv/.genicam .venv/.ptxas: $(READY)
 	@$(PIP) install --editable '.[$(@F:.%=%)]'
 	touch $@
