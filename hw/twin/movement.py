@@ -14,6 +14,8 @@ from mirrorskin.io.types import Block, Floats, Header, InputError, Motion
 
 TILT_MAX = math.radians(30.0)
 
+_UPRIGHT = np.eye(3)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
@@ -25,7 +27,7 @@ class Pose:
     @property
     def upright(self) -> bool:
         """Whether the object is neither tilted nor turned."""
-        return bool(np.array_equal(self.rotation, np.eye(3)))
+        return bool((self.rotation == _UPRIGHT).all())
 
 
 class Movement:
