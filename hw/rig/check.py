@@ -114,7 +114,7 @@ def check_stage(stage: Stage, settings: StageSettings) -> Iterator[Finding]:
         yield from _controller(stage, settings)
     if not getattr(stage, "homing_stops", True):
         remedy = "build the firmware with EMERGENCY_PARSER, or stand by with the switch"
-        yield Finding("stage", "stop of homing", "impossible", "warning", remedy)
+        yield Finding("stage", "stop of homing", "not certain", "warning", remedy)
 
 
 def _controller(stage: Any, settings: StageSettings) -> Iterator[Finding]:
