@@ -140,6 +140,7 @@ class MarlinStage(Closing):
                     path = Trapezoid(length, length / command.duration, self._acceleration)
                     self._due = max(self._due or 0.0, time.monotonic()) + path.duration
                     self._ask(command.line, self._settings.timeout + self._due - time.monotonic())
+                    self._check()  # a stop that came just before the line was for nothing
 
     def wait(self, timeout: float | None = None) -> Report:
         """Wait until the body rests where it was sent, and return the report of it; see ``Stage.wait``."""

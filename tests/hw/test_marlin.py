@@ -193,6 +193,19 @@ def test_a_word_that_noise_changed_does_not_move_it(stage, line):
     assert not any(said.startswith("G1") for said in line.log)
 
 
+def test_a_stop_just_before_a_move_is_sent_stops_it(stage, line):
+    def late(said):
+        if "G1" in said:
+            line.noise = str
+            stage.stop()
+        return said
+
+    line.noise = late
+    with pytest.raises(HardwareError, match="the stage was stopped"):
+        stage.move(Position(-5.0), speed=0.5)
+    assert rests_soon(line)
+
+
 def test_a_wait_ends_in_time(stage, line):
     begin_slow(stage)
     with pytest.raises(HardwareError, match=r"did not come to rest within 0\.1 s"):
