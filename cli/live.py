@@ -40,7 +40,10 @@ def command(
     motion: scans.Motion,
     rig_file: scans.RigFile,
     record: Annotated[
-        Path | None, Option("--record", metavar="REC.h5", help="Recording to write meanwhile.")
+        Path | None,
+        Option(
+            "--record", metavar="REC.h5|REC.mcap", help="Recording to write meanwhile; MCAP has maps, too."
+        ),
     ] = None,
     output: Annotated[
         Path | None, Option("--output", "-o", metavar="RES.h5", help="Result to write at the end.")
@@ -180,6 +183,8 @@ class _Live:
 
             def on_update(update: Any, status: Any) -> None:
                 tell(status)
+                if recorder is not None:
+                    recorder.add_maps(update.time, update.height, update.contact_area)
                 if shown is not None:
                     shown.show(update, status)
 

@@ -20,7 +20,7 @@ from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.pictures import quiet_opencv
 from mirrorskin.io.positions import Positions
 from mirrorskin.io.recording import Recording
-from mirrorskin.io.types import Floats, Header, InputError, Result
+from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, Result
 
 if TYPE_CHECKING:
     from mcap_ros2.writer import Writer
@@ -69,15 +69,20 @@ _MESSAGES = {
 }
 
 
+def load_writer() -> type[Writer]:
+    """Return what writes messages; InputError if it is not installed."""
+    try:
+        from mcap_ros2.writer import Writer
+    except ImportError as error:
+        raise InputError(_INSTALL) from error
+    return Writer
+
+
 class _File:
     """Messages on their way into an MCAP file."""
 
     def __init__(self, stream: BinaryIO) -> None:
-        try:
-            from mcap_ros2.writer import Writer
-        except ImportError as error:
-            raise InputError(_INSTALL) from error
-        self._writer: Writer = Writer(stream)
+        self._writer: Writer = load_writer()(stream)
         self._schemas: dict[str, Any] = {}
 
     def put(self, topic: str, kind: str, message: Mapping[str, Any], stamp: int) -> None:
@@ -174,26 +179,99 @@ def _put_recording(file: _File, recording: Recording) -> str:
     header, count = recording.header, recording.shape[0]
     begun = _stamp(header.start_time)
     time = np.arange(count, dtype=np.float64) if recording.time is None else recording.time
-    for name, picture in (("dark", header.dark), ("bright", header.bright)):
-        if picture is not None:
-            file.put(f"/camera/{name}", _IMAGE, _picture(np.asarray(picture, np.float32)), begun)
+    _put_header(file, header)
     recording.rewind()
     room = np.empty((1, *recording.shape[1:]), recording.dtype)
     while (block := recording.read(room)) is not None:
-        for number, frame in enumerate(block.frames):
-            stamp = begun + round(float(time[block.index + number]) * _SECOND)
-            file.put(IMAGES, _IMAGE, _picture(frame), stamp)
-            for name, scale in _SERIES.items():
-                values = getattr(block, name)
-                if values is not None:
-                    file.put(f"/{name}", _NUMBER, {"data": float(values[number]) * scale}, stamp)
+        stamps = _stamps(begun, time[block.index : block.index + len(block.frames)])
+        _put_frames(file, block, stamps)
+        for name in _SERIES:
+            if getattr(block, name) is not None:
+                _put_numbers(file, name, getattr(block, name), stamps)
     recording.rewind()
+    without = "" if recording.time is not None else ", of unknown times: a second apart"
+    return f"{count} frames of {recording.shape[2]} x {recording.shape[1]}{without}"
+
+
+def _put_header(file: _File, header: Header) -> None:
+    for name, picture in (("dark", header.dark), ("bright", header.bright)):
+        if picture is not None:
+            image = _picture(np.atleast_2d(np.asarray(picture, np.float32)))
+            file.put(f"/camera/{name}", _IMAGE, image, _stamp(header.start_time))
     notes = {
         name: getattr(header, name) for name in ("motion", "title", "pixel_size", "tilt", "press", "camera")
     }
     file.note({name: value for name, value in notes.items() if value not in (None, "")})
-    without = "" if recording.time is not None else ", of unknown times: a second apart"
-    return f"{count} frames of {recording.shape[2]} x {recording.shape[1]}{without}"
+
+
+def _put_frames(file: _File, block: Block, stamps: list[int]) -> None:
+    for frame, stamp in zip(block.frames, stamps, strict=True):
+        file.put(IMAGES, _IMAGE, _picture(frame), stamp)
+
+
+def _put_numbers(file: _File, name: str, values: Floats, stamps: list[int]) -> None:
+    for value, stamp in zip(values, stamps, strict=True):
+        file.put(f"/{name}", _NUMBER, {"data": float(value) * _SERIES[name]}, stamp)
+
+
+class GrowingMessages(Closing):
+    """An MCAP file to which frames are appended, like a `GrowingRecording`, and maps that were found of them.
+
+    Topics are those of ``save_messages``; positions come last, as the source has them then. Each update of
+    the heights is a picture on ``/height``, and the area of contact a number on ``/contact_area``, m^2. A
+    file that was cut off has no index; the program ``mcap recover`` makes one.
+    """
+
+    def __init__(self, path: Path, descriptor: int, header: Header) -> None:
+        self.count: int = 0
+        self._path, self._begun = path, _stamp(header.start_time)
+        self._stream = os.fdopen(os.dup(descriptor), "wb")
+        self._file = _File(self._stream)
+        self._stamps: list[int] = []
+        self._positions: dict[str, list[float]] = {}
+        _put_header(self._file, header)
+
+    def append(self, block: Block) -> None:
+        """Write frames, and keep their positions."""
+        assert block.time is not None  # frames that come live have one
+        stamps = _stamps(self._begun, block.time)
+        _put_frames(self._file, block, stamps)
+        self._stamps += stamps
+        for name in _SERIES:
+            if getattr(block, name) is not None:
+                self._positions.setdefault(name, []).extend(getattr(block, name).tolist())
+        self.count += len(block.frames)
+
+    def add_maps(self, time: float, height: NDArray[np.float32] | None, contact_area: float | None) -> None:
+        """Write what was found of the frames up to a time: mm, mm^2."""
+        (stamp,) = _stamps(self._begun, np.array([time]))
+        if height is not None:
+            self._file.put("/height", _IMAGE, _picture(height * np.float32(_METRE)), stamp)
+        if contact_area is not None:
+            self._file.put("/contact_area", _NUMBER, {"data": contact_area * _METRE**2}, stamp)
+
+    def mark(self, start: int, used: NDArray[np.bool_]) -> None:
+        """Forget it: MCAP files do not tell which frames were used."""
+
+    def flush(self) -> None:
+        """Hand what is written to the system."""
+        self._stream.flush()
+
+    publish = flush
+
+    def finish(self, positions: Mapping[str, Floats], state: str) -> None:
+        """Write positions, those that came with the frames where there are no better ones, and the index."""
+        for name, live in self._positions.items():
+            better = np.asarray(positions.get(name, live), np.float64)[: self.count]
+            values = np.where(np.isfinite(better), better, live[: len(better)])
+            _put_numbers(self._file, name, values, self._stamps[: len(values)])
+        self._file.note({"state": state})
+        self._file.finish()
+        self.flush()
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._stream.close()
 
 
 def _picture(values: NDArray[Any]) -> dict[str, Any]:
@@ -207,6 +285,11 @@ def _picture(values: NDArray[Any]) -> dict[str, Any]:
         "step": columns * values.itemsize,
         "data": data.tobytes(),
     }
+
+
+def _stamps(begun: int, time: Floats) -> list[int]:
+    """Return the stamps of times, seconds since it began."""
+    return [begun + round(float(one) * _SECOND) for one in time]
 
 
 def _stamp(text: str) -> int:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from mirrorskin.io.atomic import MAKE_ROOM, VERSIONS, check_output, new_file
 from mirrorskin.io.calibration.file import size_of
 from mirrorskin.io.calibration.types import Calibration
+from mirrorskin.io.frames import MCAP_SUFFIX
 from mirrorskin.io.layout import (
     CHECKSUM,
     COMPLETE,
@@ -36,6 +37,7 @@ from mirrorskin.io.layout import (
     UNDER_WAY,
     USED,
 )
+from mirrorskin.io.mcap import GrowingMessages, load_writer
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.recorder import (
     Compression,
@@ -64,6 +66,19 @@ class _Mark(NamedTuple):
     used: NDArray[np.bool_]
 
 
+class _Maps(NamedTuple):
+    """What was found of the frames up to a time."""
+
+    time: float
+    height: NDArray[np.float32] | None
+    contact_area: float | None
+
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return 0 if self.height is None else self.height.nbytes
+
+
 class _End(NamedTuple):
     """What is known after the last frame."""
 
@@ -86,8 +101,9 @@ class StreamRecorder(TeeSource[LiveSource]):
     source : LiveSource
         Frames that it does not lend are copied.
     path : str or Path
+        HDF5, or for ROS 2 a file ``.mcap`` (`GrowingMessages`), which takes maps, too.
     compression : {"raw", "bitshuffle", "blosc", "gzip", "lzf"}
-        Frames are stored in one chunk each.
+        Frames are stored in one chunk each; not of MCAP.
     period : float, optional
         Seconds.
     calibration : Calibration, optional
@@ -121,7 +137,12 @@ class StreamRecorder(TeeSource[LiveSource]):
         super().__init__(source, path, compression, calibration)
         self.count = self.written = 0
         self._period = period
-        self._queue: queue.SimpleQueue[Block | _Mark | _End] = queue.SimpleQueue()
+        self._messages = self.path.suffix.lower() == MCAP_SUFFIX
+        if self._messages:
+            load_writer()  # refused before anything moves
+            if calibration is not None:
+                raise InputError(f"{path}: MCAP has no place for a calibration; record into a file .h5")
+        self._queue: queue.SimpleQueue[Block | _Mark | _Maps | _End] = queue.SimpleQueue()
         self._backlog, self._lock = 0, threading.Lock()
         self._error: BaseException | None = None
         self._writer = threading.Thread(target=self._write, name="recorder")
@@ -171,6 +192,13 @@ class StreamRecorder(TeeSource[LiveSource]):
         """Say whether frames, from number ``index`` on, were used; unless marked, they were."""
         self._queue.put(_Mark(index, np.array(used, bool)))
 
+    def add_maps(self, time: float, height: NDArray[np.float32] | None, contact_area: float | None) -> None:
+        """Write what was found of the frames up to a time, mm and mm^2; HDF5 has no place for it."""
+        if self._messages and self.count:
+            maps = _Maps(time, height, contact_area)
+            self._reserve(maps.size)
+            self._queue.put(maps)
+
     def _check(self) -> None:
         if self._error is not None:
             raise self._error
@@ -180,6 +208,14 @@ class StreamRecorder(TeeSource[LiveSource]):
         frames, size = block.frames, block.frames.nbytes
         if frames.dtype != self.dtype or frames.shape[1:] != self.shape[1:]:
             raise ValueError(f"{self.name} gave {frames.shape} {frames.dtype} and announced {self.shape}")
+        self._reserve(size)
+        if not block.lent:
+            block = dataclasses.replace(block, frames=frames.copy())
+        self._queue.put(block)
+        self.count += len(frames)
+
+    def _reserve(self, size: int) -> None:
+        """Count bytes that are to wait for the disk; InputError if there are too many."""
         with self._lock:
             backlog, self._backlog = self._backlog, self._backlog + size
         if backlog and backlog + size > _BACKLOG:
@@ -187,10 +223,6 @@ class StreamRecorder(TeeSource[LiveSource]):
                 f"{self.path}: the disk is too slow: {backlog / 1e6:.0f} MB of frames wait for it; "
                 "take fewer or smaller ones, or choose another place with -o"
             )
-        if not block.lent:
-            block = dataclasses.replace(block, frames=frames.copy())
-        self._queue.put(block)
-        self.count += len(frames)
 
     def _finish(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
@@ -226,7 +258,7 @@ class StreamRecorder(TeeSource[LiveSource]):
         except BaseException as error:  # it is raised where frames are read
             self._error = self._error or error
 
-    def _begin(self) -> GrowingRecording | None:
+    def _begin(self) -> GrowingRecording | GrowingMessages | None:
         """Make the file with the first block in it, and give it its name; None if no block comes."""
         while (block := self._wait(_POLL)) is None:
             pass
@@ -234,15 +266,21 @@ class StreamRecorder(TeeSource[LiveSource]):
             return None
         with ExitStack() as opening:
             with new_file(self.path) as descriptor:
-                known = self.header, self.shape, self.dtype, self._compression, self._calibration
-                series = [name for name in SERIES if getattr(block, name) is not None]
-                file = opening.enter_context(GrowingRecording(self.path, descriptor, *known, series))
+                file = self._open(descriptor, block)
+                opening.push(file)
                 self._append(file, block)
                 file.publish()
             opening.pop_all()  # from here on it is the caller's to close
         return file
 
-    def _follow(self, file: GrowingRecording) -> _End:
+    def _open(self, descriptor: int, block: Block) -> GrowingRecording | GrowingMessages:
+        if self._messages:
+            return GrowingMessages(self.path, descriptor, self.header)
+        known = self.header, self.shape, self.dtype, self._compression, self._calibration
+        series = [name for name in SERIES if getattr(block, name) is not None]
+        return GrowingRecording(self.path, descriptor, *known, series)
+
+    def _follow(self, file: GrowingRecording | GrowingMessages) -> _End:
         """Append what comes; after an error, wait for the end."""
         try:
             with self._write_errors():
@@ -253,14 +291,17 @@ class StreamRecorder(TeeSource[LiveSource]):
                 pass
             return _End(item.positions, _cut_short(error))
 
-    def _append_all(self, file: GrowingRecording) -> _End:
+    def _append_all(self, file: GrowingRecording | GrowingMessages) -> _End:
         due = time.monotonic() + self._period
         while True:
             item = self._wait(max(0.0, due - time.monotonic()))
             if isinstance(item, _End):
                 return item
             if isinstance(item, _Mark):
-                file.used.set(item.start, item.used)
+                file.mark(item.start, item.used)
+            elif isinstance(item, _Maps):
+                file.add_maps(*item)
+                self._release(item.size)
             elif item is not None:
                 self._append(file, item)
             del item  # what a source lends, it has back at once
@@ -268,17 +309,20 @@ class StreamRecorder(TeeSource[LiveSource]):
                 file.flush()
                 due = time.monotonic() + self._period
 
-    def _wait(self, timeout: float) -> Block | _Mark | _End | None:
+    def _wait(self, timeout: float) -> Block | _Mark | _Maps | _End | None:
         """Return what is queued next, None if nothing comes in time; the end, where the program just left."""
         with suppress(queue.Empty):
             return self._queue.get(timeout=timeout)
         return None if threading.main_thread().is_alive() else _End({}, _cut_short(SystemExit()))
 
-    def _append(self, file: GrowingRecording, block: Block) -> None:
+    def _append(self, file: GrowingRecording | GrowingMessages, block: Block) -> None:
         file.append(block)
         self.written = file.count
+        self._release(block.frames.nbytes)
+
+    def _release(self, size: int) -> None:
         with self._lock:
-            self._backlog -= block.frames.nbytes
+            self._backlog -= size
 
     def _write_errors(self) -> AbstractContextManager[None]:
         return as_input_error(f"{self.path} could not be written", MAKE_ROOM)
@@ -346,8 +390,8 @@ class Column:
 class GrowingRecording(Closing):
     """A recording to which frames are appended; from ``publish`` on others can watch.
 
-    Raw frames follow each other without a gap as long as there are no more of them than expected. ``used``
-    says of each frame whether it was used: unless set, it was.
+    Raw frames follow each other without a gap as long as there are no more of them than expected. Unless
+    ``mark`` says otherwise, a frame was used.
     """
 
     def __init__(
@@ -411,6 +455,14 @@ class GrowingRecording(Closing):
         self._checksums.set(self.count, checksums(frames))
         self.count += n
 
+    def mark(self, start: int, used: NDArray[np.bool_]) -> None:
+        """Say whether frames, from some number on, were used."""
+        self._used.set(start, used)
+
+    def add_maps(self, *_maps: object) -> None:
+        """Refuse maps, for which there is no place."""
+        raise TypeError("maps go into MCAP files alone")
+
     def flush(self) -> None:
         """Hand everything to the system, so that it can be read and outlives this process."""
         self._hold(0)
@@ -462,12 +514,12 @@ class GrowingRecording(Closing):
         }
         self._dropped = Column(file, DROPPED, None, np.int32(0), expected)
         self._checksums = Column(file, CHECKSUM, None, np.uint32(0), expected)
-        self.used: Column = Column(file, USED, None, np.uint8(1), expected)
+        self._used = Column(file, USED, None, np.uint8(1), expected)
 
     def _flush(self) -> None:
         """Do so; the room that was reserved last is enough for it."""
         self._frames.flush()  # the frames are there before anything says so
-        for column in (*itertools.chain(*self._series.values()), self._dropped, self._checksums, self.used):
+        for column in (*itertools.chain(*self._series.values()), self._dropped, self._checksums, self._used):
             column.flush(self.count)
         self._file.flush()
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from injected_faults import failing
+from mcap.reader import make_reader
 from mishaps import state_of
 from rig_fakes import FakeCamera, FakeStage, settings, spreading
 from speckle import Speckle
@@ -96,6 +97,17 @@ def test_a_press_is_told_recorded_and_kept(fake, tmp_path):
         assert recording.shape[0] == used
     assert fake.stage.closed
     assert fake.camera.closed
+
+
+def test_frames_and_heights_go_into_an_mcap_file(fake, tmp_path):
+    record = tmp_path / "rec.mcap"
+    done = fake.run(*PRESS, "--record", str(record))
+    assert done.exit_code == 0, done.output
+    _, used, skipped, _, updates = counted(done.output)
+    with record.open("rb") as file:
+        found = [one[1].topic for one in make_reader(file).iter_messages()]
+    assert found.count("/camera/image") == used + skipped
+    assert 2 <= found.count("/height") <= updates  # while one is written, others may be missed
 
 
 def test_strokes_are_joined_and_their_hysteresis_is_told(fake, tmp_path):

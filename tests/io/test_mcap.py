@@ -1,9 +1,13 @@
 """ROS 2 messages in MCAP files, read back by the reader of their own packages, and by ours."""
 
+from contextlib import suppress
+
 import cv2
 import numpy as np
 import pytest
 from commands import run
+from growing import Feed
+from growing import frames_of as feed_of
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
@@ -139,3 +143,40 @@ def test_a_file_that_is_cut_off_or_none_is_refused(film, tmp_path):
 def test_images_that_are_not_grey_values_are_refused(film):
     with pytest.raises(io.InputError, match="encoding 'bayer_rggb8'"):
         frames_of(film(("/a", np.zeros((2, 4), np.uint8)), encoding="bayer_rggb8"))
+
+
+def test_frames_and_maps_are_written_while_they_come(tmp_path):
+    height = np.full((5, 7), 2.0, np.float32)
+    with io.StreamRecorder(Feed(6, (2,)), tmp_path / "a.mcap") as recorder:
+        while recorder.read() is not None:
+            recorder.add_maps(float(recorder.count - 1), height, 3.0)
+    found = messages(tmp_path / "a.mcap")
+    begun = found[0][1]
+    pictures = [np.frombuffer(said.data, np.uint8) for topic, _, said in found if topic == "/camera/image"]
+    np.testing.assert_array_equal(np.reshape(pictures, (6, 5, 7)), feed_of(np.arange(6)))
+    travel = [said.data for topic, _, said in found if topic == "/travel"]
+    np.testing.assert_allclose(travel, (0.01 * np.arange(6) + 0.001) * 1e-3)  # those of the end
+    heights = [(time - begun, said) for topic, time, said in found if topic == "/height"]
+    assert [time for time, _ in heights] == [1_000_000_000, 3_000_000_000, 5_000_000_000]
+    np.testing.assert_array_equal(np.frombuffer(heights[0][1].data, "<f4"), np.float32(2e-3))
+    assert [said.data for topic, _, said in found if topic == "/contact_area"] == [3e-6] * 3
+
+
+def test_frames_that_came_before_a_fault_are_kept(tmp_path):
+    feed = Feed(6, fails=(4, OSError("unplugged")))
+    with suppress(OSError), io.StreamRecorder(feed, tmp_path / "a.mcap") as recorder:
+        while recorder.read() is not None:
+            pass
+    assert sum(topic == "/camera/image" for topic, _, _ in messages(tmp_path / "a.mcap")) == 4
+    with (tmp_path / "a.mcap").open("rb") as file:
+        notes = [one.metadata for one in make_reader(file).iter_metadata()]
+    assert notes[-1] == {"state": "cut short: unplugged"}
+
+
+def test_a_calibration_has_no_place_in_it(tmp_path):
+    with pytest.raises(io.InputError, match="no place for a calibration"):
+        io.StreamRecorder(
+            Feed(),
+            tmp_path / "a.mcap",
+            calibration=io.Calibration(io.CameraId("c", (5, 7), np.dtype(np.uint8))),
+        )
