@@ -1,6 +1,7 @@
 """How the site differs from the Markdown that it is made of: what mkdocs calls while it builds (mkdocs.yml).
 
-Pages are added that lie elsewhere in the repository, or that nobody wrote: commands, Python, the gallery.
+Pages are added that lie elsewhere in the repository, or that nobody wrote: commands,
+Python, the gallery, the notebook.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any
 import command_pages
 import gallery_pages
 import mathml
+import notebook_page
 import repository
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
@@ -49,6 +51,7 @@ def on_config(config: MkDocsConfig) -> None:
 def on_files(files: Files, config: MkDocsConfig) -> None:
     """Add the pages that do not lie in the folder of the documentation."""
     made: dict[str, str | bytes] = {**command_pages.pages(), **gallery_pages.pages(), **_api_pages()}
+    made |= notebook_page.pages()
     made["decisions/index.md"] = _index_of_decisions()
     for uri, content in made.items():
         files.append(File.generated(config, uri, content=content))
