@@ -21,7 +21,7 @@ from mirrorskin.hw.grbl.moves import Axes
 from mirrorskin.hw.grbl.replies import Noise, Splitter
 from mirrorskin.hw.rig.plans import Trapezoid
 from mirrorskin.hw.rig_file import StageSettings
-from mirrorskin.hw.stage import Position, Report
+from mirrorskin.hw.stage import Limits, Position, Report
 from mirrorskin.io import InputError
 from mirrorskin.io.types import Closing
 
@@ -78,9 +78,10 @@ class MarlinStage(Closing):
     """
 
     def __init__(self, settings: StageSettings, port: serial.Serial | None = None) -> None:
-        self.name, self.limits = f"stage {settings.port}", settings.limits
+        self.name: str = f"stage {settings.port}"
+        self.limits: Limits = settings.limits
         self.error: HardwareError | None = None
-        self.axes = Axes(settings, self.name, "G1")
+        self.axes: Axes = Axes(settings, self.name, "G1")
         self._settings = settings
         self._port = open_port(settings.port, settings.baud, self.name) if port is None else port
         self._lock, self._ended = threading.RLock(), threading.Event()
@@ -93,7 +94,7 @@ class MarlinStage(Closing):
         self._homing = False
         self._acceleration = 1e6  # of the slowest axis, machine units/s^2
         try:
-            self.firmware = self._open()
+            self.firmware: str = self._open()
         except BaseException as error:
             close_port(self._port)
             if isinstance(error, HardwareError):
@@ -194,7 +195,7 @@ class MarlinStage(Closing):
         self._number = 0
         self._ask("M110 N0")
         capabilities = self._ask("M115")
-        self.homing_stops = any(line.strip() == "Cap:EMERGENCY_PARSER:1" for line in capabilities)
+        self.homing_stops: bool = any(line.strip() == "Cap:EMERGENCY_PARSER:1" for line in capabilities)
         if any(line.startswith("SD printing byte") for line in self._ask("M27", lenient=True)):
             raise InputError(f"{self.name}: it prints from its card; let that end, or stop it there")
         for line in _PREPARE:

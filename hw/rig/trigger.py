@@ -45,7 +45,7 @@ class Trigger:
         self._patience = _PATIENCE + (settings.exposure or 0.0) + (settings.delay or 0.0)
         self._before: int | None = None  # frames that had come before the first trigger
         self._given = 0
-        self.longest = 0.0  # seconds from a trigger to its frame, at most
+        self.longest: float = 0.0  # seconds from a trigger to its frame, at most
 
     def expose(self) -> Frames:
         """Trigger the camera once, and return the frame; HardwareError if none or another one came."""

@@ -217,8 +217,9 @@ class Axial(Movement):
                 f"tilt {math.degrees(tilt):g} degrees cannot be: give more than 0 and at most"
                 f" {math.degrees(TILT_MAX):g} degrees"
             )
-        self.tilt = self.steepest = tilt
-        self.pivot = _check_pivot(pivot)
+        self.tilt: float = tilt
+        self.steepest: float = tilt
+        self.pivot: tuple[float, float, float] = _check_pivot(pivot)
 
     def reduced(self, path: Floats, /) -> Floats:
         """Drop whole turns, and what of the phase rounding may differ by."""
@@ -268,11 +269,12 @@ class Leaning(Movement):
         except ValueError:
             raise InputError(f"tilt and travel: one number, or {len(alpha)} as of the phase") from None
         super().__init__(np.column_stack([alpha, lean, depth]), "pose", depth.max(initial=-math.inf))
-        self.path = np.column_stack([np.unwrap(alpha), lean, depth])
-        self.steepest = float(np.max(np.abs(lean)))
+        self.path: Floats = np.column_stack([np.unwrap(alpha), lean, depth])
+        self.steepest: float = float(np.max(np.abs(lean)))
         if not self.steepest <= TILT_MAX:
             raise InputError(f"tilt cannot be: give {math.degrees(TILT_MAX):g} degrees at most")
-        self.presses, self.pivot = bool(np.ptp(depth) > 0), _check_pivot(pivot)
+        self.presses: bool = bool(np.ptp(depth) > 0)
+        self.pivot: tuple[float, float, float] = _check_pivot(pivot)
 
     def reduced(self, path: Floats, /) -> Floats:
         """Drop whole turns."""

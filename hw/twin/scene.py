@@ -68,7 +68,8 @@ class Scene:
         shade: Shade | None = None,
     ) -> None:
         self._skin, self._optics, self._imprint, self._shade = skin, optics, imprint, shade
-        self._ends, self.moments = [0.0], [0.0]
+        self._ends = [0.0]
+        self.moments: list[float] = [0.0]
         if exposure > 0:
             self._ends = [-exposure / 2, 0.0, exposure / 2]
             self.moments = (exposure * _BLUR).tolist()
@@ -103,7 +104,7 @@ class Witness:
     """A skin that remembers what touched in all of its poses so far, (H, W), and the force in each, N."""
 
     def __init__(self, skin: Skin, shape: tuple[int, int]) -> None:
-        self.touched = np.ones(shape, bool)
+        self.touched: NDArray[np.bool_] = np.ones(shape, bool)
         self._skin = skin
         self._forces: dict[bytes, float] = {}
 
