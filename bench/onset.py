@@ -27,7 +27,7 @@ from mirrorskin.bench.scenes import LEVELS, StackName, fill_press, press_noise, 
 from mirrorskin.engine import find_onset
 from mirrorskin.engine.frames import estimate_noise, reference_maps, thin_out
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.onset import DARK, onset_heights, onset_levels
+from mirrorskin.kernels.onset import DARK, onset_heights, onset_levels, onset_near, onset_sure
 
 Maps = dict[str, NDArray[Any]]
 Flags = NDArray[np.uint8]
@@ -269,17 +269,22 @@ def _answer(
     height, sigma = (np.full(onset.shape, np.nan, np.float32) for _ in range(2))
     row, column = found = np.nonzero(status == 1)
     start, level, light = onset[found].astype(np.intp), known.level[found], known.light[found]
-    surely = level - np.float32(_SURELY * noise)
-    below, todo = start - 1, np.arange(len(start))  # back to the last frame that was surely dark
-    while len(todo := todo[below[todo] > 0]):
-        sample = frames[below[todo], row[todo], column[todo]]
-        todo = todo[~((sample < light[todo]) & (sample <= surely[todo]))]
-        below[todo] -= 1
+    sure = onset_sure(level, light, _SURELY * noise)
+
+    def last_below(bounds: NDArray[Any]) -> NDArray[np.intp]:
+        """Go back from the onsets to the last frames that are below some bounds, or the first of all."""
+        frame, todo = start - 1, np.arange(len(start))
+        while len(todo := todo[frame[todo] > 0]):
+            todo = todo[frames[frame[todo], row[todo], column[todo]] >= bounds[todo]]
+            frame[todo] -= 1
+        return frame
+
+    below, foot = last_below(sure), last_below(onset_near(level, known.dark[found], sure))
     last, slack = len(frames) - 1, _PLATEAU * noise
     before, at, *later = (frames[np.minimum(start + k, last), row, column] for k in (-1, 0, 1, 2))
     height[found], sigma[found], _ = onset_heights(
-        start, below, before, at, np.fmin(*later), level, known.dark[found], travel, noise, slack,
-        slack * np.sqrt(2), True,
+        start, below, foot, frames[foot + 1, row, column], before, at, np.fmin(*later), level,
+        known.dark[found], travel, noise, slack, slack * np.sqrt(2), True,
     )  # fmt: skip
     return height, sigma, status
 
@@ -336,6 +341,13 @@ def _numba_scan(each: bool, hold: int, *, whole: bool) -> Any:  # noqa: C901  # 
     @numba.njit(error_model="numpy")
     def answer(frames, pixel, start, travel, level, light, dark, noise):  # type: ignore[no-untyped-def]
         surely = level - np.float32(_SURELY * noise)
+        way = level - dark
+        near = level - max(np.float32(0.25) * way, np.float32(0))
+        foot = start - 1
+        while foot > 0 and (
+            frames[foot, pixel] >= light or frames[foot, pixel] > surely or frames[foot, pixel] >= near
+        ):
+            foot -= 1
         below = start - 1
         while below > 0 and (frames[below, pixel] >= light or frames[below, pixel] > surely):
             below -= 1
@@ -345,14 +357,18 @@ def _numba_scan(each: bool, hold: int, *, whole: bool) -> Any:  # noqa: C901  # 
         sudden_step = _PLATEAU * noise * math.sqrt(2)
         from_dark, to_light = low <= dark + _PLATEAU * noise, high >= after - sudden_step
         step = high - low
-        share = (min(np.float64(level), high) - low) / step
-        width = travel[start] - travel[start - 1]
-        line = width * noise * math.sqrt(share * share + (1 - share) * (1 - share)) / step
-        hovers = step <= sudden_step or (start - 2 - below) * step > 2.5 * sudden_step
-        interval = (travel[start] - travel[below] if hovers else width) / math.sqrt(12)
         sudden = from_dark and to_light
+        jumped = foot + 1 < start and frames[foot + 1, pixel] >= after - way / 8 and way >= 34 * noise
+        end = foot + 1 if jumped else start
+        from_dark, to_light = from_dark or low <= dark + step / 8, to_light or high >= after - step / 8
+        share = (min(np.float64(level), high) - low) / step
+        width = travel[end] - travel[end - 1]
+        line = width * noise * math.sqrt(share * share + (1 - share) * (1 - share)) / step
+        hovers = not jumped and (step <= sudden_step or (start - 2 - below) * step > 2.5 * sudden_step)
+        interval = (travel[start] - travel[below] if hovers else width) / math.sqrt(12)
         spread = math.sqrt(line * line + interval * interval) if from_dark or to_light else line
-        height = -(travel[start - 1] + width * (0.5 if sudden else share))
+        sudden = sudden or jumped
+        height = -(travel[end - 1] + width * (0.5 if sudden else share))
         return height, interval if sudden or hovers else spread
 
     def onsets(frames, light, onset):  # type: ignore[no-untyped-def]

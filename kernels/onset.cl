@@ -8,11 +8,12 @@
 // Maps lie in planes of `stride` pixels, of which the first `pixels` are the picture's:
 //
 // levels   counts at which a pixel turns light, NaN where it cannot; counts of its dark plateau
-// marks    the smallest sample that is light; the smallest that is not surely dark
+// marks    the smallest sample that is light; that is not surely dark; that is near the level
 // left     frames after which nothing about a pixel can change any more if all are light, or MOST if they are more
-// times    frame at which the run began; the last surely dark frame before a run that is not complete, or before now
-//          where the last sample is not surely dark
-// samples  the last sample; those before, at and after the onset of a run that is not complete
+// times    frame at which the run began; the last frame that was surely dark, and the last that was not near the
+//          level, before a run that is not complete, or before now where the last sample is near the level
+// samples  the last sample; those before, at and after the onset of a run that is not complete; that after the last
+//          that was not near the level
 // answers  height; sigma: as if no frame followed
 // status   0 invalid input, 1 onset, 2 never light, 3 light at start (`release`: 2 dark at start, 3 light to the end)
 // travel   has planes of `room` frames: travel; the step to it; travel since the first frame
@@ -87,7 +88,8 @@ __kernel void onset_levels(
     }
 }
 
-// Finds what is surely dark: samples that miss the level by `tolerance` counts.
+// Finds what is surely dark: samples that miss the level by `tolerance` counts; and what is near the level: all that
+// miss it by less than a quarter of the way from dark.
 __kernel void onset_sure(
     const int pixels, const int stride, const float tolerance, MAP levels, __global FRAME *restrict marks)
 {
@@ -101,33 +103,45 @@ __kernel void onset_sure(
         const float bound = sure < NONE ? (sure < -1 ? -1 : sure) : NONE - 1;
         const FRAME above = levels[p] < 0 ? light : (FRAME)((int)(bound + 1));
 #endif
-        marks[stride + p] = above < light ? above : light;
+        const FRAME dim = above < light ? above : light;
+        const float way = 0.25f * (levels[p] - levels[stride + p]), least = levels[p] - (way > 0 ? way : 0);
+        marks[stride + p] = dim;
+#if BITS == 32
+        marks[2 * stride + p] = least < dim ? least : dim;
+#else
+        const float bounded = least > 0 ? (least < NONE ? least : NONE) : 0;
+        const int whole = (int)bounded, reached = whole + (whole < bounded);
+        marks[2 * stride + p] = reached < dim ? reached : dim;
+#endif
     }
 }
 
 // --- What the samples around an onset tell ------------------------------------------------------------------------
 
-// The last surely dark frame from frame `from` of a pixel's `series` backwards; the first of all is taken for dark.
+// The last frame below `bound` from frame `from` of a pixel's `series` backwards; the first of all is taken for dark.
 // The series begins with frame `first`; `last` is the sample before it, and `known` the answer there.
-int last_dark(
+int last_below(
     __global const FRAME *series, const int from, const int pixels, const int first, const int release,
-    const FRAME sure, const FRAME last, const int known)
+    const FRAME bound, const FRAME last, const int known)
 {
     for (int k = from; k >= first && k > 0; --k)
-        if (SEE(series[(size_t)(k - first) * pixels]) < sure) return k;
-    return first == 0 ? 0 : SEE(last) < sure ? first - 1 : known;
+        if (SEE(series[(size_t)(k - first) * pixels]) < bound) return k;
+    return first == 0 ? 0 : last < bound ? first - 1 : known;
 }
 
 // Height and variance of a pixel: onset.py explains them. All is computed, then chosen, so that it becomes vector code.
+// `jumped` says that `from` and `step` are not of the onset, but of the step in which the pixel rose to its plateau.
 float2 answer(
     const float low, const float high, const float after, const float waited, const float doubt, const float from,
     const float step, const float level, const float dark, const float noise, const float dark_tolerance,
-    const float light_tolerance)
+    const float light_tolerance, const int jumped)
 {
     const float rise = high - low, steepness = 1 / rise;
     const int from_dark = low <= dark + dark_tolerance, to_light = high >= after - light_tolerance;
-    const int hovered = (rise <= light_tolerance) | ((waited - 2) * rise > 2.5f * light_tolerance);
-    const int sudden = from_dark & to_light, guess = from_dark | to_light | hovered, look = !(sudden | hovered);
+    const int waits = (rise <= light_tolerance) | ((waited - 2) * rise > 2.5f * light_tolerance);
+    const int hovered = waits & !jumped, sudden = (from_dark & to_light) | jumped, look = !(sudden | hovered);
+    const float near = 0.125f * rise;
+    const int beside = (low <= dark + near) | (high >= after - near), guess = from_dark | to_light | beside | hovered | jumped;
     const float least = level > low ? level : low, most = least < high ? least : high;
     const float crossed = (most - low) * steepness, rest = 1 - crossed;
     const float share = sudden ? 0.5f : crossed;
@@ -138,8 +152,15 @@ float2 answer(
 
 // --- Frames, one after the other ----------------------------------------------------------------------------------
 
-#define LAST_DARK(p, from) \
-    last_dark(frames + (p), from, pixels, first, release, sures[p], first > 0 ? lasts[p] : 0, darks[p])
+// Finds when a pixel was last surely dark, and not near its level, at frame `from` or before, and the sample after that.
+#define LOOK_BACK(p, from) \
+    { \
+        const FRAME last = first > 0 ? SEE(lasts[p]) : 0; \
+        darks[p] = last_below(frames + (p), from, pixels, first, release, sures[p], last, darks[p]); \
+        feet[p] = last_below(frames + (p), from, pixels, first, release, nears[p], last, feet[p]); \
+        const int next = feet[p] + 1 - first; \
+        if (next >= 0 && next <= from - first) risens[p] = SEE(frames[(size_t)next * pixels + (p)]); \
+    }
 
 // One of the frames that are taken side by side: where it is dark, the pixel starts again, until it has held.
 #define TAKE(i) \
@@ -194,12 +215,14 @@ __kernel void onset_scan(
     levels += base;
     answers += base;
     status += base;
-    __global int *restrict darks = times + stride;
-    __global const FRAME *restrict sures = marks + stride + base;
+    __global int *restrict darks = times + stride, *restrict feet = darks + stride;
+    __global const FRAME *restrict sures = marks + stride + base, *restrict nears = sures + stride;
     __global FRAME *restrict lasts = samples + base, *restrict lows = lasts + stride, *restrict highs = lows + stride,
-                   *restrict laters = highs + stride;
+                   *restrict laters = highs + stride, *restrict risens = laters + stride;
     if (first == 0 && subframe)
-        for (int p = 0; p < width; ++p) darks[p] = 0;
+        for (int p = 0; p < width; ++p) darks[p] = feet[p] = 0;
+    if (first < 2 && first + count > 1 && subframe)
+        for (int p = 0; p < width; ++p) risens[p] = SEE(frames[(size_t)(1 - first) * pixels + p]);
 
     for (int start = 0; start < count; start += SPAN) {
         const int now = first + start, length = min(SPAN, count - start), end = now + length;
@@ -277,26 +300,33 @@ __kernel void onset_scan(
                 later[p - low] = LEAST(one, two);
             }
 
-            // Where the sample before is not surely dark, one has to look further back.
+            // Where the sample before is near the level, one has to look further back.
             float waited[CHUNK], doubt[CHUNK];
+            int frame[CHUNK], jumped[CHUNK];
             for (int p = low; p < high; ++p) {
                 waited[p - low] = 1;
                 doubt[p - low] = 0;
-                unsure |= (before[p - low] > 0) & (times[p] > 0) & !(dim[p - low] < sures[p]);
+                frame[p - low] = times[p] < 1 ? 1 : times[p];
+                jumped[p - low] = 0;
+                unsure |= (before[p - low] > 0) & (times[p] > 0) & !(dim[p - low] < nears[p]);
             }
             for (int p = low; p < high && unsure; ++p) {
-                const int begin = times[p];
-                if (before[p - low] == 0 || begin < 1 || dim[p - low] < sures[p]) continue;
-                if (begin >= now) darks[p] = LAST_DARK(p, begin - 1);
-                waited[p - low] = begin - darks[p];
-                doubt[p - low] = travel[2 * room + begin - 1] - travel[2 * room + darks[p]];
+                const int begin = times[p], i = p - low;
+                if (before[i] == 0 || begin < 1 || dim[i] < nears[p]) continue;
+                if (begin >= now) LOOK_BACK(p, begin - 1)
+                waited[i] = begin - darks[p];
+                doubt[i] = travel[2 * room + begin - 1] - travel[2 * room + darks[p]];
+                const float way = levels[p] - levels[stride + p];
+                const int risen = risens[p] >= later[i] - way * 0.125f;
+                jumped[i] = risen & (feet[p] + 1 < begin) & (way >= 34 * noise);
+                if (jumped[i]) frame[i] = feet[p] + 1;
             }
 
             for (int p = low, i = 0; p < high; ++p, ++i) {
-                const int begin = times[p], frame = begin < 1 ? 1 : begin;
-                const float2 found = answer(dim[i], bright[i], later[i], waited[i], doubt[i], travel[frame - 1],
-                                            travel[room + frame], levels[p], levels[stride + p], noise,
-                                            dark_tolerance, light_tolerance);
+                const int begin = times[p];
+                const float2 found = answer(dim[i], bright[i], later[i], waited[i], doubt[i], travel[frame[i] - 1],
+                                            travel[room + frame[i]], levels[p], levels[stride + p], noise,
+                                            dark_tolerance, light_tolerance, jumped[i]);
                 const float height = answers[p], sigma = answers[stride + p], spread = rough_inverse_root(found.y);
                 const uchar was = status[p], is = begin > 0 ? 1 : begin == 0 ? 3 - release : begin == DARK ? never : 0;
                 answers[p] = before[i] == 0 ? height : begin > 0 ? found.x : NAN;
@@ -304,25 +334,29 @@ __kernel void onset_scan(
                 status[p] = before[i] == 0 ? was : is;
             }
             for (int p = low; p < high && running; ++p) {
-                const int begin = times[p], dark = darks[p];
+                const int begin = times[p], dark = darks[p], foot = feet[p];
+                const FRAME risen = risens[p];
+                const int rises = (begin > 0) & (dim[p - low] < nears[p]);
                 lows[p] = dim[p - low];
                 highs[p] = bright[p - low];
                 laters[p] = later[p - low];
                 darks[p] = ((begin > 0) & (dim[p - low] < sures[p])) ? begin - 1 : dark;
+                feet[p] = rises ? begin - 1 : foot;
+                risens[p] = rises ? bright[p - low] : risen;
             }
         }
     }
 
     for (int p = 0; p < width; ++p) left[base + p] = remain[p];
     if (!subframe) return;
-    // Where the last sample is not surely dark, the next block would not see since when.
+    // Where the last sample is near the level, the next block would not see since when.
     __global const FRAME *restrict final = frames + (size_t)(count - 1) * pixels;
     for (int low = 0, high; low < width; low = high) {
         high = min(low + CHUNK, width);
         int unsure = 0;
-        for (int p = low; p < high; ++p) unsure |= (remain[p] == whole) & !(SEE(final[p]) < sures[p]);
+        for (int p = low; p < high; ++p) unsure |= (remain[p] == whole) & !(SEE(final[p]) < nears[p]);
         for (int p = low; p < high && unsure; ++p)
-            if (times[p] == DARK && SEE(final[p]) >= sures[p]) darks[p] = LAST_DARK(p, first + count - 1);
+            if (times[p] == DARK && SEE(final[p]) >= nears[p]) LOOK_BACK(p, first + count - 1)
     }
     for (int p = 0; p < width; ++p) lasts[p] = final[p];
 }

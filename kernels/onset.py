@@ -69,8 +69,23 @@ def onset_sure(level: Array, light: Array, tolerance: float) -> Array:
     return np.asarray(np.minimum(above, light), light.dtype)
 
 
-def onset_scan(frames: Array, first: int, hold: int, light: Array, sure: Array, onset: Array, below: Array,
-               last: Array, before: Array, at: Array, after: Array) -> None:  # fmt: skip
+def onset_near(level: Array, dark: Array, sure: Array) -> Array:
+    """Return the smallest samples, (P,), that miss the level by less than a quarter of the way from dark.
+
+    They are never above `sure`, and `sure` itself where nothing is so far below the level.
+    """
+    level = level.astype(np.float32)
+    below = np.float32(0.25) * (level - dark)
+    near = np.nan_to_num(level - np.maximum(below, np.float32(0)), nan=np.inf)
+    if sure.dtype.kind == "f":
+        return np.asarray(np.minimum(near, sure))
+    top = np.iinfo(sure.dtype).max
+    return np.asarray(np.minimum(np.ceil(near).clip(0, top), sure), sure.dtype)
+
+
+def onset_scan(frames: Array, first: int, hold: int, light: Array, sure: Array, near: Array, onset: Array,
+               below: Array, foot: Array, risen: Array, last: Array, before: Array, at: Array,
+               after: Array) -> None:  # fmt: skip
     """Go through a block of frames; the maps are the state, changed in place.
 
     Parameters
@@ -78,11 +93,13 @@ def onset_scan(frames: Array, first: int, hold: int, light: Array, sure: Array, 
     frames : (n, P), uint8, uint16 or float32
     first : number of the block's first frame in the stack
     hold : light frames in a row that make an onset
-    light, sure : (P,), smallest sample that is light, and smallest that is not surely dark
+    light, sure, near : (P,), smallest sample that is light, that is not surely dark, that is near the level
     onset : (P,), frame at which the run began; ``DARK`` without one, ``INVALID`` after a sample that is no
         number
     below : (P,), last frame before the run that was surely dark; the first frame is taken for dark. The
         kernel keeps it only where it is not the last frame before the run
+    foot, risen : (P,), last frame before the run that was not near the level, as ``below``, and the sample
+        after it
     last : (P,), the sample before the block
     before, at, after : (P,), samples one before and at the onset, and the lesser of the two that follow it
     """
@@ -95,8 +112,11 @@ def onset_scan(frames: Array, first: int, hold: int, light: Array, sure: Array, 
         before[begins] = last[begins]
         at[begins] = frame[begins]
         onset[undecided & ~is_light] = DARK
+        after_foot = undecided & (foot == number - 1)
+        risen[after_foot] = frame[after_foot]
         if number > 0:
             below[undecided & (frame < sure)] = number
+            foot[undecided & (frame < near)] = number
         onset[undecided & ~np.isfinite(frame)] = INVALID
 
         next_to = onset == number - 1
@@ -107,9 +127,9 @@ def onset_scan(frames: Array, first: int, hold: int, light: Array, sure: Array, 
         last[:] = frame
 
 
-def onset_heights(onset: Array, below: Array, before: Array, at: Array, after: Array, level: Array,
-                  dark: Array, travel: NDArray[np.float64], noise: float, dark_tolerance: float,
-                  light_tolerance: float,
+def onset_heights(onset: Array, below: Array, foot: Array, risen: Array, before: Array, at: Array,
+                  after: Array, level: Array, dark: Array, travel: NDArray[np.float64], noise: float,
+                  dark_tolerance: float, light_tolerance: float,
                   subframe: bool) -> tuple[NDArray[np.float64], NDArray[np.float64], Array]:  # fmt: skip
     """Turn onsets into heights, standard deviations (mm) and status.
 
@@ -120,12 +140,15 @@ def onset_heights(onset: Array, below: Array, before: Array, at: Array, after: A
     change began or ended, so with one of them there the interval's share is added. A pixel may also hover
     about its level and cross it when noise says so: its step is within the noise, or it was near the level
     for longer than its step would take. It may have crossed at any time since the last frame in which it was
-    surely dark. Without `subframe` the height is that of the paper's equation 4, at the onset itself, which
-    is wrong by half a step on average and by up to a whole one.
+    surely dark. But where it had risen to its light plateau in one step, and that plateau is so near the
+    level that noise hid it at first, the change was in that step. A sample off its plateau by less than an
+    eighth of the step may sit on it all the same, lit by its neighbours. Without `subframe` the height is
+    that of the paper's equation 4, at the onset itself, which is wrong by half a step on average and by up
+    to a whole one.
 
     Parameters
     ----------
-    onset, below, before, at, after : as ``onset_scan`` leaves them
+    onset, below, foot, risen, before, at, after : as ``onset_scan`` leaves them
     level, dark : (P,), counts at which a pixel turns light, and of the dark plateau
     travel : (T,), mm, one a frame
     noise : standard deviation of a sample, counts
@@ -144,14 +167,20 @@ def onset_heights(onset: Array, below: Array, before: Array, at: Array, after: A
     low, high = before[found].astype(np.float64), at[found].astype(np.float64)
     settled = np.where(start + 1 < len(travel), after[found], high)
     from_dark, to_light = low <= dark[found] + dark_tolerance, high >= settled - light_tolerance
-    sudden, under_way = from_dark & to_light, ~(from_dark | to_light)
-
     step = high - low
+    way = level[found] - dark[found]
+    jumped = (foot[found] + 1 < start) & (risen[found] >= settled - way / 8) & (way >= 34 * noise)
+    beside = (low <= dark[found] + step / 8) | (high >= settled - step / 8)
+    sudden, under_way = from_dark & to_light | jumped, ~(from_dark | to_light | beside)
+    end = np.where(jumped, foot[found] + 1, start)
+    width = travel[end] - travel[end - 1]
+
     crossed = (np.clip(level[found], low, high) - low) / step
     known = np.abs(width) * noise * np.hypot(crossed, 1 - crossed) / step
     hovered = (step <= light_tolerance) | ((start - 2 - below[found]) * step > 2.5 * light_tolerance)
+    hovered &= ~jumped
     interval = np.abs(np.where(hovered, travel[start] - travel[below[found]], width))
     guessed = interval / 2 / np.sqrt(3)
-    height[found] = -(travel[start - 1] + width * np.where(sudden, 0.5, crossed))
+    height[found] = -(travel[end - 1] + width * np.where(sudden, 0.5, crossed))
     sigma[found] = np.select([sudden | hovered, under_way], [guessed, known], np.hypot(known, guessed))
     return height, sigma, status

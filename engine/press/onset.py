@@ -190,12 +190,12 @@ class OnsetSearch:
         """Return what is kept of each pixel."""
         return {
             "levels": Planes(2, np.float32),  # counts at the threshold, and of the dark plateau
-            "marks": Planes(2, self._dtype),  # the smallest sample that is light, and not surely dark
+            "marks": Planes(3, self._dtype),  # the smallest sample that is light, not surely dark, near
             "left": Planes(1, f"u{self._dtype.itemsize}"),  # frames after which nothing can change
-            "times": Planes(2, np.int32),  # frame at which the run began; the last surely dark one before
+            "times": Planes(3, np.int32),  # where the run began; the last before surely dark, not near
             "answers": Planes(2, np.float32),  # height and sigma
             "status": Planes(1, np.uint8),
-            **({"samples": Planes(4, self._dtype)} if self._subframe else {}),  # around an open run
+            **({"samples": Planes(5, self._dtype)} if self._subframe else {}),  # around an open run
         }
 
     def _set_levels(self, dark: NDArray[np.float32], bright: NDArray[np.float32], threshold: float) -> None:
@@ -284,6 +284,8 @@ class OnsetSearch:
         """
         self._travel.clear()
         self._noise.reset(noise)
+        if self._own_dark:  # what is near the level is looked for between it and the first frame
+            self._noise_of_bounds = None
 
     @property
     def falls(self) -> bool:

@@ -45,17 +45,20 @@ def numpy_onset(
         np.broadcast_to(part, shape).reshape(-1) for part in reference_maps(dark, bright, shape, dtype)
     )
     level, plateau, light = reference.onset_levels(high, low, threshold - 1e-12, dtype, release)
-    sure = reference.onset_sure(level, light, 6 * noise)
     flat = frames.reshape(len(frames), -1)
     flat = reference.complement(flat) if release else flat
-    below = np.zeros(level.size, np.int32)
-    onset = np.where(np.isnan(level), reference.INVALID, reference.DARK).astype(np.int32)
-    last, before, at, after = (np.zeros(level.size, dtype) for _ in range(4))
-    reference.onset_scan(flat, 0, hold, light, sure, onset, below, last, before, at, after)
     plateau = flat[0].astype(np.float32) if own_dark else plateau
+    sure = reference.onset_sure(level, light, 6 * noise)
+    near = reference.onset_near(level, plateau, sure)
+    below, foot = np.zeros((2, level.size), np.int32)
+    onset = np.where(np.isnan(level), reference.INVALID, reference.DARK).astype(np.int32)
+    risen, last, before, at, after = (np.zeros(level.size, dtype) for _ in range(5))
+    reference.onset_scan(flat, 0, hold, light, sure, near, onset, below, foot, risen, last, before, at, after)
     height, sigma, status = reference.onset_heights(
         onset,
         below,
+        foot,
+        risen,
         before,
         at,
         after,

@@ -1,5 +1,7 @@
 """Onset and release: kernels against their NumPy references, the references against a loop over pixels."""
 
+import math
+
 import numpy as np
 import pytest
 from presses import LEVELS, SPEC, assert_equal, assert_within_an_ulp, first_run, numpy_onset, random_press
@@ -212,6 +214,27 @@ def test_a_pixel_that_hovers_about_its_level_does_not_claim_to_know_when(device)
     assert np.max(np.abs(((found.height + 0.25) / found.sigma)[late])) < 4
 
 
+def test_a_plateau_that_noise_takes_below_its_level_began_in_the_step_that_led_to_it(device):
+    """Plateaus at 101 to 104 % of the threshold, with a noise of 2 %: many cross it frames after the step."""
+    generator = np.random.default_rng(3)
+    depth, plateau = generator.uniform(0.2, 1.0, (2, 40, 50))
+    share, travel = 0.5 * (1.01 + 0.03 * plateau), 0.1 * np.arange(14)
+    light = share * (travel[:, np.newaxis, np.newaxis] > depth)
+    frames = (20 + 200 * light + generator.normal(0, 2, light.shape)).astype(np.float32)
+    found = find_onset(frames, travel, dark=20.0, bright=220.0, noise=2.0, device=device)
+    known = found.status == 1
+    error = (found.height + depth)[known]
+    assert known.mean() > 0.9
+    assert np.mean(np.abs(error) > 0.15) < 1e-3  # a step is 0.1 mm
+    assert np.mean((error / found.sigma[known]) ** 2) == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_sample_that_is_lit_by_its_neighbours_does_not_tell_when_the_change_began(device):
+    frames = np.array([20.0, 20, 38, 190, 200, 200], np.float32).reshape(-1, 1, 1)
+    found = find_onset(frames, 0.1 * np.arange(6), dark=20.0, bright=220.0, noise=1.0, device=device)
+    assert found.sigma.item() == pytest.approx(0.1 / math.sqrt(12), rel=0.05)
+
+
 def test_noise_is_estimated_from_the_first_two_frames():
     generator = np.random.default_rng(1)
     for noise in (0.6, 1.5, 6.0):
@@ -364,6 +387,9 @@ def test_levels_are_those_of_the_reference_to_the_last_bit(device, dtype, event)
         np.testing.assert_array_equal(band.picture(band.maps["marks"].host[0])[alive], light[alive])
         sure = reference.onset_sure(level, light, 6 * noise)
         np.testing.assert_array_equal(band.picture(band.maps["marks"].host[1])[alive], sure[alive])
+        plane = reference.complement(np.zeros(shape, dtype)) if event == "release" else plateau
+        near = reference.onset_near(level, plane, sure)
+        np.testing.assert_array_equal(band.picture(band.maps["marks"].host[2])[alive], near[alive])
 
 
 def test_the_whole_range_of_uint16(device):
