@@ -10,8 +10,8 @@ from mirrorskin.kernels.errors import DeviceError
 
 FRAMES = random_press("uint8", 30, (23, 31), seed=5)
 TRAVEL = np.arange(30) * 0.1
-LARGEST = 2 * 768 * 4  # two planes of floats, 23 x 31 pixels in whole words
-SMALLEST = 3 * 64 * 4  # the travel must fit too
+LARGEST = 3 * 768 * 4  # three planes of frame numbers, 23 x 31 pixels in whole words
+SMALLEST = 3 * 64 * 4  # those of one row
 
 
 @pytest.mark.parametrize("limit", [LARGEST, LARGEST - 1, SMALLEST])
@@ -28,10 +28,10 @@ def test_less_room_gives_the_same_answer(small_device, limit):
 
 
 def test_the_room_shrinks_before_the_picture_is_cut_and_one_row_must_fit(small_device):
-    small_device.max_allocation = 10 * 23 * 31
+    small_device.max_allocation = 14 * 23 * 31
     search = OnsetSearch((23, 31), FRAMES.dtype, device=small_device)
-    assert 1 <= len(search.room) <= 10
-    small_device.max_allocation = 2 * 64 * 4 - 1
+    assert 1 <= len(search.room) <= 14
+    small_device.max_allocation = SMALLEST - 1
     with pytest.raises(DeviceError, match="one row of 31 pixels does not fit"):
         OnsetSearch((23, 31), FRAMES.dtype, device=small_device)
 

@@ -183,7 +183,7 @@ def fake(monkeypatch):
     """A rig whose file is read and which is opened without hardware; its own references are wrong."""
     known = {"pixel_size": (0.05, 0.05), "delay": 0.0, "rate": 60.0, "name": "left", "bright": 255.0}
 
-    def opened(told):
+    def opened(told, in_steps=False):
         stage = FakeStage()
         return rig.Rig(stage, FakeCamera(stage.position, spreading(SHAPE), rate=60.0), told)
 
