@@ -38,7 +38,7 @@ INLINE Kept keep(const Samples of, const Known known, const float rest_below, co
         const F least = GREATER(of.low, (F)0.0f) + AT_REST * known.error_of_one / entry(of, ROOT_WEIGHT, k);
         const I clipped = COUNTED ? (of.per_count > 0.0f ? raw <= 0.0f : raw >= TOP) : (I)0;
         const I resting = (zenith_of(of, raw) < GREATER(least, (F)rest_below)) | clipped;
-        kept.lost = resting & (kept.lost < entry(of, TRAVEL, k)) ? (F)entry(of, TRAVEL, k) : kept.lost;
+        kept.lost = (resting & (kept.lost < entry(of, TRAVEL, k))) ? (F)entry(of, TRAVEL, k) : kept.lost;
     }
     kept.usable = 0;
     for (int k = 0; k < of.count; ++k) {

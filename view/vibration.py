@@ -62,9 +62,10 @@ class Vibration:
         assert rocked.slope_sigma is not None
         assert rocked.contact is not None
         touched = np.where(rocked.contact == 1, rocked.slope, np.nan)
+        lag = np.where(np.isfinite(self.height), press.hysteresis - self.hysteresis, np.nan)
         found = {
             "height": (press.height - self.height) / press.height_sigma,
-            "hysteresis": (press.hysteresis - self.hysteresis) / press.hysteresis_sigma,
+            "hysteresis": lag / press.hysteresis_sigma,
             "slope": (touched - self.slope) / rocked.slope_sigma,
         }
         return {name: one[np.isfinite(one)].astype(np.float64) for name, one in found.items()}
@@ -105,7 +106,7 @@ def vibration_figure(found: Vibration, title: str, path: Path) -> None:
     axes.legend(frameon=False)
 
     axes = figure.add_subplot(grid[0, 1])
-    hysteresis = _MICRO * press.hysteresis[np.isfinite(press.hysteresis)]
+    hysteresis = _MICRO * press.hysteresis[np.isfinite(press.hysteresis + found.height)]
     low, high = np.percentile(hysteresis, [0.2, 99.8]).tolist()
     axes.hist(hysteresis, np.linspace(low, high, 60).tolist(), color="tab:blue", alpha=0.7)
     axes.axvline(_MICRO * found.hysteresis, color="tab:red", label="truth")

@@ -27,8 +27,14 @@ class Sensor(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What to call it in tables and figures."""
+        """Its name in the JSON."""
         return f"{self.contact}, {self.optics}"
+
+    @property
+    def title(self) -> str:
+        """What to call it in tables and figures."""
+        contact = "ideal contact" if self.contact == "conform" else "elastic body"
+        return f"{contact}, {'ideal light' if self.optics == 'ideal' else 'lit wall'}"
 
 
 PAPERS = Sensor("conform", "ideal")
@@ -81,7 +87,7 @@ EXPERIMENTS = (
 )
 _HEAD = [
     "experiment",
-    "contact, optics",
+    "contact, light",
     "method",
     "answered",
     "untouched",
@@ -94,7 +100,8 @@ _HEAD = [
 _LEGEND = """\
 Errors in mm. answered: pixels with a height over the object. untouched: pixels with a height where
 nothing touches. shared: RMS error on the pixels that all sensors of an experiment answer. cost: by how
-much that is above that of the paper's idealisations, conform and ideal."""
+much that is above the paper's idealisations. ideal contact: the sheet takes the object's shape (eq. 1).
+ideal light: it depends on the zenith alone."""
 
 # Of a sensor and a method: the fields of a Score, pixels answered without contact, and the RMS error on
 # the pixels that all sensors answer.
@@ -139,7 +146,7 @@ def run(experiment: Experiment, folder: Path, device: str | None) -> Outcomes:
         base = folder / f"{experiment.name}-{sensor.contact}-{sensor.optics}"
         truths[sensor] = _record(experiment, sensor, base.with_suffix(".h5"), device)
         results[sensor] = _reconstruct(base, sensor, device)
-    best = {sensor.name: by_method["sub-frame"] for sensor, by_method in results.items()}
+    best = {sensor.title: by_method["sub-frame"] for sensor, by_method in results.items()}
     path = (folder / experiment.name).with_suffix(".png")
     view.height_figure(
         best,
@@ -172,7 +179,7 @@ def _record(experiment: Experiment, sensor: Sensor, path: Path, device: str | No
         references="ball",
         device=device,
     )
-    return record(twin, path, f"pressing on the {experiment.thing} ({sensor.name})")
+    return record(twin, path, f"pressing on the {experiment.thing} ({sensor.title})")
 
 
 def _reconstruct(base: Path, sensor: Sensor, device: str | None) -> dict[str, io.Result]:
@@ -221,8 +228,9 @@ def _height(result: io.Result) -> NDArray[np.float32]:
 
 def _rows(name: str, by_sensor: Outcomes) -> list[list[str]]:
     ideal = by_sensor[PAPERS.name]["sub-frame"]["shared_rms"]
+    titles = {sensor.name: sensor.title for sensor in SENSORS}
     return [
-        [name, sensor, method, *_cells(outcome, ideal)]
+        [name, titles[sensor], method, *_cells(outcome, ideal)]
         for sensor, methods in by_sensor.items()
         for method, outcome in methods.items()
     ]

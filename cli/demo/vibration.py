@@ -27,7 +27,7 @@ _SIDES, _APART = 5, 7  # of the pyramid; pixels, across, that show one of them
 _HEAD = ["vibration", "found", "sigma", "truth", "chi2"]
 _LEGEND = """\
 height: RMS error and RMS of the predicted standard deviation after all strokes, um. hysteresis: mean over
-the pixels; the truth is the backlash of the twin's stage, um. slope: RMS error and RMS of the predicted
+the same pixels; the truth is the backlash of the twin's stage, um. slope: RMS error and RMS of the predicted
 standard deviation, of a pyramid, away from its ridges and the contact's border. growth: mm^2 of light for
 each mm of travel, of a ball in elastic contact."""
 
@@ -64,11 +64,12 @@ def run(experiment: Experiment, folder: Path, device: str | None) -> Outcomes:
     assert rocked.slope_sigma is not None
     touched = (rocked.contact == 1) & np.isfinite(slope)
     wrong = (rocked.slope - slope)[touched]
+    known = np.isfinite(height)
     return {
         "height": {"found": 1e3 * strokes[-1][1], "sigma": 1e3 * strokes[-1][2], "chi2": chi["height"]},
         "hysteresis": {
-            "found": 1e3 * float(np.nanmean(pressed.hysteresis)),
-            "sigma": 1e3 * float(np.sqrt(np.nanmean(pressed.hysteresis_sigma**2))),
+            "found": 1e3 * float(np.nanmean(pressed.hysteresis[known])),
+            "sigma": 1e3 * float(np.sqrt(np.nanmean(pressed.hysteresis_sigma[known] ** 2))),
             "truth": 1e3 * _BACKLASH,
             "chi2": chi["hysteresis"],
         },
@@ -101,7 +102,7 @@ def _oscillate(
         true.append(float(np.clip(true[-1], place, place + _BACKLASH)))
     twin = _twin(experiment, "sphere", Vertical(np.array(true)), device=device, references="exact")
     header = twin.header
-    # What is hardly light when it touches is found too deep, by noise.
+    # What is hardly light when it touches is crossed by noise, and its release is found too early.
     steep = twin.truth.zenith > _FAINT
     truth = np.where(steep, twin.truth.height, np.float32(np.nan))
     search = engine.StrokeSearch(

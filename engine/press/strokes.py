@@ -241,6 +241,10 @@ class _JoinedOnsets:
         sigma = found.sigma.reshape(-1)[at].astype(np.float64)
         ends = -travel[frame - 1], -travel[frame]
         low, high = np.minimum(*ends), np.maximum(*ends)
+        # What noise hid at first was found in another step: the middle of it is the height.
+        elsewhere = np.maximum(low - height, height - high) > _ALIKE * (high - low)
+        low = np.where(elsewhere, height - np.sqrt(3) * sigma, low)
+        high = np.where(elsewhere, height + np.sqrt(3) * sigma, high)
         half = (high - low) / 2
         guess = half / np.sqrt(3)
         guessed = sigma >= (1 - _ALIKE) * guess

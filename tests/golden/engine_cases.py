@@ -41,6 +41,7 @@ SOLVED: Tolerance = (0.0, 1e-4)  # mm: the integration's own tolerance
 SIGMA: Tolerance = (1e-2, 1e-7)
 FITTED: Tolerance = (1e-5, 1e-7)  # what least squares in double precision settle at
 NORMAL: Tolerance = (1e-5, 2e-6)  # of unit vectors in single precision
+SMALL = (19, 26)
 
 
 def onset_maps(found: engine.Onset) -> Answer:
@@ -359,6 +360,41 @@ def correlate_a_sliding_window() -> Answer:
         for number, block in enumerate(blocks(frames, [4, 9, 1, 3], phase=phase)):
             push_block(correlator, block)
             answers[f"{dtype}_{number}"] = wave_maps(correlator.result())
+    return named(**answers)
+
+
+@case(phase=NORMAL, sigma=(1e-4, 1e-7))
+def fit_fringes() -> Answer:
+    known = ("phase", "sigma", "mean", "modulation", "residual", "noise")
+    found = {d: engine.fit_fringes(turn(d, SMALL, UNEVEN)[0], UNEVEN) for d in LEVELS}
+    return named(**{d: {name: getattr(fit, name) for name in known} for d, fit in found.items()})
+
+
+@case(height=HEIGHT, height_sigma=SIGMA, sharpness=FITTED)
+def find_focus() -> Answer:
+    travel, texture = np.arange(0.0, 2.4, 0.2), np.random.default_rng(6).random(SMALL)
+    sharp = np.exp(-((travel[:, None, None] + 2 * dome(SMALL)[0] - 0.6) ** 2))
+    answers = {}
+    for dtype in LEVELS:
+        found = engine.find_focus(counted(texture * sharp, dtype), travel, noise=0.01)
+        answers[dtype] = {
+            name: getattr(found, name) for name in ("height", "height_sigma", "status", "sharpness")
+        }
+    return named(**answers)
+
+
+@case(normals=NORMAL, normal_sigma=SIGMA, albedo=FITTED, albedo_sigma=SIGMA, residual=(1e-3, 1e-6))
+def photometric_stereo() -> Answer:
+    known = ("normals", "normal_sigma", "albedo", "albedo_sigma", "residual", "samples", "noise")
+    _, along_x, along_y = dome(SMALL)
+    normal = np.stack([-along_x, -along_y, np.ones(SMALL)]) / np.sqrt(1 + along_x**2 + along_y**2)
+    light = np.stack([0.7 * np.cos(EIGHTHS), 0.7 * np.sin(EIGHTHS), np.full(8, 0.714)], axis=1)
+    share = 0.8 * np.clip(np.einsum("ki,ihw->khw", light, normal), 0, 1)
+    share += np.random.default_rng(4).normal(0, 0.01, share.shape)
+    answers = {}
+    for dtype, (dark, _) in LEVELS.items():
+        found = engine.photometric_stereo(counted(share, dtype), light, dark=dark)
+        answers[dtype] = {name: getattr(found, name) for name in known}
     return named(**answers)
 
 

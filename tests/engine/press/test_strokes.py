@@ -12,7 +12,7 @@ from mirrorskin.hw.twin import Camera, Vertical, oscillating_travel
 DARK, BRIGHT, NOISE = 20.0, 220.0, 2.0
 
 
-def made_press(travel, depth, hysteresis=0.0, rise=1e-9, jitter=0.0, seed=1):
+def made_press(travel, depth, hysteresis=0.0, rise=1e-9, jitter=0.0, seed=1, full=BRIGHT):
     """Frames of pixels that turn light at a travel and dark again at another; each pixel alone, no twin."""
     random = np.random.default_rng(seed)
     light, frames = np.zeros(depth.shape), []
@@ -21,7 +21,7 @@ def made_press(travel, depth, hysteresis=0.0, rise=1e-9, jitter=0.0, seed=1):
     ):
         at = depth - (hysteresis if step < 0 else 0.0)
         light = np.clip((place - at) / rise + 0.5, 0, 1)
-        frames.append(DARK + (BRIGHT - DARK) * light + random.normal(0, NOISE, depth.shape))
+        frames.append(DARK + (full - DARK) * light + random.normal(0, NOISE, depth.shape))
     return np.clip(np.rint(frames), 0, 255).astype(np.uint8)
 
 
@@ -54,6 +54,15 @@ def test_onset_release_and_hysteresis_are_unbiased_and_as_sure_as_they_say(trave
         assert known.sum() > 2500
         assert abs(error.mean()) < 4 * np.sqrt(np.mean(onset.sigma[known] ** 2) / 50)  # few are independent
         assert np.mean((error / onset.sigma[known]) ** 2) == pytest.approx(1, abs=0.1)
+
+
+def test_onsets_that_noise_hides_at_first_are_joined_by_the_steps_in_which_they_were():
+    found = strokes_of(made_press(UNEVEN, DEPTH, full=122.0), UNEVEN, noise=NOISE)  # the level is 120
+    known = found.onset.status == 1
+    error = (found.onset.height + DEPTH)[known]
+    assert known.mean() > 0.95
+    assert np.sqrt(np.mean(error**2)) < 0.03
+    assert np.mean((error / found.onset.sigma[known]) ** 2) < 1.5
 
 
 def test_hysteresis_is_the_difference_of_both():
