@@ -305,7 +305,9 @@ def check_figure(check: Check, title: str, path: Path) -> None:
 
 def _draw(axes: Axes, name: str, errors: Errors, check: Check, worst: float) -> None:
     place, label = extent(check.x, check.y), f"found - true ({errors.unit})"
-    draw_image(axes, errors.error, place, label, cmap=DIVERGING, vmin=-worst, vmax=worst)
+    signed = bool(np.nanmin(errors.error, initial=0.0) < 0)  # the angle between normals is not
+    colours = DIVERGING if signed else ERROR
+    draw_image(axes, errors.error, place, label, cmap=colours, vmin=-worst if signed else 0.0, vmax=worst)
     digits = 3 if errors.unit == "deg" else 4
     rms, bias = (round(float(value), digits) + 0.0 for value in (errors.whole.rms, errors.whole.bias))
     summary = f"RMS {rms:.{digits}f}, bias {bias:+.{digits}f} {errors.unit}"

@@ -53,7 +53,7 @@ class Relief:
         """Tell what colours mean, which share of the heights was filled, and what a level is worth."""
         share = 100 * float(self.filled.sum()) / max(1.0, float(np.isfinite(self.height).sum()))
         filled = [f"orange: filled, {share:.0f} % of the heights"] if self.filled.any() else []
-        return "; ".join([*filled, missing, *(["truth's level"] if self.levelled else [])])
+        return "\n".join([*filled, missing, *(["truth's level"] if self.levelled else [])])
 
     @property
     def measured(self) -> Relief:
@@ -148,7 +148,7 @@ def draw_cuts(axes: Axes, reliefs: Mapping[str, Relief], truth: Truth, limits: R
     axes.legend(
         loc="upper center",
         bbox_to_anchor=(0.5, -0.13),
-        ncols=3,
+        ncols=2,
         markerscale=2,
         frameon=False,
         fontsize="small",
