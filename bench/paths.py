@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -53,11 +54,13 @@ from mirrorskin.bench.harness import (
     ratio_target,
 )
 from mirrorskin.bench.limits import beside_limits
+from mirrorskin.bench.object_store import object_store
 from mirrorskin.bench.onset import numba_onsets
 from mirrorskin.bench.scenes import SCALES, STEPS, TILT, Floats, references
 from mirrorskin.engine import Correlator, NormalEstimator, Onset, OnsetSearch
 from mirrorskin.engine.streaming import push_block
 from mirrorskin.engine.tiling import MEMORY_LIMIT
+from mirrorskin.io.url import path_of
 from mirrorskin.kernels.device import Device, list_devices, open_device
 
 Shape = tuple[int, int, int]
@@ -65,7 +68,7 @@ Shape = tuple[int, int, int]
 KERNEL, IN_MEMORY = f"{OURS}, onset kernel in memory", f"{OURS}, onset kernel and maps in memory"
 READ, H5PY = f"{OURS}, frames read", "h5py, frames read"
 PLAIN = f"{PATH}, equation 4"
-_ZARR_PATH = f"{PATH}, from Zarr"
+_ZARR_PATH, _OBJECTS = f"{PATH}, from Zarr", "s3fs, objects fetched"
 
 _QUICK, _QUICK_TURNS = (12, 48, 64), (64, 48, 64)
 _PRESS, _TURNS, _LAB, _BUDGET = (1907, 1024, 1024), (16_000, 240, 320), (256, 1080, 1920), (6_500, 480, 640)
@@ -132,35 +135,48 @@ def run_press(name: str, compression: Literal["raw", "bitshuffle"], device: Devi
 
 def run_zarr(device: Device, quick: bool) -> Case:
     """Time the path of a press in Zarr beside that in HDF5, packed alike; results must be the same bits."""
-    name, shape = "file-zarr", _QUICK if quick else _ZARR
-    title = f"full default, references of each pixel; {_size(shape)}, bitshuffle-LZ4 in a local folder"
-    if absent := missing("zarr"):
+    return _beside_hdf5("file-zarr", "a local folder", missing("zarr"), device, quick)
+
+
+def run_s3(device: Device, quick: bool) -> Case:
+    """Time the path of a press in an S3-compatible server beside its objects alone, and beside HDF5."""
+    return _beside_hdf5("file-s3", "a server on this machine", missing("zarr", "s3fs", "moto"), device, quick)
+
+
+def _beside_hdf5(name: str, place: str, absent: dict[str, str], device: Device, quick: bool) -> Case:
+    shape = _QUICK if quick else _ZARR
+    title = f"full default, references of each pixel; {_size(shape)}, bitshuffle-LZ4 in {place}"
+    if absent:
         return Case(name, title, [], absent)
     size, extra, rounds = math.prod(shape), MAPS * math.prod(shape[1:]), 1 if quick else ROUNDS
     check_memory(name, 3 * size + MEMORY_LIMIT + extra)
-    with new_folder(name, 3 * size + 2 * rounds * extra) as folder:
+    with ExitStack() as stack:
+        folder = stack.enter_context(new_folder(name, 3 * size + 2 * rounds * extra))
         path, copy = folder / "press.h5", folder / "press.zarr"
+        works: dict[str, Work] = {}
+        if name == "file-s3":
+            files, copy = stack.enter_context(object_store("bench")), path_of("s3://bench/press.zarr")
+            works[_OBJECTS] = lambda: files.cat(files.find("bench/press.zarr"))
         record(make_press(shape), path, "bitshuffle")
         storage = io.save_zarr(path, copy)
-        with io.open_recording(path) as first, io.open_recording(copy) as second:
-            works: dict[str, Work] = {
-                PATH: to_new_results(path, folder / "hdf5.h5", device),
-                _ZARR_PATH: to_new_results(copy, folder / "zarr.h5", device),
-                READ: partial(_fetch, first, _room(first)),
-                f"{READ} from Zarr": partial(_fetch, second, _room(second)),
-            }
+        first, second = (stack.enter_context(io.open_recording(one)) for one in (path, copy))
+        works |= {
+            PATH: to_new_results(path, folder / "hdf5.h5", device),
+            _ZARR_PATH: to_new_results(copy, folder / "zarr.h5", device),
+            READ: partial(_fetch, first, _room(first)),
+            f"{READ} from Zarr": partial(_fetch, second, _room(second)),
+        }
 
-            def check(results: dict[str, Any]) -> None:
-                maps = results[PATH].maps()
-                if any(
-                    maps[one].tobytes() != got.tobytes() for one, got in results[_ZARR_PATH].maps().items()
-                ):
-                    raise DisagreementError(f"{_ZARR_PATH}: not the bits of HDF5")
+        def check(results: dict[str, Any]) -> None:
+            maps = results[PATH].maps()
+            if any(maps[one].tobytes() != got.tobytes() for one, got in results[_ZARR_PATH].maps().items()):
+                raise DisagreementError(f"{_ZARR_PATH}: not the bits of HDF5")
 
-            limits, measured = beside_limits(works, size, device, quick, check, rounds=rounds)
-            notes = (f"HDF5: {first.storage}; {first.how}", f"Zarr: {storage}; {second.how}")
+        limits, measured = beside_limits(works, size, device, quick, check, rounds=rounds)
+        notes = (f"HDF5: {first.storage}; {first.how}", f"Zarr: {storage}; {second.how}")
     rows = {work: Row(work, measured[work], size, shape[0]) for work in works}
-    target = ratio_target(_ZARR_PATH, 1.5, rows[_ZARR_PATH], rows[PATH], "HDF5, packed alike", faster=False)
+    other, than = (_OBJECTS, "its objects alone") if _OBJECTS in rows else (PATH, "HDF5, packed alike")
+    target = ratio_target(_ZARR_PATH, 1.5, rows[_ZARR_PATH], rows[other], than, faster=False)
     return Case(name, title, limits + list(rows.values()), {}, notes, () if quick else (target,))
 
 
@@ -469,6 +485,7 @@ CASES: Cases = {
     "file-lab": run_lab,
     "file-budget": run_budget,
     "file-zarr": run_zarr,
+    "file-s3": run_s3,
 }
 
 if __name__ == "__main__":

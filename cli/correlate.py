@@ -15,7 +15,11 @@ def command(
     output: Annotated[
         Path | None,
         Option(
-            "--output", "-o", metavar="RES.h5", help="Result to write.", show_default="STACK-correlation.h5"
+            "--output",
+            "-o",
+            metavar="RES.h5",
+            help="Result to write: HDF5, or NAME.zarr.",
+            show_default="STACK-correlation.h5",
         ),
     ] = None,
     dataset: options.Dataset = None,
@@ -61,7 +65,7 @@ def command(
         stack, dataset=dataset, memory_limit=limit, override_motion=not dither, **known
     ) as source:
         target = output or stack.with_name(f"{stack.stem}-correlation.h5")
-        io.check_output(target, stack, phases)
+        io.check_output(target, stack, phases, or_zarr=True)
         with progress("correlating", source.shape[0]) as show:
             result = correlate_source(
                 source,

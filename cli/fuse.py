@@ -18,7 +18,13 @@ def command(
     axial: Annotated[Path, Argument(metavar="AXIAL", help="Recording of a rotation, in HDF5.")],
     output: Annotated[
         Path | None,
-        Option("--output", "-o", metavar="RES.h5", help="Result to write.", show_default="VERTICAL-fused.h5"),
+        Option(
+            "--output",
+            "-o",
+            metavar="RES.h5",
+            help="Result to write: HDF5, or NAME.zarr.",
+            show_default="VERTICAL-fused.h5",
+        ),
     ] = None,
     dataset: Annotated[
         str | None, Option(metavar="PATH", help="The stack in others' files, of one name in both.")
@@ -70,7 +76,7 @@ def command(
         _open(vertical, "vertical", dataset, known, limit) as pressed,
         _open(axial, "axial", dataset, known, limit) as turned,
     ):
-        io.check_output(target, vertical, axial, phases, travel, calibration)
+        io.check_output(target, vertical, axial, phases, travel, calibration, or_zarr=True)
         shared = None if calibration is None else io.open_calibration(calibration)
         with progress("fusing", frames_to_read(pressed, turned, register)) as show:
             result = fuse_sources(

@@ -46,7 +46,8 @@ def command(
         ),
     ] = None,
     output: Annotated[
-        Path | None, Option("--output", "-o", metavar="RES.h5", help="Result to write at the end.")
+        Path | None,
+        Option("--output", "-o", metavar="RES.h5", help="Result to write at the end: HDF5, or NAME.zarr."),
     ] = None,
     view: Annotated[
         str | None,
@@ -115,7 +116,7 @@ def command(
         raise io.InputError(f"{told} an --estimator of your own: leave it out")
     for path, others in ((record, ()), (output, (record,))):
         if path is not None:
-            io.check_output(path, rig_file, calibration, contact, *others)
+            io.check_output(path, rig_file, calibration, contact, *others, or_zarr=path == output)
     known = scans.open_calibration(calibration, rig)
     given = {**context.params, "latency": duration(latency, "--latency"), "own": own}
     _Live(rig, plan, given, known).run()

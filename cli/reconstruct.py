@@ -77,7 +77,13 @@ def command(
     recording: Annotated[Path, Argument(metavar="REC.h5", help="Frames in HDF5, Zarr, NPY or NPZ.")],
     output: Annotated[
         Path | None,
-        Option("--output", "-o", metavar="RES.h5", help="Result to write.", show_default="REC-result.h5"),
+        Option(
+            "--output",
+            "-o",
+            metavar="RES.h5",
+            help="Result to write: HDF5, or NAME.zarr.",
+            show_default="REC-result.h5",
+        ),
     ] = None,
     dataset: options.Dataset = None,
     motion: options.Motion = None,
@@ -202,7 +208,7 @@ def command(
     with io.open_recording(recording, dataset=dataset, memory_limit=limit, live=live, **known) as source:
         _refuse_foreign(context, recording, source.motion)
         target = output or recording.with_name(f"{recording.stem}-result.h5")
-        io.check_output(target, recording, phases, travel, heights, calibration, contact)
+        io.check_output(target, recording, phases, travel, heights, calibration, contact, or_zarr=True)
         calibrated = _calibrated(source, calibration, pixel_size)
         arguments: dict[str, Any] = {"method": method and method.value, "noise": noise}
         if modulus is not None:

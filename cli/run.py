@@ -23,7 +23,13 @@ def command(
     recording: Annotated[Path, Argument(metavar="REC.h5", help="Frames in HDF5, Zarr, NPY or NPZ.")],
     output: Annotated[
         Path | None,
-        Option("--output", "-o", metavar="RES.h5", help="Result to write.", show_default="REC-CLASS.h5"),
+        Option(
+            "--output",
+            "-o",
+            metavar="RES.h5",
+            help="Result to write: HDF5, or NAME.zarr.",
+            show_default="REC-CLASS.h5",
+        ),
     ] = None,
     settings: Settings = None,
     dataset: options.Dataset = None,
@@ -66,7 +72,7 @@ def command(
     limit = bytes_of(memory, "--memory")
     with io.open_recording(recording, dataset=dataset, memory_limit=limit, live=live, **known) as source:
         target = output or recording.with_name(f"{recording.stem}-{estimator.rpartition(':')[2]}.h5")
-        io.check_output(target, recording, phases, travel)
+        io.check_output(target, recording, phases, travel, or_zarr=True)
         with progress("running", source.shape[0]) as show:
             result = engine.run(source, make, memory_limit=limit, progress=show)
     device = result.process.get("device")

@@ -14,7 +14,9 @@ def command(
         list[Path],
         Argument(metavar="RES.h5...", help="Results of touches that overlap; x and y are the first one's."),
     ],
-    output: Annotated[Path, Option("--output", "-o", metavar="RES.h5", help="Result to write.")],
+    output: Annotated[
+        Path, Option("--output", "-o", metavar="RES.h5", help="Result to write: HDF5, or NAME.zarr.")
+    ],
     pixel_size: options.PixelSize = None,
     device: options.Device = None,
     as_json: options.Json = False,
@@ -25,7 +27,7 @@ def command(
     from mirrorskin.cli.stack import stack_options
 
     size = stack_options(pixel_size=pixel_size).get("pixel_size")
-    io.check_output(output, *results)
+    io.check_output(output, *results, or_zarr=True)
     touches = [io.open_result(path) for path in results]
     whole = engine.stitch(touches, size, names=[str(path) for path in results], device=device)
     save_and_report(whole.result, output, device, as_json)

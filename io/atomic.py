@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.os_errors import as_input_error, legible
 from mirrorskin.io.types import Closing, InputError, ProcessValue
-from mirrorskin.io.url import is_zarr
+from mirrorskin.io.url import ZARR_SUFFIX, is_zarr
 
 MAKE_ROOM = "make room, or choose another place with -o"
 """What to do where a disk did not take all."""
@@ -44,7 +44,7 @@ _WITH_GROUPS.set_char_encoding(h5py.h5t.CSET_UTF8)
 _ALIGNED = {"alignment_threshold": 1 << 20, "alignment_interval": 4096}
 
 
-def check_output(path: Path, *keep: Path | None) -> None:
+def check_output(path: Path, *keep: Path | None, or_zarr: bool = False) -> None:
     """Refuse an output that could not be written, before any work is done for it.
 
     Parameters
@@ -53,6 +53,8 @@ def check_output(path: Path, *keep: Path | None) -> None:
         File to write.
     *keep : Path or None
         Inputs, files or folders of files, which must not be overwritten.
+    or_zarr : bool
+        Whether it may be a Zarr store, too, which must be a new one.
 
     Raises
     ------
@@ -65,6 +67,11 @@ def check_output(path: Path, *keep: Path | None) -> None:
     >>> check_output(Path("result.h5"), Path("press.h5"))  # doctest: +SKIP
     """
     with as_input_error(f"{path} cannot be written", "choose another place with -o"):
+        if or_zarr and is_zarr(path) and path.suffix.lower() == ZARR_SUFFIX:
+            from mirrorskin.io.zarr_export import check_store
+
+            check_store(path)
+            return
         if is_zarr(path):
             raise InputError(f"{path}: this is written as HDF5: name a local file, .h5, with -o")
         if path.is_dir():

@@ -8,7 +8,6 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from io import BytesIO, StringIO
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -96,11 +95,8 @@ def export_result(
 
         holds = save_messages(result, path)
     elif suffix == ZARR_SUFFIX:
-        from mirrorskin.io.zarr_export import save_zarr
-
-        with TemporaryDirectory() as folder:
-            save_result(result, Path(folder, "result.h5"))
-            holds = save_zarr(Path(folder, "result.h5"), path)
+        save_result(result, path)
+        holds = "Zarr"
     else:
         try:
             with_points = {"points": True} if points and suffix == ".ply" else {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, replace
@@ -16,7 +17,7 @@ from mirrorskin.io.atomic import Item, fixed_text, process_items, write_file
 from mirrorskin.io.calibration.file import CARRIED, calibration_items, carried_by
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape, read_process
 from mirrorskin.io.types import NO_MAPS, SCALARS, SERIES, InputError, ProcessValue, Result
-from mirrorskin.io.url import path_of
+from mirrorskin.io.url import is_zarr, path_of
 from mirrorskin.io.zarr import open_file
 
 MARK = "mirrorskin_result"
@@ -104,6 +105,7 @@ def save_result(result: Result, path: str | Path) -> None:
     ----------
     result : Result
     path : str or Path
+        HDF5, or ``NAME.zarr``, also at an address such as ``s3://bucket/NAME.zarr``.
 
     Raises
     ------
@@ -116,7 +118,15 @@ def save_result(result: Result, path: str | Path) -> None:
     >>> from mirrorskin import io
     >>> io.save_result(io.Result(height=np.zeros((2, 3), np.float32)), "flat.h5")  # doctest: +SKIP
     """
-    write_file(Path(path), _items(result))
+    target = path_of(path)
+    if not is_zarr(target):
+        write_file(target, _items(result))
+        return
+    from mirrorskin.io.zarr_export import save_zarr
+
+    with tempfile.TemporaryDirectory() as folder:
+        write_file(Path(folder, "result.h5"), _items(result))
+        save_zarr(Path(folder, "result.h5"), target)
 
 
 def _items(result: Result) -> Iterator[Item]:

@@ -19,7 +19,7 @@ from mirrorskin.io.hdf5 import Hdf5File, Node
 from mirrorskin.io.layout import STACK
 from mirrorskin.io.recording import is_recording, open_recording
 from mirrorskin.io.types import InputError, Source
-from mirrorskin.io.url import Url, path_of
+from mirrorskin.io.url import ZARR_SUFFIX, Url, path_of
 from mirrorskin.io.zarr import AT_ONCE, ZarrFile, naming, open_file, opened_store
 
 _WHOLE: Any = {"write_empty_chunks": True}
@@ -71,25 +71,41 @@ def save_zarr(source: str | Path, path: str | Path, progress: Callable[[int], No
         return written.storage(stack) if isinstance(stack, h5py.Dataset) else "Zarr"
 
 
+def check_store(target: Path) -> None:
+    """Refuse a store that could not be written, before any work is done for it."""
+    if target.suffix.lower() != ZARR_SUFFIX:
+        raise InputError(f"{target}: Zarr is written as NAME{ZARR_SUFFIX}: name it so with -o")
+    taken = f"{target} is there already: remove it, or name another output with -o"
+    if isinstance(target, Url):
+        with naming(f"{target} cannot be written"):
+            from zarr.core.sync import sync
+
+            with opened_store(target, read_only=False) as store:
+                if not sync(store.is_empty("")):
+                    raise InputError(taken)
+        return
+    if target.exists():
+        raise InputError(taken)
+    if not target.parent.is_dir():
+        raise InputError(f"{target}: there is no folder {target.parent}: make it first")
+    with naming(f"{target} cannot be written"):
+        import zarr  # noqa: F401
+
+
 @contextmanager
 def _new_store(target: Path) -> Iterator[Any]:
     """Make a store; what was written of it is removed after an error."""
-    if target.exists():
-        raise InputError(f"{target} is there already: remove it, or name another output with -o")
+    check_store(target)
     if isinstance(target, Url):
         from zarr.core.sync import sync
 
         with naming(f"{target} cannot be written"), opened_store(target, read_only=False) as store:
-            if not sync(store.is_empty("")):
-                raise InputError(f"{target} is there already: remove it, or name another output with -o")
             try:
                 yield store
             except BaseException:
                 sync(store.delete_dir(""))
                 raise
         return
-    if not target.parent.is_dir():
-        raise InputError(f"{target}: there is no folder {target.parent}: make it first")
     part = target.with_name(f".mirrorskin-{secrets.token_hex(8)}.part")
     try:
         with naming(f"{target} cannot be written"), opened_store(part, read_only=False) as store:

@@ -44,6 +44,7 @@ QUICK = (
     "file-turns",
     "file-lab",
     "file-zarr",
+    "file-s3",
     "batch-small",
     "live-vertical-vga",
     "scaling-frames",

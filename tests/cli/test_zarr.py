@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
+
 import pytest
 from commands import run
 from stacks import record, sphere
@@ -30,6 +34,20 @@ def test_a_command_reads_an_address_as_a_file(bucket, tmp_path):
     assert run("reconstruct", "press.h5", "-o", "hdf5.h5").code == 0
     found = [io.open_result(name).height for name in ("zarr.h5", "hdf5.h5")]
     assert found[0].tobytes() == found[1].tobytes()
+
+
+@pytest.mark.parametrize("output", ["result.zarr", "memory://bucket/result.zarr"])
+def test_a_result_is_written_as_zarr_and_read_as_a_file(bucket, output):
+    assert run("reconstruct", "press.h5").code == 0
+    ended = run("reconstruct", "press.h5", "-o", output)
+    assert (ended.code, ended.out.split(":")[0]) == (0, output.split(":")[0])
+    first, second = io.open_result("press-result.h5"), io.open_result(output)
+    assert {name: one.tobytes() for name, one in first.maps().items()} == {
+        name: one.tobytes() for name, one in second.maps().items()
+    }
+    assert dict(first.process) == dict(second.process)
+    scores = [run("score", name, "--truth", "press.h5").out for name in ("press-result.h5", output)]
+    assert scores[0] == scores[1]
 
 
 def test_info_differs_in_the_storage_alone(bucket):
@@ -70,6 +88,12 @@ def test_import_makes_hdf5_of_an_address(bucket):
         (("info", "gone.zarr"), "gone.zarr: no such file"),
         (("info", "unheard://of"), "unheard://of: Protocol not known: unheard: check the address"),
         (("export", "press.h5", "-o", ADDRESS), f"{ADDRESS} is there already: remove it, or name another"),
+        (
+            ("reconstruct", "press.h5", "-o", ADDRESS),
+            f"{ADDRESS} is there already: remove it, or name another",
+        ),
+        (("reconstruct", "press.h5", "-o", "no/x.zarr"), "no/x.zarr: there is no folder no: make it first"),
+        (("export", "press.h5", "-o", "x.zarr.zip"), "x.zarr.zip: Zarr is written as NAME.zarr: name it so"),
         (("simulate", "vertical", "-o", "new.zarr"), "new.zarr: this is written as HDF5: name a local file"),
         (("batch", "memory://bucket/x*", "-o", "r"), "memory://bucket/x*: nothing answers to that"),
     ],
@@ -91,3 +115,17 @@ def test_a_chunk_that_is_lost_in_the_middle_leaves_nothing(bucket, tmp_path):
         in ended.said
     )
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_folder_behind_a_web_server_is_read_as_a_file(bucket, tmp_path):
+    assert run("export", "press.h5", "-o", "press.zarr").code == 0
+    handler = partial(SimpleHTTPRequestHandler, directory=str(tmp_path))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{server.server_port}/press.zarr"
+        assert run("reconstruct", address, "-o", "web.h5").code == 0
+        assert "no Zarr" in run("info", f"{address[:-5]}s.zarr").said
+        server.shutdown()
+    assert run("reconstruct", "press.h5").code == 0
+    found = [io.open_result(name).height for name in ("web.h5", "press-result.h5")]
+    assert found[0].tobytes() == found[1].tobytes()

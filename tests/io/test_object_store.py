@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
-import sys
 
 import pytest
 from commands import run
 from stacks import record, sphere
 
 from mirrorskin import io
+from mirrorskin.bench.object_store import object_store
 
 pytest.importorskip("s3fs", reason="needs 'mirrorskin[s3]'")
 pytest.importorskip("moto.server", reason="needs 'moto[server]'")
@@ -19,46 +18,21 @@ ADDRESS = "s3://presses/press.zarr"
 
 
 @pytest.fixture(scope="module")
-def endpoint():
-    """A server in a process of its own, which takes a free port and says which."""
-    code = (
-        "import sys, moto.server, werkzeug.serving as w;"
-        "s = w.make_server('127.0.0.1', 0, moto.server.DomainDispatcherApplication("
-        "moto.server.create_backend_app), threaded=True); print(s.port, flush=True); s.serve_forever()"
-    )
-    server = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
-    with server:
-        assert server.stdout is not None
-        yield f"http://127.0.0.1:{int(server.stdout.readline())}"
-        server.terminate()
-
-
-@pytest.fixture(scope="module")
-def press(endpoint, tmp_path_factory):
-    """A recording, which is also in the store."""
+def press(tmp_path_factory):
+    """A recording, which is also in the store of the module's tests, and the store."""
     path = record(sphere(), tmp_path_factory.mktemp("made") / "press.h5", truth=sphere().truth)
-    with pytest.MonkeyPatch.context() as patch:
-        connect(patch, endpoint).mkdir("presses")
+    with object_store("presses") as store:
         assert run("export", path, "-o", ADDRESS).code == 0
-    return path
-
-
-def connect(patch, endpoint):
-    import s3fs
-
-    patch.setenv("AWS_ENDPOINT_URL", endpoint)
-    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
-        patch.setenv(name, "testing")
-    s3fs.S3FileSystem.clear_instance_cache()
-    return s3fs.S3FileSystem(use_listings_cache=False)
+        yield path, store
 
 
 @pytest.fixture
-def bucket(press, endpoint, tmp_path, monkeypatch):
+def bucket(press, tmp_path, monkeypatch):
     """The store, with the recording's file in the working directory."""
-    shutil.copy(press, tmp_path)
+    path, store = press
+    shutil.copy(path, tmp_path)
     monkeypatch.chdir(tmp_path)
-    return connect(monkeypatch, endpoint)
+    return store
 
 
 def test_results_are_those_of_the_file_bit_for_bit(bucket):
