@@ -35,6 +35,9 @@ PATIENCE = 7.0
 FULL = 2_950_000
 """Bytes that a full disk takes: the maps, what is kept free to the end, and some tens of frames."""
 
+ON_THE_WAY = 0.3
+"""Seconds more that a camera may be silent where it does not matter when frames came: 3 times ``stall``."""
+
 _START = 30.0
 _LATEST = 1.5  # seconds after the first move that a mishap comes
 
@@ -96,9 +99,10 @@ def capture_with(mishap: Mishap, seed: int, path: Path) -> Outcome:
             trouble.join()
         happened = trouble.at is not None and trouble.at < ended and error is not None
         at = trouble.at or ended
-        while time.monotonic() < at + SOON:
+        soon = at + SOON + (ON_THE_WAY if mishap is INSIDE["camera stalls"] else 0)
+        while time.monotonic() < soon:
             time.sleep(0.01)
-        return Outcome(error, emulated.machine.moving(at + SOON), ended - at, happened)
+        return Outcome(error, emulated.machine.moving(soon), ended - at, happened)
 
 
 def _drain(rig: Rig, plan: Plan, path: Path) -> None:
