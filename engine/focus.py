@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -114,16 +114,18 @@ class FocusEstimator:
             weight = signal**2 / (2 * freedom * variance + 4 * signal)
             weight = np.where(signal > 0, weight, 0)
             value = np.log(np.where(signal > 0, signal, 1))
-            away, away_variance, bent = _vertex(place, value, weight)
+            peak = _fit(place, value, weight)
+            found = (weight > 0).sum(axis=0) > 2  # two points have no vertex
             top = signal[self._reach]
-            found = (top > _SURELY * variance * np.sqrt(2 * freedom)) & (bent > _BENT**2 * variance)
+            found &= (top > _SURELY * variance * np.sqrt(2 * freedom)) & (peak.bent > _BENT**2 * variance)
+            misfit = _misfit(peak, (weight > 0).sum(axis=0), found, variance)
             beside = place[self._reach - 1 : self._reach + 2]
-            found &= (beside.min(axis=0) < away) & (away < beside.max(axis=0))
+            found &= (beside.min(axis=0) < peak.vertex) & (peak.vertex < beside.max(axis=0))
             sharpness = np.sqrt(np.maximum(top, 0) / np.maximum(freedom, 1))
         status = np.where(found, 1, 2)
         status[(best == 0) | (best == len(self._travel) - 1)] = 3
         status[~np.isfinite(squares[self._reach])] = 0
-        height, sigma = -(self._travel[best] + away), np.sqrt(variance * away_variance)
+        height, sigma = -(self._travel[best] + peak.vertex), np.sqrt(variance * peak.variance + misfit * peak.gain)
         height, sigma = (np.where(status == 1, one, np.nan).astype(np.float32) for one in (height, sigma))
         return Focus(height, sigma, status.astype(np.uint8), sharpness.astype(np.float32))
 
@@ -147,7 +149,8 @@ def find_focus(
     Sharpness S is the sum of squares of a window's samples less their mean, N - 1 times their variance, less
     (N - 1) noise^2, which noise adds. A Gaussian is fitted through the peak and its neighbours, a parabola
     through log S (Nayar and Nakagawa 1994), with weights one over the variance of log S, which is
-    noise^2 (2 (N - 1) noise^2 + 4 S) / S^2 (a non-central chi-square). The standard error follows from them.
+    noise^2 (2 (N - 1) noise^2 + 4 S) / S^2 (a non-central chi-square). The standard error follows from them
+    and, if reach is 2 or more, from the picture's median misfit of such a curve.
 
     Parameters
     ----------
@@ -200,12 +203,19 @@ def _window(length: int, radius: int) -> Doubles:
     return np.minimum(place + radius, length - 1.0) - np.maximum(place - radius, 0) + 1
 
 
-def _vertex(place: Doubles, value: Doubles, weight: Doubles) -> tuple[Doubles, Doubles, Doubles]:
-    """Return the vertex of a parabola through values, (n, H, W) each, its variance, and how sure it is bent.
+class _Peak(NamedTuple):
+    """A parabola through the logarithms of the sharpness of each pixel, for values of variance 1 / weight."""
 
-    The last is the square of the curvature by its standard error, 0 of a curve that is bent up. Values have
-    the variance 1 / weight. Polynomials are orthogonal over the places (Forsythe, J. SIAM 5, 1957).
-    """
+    vertex: Doubles
+    variance: Doubles
+    gain: Doubles  # the variance of the vertex where all values had the variance 1
+    bent: Doubles  # the square of the curvature by its standard error, 0 of a curve that is bent up
+    residual: Doubles  # the sum of weight * residual^2
+    free: Doubles  # its mean, likewise
+
+
+def _fit(place: Doubles, value: Doubles, weight: Doubles) -> _Peak:
+    """Fit a parabola to values, (n, H, W), by polynomials orthogonal over the places (Forsythe 1957)."""
     total = weight.sum(axis=0)
     mean = (weight * place).sum(axis=0) / total
     first = place - mean
@@ -213,6 +223,26 @@ def _vertex(place: Doubles, value: Doubles, weight: Doubles) -> tuple[Doubles, D
     skew = (weight * first**3).sum(axis=0) / norm
     second = first**2 - skew * first - norm / total
     bent = (weight * second**2).sum(axis=0)
+    level = (weight * value).sum(axis=0) / total
     along, across = (weight * value * first).sum(axis=0) / norm, (weight * value * second).sum(axis=0) / bent
     variance = (1 / norm + (along / across) ** 2 / bent) / (2 * across) ** 2
-    return mean + skew / 2 - along / (2 * across), variance, np.where(across < 0, across**2 * bent, 0)
+    gain = (weight**2 * (first / norm - along / across * second / bent) ** 2).sum(axis=0) / (2 * across) ** 2
+    residual = (weight * (value - level - along * first - across * second) ** 2).sum(axis=0)
+    taken = (weight**2 * (1 / total + first**2 / norm + second**2 / bent)).sum(axis=0)
+    vertex = mean + skew / 2 - along / (2 * across)
+    bent = np.where(across < 0, across**2 * bent, 0)
+    return _Peak(vertex, variance, gain, bent, residual, total - taken)
+
+
+def _misfit(peak: _Peak, points: NDArray[np.intp], found: NDArray[np.bool_], variance: float) -> float:
+    """Return the variance by which logarithms of the sharpness differ from a parabola beyond the noise's.
+
+    It is the median of what pixels with four points or more tell, whose residuals are a chi-square; its
+    median is (1 - 2 / 9n)^3 of its mean n (Wilson and Hilferty 1931). 0 if no pixel has as many.
+    """
+    some = found & (points > 3) & (peak.free > 0)
+    if not some.any():
+        return 0.0
+    freedom = points[some] - 3
+    residual = peak.residual[some] / (1 - 2 / (9 * freedom)) ** 3
+    return max(0.0, float(np.median((residual - freedom * variance) / peak.free[some])))

@@ -52,6 +52,20 @@ def test_texture_of_all_lengths_is_right_to_a_twentieth_of_a_step():
     assert abs(np.median(found.height) + 4.2) < 0.5 / 20
 
 
+def test_the_standard_error_knows_a_curve_that_is_no_gaussian():
+    frames = textured(waves=lambda generator: np.sqrt(generator.uniform(0.02**2, 0.3**2, 200)))
+    found = engine.find_focus(noisy(frames, 0.1, 0), TRAVEL, noise=0.1)
+    ratio = (found.height + 4.2) / found.height_sigma
+    assert 0.1 < np.mean(ratio**2) < 2  # 100 by noise alone
+
+
+def test_contrast_in_two_frames_has_no_vertex():
+    strength = np.array([0, 0, 0, 1, 0.9, 0, 0, 0, 0], np.float32)[:, None, None]
+    texture = np.random.default_rng(0).normal(100, 10, SHAPE).astype(np.float32)
+    found = engine.find_focus(strength * texture, np.arange(9.0), noise=0.1)
+    assert (found.status == 2).all()
+
+
 def test_a_slope_is_followed():
     slope = 4 + 0.02 * (np.arange(SHAPE[1]) - 23.5)
     found = engine.find_focus(textured(sharpest=slope).astype(np.float32), TRAVEL, noise=0)
