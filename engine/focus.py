@@ -125,7 +125,8 @@ class FocusEstimator:
         status = np.where(found, 1, 2)
         status[(best == 0) | (best == len(self._travel) - 1)] = 3
         status[~np.isfinite(squares[self._reach])] = 0
-        height, sigma = -(self._travel[best] + peak.vertex), np.sqrt(variance * peak.variance + misfit * peak.gain)
+        height = -(self._travel[best] + peak.vertex)
+        sigma = np.sqrt(variance * peak.variance + misfit * peak.gain)
         height, sigma = (np.where(status == 1, one, np.nan).astype(np.float32) for one in (height, sigma))
         return Focus(height, sigma, status.astype(np.uint8), sharpness.astype(np.float32))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import signal
 
 import pytest
 
@@ -15,6 +16,8 @@ from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # A test opens no window, which nobody would close.
 os.environ["MPLBACKEND"] = "agg"
+# Shells start what runs in the background deaf to Ctrl-C, which some tests send.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 FOUND = list_devices()
 if not FOUND:
