@@ -10,6 +10,7 @@
 #define FLAT 1e-3f
 #define BLOCK 8
 #define SUMS 67
+#define POSE 25
 #define NEAR 1e20f
 #define VAGUE 100.0f
 
@@ -99,14 +100,16 @@ void jacobian(const float3 n, const float3 h, const float3 arm, const float3 low
     rows[2] = sure * move_z + by * n.x * move_x + by * n.y * move_y;
 }
 
-// Of block after block of the first map's pixels: the sums that pose.py names, SUMS numbers each.
+// Of pose after pose, and block after block of the first map's pixels: the sums that pose.py names, SUMS numbers each.
 __kernel void pose_equations(
-    const int rows, const int columns, const int other_rows, const int other_columns, const int step, MAP first,
-    MAP second, MAP pose, OUT sums)
+    const int count, const int rows, const int columns, const int other_rows, const int other_columns, const int step,
+    MAP first, MAP second, MAP poses, OUT sums)
 {
-    const int side = BLOCK * step, across = (columns + side - 1) / side, item = get_global_id(0);
-    const int top = item / across * side, begin = item % across * side;
-    if (top >= rows) return;
+    const int side = BLOCK * step, across = (columns + side - 1) / side, blocks = (rows + side - 1) / side * across;
+    const int item = get_global_id(0), block = item % blocks;
+    const int top = block / across * side, begin = block % across * side;
+    if (item / blocks >= count) return;
+    MAP pose = poses + item / blocks * POSE;
     float turn[9];
     for (int i = 0; i < 9; ++i) turn[i] = pose[i];
     const float3 shift = vload3(3, pose), centre = vload3(4, pose);

@@ -70,8 +70,8 @@ def pose_gradient(step_x: float, step_y: float, values: Array, gradient: Array) 
         gradient[..., 1] = np.where(good, -(xx * yz - xy * xz) / area / step_y, np.nan)
 
 
-def pose_equations(step: int, first: Array, second: Array, pose: Array, sums: Array) -> None:
-    """Write sums of each block of the first map's pixels, (blocks, SUMS); every ``step``-th pixel counts.
+def pose_equations(step: int, first: Array, second: Array, poses: Array, sums: Array) -> None:
+    """Write sums of each block of the first map's pixels at some poses; every ``step``-th pixel counts.
 
     Parameters
     ----------
@@ -79,14 +79,19 @@ def pose_equations(step: int, first: Array, second: Array, pose: Array, sums: Ar
         A block has `BLOCK` x `BLOCK` pixels that count.
     first, second : (H, W, 8)
         Records; the two maps may be of different sizes.
-    pose : (25,)
+    poses : (count, 25)
         Matrix of the rotation (9), translation (3), the point that further rotations are about (3), x and y
         of the first map's first pixel and the pixel's size along x and y (4), the same of the second (4),
         and of both the squared sine of the tilt (2), with which the normals were measured; 1 of normals whose
         error is the same in all directions.
-    sums : (blocks, SUMS)
+    sums : (count, blocks, SUMS)
         See `PARTS`.
     """
+    for pose, out in zip(poses, sums, strict=True):
+        _equations_at(step, first, second, pose, out)
+
+
+def _equations_at(step: int, first: Array, second: Array, pose: Array, sums: Array) -> None:
     row, column = (one.ravel() for one in np.indices(first.shape[:2]))
     across = -(-first.shape[1] // (BLOCK * step))
     block = row // (BLOCK * step) * across + column // (BLOCK * step)

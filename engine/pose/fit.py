@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -53,13 +53,10 @@ class Equations:
     normals: NDArray[np.float64]
 
     def __init__(self, sums: NDArray[np.float32], size: float, beside: bool) -> None:
-        scale = np.repeat([1 / size, 1.0], 3)
+        scale = _scale_of(size)
         parts = np.split(sums.astype(np.float64), PARTS[1:-1], axis=1)
         upper, scores, chi, expected, self.heights, self.normals, whole = parts
-        self.normal_matrix: NDArray[Any] = np.zeros((6, 6))
-        self.normal_matrix[_UPPER] = upper.sum(axis=0)
-        self.normal_matrix += np.triu(self.normal_matrix, 1).T
-        self.normal_matrix *= np.outer(scale, scale)
+        self.normal_matrix: NDArray[Any] = _symmetric(upper.sum(axis=0), scale)
         own = whole.sum(axis=0).reshape(6, 6) * np.outer(scale, scale)
         self.unbiased: NDArray[Any] = own if beside else self.normal_matrix
         self.scores: NDArray[np.float64] = scores * scale
@@ -97,6 +94,18 @@ class Equations:
         return np.asarray(ways @ inverse @ middle @ inverse.T @ ways.T)
 
 
+def _scale_of(size: float) -> Doubles:
+    """Return what makes of turns and shifts such in units of the object's size."""
+    return np.repeat([1 / size, 1.0], 3)
+
+
+def _symmetric(upper: Doubles, scale: Doubles) -> Doubles:
+    """Return the matrix whose upper triangle is given, scaled along rows and columns."""
+    matrix = np.zeros((6, 6))
+    matrix[_UPPER] = upper
+    return (matrix + np.triu(matrix, 1).T) * np.outer(scale, scale)
+
+
 def complement(free: Doubles) -> Doubles:
     """Return orthonormal directions, (6, 6 - k), at right angles to others."""
     return np.asarray(np.linalg.svd(free, full_matrices=True)[0][:, free.shape[1] :])
@@ -114,20 +123,20 @@ class PairFit:
 
     def equations(self, motion: Motion, beside: bool = False, step: int = 1) -> Equations:
         """Return the sums at a motion."""
+        return Equations(self._sums([motion], beside, step)[0], self.second.size, beside)
+
+    def _sums(self, motions: Sequence[Motion], beside: bool = False, step: int = 1) -> NDArray[np.float32]:
+        """Return the sums of each block at each motion, (n, blocks, SUMS)."""
         first, second = self.first, self.second
         rows, columns = first.records.shape[:2]
         side = BLOCK * step
         blocks = -(-rows // side) * -(-columns // side)
-        pose = self.device.given(
-            "pose",
-            np.concatenate(
-                [motion.turn.ravel(), motion.shift, second.middle, first.grid, second.grid,
-                 [first.least, second.least]]
-            ),
-        )  # fmt: skip
-        sums = self.device.array("sums", (blocks, SUMS), np.float32, zeroed=False)
+        maps = *second.middle, *first.grid, *second.grid, first.least, second.least
+        poses = self.device.given("poses", [[*one.turn.ravel(), *one.shift, *maps] for one in motions])
+        sums = self.device.array("sums", (len(motions), blocks, SUMS), np.float32, zeroed=False)
         self.device.kernel("pose", "pose_equations", BESIDE=int(beside))(
-            blocks,
+            len(motions) * blocks,
+            count=len(motions),
             rows=rows,
             columns=columns,
             other_rows=second.records.shape[0],
@@ -135,11 +144,11 @@ class PairFit:
             step=step,
             first=first.array,
             second=second.array,
-            pose=pose,
+            poses=poses,
             sums=sums,
-            moved=32 * rows * columns // step**2,
+            moved=32 * rows * columns // step**2 * len(motions),
         )
-        return Equations(sums.download(), second.size, beside)
+        return sums.download()
 
     def solve(self, start: Motion | None = None, near: bool = False) -> tuple[Motion, Equations, Doubles]:
         """Return the motion, its equations, and what they leave free, from a start, or from none and many.
@@ -186,13 +195,16 @@ class PairFit:
 
     def search(self) -> Motion | None:
         """Return the best of the motions that are found from turns about z and shifts of all sizes."""
-        found = []
-        for start in self._starts():
-            now = self.equations(start)
-            if now.pixels > _SHARED * len(self.first.points):
-                matrix = now.normal_matrix + _FLOOR * np.trace(now.normal_matrix) / 6 * np.eye(6)
-                gain = now.right @ np.linalg.solve(matrix, now.right)
-                found.append((now.chi_square - gain / now.compared, start))
+        found, scale = [], _scale_of(self.second.size)
+        for starts in self._starts():
+            sums = self._sums(starts).sum(axis=1, dtype=np.float64)
+            upper, right, chi, compared, heights, normals, _ = np.split(sums, PARTS[1:-1], axis=1)
+            pixels = np.maximum(heights, normals)[:, 0]
+            for k in np.flatnonzero(pixels > _SHARED * len(self.first.points)):
+                matrix, slope = _symmetric(upper[k], scale), right[k] * scale
+                matrix += _FLOOR * np.trace(matrix) / 6 * np.eye(6)
+                gain = slope @ np.linalg.solve(matrix, slope)
+                found.append(((chi[k, 0] - gain) / max(compared[k, 0], 1e-9), starts[k]))
         found.sort(key=lambda one: one[0])
         best, least = None, math.inf
         for _, start in found[:_TRIED]:
@@ -203,14 +215,15 @@ class PairFit:
                     best, least = motion, now.typical
         return best
 
-    def _starts(self) -> Iterator[Motion]:
-        extent = np.ptp(self.first.points, axis=0)
+    def _starts(self) -> Iterator[list[Motion]]:
+        """Return motions of one turn after the other."""
+        extent, shifts = np.ptp(self.first.points, axis=0), np.linspace(-_REACH, _REACH, _SHIFTS)
         for angle in np.linspace(0, 2 * math.pi, _ANGLES, endpoint=False):
             turn = Rotation.from_rotvec([0, 0, angle]).as_matrix()
-            for along in np.linspace(-_REACH, _REACH, _SHIFTS):
-                for up in np.linspace(-_REACH, _REACH, _SHIFTS):
-                    shift = np.array([along, up, 0]) * extent
-                    yield Motion(turn, self.first.middle - turn @ self.first.middle + shift)
+            middle = self.first.middle - turn @ self.first.middle
+            yield [
+                Motion(turn, middle + np.array([along, up, 0]) * extent) for along in shifts for up in shifts
+            ]
 
     def refine(self, motion: Motion, free: Doubles = _NONE) -> Motion | None:
         """Return the motion from which no step but the free ones leads further; None without overlap."""
@@ -233,8 +246,7 @@ class PairFit:
         step = -ways @ np.linalg.solve(matrix, ways.T @ now.right)
         step /= max(float(np.linalg.norm(step)) / (_LONGEST * self.second.size), 1.0)
         sigmas = math.sqrt(step @ now.normal_matrix @ step / max(now.chi_square, 1.0))
-        scale = np.repeat([1 / self.second.size, 1.0], 3)
-        return motion.small_step(step * scale, self.second.middle), sigmas
+        return motion.small_step(step * _scale_of(self.second.size), self.second.middle), sigmas
 
     def at_origin(self) -> Doubles:
         """Return what makes of steps as these equations have them small motions about the origin, (6, 6)."""

@@ -51,12 +51,14 @@ def blocks_of(shape: tuple[int, int], step: int) -> int:
     return int(np.prod([-(-size // (BLOCK * step)) for size in shape]))
 
 
-def on_device(device: Device, step: int, first, second, pose) -> np.ndarray:
+def on_device(device: Device, step: int, first, second, poses) -> np.ndarray:
     count = blocks_of(first.shape[:2], step)
-    given = [device.given(name, one) for name, one in (("first", first), ("second", second), ("pose", pose))]
-    sums = device.array("sums", (count, SUMS), np.float32)
+    given = [
+        device.given(name, one) for name, one in (("first", first), ("second", second), ("poses", poses))
+    ]
+    sums = device.array("sums", (len(poses), count, SUMS), np.float32)
     kernel = device.kernel("pose", "pose_equations", BESIDE=1)
-    launch(kernel, count, *first.shape[:2], *second.shape[:2], step, *given, sums)
+    launch(kernel, len(poses) * count, len(poses), *first.shape[:2], *second.shape[:2], step, *given, sums)
     return sums.download()
 
 
@@ -66,12 +68,14 @@ def test_sums_agree_with_the_reference(
     device: Device, shape: tuple[int, int], step: int, least: float
 ) -> None:
     first, second = quadratic_map(*shape, 0.0), quadratic_map(*shape, 0.1, seed=1)
-    pose = pose_of((0.02, -0.05, 0.3), shape, (0.03, -0.04, 0.01), least)
-    wanted = np.zeros((blocks_of(shape, step), SUMS))
-    pose_equations(step, first, second, pose, wanted)
-    found = on_device(device, step, first, second, pose)
-    scale = np.abs(wanted).max(axis=0)
-    assert wanted[:, PARTS[5]].any()
+    poses = np.stack(
+        [pose_of((0.02, -0.05, turn), shape, (0.03, -0.04, 0.01), least) for turn in (0.3, -0.1, 0.0)]
+    )
+    wanted = np.zeros((3, blocks_of(shape, step), SUMS))
+    pose_equations(step, first, second, poses, wanted)
+    found = on_device(device, step, first, second, poses)
+    scale = np.abs(wanted).max(axis=(0, 1))
+    assert wanted[..., PARTS[5]].any()
     np.testing.assert_allclose(found / (scale + 1e-9), wanted / (scale + 1e-9), atol=1e-4)
 
 
@@ -113,9 +117,9 @@ def test_a_moved_ball_fits_where_it_was_moved_to() -> None:
     first, second = sphere_map(*shape, 5, (0, 0, -5)), sphere_map(*shape, 5, (*move[:2], move[2] - 5))
     pose = pose_of((0, 0, 0), shape, tuple(move), 1.0).astype(float)
     pose[12:15] = [*move[:2], move[2] - 5]
-    sums = np.zeros((blocks_of(shape, 1), SUMS))
-    pose_equations(1, first, second, pose, sums)
-    total = sums.sum(axis=0)
+    sums = np.zeros((1, blocks_of(shape, 1), SUMS))
+    pose_equations(1, first, second, pose[np.newaxis], sums)
+    total = sums.sum(axis=(0, 1))
     normal_matrix = np.zeros((6, 6))
     normal_matrix[np.triu_indices(6)] = total[: PARTS[1]]
     assert total[PARTS[2]] / total[PARTS[3]] < 1e-4
@@ -139,9 +143,9 @@ def test_the_jacobian_is_the_residuals_change(number: int) -> None:
         moved = Rotation.from_rotvec(step[:3]).apply(shift - centre) + centre + step[3:]
         pose = pose_of((0, 0, 0), shape, tuple(moved), 1.0).astype(float)
         pose[:9] = turn.as_matrix().ravel()
-        sums = np.zeros((blocks_of(shape, 1), SUMS))
-        pose_equations(1, first[10:-10, 10:-10], second, shifted(pose), sums)
-        return sums.sum(axis=0)
+        sums = np.zeros((1, blocks_of(shape, 1), SUMS))
+        pose_equations(1, first[10:-10, 10:-10], second, shifted(pose)[np.newaxis], sums)
+        return sums.sum(axis=(0, 1))
 
     small = 1e-4
     change = (sums_at(small)[PARTS[2]] - sums_at(-small)[PARTS[2]]) / (4 * small)

@@ -95,7 +95,7 @@ def test_the_error_of_the_force_is_honest_for_windows_too():
     generator = np.random.default_rng(1)
     for window in (1, 5):
         drawn = []
-        for _ in range(40):
+        for _ in range(20):
             noise = generator.normal(0, 0.001 * window, moved.shape)
             noise = ndimage.uniform_filter(noise, (window, window, 0))
             found = find_tangential_force(
