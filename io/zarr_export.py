@@ -168,13 +168,11 @@ def _finish(file: Hdf5File, store: Any) -> None:
     """Write what the groups say, which makes it one of ours, and all metadata in one place."""
     import zarr
 
-    groups: list[h5py.Group] = [file.root["/"]]
+    groups: list[h5py.Group] = []
     file.root.visititems(lambda _, node: groups.append(node) if isinstance(node, h5py.Group) else None)
     root = zarr.open_group(store, mode="a")
     for group in groups:
-        root.require_group(str(group.name)).attrs.update(
-            _attributes(file, group)
-        ) if group.name != "/" else None
+        root.require_group(str(group.name)).attrs.update(_attributes(file, group))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # other programs of version 3 need not read it, and lose nothing
         zarr.consolidate_metadata(store)

@@ -19,10 +19,8 @@ from mirrorskin.kernels.pose import BLOCK, PARTS, SUMS
 
 _UPPER = np.triu_indices(6)
 _FLOOR = 1e-5  # of the mean information: what rounding and the pixels' size leave of none
-_LIKELY, _AWAY = (
-    (0.5, 0.02),
-    3.0,
-)  # times the pretended information that a step's direction needs, near and away
+_LIKELY = 0.5, 0.02  # times the pretended information that a step's direction needs, near and away
+_AWAY = 3.0  # chi square of a motion that is away
 _FEWEST = 20  # pixels that two maps must share
 _COARSEST = 24  # pixels along the shorter side of the coarsest maps
 _STEPS, _STILL = 40, 1e-2  # steps at most, and the step in standard deviations that ends them
