@@ -33,6 +33,12 @@ WAYS = [
 ]
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers():
+    """One more than there are cores, as tests of hardware wait for clocks."""
+    return (os.cpu_count() or 1) + 1
+
+
 def pytest_configure(config):
     config.addinivalue_line("markers", "device: runs on each OpenCL device")
     config.addinivalue_line("markers", "slow: only 'make test-all' runs it")
