@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -98,10 +99,10 @@ def _scale_of(size: float) -> Doubles:
 
 
 def _symmetric(upper: Doubles, scale: Doubles) -> Doubles:
-    """Return the matrix whose upper triangle is given, scaled along rows and columns."""
-    matrix = np.zeros((6, 6))
-    matrix[_UPPER] = upper
-    return (matrix + np.triu(matrix, 1).T) * np.outer(scale, scale)
+    """Return the matrices, (..., 6, 6), whose upper triangles are given, scaled along rows and columns."""
+    matrix = np.zeros((*upper.shape[:-1], 6, 6))
+    matrix[..., *_UPPER] = upper
+    return (matrix + np.triu(matrix, 1).swapaxes(-1, -2)) * np.outer(scale, scale)
 
 
 def complement(free: Doubles) -> Doubles:
@@ -193,16 +194,17 @@ class PairFit:
 
     def search(self) -> Motion | None:
         """Return the best of the motions that are found from turns about z and shifts of all sizes."""
-        found, scale = [], _scale_of(self.second.size)
+        found: list[tuple[float, Motion]] = []
+        scale = _scale_of(self.second.size)
         for starts in self._starts():
             sums = self._sums(starts).sum(axis=1, dtype=np.float64)
             upper, right, chi, compared, heights, normals, _ = np.split(sums, PARTS[1:-1], axis=1)
-            pixels = np.maximum(heights, normals)[:, 0]
-            for k in np.flatnonzero(pixels > _SHARED * len(self.first.points)):
-                matrix, slope = _symmetric(upper[k], scale), right[k] * scale
-                matrix += _FLOOR * np.trace(matrix) / 6 * np.eye(6)
-                gain = slope @ np.linalg.solve(matrix, slope)
-                found.append(((chi[k, 0] - gain) / max(compared[k, 0], 1e-9), starts[k]))
+            some = np.maximum(heights, normals)[:, 0] > _SHARED * len(self.first.points)
+            matrix, slope = _symmetric(upper[some], scale), right[some] * scale
+            matrix += _FLOOR * np.trace(matrix, axis1=1, axis2=2)[:, np.newaxis, np.newaxis] / 6 * np.eye(6)
+            gain = np.vecdot(slope, np.linalg.solve(matrix, slope[..., np.newaxis])[..., 0])
+            merit = (chi[some, 0] - gain) / np.maximum(compared[some, 0], 1e-9)
+            found += zip(merit, itertools.compress(starts, some), strict=True)
         found.sort(key=lambda one: one[0])
         best, least = None, math.inf
         for _, start in found[:_TRIED]:
