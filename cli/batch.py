@@ -136,7 +136,11 @@ def _find(words: Sequence[str], folder: Path) -> list[Path]:
             found += find_stores(path)
             continue
         every = map(Path, sorted(glob.glob(word, recursive=True)))  # noqa: PTH207  # paths may be absolute
-        answers = [path for path in every if path.is_file() or is_zarr(path)]
+        answers = [
+            path
+            for path in every
+            if (path.is_file() or is_zarr(path)) and not any(map(is_zarr, path.parents))
+        ]
         if not answers:
             raise InputError(f"{word}: no file answers to that: name recordings")
         found += answers

@@ -48,9 +48,7 @@ def command(
         if given and suffix not in suffixes:
             raise io.InputError(f"{option} is for a {suffix} file: name one with -o, or leave {option} out")
     ends = None if section is None else segment(section, "--section")
-    stores, output = _part(output, turn)
-    for path in output:
-        io.check_output(path, result)
+    stores, output = _part(output, result, turn)
     if all(path.suffix.lower() == MCAP_SUFFIX for path in output) and is_recording(result):
         with io.open_recording(result) as recording:
             for path in output:
@@ -67,10 +65,11 @@ def command(
             click.echo(f"{path}: {io.save_zarr(result, path, show)}")
 
 
-def _part(output: list[Path], turn: int | None) -> tuple[list[Path], list[Path]]:
-    """Return what is to be written as Zarr, and the rest."""
-    from mirrorskin.io import InputError
+def _part(output: list[Path], result: Path, turn: int | None) -> tuple[list[Path], list[Path]]:
+    """Return what is to be written as Zarr, and the rest, all of which can be."""
+    from mirrorskin.io import InputError, check_output
     from mirrorskin.io.url import is_zarr
+    from mirrorskin.io.zarr_export import check_store
 
     for number, path in enumerate(output):
         if path.resolve() in (other.resolve() for other in output[:number]):
@@ -78,6 +77,11 @@ def _part(output: list[Path], turn: int | None) -> tuple[list[Path], list[Path]]
     stores = [path for path in output if is_zarr(path)]
     if stores and turn is not None:
         raise InputError(f"{stores[0]} takes all turns: leave --turn out")
+    for path in output:
+        if path in stores:
+            check_store(path)
+        else:
+            check_output(path, result)
     return stores, [path for path in output if path not in stores]
 
 

@@ -114,9 +114,9 @@ def command(
     if (own and ours) or (settings and not own):
         told = f"--{ours[0]} says nothing of" if own else "--set is for"
         raise io.InputError(f"{told} an --estimator of your own: leave it out")
-    for path, others in ((record, ()), (output, (record,))):
+    for path, others, or_zarr in ((record, (), False), (output, (record,), True)):
         if path is not None:
-            io.check_output(path, rig_file, calibration, contact, *others, or_zarr=path == output)
+            io.check_output(path, rig_file, calibration, contact, *others, or_zarr=or_zarr)
     known = scans.open_calibration(calibration, rig)
     given = {**context.params, "latency": duration(latency, "--latency"), "own": own}
     _Live(rig, plan, given, known).run()

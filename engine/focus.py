@@ -77,7 +77,7 @@ class FocusEstimator:
     ) -> None:
         if not 0 <= noise < np.inf:
             raise InputError(f"noise {noise}: the standard deviation of a sample is needed, counts")
-        if not 1 <= radius <= 50 or not 1 <= reach <= 50:
+        if not all(isinstance(one, int | np.integer) and 1 <= one <= 50 for one in (radius, reach)):
             raise InputError(f"radius {radius} and reach {reach}: whole numbers from 1 to 50 are needed")
         self._shape, self._dtype, self.device = shape, check_dtype(dtype), open_device(device)
         self._noise, self._radius, self._reach = noise, radius, reach

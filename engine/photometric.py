@@ -17,9 +17,7 @@ from mirrorskin.kernels.device import C_TYPES, Device, open_device
 
 Doubles = NDArray[np.float64]
 
-_FLATTEST = (
-    1e-3  # of the lamps that lit a pixel: how far one is out of the plane of the others, of its length
-)
+_FLATTEST = 1e-3  # least pivot of the lamps' directions, of their size: below it they lie in a plane
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -128,7 +126,8 @@ class PhotometricStereo:
         triangle = self._triangle.download().astype(np.float64)
         r00, r01, r02, r03, r11, r12, r13, r22, r23, rest, used = triangle
         freedom = used - 3
-        solid = np.minimum(r11, r22) > _FLATTEST * r00
+        size = np.sqrt(r00**2 + r01**2 + r02**2 + r11**2 + r12**2 + r22**2)
+        solid = np.minimum(np.minimum(r00, r11), r22) > _FLATTEST * size
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             residual = np.sqrt(rest / np.where(freedom > 0, freedom, np.nan))
             # The triangle's inverse, whose product with its transpose is the covariance for noise 1.

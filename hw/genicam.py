@@ -20,7 +20,7 @@ _LOOK = 0.2  # seconds that one waits for a frame before it looks whether to end
 _FORMATS = {"uint8": ("Mono8",), "uint16": ("Mono16", "Mono14", "Mono12", "Mono10")}  # the first is preferred
 _INPUT = "Line0"  # that triggers it, unless another is given
 _WRAP = 65535  # the greatest frame number of GigE Vision 1; then comes 1
-_SPAN = 5.0  # seconds that the least delay is looked for in; clocks drift by some 0.1 ms meanwhile
+_SPAN = 5.0  # seconds that the least delay is looked for in; 50 ppm of drift are 0.25 ms meanwhile
 _REMEDY = (
     "Debian: apt install gir1.2-aravis-0.8 libgirepository1.0-dev libcairo2-dev pkg-config gcc, "
     "then pip install 'mirrorskin[genicam]'"
@@ -127,6 +127,12 @@ class GenicamCamera(ReopenedCamera):
         device.set_acquisition_mode(self._aravis.AcquisitionMode.CONTINUOUS)
         device.clear_triggers()
         device.set_region(-1, -1, *asked.size)  # where it begins is the camera's own
+        *_, width, height = device.get_region()
+        if (width, height) != tuple(asked.size):
+            raise InputError(
+                f"{self.name} gives {width} x {height} pixels, not {asked.size[0]} x {asked.size[1]}: set"
+                " camera.size in the rig file accordingly"
+            )
         there = device.dup_available_pixel_formats_as_strings()
         formats = _FORMATS.get(asked.dtype, ())
         chosen = [one for one in formats if one in there and asked.fourcc in (None, one)]
@@ -137,9 +143,6 @@ class GenicamCamera(ReopenedCamera):
                 f"{', '.join(there)}): set camera.dtype and camera.fourcc in the rig file accordingly"
             )
         device.set_pixel_format_from_string(chosen[0])
-        if asked.rate is not None:
-            device.set_frame_rate(asked.rate)
-            self._compare("rate", asked.rate, device.get_frame_rate(), " Hz")
         if asked.exposure is not None:
             if device.is_exposure_auto_available():
                 device.set_exposure_time_auto(off)
@@ -150,6 +153,9 @@ class GenicamCamera(ReopenedCamera):
                 device.set_gain_auto(off)
             device.set_gain(asked.gain)
             self._compare("gain", asked.gain, device.get_gain())
+        if asked.rate is not None:
+            device.set_frame_rate(asked.rate)
+            self._compare("rate", asked.rate, device.get_frame_rate(), " Hz")
         if asked.trigger is not None:  # last: a rate switches it off
             device.set_trigger(asked.trigger_input or _INPUT)
 
@@ -169,9 +175,9 @@ class GenicamCamera(ReopenedCamera):
 class DeviceClock:
     """Puts a camera's times on the clock of ``time.monotonic``.
 
-    A frame is read when it was stamped, plus the difference of both clocks, plus what its way took. The least
-    sum of the two of the last 5 s is added to all stamps: so the jitter of the way is left out, and what
-    clocks drift is followed. A stamp that is not after the one before is another clock's: all begins anew.
+    A frame is read at its stamp, plus the difference between the clocks, plus its transfer time. The least
+    (read - stamp) of the last 5 s is added to every stamp: this removes the jitter of the transfer and
+    follows the drift. A stamp that does not increase means that the camera's clock was reset: all is new.
     """
 
     def __init__(self) -> None:

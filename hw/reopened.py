@@ -109,6 +109,8 @@ class ReopenedCamera(ThreadedCamera):
         except Exception as error:  # whatever it is, readers must not wait
             _log.debug("%s failed", self.name, exc_info=error)
             self._fail(f"{self.name} failed: {error}")
+            if not self._ready.is_set():
+                self._refusal = InputError(f"{self.name} failed: {error}")
         finally:
             self._ready.set()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import time
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -224,7 +225,8 @@ class GrowingMessages(Closing):
 
     def __init__(self, path: Path, descriptor: int, header: Header) -> None:
         self.count: int = 0
-        self._path, self._begun = path, _stamp(header.start_time)
+        self._path = path
+        self._begun: int | None = None  # when the source's clock began: at the first frames
         self._stream = os.fdopen(os.dup(descriptor), "wb")
         self._file = _File(self._stream)
         self._stamps: list[int] = []
@@ -234,6 +236,8 @@ class GrowingMessages(Closing):
     def append(self, block: Block) -> None:
         """Write frames, and keep their positions."""
         assert block.time is not None  # frames that come live have one
+        if self._begun is None:
+            self._begun = time.time_ns() - round(float(block.time[-1]) * _SECOND)
         stamps = _stamps(self._begun, block.time)
         _put_frames(self._file, block, stamps)
         self._stamps += stamps
@@ -244,6 +248,7 @@ class GrowingMessages(Closing):
 
     def add_maps(self, time: float, height: NDArray[np.float32] | None, contact_area: float | None) -> None:
         """Write what was found of the frames up to a time: mm, mm^2."""
+        assert self._begun is not None  # of frames that have come
         (stamp,) = _stamps(self._begun, np.array([time]))
         if height is not None:
             self._file.put("/height", _IMAGE, _picture(height * np.float32(_METRE)), stamp)
@@ -296,7 +301,7 @@ def _stamp(text: str) -> int:
     """Return nanoseconds since 1970 of an ISO 8601 time; 0 if it is none."""
     with contextlib.suppress(ValueError):
         when = datetime.fromisoformat(text)
-        return round((when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()) * _SECOND
+        return round((when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp() * 1e6) * 1000
     return 0
 
 

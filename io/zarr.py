@@ -5,10 +5,12 @@ All but the frames is held as HDF5 in memory, so that it is read and checked as 
 
 from __future__ import annotations
 
+import errno
 import functools
 import hashlib
 import json
 import math
+import os
 import secrets
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -20,7 +22,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.atomic import fixed_text
+from mirrorskin.io.atomic import MAKE_ROOM, fixed_text
 from mirrorskin.io.fingerprint import State, state_of
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
 from mirrorskin.io.layout import CHECKSUM, STACK
@@ -60,6 +62,10 @@ def naming(what: str) -> Iterator[None]:
 
 
 def _reason(error: Exception) -> str:
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return f"{os.strerror(error.errno)}: {MAKE_ROOM}"
+    if isinstance(error, PermissionError) and error.errno:
+        return f"{os.strerror(error.errno)}: check the permissions"
     kinds = {kind.__name__ for kind in type(error).__mro__}
     said = " ".join(str(error).split())[:200] or type(error).__name__
     if isinstance(error, _MissingChunkError):
@@ -151,6 +157,7 @@ class ZarrFile(Hdf5File):
             root = h5py.File(secrets.token_hex(8), "w", driver="core", backing_store=False)
             super().__init__(path, memory_limit, opening.enter_context(root))
             self._fill(groups)
+            _set_attributes(self.root["/"], node.attrs if isinstance(node, zarr.Group) else {})
             self._opened = opening.pop_all()
 
     def close(self) -> None:
@@ -217,7 +224,7 @@ class ZarrFile(Hdf5File):
             key = f"{array.path}/{array.metadata.encode_chunk_key(tuple(last))}".lstrip("/")
             if not sync(array.store.exists(key)):
                 raise _MissingChunkError(
-                    f"its last chunk, {key}, is missing: it was cut short; copy it again"
+                    f"its last chunk, {key}, is missing: copy it again, or write empty ones, too"
                 )
 
     def frames(self, stack: h5py.Dataset) -> ZarrFrames:
@@ -234,7 +241,8 @@ class ZarrFile(Hdf5File):
         """Return what tells of a change: of a folder its metadata, of a zip itself, of an address nothing."""
         if isinstance(self.path, Url):
             return {}
-        files = [self.path] if self.path.is_file() else sorted(self.path.glob("zarr.json"))
+        files = [self.path] if self.path.is_file() else [self.path / name for name in _METADATA]
+        files = [file for file in files if file.is_file()]
         return {file: state_of(file.stat()) for file in files}
 
     def fingerprint(self, stack: h5py.Dataset) -> str:
@@ -259,6 +267,8 @@ def _set_attributes(node: h5py.Group | h5py.Dataset, attributes: Mapping[str, An
             node.attrs.create(name, fixed_text(value))
         elif isinstance(value, bool | int | float):
             node.attrs.create(name, value)
+        elif isinstance(value, list) and all(isinstance(one, str) for one in value):
+            node.attrs.create(name, fixed_text(value))
 
 
 class ZarrFrames(Closing):

@@ -17,6 +17,7 @@ import numpy as np
 
 from mirrorskin.io.hdf5 import Hdf5File, Node
 from mirrorskin.io.layout import STACK
+from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.recording import is_recording, open_recording
 from mirrorskin.io.types import InputError, Source
 from mirrorskin.io.url import ZARR_SUFFIX, Url, path_of
@@ -138,8 +139,14 @@ def _write_nodes(file: Hdf5File, store: Any) -> None:
 
 
 def _attributes(file: Hdf5File, node: Node) -> dict[str, Any]:
-    found = {name: file.attribute(str(node.name), name) for name in node.attrs}
-    return {name: value for name, value in found.items() if isinstance(value, str | bool | int | float)}
+    found: dict[str, Any] = {}
+    for name in node.attrs:
+        with as_input_error(f"{file.path}: {node.name}"):
+            value = np.asarray(node.attrs[name])
+        texts = np.vectorize(lambda one: one.decode() if isinstance(one, bytes) else one, otypes=[object])
+        if value.dtype.kind in "biufSUO":
+            found[name] = (texts(value) if value.size and value.dtype.kind in "SUO" else value).tolist()
+    return found
 
 
 def _write_frames(recording: Source, store: Any, progress: Callable[[int], None]) -> None:
@@ -173,6 +180,7 @@ def _finish(file: Hdf5File, store: Any) -> None:
     root = zarr.open_group(store, mode="a")
     for group in groups:
         root.require_group(str(group.name)).attrs.update(_attributes(file, group))
+    root.attrs.update(_attributes(file, file.root))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # other programs of version 3 need not read it, and lose nothing
         zarr.consolidate_metadata(store)

@@ -23,6 +23,7 @@
 
 #define DARK -1
 #define INVALID -2
+#define SURE_WAY 34  // standard deviations: a quarter of it is 8.5, which noise does not reach
 
 // As wide as a sample, so that whole vectors of both are worked on.
 #if BITS == 8
@@ -318,7 +319,7 @@ __kernel void onset_scan(
                 doubt[i] = travel[2 * room + begin - 1] - travel[2 * room + darks[p]];
                 const float way = levels[p] - levels[stride + p];
                 const int risen = risens[p] >= later[i] - way * 0.125f;
-                jumped[i] = risen & (feet[p] + 1 < begin) & (way >= 34 * noise);
+                jumped[i] = risen & (feet[p] + 1 < begin) & (way >= SURE_WAY * noise);
                 if (jumped[i]) frame[i] = feet[p] + 1;
             }
 

@@ -20,6 +20,7 @@ Array = NDArray[Any]
 
 DARK = -1
 INVALID = -2
+_SURE_WAY = 34  # standard deviations: a quarter of it is 8.5, which noise does not reach
 
 
 def complement(samples: Array) -> Array:
@@ -169,7 +170,7 @@ def onset_heights(onset: Array, below: Array, foot: Array, risen: Array, before:
     from_dark, to_light = low <= dark[found] + dark_tolerance, high >= settled - light_tolerance
     step = high - low
     way = level[found] - dark[found]
-    jumped = (foot[found] + 1 < start) & (risen[found] >= settled - way / 8) & (way >= 34 * noise)
+    jumped = (foot[found] + 1 < start) & (risen[found] >= settled - way / 8) & (way >= _SURE_WAY * noise)
     beside = (low <= dark[found] + step / 8) | (high >= settled - step / 8)
     sudden, under_way = from_dark & to_light | jumped, ~(from_dark | to_light | beside)
     end = np.where(jumped, foot[found] + 1, start)

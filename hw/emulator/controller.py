@@ -30,7 +30,7 @@ _RESET, _QUERY, _HOLD, _RESUME = 0x18, ord("?"), ord("!"), ord("~")
 _SWITCHES: Mapping[str, tuple[str, bool]] = {
     "M8": ("coolant", True),
     "M9": ("coolant", False),
-    "M3S1000": ("spindle", True),
+    "M3S999999": ("spindle", True),
     "M5": ("spindle", False),
 }
 _LINE_MAX = 79  # characters of a line, without spaces

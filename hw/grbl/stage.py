@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _SWITCHES: dict[tuple[Line, bool], str] = {
     ("coolant", True): "M8",
     ("coolant", False): "M9",
-    ("spindle", True): "M3S1000",  # an output that dims is full on at the greatest speed, $30
+    ("spindle", True): "M3S999999",  # an output that dims is full on at the greatest speed, $30, and beyond
     ("spindle", False): "M5",
 }
 _PREPARE = "G21G90G94"  # millimetres, absolute places, feeds a minute

@@ -131,9 +131,9 @@ class MarlinStage(Closing):
         """Begin to go to some places, one after the other; see ``Stage.follow``."""
         for place in places:
             self.limits.check(place, self.name)
+        ways = list(itertools.pairwise([self._target or self.report().position, *places]))
+        commands = [self.axes.straight(*way, speed) for way in ways]  # all, before any is sent
         with self._guarded(), self._lock:
-            ways = list(itertools.pairwise([self._target or self.report().position, *places]))
-            commands = [self.axes.straight(*way, speed) for way in ways]  # all, before any is sent
             for way, command in zip(ways, commands, strict=True):
                 self._target = way[1]
                 if command is not None:
@@ -146,7 +146,7 @@ class MarlinStage(Closing):
     def wait(self, timeout: float | None = None) -> Report:
         """Wait until the body rests where it was sent, and return the report of it; see ``Stage.wait``."""
         began = time.monotonic()
-        due = began if self._due is None else self._due
+        due = max(began, self._due or began)
         limit = 0.25 * (due - began) + self._settings.timeout if timeout is None else began + timeout - due
         with self._guarded():
             while (left := due - time.monotonic()) > 0:  # no line pends, so that a stop is heeded at once

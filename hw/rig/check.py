@@ -230,7 +230,6 @@ def _reports(stage: Stage, settings: StageSettings) -> Iterator[Finding]:
     if rate < _REPORT_SHARE * asked:
         remedy = f"the line is slow; set stage.report_rate = {max(1, round(rate))}, or raise stage.baud"
     yield _rated("stage", "reports", f"{rate:.1f} Hz, asked {asked:g} Hz", remedy)
-    remedy = ""
 
 
 def _wait(part: str, what: str, longest: float, limit: float, key: str) -> Finding:

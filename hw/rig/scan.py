@@ -169,7 +169,7 @@ class Scan(Closing):
         header = Header(
             self.motion,
             title=f"{self.name}, {self.motion} motion",
-            start_time=datetime.now(UTC).isoformat(timespec="seconds"),
+            start_time=datetime.now(UTC).isoformat(timespec="milliseconds"),
             pixel_size=camera.pixel_sides,
             zenith_gain=_scalar(camera.counts_per_radian),
             zenith_offset=_scalar(camera.zenith_offset),

@@ -56,6 +56,13 @@ def test_the_maps_are_written_and_told_in_a_line(place):
     np.testing.assert_array_equal(io.open_result("press-Light.h5").own_maps["light"], light)
 
 
+def test_files_of_one_name_are_two_modules():
+    for folder, kind in (("a", "One"), ("b", "Two")):
+        Path(folder).mkdir()
+        Path(folder, "mine.py").write_text(MINE.replace("class Light", f"class {kind}"))
+        assert run("run", f"{folder}/mine.py:{kind}", "press.h5", "--set", "level=50").code == 0
+
+
 def test_region_frames_and_travel_are_those_of_reconstruct():
     example = ROOT / "examples" / "steepest_rise.py"
     chosen = ("--region", "1,1,4x3", "--frames", "1:7", "--travel-step", "0.2mm")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from threading import Thread
 
 import pytest
@@ -60,6 +61,22 @@ def test_info_differs_in_the_storage_alone(bucket):
 def test_a_batch_takes_addresses_and_keeps_what_is_made(bucket):
     assert "1 done" in run("batch", "memory://bucket/*.zarr", "-o", "results").out
     assert "1 kept" in run("batch", ADDRESS, "-o", "results").out
+
+
+def test_a_pattern_does_not_look_into_stores(bucket):
+    assert run("export", "press.h5", "-o", "other.zarr").code == 0
+    ended = run("batch", "**/*", "-o", "results")
+    assert (ended.code, sorted(path.name for path in Path("results").glob("*-result.h5"))) == (
+        0, ["other-result.h5", "press-result.h5"],
+    )  # fmt: skip
+
+
+def test_nothing_is_exported_beside_a_store_that_is_there(bucket):
+    for words in (("reconstruct", "press.h5"), ("export", "press-result.h5", "-o", "taken.zarr")):
+        assert run(*words).code == 0
+    ended = run("export", "press-result.h5", "-o", "a.ply", "-o", "taken.zarr")
+    assert (ended.code, Path("a.ply").exists()) == (2, False)
+    assert "taken.zarr is there already" in ended.said
 
 
 def test_a_batch_mixes_files_and_addresses(bucket):

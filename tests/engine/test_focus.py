@@ -139,3 +139,8 @@ FRAMES = textured().astype(np.float32)
 def test_bad_input_is_one_line(arguments, line):
     with pytest.raises(io.InputError, match=re.escape(line)):
         engine.find_focus(**{"frames": FRAMES, "travel": TRAVEL, "noise": 1, **arguments})
+
+
+def test_half_a_pixel_is_refused():
+    with pytest.raises(io.InputError, match=re.escape("radius 1.5")):
+        engine.FocusEstimator(SHAPE, "uint8", noise=1, radius=1.5)

@@ -121,3 +121,10 @@ FRAMES = lit(LAMPS)
 def test_bad_input_is_one_line(arguments, line):
     with pytest.raises(io.InputError, match=re.escape(line)):
         engine.photometric_stereo(FRAMES, **arguments)
+
+
+@pytest.mark.parametrize("azimuth", [[0, np.pi, 0, np.pi], np.pi / 2 * np.array([1, -1, 1, -1])])
+def test_lamps_in_a_plane_determine_no_normal(azimuth):
+    found = engine.photometric_stereo(lit(round_lamps(0.6, np.array(azimuth))), azimuth, zenith=0.6, noise=1)
+    assert np.isnan(found.normals).all()
+    assert np.isnan(found.normal_sigma).all()

@@ -85,6 +85,13 @@ def rests_soon(line):
     return not line.moving and -1.0 < line.now()["Z"] < 0.0
 
 
+def test_a_refused_speed_stops_nothing(stage):
+    with pytest.raises(io.InputError, match="slow"):
+        stage.move(Position(1.0), speed=1e-9)
+    stage.move(Position(1.0))
+    assert stage.wait().position.travel == pytest.approx(1.0)
+
+
 @pytest.mark.parametrize("emergency", [True, False])
 def test_a_stop_in_motion_comes_at_once(emergency):
     line = FakeMarlin(emergency, home=(0.0, 0.0, 0.0))

@@ -14,8 +14,9 @@ import pytest
 from stacks import SHAPE, random_stack, read_all, record, sphere
 
 from mirrorskin import engine, io
+from mirrorskin.io.hdf5 import Hdf5File
 from mirrorskin.io.url import Url, path_of
-from mirrorskin.io.zarr import ZarrFrames
+from mirrorskin.io.zarr import ZarrFile, ZarrFrames
 
 zarr = pytest.importorskip("zarr")
 
@@ -181,7 +182,7 @@ def test_a_fingerprint_tells_recordings_apart(pair, tmp_path):
         ({"shape": [8, 5]}, "it is damaged"),
         ({"shape": [1 << 40, 5, 7]}, "claims 1099511627776 frames: it is damaged"),
         ({"shape": [-8, 5, 7]}, "it is damaged"),
-        ({"shape": [800, 5, 7]}, "is missing: it was cut short; copy it again"),
+        ({"shape": [800, 5, 7]}, "is missing: copy it again"),
         ({"data_type": "float64"}, "is of type float64: frames are uint8, uint16 or float32"),
         ({"codecs": [{"name": "unheard-of"}]}, "it is damaged"),
         ({"node_type": "sheep"}, ""),
@@ -252,3 +253,17 @@ def test_a_path_keeps_the_slashes_of_an_address():
     url = path_of("s3://bucket/monday/press.zarr")
     assert str(url.with_name("b.zarr")) == "s3://bucket/monday/b.zarr"
     assert str(path_of("press.zarr")) == "press.zarr"
+
+
+def test_lists_in_attributes_and_those_of_the_root_are_kept(tmp_path):
+    flat = io.Result(height=np.zeros((4, 5), np.float32))
+    for path in (tmp_path / "flat.h5", tmp_path / "flat.zarr"):
+        io.save_result(flat, path)
+    with Hdf5File(tmp_path / "flat.h5") as theirs, ZarrFile(tmp_path / "flat.zarr") as ours:
+        for name in ("/", "/entry", "/entry/result"):
+            known = theirs.root[name].attrs
+            assert set(ours.root[name].attrs) == set(known)
+            for attribute, value in known.items():
+                np.testing.assert_array_equal(
+                    np.asarray(ours.root[name].attrs[attribute]).astype(str), np.asarray(value).astype(str)
+                )
