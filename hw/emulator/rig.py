@@ -45,7 +45,7 @@ SHIFT, TURN = 2.0, 45.0
 """Greatest displacement along x and y, mm, and greatest twist, degrees, either way."""
 
 _SILENCE, _STALL = 0.07, 0.1  # seconds that the emulators may be silent in motion
-_SERVED = 0.5  # the same of other processes', which share the computer with them
+_SERVED = 0.5  # the same for emulators in another process, which competes for the processor
 _LIFT = 4.0  # how far above the object the body begins, mm
 _HIGHEST = 4.5  # and how far it can be lifted
 # GRBL's settings of homing, in units a minute, ms and units; and of its axes X, Y, Z, A, B and C, which are

@@ -78,8 +78,8 @@ class Rig(Closing):
     While a move is under way a thread looks fifty times a second whether frames still arrive and whether
     stage and camera are well. If not, it stops the stage, also while everyone else is busy, and whoever asks
     the rig for anything gets the reason. Frames are missed after ``camera.stall`` or three periods, whichever
-    is longer, and after three times that where it does not matter when they came, in steps and on the
-    way; a computer that is too busy to look that often gives the camera more time. If it does not look
+    is longer, and three times that in steps and on the way to the start, where arrival times do not
+    matter; a computer that is too busy to look that often gives the camera more time. If it does not look
     for 0.5 s in a timed move, when frames came is not known, and the move ends. Only moves that the rig
     begins are guarded.
 

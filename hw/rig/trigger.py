@@ -1,4 +1,4 @@
-"""Frames one by one: a line of the stage's controller goes on for each, and triggers the camera or a lamp."""
+"""Frames one by one: a line of the stage's controller is switched on for each, for camera or lamp."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Trigger:
     """Takes exactly one frame each time that a line of the controller is switched on.
 
     The line is on until the frame has arrived, and off afterwards whatever happens, as long as the controller
-    obeys: a stop of the stage resets that, which switches it off, too.
+    obeys: a stop of the stage resets the controller, which switches the line off, too.
 
     Parameters
     ----------

@@ -33,7 +33,8 @@ def stage(request, tmp_path):
     machine = GrblMachine(QUICK) if emulated else Firmware(PROGRAM, tmp_path, QUICK)
     with nullcontext() if emulated else machine, GrblPort(machine) as port:
         axes = {name: structs.replace(axis, zero=0.0) for name, axis in stage_settings().axes.items()}
-        with GrblStage(stage_settings(port=port.url, timeout=2.0 if emulated else 10.0, **axes)) as opened:
+        borne = {"silence": 0.3, "timeout": 2.0 if emulated else 10.0}  # beside other tests
+        with GrblStage(stage_settings(port=port.url, **borne, **axes)) as opened:
             yield opened, machine, port
 
 
