@@ -115,10 +115,10 @@ class FocusEstimator:
             weight = np.where(signal > 0, weight, 0)
             value = np.log(np.where(signal > 0, signal, 1))
             peak = _fit(place, value, weight)
-            found = (weight > 0).sum(axis=0) > 2  # two points have no vertex
-            top = signal[self._reach]
+            points, top = (weight > 0).sum(axis=0), signal[self._reach]
+            found = points > 2  # two have no vertex
             found &= (top > _SURELY * variance * np.sqrt(2 * freedom)) & (peak.bent > _BENT**2 * variance)
-            misfit = _misfit(peak, (weight > 0).sum(axis=0), found, variance)
+            misfit = _misfit(peak, points, found, variance)
             beside = place[self._reach - 1 : self._reach + 2]
             found &= (beside.min(axis=0) < peak.vertex) & (peak.vertex < beside.max(axis=0))
             sharpness = np.sqrt(np.maximum(top, 0) / np.maximum(freedom, 1))
@@ -212,7 +212,7 @@ class _Peak(NamedTuple):
     gain: Doubles  # the variance of the vertex where all values had the variance 1
     bent: Doubles  # the square of the curvature by its standard error, 0 of a curve that is bent up
     residual: Doubles  # the sum of weight * residual^2
-    free: Doubles  # its mean, likewise
+    free: Doubles  # the mean of that sum where all values had the variance 1
 
 
 def _fit(place: Doubles, value: Doubles, weight: Doubles) -> _Peak:

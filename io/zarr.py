@@ -10,7 +10,6 @@ import functools
 import hashlib
 import json
 import math
-import os
 import secrets
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -26,6 +25,7 @@ from mirrorskin.io.atomic import MAKE_ROOM, fixed_text
 from mirrorskin.io.fingerprint import State, state_of
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
 from mirrorskin.io.layout import CHECKSUM, STACK
+from mirrorskin.io.os_errors import reason
 from mirrorskin.io.selection import Place, Region, Span
 from mirrorskin.io.types import Closing, InputError
 from mirrorskin.io.url import Url, is_zarr, path_of
@@ -63,9 +63,9 @@ def naming(what: str) -> Iterator[None]:
 
 def _reason(error: Exception) -> str:
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return f"{os.strerror(error.errno)}: {MAKE_ROOM}"
+        return f"{reason(error)}: {MAKE_ROOM}"
     if isinstance(error, PermissionError) and error.errno:
-        return f"{os.strerror(error.errno)}: check the permissions"
+        return f"{reason(error)}: check the permissions"
     kinds = {kind.__name__ for kind in type(error).__mro__}
     said = " ".join(str(error).split())[:200] or type(error).__name__
     if isinstance(error, _MissingChunkError):

@@ -143,9 +143,10 @@ def _attributes(file: Hdf5File, node: Node) -> dict[str, Any]:
     for name in node.attrs:
         with as_input_error(f"{file.path}: {node.name}"):
             value = np.asarray(node.attrs[name])
-        texts = np.vectorize(lambda one: one.decode() if isinstance(one, bytes) else one, otypes=[object])
-        if value.dtype.kind in "biufSUO":
-            found[name] = (texts(value) if value.size and value.dtype.kind in "SUO" else value).tolist()
+            if value.dtype.kind == "S":
+                value = np.char.decode(value, "utf-8")
+        if value.dtype.kind in "biufU" or all(isinstance(one, str) for one in value.flat):
+            found[name] = value.tolist()
     return found
 
 
