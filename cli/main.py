@@ -27,7 +27,7 @@ _HELP = "NoArgsIsHelpError"  # of a group that no command was named of; its mess
 PURPOSES = {
     "demo": "Repeat the paper's experiments on the twin.",
     "simulate": "Record what the twin sees, with the truth.",
-    "sample": "Make data to try things on.",
+    "sample": "Write example data.",
     "import": "Make a recording of a video or pictures.",
     "capture": "Move the stage, and record what the camera sees.",
     "live": "Reconstruct while the stage moves.",

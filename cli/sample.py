@@ -1,4 +1,4 @@
-"""``mirrorskin sample``: data to try things on, as a real sensor would give them."""
+"""``mirrorskin sample``: example data, as a real sensor produces them."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 _SHAPE, _PIXEL = (320, 320), 0.0375  # rows and columns, and mm: a field of 12 mm
 _SEED = 11
+_STEP, _FRAMES = 0.1, 31  # of the press: mm, from 0, where the skin touches the top of the ball
 _PIVOT = (0.3, -0.2, 2.0)  # mm
 _AT = ((0.0, 0.0), (-2.2, -2.2), (2.2, -2.2), (-2.2, 2.2), (2.2, 2.2))  # mm, where the balls lie
 _FLAT_FRAMES = 16
@@ -29,7 +30,7 @@ _BLUR, _NOISE = 0.5, 1.0  # of its picture: pixels and counts, one sigma
 
 
 class SampleName(StrEnum):
-    """What there is to try things on."""
+    """The samples."""
 
     press = "press"
     turn = "turn"
@@ -41,18 +42,20 @@ class SampleName(StrEnum):
 
 
 def command(
-    name: Annotated[SampleName, Argument(help="What to make.")],
+    name: Annotated[SampleName, Argument(help="Sample to write.")],
     output: Annotated[
         Path,
         Option("--output", "-o", metavar="FILE-OR-FOLDER", help="Folder for calibration and pictures."),
     ],
 ) -> None:
-    """Make data to try things on.
+    """Write example data.
 
-    A press on and a turn about a ball of 10 mm, and a slide of a textured sheet (.h5); all that a sensor is
-    calibrated with; the press as other programs have it: a stack without any more (.h5), numbered pictures,
-    and a video (.avi). Light, lens and pixels are those of a real camera; the calibration's sensor has a real
-    wall and uneven lamps as well. 'simulate' has an option for each of these.
+    press: frames of a 10 mm ball under a press from 0 to 3 mm, with the ground truth (.h5). turn: the same
+    ball in a rotation. slide: a textured sheet that slides (.h5). calibration: every recording that the
+    calibration of a sensor needs. stack, pictures and video: the frames of 'press' as other programs store
+    them, an HDF5 stack without metadata, numbered PNG files, and an AVI file. Light, lens and pixels are
+    those of a real camera; the sensor of 'calibration' also has a real wall and uneven lamps. 'simulate' has
+    an option for each of these properties.
     """
     from mirrorskin import io
 
@@ -61,22 +64,23 @@ def command(
         try:
             output.mkdir()
         except OSError as error:
-            raise io.InputError(f"{output} cannot be made: {error.strerror}; name another with -o") from error
+            raise io.InputError(f"{output}: the folder cannot be created: {error.strerror}. Choose another with -o") from error
     elif not folder:
         io.check_output(output)
     _MAKERS[name](output)
     click.echo(f"{output}: {_HOLDS[name]}")
 
 
+_PRESS = f"{_FRAMES} frames from travel 0 to {_STEP * (_FRAMES - 1):g} mm in steps of {_STEP:g} mm"
 _HOLDS = {
-    SampleName.press: "a ball of 10 mm, pressed by 30 steps of 0.1 mm",
-    SampleName.turn: "the same ball under a body that leans by 2.5 degrees, at 8 phases of a turn",
-    SampleName.slide: "a ball under a textured sheet that slides by 30 steps of 0.01 mm",
-    SampleName.calibration: "dark.h5, flat.h5, photo.png, ball-1.h5 to ball-5.h5 (4 mm, turned),"
-    " press-ball.h5 (4 mm, pressed with 3 N), other.h5 (6 mm, turned)",
-    SampleName.stack: "the frames of the press in the dataset /raw/images, and nothing else",
-    SampleName.pictures: "the frames of the press as numbered PNG",
-    SampleName.video: "the frames of the press as a video",
+    SampleName.press: f"a 10 mm ball, {_PRESS}, with the ground truth",
+    SampleName.turn: "the same ball in a rotation, 8 phases at a tilt of 2.5 degrees, with the ground truth",
+    SampleName.slide: "a 10 mm ball under a textured sheet, 30 frames in steps of 0.01 mm",
+    SampleName.calibration: "dark.h5, flat.h5, photo.png, ball-1.h5 to ball-5.h5 (rotations of a 4 mm ball),"
+    " press-ball.h5 (a press of a 4 mm ball with 3 N), other.h5 (a rotation of a 6 mm ball)",
+    SampleName.stack: f"the frames of 'sample press' as dataset /raw/images without metadata; {_PRESS}",
+    SampleName.pictures: f"the frames of 'sample press' as numbered PNG files; {_PRESS}",
+    SampleName.video: f"the frames of 'sample press' as a video; {_PRESS}",
 }
 
 
@@ -109,7 +113,7 @@ def _pressed() -> hw.Twin:
     from mirrorskin import io
     from mirrorskin.hw.twin import Vertical
 
-    return _twin(10.0, Vertical(io.Steps(0.1, 0.1).positions(30)))
+    return _twin(10.0, Vertical(io.Steps(_STEP).positions(_FRAMES)))
 
 
 def _make_press(path: Path) -> None:
@@ -168,7 +172,7 @@ def _make_video(path: Path) -> None:
     size = (_SHAPE[1], _SHAPE[0])
     film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, size, isColor=False)
     if not film.isOpened():
-        raise io.InputError(f"{path} cannot be written as a video: name a file that ends with .avi")
+        raise io.InputError(f"{path}: OpenCV cannot write a video of this name. Use a name that ends in .avi")
     for frame in _frames():
         film.write(frame)
     film.release()
