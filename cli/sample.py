@@ -64,7 +64,9 @@ def command(
         try:
             output.mkdir()
         except OSError as error:
-            raise io.InputError(f"{output}: the folder cannot be created: {error.strerror}. Choose another with -o") from error
+            raise io.InputError(
+                f"{output}: the folder cannot be created: {error.strerror}. Choose another with -o"
+            ) from error
     elif not folder:
         io.check_output(output)
     _MAKERS[name](output)

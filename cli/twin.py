@@ -1,7 +1,10 @@
-"""``mirrorskin twin serve``: a rig for anyone to try, without hardware."""
+"""``mirrorskin twin serve``: an emulated rig, which needs no hardware."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +14,8 @@ import click
 from mirrorskin.cli import options, sensor
 from mirrorskin.cli.groups import Group, Option
 
-_LOOK = 0.2  # seconds from one look whether all is well to the next
+_LOOK = 0.2  # seconds between checks of the camera
+_LOG = "twin.log"
 _PRESS = "vertical --stop 1.5mm --speed 0.5mm/s"
 _TURN = "axial --press 1mm --rate 0.5"  # which needs the zenith's scale
 _SIDEWAYS = (
@@ -25,7 +29,7 @@ app = Group(help="Emulate a whole rig: its stage and its camera.", no_args_is_he
 @app.add
 def serve(
     output: Annotated[
-        Path, Option("--output", "-o", metavar="DIR", help="Where to write the rig file.")
+        Path, Option("--output", "-o", metavar="DIR", help="Folder for the rig file, rig.toml.")
     ] = Path("emulated-rig"),
     thing: Annotated[
         str,
@@ -53,12 +57,27 @@ def serve(
     jitter: Annotated[str, Option(metavar="TIME", help="Of that delay, one sigma.")] = "0s",
     seed: Annotated[int, Option(help="Of noise and jitter.")] = 0,
     device: options.Device = None,
+    background: Annotated[
+        bool,
+        Option(
+            "--background", help=f"Return when the rig is ready and keep it running; it logs to DIR/{_LOG}."
+        ),
+    ] = False,
+    ready: Annotated[int | None, Option("--ready-fd", hidden=True)] = None,
 ) -> None:
-    """Run an emulated rig: a stage behind a serial port, and the twin as its camera, until Ctrl-C."""
+    """Run an emulated rig: a stage behind a serial port, with the twin as its camera.
+
+    DIR/rig.toml appears when the rig is ready, and is removed when it ends: on Ctrl-C, or with --background on
+    'kill' and the process id that is printed.
+    """
+    if background and ready is None:
+        _start_in_background()
+        return
     from mirrorskin.cli.quantity import duration, frame_size, lengths
     from mirrorskin.hw.emulator.rig import EmulatedRig
 
     columns, rows = frame_size(size, "--size")
+    EmulatedRig.check_folder(output)
     rig = EmulatedRig(
         thing,
         shape=(rows, columns),
@@ -78,8 +97,13 @@ def serve(
         path = rig.write(output, server.url)
         what = f"{thing} under {columns} x {rows} pixels at {rate:g} frames a second"
         click.echo(f"{path}: {what}; stage at {rig.port.url}, camera at {server.url}")
-        scale = rig.settings.camera.zenith_gain
-        click.echo(_tell(path, [_PRESS] if scale is None else [_PRESS, _TURN]))
+        if ready is None:
+            scale = rig.settings.camera.zenith_gain
+            click.echo(_suggestions(path, [_PRESS] if scale is None else [_PRESS, _TURN]))
+        else:
+            log = output / _LOG
+            click.echo(f"running as process {os.getpid()}, log in {log}; end it with 'kill {os.getpid()}'")
+            _detach(log, ready)
         try:
             while rig.camera.error is None:
                 time.sleep(_LOOK)
@@ -88,16 +112,55 @@ def serve(
             click.echo("the rig has ended")
 
 
-def _tell(rig: Path, movements: list[str]) -> str:
-    """Say what can be tried."""
-    said = ["in another terminal, try", f"  mirrorskin rig check {rig}"]
+def _start_in_background() -> None:
+    """Run this command in a session of its own; return when it is ready, or exit with its code."""
+    from mirrorskin.hw.errors import HardwareError
+
+    reading, writing = os.pipe()
+    own = [sys.executable, "-P", "-m", "mirrorskin.cli.main", *sys.argv[1:], "--ready-fd", str(writing)]
+    with open(reading, "rb") as pipe:
+        try:
+            child = subprocess.Popen(
+                own, stdin=subprocess.DEVNULL, pass_fds=(writing,), start_new_session=True
+            )
+        finally:
+            os.close(writing)
+        try:
+            ready = pipe.read(1)
+        except BaseException:
+            child.terminate()
+            child.wait()
+            raise
+    if ready:
+        return
+    code = child.wait()
+    if code < 0:
+        raise HardwareError(f"twin serve: signal {-code} ended the rig before it was ready. Start it again")
+    raise click.exceptions.Exit(code or 1)
+
+
+def _detach(log: Path, ready: int) -> None:
+    """Send further output to a log, and report to the waiting parent that the rig is ready."""
+    from mirrorskin.io.os_errors import as_input_error
+
+    sys.stdout.flush()
+    with as_input_error(f"{log} cannot be written", "choose another folder with -o"), log.open("ab") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    with open(ready, "wb") as pipe:
+        pipe.write(b"1")
+
+
+def _suggestions(rig: Path, movements: list[str]) -> str:
+    """List commands to try."""
+    lines = ["in another terminal, try", f"  mirrorskin rig check {rig}"]
     for movement in movements:
         name = movement.split()[0]
-        said += [
+        lines += [
             f"  mirrorskin capture {movement} --rig {rig} -o {name}.h5",
             f"  mirrorskin reconstruct {name}.h5",
             f"  mirrorskin live {movement} --rig {rig}",
         ]
     for movement in _SIDEWAYS:
-        said.append(f"  mirrorskin capture {movement} --rig {rig} -o {movement.split()[0]}.h5")
-    return "\n".join([*said, "Ctrl-C ends the rig"])
+        lines.append(f"  mirrorskin capture {movement} --rig {rig} -o {movement.split()[0]}.h5")
+    return "\n".join([*lines, "Ctrl-C ends the rig"])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -15,6 +16,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import msgspec
 from msgspec import Meta
 
+from mirrorskin.hw.emulated_file import Emulator
 from mirrorskin.hw.rig.references import SUFFIXES, check_references
 from mirrorskin.hw.stage import Limits
 from mirrorskin.io import InputError
@@ -373,12 +375,17 @@ def load_rig(path: Path | str) -> RigSettings:
     Parameters
     ----------
     path : Path or str
-        TOML as ``docs/rig.md`` describes it. Files that it names lie beside it.
+        TOML with the keys of ``TEMPLATE``. Files that it names are relative to its folder.
 
     Returns
     -------
     RigSettings
         With the paths of those files.
+
+    Raises
+    ------
+    InputError
+        The file is invalid, or belongs to an emulated rig that has ended.
 
     Examples
     --------
@@ -392,6 +399,7 @@ def load_rig(path: Path | str) -> RigSettings:
         if path.exists():
             raise
         raise InputError(f"{error}, or begin with 'mirrorskin rig new'") from error
+    _check_emulator(path, file.stage.port)
     camera = file.camera
     beside: dict[str, Any] = {
         name: str(path.parent / given)
@@ -404,6 +412,18 @@ def load_rig(path: Path | str) -> RigSettings:
     check_references(camera, str(path))
     stage = msgspec.structs.replace(file.stage, firmware=_own_stage(path, file.stage.firmware))
     return RigSettings(path, file.name or path.stem, stage, camera)
+
+
+def _check_emulator(path: Path, port: str) -> None:
+    """Refuse the file of an emulated rig that has ended: its port may belong to another terminal by now."""
+    emulator = Emulator.read(path)
+    if emulator is None or emulator.port != port or emulator.running:
+        return
+    folder = shlex.quote(str(path.parent))
+    raise InputError(
+        f"{path}: the emulated rig has ended, its port {port} is gone. Start it again with"
+        f" 'mirrorskin twin serve -o {folder} --background'"
+    )
 
 
 def _own_stage(path: Path, name: str) -> str:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import functools
 import json
 import math
+import os
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -16,6 +17,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.hw.emulated_file import Emulator
 from mirrorskin.hw.emulator.camera import TwinCamera, pose_at
 from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
 from mirrorskin.hw.emulator.server import FrameServer
@@ -33,6 +35,8 @@ from mirrorskin.hw.rig_file import (
 from mirrorskin.hw.stage import Position
 from mirrorskin.hw.twin import Axial, Camera, Object, Twin, Vertical
 from mirrorskin.hw.twin.movement import Movement, Pose
+from mirrorskin.io.atomic import write_new
+from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.types import Floats, InputError
 
 PRESS = 3.0
@@ -63,7 +67,7 @@ MACHINE = (
 )
 """The controller's ``$`` settings."""
 
-_FIRST = "# An emulated rig; it is there as long as the program that wrote this runs.\n"
+_FILE, _REFERENCE = "rig.toml", "bright.npy"
 
 
 class EmulatedRig:
@@ -187,27 +191,64 @@ class EmulatedRig:
         """Stream the camera's frames to other processes, until what is returned is closed."""
         return FrameServer(self.camera, self._seen.frame_rate, port)
 
-    def write(self, folder: Path, source: str) -> Path:
-        """Write ``rig.toml`` with a stream's URL as camera, and the bright reference beside it.
+    @staticmethod
+    def check_folder(folder: Path) -> None:
+        """Refuse a folder in which `write` must not replace a file.
 
-        The folder is made where it is missing; files of an emulated rig that was there before are replaced.
+        Raises
+        ------
+        InputError
+            It contains a rig file or a ``bright.npy`` that the twin did not write, or an emulated rig that is
+            still running uses it.
         """
-        path, picture = folder / "rig.toml", folder / "bright.npy"
+        path, picture = folder / _FILE, folder / _REFERENCE
+        with as_input_error(f"{path} cannot be read", "choose another folder with -o"):
+            if not path.exists():
+                if picture.exists():
+                    raise InputError(f"{picture} exists. Delete it, or choose another folder with -o")
+                return
+            emulator = Emulator.read(path)
+            if emulator is None or path.stat().st_uid != os.geteuid():
+                raise InputError(f"{path} is someone else's rig file. Choose another folder with -o")
+        if emulator.running and emulator.process != os.getpid():
+            raise InputError(
+                f"{path}: an emulated rig is already running in this folder (process {emulator.process})."
+                f" End it with 'kill {emulator.process}', or choose another folder with -o"
+            )
+
+    def write(self, folder: Path, source: str) -> Path:
+        """Write ``rig.toml`` and the bright reference that it names; both are removed when the rig ends.
+
+        Parameters
+        ----------
+        folder : Path
+            Created if missing. What an emulated rig that was killed left in it is replaced.
+        source : str
+            URL of the camera's stream; see `serve`.
+
+        Returns
+        -------
+        Path
+            The rig file. It appears complete, after everything else is ready.
+
+        Raises
+        ------
+        InputError
+            The folder cannot be written to, or contains files of others; see `check_folder`.
+        """
+        self.check_folder(folder)
+        path, picture = folder / _FILE, folder / _REFERENCE
         settings, change = self.settings, msgspec.structs.replace
         camera = change(settings.camera, source=source, bright=picture.name, stall=max(_STALL, _SERVED))
         stage = change(settings.stage, silence=max(_SILENCE, _SERVED))
         file = RigFile(name=settings.name, stage=stage, camera=camera)
         text = "\n".join(_toml(msgspec.to_builtins(file)))
-        try:
-            if path.exists() and not path.read_text(errors="replace").startswith(_FIRST):
-                raise InputError(f"{path} is a rig file that someone else wrote: name another folder with -o")
+        emulator = Emulator.here(stage.port)
+        with as_input_error(f"{folder} cannot be written to", "choose another folder with -o"):
             folder.mkdir(parents=True, exist_ok=True)
+            self._leaving.callback(_remove, folder, emulator)
             np.save(picture, self.references()[1])
-            path.write_text(f"{_FIRST}{text}\n")
-        except OSError as error:
-            raise InputError(
-                f"{folder} cannot be written to: {error.strerror}; name another with -o"
-            ) from None
+            write_new(path, [f"{emulator.heading}{text}\n".encode()])
         return path
 
     def _camera_settings(self) -> CameraSettings:
@@ -244,6 +285,15 @@ class _Anywhere(Axial):
         lean = self.tilt * math.cos(phase), self.tilt * math.sin(phase)
         x, y = np.sign(np.round([math.cos(phase), math.sin(phase)], 9)) * SHIFT
         return pose_at(Position(PRESS, *lean, x, y, turn * math.cos(4 * phase)), self.pivot)
+
+
+def _remove(folder: Path, emulator: Emulator) -> None:
+    """Remove the files that `EmulatedRig.write` wrote, unless another rig's have replaced them."""
+    path = folder / _FILE
+    with suppress(OSError):
+        if not path.exists() or Emulator.read(path) == emulator:
+            path.unlink(missing_ok=True)
+            (folder / _REFERENCE).unlink()
 
 
 def _axes(home: bool, letters: str) -> dict[str, Any]:
