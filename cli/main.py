@@ -16,9 +16,11 @@ from types import FrameType, TracebackType
 from typing import Annotated
 
 import click
+from click.shell_completion import shell_complete
 
 from mirrorskin.cli.groups import LazyGroup, Option, make_command
 
+_COMPLETE = "_MIRRORSKIN_COMPLETE"  # environment variable of shell completion, see click.shell_completion
 _INTERRUPTED = 130  # what shells say of a program that Ctrl-C ended
 _SOON = 0.001  # seconds
 _LESS = "take a smaller region or fewer frames, or end other programs"
@@ -148,11 +150,23 @@ def _ended_by_signals() -> Iterator[None]:
         sys.unraisablehook = told
 
 
+def _complete(instruction: str) -> None:
+    """Print a shell's completion script, or what completes its command line, as the instruction asks."""
+    if shell_complete(app, {}, "mirrorskin", _COMPLETE, instruction):
+        raise click.UsageError(
+            f"{_COMPLETE}={instruction}: no such instruction. Use bash_source, zsh_source or fish_source"
+        )
+
+
 def main() -> None:
-    """Run the command line."""
+    """Run the command line, or answer a shell that completes one."""
     words = sys.argv[1:] or ["--help"]
+    completion = os.environ.get(_COMPLETE)
     with _ended_by_signals(), _OneLine():
         try:
+            if completion:
+                _complete(completion)
+                sys.exit(0)
             with app.make_context("mirrorskin", words) as context:
                 app.invoke(context)
             sys.stdout.flush()

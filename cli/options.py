@@ -80,7 +80,7 @@ Section = Annotated[
 Dataset = Annotated[str | None, Option(metavar="PATH", help="The stack in another's file.")]
 Calibration = Annotated[
     Path | None,
-    Option(metavar="CAL.h5", help="What is known of the sensor; see docs/calibration.md."),
+    Option(metavar="CAL.h5", help="Calibration of the sensor, by 'mirrorskin calibrate'."),
 ]
 Memory = Annotated[str, Option(metavar="SIZE", help="Memory for frames on the move.")]
 Compression = Annotated[CompressionName, Option(help="How to pack the frames.")]

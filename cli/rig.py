@@ -28,7 +28,9 @@ _SLOW = 0.1  # of an axis's speed, for moves by hand
 _COLOURS = {"ok": "green", "warning": "yellow", "failed": "red"}
 
 
-RigFile = Annotated[Path, Argument(metavar="RIG.toml", help="Rig file; see docs/rig.md.")]
+RigFile = Annotated[
+    Path, Argument(metavar="RIG.toml", help="Rig file; 'mirrorskin rig new' writes a template.")
+]
 
 
 class AxisName(StrEnum):
@@ -46,7 +48,7 @@ class AxisName(StrEnum):
 def new(
     output: Annotated[Path, Option("--output", "-o", metavar="RIG.toml", help="File to write.")],
 ) -> None:
-    """Write a rig file to begin with; docs/rig.md tells of every key."""
+    """Write a template of a rig file, in which every key is described."""
     from mirrorskin.hw.rig_file import TEMPLATE
     from mirrorskin.io import InputError
 

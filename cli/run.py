@@ -50,7 +50,9 @@ def command(
 ) -> None:
     """Run an estimator of your own over a recording.
 
-    See docs/estimators.md.
+    ESTIMATOR is a class with the methods of mirrorskin.engine.Estimator: it is called with a frame's (rows,
+    columns) and sample type, push(frames) gets the next frames (n, rows, columns), result() returns maps by
+    name, and reset() forgets the frames.
     """
     from mirrorskin import engine, io
     from mirrorskin.cli.output import progress, save_and_report

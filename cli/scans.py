@@ -44,7 +44,9 @@ def _option(metavar: str, text: str, default: str | float | None = None) -> Any:
 
 
 Motion = Annotated[ScanName, Argument(help="How the body moves.")]
-RigFile = Annotated[Path, Option("--rig", metavar="RIG.toml", help="The rig; see docs/rig.md.")]
+RigFile = Annotated[
+    Path, Option("--rig", metavar="RIG.toml", help="Rig file; 'mirrorskin rig new' writes a template.")
+]
 Start = Annotated[str | None, _option("LENGTH", "Vertical: first travel.", _START)]
 Stop = Annotated[str | None, _option("LENGTH", "Vertical: last travel, deeper than the first.")]
 Strokes = Annotated[

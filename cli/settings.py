@@ -93,9 +93,12 @@ class _Settings(Struct, frozen=True):
     slip: _Slip = field(default_factory=_Slip)
 
 
+_REMEDY = f"write the tables {', '.join(f'[{name}]' for name in _Settings.__struct_fields__)} in TOML"
+
+
 def read_settings(path: Path | None, memory_limit: int) -> Plan:
-    """Read what a batch does with every recording, as ``docs/batch.md`` describes it."""
-    settings = _Settings() if path is None else load_toml(path, _Settings, "docs/batch.md")
+    """Read what a batch does with every recording."""
+    settings = _Settings() if path is None else load_toml(path, _Settings, _REMEDY)
     where = f"{path}: "
     opening = _opening(_given(settings.stack), f"{where}stack.")
     return Plan(

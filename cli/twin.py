@@ -67,8 +67,8 @@ def serve(
 ) -> None:
     """Run an emulated rig: a stage behind a serial port, with the twin as its camera.
 
-    DIR/rig.toml appears when the rig is ready, and is removed when it ends: on Ctrl-C, or with --background on
-    'kill' and the process id that is printed.
+    DIR/rig.toml appears when the rig is ready and is removed when the rig ends. Ctrl-C ends it, or with
+    --background 'kill' and the process id that is printed.
     """
     if background and ready is None:
         _start_in_background()
@@ -118,7 +118,7 @@ def _start_in_background() -> None:
 
     reading, writing = os.pipe()
     own = [sys.executable, "-P", "-m", "mirrorskin.cli.main", *sys.argv[1:], "--ready-fd", str(writing)]
-    with open(reading, "rb") as pipe:
+    with os.fdopen(reading, "rb") as pipe:
         try:
             child = subprocess.Popen(
                 own, stdin=subprocess.DEVNULL, pass_fds=(writing,), start_new_session=True
@@ -147,8 +147,8 @@ def _detach(log: Path, ready: int) -> None:
     with as_input_error(f"{log} cannot be written", "choose another folder with -o"), log.open("ab") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
-    with open(ready, "wb") as pipe:
-        pipe.write(b"1")
+    os.write(ready, b"1")
+    os.close(ready)
 
 
 def _suggestions(rig: Path, movements: list[str]) -> str:

@@ -38,7 +38,7 @@ class Counts:
 
 
 class Camera(Protocol):
-    """A camera that runs: its frames arrive by themselves and wait to be taken. See ``docs/camera.md``.
+    """A camera that runs: its frames arrive by themselves and wait to be taken.
 
     It runs from its making until ``close``. All of it may be used from any thread, but one thread takes.
     """

@@ -23,8 +23,7 @@ _LATE = 1.5  # periods
 class ThreadedCamera(Closing):
     """A ``mirrorskin.hw.camera.Camera`` but for the thread that brings the frames, and ``close``.
 
-    That thread fills ``_slot()`` and calls ``_put``, again and again, and ``_fail`` when it gives up; see
-    ``docs/camera.md``.
+    That thread fills ``_slot()`` and calls ``_put``, again and again, and ``_fail`` when it gives up.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The rig file: TOML that says how a stage and a camera are opened (``docs/rig.md``).
+"""The rig file: TOML that says how a stage and a camera are opened.
 
 Each class is a table of the file, and each of its fields a key, in the file's units; properties give mm,
 radians and seconds.
@@ -174,7 +174,7 @@ class TiltAxis(AngleAxis, frozen=True, kw_only=True):
 
 
 class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """How the stage is reached, and what it may do: the table ``[stage]`` of ``docs/rig.md``."""
+    """How the stage is reached, and what it may do: the table ``[stage]``."""
 
     port: Annotated[Text, Meta(description="a serial port or a URL, in quotes,", examples=["/dev/ttyUSB0"])]
     firmware: Annotated[
@@ -256,7 +256,7 @@ class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """How the camera is opened, and what its counts mean: the table ``[camera]`` of ``docs/rig.md``."""
+    """How the camera is opened, and what its counts mean: the table ``[camera]``."""
 
     source: Annotated[
         Annotated[int, Meta(ge=0, lt=1000)] | Text,
@@ -393,12 +393,7 @@ def load_rig(path: Path | str) -> RigSettings:
     2.0
     """
     path = Path(path)
-    try:
-        file = load_toml(path, RigFile, "docs/rig.md")
-    except InputError as error:
-        if path.exists():
-            raise
-        raise InputError(f"{error}, or begin with 'mirrorskin rig new'") from error
+    file = load_toml(path, RigFile, "'mirrorskin rig new' writes a template")
     _check_emulator(path, file.stage.port)
     camera = file.camera
     beside: dict[str, Any] = {
@@ -444,14 +439,14 @@ def _beside(path: Path, name: str) -> str:
 
 
 TEMPLATE = """\
-# A rig for mirrorskin: what moves the sensor's body, and what looks at its skin (docs/rig.md).
+# A rig for mirrorskin: what moves the sensor's body, and what looks at its skin.
 # Lines that begin with # show what may be set as well.
 
 name = "bench"
 
 [stage]
 port = "/dev/ttyUSB0"           # or COM3, socket://192.168.0.7:23, rfc2217://host:port
-# firmware = "grbl"             # or "marlin", or a class of your own (docs/stages.md)
+# firmware = "grbl"             # or "marlin", or a class of your own as "my_stage.py:MyStage"
 # baud = 115200
 home = true                     # the stage has switches, and must home before it moves
 # timeout = 2.0                 # s that an answer may take

@@ -162,7 +162,7 @@ class Limits:
 
 
 class Stage(Protocol):
-    """A stage that is open, and moves the body. See ``docs/stages.md``.
+    """A stage that is open, and moves the body.
 
     All of it may be used from any thread. What cannot be done is an `InputError`, raised before anything
     moves; what goes wrong afterwards is a `HardwareError`. A stage that failed or was stopped says so in

@@ -1,4 +1,4 @@
-"""A result as a file that other programs open (``docs/formats.md``, exports); the suffix says which kind."""
+"""A result as a file that other programs open: the suffix says which kind."""
 
 from __future__ import annotations
 

@@ -99,7 +99,7 @@ def with_fields(result: Result, values: Mapping[str, Any]) -> Result:
 
 @checked
 def save_result(result: Result, path: str | Path) -> None:
-    """Write a result; the file exists whole or not at all (``docs/formats.md``).
+    """Write a result; the file exists whole or not at all.
 
     Parameters
     ----------

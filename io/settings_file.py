@@ -18,8 +18,8 @@ _Model = TypeVar("_Model", bound=msgspec.Struct)
 _LONGEST = 40  # letters of a value that a message quotes
 
 
-def load_toml(path: str | Path, model: type[_Model], page: str) -> _Model:
-    """Read a file of TOML, which ``page`` describes (``"docs/batch.md"``), as its model.
+def load_toml(path: str | Path, model: type[_Model], remedy: str) -> _Model:
+    """Read a TOML file as its model; ``remedy`` ends the message about a file that cannot be read.
 
     A table is a field whose type is a `msgspec.Struct`. What a key may be is its type: a number with bounds,
     a text, a choice (`Literal`), a list; ``msgspec.Meta`` gives the bounds, says in words what is needed
@@ -35,7 +35,7 @@ def load_toml(path: str | Path, model: type[_Model], page: str) -> _Model:
     ...     press: Length
     >>> class Rig(msgspec.Struct):
     ...     stage: Stage
-    >>> load_toml("rig.toml", Rig, "docs/rig.md").stage.press  # doctest: +SKIP
+    >>> load_toml("rig.toml", Rig, "'mirrorskin rig new' writes a template").stage.press  # doctest: +SKIP
     2.0
     """
     path = Path(path)
@@ -45,9 +45,9 @@ def load_toml(path: str | Path, model: type[_Model], page: str) -> _Model:
         with path.open("rb") as file:
             tables = tomllib.load(file)
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}; write it as {page} describes") from error
+        raise InputError(f"{path} cannot be read: {error.strerror}; {remedy}") from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not text: write it in TOML, as {page} describes") from error
+        raise InputError(f"{path} is not text, but must be TOML; {remedy}") from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not TOML: {error}; correct it there") from error
     return _table(tables, model, str(path), "")

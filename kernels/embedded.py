@@ -1,7 +1,6 @@
 """The embedded OpenCL device: PoCL from its wheel, which needs no GPU, no driver and no root.
 
-What keeps it from running is corrected or reported here, before PoCL can end the process
-(docs/decisions/0003-embedded-opencl-device.md).
+What keeps it from running is corrected or reported here, before PoCL can end the process.
 """
 
 from __future__ import annotations

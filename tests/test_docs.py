@@ -73,9 +73,26 @@ def test_messages_that_troubleshooting_tells_of_are_those_of_the_program():
     assert [part for part in parts if len(part) > 8 and part not in joined] == []
 
 
+@pytest.mark.parametrize("page", [*sorted(ROOT.glob("*.md")), *PAGES], ids=lambda page: page.name)
+def test_every_table_of_a_page_is_one(page):
+    text = re.sub(r"^ *```.*?^ *```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    for block in text.split("\n\n"):
+        lines = [line.strip() for line in block.strip("\n").splitlines()]
+        rows = [line for line in lines if line.startswith("|")]
+        if rows:
+            assert lines[-len(rows) :] == rows, f"a table stands between blank lines: {lines[0]}"
+            assert re.fullmatch(r"\|(\s*:?-+:?\s*\|)+", rows[1] if rows[1:] else ""), f"no head: {rows[0]}"
+            assert len({cells_of(row) for row in rows}) == 1, f"rows differ in length: {rows[0]}"
+
+
 def test_a_command_that_is_none_is_not_understood():
     with pytest.raises(Exception, match="such"):
         understood(["reconstruct", "press.h5", "--travel-stop", "1mm"])
+
+
+def cells_of(row):
+    """Count the cells of a table's row; a bar within code or a formula separates none."""
+    return re.sub(r"`[^`]*`|\$[^$]*\$", "", row).replace(r"\|", "").count("|") - 1
 
 
 def understood(words):

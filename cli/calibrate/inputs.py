@@ -27,7 +27,7 @@ _STILL = 0.05  # mm that the body moves in a recording of it at rest: a press ha
 
 OptionalRig = Annotated[
     Path | None,
-    Option("--rig", metavar="RIG.toml", help="Take what is needed first, on this rig; see docs/rig.md."),
+    Option("--rig", metavar="RIG.toml", help="Capture the recordings first, with this rig."),
 ]
 Settle = scans.Settle
 Places = Annotated[int, Option(min=1, help="With --rig: of the ball.")]

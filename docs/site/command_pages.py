@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import html
 import inspect
-import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -14,7 +13,17 @@ import click
 from mirrorskin.cli.main import app
 
 _PROGRAM = "mirrorskin"
-_PAGE = re.compile(r"docs/(\w+\.md)")
+_SEE = {
+    "batch": "batch.md",
+    "calibrate": "calibration.md",
+    "capture": "capture.md",
+    "live": "live.md",
+    "rig": "rig.md",
+    "run": "estimators.md",
+    "simulate": "twin.md",
+    "twin": "twin.md",
+}
+"""The pages that explain more than a command's help."""
 
 
 @functools.cache
@@ -23,10 +32,7 @@ def pages() -> dict[str, str]:
     whole: Any = app
     context = click.Context(whole, info_name=_PROGRAM)
     commands = {name: whole.get_command(context, name) for name in whole.list_commands(context)}
-    rows = [
-        f"| [`{_PROGRAM} {name}`]({name}.md) | {_linked(_first(command))} |"
-        for name, command in commands.items()
-    ]
+    rows = [f"| [`{_PROGRAM} {name}`]({name}.md) | {_first(command)} |" for name, command in commands.items()]
     index = [
         "# Commands\n",
         f"What `--help` says; `{_PROGRAM} --debug` before a command shows tracebacks, and what is logged.\n",
@@ -57,7 +63,9 @@ def _page(command: Any, above: Any, name: str, level: int) -> Iterator[str]:
     """Return the lines on a command, and on those below it."""
     context = click.Context(command, info_name=name, parent=above)
     yield f"{'#' * level} {context.command_path}\n"
-    yield f"{_linked(_text(command))}\n"
+    yield f"{_text(command)}\n"
+    if level == 1 and name in _SEE:
+        yield f"See [the guide](../{_SEE[name]}).\n"
     is_group = hasattr(command, "list_commands")
     if command.params or not is_group:  # some groups do something by themselves
         yield from _options(command, context)
@@ -83,9 +91,4 @@ def _cell(text: str) -> str:
     told = html.escape(" ".join(text.split()))
     for sign in "|*_[`\\":
         told = told.replace(sign, f"&#{ord(sign)};")
-    return _linked(told)
-
-
-def _linked(text: str) -> str:
-    """Return text whose names of pages lead there."""
-    return _PAGE.sub(r"[\g<0>](../\1)", text)
+    return told

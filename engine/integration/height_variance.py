@@ -34,7 +34,8 @@ leaves a share of each loop of links (`expected_misfit`).
 Exact variances over these, of pictures of 64 x 64 pixels, are 0.98 to 1.00 in the mean, and within 1.0 +- 0.1
 for all of a rectangle's pixels, and all but 1 % of a disc's, 3 % of an annulus', 3 % around cuts, 2 % where
 heights are known on one side. Where a fifth of the pixels are missing at random, the mean is 0.92, 35 % are
-off by more than a tenth and 4 % by more than a fifth. docs/method/heights.md has the table.
+off by more than a tenth and 4 % by more than a fifth. The documentation has the table, in "Heights from
+slopes".
 """
 
 from __future__ import annotations

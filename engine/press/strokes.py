@@ -58,7 +58,8 @@ class StrokeSearch:
     """Find onsets and releases in a press that oscillates; see `mirrorskin.engine.streaming.Estimator`.
 
     A stroke is a run of frames in which travel does not change its direction; its turning points belong to
-    both strokes. Each is searched by `OnsetSearch`. See docs/method/vibration.md for how strokes are joined.
+    both strokes. Each is searched by `OnsetSearch`. The documentation, "Vibration", describes how strokes
+    are joined.
 
     Parameters
     ----------

@@ -126,7 +126,8 @@ def estimate_normals(
     """Estimate the normals from a stack that fits in memory.
 
     At each phase a pixel shows the angle between its normal n and the body's axis a, cos theta' = n . a
-    (eq. 10); the normal is the most likely one by all samples. See docs/method/rotation.md.
+    (eq. 10); the normal is the most likely one by all samples. See the
+    documentation, "Normals from a rotation".
 
     Parameters
     ----------

@@ -67,7 +67,7 @@ def find_displacement(
     """Find how far the texture of a reference has moved in frames.
 
     Least squares in square windows, of which each may move, strain and turn (an affine field), and whose
-    brightness may change by a gain and a plane; see ``docs/method/slip.md``. What is seen at the pixel x of
+    brightness may change by a gain and a plane; see the documentation, "Slip". What is seen at the pixel x of
     the reference is seen at x + displacement in the frame. Each frame begins where those before it lead to,
     so that steps may be as long as half of the texture's grain; after a longer one, coarser resolutions and
     the correlation of the whole picture are tried.

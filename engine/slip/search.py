@@ -99,7 +99,7 @@ class SlipSearch:
 
     The first frame is the reference. In the body's frame, skin that sticks to an object at rest moves as the
     object does, against the body; by what it lags behind it has slipped. When that began is fitted to all
-    frames (`mirrorskin.engine.slip.onset_map.fit_onsets`); see ``docs/method/slip.md``.
+    frames (`mirrorskin.engine.slip.onset_map.fit_onsets`); see the documentation, "Slip".
 
     Parameters
     ----------

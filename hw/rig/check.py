@@ -77,7 +77,10 @@ def check_rig(
         with _logged_warnings() as logged, closing(open_camera(settings.camera)) as camera:
             looked = check_camera if settings.camera.trigger is None else partial(check_trigger, stage)
             yield from looked(camera, settings.camera)
-        yield from (Finding("camera", "message", line, "warning", "see docs/camera.md") for line in logged)
+        yield from (
+            Finding("camera", "message", line, "warning", "correct [camera] in the rig file, or the camera")
+            for line in logged
+        )
         if move and sound:
             yield from check_moves(stage, settings.stage)
         elif move:

@@ -279,7 +279,9 @@ def _open_own(settings: StageSettings) -> Stage:
     try:
         inspect.signature(made).bind(settings)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{name}(settings) cannot be made: {error}; see docs/stages.md") from error
+        raise InputError(
+            f"{name}(settings) cannot be made: {error}; a stage's class takes one argument, the StageSettings"
+        ) from error
     try:
         stage = made(settings)
     except OSError as error:  # a SerialException is one
@@ -288,7 +290,9 @@ def _open_own(settings: StageSettings) -> Stage:
     if lacking:
         if hasattr(stage, "close"):
             stage.close()
-        raise InputError(f"{name} has no {', no '.join(lacking)}: see docs/stages.md")
+        raise InputError(
+            f"{name} has no {', no '.join(lacking)}: mirrorskin.hw.stage.Stage lists what a stage has"
+        )
     return cast("Stage", stage)
 
 

@@ -1,6 +1,6 @@
 """Calibration files, and the copies that recordings and results carry: read, write, replace one part.
 
-The layout (docs/calibration.md) is declared by the fields of the parts, see ``types.kept``.
+The layout is declared by the fields of the parts, see ``types.kept``.
 """
 
 from __future__ import annotations

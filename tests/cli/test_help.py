@@ -1,28 +1,32 @@
 """`mirrorskin --help`: quick, as no command is needed for it, and true to what commands say themselves."""
 
+import ast
 import json
+import os
 import subprocess
 import sys
 from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 from commands import run
 
-from mirrorskin.cli.main import PURPOSES, app
+from mirrorskin.cli.main import PURPOSES, app, main
 
 LOADED = """
 import contextlib, io, json, sys
 from mirrorskin.cli.main import main
 sys.argv = ["mirrorskin", *sys.argv[1:]]
-with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+with contextlib.redirect_stdout(io.TextIOWrapper(io.BytesIO())), contextlib.suppress(SystemExit):
     main()
 print(json.dumps(list(sys.modules)))
 """
 
 
-def loaded(*words):
+def loaded(*words, **variables):
     """Return which modules a command needs."""
-    done = subprocess.run([sys.executable, "-c", LOADED, *words], capture_output=True, text=True, check=True)
+    command, environment = [sys.executable, "-c", LOADED, *words], {**os.environ, **variables}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     return set(json.loads(done.stdout))
 
 
@@ -145,3 +149,112 @@ def test_a_closed_pipe_ends_a_command_without_a_traceback():
         process.stdout.close()
         assert process.stderr.read() == ""
         assert process.wait() == 1
+
+
+# Shell completion
+
+
+@pytest.fixture
+def ask(monkeypatch, capsys):
+    """Answer an instruction of a shell: the exit code and what is printed."""
+
+    def answer(instruction, **variables):
+        for name, value in {"_MIRRORSKIN_COMPLETE": instruction, **variables}.items():
+            monkeypatch.setenv(name, value)
+        monkeypatch.setattr(sys, "argv", ["mirrorskin"])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return ended.value.code, *capsys.readouterr()
+
+    return answer
+
+
+@pytest.fixture
+def complete(ask):
+    """Complete a command line as bash does, and return the answers, each as "type,value"."""
+
+    def answers(line):
+        code, out, said = ask("bash_complete", COMP_WORDS=line, COMP_CWORD=str(line.count(" ")))
+        assert (code, said) == (0, "")
+        return out.split()
+
+    return answers
+
+
+@pytest.mark.parametrize(
+    ("line", "answers"),
+    [
+        ("mirrorskin re", ["plain,reconstruct", "plain,report"]),
+        ("mirrorskin --ver", ["plain,--version"]),
+        ("mirrorskin calibrate ze", ["plain,zenith"]),
+        ("mirrorskin twin ", ["plain,serve"]),
+        ("mirrorskin reconstruct --travel-st", ["plain,--travel-step", "plain,--travel-start"]),
+        ("mirrorskin twin serve --ready", []),  # hidden
+        ("mirrorskin sample p", ["plain,press", "plain,pictures"]),
+        ("mirrorskin import frames --motion ver", ["plain,vertical"]),
+        ("mirrorskin reconstruct pre", ["file,pre"]),
+        ("mirrorskin score missing.h5 --truth pre", ["file,pre"]),
+        ("mirrorskin reconstruct missing.h5 -o pre", ["file,pre"]),
+        ("mirrorskin simulate vertical --object ba", ["file,ba"]),
+        ("mirrorskin reconstruct missing.h5 --travel-step ", []),
+    ],
+)
+def test_a_command_line_is_completed(line, answers, complete):
+    assert sorted(complete(line)) == sorted(answers)
+
+
+def test_every_command_is_offered(complete):
+    assert complete("mirrorskin ") == [f"plain,{name}" for name in PURPOSES]
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_gets_its_script(shell, ask):
+    code, out, _ = ask(f"{shell}_source")
+    assert code == 0
+    assert f"_MIRRORSKIN_COMPLETE={shell}_complete" in out
+
+
+def test_the_script_of_bash_completes_in_bash(tmp_path):
+    program = tmp_path / "mirrorskin"
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} -P -m mirrorskin.cli.main "$@"\n')
+    program.chmod(0o755)
+    line = (
+        f'eval "$(_MIRRORSKIN_COMPLETE=bash_source {program})"; COMP_WORDS=(mirrorskin sco) COMP_CWORD=1;'
+        f' $(complete -p mirrorskin | sed "s/.*-F \\([^ ]*\\) .*/\\1/") {program}; echo "${{COMPREPLY[@]}}"'
+    )
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True)
+    assert done.stdout == "score\n"
+
+
+def test_another_instruction_is_refused(ask):
+    code, _, said = ask("bash")
+    assert (code, said.count("\n")) == (2, 1)
+    assert "bash_source" in said
+
+
+def test_completion_of_a_command_imports_no_command():
+    asked = {"_MIRRORSKIN_COMPLETE": "bash_complete", "COMP_WORDS": "mirrorskin re", "COMP_CWORD": "1"}
+    ours = {name for name in loaded(**asked) if name.startswith("mirrorskin.")}
+    assert ours == {"mirrorskin.cli", "mirrorskin.cli.groups", "mirrorskin.cli.main"}
+
+
+@pytest.mark.parametrize("name", ["reconstruct", "twin serve", "sample"])
+def test_completion_of_an_option_imports_nothing_heavy(name):
+    words = f"mirrorskin {name} -"
+    asked = {"_MIRRORSKIN_COMPLETE": "bash_complete", "COMP_WORDS": words}
+    assert not loaded(**asked, COMP_CWORD=str(words.count(" "))) & set(HEAVY)
+
+
+# What help, messages and docstrings refer to
+
+
+def test_no_text_of_the_product_names_a_file_of_the_documentation():
+    root = Path(__file__).parents[2]
+    found = [
+        f"{path.relative_to(root)}:{node.lineno}"
+        for package in ("cli", "engine", "hw", "io", "kernels", "view")
+        for path in (root / package).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and "docs/" in node.value
+    ]
+    assert found == []  # an installed wheel has no docs

@@ -210,13 +210,21 @@ def test_commands_move_it_from_a_rig_file(folder):
 @pytest.mark.parametrize(
     ("words", "change", "said"),
     [
-        ("home", ("def home(", "def seek("), "my_stage.py:LabStage has no home: see docs/stages.md"),
+        (
+            "home",
+            ("def home(", "def seek("),
+            "my_stage.py:LabStage has no home: mirrorskin.hw.stage.Stage",
+        ),
         ("unlock", ("", ""), "only GRBL is unlocked"),
         ("lift", (":LabStage", ":NoStage"), "there is no class NoStage"),
         ("lift", ("my_stage:", "no_stage:"), "there is no no_stage in"),
         ("lift", ("my_stage:LabStage", "collections:namedtuple"), "namedtuple(settings) cannot be made"),
         ("lift", ("my_stage:LabStage", "copy:copy"), "copy:copy has no name, no error"),
-        ("check", ("def precess(", "def spin("), "my_stage.py:LabStage has no precess: see docs/stages.md"),
+        (
+            "check",
+            ("def precess(", "def spin("),
+            "my_stage.py:LabStage has no precess: mirrorskin.hw.stage.Stage",
+        ),
     ],
 )
 def test_what_a_class_lacks_is_refused_in_a_line(folder, words, change, said):
