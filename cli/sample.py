@@ -171,10 +171,13 @@ def _make_video(path: Path) -> None:
 
     from mirrorskin import io
 
+    refusal = io.InputError(f"{path}: cannot be written as a video. Choose a name that ends in .avi")
+    if path.suffix.lower() != ".avi":
+        raise refusal
     size = (_SHAPE[1], _SHAPE[0])
     film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, size, isColor=False)
     if not film.isOpened():
-        raise io.InputError(f"{path}: OpenCV cannot write a video of this name. Use a name that ends in .avi")
+        raise refusal
     for frame in _frames():
         film.write(frame)
     film.release()

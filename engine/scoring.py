@@ -56,6 +56,7 @@ class AngleScore:
         return self._table("deg", "error", {})
 
     def _table(self, unit: str, error: str, after_rms: dict[str, str]) -> dict[str, str]:
+        chi_square = {} if math.isnan(self.chi_square) else {"mean (error/sigma)^2": f"{self.chi_square:.3f}"}
         return {
             "answered": f"{self.answered} pixels",
             "coverage": f"{100 * self.coverage:.2f} % of the {self.touched} pixels in contact",
@@ -64,7 +65,7 @@ class AngleScore:
             f"median {error}": f"{self.median:.4f} {unit}",
             f"99 % {error}": f"{self.p99:.4f} {unit}",
             f"largest {error}": f"{self.largest:.4f} {unit}",
-            "mean (error/sigma)^2": f"{self.chi_square:.3f}",
+            **chi_square,
         }
 
 

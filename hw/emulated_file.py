@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Self
 
 _HEADING = re.compile(r"# Emulated rig: port (\S+), process (\d+), started at (\d+)\.")
+_LONGEST = 1 << 20  # characters of a rig file
 _STARTED = 18  # index, after state, of the start time in /proc/PID/stat; see proc(5)
 
 
@@ -39,10 +40,16 @@ class Emulator:
 
     @classmethod
     def read(cls, path: Path) -> Self | None:
-        """Return the emulator that wrote a rig file; None if the twin did not write it."""
+        """Return the emulator that wrote a rig file.
+
+        None if the twin did not write it, or if the stage's port has been changed: then it is a user's own.
+        """
         with path.open(encoding="utf-8", errors="replace") as file:
-            found = _HEADING.match(file.readline())
-        return None if found is None else cls(found[1], int(found[2]), int(found[3]))
+            text = file.read(_LONGEST)
+        found = _HEADING.match(text)
+        if found is None or f'\nport = "{found[1]}"\n' not in text:
+            return None
+        return cls(found[1], int(found[2]), int(found[3]))
 
     @property
     def heading(self) -> str:

@@ -394,7 +394,7 @@ def load_rig(path: Path | str) -> RigSettings:
     """
     path = Path(path)
     file = load_toml(path, RigFile, "'mirrorskin rig new' writes a template")
-    _check_emulator(path, file.stage.port)
+    _check_emulator(path)
     camera = file.camera
     beside: dict[str, Any] = {
         name: str(path.parent / given)
@@ -409,14 +409,14 @@ def load_rig(path: Path | str) -> RigSettings:
     return RigSettings(path, file.name or path.stem, stage, camera)
 
 
-def _check_emulator(path: Path, port: str) -> None:
+def _check_emulator(path: Path) -> None:
     """Refuse the file of an emulated rig that has ended: its port may belong to another terminal by now."""
     emulator = Emulator.read(path)
-    if emulator is None or emulator.port != port or emulator.running:
+    if emulator is None or emulator.running:
         return
     folder = shlex.quote(str(path.parent))
     raise InputError(
-        f"{path}: the emulated rig has ended, its port {port} is gone. Start it again with"
+        f"{path}: the emulated rig has ended, its port {emulator.port} is gone. Start it again with"
         f" 'mirrorskin twin serve -o {folder} --background'"
     )
 

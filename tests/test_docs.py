@@ -8,6 +8,7 @@ import click
 import numpy as np
 import pytest
 from commands import run
+from right_scores import check_score
 
 from mirrorskin.cli import groups
 from mirrorskin.cli.main import app
@@ -40,6 +41,7 @@ COMMAND = app
 
 def test_there_are_steps_and_commands():
     assert len(STEPS) >= 10
+    assert sum(words[0] == "score" for words in STEPS) == 4
     assert len(WRITTEN) >= 40
 
 
@@ -48,6 +50,8 @@ def test_the_steps_of_the_start_run_one_after_the_other(tmp_path, monkeypatch):
     for words in STEPS:
         ended = run(*words)
         assert ended.code == 0, f"{' '.join(words)}: {ended.said}"
+        if words[0] == "score":
+            check_score(words)
     for page in ("start.md", "index.md"):
         (code,) = blocks_of(DOCS / page, "python")
         known = {}

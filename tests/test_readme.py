@@ -1,86 +1,99 @@
-"""Commands of the README and the twin's page run as they stand there; demo, rig, twin with fewer pixels."""
+"""Commands of the README and the twin's page run as they stand there, and give right numbers.
+
+Some simulations of the twin's page run with fewer pixels.
+"""
 
 import contextlib
+import json
 import re
 import shlex
-import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from background import end, install, process_of
 from commands import run
 from mishaps import starved
+from right_scores import check_score
 from rotations import Setup, direction, expose
 
 ROOT = Path(__file__).parent.parent
 TEXT = "\n".join((ROOT / page).read_text(encoding="utf-8") for page in ("README.md", "docs/twin.md"))
 BLOCKS = re.findall(r"```sh\n(.*?)```", TEXT, re.DOTALL)
 PYTHON = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
-COMMANDS = [line for block in BLOCKS for line in block.splitlines() if line.startswith("mirrorskin ")]
+(RIG,) = (block for block in BLOCKS if "twin serve" in block)
+COMMANDS = [
+    line
+    for block in BLOCKS
+    if block is not RIG
+    for line in block.splitlines()
+    if line.startswith("mirrorskin ")
+]
 SUPPORT = Path(__file__).parent / "support"
-SERVERS = []
-OF_THEIR_OWN = (
-    "demo",
-    "batch",
-    "bench",
-    "rig",
-    "capture",
-    "live",
-)  # in processes, which they start or end
+OF_THEIR_OWN = ("batch",)  # in processes, which they start or end
 FEWER = "--size", "424x296", "--pixel-size", "0.035mm"  # where a simulation takes the default; a ball fits in
 TRIES = 5  # of what a machine may be too busy for to emulate in time
-RUN = "import sys; sys.path.insert(0, sys.argv.pop(1)); import commands; commands.main_with_a_small_demo()"
+ZENITH = 0.2  # degrees that a calibration leaves
 
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory):
     """A folder in which the commands run one after the other, each with what those before have made."""
-    place = tmp_path_factory.mktemp("desk")
-    yield place
-    while SERVERS:
-        with SERVERS.pop() as server:
-            server.terminate()
-            assert server.wait(timeout=30) == 128 + signal.SIGTERM
+    return tmp_path_factory.mktemp("desk")
 
 
 def test_there_are_commands_to_run():
     assert len(COMMANDS) >= 8
+    assert sum(line.startswith("mirrorskin score ") for line in COMMANDS) == 4
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("line", COMMANDS)
-def test_a_command_runs(desk, line):
+def test_a_command_runs(desk, line, monkeypatch):
     words = shlex.split(line, comments=True)[1:]
-    if words[-1] == "&":
-        serve(desk, words[:-1])
-        return
     if words[0] == "simulate" and "--size" not in words:
         words += FEWER
-    if words[0] not in OF_THEIR_OWN:
-        with contextlib.chdir(desk):
-            ended = run(*words)
-        assert ended.code == 0, ended.said
-        return
-    for _ in range(TRIES):
+    monkeypatch.chdir(desk)
+    if words[0] in OF_THEIR_OWN:
         done = subprocess.run(
-            [sys.executable, "-c", RUN, str(SUPPORT), *words], cwd=desk, capture_output=True, text=True
+            [sys.executable, "-P", "-m", "mirrorskin.cli.main", *words], capture_output=True, text=True
         )
+        assert done.returncode == 0, done.stderr
+        return
+    ended = run(*words)
+    assert ended.code == 0, ended.said
+    if words[0] == "score":
+        check_score(words)
+    elif words[:2] == ["calibrate", "check"]:
+        check_zenith(words)
+
+
+def check_zenith(words):
+    """Hold the zeniths of a ball that no calibration was made with against what they must be."""
+    assert json.loads(run(*words, "--json").out)["after"]["zenith"]["rms"] < ZENITH
+
+
+@pytest.mark.slow
+@pytest.mark.real_time
+def test_the_block_of_the_emulated_rig_runs_as_it_is_pasted(tmp_path):
+    environment = install(tmp_path / "bin")
+    for attempt in range(TRIES):
+        folder = tmp_path / str(attempt)
+        folder.mkdir()
+        shell = ["bash", "-ec", RIG]
+        done = subprocess.run(shell, cwd=folder, env=environment, capture_output=True, text=True)
+        if "end it with" in done.stdout:
+            end(process_of(done.stdout))
+            assert not (folder / "rig" / "rig.toml").exists()
         if done.returncode == 0 or not starved(done.stderr):
             break
     assert done.returncode == 0, done.stderr
-
-
-def serve(desk, words):
-    """Start what goes on in the background, a small rig, and wait until it is there."""
-    program = "from mirrorskin.cli.main import main; main()"
-    small = "--size", "80x60", "--pixel-size", "0.16mm", "--rate", "10"
-    server = subprocess.Popen(
-        [sys.executable, "-P", "-c", program, *words, *small], cwd=desk, stdout=subprocess.PIPE, text=True
-    )
-    SERVERS.append(server)
-    assert "rig.toml" in server.stdout.readline()
+    with contextlib.chdir(folder):
+        found = json.loads(run("measure", "again.h5", "--json").out)["quantities"]
+    for name, true in (("sphere radius", 5.0), ("sphere top", 0.0)):
+        assert found[name]["value"] == pytest.approx(true, abs=0.05), name  # 50 ms of the motion
 
 
 def test_the_python_runs(tmp_path, monkeypatch):

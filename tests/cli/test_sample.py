@@ -4,6 +4,7 @@ import h5py
 import numpy as np
 import pytest
 from commands import run
+from right_scores import check_score
 
 from mirrorskin import io
 
@@ -30,6 +31,7 @@ def test_a_press_is_the_same_in_every_form(sample):
         frames, header = frames_of(press).copy(), io.Header("vertical")
         assert press.truth is not None
         assert press.header.pixel_size == (0.0375, 0.0375)
+        np.testing.assert_allclose(press.travel, 0.1 * np.arange(31))  # from 0, as frames are taken to begin
     with h5py.File(sample("stack", "stack.h5")) as file:
         np.testing.assert_array_equal(file["raw/images"][:], frames)
     with io.open_frames(sample("pictures", "frames"), header, travel=io.Steps(0.1)) as pictures:
@@ -58,10 +60,36 @@ def test_what_a_sensor_is_calibrated_with_is_all_there(sample):
 def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
     ended = run("sample", "pictures", "-o", tmp_path / "none" / "frames")
     assert ended.code == 2
-    assert "cannot be made" in ended.said
+    assert "cannot be created" in ended.said
 
 
-def test_a_name_that_is_no_video_is_refused(tmp_path):
+def test_a_name_that_is_no_video_is_refused_in_one_line(tmp_path, capfd):
     ended = run("sample", "video", "-o", tmp_path / "press.txt")
-    assert ended.code == 2
-    assert "name a file that ends with .avi" in ended.said
+    assert (ended.code, ended.said.count("\n")) == (2, 1)
+    assert "ends in .avi" in ended.said
+    assert capfd.readouterr().err == ""  # nor does OpenCV print anything
+
+
+KNOWN = ("--motion", "vertical", "--travel-step", "0.1mm", "--pixel-size", "0.0375mm")  # of a user's frames
+
+
+@pytest.fixture
+def score(sample, tmp_path, monkeypatch):
+    """Compare a result with the truth that `sample press` has."""
+    monkeypatch.chdir(tmp_path)
+    sample("press", "truth.h5")
+    return lambda result: check_score(["score", result, "--truth", "truth.h5"])
+
+
+def test_the_stack_s_heights_are_right_without_more_options(sample, score):
+    sample("stack", "theirs.h5")
+    assert run("reconstruct", "theirs.h5", "--dataset", "/raw/images", *KNOWN, "-o", "heights.h5").code == 0
+    score("heights.h5")
+
+
+@pytest.mark.parametrize(("name", "file"), [("pictures", "frames"), ("video", "press.avi")])
+def test_heights_of_imported_frames_are_right_without_more_options(name, file, sample, score):
+    sample(name, file)
+    assert run("import", file, "-o", "press.h5", *KNOWN).code == 0
+    assert run("reconstruct", "press.h5").code == 0
+    score("press-result.h5")

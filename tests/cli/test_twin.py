@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import signal
 import socket
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from background import end, install, process_of
 from commands import run
 
 from mirrorskin.hw.rig_file import load_rig
@@ -68,6 +70,7 @@ def test_a_rig_is_served_until_it_is_told_to_end(name: str, code: int, tmp_path:
         assert child.wait(PATIENCE) == code
         assert child.stdout is not None
         assert "Traceback" not in child.stdout.read()
+        assert not path.exists()
     with pytest.raises(OSError, match="refused"):
         socket.create_connection((match[1], int(match[2])), PATIENCE)
 
@@ -91,9 +94,107 @@ def test_what_cannot_be_served_is_refused(words: tuple[str, ...], told: str, tmp
     assert not (tmp_path / "rig").exists()
 
 
-def test_someone_elses_rig_file_is_kept(tmp_path: Path) -> None:
-    (tmp_path / "rig.toml").write_text("# mine\n")
-    ended = run("twin", "serve", "-o", tmp_path, *SMALL)
-    assert (ended.code, ended.said.count("\n")) == (2, 1)
-    assert "-o" in ended.said
-    assert (tmp_path / "rig.toml").read_text() == "# mine\n"
+@pytest.mark.parametrize("background", [(), ("--background",)])
+def test_someone_elses_rig_file_is_kept(background: tuple[str, ...], terminal: Terminal) -> None:
+    (terminal.folder / "rig").mkdir()
+    path = terminal.folder / "rig" / "rig.toml"
+    path.write_text("# mine\n")
+    ended = terminal("twin", "serve", "-o", "rig", *SMALL, *background)
+    assert (ended.returncode, ended.stderr.count("\n")) == (2, 1)
+    assert "-o" in ended.stderr
+    assert path.read_text() == "# mine\n"
+
+
+class Terminal:
+    """Runs commands in a folder, as a terminal does, and ends what goes on in the background."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self._processes = folder, list[int]()
+        self._environment = install(folder / "bin")
+
+    def __call__(self, *words: str) -> subprocess.CompletedProcess[str]:
+        command = ["mirrorskin", *words]
+        return subprocess.run(
+            command, cwd=self.folder, env=self._environment, capture_output=True, text=True, check=False
+        )
+
+    def serve(self) -> int:
+        """Start a small rig in the background, and return its process."""
+        ended = self("twin", "serve", "-o", "rig", "--background", *SMALL)
+        assert (ended.returncode, ended.stderr) == (0, "")
+        self._processes.append(process_of(ended.stdout))
+        return self._processes[-1]
+
+    def end(self, process: int, number: int) -> None:
+        self._processes.remove(process)
+        end(process, number)
+
+    def close(self) -> None:
+        for process in self._processes:
+            end(process)
+
+
+@pytest.fixture
+def terminal(tmp_path: Path) -> Iterator[Terminal]:
+    with contextlib.closing(Terminal(tmp_path)) as opened:
+        yield opened
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT", "SIGHUP"])
+def test_a_rig_in_the_background_is_ready_at_once_and_removes_its_file(name: str, terminal: Terminal) -> None:
+    process, folder = terminal.serve(), terminal.folder / "rig"
+    assert terminal("rig", "check", "rig/rig.toml").returncode == 0
+    terminal.end(process, getattr(signal, name))
+    assert {path.name for path in folder.iterdir()} == {"twin.log"}
+    assert "Traceback" not in (folder / "twin.log").read_text()
+
+
+def test_a_rig_in_the_background_has_no_terminal(terminal: Terminal) -> None:
+    process = terminal.serve()
+    session, terminal_number = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[3:5]
+    assert (int(session), int(terminal_number)) == (process, 0)  # so a terminal that closes does not end it
+    for number in (0, 1, 2):
+        assert not os.isatty(os.open(f"/proc/{process}/fd/{number}", os.O_RDONLY))
+
+
+def test_the_file_of_a_killed_rig_is_refused_and_replaced(terminal: Terminal) -> None:
+    terminal.end(terminal.serve(), signal.SIGKILL)
+    for words in (("rig", "check", "rig/rig.toml"), ("rig", "home", "rig/rig.toml")):
+        ended = terminal(*words)
+        assert (ended.returncode, ended.stderr.count("\n")) == (2, 1)
+        assert "port /dev/pts/" in ended.stderr
+        assert "'mirrorskin twin serve -o rig --background'" in ended.stderr
+    terminal.serve()
+    assert terminal("rig", "check", "rig/rig.toml").returncode == 0
+
+
+def test_a_rig_that_runs_is_not_replaced(terminal: Terminal) -> None:
+    process = terminal.serve()
+    before = (terminal.folder / "rig" / "rig.toml").read_text()
+    ended = terminal("twin", "serve", "-o", "rig", "--background", *SMALL)
+    assert (ended.returncode, ended.stderr.count("\n")) == (2, 1)
+    assert f"'kill {process}'" in ended.stderr
+    assert (terminal.folder / "rig" / "rig.toml").read_text() == before
+
+
+def test_a_copy_with_a_port_of_its_own_is_a_rig_file_like_any_other(terminal: Terminal) -> None:
+    process, path = terminal.serve(), terminal.folder / "rig" / "rig.toml"
+    own = re.sub('port = ".*"', 'port = "/dev/ttyUSB0"', path.read_text())
+    terminal.end(process, signal.SIGKILL)
+    path.write_text(own)
+    assert load_rig(path).stage.port == "/dev/ttyUSB0"
+    assert terminal("twin", "serve", "-o", "rig", "--background", *SMALL).returncode == 2
+    assert path.read_text() == own
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [(("--size", "42"), "--size"), (("--object", "cube"), "cube"), (("-o", "/proc/rig"), "-o")],
+)
+def test_what_cannot_be_served_in_the_background_is_refused(
+    words: tuple[str, ...], told: str, terminal: Terminal
+) -> None:
+    ended = terminal("twin", "serve", "-o", "rig", "--background", *SMALL, *words)
+    assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (2, "", 1)
+    assert told in ended.stderr
+    assert not (terminal.folder / "rig").exists()

@@ -176,7 +176,8 @@ def test_the_rig_file_says_what_the_settings_say(tmp_path: Path) -> None:
     with EmulatedRig(pattern="linear", home=True, camera=Camera(np.dtype(np.uint16)), **SMALL) as rig:
         path = rig.write(tmp_path / "a new one", "tcp://127.0.0.1:1234")
         found, said = load_rig(path), rig.settings
-    bright = str(path.parent / "bright.npy")
+        bright = str(path.parent / "bright.npy")
+        np.testing.assert_array_equal(np.load(bright), rig.twin(Vertical([0.0])).header.bright)
     assert (found.name, found.stage) == (said.name, structs.replace(said.stage, silence=0.5))
     camera = structs.replace(said.camera, source="tcp://127.0.0.1:1234", bright=bright, stall=0.5)
     assert found.camera == camera
@@ -186,7 +187,6 @@ def test_the_rig_file_says_what_the_settings_say(tmp_path: Path) -> None:
     assert (found.camera.counts_per_radian, found.camera.zenith_offset) == pytest.approx(
         (float(np.mean(header.zenith_gain)), float(np.mean(header.zenith_offset))), rel=1e-5
     )
-    np.testing.assert_array_equal(np.load(bright), header.bright)
     np.testing.assert_array_equal(rig.references()[0], header.dark)
 
 
@@ -198,10 +198,24 @@ def test_only_its_own_rig_file_is_replaced(tmp_path: Path) -> None:
         path.write_text("# mine\n")
         with pytest.raises(InputError, match="someone else"):
             rig.write(tmp_path, "tcp://127.0.0.1:3")
-        assert path.read_text() == "# mine\n"
         (tmp_path / "file").write_text("")
         with pytest.raises(InputError, match="cannot be written"):
             rig.write(tmp_path / "file" / "below", "tcp://127.0.0.1:4")
+    assert path.read_text() == "# mine\n"
+
+
+def test_its_files_are_removed_when_it_ends(tmp_path: Path) -> None:
+    with EmulatedRig(**SMALL) as rig:
+        rig.write(tmp_path / "rig", "tcp://127.0.0.1:1")
+        assert {path.name for path in (tmp_path / "rig").iterdir()} == {"rig.toml", "bright.npy"}
+    assert list((tmp_path / "rig").iterdir()) == []
+
+
+def test_a_picture_of_someone_else_is_kept(tmp_path: Path) -> None:
+    (tmp_path / "bright.npy").write_bytes(b"mine")
+    with EmulatedRig(**SMALL) as rig, pytest.raises(InputError, match="bright.npy exists"):
+        rig.write(tmp_path, "tcp://127.0.0.1:1")
+    assert (tmp_path / "bright.npy").read_bytes() == b"mine"
 
 
 def test_a_rig_that_cannot_be_leaves_nothing_running() -> None:

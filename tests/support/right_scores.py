@@ -1,0 +1,29 @@
+"""What the documentation's first commands must give: heights as good as their standard deviations say."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+from commands import run
+
+from mirrorskin import io
+
+STEP = 0.1  # mm from frame to frame
+FUSED = 0.0012  # mm, as the README has it
+
+
+def check_score(words: list[str]) -> None:
+    """Run ``score RES.h5 --truth REC.h5`` as JSON, and hold its numbers against what they must be."""
+    name = words[1]
+    heights = json.loads(run(*words, "--json").out)["height"]
+    result = io.open_result(name)
+    assert np.nanmax(result.height) < 0.001, f"{name}: heights above the rest plane"
+    assert heights["coverage"] > 0.5
+    if result.normals is not None:  # heights and normals, fused
+        assert heights["rms"] < FUSED
+        assert abs(heights["mean"]) < FUSED / 2
+        return
+    assert heights["rms"] < STEP / np.sqrt(12)
+    assert abs(heights["mean"]) < STEP / 20
+    assert 0.5 < heights["chi_square"] < 1.5
