@@ -213,7 +213,7 @@ def test_its_files_are_removed_when_it_ends(tmp_path: Path) -> None:
 
 def test_a_picture_of_someone_else_is_kept(tmp_path: Path) -> None:
     (tmp_path / "bright.npy").write_bytes(b"mine")
-    with EmulatedRig(**SMALL) as rig, pytest.raises(InputError, match="bright.npy exists"):
+    with EmulatedRig(**SMALL) as rig, pytest.raises(InputError, match=r"bright\.npy exists"):
         rig.write(tmp_path, "tcp://127.0.0.1:1")
     assert (tmp_path / "bright.npy").read_bytes() == b"mine"
 
