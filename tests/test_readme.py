@@ -19,6 +19,8 @@ from mishaps import starved
 from right_scores import check_score
 from rotations import Setup, direction, expose
 
+from mirrorskin import io
+
 ROOT = Path(__file__).parent.parent
 TEXT = "\n".join((ROOT / page).read_text(encoding="utf-8") for page in ("README.md", "docs/twin.md"))
 BLOCKS = re.findall(r"```sh\n(.*?)```", TEXT, re.DOTALL)
@@ -91,9 +93,11 @@ def test_the_block_of_the_emulated_rig_runs_as_it_is_pasted(tmp_path):
             break
     assert done.returncode == 0, done.stderr
     with contextlib.chdir(folder):
-        found = json.loads(run("measure", "again.h5", "--json").out)["quantities"]
+        found = json.loads(run("measure", "steps-result.h5", "--json").out)["quantities"]
+        live, again = io.open_result("live-result.h5"), io.open_result("again.h5")
     for name, true in (("sphere radius", 5.0), ("sphere top", 0.0)):
-        assert found[name]["value"] == pytest.approx(true, abs=0.05), name  # 50 ms of the motion
+        assert found[name]["value"] == pytest.approx(true, abs=0.03), name
+    np.testing.assert_array_equal(again.height, live.height)
 
 
 def test_the_python_runs(tmp_path, monkeypatch):
