@@ -96,7 +96,7 @@ def command(
     contact: options.Contact = None,
     estimator: Annotated[
         str | None,
-        Option(metavar="MODULE:CLASS", help="Your own; see docs/estimators.md.", show_default="the motion's"),
+        Option(metavar="MODULE:CLASS", help="Your own class; see 'run --help'.", show_default="the motion's"),
     ] = None,
     settings: Settings = None,
     calibration: options.Calibration = None,
