@@ -140,7 +140,7 @@ def test_a_buffer_that_cannot_be_unmapped_ends_no_process(device, use):
         assert "cannot hold or copy values: clEnqueueUnmapMemObject failed" in ran.stdout
 
 
-LONG = """
+LOOP = """
 SPIN = '''__kernel void spin(__global float *values, const int count) {
     float value = get_global_id(0);
     for (int i = 0; i < count; i++) value = fma(value, 0.999f, 0.5f);
@@ -151,7 +151,7 @@ begun = threading.Event()
 
 def work():
     while True:
-        spin(256, values=values, count=300_000, moved=0)
+        spin(256, values=values, count=20_000, moved=0)
         begun.set()
         values.download()
 
@@ -160,7 +160,7 @@ thread = threading.Thread(target=work, daemon=True)
 
 
 def test_the_interpreter_ends_while_a_daemon_thread_waits_for_a_kernel(device):
-    ran = run_script(device, LONG + "thread.start(); begun.wait()")
+    ran = run_script(device, LOOP + "thread.start(); begun.wait()")
     assert (ran.returncode, ran.stdout, ran.stderr) == (0, "", "")
 
 
@@ -176,7 +176,7 @@ def end():
 
 atexit.register(end)
 {START.format(choice=device.info.title, source=FILL)}
-{LONG}
+{LOOP}
 thread.start()
 begun.wait()
 """
