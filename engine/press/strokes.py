@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from scipy import special
 
 from mirrorskin.engine.press.onset import Onset, OnsetSearch
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io.positions import check_strokes, stroke_starts
 from mirrorskin.kernels.device import Device
 
@@ -54,7 +55,7 @@ class Strokes:
         return np.hypot(self.onset.sigma, self.release.sigma)
 
 
-class StrokeSearch:
+class StrokeSearch(ThreadSafe):
     """Find onsets and releases in a press that oscillates; see `mirrorskin.engine.streaming.Estimator`.
 
     A stroke is a run of frames in which travel does not change its direction; its turning points belong to
