@@ -357,14 +357,14 @@ def test_threads_that_integrate_at_once_get_what_each_gets_alone():
     assert found == alone * 3
 
 
-def test_an_estimator_that_refuses_frames_goes_on_as_if_they_had_not_come():
-    search = engine.OnsetSearch(*PICTURE)
-    search.push(PRESS, travel=TRAVEL)
-    expected = digest(search.result())
-    search.reset()
+@pytest.mark.parametrize("kind", [engine.OnsetSearch, engine.StrokeSearch])
+def test_an_estimator_that_refuses_frames_goes_on_as_if_they_had_not_come(kind):
+    search, whole = kind(*PICTURE), kind(*PICTURE)
+    whole.push(PRESS, travel=TRAVEL)
     search.push(PRESS[:50], travel=TRAVEL[:50])
-    for frames, travel in ((PRESS[50:, 1:], TRAVEL[50:]), (PRESS[50:], TRAVEL[49:]), (PRESS[:9], TRAVEL[:9])):
+    back = TRAVEL[40::-1]
+    for frames, travel in ((PRESS[:41, 1:], back), (PRESS[:41].astype(np.uint16), back), (PRESS[:9], [1.0])):
         with pytest.raises(InputError), ThreadPoolExecutor(1) as pool:
             pool.submit(search.push, frames, travel=travel).result()
     search.push(PRESS[50:], travel=TRAVEL[50:])
-    assert digest(search.result()) == expected
+    assert digest(search.result()) == digest(whole.result())
