@@ -38,6 +38,33 @@ def test_a_kernel_is_compiled_once_for_all_threads(device):
     assert not device.profile.records()
 
 
+OPENED = """
+import threading
+from concurrent.futures import ThreadPoolExecutor
+import numpy as np
+from mirrorskin.kernels.device import open_device
+
+start = threading.Barrier(6)
+
+def first_use(number):
+    start.wait()
+    device = open_device({choice!r})
+    values = device.array("values", (256,), np.int32)
+    device.kernel({source!r}, "fill")(256, values=values, number=number, moved=0)
+    return device, set(values.download().tolist())
+
+with ThreadPoolExecutor(6) as pool:
+    devices, values = zip(*pool.map(first_use, range(6)))
+print(len(set(devices)), values == tuple({{number}} for number in range(6)))
+"""
+
+
+def test_threads_that_open_a_device_for_the_first_time_share_it(device):
+    script = OPENED.format(choice=device.info.title, source=FILL)
+    ran = subprocess.run([sys.executable, "-P", "-c", script], capture_output=True, text=True, timeout=300)
+    assert (ran.returncode, ran.stdout, ran.stderr) == (0, "1 True\n", "")
+
+
 def test_threads_that_launch_one_kernel_each_get_their_own_answer(device):
     fill, start = device.kernel(FILL, "fill"), threading.Barrier(4)
 
