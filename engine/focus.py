@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.frames import check_dtype, check_frames
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
 from mirrorskin.io.positions import check_strokes
@@ -41,7 +42,7 @@ class Focus(Shown):
     sharpness: NDArray[np.float32]
 
 
-class FocusEstimator:
+class FocusEstimator(ThreadSafe):
     """An `Estimator` for frames of a focus stack that come block by block; see `find_focus`.
 
     Parameters

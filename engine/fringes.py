@@ -15,6 +15,7 @@ from scipy.special import expit, ndtr
 from mirrorskin.engine.frames import noise_of_residual
 from mirrorskin.engine.rotation.correlation import Correlation, Correlator, correlate
 from mirrorskin.engine.rotation.design_matrix import Doubles, fit_matrix
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
 from mirrorskin.io.types import Shown
@@ -71,7 +72,7 @@ class Unwrapped(Shown):
         return self.risk <= risk
 
 
-class FringeEstimator:
+class FringeEstimator(ThreadSafe):
     """An `Estimator` for frames of shifted fringes that come block by block; see `fit_fringes`.
 
     Parameters

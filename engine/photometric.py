@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.frames import check_dtype, check_frames, noise_of_residual
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import as_array, checked
 from mirrorskin.io.positions import check_phase
@@ -50,7 +51,7 @@ class Lambertian(Shown):
     noise: float | NDArray[Any]
 
 
-class PhotometricStereo:
+class PhotometricStereo(ThreadSafe):
     """An `Estimator` for frames under one lamp after the other; see `photometric_stereo`.
 
     Parameters

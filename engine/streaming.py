@@ -26,6 +26,8 @@ class Estimator(Protocol):
     ``result()`` returns the maps of the frames so far as plain arrays, by name or in a data class. It changes
     nothing: it may be called again, and more frames may follow. ``reset()`` forgets the frames, and what was
     estimated from them; parameters, references and device buffers stay.
+
+    Several threads may use an estimator of this package; see `mirrorskin.engine.thread_safe.ThreadSafe`.
     """
 
     def push(self, *args: Any, **kwargs: Any) -> None:

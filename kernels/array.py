@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cached_property, wraps
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.kernels import memory
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError
+from mirrorskin.kernels.waiting import keep_for_ever, waiting
 
 if TYPE_CHECKING:
     from mirrorskin.kernels.device import Device
@@ -42,16 +44,59 @@ def failed(device: Device, what: str, error: cl.Error) -> DeviceError:
 
 
 def _told(work: Callable[Concatenate[Any, _Given], _Made]) -> Callable[Concatenate[Any, _Given], _Made]:
-    """Let a method of an array name device and array where OpenCL fails."""
+    """Run a method of an array in one thread at a time, and name device and array where OpenCL fails."""
 
     @wraps(work)
     def told(array: Array | BorrowedBuffer, /, *given: _Given.args, **named: _Given.kwargs) -> _Made:
-        try:
-            return work(array, *given, **named)
-        except cl.Error as error:
-            raise failed(array._device, f"hold or copy {array.name}", error) from error
+        with array._lock:
+            try:
+                with waiting:
+                    return work(array, *given, **named)
+            except cl.Error as error:
+                raise failed(array._device, f"hold or copy {array.name}", error) from error
 
     return told
+
+
+class _Mapping:
+    """A device's buffer, mapped into the host's memory until ``release``; an array for ``np.asarray``.
+
+    A `pyopencl.MemoryMap` unmaps the buffer when it is destroyed. If that fails, because the device is lost
+    or the buffer is unmapped already, pyopencl aborts the process. So the buffer is unmapped here, once, and
+    a map that cannot be unmapped is never destroyed.
+    """
+
+    def __init__(
+        self,
+        queue: cl.CommandQueue,
+        buffer: cl.Buffer,
+        like: NDArray[Any],
+        flags: Any,
+        after: Sequence[cl.Event] = (),
+    ) -> None:
+        """Map a buffer with the shape and dtype of an array, once some events are over."""
+        self._maps: list[cl.MemoryMap] = []  # none after the release
+        view, _ = cl.enqueue_map_buffer(
+            queue, buffer, flags, 0, like.shape, like.dtype, wait_for=after, is_blocking=True
+        )
+        self._maps.append(view.base)
+        self.__array_interface__ = view.__array_interface__
+
+    def __del__(self) -> None:
+        with suppress(cl.Error):
+            self.release()
+
+    def release(self, queue: cl.CommandQueue | None = None) -> None:
+        """Unmap the buffer, unless that was done before; by default on the queue that mapped it."""
+        try:
+            mapped = self._maps.pop()  # at once, so that no two threads have it
+        except IndexError:
+            return
+        try:
+            mapped.release(queue)
+        except cl.Error:
+            keep_for_ever(mapped)
+            raise
 
 
 class Array:
@@ -83,7 +128,8 @@ class Array:
         self._arriving = 0  # bytes
         self._device = device
         self._shared = device.info.shares_memory
-        self._mapped: cl.MemoryMap | None = None
+        self._lock = threading.RLock()
+        self._mapped: _Mapping | None = None
         self._buffer: cl.Buffer | None = None
         self.shape, self._dtype, self._zeroed = shape, dtype, zeroed
         self.nbytes: int = math.prod(shape) * dtype.itemsize
@@ -108,10 +154,9 @@ class Array:
         return memory.take(self.nbytes + SLACK, self._zeroed)
 
     def __del__(self) -> None:
-        # A kernel may still be at work in this memory, which others have next; on a lost device none is.
-        with suppress(cl.Error):
-            if self._shared and self.last_use is not None:
-                self.last_use.wait()
+        # A kernel may still use this memory, which another array gets next. On a lost device none does.
+        if self._shared and self.last_use is not None:
+            _wait_before_end(self.last_use, self._memory)
 
     @_told
     def claim(self) -> None:
@@ -169,7 +214,7 @@ class Array:
         """Wait for the device and return what it wrote, in the host's array."""
         if self._shared:
             if self._mapped is None and self._buffer is not None:
-                self._mapped = _map(self._device.queue, self._buffer, self.host, _READ_WRITE).base
+                self._mapped = _Mapping(self._device.queue, self._buffer, self.host, _READ_WRITE)
         else:
             event = cl.enqueue_copy(self._device.queue, self.host, self.buffer)
             self._device.profile.wait("download", self.name, event, self.host.nbytes)
@@ -184,9 +229,9 @@ class Array:
             event = cl.enqueue_copy(queue, self.host, self.buffer, wait_for=after)
             self._device.profile.wait("download", self.name, event, self.host.nbytes)
             return self.host.copy()
-        view = _map(queue, self.buffer, self.host, cl.map_flags.READ, after)
-        copied: NDArray[Any] = view.copy()
-        view.base.release(queue)
+        mapping = _Mapping(queue, self.buffer, self.host, cl.map_flags.READ, after)
+        copied: NDArray[Any] = np.array(mapping)
+        mapping.release(queue)
         return copied
 
     @_told
@@ -197,9 +242,7 @@ class Array:
             self._mapped.release()
             self._mapped = None
             self._device.finish()
-        if self._buffer is not None:
-            self._buffer.release()
-            self._buffer = None
+        self._buffer = None
         return host
 
     def evict(self) -> None:
@@ -211,8 +254,7 @@ class Array:
     @_told
     def discard(self) -> None:
         """Make room on the device, and forget what the device held."""
-        if not self._shared and self._buffer is not None:
-            self._buffer.release()
+        if not self._shared:
             self._buffer = None
 
     @_told
@@ -222,9 +264,14 @@ class Array:
             self._allocate()
 
     @property
-    @_told
     def buffer(self) -> cl.Buffer:
         """The device's side, for kernels; the host must not write while they run."""
+        buffer = self._buffer
+        return self._unmapped() if buffer is None or self._mapped is not None else buffer
+
+    @_told
+    def _unmapped(self) -> cl.Buffer:
+        """Return the device's side, allocated and unmapped."""
         if self._buffer is None:
             if not self._shared:
                 raise RuntimeError(f"{self.name} was evicted: upload it first")
@@ -237,7 +284,7 @@ class Array:
 
     def _allocate(self) -> None:
         flags = cl.mem_flags.READ_WRITE
-        with _naming(self._device, self.name, self.nbytes):
+        with _naming(self._device, self.name, self.nbytes), waiting:
             if self._shared:
                 self._buffer = cl.Buffer(
                     self._device.context, flags | cl.mem_flags.USE_HOST_PTR, hostbuf=self._memory
@@ -263,14 +310,15 @@ class BorrowedBuffer:
     def __init__(self, device: Device, name: str, values: NDArray[Any]) -> None:
         self._device, self.name, self.host = device, name, values
         self.last_use: cl.Event | None = None
+        self._lock = threading.RLock()
         flags = cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR
         loaded = as_strided(values.reshape(-1).view(np.uint8), (values.nbytes + SLACK,))
         with _naming(device, name, values.nbytes):
             self.buffer: cl.Buffer = cl.Buffer(device.context, flags, hostbuf=loaded)
 
     def __del__(self) -> None:
-        with suppress(DeviceError):
-            self.wait()
+        if self.last_use is not None:
+            _wait_before_end(self.last_use, self.host)
 
     @_told
     def wait(self) -> None:
@@ -302,22 +350,19 @@ def pinned(device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDAr
     """Make room on the host from where copies to a device are fastest; see ``Device.pinned``."""
     nbytes = math.prod(shape) * dtype.itemsize
     flags = cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR
-    with _naming(device, "frames on the host", nbytes):
+    with _naming(device, "frames on the host", nbytes), waiting:
         buffer = cl.Buffer(device.context, flags, size=nbytes)
-        room: NDArray[Any] = _map(
-            device.copies, buffer, np.broadcast_to(np.empty((), dtype), shape), _READ_WRITE
-        )
-    return room
+        like = np.broadcast_to(np.empty((), dtype), shape)
+        return np.asarray(_Mapping(device.copies, buffer, like, _READ_WRITE))
 
 
-def _map(
-    queue: cl.CommandQueue, buffer: cl.Buffer, like: NDArray[Any], flags: Any, after: Sequence[cl.Event] = ()
-) -> Any:
-    """Return a device's buffer as an array of the host's, whose base is the mapping, once it is there."""
-    view, _ = cl.enqueue_map_buffer(
-        queue, buffer, flags, 0, like.shape, like.dtype, wait_for=after, is_blocking=True
-    )
-    return view
+def _wait_before_end(last_use: cl.Event, memory_in_use: NDArray[Any]) -> None:
+    """Wait for the last kernel that uses some memory, before nobody refers to the memory any more."""
+    try:
+        with waiting, suppress(cl.Error):
+            last_use.wait()
+    except SystemExit:  # the interpreter ends, and the kernel goes on
+        keep_for_ever(memory_in_use)
 
 
 @contextmanager

@@ -28,6 +28,7 @@ from mirrorskin.kernels.errors import DeviceError, UnknownDeviceError
 from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT, Layout
 from mirrorskin.kernels.profile import Profile
 from mirrorskin.kernels.signature import Signature, read_signatures
+from mirrorskin.kernels.waiting import close_at_exit, waiting
 
 DeviceKind = Literal["gpu", "cpu", "other"]
 C_TYPES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
@@ -167,6 +168,7 @@ class Device:
         self.profile: Profile = Profile()
         self.max_allocation: int = self.info.max_allocation
         self.layout: Layout = CPU_LAYOUT if self.info.kind == "cpu" else GPU_LAYOUT
+        close_at_exit()
         try:
             self.context: cl.Context = cl.Context([device])
             self.queue, self.copies = _queues(self.context)
@@ -174,7 +176,8 @@ class Device:
             raise failed(self, "be used", error) from error
         self._programs: dict[tuple[str | Path, tuple[str, ...]], tuple[cl.Program, dict[str, Signature]]] = {}
         self._lock = threading.Lock()
-        self._kernels = _ThreadKernels()
+        self._launching = threading.Lock()
+        self._kernels: dict[tuple[object, ...], Kernel] = {}
         self.spare: dict[str, Any] = {}
         _log.info("using %s (driver %s)", self.info.title, self.info.driver)
 
@@ -282,12 +285,13 @@ class Device:
         >>> words.download().tolist()
         [0, 1, 2, 3, 0, 1, 2, 3]
         """
-        made, key = self._kernels.made, (file, name, self.layout, *defines.items())
-        if key not in made:
+        key = file, name, self.layout, *defines.items()
+        kernel = self._kernels.get(key)
+        if kernel is None:
             cut = {"WORDS": self.layout.words, "TILE": self.layout.tile}
             options = tuple(f"-D{key}={value}" for key, value in sorted({**cut, **defines}.items()))
-            made[key] = self._make_kernel(file, name, options)
-        return made[key]
+            kernel = self._kernels.setdefault(key, self._make_kernel(file, name, options))
+        return kernel
 
     def beside(self) -> Device:
         """Return the same device with queues of its own, whose kernels need not wait for those before.
@@ -296,7 +300,7 @@ class Device:
         """
         other = copy.copy(self)
         other.queue, other.copies = _queues(self.context)
-        other._kernels = _ThreadKernels()
+        other._launching, other._kernels = threading.Lock(), {}
         return other
 
     def flush(self) -> None:
@@ -309,7 +313,8 @@ class Device:
     def finish(self) -> None:
         """Wait until everything given to the device is done."""
         try:
-            self.queue.finish()
+            with waiting:
+                self.queue.finish()
         except cl.Error as error:
             raise failed(self, "finish its work", error) from error
 
@@ -352,7 +357,8 @@ class Device:
         try:
             with warnings.catch_warnings():  # of a log that is not empty: some compilers always write one
                 warnings.simplefilter("ignore", cl.CompilerWarning)
-                program = self._compile(source, ["-cl-std=CL1.2", *options])
+                with waiting:
+                    program = self._compile(source, ["-cl-std=CL1.2", *options])
         except cl.RuntimeError as error:
             raise DeviceError(_explain_build(path, text, str(error), self.info)) from error
         self.profile.add("compile", path.stem, time.perf_counter() - start)
@@ -436,15 +442,17 @@ class Kernel:
         args = self._in_order(arguments)
         group = self.group
         size = -(-items // group) * group
-        values = [arg.buffer if isinstance(arg, Operand) else arg for arg in args]
         arrays = [arg for arg in args if isinstance(arg, Operand)]
-        copies = [array.arrived for array in arrays if array.arrived is not None]
         try:
-            event = self._kernel(
-                self._device.queue, (size,), (group,), *values, global_offset=(first_item,), wait_for=copies
-            )
-            for array in arrays:
-                array.last_use = event
+            with self._device._launching:  # as a kernel object holds the arguments until it is enqueued
+                values = [arg.buffer if isinstance(arg, Operand) else arg for arg in args]
+                copies = [array.arrived for array in arrays if array.arrived is not None]
+                event = self._kernel(
+                    self._device.queue, (size,), (group,), *values,
+                    global_offset=(first_item,), wait_for=copies,
+                )  # fmt: skip
+                for array in arrays:
+                    array.last_use = event
             self._device.profile.watch("kernel", self.name, event, moved)
         except cl.Error as error:
             raise failed(self._device, f"run {self.name}", error) from error
@@ -479,13 +487,6 @@ def _group_of(kernel: cl.Kernel, device: cl.Device, wanted: int) -> int:
     most = min(wanted, allowed, device.max_work_item_sizes[0])
     lanes = kernel.get_work_group_info(ask.PREFERRED_WORK_GROUP_SIZE_MULTIPLE, device)
     return most // lanes * lanes or most
-
-
-class _ThreadKernels(threading.local):
-    """Each thread's own kernel objects: setting the arguments of one is not thread-safe."""
-
-    def __init__(self) -> None:
-        self.made: dict[tuple[object, ...], Kernel] = {}
 
 
 def _queues(context: cl.Context) -> list[cl.CommandQueue]:

@@ -8,6 +8,8 @@ from typing import Literal
 
 import pyopencl as cl
 
+from mirrorskin.kernels.waiting import waiting
+
 Kind = Literal["compile", "upload", "kernel", "download"]
 
 _PENDING_LIMIT = 1024  # events held before they are read, so that an endless run stays bounded
@@ -45,8 +47,10 @@ class Profile:
 
     def wait(self, kind: Kind, name: str, event: cl.Event, nbytes: int) -> None:
         """Wait for the run that ``event`` ends, and count it; a pending copy would keep its array alive."""
+        with waiting:
+            event.wait()
         with self._lock:
-            self._finish(kind, name, event, nbytes)
+            self._count(kind, name, event, nbytes)
 
     def watch(self, kind: Kind, name: str, event: cl.Event, nbytes: int) -> None:
         """Count the run that ``event`` ends, once it is over."""
@@ -70,10 +74,11 @@ class Profile:
     def _read_pending(self) -> None:
         pending, self._pending = self._pending, []  # one that failed is not waited for again
         for kind, name, event, nbytes in pending:
-            self._finish(kind, name, event, nbytes)
+            with waiting:
+                event.wait()
+            self._count(kind, name, event, nbytes)
 
-    def _finish(self, kind: Kind, name: str, event: cl.Event, nbytes: int) -> None:
-        event.wait()
+    def _count(self, kind: Kind, name: str, event: cl.Event, nbytes: int) -> None:
         self._add(kind, name, (event.profile.end - event.profile.start) * 1e-9, nbytes)
 
     def _add(self, kind: Kind, name: str, seconds: float, nbytes: int) -> None:

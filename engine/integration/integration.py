@@ -22,6 +22,7 @@ from mirrorskin.engine.integration.validation import (
     check_pixel_size,
     logarithm,
 )
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
 from mirrorskin.kernels.device import Device, open_device
@@ -189,7 +190,7 @@ def _borrowed_solver(device: Device, inputs: Inputs) -> Iterator[SurfaceSolver]:
         device.spare["integration"] = key, solver
 
 
-class Integrator:
+class Integrator(ThreadSafe):
     """Integrate slopes frame after frame: memory is kept, and heights start from the last ones.
 
     Parameters

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from mirrorskin.engine.integration.graph import LEVEL, Levelling, PixelGraph, find_components
 from mirrorskin.engine.integration.multigrid import Multigrid
 from mirrorskin.engine.integration.validation import Floats, Inputs, check_pixel_size
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 
@@ -23,7 +24,7 @@ _FAR = 0.3  # gap from which on heights are found from scratch
 _LOOK = 8  # frames after which the gap is looked at: that waits for the device
 
 
-class WarmStartIntegrator:
+class WarmStartIntegrator(ThreadSafe):
     """Integrate slopes that kernels leave on the device: heights are those of `Integrator`, a step behind.
 
     Attributes

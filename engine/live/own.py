@@ -13,6 +13,7 @@ from mirrorskin.engine.estimator import Maker, finish, prepare, wanted
 from mirrorskin.engine.live.press import area_of
 from mirrorskin.engine.live.status import Maps
 from mirrorskin.engine.streaming import Estimator
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError, LiveSource, Result
 from mirrorskin.io.layout import POSITIONS
 
@@ -21,7 +22,7 @@ _UPDATES = 15.0  # a second
 _SHOWN = ("height", "normals", "contact", "edges", "displacement", "slope")
 
 
-class LiveOwn:
+class LiveOwn(ThreadSafe):
     """Maps of a user's own estimator so far; see `mirrorskin.engine.live.LiveEstimator`.
 
     Parameters

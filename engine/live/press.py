@@ -13,6 +13,7 @@ from mirrorskin.engine.press.press import add_hysteresis, finish_press
 from mirrorskin.engine.press.strokes import StrokeSearch
 from mirrorskin.engine.provenance import attach_provenance, level_origin
 from mirrorskin.engine.reconstruction import undistorted
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError, LiveSource, Result
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.device import Device
@@ -22,7 +23,7 @@ _UPDATES = 15.0  # a second, as many as people follow; each costs as much as man
 _ONSET, _LIGHT_AT_START = 1, 3  # of an onset's status
 
 
-class LivePress:
+class LivePress(ThreadSafe):
     """Heights of a press so far, by `StrokeSearch`; see `mirrorskin.engine.live.LiveEstimator`.
 
     Parameters

@@ -15,6 +15,7 @@ from mirrorskin.engine.reconstruction import undistorted
 from mirrorskin.engine.rotation.normals_kernel import options_from
 from mirrorskin.engine.rotation.normals_pose import PoseEstimator, PoseNormals
 from mirrorskin.engine.rotation.rotation import rotation_at_poses, rotation_maps
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError, LiveSource, Result
 from mirrorskin.io.types import body_axes
 from mirrorskin.kernels.device import Device
@@ -24,7 +25,7 @@ _FEWEST = 4  # frames of an update: 3 determine a slope, and no noise
 _WARMING = 8  # frames
 
 
-class LiveRocking:
+class LiveRocking(ThreadSafe):
     """The slope along the way that the body rocks; see `mirrorskin.engine.live.LiveEstimator`.
 
     Frames are estimated in windows of 64, and what they say is averaged; see `PoseEstimator`.

@@ -27,6 +27,7 @@ from mirrorskin.engine.rotation.normals_to_height import integrate_normals
 from mirrorskin.engine.rotation.normals_window import NormalWindow
 from mirrorskin.engine.rotation.response import initial_response, wall_response_of
 from mirrorskin.engine.rotation.rotation import Rotation, rotation_maps
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError, LiveSource, Result
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.device import Device
@@ -66,7 +67,7 @@ def choose_window(frames_a_turn: float, window: int | None = None) -> tuple[int,
     return window, max(1, round(frames_a_turn) // window)  # within one turn
 
 
-class LiveRotation:
+class LiveRotation(ThreadSafe):
     """Normals, edges and heights of the last frames; see `mirrorskin.engine.live.LiveEstimator`.
 
     Where the source's calibration says how bright a wall makes pixels look, that is used; how high the object

@@ -15,6 +15,7 @@ from mirrorskin.engine.reconstruction import undistorted
 from mirrorskin.engine.slip.displacement import STEP
 from mirrorskin.engine.slip.search import WINDOW
 from mirrorskin.engine.slip.slip import slip_result, slip_search
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import LiveSource, Result
 from mirrorskin.kernels.device import Device
 
@@ -22,7 +23,7 @@ _ROOM = 16  # frames that may wait to be taken at once
 _UPDATES = 15.0  # a second, as many as people follow
 
 
-class LiveSlip:
+class LiveSlip(ThreadSafe):
     """Displacement of the skin so far, by `SlipSearch`; see `mirrorskin.engine.live.LiveEstimator`.
 
     Slip is fitted to all frames together, when the result is asked for.

@@ -11,6 +11,7 @@ from typing import Any, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import Motion
 
 WAITED, PUSHED, UPDATED, SHOWN, RAISED = "waited", "push", "update", "frame to map", "frame to height"
@@ -133,7 +134,7 @@ class Status:
     latency: Mapping[str, Latency] = field(default_factory=dict)
 
 
-class Monitor:
+class Monitor(ThreadSafe):
     """Counts frames and updates, and times stages."""
 
     def __init__(self) -> None:

@@ -9,6 +9,7 @@ from mirrorskin.engine.pose.fit import PairFit, complement
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import STILL, Doubles, Motion
 from mirrorskin.engine.pose.pose import Pose, pose_of
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import Result
 from mirrorskin.kernels.device import Device, open_device
 
@@ -18,7 +19,7 @@ _FEWEST = 20  # pixels of a coarse comparison
 _LOST = 3.0  # times the key's first chi square, from which on the motion is looked for anew
 
 
-class PoseTracker:
+class PoseTracker(ThreadSafe):
     """Finds where an object is in each of a stream of results, against where it was in the first.
 
     Each result is compared with a key: the first one, and later the last before too few pixels were shared.

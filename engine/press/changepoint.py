@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.frames import Noise, check_dtype, check_frames, reference_pair
 from mirrorskin.engine.press.onset import Event, Onset, check_event, check_stack
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Staged, cut_into_bands, join_rows, room_of
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
@@ -99,7 +100,7 @@ def find_change_point(
     return search.result()
 
 
-class ChangePointSearch:
+class ChangePointSearch(ThreadSafe):
     """Find the change in frames that come block by block; see `mirrorskin.engine.streaming.Estimator`.
 
     With known levels one pass is enough, and ``result`` may be called at any time. With unknown ones all

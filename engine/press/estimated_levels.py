@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.frames import estimate_noise, thin_out
 from mirrorskin.engine.press.onset import Onset, OnsetSearch
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import Source
 from mirrorskin.kernels.device import Device
 
@@ -89,7 +90,7 @@ def _median(counts: ArrayLike) -> float:
     return float(np.nanmedian(np.asarray(counts, np.float64)))
 
 
-class EstimatedLevelSearch:
+class EstimatedLevelSearch(ThreadSafe):
     """Find onsets between estimated levels, whose uncertainty is in sigma.
 
     A second search, at a threshold that is lower by one standard deviation of the level, tells by how much

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.press.onset import Onset, OnsetSearch
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError
 from mirrorskin.kernels.device import Device
 
@@ -73,7 +74,7 @@ def _listed(numbers: Any) -> str:
     return ", ".join(f"{number:g}" for number in numbers)
 
 
-class LevelSearch:
+class LevelSearch(ThreadSafe):
     """Find onsets at several thresholds; see `mirrorskin.engine.streaming.Estimator`.
 
     Parameters

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.frames import Noise, check_dtype, check_frames, reference_maps
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_into_bands, join_rows, room_of
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
@@ -125,7 +126,7 @@ def find_onset(
     return search.finish()
 
 
-class OnsetSearch:
+class OnsetSearch(ThreadSafe):
     """Find the onset in frames that come block by block; see `mirrorskin.engine.streaming.Estimator`.
 
     Parameters

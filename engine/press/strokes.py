@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 from scipy import special
 
+from mirrorskin.engine.frames import check_frames
 from mirrorskin.engine.press.onset import Onset, OnsetSearch
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io.positions import check_strokes, stroke_starts
 from mirrorskin.kernels.device import Device
 
@@ -54,7 +56,7 @@ class Strokes:
         return np.hypot(self.onset.sigma, self.release.sigma)
 
 
-class StrokeSearch:
+class StrokeSearch(ThreadSafe):
     """Find onsets and releases in a press that oscillates; see `mirrorskin.engine.streaming.Estimator`.
 
     A stroke is a run of frames in which travel does not change its direction; its turning points belong to
@@ -103,7 +105,7 @@ class StrokeSearch:
         down = OnsetSearch(shape, dtype, device=device, **options)
         up = OnsetSearch(shape, dtype, device=down.device, **options, event="release")
         self.device, self._searches = down.device, {1: down, -1: up}
-        self._shape = shape
+        self._shape, self._dtype = shape, np.dtype(dtype)
         self.reset()
 
     @cached_property
@@ -134,6 +136,7 @@ class StrokeSearch:
         mirrorskin.io.InputError
             Frames of another shape or type; travel is missing or not finite.
         """
+        check_frames(frames, self._dtype, self._shape)
         values = check_strokes(travel, len(frames), "travel")
         before = self._travel[-1:]
         turns = (stroke_starts(np.concatenate([before, values]), self._direction) - len(before)).tolist()

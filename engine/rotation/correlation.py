@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.frames import check_dtype, check_frames
 from mirrorskin.engine.rotation.design_matrix import Doubles, basis, check_phases, check_weights
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_into_bands, join_rows, room_of
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
@@ -146,7 +147,7 @@ def check_harmonic(harmonic: int) -> int:
     return int(harmonic)
 
 
-class Correlator:
+class Correlator(ThreadSafe):
     """Fit mean, cosine and sine to frames that come block by block, however they are cut.
 
     Parameters

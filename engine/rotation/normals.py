@@ -29,6 +29,7 @@ from mirrorskin.engine.rotation.normals_kernel import (
 )
 from mirrorskin.engine.rotation.poses import PoseFit, check_poses, even_windows, rocks
 from mirrorskin.engine.rotation.response import Response
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, cut_into_bands, join_rows, room_of
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
@@ -217,7 +218,7 @@ def estimate_normals(
     return estimator.result()
 
 
-class NormalEstimator:
+class NormalEstimator(ThreadSafe):
     """Estimate normals from frames that come block by block, turn after turn.
 
     Frames are kept until their turn is over, at most 64 of them; of turns that are over, the device keeps the

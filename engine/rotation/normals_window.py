@@ -12,6 +12,7 @@ from mirrorskin.engine.rotation.correlation import Correlation, WindowSums
 from mirrorskin.engine.rotation.design_matrix import TurnFit, check_phases, turn_fit
 from mirrorskin.engine.rotation.normals import Normals
 from mirrorskin.engine.rotation.normals_kernel import MAPS, NormalKernel, NormalOptions, Samples, TurnModel
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.engine.tiling import Band, join_rows
 from mirrorskin.io import InputError
 from mirrorskin.io.positions import check_phase
@@ -21,7 +22,7 @@ from mirrorskin.kernels.device import Device
 _ROOM = 16  # frames that may be pushed at once without a copy
 
 
-class NormalWindow:
+class NormalWindow(ThreadSafe):
     """Estimate normals of a window that moves on with the frames, however they are cut into blocks.
 
     Noise and tilt are those of the first full window, unless they are given. Its frames are kept on

@@ -27,6 +27,7 @@ from mirrorskin.engine.slip.displacement import (
 from mirrorskin.engine.slip.onset_map import Expected, OnsetMap, fit_onsets
 from mirrorskin.engine.slip.status import CLEAR, NO_CONTACT, SLIPPED, STICKS, UNKNOWN
 from mirrorskin.engine.slip.tracking import NodeField, Tracker
+from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, pixel_axes
 from mirrorskin.io.types import Shown
@@ -94,7 +95,7 @@ class Slip(Shown):
     noise: float
 
 
-class SlipSearch:
+class SlipSearch(ThreadSafe):
     """Find displacement and slip in frames that come block by block; see `engine.streaming.Estimator`.
 
     The first frame is the reference. In the body's frame, skin that sticks to an object at rest moves as the

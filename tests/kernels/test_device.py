@@ -4,7 +4,6 @@ import doctest
 import os
 import subprocess
 import sys
-import threading
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -105,18 +104,6 @@ def test_a_kernel_in_a_text_runs_and_one_that_does_not_compile_is_quoted(device)
     assert values.download().tolist() == [0, 2, 4, 6, 8]
     with pytest.raises(DeviceError, match=r"text\.cl line 5 does not compile.*`if .item < count. valus"):
         device.kernel(TWICE.replace("values[item]", "valus[item]"), "twice")
-
-
-def test_kernels_are_compiled_once_and_made_anew_for_each_thread(device):
-    mine = device.kernel("limits", "copy_all", **MACROS)
-    assert device.kernel("limits", "copy_all", **MACROS) is mine
-    device.profile.clear()
-    others = []
-    thread = threading.Thread(target=lambda: others.append(device.kernel("limits", "copy_all", **MACROS)))
-    thread.start()
-    thread.join()
-    assert others[0] is not mine
-    assert not device.profile.records()
 
 
 def test_arguments_are_named_and_numbers_become_what_the_source_says(device):
