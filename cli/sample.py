@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import click
@@ -17,12 +18,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mirrorskin import hw
+    from mirrorskin.io.existing import Replaces
 
 _SHAPE, _PIXEL = (320, 320), 0.0375  # rows and columns, and mm: a field of 12 mm
 _SEED = 11
 _PIVOT = (0.3, -0.2, 2.0)  # mm
 _AT = ((0.0, 0.0), (-2.2, -2.2), (2.2, -2.2), (-2.2, 2.2), (2.2, 2.2))  # mm, where the balls lie
-_FLAT_FRAMES = 16
+_FLAT_FRAMES, _PRESS_FRAMES = 16, 30
 _BOARD, _DPI = "dots:7x5:1mm", 1200  # as the README prints it
 _LEAN = 2e-5  # how obliquely the board's camera looks, 1/pixel
 _BLUR, _NOISE = 0.5, 1.0  # of its picture: pixels and counts, one sigma
@@ -46,6 +48,7 @@ def command(
         Path,
         Option("--output", "-o", metavar="FILE-OR-FOLDER", help="Folder for calibration and pictures."),
     ],
+    overwrite: Annotated[bool, Option("--overwrite", help="Replace existing files of these names.")] = False,
 ) -> None:
     """Make data to try things on.
 
@@ -56,18 +59,25 @@ def command(
     """
     from mirrorskin import io
 
-    folder = name in (SampleName.calibration, SampleName.pictures)
-    if folder and not output.is_dir():
+    replaces: Replaces = "anything" if overwrite else "nothing"
+    if name in _FILES and not output.is_dir():
         try:
             output.mkdir()
         except OSError as error:
             raise io.InputError(f"{output} cannot be made: {error.strerror}; name another with -o") from error
-    elif not folder:
-        io.check_output(output)
-    _MAKERS[name](output)
+    for path in [output / file for file in _FILES[name]] if name in _FILES else [output]:
+        io.check_output(path, replaces=replaces)
+    _MAKERS[name](output, replaces)
     click.echo(f"{output}: {_HOLDS[name]}")
 
 
+_FILES = {
+    SampleName.calibration: (
+        *("dark.h5", "flat.h5", "photo.png", "press-ball.h5", "other.h5"),
+        *(f"ball-{number}.h5" for number in range(1, len(_AT) + 1)),
+    ),
+    SampleName.pictures: [f"frame{number:02d}.png" for number in range(_PRESS_FRAMES)],
+}
 _HOLDS = {
     SampleName.press: "a ball of 10 mm, pressed by 30 steps of 0.1 mm",
     SampleName.turn: "the same ball under a body that leans by 2.5 degrees, at 8 phases of a turn",
@@ -94,12 +104,12 @@ def _twin(
     return hw.Twin(object=Sphere(diameter), object_shift=at, **known | more)
 
 
-def _record(twin: hw.Twin, path: Path) -> None:
+def _record(twin: hw.Twin, path: Path, replaces: Replaces) -> None:
     from mirrorskin import io
     from mirrorskin.cli.output import progress
 
     with (
-        io.Recorder(twin, path, truth=lambda: twin.truth) as recorder,
+        io.Recorder(twin, path, truth=lambda: twin.truth, overwrite=replaces == "anything") as recorder,
         progress(f"making {path.name}", twin.shape[0]) as show,
     ):
         recorder.drain(show)
@@ -109,15 +119,15 @@ def _pressed() -> hw.Twin:
     from mirrorskin import io
     from mirrorskin.hw.twin import Vertical
 
-    return _twin(10.0, Vertical(io.Steps(0.1, 0.1).positions(30)))
+    return _twin(10.0, Vertical(io.Steps(0.1, 0.1).positions(_PRESS_FRAMES)))
 
 
-def _make_press(path: Path) -> None:
-    _record(_pressed(), path)
+def _make_press(path: Path, replaces: Replaces) -> None:
+    _record(_pressed(), path, replaces)
 
 
-def _make_turn(path: Path) -> None:
-    _record(_twin(10.0, _turn(1.5), pattern="linear"), path)
+def _make_turn(path: Path, replaces: Replaces) -> None:
+    _record(_twin(10.0, _turn(1.5), pattern="linear"), path, replaces)
 
 
 def _turn(press: float) -> hw.twin.Axial:
@@ -127,14 +137,14 @@ def _turn(press: float) -> hw.twin.Axial:
     return Axial(io.Steps(math.pi / 4).positions(8), math.radians(2.5), press, _PIVOT)
 
 
-def _make_slide(path: Path) -> None:
+def _make_slide(path: Path, replaces: Replaces) -> None:
     import numpy as np
 
     from mirrorskin.hw.twin import Horizontal, SheetTexture
 
     way = np.stack([0.01 * np.arange(30), np.zeros(30)], axis=1)
     small: dict[str, Any] = {"shape": (96, 96), "pixel_size": 0.05, "contact": "elastic"}
-    _record(_twin(10.0, Horizontal(way, 0.5), texture=SheetTexture("flakes"), **small), path)
+    _record(_twin(10.0, Horizontal(way, 0.5), texture=SheetTexture("flakes"), **small), path, replaces)
 
 
 def _frames() -> NDArray[np.uint8]:
@@ -146,37 +156,49 @@ def _frames() -> NDArray[np.uint8]:
     return frames
 
 
-def _make_stack(path: Path) -> None:
-    import h5py
+def _make_stack(path: Path, replaces: Replaces) -> None:
+    from mirrorskin.io.atomic import new_hdf5
 
-    with h5py.File(path, "w") as file:
-        file["raw/images"] = _frames()
-
-
-def _make_pictures(folder: Path) -> None:
-    import cv2
-
-    for number, frame in enumerate(_frames()):
-        cv2.imwrite(str(folder / f"frame{number:02d}.png"), frame)
+    with new_hdf5(path, replaces) as new:
+        new.root["raw/images"] = _frames()
 
 
-def _make_video(path: Path) -> None:
+def _make_pictures(folder: Path, replaces: Replaces) -> None:
+    for name, frame in zip(_FILES[SampleName.pictures], _frames(), strict=True):
+        _write_picture(folder / name, frame, replaces)
+
+
+def _write_picture(path: Path, picture: NDArray[np.uint8], replaces: Replaces) -> None:
+    from mirrorskin.io.atomic import write_new
+    from mirrorskin.io.pictures import encode_png
+
+    size = _PIXEL * 1e-3  # m
+    write_new(path, encode_png(picture, (size, size)), replaces)
+
+
+def _make_video(path: Path, replaces: Replaces) -> None:
     import cv2
 
     from mirrorskin import io
+    from mirrorskin.io.atomic import MAKE_ROOM, write_new
 
     size = (_SHAPE[1], _SHAPE[0])
-    film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, size, isColor=False)
-    if not film.isOpened():
-        raise io.InputError(f"{path} cannot be written as a video: name a file that ends with .avi")
-    for frame in _frames():
-        film.write(frame)
-    film.release()
+    with TemporaryDirectory() as folder:
+        made = Path(folder, "video").with_suffix(path.suffix)
+        film = cv2.VideoWriter(str(made), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, size, isColor=False)
+        if not film.isOpened():
+            raise io.InputError(f"{path} cannot be written as a video: name a file that ends with .avi")
+        for frame in _frames():
+            film.write(frame)
+        film.release()
+        # OpenCV does not report a disk that is full.
+        if cv2.VideoCapture(str(made)).get(cv2.CAP_PROP_FRAME_COUNT) != _PRESS_FRAMES:
+            raise io.InputError(f"{folder}: the video could not be written there; {MAKE_ROOM}")
+        write_new(path, [made.read_bytes()], replaces)
 
 
-def _make_calibration(folder: Path) -> None:
+def _make_calibration(folder: Path, replaces: Replaces) -> None:
     """Record what a sensor with a real wall, uneven lamps and a lens near the sheet is calibrated with."""
-    import cv2
     import numpy as np
 
     from mirrorskin.hw.twin import Body, Camera, Vertical
@@ -185,16 +207,16 @@ def _make_calibration(folder: Path) -> None:
     body = Body(asymmetry=0.05, asymmetry_azimuth=0.7)
     real: dict[str, Any] = {"optics": "cylinder", "pattern": "linear", "body": body, "camera": camera}
     for name, light in (("dark", 0.0), ("flat", 1.0)):
-        _record_flat(folder / f"{name}.h5", camera, light)
+        _record_flat(folder / f"{name}.h5", camera, light, replaces)
     for number, at in enumerate(_AT, 1):
-        _record(_twin(4.0, _turn(0.4), at, **real), folder / f"ball-{number}.h5")
-    _record(_twin(6.0, _turn(0.8), (0.5, -0.4), **real), folder / "other.h5")
+        _record(_twin(4.0, _turn(0.4), at, **real), folder / f"ball-{number}.h5", replaces)
+    _record(_twin(6.0, _turn(0.8), (0.5, -0.4), **real), folder / "other.h5", replaces)
     travel = Vertical(np.arange(0.0, 1.21, 0.04))
-    _record(_twin(4.0, travel, contact="elastic", **real), folder / "press-ball.h5")
-    cv2.imwrite(str(folder / "photo.png"), _photograph())
+    _record(_twin(4.0, travel, contact="elastic", **real), folder / "press-ball.h5", replaces)
+    _write_picture(folder / "photo.png", _photograph(), replaces)
 
 
-def _record_flat(path: Path, camera: hw.twin.Camera, light: float) -> None:
+def _record_flat(path: Path, camera: hw.twin.Camera, light: float, replaces: Replaces) -> None:
     """Record a field that is all alike."""
     import numpy as np
 
@@ -208,7 +230,8 @@ def _record_flat(path: Path, camera: hw.twin.Camera, light: float) -> None:
         sensor.expose(field, number + round(light) * _FLAT_FRAMES, frame)
     header = {"title": f"flat field, light {light:g}", "pixel_size": (_PIXEL, _PIXEL)}
     phase = np.linspace(0, math.tau, _FLAT_FRAMES, endpoint=False)
-    with io.Recorder(ArrayRecording(frames, {"phase": phase}, header), path) as recorder:
+    source = ArrayRecording(frames, {"phase": phase}, header)
+    with io.Recorder(source, path, overwrite=replaces == "anything") as recorder:
         recorder.drain(lambda _: None)
 
 
@@ -231,7 +254,7 @@ def _photograph() -> NDArray[np.uint8]:
     return np.rint(noisy).astype(np.uint8)
 
 
-_MAKERS: dict[SampleName, Callable[[Path], None]] = {
+_MAKERS: dict[SampleName, Callable[[Path, Replaces], None]] = {
     SampleName.press: _make_press,
     SampleName.turn: _make_turn,
     SampleName.slide: _make_slide,

@@ -172,6 +172,7 @@ def command(
     ] = ReferenceName.ball,
     seed: Annotated[int, Option(help="The same seed, the same recording.")] = 0,
     compression: options.Compression = options.CompressionName.raw,
+    overwrite: options.Overwrite = False,
     device: options.Device = None,
 ) -> None:
     """Record what the twin sees, with the truth."""
@@ -183,7 +184,8 @@ def command(
     from mirrorskin.hw.twin import Body, Camera
 
     for source in map(Path, (thing, pattern)):
-        io.check_output(output, source if source.suffix else None)  # a name is no file to keep
+        known = source if source.suffix else None  # the name of a shape is not a file to keep
+        io.check_output(output, known, replaces="anything" if overwrite else "nothing")
     given = {name: context.params[name.replace("-", "_")] for own in DEFAULTS.values() for name in own}
     columns, rows = frame_size(size, "--size")
     along = vector(object_shift, 2, "--object-shift")
@@ -224,7 +226,9 @@ def command(
     )
     count = twin.shape[0]
     with (
-        io.Recorder(twin, output, compression.value, truth=lambda: twin.truth) as recorder,
+        io.Recorder(
+            twin, output, compression.value, truth=lambda: twin.truth, overwrite=overwrite
+        ) as recorder,
         progress("simulating", count) as show,
     ):
         recorder.drain(show)

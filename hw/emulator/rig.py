@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self, cast
@@ -33,6 +34,7 @@ from mirrorskin.hw.rig_file import (
 from mirrorskin.hw.stage import Position
 from mirrorskin.hw.twin import Axial, Camera, Object, Twin, Vertical
 from mirrorskin.hw.twin.movement import Movement, Pose
+from mirrorskin.io.atomic import write_new
 from mirrorskin.io.types import Floats, InputError
 
 PRESS = 3.0
@@ -202,8 +204,10 @@ class EmulatedRig:
             if path.exists() and not path.read_text(errors="replace").startswith(_FIRST):
                 raise InputError(f"{path} is a rig file that someone else wrote: name another folder with -o")
             folder.mkdir(parents=True, exist_ok=True)
-            np.save(picture, self.references()[1])
-            path.write_text(f"{_FIRST}{text}\n")
+            array = BytesIO()
+            np.save(array, self.references()[1])
+            write_new(picture, [array.getvalue()])
+            write_new(path, [f"{_FIRST}{text}\n".encode()])
         except OSError as error:
             raise InputError(
                 f"{folder} cannot be written to: {error.strerror}; name another with -o"

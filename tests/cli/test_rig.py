@@ -231,6 +231,6 @@ def test_a_new_rig_file_can_be_loaded_and_is_never_written_over_another(folder):
     ended = run("rig", "new", "-o", "mine.toml")
     assert (ended.code, ended.said) == (
         2,
-        "mirrorskin: mine.toml is there already; name another file with --output\n",
+        "mirrorskin: mine.toml exists and is not replaced: choose another name with -o\n",
     )
     assert (folder / "mine.toml").read_bytes() == before

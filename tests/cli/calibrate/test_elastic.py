@@ -82,7 +82,7 @@ def test_a_ball_becomes_a_gel_in_the_file_and_is_told_in_a_line():
     [
         ([], "no recordings"),
         (["ball.h5", "--rig", "rig.toml"], "leave one of them out"),
-        (["ball.h5", "--press", "1mm"], "--press says how a rig is to press"),
+        (["ball.h5", "--press", "1mm"], "--press applies to presses on a rig"),
         (["ball.h5", "--sheet", "-1mm"], "--sheet -1mm cannot be"),
         (["turn.h5"], "axial motion"),
         (["none.h5"], "none.h5"),

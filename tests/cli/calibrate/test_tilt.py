@@ -114,7 +114,7 @@ def test_what_the_file_knew_before_is_kept_and_what_the_user_says_of_the_scale_i
         ([], "no recordings"),
         (["ball.h5"], "half-angle is not determined"),
         (["--flat", "flat.h5"], "neither phases"),
-        (["ball.h5", "--press", "1mm"], "--press says how a rig is to press"),
+        (["ball.h5", "--press", "1mm"], "--press applies to presses on a rig"),
         (["--rig", "rig.toml"], "--press is missing"),
         (["ball.h5", "--flat", "other.h5"], "take all with one camera"),
         (["bare.h5"], "bare.h5: the recording has no zenith gain and offset"),
