@@ -183,9 +183,9 @@ def command(
     from mirrorskin.cli.quantity import angle, duration, frame_size, length, lengths, vector
     from mirrorskin.hw.twin import Body, Camera
 
-    for source in map(Path, (thing, pattern)):
-        known = source if source.suffix else None  # the name of a shape is not a file to keep
-        io.check_output(output, known, replaces="anything" if overwrite else "nothing")
+    # A name without a suffix is that of a shape, and not of a file to keep.
+    files = [source for source in map(Path, (thing, pattern)) if source.suffix]
+    io.check_output(output, *files, replaces="anything" if overwrite else "nothing")
     given = {name: context.params[name.replace("-", "_")] for own in DEFAULTS.values() for name in own}
     columns, rows = frame_size(size, "--size")
     along = vector(object_shift, 2, "--object-shift")

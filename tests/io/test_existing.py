@@ -84,7 +84,7 @@ def test_nothing_that_can_be_computed_replaces_what_cannot(protected, write):
 @pytest.mark.parametrize("replaces", ["nothing", "derived", "calibration"])
 def test_a_recording_that_came_meanwhile_is_not_replaced(tmp_path, replaces):
     path = tmp_path / "a.h5"
-    with pytest.raises(io.InputError, match="a.h5 (exists and )?is a recording"), new_file(path, replaces):
+    with pytest.raises(io.InputError, match=r"a\.h5 (exists and )?is a recording"), new_file(path, replaces):
         stream(Feed(3), path)
     assert io.describe(path)["kind"] == "recording"
     assert list(tmp_path.iterdir()) == [path]

@@ -172,8 +172,7 @@ def test_what_a_run_that_was_cut_short_recorded_has_a_name_of_its_own(older):
     for number in (1, 2):
         recorder = io.StreamRecorder(Feed(fails=(4, SystemExit(1))), older, overwrite=True)
         with pytest.raises(SystemExit), recorder:
-            while True:
-                recorder.read()
+            drain(recorder)
         assert recorder.file == partial(older, number)
         assert recorder.written == 4
     assert older.read_bytes() == before
@@ -207,12 +206,12 @@ def test_of_two_runs_at_once_each_keeps_its_recording(tmp_path, overwrite):
     path = tmp_path / "a.h5"
     with io.StreamRecorder(Feed(6), path, overwrite=overwrite) as first:
         second = io.StreamRecorder(Feed(4), path, overwrite=overwrite)
-        with pytest.raises(io.InputError, match="a.h5 was made by another program meanwhile"), second:
-            while first.read() is not None:
-                pass
-            wait_for(path)
-            while second.read() is not None:
-                pass
+        second.__enter__()
+        drain(first)
+        wait_for(path)
+        drain(second)
+        with pytest.raises(io.InputError, match=r"a\.h5 was made by another program meanwhile"):
+            second.__exit__(None, None, None)
     assert (first.file, second.file) == (path, tmp_path / "a-partial.h5")
     assert [len(held(one.file)["data"]) for one in (first, second)] == [6, 4]
     assert [held(one.file)["state"] for one in (first, second)] == ["complete"] * 2
@@ -236,6 +235,11 @@ def test_the_target_of_a_link_is_replaced_and_the_link_stays(tmp_path):
     assert (tmp_path / "a.h5").is_symlink()
     assert len(held(tmp_path / "far" / "a.h5")["data"]) == 7
     assert names(tmp_path / "far") == ["a.h5"]
+
+
+def drain(recorder):
+    while recorder.read() is not None:
+        pass
 
 
 def wait_for(path):
