@@ -99,7 +99,7 @@ def test_what_cannot_be_learned_from_is_refused_in_a_line(words, complaint):
 def test_a_rig_presses_the_ball_at_each_place(monkeypatch):
     asked = []
 
-    def take(rig, calibration, places, settle=None):
+    def take(rig, calibration, places, settle, overwrite):
         asked.extend(places)
         raise io.InputError("stop here")
 

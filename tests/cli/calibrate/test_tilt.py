@@ -142,7 +142,7 @@ def test_what_cannot_be_is_one_line_and_writes_nothing(words, said):
 def test_a_rig_is_asked_for_balls_at_several_places(monkeypatch):
     asked = []
 
-    def take(rig, calibration, places, settle):
+    def take(rig, calibration, places, settle, overwrite):
         asked.extend(places)
         return [calibration.with_name("ball.h5")]
 
