@@ -72,9 +72,10 @@ def test_a_recording_is_taken_in_the_place_of_another_only_where_that_is_asked_f
     _record_flat_field(older)
     before = older.read_bytes()
     places = [inputs.Place("dark", "take everything off", inputs.still_plan(rig_file), frames=3)]
-    with monkeypatch.context() as patch, pytest.raises(io.InputError, match="exists and is a recording: add"):
+    with monkeypatch.context() as patch:
         patch.setattr(rigs, "open_rig", None)
-        inputs.take(rig_file, tmp_path / "cal.h5", places, settle="0s")
+        with pytest.raises(io.InputError, match="exists and is a recording: add"):
+            inputs.take(rig_file, tmp_path / "cal.h5", places, settle="0s")
     assert older.read_bytes() == before
     inputs.take(rig_file, tmp_path / "cal.h5", places, settle="0s", overwrite=True)
     with io.open_recording(older) as recording:
