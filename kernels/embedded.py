@@ -357,6 +357,8 @@ def _probe(platform: cl.Platform) -> str | None:
             )
         except subprocess.TimeoutExpired:
             return f"PoCL did not finish a small kernel within {_TIMEOUT} s; choose another device"
+        except OSError as error:
+            return f"PoCL cannot be tried, since {sys.executable} does not start ({error.strerror})"
     if child.returncode == 0 and child.stdout.decode().startswith(_RAN):
         return None
     return _explain(child.returncode, child.stderr.decode(errors="replace"))

@@ -135,6 +135,13 @@ def test_a_device_that_never_answers(pocl, monkeypatch):
         embedded.verify(pocl)
 
 
+def test_a_python_that_does_not_start_is_named(pocl, monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    monkeypatch.setattr(embedded, "find_zig", lambda: None)
+    with pytest.raises(DeviceError, match=r"since .*/python does not start \(No such file or directory\)$"):
+        embedded.verify(pocl)
+
+
 def test_without_the_wheel_nothing_is_prepared(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     monkeypatch.setattr(embedded, "_processor", None)
