@@ -15,7 +15,7 @@ PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist loadfile --ignore t
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 demo: $(READY)
-	@$(BIN)/mirrorskin demo -o demo
+	@$(BIN)/mirrorskin demo -o demo --overwrite
 
 # A process for each core, each with files of its own. Types are checked meanwhile, as some tests wait for clocks.
 test: lint

@@ -8,6 +8,7 @@ from pathlib import Path
 from mirrorskin.bench.harness import FIRST, OURS
 from mirrorskin.bench.run import Data, Run
 from mirrorskin.io import InputError, check_output
+from mirrorskin.io.atomic import write_new
 
 HEAD = ("work", "ms", "quartiles", "kernels", "copies", "GB/s", "frames/s", "of limit", "kernels")
 TARGET_HEAD = ("aim", "bound", "measured", "reached")
@@ -155,15 +156,7 @@ def write_page(runs: Mapping[Path, Run], page: Path) -> None:
             raise InputError(f"{picture.parent} cannot be made: {error.strerror}; {where}") from error
         check_output(picture, *runs)
         draw_rooflines(rooflines, picture)
-    write_text(page, as_page(runs, pictured=bool(rooflines)))
-
-
-def write_text(path: Path, content: str) -> None:
-    """Write a text file, or raise InputError."""
-    try:
-        path.write_text(content, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path} could not be written: {error.strerror}; make room") from error
+    write_new(page, [as_page(runs, pictured=bool(rooflines)).encode()])
 
 
 def gather(runs: Iterable[Run]) -> dict[str, Machine]:

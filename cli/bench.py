@@ -176,7 +176,8 @@ def _check(output: Path | None) -> Path | None:
 
 
 def _tell(data: Mapping[str, Any], output: Path | None, page: Path | None, as_json: bool) -> None:
-    from mirrorskin.bench.report import as_markdown, write_text
+    from mirrorskin.bench.report import as_markdown
+    from mirrorskin.io.atomic import write_new
 
     text = json.dumps(data, indent=2)
     if as_json:
@@ -185,7 +186,7 @@ def _tell(data: Mapping[str, Any], output: Path | None, page: Path | None, as_js
         _print(data)
     for path, content in ((output, text + "\n"), (page, as_markdown(data))):
         if path is not None:
-            write_text(path, content)
+            write_new(path, [content.encode()])
             click.echo(f"written to {path}", err=True)
 
 

@@ -42,6 +42,7 @@ def command(
     frames: scans.StepFrames = None,
     calibration: options.Calibration = None,
     compression: options.Compression = options.CompressionName.raw,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Move the stage, and record what the camera sees; what was taken is kept whatever happens."""
     from mirrorskin import io
@@ -51,12 +52,12 @@ def command(
 
     settings = load_rig(rig_file)
     plan = scans.make_plan(context.params, settings)  # from the options above
-    io.check_output(output, rig_file, calibration)
+    io.check_output(output, rig_file, calibration, replaces="anything" if overwrite else "nothing")
     known = scans.open_calibration(calibration, settings)
     with open_rig(settings, plan.in_steps) as rig:
         # Normals are told from so many frames of a turn; more would be of no use to 'reconstruct'.
         scan = scans.make_scan(rig, plan, settle, frames, turn_frames=WINDOW)
-        recorder = io.StreamRecorder(scan, output, compression.value, calibration=known)
+        recorder = io.StreamRecorder(scan, output, compression.value, calibration=known, overwrite=overwrite)
         with scans.kept(recorder):
             _drain(recorder)
         click.echo(f"{output}: {_summary(scan)}")

@@ -29,13 +29,14 @@ def command(
     pixel_size: options.PixelSize = None,
     topic: Annotated[str | None, Option(metavar="TOPIC", help="Of an MCAP file: that of the images.")] = None,
     compression: options.Compression = options.CompressionName.raw,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Make a recording of a video or pictures."""
     from mirrorskin import io
     from mirrorskin.cli.output import progress
     from mirrorskin.cli.stack import stack_options
 
-    io.check_output(output, frames, phases, travel)
+    io.check_output(output, frames, phases, travel, replaces="anything" if overwrite else "nothing")
     known = stack_options(
         travel_step=travel_step,
         travel_start=travel_start,
@@ -51,7 +52,7 @@ def command(
     with progress("counting frames", None) as show:
         source = io.open_frames(frames, header, known.get("travel"), known.get("phase"), topic, show)
     with (
-        io.Recorder(source, output, compression.value) as recorder,
+        io.Recorder(source, output, compression.value, overwrite=overwrite) as recorder,
         progress("importing", source.shape[0]) as show,
     ):
         recorder.drain(show)

@@ -45,6 +45,9 @@ def command(
             "--record", metavar="REC.h5|REC.mcap", help="Recording to write meanwhile; MCAP has maps, too."
         ),
     ] = None,
+    overwrite: Annotated[
+        bool, Option("--overwrite", help="Replace an existing recording of that name.")
+    ] = False,
     output: Annotated[
         Path | None,
         Option("--output", "-o", metavar="RES.h5", help="Result to write at the end: HDF5, or NAME.zarr."),
@@ -114,9 +117,13 @@ def command(
     if (own and ours) or (settings and not own):
         told = f"--{ours[0]} says nothing of" if own else "--set is for"
         raise io.InputError(f"{told} an --estimator of your own: leave it out")
-    for path, others, or_zarr in ((record, (), False), (output, (record,), True)):
-        if path is not None:
-            io.check_output(path, rig_file, calibration, contact, *others, or_zarr=or_zarr)
+    if overwrite and record is None:
+        raise io.InputError("--overwrite is for --record: leave it out")
+    inputs = rig_file, calibration, contact
+    if record is not None:
+        io.check_output(record, *inputs, replaces="anything" if overwrite else "nothing")
+    if output is not None:
+        io.check_output(output, *inputs, record, or_zarr=True)
     known = scans.open_calibration(calibration, rig)
     given = {**context.params, "latency": duration(latency, "--latency"), "own": own}
     _Live(rig, plan, given, known).run()
@@ -173,7 +180,9 @@ class _Live:
             shown = stack.enter_context(_viewer(view, scan.shape[1:], settings)) if view else None
             tell = stack.enter_context(show_status())
             record = given["record"]
-            recorder = None if record is None else StreamRecorder(scan, record, calibration=known)
+            recorder = None
+            if record is not None:
+                recorder = StreamRecorder(scan, record, calibration=known, overwrite=given["overwrite"])
             source: LiveSource = scan if recorder is None else recorder
             if known is not None:
                 source = Calibrated(source, known)

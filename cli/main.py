@@ -11,7 +11,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType, TracebackType
 from typing import Annotated
 
@@ -23,7 +23,12 @@ from mirrorskin.cli.groups import LazyGroup, Option, make_command
 _COMPLETE = "_MIRRORSKIN_COMPLETE"  # environment variable of shell completion, see click.shell_completion
 _INTERRUPTED = 130  # what shells say of a program that Ctrl-C ended
 _SOON = 0.001  # seconds
+_INSISTS = 3  # signals after the first one that end the program at once
+_STOPPING = b"mirrorskin: it is being stopped; two more Ctrl-C end it at once\n"
 _LESS = "take a smaller region or fewer frames, or end other programs"
+_LEAST = 512 << 20  # bytes of address space, without which NumPy's libraries end the process
+_REFUSED = ("failed to map segment", "annot allocate memory", "can't start new thread")
+"""What libraries say when the system gives them no memory or thread."""
 _HELP = "NoArgsIsHelpError"  # of a group that no command was named of; its message is the group's help
 
 PURPOSES = {
@@ -59,8 +64,20 @@ def _common(
 ) -> None:
     import logging
 
+    _check_address_space()
     _OneLine.debug = debug
     logging.basicConfig(level=logging.INFO if debug else logging.WARNING, format="%(message)s")
+
+
+def _check_address_space() -> None:
+    import resource
+
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY and limit < _LEAST:
+        raise click.ClickException(
+            f"the address space is limited to {limit >> 20} MB, and {_LEAST >> 20} MB are needed:"
+            " raise or remove the limit (ulimit -v)"
+        )
 
 
 app: LazyGroup = make_command(
@@ -81,6 +98,7 @@ class _OneLine:
 
     debug = False
     signalled = 0  # the exit code of a signal that came; libraries make another error of it at times
+    insisted = 0  # signals after the first one
 
     def __enter__(self) -> None: ...
 
@@ -92,7 +110,8 @@ class _OneLine:
         if isinstance(error, Exception) and self.signalled:
             sys.exit(self.signalled)
         # The classes that carry a code are not named here: importing them takes longer than --help may.
-        no_memory = isinstance(error, MemoryError)
+        lacking = _lacking(error)
+        no_memory = isinstance(error, MemoryError) or bool(lacking)
         code = 1 if no_memory else getattr(error, "exit_code", None)
         usage = getattr(error, "format_message", None)
         ours = no_memory or (kind is not None and kind.__module__.startswith("mirrorskin."))
@@ -100,7 +119,7 @@ class _OneLine:
             return
         if self.debug:
             traceback.print_exception(error)
-        message = usage() if usage else str(error)
+        message = usage() if usage else lacking or str(error)
         if no_memory:
             message = f"not enough memory{message and f' ({message})'}: {_LESS}"
         if kind is not None and kind.__name__ == _HELP:
@@ -112,22 +131,43 @@ class _OneLine:
         sys.exit(code)
 
 
-@contextmanager
-def _ended_by_signals() -> Iterator[None]:
-    """Let signals end the program by an exception, so that nothing half-written stays behind."""
-    _OneLine.signalled = 0
+def _lacking(error: BaseException | None) -> str:
+    """Return the line in which a library says that the system refused memory or a thread, if it does."""
+    if not isinstance(error, ImportError | OSError | RuntimeError) or getattr(error, "exit_code", None):
+        return ""
+    lines = str(error).splitlines()
+    return next((line.strip() for line in lines if any(said in line for said in _REFUSED)), "")
 
-    def end(number: int, frame: FrameType | None) -> None:
+
+def _end(number: int, frame: FrameType | None) -> None:
+    """End the program by an exception; leave what that began alone, unless the user insists."""
+    if not _OneLine.signalled:
         _OneLine.signalled = 128 + number
         if number == signal.SIGINT:
             raise KeyboardInterrupt
         sys.exit(128 + number)
+    _OneLine.insisted += 1
+    if _OneLine.insisted == 1:
+        with suppress(OSError):
+            os.write(2, _STOPPING)  # a stream of Python may be in use
+    elif _OneLine.insisted == _INSISTS:
+        os._exit(128 + number)
+
+
+@contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """Let signals end the program by an exception, so that nothing half-written stays behind.
+
+    Further signals must not interrupt what the first one began: a stage is stopped, files are completed, and
+    threads are waited for, since OpenCL aborts a program that leaves it at work.
+    """
+    _OneLine.signalled = _OneLine.insisted = 0
 
     for name in ("SIGTERM", "SIGHUP"):
         if hasattr(signal, name):
-            signal.signal(getattr(signal, name), end)
+            signal.signal(getattr(signal, name), _end)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where it is ignored
-        signal.signal(signal.SIGINT, end)
+        signal.signal(signal.SIGINT, _end)
     told = sys.unraisablehook
 
     def insist(lost: sys.UnraisableHookArgs) -> None:

@@ -85,6 +85,7 @@ Calibration = Annotated[
 Memory = Annotated[str, Option(metavar="SIZE", help="Memory for frames on the move.")]
 Compression = Annotated[CompressionName, Option(help="How to pack the frames.")]
 NewRecording = Annotated[Path, Option("--output", "-o", metavar="REC.h5", help="Recording to write.")]
+Overwrite = Annotated[bool, Option("--overwrite", help="Replace an existing file of that name.")]
 LearnedCalibration = Annotated[
     Path, Option("--output", "-o", metavar="CAL.h5", help="Calibration file to write or add to.")
 ]

@@ -51,14 +51,11 @@ def new(
     """Write a template of a rig file, in which every key is described."""
     from mirrorskin.hw.rig_file import TEMPLATE
     from mirrorskin.io import InputError
+    from mirrorskin.io.atomic import write_new
 
-    try:
-        with output.open("x", encoding="utf-8") as file:
-            file.write(TEMPLATE)
-    except FileExistsError as error:
-        raise InputError(f"{output} is there already; name another file with --output") from error
-    except OSError as error:
-        raise InputError(f"{output} cannot be written: {error.strerror}; name another file") from error
+    if output.exists():
+        raise InputError(f"{output} exists and is not replaced: choose another name with -o")
+    write_new(output, [TEMPLATE.encode()], replaces="nothing")
     click.echo(f"{output}: now set port, letters, zeros and limits, and try 'mirrorskin rig check {output}'")
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import click
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mirrorskin import hw
+    from mirrorskin.io.existing import Replaces
 
 _SHAPE, _PIXEL = (320, 320), 0.0375  # rows and columns, and mm: a field of 12 mm
 _SEED = 11
@@ -47,6 +49,7 @@ def command(
         Path,
         Option("--output", "-o", metavar="FILE-OR-FOLDER", help="Folder for calibration and pictures."),
     ],
+    overwrite: Annotated[bool, Option("--overwrite", help="Replace existing files of these names.")] = False,
 ) -> None:
     """Write example data.
 
@@ -59,18 +62,27 @@ def command(
     """
     from mirrorskin import io
 
-    folder = name in (SampleName.calibration, SampleName.pictures)
-    if folder and not output.is_dir():
+    replaces: Replaces = "anything" if overwrite else "nothing"
+    if name in _FILES and not output.is_dir():
         try:
             output.mkdir()
         except OSError as error:
             raise io.InputError(
                 f"{output}: the folder cannot be created: {error.strerror}. Choose another with -o"
             ) from error
-    elif not folder:
-        io.check_output(output)
-    _MAKERS[name](output)
+    for path in [output / file for file in _FILES[name]] if name in _FILES else [output]:
+        io.check_output(path, replaces=replaces)
+    _MAKERS[name](output, replaces)
     click.echo(f"{output}: {_HOLDS[name]}")
+
+
+_FILES = {
+    SampleName.calibration: (
+        *("dark.h5", "flat.h5", "photo.png", "press-ball.h5", "other.h5"),
+        *(f"ball-{number}.h5" for number in range(1, len(_AT) + 1)),
+    ),
+    SampleName.pictures: [f"frame{number:02d}.png" for number in range(_FRAMES)],
+}
 
 
 _PRESS = f"{_FRAMES} frames from travel 0 to {_STEP * (_FRAMES - 1):g} mm in steps of {_STEP:g} mm"
@@ -100,12 +112,12 @@ def _twin(
     return hw.Twin(object=Sphere(diameter), object_shift=at, **known | more)
 
 
-def _record(twin: hw.Twin, path: Path) -> None:
+def _record(twin: hw.Twin, path: Path, replaces: Replaces) -> None:
     from mirrorskin import io
     from mirrorskin.cli.output import progress
 
     with (
-        io.Recorder(twin, path, truth=lambda: twin.truth) as recorder,
+        io.Recorder(twin, path, truth=lambda: twin.truth, overwrite=replaces == "anything") as recorder,
         progress(f"making {path.name}", twin.shape[0]) as show,
     ):
         recorder.drain(show)
@@ -118,12 +130,12 @@ def _pressed() -> hw.Twin:
     return _twin(10.0, Vertical(io.Steps(_STEP).positions(_FRAMES)))
 
 
-def _make_press(path: Path) -> None:
-    _record(_pressed(), path)
+def _make_press(path: Path, replaces: Replaces) -> None:
+    _record(_pressed(), path, replaces)
 
 
-def _make_turn(path: Path) -> None:
-    _record(_twin(10.0, _turn(1.5), pattern="linear"), path)
+def _make_turn(path: Path, replaces: Replaces) -> None:
+    _record(_twin(10.0, _turn(1.5), pattern="linear"), path, replaces)
 
 
 def _turn(press: float) -> hw.twin.Axial:
@@ -133,14 +145,14 @@ def _turn(press: float) -> hw.twin.Axial:
     return Axial(io.Steps(math.pi / 4).positions(8), math.radians(2.5), press, _PIVOT)
 
 
-def _make_slide(path: Path) -> None:
+def _make_slide(path: Path, replaces: Replaces) -> None:
     import numpy as np
 
     from mirrorskin.hw.twin import Horizontal, SheetTexture
 
     way = np.stack([0.01 * np.arange(30), np.zeros(30)], axis=1)
     small: dict[str, Any] = {"shape": (96, 96), "pixel_size": 0.05, "contact": "elastic"}
-    _record(_twin(10.0, Horizontal(way, 0.5), texture=SheetTexture("flakes"), **small), path)
+    _record(_twin(10.0, Horizontal(way, 0.5), texture=SheetTexture("flakes"), **small), path, replaces)
 
 
 def _frames() -> NDArray[np.uint8]:
@@ -152,40 +164,52 @@ def _frames() -> NDArray[np.uint8]:
     return frames
 
 
-def _make_stack(path: Path) -> None:
-    import h5py
+def _make_stack(path: Path, replaces: Replaces) -> None:
+    from mirrorskin.io.atomic import new_hdf5
 
-    with h5py.File(path, "w") as file:
-        file["raw/images"] = _frames()
-
-
-def _make_pictures(folder: Path) -> None:
-    import cv2
-
-    for number, frame in enumerate(_frames()):
-        cv2.imwrite(str(folder / f"frame{number:02d}.png"), frame)
+    with new_hdf5(path, replaces) as new:
+        new.root["raw/images"] = _frames()
 
 
-def _make_video(path: Path) -> None:
+def _make_pictures(folder: Path, replaces: Replaces) -> None:
+    for name, frame in zip(_FILES[SampleName.pictures], _frames(), strict=True):
+        _write_picture(folder / name, frame, replaces)
+
+
+def _write_picture(path: Path, picture: NDArray[np.uint8], replaces: Replaces) -> None:
+    from mirrorskin.io.atomic import write_new
+    from mirrorskin.io.pictures import encode_png
+
+    size = _PIXEL * 1e-3  # m
+    write_new(path, encode_png(picture, (size, size)), replaces)
+
+
+def _make_video(path: Path, replaces: Replaces) -> None:
     import cv2
 
     from mirrorskin import io
+    from mirrorskin.io.atomic import MAKE_ROOM, write_new
 
     refusal = io.InputError(f"{path}: cannot be written as a video. Choose a name that ends in .avi")
     if path.suffix.lower() != ".avi":
         raise refusal
     size = (_SHAPE[1], _SHAPE[0])
-    film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, size, isColor=False)
-    if not film.isOpened():
-        raise refusal
-    for frame in _frames():
-        film.write(frame)
-    film.release()
+    with TemporaryDirectory() as folder:
+        made = Path(folder, "video").with_suffix(path.suffix)
+        film = cv2.VideoWriter(str(made), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, size, isColor=False)
+        if not film.isOpened():
+            raise refusal
+        for frame in _frames():
+            film.write(frame)
+        film.release()
+        # OpenCV does not report a disk that is full.
+        if cv2.VideoCapture(str(made)).get(cv2.CAP_PROP_FRAME_COUNT) != _FRAMES:
+            raise io.InputError(f"{folder}: the video could not be written there; {MAKE_ROOM}")
+        write_new(path, [made.read_bytes()], replaces)
 
 
-def _make_calibration(folder: Path) -> None:
+def _make_calibration(folder: Path, replaces: Replaces) -> None:
     """Record what a sensor with a real wall, uneven lamps and a lens near the sheet is calibrated with."""
-    import cv2
     import numpy as np
 
     from mirrorskin.hw.twin import Body, Camera, Vertical
@@ -194,16 +218,16 @@ def _make_calibration(folder: Path) -> None:
     body = Body(asymmetry=0.05, asymmetry_azimuth=0.7)
     real: dict[str, Any] = {"optics": "cylinder", "pattern": "linear", "body": body, "camera": camera}
     for name, light in (("dark", 0.0), ("flat", 1.0)):
-        _record_flat(folder / f"{name}.h5", camera, light)
+        _record_flat(folder / f"{name}.h5", camera, light, replaces)
     for number, at in enumerate(_AT, 1):
-        _record(_twin(4.0, _turn(0.4), at, **real), folder / f"ball-{number}.h5")
-    _record(_twin(6.0, _turn(0.8), (0.5, -0.4), **real), folder / "other.h5")
+        _record(_twin(4.0, _turn(0.4), at, **real), folder / f"ball-{number}.h5", replaces)
+    _record(_twin(6.0, _turn(0.8), (0.5, -0.4), **real), folder / "other.h5", replaces)
     travel = Vertical(np.arange(0.0, 1.21, 0.04))
-    _record(_twin(4.0, travel, contact="elastic", **real), folder / "press-ball.h5")
-    cv2.imwrite(str(folder / "photo.png"), _photograph())
+    _record(_twin(4.0, travel, contact="elastic", **real), folder / "press-ball.h5", replaces)
+    _write_picture(folder / "photo.png", _photograph(), replaces)
 
 
-def _record_flat(path: Path, camera: hw.twin.Camera, light: float) -> None:
+def _record_flat(path: Path, camera: hw.twin.Camera, light: float, replaces: Replaces) -> None:
     """Record a field that is all alike."""
     import numpy as np
 
@@ -217,7 +241,8 @@ def _record_flat(path: Path, camera: hw.twin.Camera, light: float) -> None:
         sensor.expose(field, number + round(light) * _FLAT_FRAMES, frame)
     header = {"title": f"flat field, light {light:g}", "pixel_size": (_PIXEL, _PIXEL)}
     phase = np.linspace(0, math.tau, _FLAT_FRAMES, endpoint=False)
-    with io.Recorder(ArrayRecording(frames, {"phase": phase}, header), path) as recorder:
+    source = ArrayRecording(frames, {"phase": phase}, header)
+    with io.Recorder(source, path, overwrite=replaces == "anything") as recorder:
         recorder.drain(lambda _: None)
 
 
@@ -240,7 +265,7 @@ def _photograph() -> NDArray[np.uint8]:
     return np.rint(noisy).astype(np.uint8)
 
 
-_MAKERS: dict[SampleName, Callable[[Path], None]] = {
+_MAKERS: dict[SampleName, Callable[[Path, Replaces], None]] = {
     SampleName.press: _make_press,
     SampleName.turn: _make_turn,
     SampleName.slide: _make_slide,

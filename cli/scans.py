@@ -167,14 +167,15 @@ def open_calibration(path: Path | None, settings: RigSettings) -> Calibration | 
 
 @contextmanager
 def kept(recorder: StreamRecorder | None) -> Iterator[None]:
-    """Say of a recording that was cut short what was kept of it, with exit code 1."""
+    """Report which frames of a recording that was cut short were kept, and where; the exit code is 1."""
     from mirrorskin.hw.errors import HardwareError
     from mirrorskin.io import InputError
+    from mirrorskin.io.layout import COMPLETE
 
     try:
         yield
     except (HardwareError, InputError) as error:
-        if recorder is None or not recorder.count:
+        if recorder is None or not recorder.count or recorder.state == COMPLETE:
             raise
         raise HardwareError(f"{error}; {_remains(recorder)}") from error
     except (KeyboardInterrupt, SystemExit):
@@ -186,7 +187,8 @@ def kept(recorder: StreamRecorder | None) -> Iterator[None]:
 def _remains(recorder: StreamRecorder) -> str:
     if not recorder.written:
         return f"of {recorder.path} nothing was written"
-    return f"{recorder.path} was cut short and holds {recorder.written} frames"
+    older = "" if recorder.file == recorder.path else f"; the older {recorder.path} is unchanged"
+    return f"{recorder.file} was cut short and holds {recorder.written} frames{older}"
 
 
 def _vertical(words: Mapping[str, Any]) -> VerticalPlan:

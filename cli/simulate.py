@@ -172,6 +172,7 @@ def command(
     ] = ReferenceName.ball,
     seed: Annotated[int, Option(help="The same seed, the same recording.")] = 0,
     compression: options.Compression = options.CompressionName.raw,
+    overwrite: options.Overwrite = False,
     device: options.Device = None,
 ) -> None:
     """Record what the twin sees, with the truth."""
@@ -182,8 +183,9 @@ def command(
     from mirrorskin.cli.quantity import angle, duration, frame_size, length, lengths, vector
     from mirrorskin.hw.twin import Body, Camera
 
-    for source in map(Path, (thing, pattern)):
-        io.check_output(output, source if source.suffix else None)  # a name is no file to keep
+    # A name without a suffix is that of a shape, and not of a file to keep.
+    files = [source for source in map(Path, (thing, pattern)) if source.suffix]
+    io.check_output(output, *files, replaces="anything" if overwrite else "nothing")
     given = {name: context.params[name.replace("-", "_")] for own in DEFAULTS.values() for name in own}
     columns, rows = frame_size(size, "--size")
     along = vector(object_shift, 2, "--object-shift")
@@ -224,7 +226,9 @@ def command(
     )
     count = twin.shape[0]
     with (
-        io.Recorder(twin, output, compression.value, truth=lambda: twin.truth) as recorder,
+        io.Recorder(
+            twin, output, compression.value, truth=lambda: twin.truth, overwrite=overwrite
+        ) as recorder,
         progress("simulating", count) as show,
     ):
         recorder.drain(show)

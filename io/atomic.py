@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import functools
 import os
@@ -17,6 +18,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io.existing import Replaces, check_replaced
 from mirrorskin.io.os_errors import as_input_error, legible
 from mirrorskin.io.types import Closing, InputError, ProcessValue
 from mirrorskin.io.url import ZARR_SUFFIX, is_zarr
@@ -29,6 +31,8 @@ _PREFIX, _SUFFIX = ".mirrorskin-", ".part"
 # Files for HDF5 1.10 and later: the first whose own structures have checksums, and that could read what is
 # being written.
 VERSIONS = ("v110", "v110")
+
+_NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)  # of a file system
 
 _LARGE = 4096  # bytes of a dataset that is not kept in memory with a file's structure
 _MOST_LAYOUTS = 16  # that are remembered
@@ -44,7 +48,9 @@ _WITH_GROUPS.set_char_encoding(h5py.h5t.CSET_UTF8)
 _ALIGNED = {"alignment_threshold": 1 << 20, "alignment_interval": 4096}
 
 
-def check_output(path: Path, *keep: Path | None, or_zarr: bool = False) -> None:
+def check_output(
+    path: Path, *keep: Path | None, or_zarr: bool = False, replaces: Replaces = "derived"
+) -> None:
     """Refuse an output that could not be written, before any work is done for it.
 
     Parameters
@@ -55,12 +61,15 @@ def check_output(path: Path, *keep: Path | None, or_zarr: bool = False) -> None:
         Inputs, files or folders of files, which must not be overwritten.
     or_zarr : bool
         Whether it may be a Zarr store, too, which must be a new one.
+    replaces : {"nothing", "derived", "calibration", "anything"}
+        Which existing file may be replaced. By default one that can be computed again: not a recording, a
+        calibration, or an HDF5 or MCAP file of another program.
 
     Raises
     ------
     InputError
-        Its folder does not exist or cannot be written to, it is a folder itself, it is the input, or an HDF5
-        file that is being written.
+        Its folder does not exist or cannot be written to, it is a folder itself, it is the input, a file that
+        is being written, or one that may not be replaced.
 
     Examples
     --------
@@ -84,10 +93,16 @@ def check_output(path: Path, *keep: Path | None, or_zarr: bool = False) -> None:
             inputs = [one for one in keep if one is not None and one.exists()]
             if any(path.samefile(one) or path.parent.samefile(one) for one in inputs):
                 raise InputError(f"{path} is the input, or part of it: name another output with -o")
-            if is_locked(path) and not _readable(path):
-                raise InputError(f"{path} is being written by another program: name another output with -o")
+            _check_existing(path, replaces)
         with tempfile.TemporaryFile(dir=path.parent):
             pass
+
+
+def _check_existing(path: Path, replaces: Replaces) -> None:
+    """Raise InputError if a file is being written, or may not be replaced."""
+    if is_locked(path) and not _readable(path):
+        raise InputError(f"{path} is being written by another program: name another output with -o")
+    check_replaced(path, replaces)
 
 
 def is_locked(path: Path) -> bool:
@@ -122,38 +137,80 @@ class NewHdf5(Closing):
 
 
 @contextmanager
-def new_file(path: Path) -> Iterator[int]:
-    """Make a file under a temporary name beside ``path``, and rename it when all went well.
+def new_file(path: Path, replaces: Replaces = "derived") -> Iterator[int]:
+    """Make a file under a temporary name next to ``path``, and rename it when all went well.
 
-    It is on the disk before it has its name. What killed programs left half-written in that folder is
-    removed, once per process. Where ``path`` is a link, what the link leads to is replaced.
+    It is on the disk before it has its name. Files that killed programs left half-written in that folder are
+    removed, once per process. If ``path`` is a link, its target is replaced. Whether an existing file may be
+    replaced is checked at the start, and again just before that.
     """
-    check_output(path)
-    target = Path(os.path.realpath(path))
-    _tidy(target.parent)
+    check_output(path, replaces=replaces)
+    with new_part(path) as (part, descriptor):
+        yield descriptor
+        with as_input_error(f"{path} could not be written", MAKE_ROOM):
+            complete_part(part, descriptor)
+            _rename(part, path, replaces)
+
+
+@contextmanager
+def new_part(path: Path) -> Iterator[tuple[Path, int]]:
+    """Make a locked file in the folder of ``path``, under a temporary name that is removed at the end."""
+    folder = Path(os.path.realpath(path)).parent
+    _tidy(folder)
     # Its name is known before there is a file: whenever the program is ended, it is removed.
-    part, descriptor = target.parent / f"{_PREFIX}{secrets.token_hex(8)}{_SUFFIX}", -1
+    part, descriptor = folder / f"{_PREFIX}{secrets.token_hex(8)}{_SUFFIX}", -1
     try:
         with as_input_error(f"{path} could not be written"):
             descriptor = _make(part)
-        yield descriptor
-        with as_input_error(f"{path} could not be written", MAKE_ROOM):
-            os.fsync(descriptor)
-            os.close(os.dup(descriptor))  # some disks tell only then that they did not take all
-            mask = os.umask(0)
-            os.umask(mask)
-            part.chmod(0o666 & ~mask)
-            part.replace(target)
+        yield part, descriptor
     finally:
         part.unlink(missing_ok=True)
         with suppress(OSError):
             os.close(descriptor)  # it was locked until it had its name
 
 
+def complete_part(part: Path, descriptor: int) -> None:
+    """Put a file on the disk, and let others read it as the process's mask says."""
+    os.fsync(descriptor)
+    os.close(os.dup(descriptor))  # some disks report only then that they did not take all
+    mask = os.umask(0)
+    os.umask(mask)
+    part.chmod(0o666 & ~mask)
+
+
+def link_new(part: Path, target: Path) -> None:
+    """Give a file a further name; FileExistsError if that is taken, even by a program that is as quick."""
+    try:
+        os.link(part, target)
+    except FileExistsError:
+        raise
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        if os.path.lexists(target):
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(target)) from None
+        part.rename(target)
+
+
+def _rename(part: Path, path: Path, replaces: Replaces) -> None:
+    """Give a file its name; refuse again to replace a file, since it may be new."""
+    target = Path(os.path.realpath(path))
+    if replaces == "nothing":
+        try:
+            link_new(part, target)
+        except FileExistsError:
+            _check_existing(path, replaces)
+            raise
+        return
+    if target.exists():
+        _check_existing(path, replaces)
+    part.replace(target)
+
+
 @contextmanager
-def new_hdf5(path: Path) -> Iterator[NewHdf5]:
+def new_hdf5(path: Path, replaces: Replaces = "derived") -> Iterator[NewHdf5]:
     """Write an HDF5 file as ``new_file`` does."""
-    with new_file(path) as descriptor, NewHdf5(path, descriptor) as new:
+    with new_file(path, replaces) as descriptor, NewHdf5(path, descriptor) as new:
         yield new
 
 
@@ -217,10 +274,10 @@ class _Disk(FileIO):
         return size or 0
 
 
-def write_new(path: Path, parts: Sequence[bytes]) -> None:
+def write_new(path: Path, parts: Sequence[bytes], replaces: Replaces = "derived") -> None:
     """Write the parts of a file, which exists whole or not at all."""
     with (
-        new_file(path) as descriptor,
+        new_file(path, replaces) as descriptor,
         as_input_error(f"{path} could not be written", MAKE_ROOM),
         os.fdopen(descriptor, "wb", closefd=False) as file,
     ):
@@ -260,7 +317,7 @@ def write_item(root: h5py.Group, item: Item) -> int | None:
     return place
 
 
-def write_file(path: Path, items: Iterable[Item]) -> None:
+def write_file(path: Path, items: Iterable[Item], replaces: Replaces = "derived") -> None:
     """Write a file of these items, which exists whole or not at all.
 
     HDF5 says once where things lie in a file of certain names, shapes, types and attributes. The next file
@@ -274,7 +331,8 @@ def write_file(path: Path, items: Iterable[Item]) -> None:
     ]
     likeness = repr([(item.name, kind, item.attributes) for item, kind in zip(items, kinds, strict=True)])
     layout = _layouts.get(likeness)
-    with new_file(path) as descriptor, as_input_error(f"{path} could not be written", MAKE_ROOM, OSError):
+    writing = as_input_error(f"{path} could not be written", MAKE_ROOM, OSError)
+    with new_file(path, replaces) as descriptor, writing:
         if layout is not None:
             layout.write(descriptor, arrays)
             return

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from mcap_ros2.writer import Writer
 
 IMAGES = "/camera/image"
+_SURFACE = "/surface"
+_OF_RESULTS = {_SURFACE, "/height", "/force"}
 _METRE = 1e-3  # m a mm
 _SECOND = 1_000_000_000  # nanoseconds
 _FRAME = "sensor"  # to which coordinates belong: x right and y up in the picture, z towards the sensor
@@ -167,7 +169,7 @@ def _put_result(file: _File, result: Result, path: str | Path) -> str:
     ]
     cloud = {"height": 1, "width": len(points), "fields": fields, "is_bigendian": False, "is_dense": False}
     size = {"point_step": 4 * len(table), "row_step": points.nbytes, "data": points.tobytes()}
-    file.put("/surface", _CLOUD, cloud | size, stamp)
+    file.put(_SURFACE, _CLOUD, cloud | size, stamp)
     file.put("/height", _IMAGE, _picture(result.height * np.float32(_METRE)), stamp)
     if result.force is not None:
         along = {"x": result.force_x or 0.0, "y": result.force_y or 0.0, "z": result.force}
@@ -213,6 +215,19 @@ def _put_frames(file: _File, block: Block, stamps: list[int]) -> None:
 def _put_numbers(file: _File, name: str, values: Floats, stamps: list[int]) -> None:
     for value, stamp in zip(values, stamps, strict=True):
         file.put(f"/{name}", _NUMBER, {"data": float(value) * _SERIES[name]}, stamp)
+
+
+def is_surface(path: Path) -> bool:
+    """Return whether an MCAP file holds an exported result and nothing else, so no frames of a camera."""
+    try:
+        from mcap.reader import make_reader
+
+        with path.open("rb") as file:
+            summary = make_reader(file).get_summary()
+    except Exception:  # the packages are missing, or damaged bytes lead them to anything
+        return False
+    topics = {channel.topic for channel in summary.channels.values()} if summary is not None else set()
+    return _SURFACE in topics and topics <= _OF_RESULTS
 
 
 class GrowingMessages(Closing):

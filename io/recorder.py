@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mirrorskin.io.atomic import fixed_text, new_hdf5
 from mirrorskin.io.calibration.file import CARRIED, write_calibration
 from mirrorskin.io.calibration.types import Calibration
+from mirrorskin.io.existing import Replaces
 from mirrorskin.io.layout import CHECKSUM, MARK, POSITIONS, SERIES, STACK, TRUTH, TRUTH_UNITS
 from mirrorskin.io.types import Block, Floats, Header, InputError, Motion, Source, Truth
 
@@ -123,7 +124,12 @@ class TeeSource(Generic[_Source]):
     rewindable = False
 
     def __init__(
-        self, source: _Source, path: str | Path, compression: Compression, calibration: Calibration | None
+        self,
+        source: _Source,
+        path: str | Path,
+        compression: Compression,
+        calibration: Calibration | None,
+        overwrite: bool,
     ) -> None:
         check_compression(compression)
         self.source = source
@@ -131,6 +137,7 @@ class TeeSource(Generic[_Source]):
         self.name, self.motion = source.name, source.motion
         self._compression: Compression = compression
         self._calibration = calibration
+        self._replaces: Replaces = "anything" if overwrite else "nothing"
         self._exit = ExitStack()  # what is to be done when it is left
 
     def __exit__(
@@ -162,6 +169,8 @@ class Recorder(TeeSource[Source]):
         What a simulation knows; a callable is called after the last frame.
     calibration : Calibration, optional
         What the recording is to carry a copy of; positions and references stay those of the source.
+    overwrite : bool, optional
+        Whether an existing file of that name is replaced; by default it is refused.
 
     Attributes
     ----------
@@ -185,8 +194,9 @@ class Recorder(TeeSource[Source]):
         compression: Compression = "raw",
         truth: Truth | Callable[[], Truth] | None = None,
         calibration: Calibration | None = None,
+        overwrite: bool = False,
     ) -> None:
-        super().__init__(source, path, compression, calibration)
+        super().__init__(source, path, compression, calibration, overwrite)
         self.header, self.shape, self.dtype = source.header, source.shape, source.dtype
         self._truth = truth
         self._count = 0
@@ -195,7 +205,7 @@ class Recorder(TeeSource[Source]):
 
     def __enter__(self) -> Self:
         with ExitStack() as opening:
-            self._new = opening.enter_context(new_hdf5(self.path))
+            self._new = opening.enter_context(new_hdf5(self.path, self._replaces))
             opening.push(self._finish)
             opening.enter_context(self.source)
             write_header(self._new.root, self.header, self._calibration)

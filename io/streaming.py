@@ -21,7 +21,14 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.atomic import MAKE_ROOM, VERSIONS, check_output, new_file
+from mirrorskin.io.atomic import (
+    MAKE_ROOM,
+    VERSIONS,
+    check_output,
+    complete_part,
+    link_new,
+    new_part,
+)
 from mirrorskin.io.calibration.file import size_of
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.frames import MCAP_SUFFIX
@@ -80,7 +87,7 @@ class _Maps(NamedTuple):
 
 
 class _End(NamedTuple):
-    """What is known after the last frame."""
+    """What is stored after the last frame."""
 
     positions: Mapping[str, Floats]
     state: str
@@ -89,12 +96,14 @@ class _End(NamedTuple):
 class StreamRecorder(TeeSource[LiveSource]):
     """Pass on the frames of a live source at once, and write them to a recording behind its back.
 
-    The recording appears under its name with the first frame, and an older file of that name is replaced
-    then, not before. From then on other programs can watch (HDF5's SWMR): everything is handed to the
-    system each ``period``, and that is what remains if this process is killed. Left by an exception, it
-    keeps what was taken, and says in ``/entry/state`` that it was cut short, and why. When it is left, the
-    source is left first, so that hardware stops; then the positions are replaced by the source's corrected
-    ones, and those that came with the frames stay beside them.
+    The recording appears with the first frame, as ``file``: that is ``path`` if no file has this name. If an
+    older file has it and ``overwrite`` was given, the recording gets a name of its own next to it
+    (``press-partial.h5``), and replaces the older file at the end, if it is complete. From the first frame on
+    other programs can watch (HDF5's SWMR): everything is handed to the system each ``period``, and that is
+    what remains if this process is killed. After an exception the frames so far are kept, and
+    ``/entry/state`` states that the recording was cut short, and why. At the end the source is closed first,
+    so that hardware stops; then the positions are replaced by the source's corrected ones, and those that
+    came with the frames are kept, too.
 
     Parameters
     ----------
@@ -108,11 +117,17 @@ class StreamRecorder(TeeSource[LiveSource]):
         Seconds.
     calibration : Calibration, optional
         What the recording is to carry a copy of; positions and references stay those of the source.
+    overwrite : bool, optional
+        Whether an existing file of that name is replaced; by default it is refused.
 
     Attributes
     ----------
     name, header, shape, dtype, motion, rewindable
         The source's; what was recorded cannot be read again.
+    path, file : Path
+        The name that was asked for, and that under which the recording is, once the first frame is written.
+    state : str
+        "under way", "complete", or "cut short: " and why.
     count, written : int
         Frames that were taken, and those of them that are in the file.
 
@@ -133,8 +148,12 @@ class StreamRecorder(TeeSource[LiveSource]):
         compression: Compression = "raw",
         period: float = 0.5,
         calibration: Calibration | None = None,
+        overwrite: bool = False,
     ) -> None:
-        super().__init__(source, path, compression, calibration)
+        super().__init__(source, path, compression, calibration, overwrite)
+        self.file: Path = self.path
+        self.state: str = UNDER_WAY
+        self._older: _Identity | None = None  # which file has the name at the start
         self.count = self.written = 0
         self._period = period
         self._messages = self.path.suffix.lower() == MCAP_SUFFIX
@@ -163,7 +182,8 @@ class StreamRecorder(TeeSource[LiveSource]):
         return self.source.dtype
 
     def __enter__(self) -> Self:
-        check_output(self.path)
+        check_output(self.path, replaces=self._replaces)
+        self._older = _identity(self.path)
         with ExitStack() as opening:
             opening.push(self._finish)
             self._writer.start()
@@ -255,6 +275,9 @@ class StreamRecorder(TeeSource[LiveSource]):
                     with file:
                         end = self._follow(file)
                         file.finish(end.positions, end.state)
+                    self.state = end.state
+                    if self.state == COMPLETE:
+                        self._take_name()
         except BaseException as error:  # it is raised where frames are read
             self._error = self._error or error
 
@@ -264,14 +287,50 @@ class StreamRecorder(TeeSource[LiveSource]):
             pass
         if not isinstance(block, Block):
             return None
-        with ExitStack() as opening:
-            with new_file(self.path) as descriptor:
-                file = self._open(descriptor, block)
-                opening.push(file)
-                self._append(file, block)
-                file.publish()
+        with ExitStack() as opening, new_part(self.path) as (part, descriptor):
+            file = self._open(descriptor, block)
+            opening.push(file)
+            self._append(file, block)
+            file.publish()
+            complete_part(part, descriptor)
+            self.file = self._name(part)
             opening.pop_all()  # from here on it is the caller's to close
         return file
+
+    def _name(self, part: Path) -> Path:
+        """Give the recording the first free name: that of ``path``, or one of its own next to it."""
+        target = Path(os.path.realpath(self.path))
+        with suppress(FileExistsError):
+            link_new(part, target)
+            return self.path
+        number = 1
+        while True:
+            ending = "-partial" if number == 1 else f"-partial-{number}"
+            name = target.with_name(f"{target.stem}{ending}{target.suffix}")
+            with suppress(FileExistsError):
+                link_new(part, name)
+                return name
+            number += 1
+
+    def _take_name(self) -> None:
+        """Replace the older file by the complete recording, if it still is the one that may be replaced."""
+        if self.file == self.path:
+            return
+        target = Path(os.path.realpath(self.path))
+        with self.file.open("rb") as file:
+            os.fsync(file.fileno())
+        with suppress(FileExistsError):
+            if self._older is not None and _identity(target) == self._older:
+                self.file.replace(target)
+            else:
+                link_new(self.file, target)
+                self.file.unlink(missing_ok=True)
+            self.file = self.path
+            return
+        raise InputError(
+            f"{self.path} was made by another program meanwhile: the recording is complete, and named"
+            f" {self.file}; rename it"
+        )
 
     def _open(self, descriptor: int, block: Block) -> GrowingRecording | GrowingMessages:
         if self._messages:
@@ -326,6 +385,18 @@ class StreamRecorder(TeeSource[LiveSource]):
 
     def _write_errors(self) -> AbstractContextManager[None]:
         return as_input_error(f"{self.path} could not be written", MAKE_ROOM)
+
+
+_Identity = tuple[int, int]
+
+
+def _identity(path: Path) -> _Identity | None:
+    """Return what distinguishes a file from another one of the same name; None if there is no file."""
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return None
+    return found.st_dev, found.st_ino
 
 
 def _cut_short(error: BaseException) -> str:

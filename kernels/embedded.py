@@ -9,11 +9,11 @@ import atexit
 import ctypes
 import functools
 import hashlib
-import importlib.metadata
 import importlib.util
 import logging
 import mmap
 import os
+import resource
 import shlex
 import shutil
 import subprocess
@@ -44,17 +44,27 @@ _patched = False
 
 
 def prepare() -> None:
-    """Let PoCL's compiler know this processor; call it before the first look at OpenCL's platforms."""
+    """Prepare what PoCL needs; call it before the first look at OpenCL's platforms.
+
+    PoCL gets folders for its caches, and its compiler the name of this processor.
+
+    Raises
+    ------
+    DeviceError
+        PoCL would end the process for lack of address space.
+    """
     global _processor, _patched
     with _lock:
         library = find_library() if _processor is None else None
         if library is None:
             return
+        _check_address_space()
+        _provide_caches()
         try:
             _processor, _patched = _ensure_name(library)
-        except (OSError, importlib.metadata.PackageNotFoundError) as error:
-            _processor = "generic"
-            _log.warning("PoCL's compiler does not know this processor, and was not patched: %s", error)
+        except OSError as error:
+            _processor = "unknown"
+            _log.info("PoCL is used as it is, and may not know this processor: %s", error)
 
 
 def note(driver: str) -> str:
@@ -124,11 +134,13 @@ def find_library() -> Path | None:
 # --- The processor's name ------------------------------------------------------------------------------
 #
 # The wheel of PoCL 3.0 holds LLVM 14. A processor younger than that is "generic" to it, a name that its own
-# compiler then refuses, and no option overrides it.
+# compiler then refuses, and no option overrides it. Only the very function of that wheel is called and
+# patched: in another library the same name may stand for anything. Any other PoCL is used as it is.
 
-_PATCHABLE = "3.0"  # version of the wheel whose function was looked at
+_PATCHABLE = "3.0"  # version of the wheel whose function was examined
 _NAME_FUNCTION = "pocl_get_llvm_cpu_name"
 _NAME_FUNCTION_SIZE = 83  # bytes, in that wheel
+_NAME_FUNCTION_SHA256 = "fd587da3800019b6c70376351f2227b8fea5f15daff803329977ee54951655b6"  # of its code
 
 # PoCL's builds of its own library, by the processor they are for. Each needs what the ones before it need
 # and what stands beside it: the instructions that a compiler uses unasked, in the words of /proc/cpuinfo.
@@ -145,21 +157,28 @@ _LEVELS = (
 def _ensure_name(library: Path) -> tuple[str, bool]:
     """Make PoCL compile for a processor that its LLVM knows; return its name, and whether it was patched.
 
-    Raises OSError where the library is another one than expected, or the system forbids changing code.
+    Raises OSError if the library is not the expected one, or the system forbids changing code.
     """
-    ask = getattr(ctypes.CDLL(str(library)), _NAME_FUNCTION)
+    try:
+        ask = getattr(ctypes.CDLL(str(library)), _NAME_FUNCTION)
+    except AttributeError:
+        raise OSError(f"{library} has no function {_NAME_FUNCTION}") from None
+    start = _address(ask)
+    if _look_up(start)[1] != _NAME_FUNCTION_SIZE or _digest(start) != _NAME_FUNCTION_SHA256:
+        raise OSError(f"{_NAME_FUNCTION} in {library} is not that of PoCL {_PATCHABLE}")
     ask.restype = ctypes.c_void_p
     known = _take_string(ask())
     if known != "generic":
         return known, False
-    version = importlib.metadata.version("pocl-binary-distribution")
-    size = _look_up(_address(ask))[1]
-    if (version, size) != (_PATCHABLE, _NAME_FUNCTION_SIZE):
-        raise OSError(f"{_NAME_FUNCTION} of version {version} has {size} bytes, which is unknown")
     name = choose_name(_read_flags())
-    _answer_with(_address(ask), name)
+    _answer_with(start, name)
     _log.info("PoCL does not know this processor; it compiles for %s", name)
     return name, True
+
+
+def _digest(start: int) -> str:
+    """Return the SHA-256 of the code of the function that names the processor."""
+    return hashlib.sha256(ctypes.string_at(start, _NAME_FUNCTION_SIZE)).hexdigest()
 
 
 def choose_name(flags: Set[str]) -> str:
@@ -337,6 +356,8 @@ def _probe(platform: cl.Platform) -> str | None:
             )
         except subprocess.TimeoutExpired:
             return f"PoCL did not finish a small kernel within {_TIMEOUT} s; choose another device"
+        except OSError as error:
+            return f"PoCL cannot be tried, since {sys.executable} does not start ({error.strerror})"
     if child.returncode == 0 and child.stdout.decode().startswith(_RAN):
         return None
     return _explain(child.returncode, child.stderr.decode(errors="replace"))
@@ -384,10 +405,44 @@ def _why_no_cache() -> str | None:
     return None
 
 
+def _provide_caches() -> None:
+    """Let PoCL and pyopencl write to a temporary folder if they cannot write to their own."""
+    problem = _why_no_cache()
+    if problem is None:
+        return
+    try:
+        folder = tempfile.mkdtemp(prefix="mirrorskin-cache-")
+    except OSError:
+        return  # there is no device then, and the message names the problem
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    os.environ.update(XDG_CACHE_HOME=folder, POCL_CACHE_DIR=str(Path(folder, "pocl")))
+    _log.warning("%s; until then kernels are compiled again by every command", problem)
+
+
+# --- The address space -----------------------------------------------------------------------------------
+#
+# PoCL aborts, and LLVM in it crashes, where a limit to the address space ('ulimit -v') refuses a thread or
+# memory. Measured with PoCL 3.0 on two cores, from before its first call to the end of a command: 0.84 GB.
+
+_PLACE, _PLACE_PER_CORE = 800 << 20, 80 << 20  # bytes; a thread has a stack (8 MB) and a heap (64 MB)
+
+
+def _check_address_space() -> None:
+    """Raise DeviceError if a limit to the address space is too low for PoCL."""
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit == resource.RLIM_INFINITY:
+        return
+    used = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * mmap.PAGESIZE
+    needed = used + _PLACE + _PLACE_PER_CORE * (os.cpu_count() or 1)
+    if limit < needed:
+        raise DeviceError(
+            f"the address space is limited to {limit >> 20} MB, and PoCL needs {needed >> 20} MB:"
+            " raise or remove the limit (ulimit -v)"
+        )
+
+
 def _run_probe(number: int) -> None:
     """Run one kernel on each device of a platform: what the child process does."""
-    import resource
-
     resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
     prepare()
     for device in cl.get_platforms()[number].get_devices():

@@ -37,6 +37,7 @@ def command(
     places: inputs.Places = 1,
     press: Annotated[str | None, inputs.press_option(_PRESS)] = None,
     settle: inputs.Settle = None,
+    overwrite: inputs.Overwrite = False,
     device: options.Device = None,
     as_json: options.Json = False,
 ) -> None:
@@ -50,7 +51,7 @@ def command(
     radius, thickness = length(ball, "--ball") / 2, length(sheet, "--sheet")
     if thickness < 0:
         raise io.InputError(f"--sheet {sheet} cannot be: give a thickness of 0 or more")
-    known = inputs.check_call(output, paths, rig, press=press, settle=settle)
+    known = inputs.check_call(output, paths, rig, press=press, settle=settle, overwrite=overwrite)
     if rig is not None:
         from mirrorskin.hw.rig.plans import VerticalPlan
 
@@ -60,7 +61,8 @@ def command(
             step=length(travel_step or _STEP, "--travel-step"),
         )
         prompt = "put the ball at place {} of {}, near the middle of the field"
-        paths = inputs.take(rig, output, inputs.at_each("elastic", prompt, places, plan), settle)
+        balls = inputs.at_each("elastic", prompt, places, plan)
+        paths = inputs.take(rig, output, balls, settle, overwrite)
         travel_step = travel_start = None
     given = stack_options(travel_step=travel_step, travel_start=travel_start, pixel_size=pixel_size)
     with inputs.open_all(paths, given, known, output) as (sources, camera):

@@ -29,6 +29,9 @@ OptionalRig = Annotated[
     Path | None,
     Option("--rig", metavar="RIG.toml", help="Capture the recordings first, with this rig."),
 ]
+Overwrite = Annotated[
+    bool, Option("--overwrite", help="With --rig: replace existing recordings of these names.")
+]
 Settle = scans.Settle
 Places = Annotated[int, Option(min=1, help="With --rig: of the ball.")]
 
@@ -43,7 +46,7 @@ def check_call(
     presses: Sequence[Path],
     rig: Path | None,
     plates: Sequence[Path] = (),
-    **options: str | None,
+    **options: str | bool | None,
 ) -> Calibration | None:
     """Check where recordings come from and where the calibration goes; return the one that is added to.
 
@@ -56,9 +59,9 @@ def check_call(
     if rig is not None and presses:
         raise io.InputError("recordings and --rig both give the presses: leave one of them out")
     for name, value in options.items():
-        if rig is None and value is not None:
-            raise io.InputError(f"--{name} says how a rig is to press: give --rig, too, or leave it out")
-    io.check_output(output, *presses, *plates, rig)
+        if rig is None and value not in (None, False):
+            raise io.InputError(f"--{name} applies to presses on a rig: add --rig, or remove it")
+    io.check_output(output, *presses, *plates, rig, replaces="calibration")
     return io.open_calibration(output) if output.exists() else None
 
 
@@ -139,8 +142,14 @@ class Place(NamedTuple):
     frames: int = 1  # at each step of a plan in steps
 
 
-def take(rig_file: Path, calibration: Path, places: Sequence[Place], settle: str | None = None) -> list[Path]:
-    """Take recordings, and keep them beside the calibration file: CAL-dark.h5 of CAL.h5 and a place "dark".
+def take(
+    rig_file: Path,
+    calibration: Path,
+    places: Sequence[Place],
+    settle: str | None = None,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Take recordings, and keep them next to the calibration: CAL-dark.h5 for CAL.h5 and a place "dark".
 
     The body is lifted, then the user is asked to make each place ready and to press Enter. Plans and files
     are checked before anything moves.
@@ -154,10 +163,10 @@ def take(rig_file: Path, calibration: Path, places: Sequence[Place], settle: str
     paths = [calibration.with_name(f"{calibration.stem}-{place.name}.h5") for place in places]
     for place, path in zip(places, paths, strict=True):
         check_plan(place.plan, settings.stage, settings.name)
-        io.check_output(path, rig_file)
+        io.check_output(path, rig_file, replaces="anything" if overwrite else "nothing")
     with open_rig(settings) as rig:
         for place, path in zip(places, paths, strict=True):
-            _take_one(rig, place, path, settle)
+            _take_one(rig, place, path, settle, overwrite)
     return paths
 
 
@@ -193,7 +202,7 @@ def still_plan(rig_file: Path, travel: float | None = None) -> VerticalPlan:
     return VerticalPlan(start, start + _STILL, step=_STILL)
 
 
-def _take_one(rig: Rig, place: Place, path: Path, settle: str | None) -> None:
+def _take_one(rig: Rig, place: Place, path: Path, settle: str | None, overwrite: bool) -> None:
     import numpy as np
 
     from mirrorskin import io
@@ -205,7 +214,7 @@ def _take_one(rig: Rig, place: Place, path: Path, settle: str | None) -> None:
     click.echo(f"{place.prompt}, then press Enter", err=True)
     if not sys.stdin.readline():  # nobody is there
         raise click.Abort
-    recorder = io.StreamRecorder(scan, path)
+    recorder = io.StreamRecorder(scan, path, overwrite=overwrite)
     with scans.kept(recorder), recorder, progress(place.name, recorder.shape[0]) as show:
         room = np.empty((_BLOCK, *recorder.shape[1:]), recorder.dtype)
         while recorder.read(room) is not None:

@@ -55,18 +55,19 @@ def command(
         str | None,
         Option(metavar="LENGTH", help="With --rig and --rolled: how far the body is lowered: 2mm."),
     ] = None,
+    overwrite: inputs.Overwrite = False,
     as_json: options.Json = False,
 ) -> None:
     """Average dark and bright references to a stated noise, and find hot, dead and saturated pixels."""
     from mirrorskin import io
 
     darks, brights = list(dark or []), list(bright or [])
-    _check_call(darks, brights, noise, rig, rolled, press)
-    io.check_output(output, *darks, *brights, rig)
+    _check_call(darks, brights, noise, rig, rolled, press, overwrite)
+    io.check_output(output, *darks, *brights, rig, replaces="calibration")
     if rig is not None:
-        darks = darks or inputs.take(rig, output, [_still("dark", rig, frames)])
+        darks = darks or inputs.take(rig, output, [_still("dark", rig, frames)], overwrite=overwrite)
         balls = _balls(rig, places, frames, press) if rolled else [_still("bright", rig, frames)]
-        brights = brights or inputs.take(rig, output, balls)
+        brights = brights or inputs.take(rig, output, balls, overwrite=overwrite)
     measured, camera = _measure(darks, brights, rolled)
     for number in range(2, _ROUNDS + 1):
         missing = _missing(measured, noise, rig is None or rolled)
@@ -74,7 +75,8 @@ def command(
             break
         more = {name: _still(name, rig, count, number) for name, count in missing.items()}
         for name, place in more.items():
-            (darks if name == "dark" else brights).extend(inputs.take(rig, output, [place]))
+            paths = inputs.take(rig, output, [place], overwrite=overwrite)
+            (darks if name == "dark" else brights).extend(paths)
         measured, camera = _measure(darks, brights, rolled)
     _missing(measured, noise, True)
     process = inputs.process_of(bright_light="of a ball rolled about" if rolled else "of a flat field")
@@ -92,6 +94,7 @@ def _check_call(
     rig: Path | None,
     rolled: bool,
     press: str | None,
+    overwrite: bool,
 ) -> None:
     from mirrorskin.io import InputError
 
@@ -102,6 +105,8 @@ def _check_call(
         )
     if noise is not None and not noise > 0:
         raise InputError(f"--noise {noise:g}: no number of frames is enough for that: give some counts")
+    if overwrite and rig is None:
+        raise InputError("--overwrite is for recordings taken with --rig: remove it")
     if press is not None and (rig is None or not rolled):
         raise InputError("--press says how far a ball is pressed on a rig: give --rig and --rolled, too")
     if rig is not None and rolled and not brights and press is None:

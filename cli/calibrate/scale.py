@@ -87,6 +87,7 @@ def command(
     ] = None,
     rig: inputs.OptionalRig = None,
     places: Annotated[int, Option(min=1, help="With --rig: of the board.")] = _PLACES,
+    overwrite: inputs.Overwrite = False,
     as_json: options.Json = False,
 ) -> None:
     """Find millimetres per pixel, perspective and distortion from a board on the sheet.
@@ -101,14 +102,17 @@ def command(
     kind, paths = board_of(board), list(pictures or [])
     if not paths and rig is None:
         raise io.InputError("no picture of a board is given: name some, or take them with --rig RIG.toml")
-    io.check_output(output, *paths, rig)
+    if overwrite and rig is None:
+        raise io.InputError("--overwrite is for recordings taken with --rig: remove it")
+    io.check_output(output, *paths, rig, replaces="calibration")
     if rig is not None:
         prompt = (
             "lay the board flat on the sheet, place {} of {}, turned and moved from the others, up to the"
             " corners"
         )
         plan = inputs.still_plan(rig)
-        paths += inputs.take(rig, output, inputs.at_each("board", prompt, places, plan, _SHOTS))
+        boards = inputs.at_each("board", prompt, places, plan, _SHOTS)
+        paths += inputs.take(rig, output, boards, overwrite=overwrite)
     read, camera = _read(paths, output)
     fit = calibrate_lens(read, kind)
     process = inputs.process_of(

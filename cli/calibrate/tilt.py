@@ -50,6 +50,7 @@ def command(
         str | None, Option(metavar="ANGLE", help=f"With --rig: nominal half-angle, else {inputs.TILT}.")
     ] = None,
     settle: inputs.Settle = None,
+    overwrite: inputs.Overwrite = False,
     as_json: options.Json = False,
 ) -> None:
     """Find half-angle, phase offset, direction, ellipticity and pivot of the rotation, with their errors."""
@@ -62,11 +63,14 @@ def command(
 
     paths, flats, wedges = list(balls or []), list(flat or []), list(wedge or [])
     radius = length(ball, "--ball") / 2
-    known = inputs.check_call(output, paths, rig, [*flats, *wedges], press=press, tilt=tilt, settle=settle)
+    known = inputs.check_call(
+        output, paths, rig, [*flats, *wedges], press=press, tilt=tilt, settle=settle, overwrite=overwrite
+    )
     given = stack_options(phase_step=phase_step, phases=phases, pixel_size=pixel_size)
     if rig is not None:
         plan = inputs.turn_plan(press, tilt, phase_step, "0.5mm")
-        paths = inputs.take(rig, output, inputs.at_each("tilt", inputs.BALL, places, plan), settle)
+        turns = inputs.at_each("tilt", inputs.BALL, places, plan)
+        paths = inputs.take(rig, output, turns, settle, overwrite)
         given = {}
     with inputs.open_all([*paths, *flats, *wedges], given, known, output) as (sources, camera):
         light = _brightness(sources[0], known, zenith_gain, zenith_offset)

@@ -52,6 +52,7 @@ def command(
     places: Annotated[int, Option(min=5, help="With --rig: of the ball.")] = 9,
     press: Annotated[str | None, inputs.press_option("0.4mm for 4 mm")] = None,
     settle: inputs.Settle = None,
+    overwrite: inputs.Overwrite = False,
     as_json: options.Json = False,
 ) -> None:
     """Learn what brightness means at each place, from a ball of known size pressed all over the field."""
@@ -64,11 +65,11 @@ def command(
     paths = list(presses or [])
     radius = length(ball, "--ball") / 2
     body = length(body_radius, "--body-radius"), length(body_height, "--body-height")
-    known = inputs.check_call(output, paths, rig, press=press, settle=settle)
+    known = inputs.check_call(output, paths, rig, press=press, settle=settle, overwrite=overwrite)
     if rig is not None:
         plan = inputs.turn_plan(press, tilt, phase_step, "0.4mm for 4 mm")
         balls = inputs.at_each("zenith", inputs.BALL, places, plan)
-        paths, tilt, phase_step = inputs.take(rig, output, balls, settle), None, None
+        paths, tilt, phase_step = inputs.take(rig, output, balls, settle, overwrite), None, None
     given = stack_options(tilt=tilt, phase_step=phase_step, pixel_size=pixel_size)
     with inputs.open_all(paths, given, known, output) as (sources, camera):
         with progress("fitting", len(sources)) as show:

@@ -18,6 +18,9 @@ def command(
     output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Folder for all files.")] = Path(
         "demo"
     ),
+    overwrite: Annotated[
+        bool, Option("--overwrite", help="Replace recordings of an earlier demo in that folder.")
+    ] = False,
     device: options.Device = None,
     as_json: options.Json = False,
 ) -> None:
@@ -40,10 +43,10 @@ def command(
     pressed, turned = {}, {}
     for press in presses.EXPERIMENTS:
         say(press.title)
-        pressed[press.name] = presses.run(press, output, device)
+        pressed[press.name] = presses.run(press, output, device, overwrite)
     for turn in rotation.EXPERIMENTS:
         say(turn.title)
-        turned[turn.name] = rotation.run(turn, output, device)
+        turned[turn.name] = rotation.run(turn, output, device, overwrite)
     say("a press and a rotation, fused")
     shaped = shapes.run(output, device)
     say("the force of a press")

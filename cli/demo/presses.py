@@ -116,13 +116,13 @@ def lab_camera() -> Camera:
     return Camera(noise=1.0, electrons=40.0, gain_deviation=0.02, offset_deviation=0.5, point_spread=0.5)
 
 
-def record(twin: hw.Twin, path: Path, doing: str) -> io.Truth:
+def record(twin: hw.Twin, path: Path, doing: str, overwrite: bool) -> io.Truth:
     """Record all frames of a twin, with a bar that says what it is doing; return the truth."""
     from mirrorskin import io
     from mirrorskin.cli.output import progress
 
     with (
-        io.Recorder(twin, path, truth=lambda: twin.truth) as recorder,
+        io.Recorder(twin, path, truth=lambda: twin.truth, overwrite=overwrite) as recorder,
         progress(doing, twin.shape[0]) as show,
     ):
         recorder.drain(show)
@@ -135,7 +135,7 @@ def print_outcomes(outcomes: Mapping[str, Outcomes]) -> None:
     click.echo(_LEGEND)
 
 
-def run(experiment: Experiment, folder: Path, device: str | None) -> Outcomes:
+def run(experiment: Experiment, folder: Path, device: str | None, overwrite: bool = False) -> Outcomes:
     """Press on the object with each sensor, and draw what comes out; return outcomes by sensor and method."""
     import numpy as np
 
@@ -144,7 +144,7 @@ def run(experiment: Experiment, folder: Path, device: str | None) -> Outcomes:
     truths, results = {}, {}
     for sensor in experiment.sensors:
         base = folder / f"{experiment.name}-{sensor.contact}-{sensor.optics}"
-        truths[sensor] = _record(experiment, sensor, base.with_suffix(".h5"), device)
+        truths[sensor] = _record(experiment, sensor, base.with_suffix(".h5"), device, overwrite)
         results[sensor] = _reconstruct(base, sensor, device)
     best = {sensor.title: by_method["sub-frame"] for sensor, by_method in results.items()}
     path = (folder / experiment.name).with_suffix(".png")
@@ -163,7 +163,9 @@ def run(experiment: Experiment, folder: Path, device: str | None) -> Outcomes:
     }
 
 
-def _record(experiment: Experiment, sensor: Sensor, path: Path, device: str | None) -> io.Truth:
+def _record(
+    experiment: Experiment, sensor: Sensor, path: Path, device: str | None, overwrite: bool
+) -> io.Truth:
     """Press with a camera as labs have it, and references taken with a ball."""
     from mirrorskin import hw, io
     from mirrorskin.hw.twin import Vertical
@@ -179,7 +181,7 @@ def _record(experiment: Experiment, sensor: Sensor, path: Path, device: str | No
         references="ball",
         device=device,
     )
-    return record(twin, path, f"pressing on the {experiment.thing} ({sensor.title})")
+    return record(twin, path, f"pressing on the {experiment.thing} ({sensor.title})", overwrite)
 
 
 def _reconstruct(base: Path, sensor: Sensor, device: str | None) -> dict[str, io.Result]:

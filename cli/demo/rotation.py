@@ -63,12 +63,12 @@ object, by its true heights."""
 Outcomes = Mapping[str, "Score"]
 
 
-def run(experiment: Experiment, folder: Path, device: str | None) -> Outcomes:
+def run(experiment: Experiment, folder: Path, device: str | None, overwrite: bool = False) -> Outcomes:
     """Turn about the sheet's centre, and draw the normals; return scores by method."""
     from mirrorskin import engine, io, view
 
     base = folder / experiment.name
-    truth = _record(experiment, base.with_suffix(".h5"), device)
+    truth = _record(experiment, base.with_suffix(".h5"), device, overwrite)
     results = {}
     with io.open_recording(base.with_suffix(".h5")) as recording:
         for name, (method, registered) in _WAYS.items():
@@ -81,7 +81,7 @@ def run(experiment: Experiment, folder: Path, device: str | None) -> Outcomes:
     return {name: engine.score(result, truth) for name, result in results.items()}
 
 
-def _record(experiment: Experiment, path: Path, device: str | None) -> io.Truth:
+def _record(experiment: Experiment, path: Path, device: str | None, overwrite: bool) -> io.Truth:
     """Turn with a camera as labs have it, and a wall whose light is linear in the zenith."""
     import math
 
@@ -98,7 +98,7 @@ def _record(experiment: Experiment, path: Path, device: str | None) -> io.Truth:
         camera=lab_camera(),
         device=device,
     )
-    return record(twin, path, f"turning on the {experiment.thing}")
+    return record(twin, path, f"turning on the {experiment.thing}", overwrite)
 
 
 def print_outcomes(outcomes: Mapping[str, Outcomes]) -> None:

@@ -9,6 +9,7 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self, cast
@@ -247,7 +248,9 @@ class EmulatedRig:
         with as_input_error(f"{folder} cannot be written to", "choose another folder with -o"):
             folder.mkdir(parents=True, exist_ok=True)
             self._leaving.callback(_remove, folder, emulator)
-            np.save(picture, self.references()[1])
+            array = BytesIO()
+            np.save(array, self.references()[1])
+            write_new(picture, [array.getvalue()])
             write_new(path, [f"{emulator.heading}{text}\n".encode()])
         return path
 

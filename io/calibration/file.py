@@ -84,7 +84,7 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     'left', 640 x 480, uint8
     """
     root = Item("/", None, {"NX_class": "NXroot", "default": "entry"})
-    write_file(Path(path), [root, *calibration_items(calibration, ENTRY)])
+    write_file(Path(path), [root, *calibration_items(calibration, ENTRY)], replaces="calibration")
 
 
 def update_calibration(

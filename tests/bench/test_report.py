@@ -97,5 +97,5 @@ def test_a_sweep_is_a_table_of_sizes():
 
 
 def test_a_page_that_cannot_be_written_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"page\.md could not be written"):
+    with pytest.raises(InputError, match=r"page\.md: there is no folder"):
         write_page({Path("a.json"): run(case("press", LIMIT, OURS))}, tmp_path / "none" / "page.md")

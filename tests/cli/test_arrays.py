@@ -140,7 +140,7 @@ def test_what_an_array_or_an_archive_holds_is_told():
 def test_an_import_without_the_pixel_size_says_what_needs_it():
     words = ("import", "ball.npy", "--motion", "vertical", *STEPS, "-o", "rec.h5")
     assert "no pixel size" in run(*words).said
-    assert run(*words, *SIZE).said == ""
+    assert run(*words, *SIZE, "--overwrite").said == ""
 
 
 # In Python.

@@ -8,6 +8,7 @@ from commands import run
 from injected_faults import failing
 from mishaps import state_of
 from served_rig import served_rig
+from stacks import record, sphere
 
 from mirrorskin import io
 from mirrorskin.hw.rig import rig as rigs
@@ -154,6 +155,70 @@ def test_a_capture_that_is_cut_short_says_what_it_kept(emulated, tmp_path, monke
         assert recording.shape[0] == int(kept[1])
         assert recording.state.startswith("cut short")
     assert not rig.machine.moving()
+
+
+STEPS = ("--stop", "1mm", "--step", "500um", "--settle", "0s")
+
+
+def fail_at(monkeypatch, count):
+    """Let captures fail when so many frames are there."""
+    read = io.StreamRecorder.read
+
+    def fail(recorder, out=None, /):
+        if recorder.count >= count:
+            raise io.InputError("the camera is lost: plug it in")
+        return read(recorder, None if out is None else out[:1])
+
+    monkeypatch.setattr(io.StreamRecorder, "read", fail)
+
+
+@pytest.fixture
+def older(tmp_path):
+    """A recording that is to stay, and its bytes."""
+    path = record(sphere(), tmp_path / "older.h5")
+    return path, path.read_bytes()
+
+
+def test_a_capture_over_a_recording_is_refused_before_anything_moves(emulated, older, monkeypatch):
+    monkeypatch.setattr(rigs, "open_rig", None)
+    ended = capture(emulated, "vertical", "-o", older[0], *STEPS)
+    assert ended.code == 2
+    assert ended.said == (
+        f"mirrorskin: {older[0]} exists and is a recording: add --overwrite to replace it, or choose another"
+        " name with -o\n"
+    )
+    assert older[0].read_bytes() == older[1]
+
+
+def test_a_capture_that_is_complete_replaces_a_recording_where_that_is_asked_for(emulated, older):
+    ended = capture(emulated, "vertical", "-o", older[0], *STEPS, "--overwrite")
+    assert ended.code == 0, ended.said
+    assert ended.out.startswith(f"{older[0]}: 3 frames")
+    with io.open_recording(older[0]) as recording:
+        assert (recording.shape, recording.state) == ((3, *SHAPE), "complete")
+    assert list(older[0].parent.iterdir()) == [older[0]]
+
+
+def test_a_capture_that_fails_at_its_first_frame_leaves_a_recording(emulated, older, monkeypatch):
+    fail_at(monkeypatch, 0)
+    ended = capture(emulated, "vertical", "-o", older[0], *STEPS, "--overwrite")
+    assert (ended.code, ended.said) == (2, "mirrorskin: the camera is lost: plug it in\n")
+    assert older[0].read_bytes() == older[1]
+    assert list(older[0].parent.iterdir()) == [older[0]]
+
+
+def test_a_capture_that_is_cut_short_leaves_a_recording_and_names_its_own(emulated, older, monkeypatch):
+    fail_at(monkeypatch, 2)
+    ended = capture(emulated, "vertical", "-o", older[0], *STEPS, "--overwrite")
+    own = older[0].with_name("older-partial.h5")
+    assert ended.code == 1
+    assert ended.said == (
+        f"mirrorskin: the camera is lost: plug it in; {own} was cut short and holds 2 frames;"
+        f" the older {older[0]} is unchanged\n"
+    )
+    assert older[0].read_bytes() == older[1]
+    with io.open_recording(own) as recording:
+        assert recording.state == "cut short: the camera is lost: plug it in"
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from growing import Feed, stream
 from injected_faults import failing
 from mcap.reader import make_reader
 from mishaps import state_of
@@ -192,6 +193,36 @@ def test_ctrl_c_stops_the_stage_and_keeps_what_there_is(fake, tmp_path):
     assert 0 < io.open_result(output).process["frames"] == counted(done.output)[1]
     with io.open_recording(record) as recording:
         assert recording.state.startswith("cut short")
+
+
+def test_a_run_that_is_cut_short_leaves_an_older_recording(fake, tmp_path):
+    record = tmp_path / "rec.h5"
+    stream(Feed(3), record)
+    before = record.read_bytes()
+    picture = fake.picture
+
+    def lost(place):
+        if place.travel > 0.5:
+            fake.camera.lose()
+        return picture(place)
+
+    refused = fake.run(*PRESS, "--record", str(record))
+    assert isinstance(refused.exception, io.InputError)
+    assert not hasattr(fake, "stage")
+    fake.picture = lost
+    done = fake.run(*PRESS, "--record", str(record), "--overwrite")
+    assert isinstance(done.exception, HardwareError)
+    assert re.search(
+        r"rec-partial\.h5 was cut short and holds \d+ frames; the older .*rec\.h5 is unchanged$",
+        str(done.exception),
+    )
+    assert record.read_bytes() == before
+    with io.open_recording(tmp_path / "rec-partial.h5") as recording:
+        assert recording.state.startswith("cut short")
+    fake.picture = picture
+    assert fake.run(*PRESS, "--record", str(record), "--overwrite").exit_code == 0
+    with io.open_recording(record) as recording:
+        assert recording.state == "complete"
 
 
 def test_a_camera_that_is_lost_ends_it_with_its_own_complaint(fake, tmp_path):

@@ -3,6 +3,7 @@
 import io
 import json
 import re
+import subprocess
 import sys
 import time
 
@@ -231,6 +232,22 @@ def test_a_new_rig_file_can_be_loaded_and_is_never_written_over_another(folder):
     ended = run("rig", "new", "-o", "mine.toml")
     assert (ended.code, ended.said) == (
         2,
-        "mirrorskin: mine.toml is there already; name another file with --output\n",
+        "mirrorskin: mine.toml exists and is not replaced: choose another name with -o\n",
     )
     assert (folder / "mine.toml").read_bytes() == before
+
+
+def test_a_full_disk_leaves_no_half_a_rig_file(tmp_path):
+    code = (
+        "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (500, 500));"
+        "from mirrorskin.cli.main import main; main()"
+    )
+    words = [sys.executable, "-c", code, "rig", "new", "-o", "mine.toml"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == (
+        "mirrorskin: mine.toml could not be written: File too large; make room, or choose another place with"
+        " -o\n"
+    )
+    assert not list(tmp_path.glob("*.toml"))
+    assert not list(tmp_path.glob(".*"))

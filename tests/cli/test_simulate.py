@@ -427,15 +427,16 @@ def test_what_cannot_be_is_refused_in_one_line(case):
 
 def test_a_refusal_leaves_the_recording_that_was_there():
     Path("a.h5").write_bytes(b"as it was")
-    assert_refused(["axial", *SMALL, "--tilt", "0deg", "-o", "a.h5"], "tilt")
+    assert_refused(["axial", *SMALL, "--tilt", "0deg", "-o", "a.h5", "--overwrite"], "tilt")
 
 
 def test_an_input_is_not_overwritten_but_a_name_is_no_input():
     picture("wall.png")
     assert_refused(["vertical", *WALL, "--pattern", "wall.png", "-o", "wall.png"], "is the input")
     Path("sphere").mkdir()
-    for _ in range(2):
-        code, _, said = run("simulate", "vertical", *SMALL, "--frames", "2", *EXACT, "-o", "sphere/a.h5")
+    for again in ([], ["--overwrite"]):
+        words = ("simulate", "vertical", *SMALL, "--frames", "2", *EXACT, "-o", "sphere/a.h5")
+        code, _, said = run(*words, *again)
         assert (code, said) == (0, "")
 
 

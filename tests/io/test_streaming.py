@@ -15,7 +15,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from growing import Feed, frames_of, stream
+from growing import Feed, frames_of, started, stream
 from stacks import plot_of, read_all
 
 from mirrorskin import io
@@ -119,21 +119,134 @@ def test_marks_reach_frames_that_are_written_and_frames_that_are_yet_to_come(tmp
     np.testing.assert_array_equal(held(tmp_path / "a.h5")["used"], [1, 0, 1, 1, 0, 1, 1, 1, 0, 1, 1, 0])
 
 
-# What is there before and after.
+# Where an older file has the name.
 
 
-def test_an_older_file_is_replaced_when_the_first_frame_has_come(tmp_path):
-    path = tmp_path / "a.h5"
-    path.write_bytes(b"older")
-    with pytest.raises(KeyboardInterrupt):
-        stream(Feed(fails=(0, KeyboardInterrupt())), path)
+def names(folder):
+    return sorted(one.name for one in folder.iterdir())
+
+
+@pytest.fixture(params=["a.h5", "a.mcap"])
+def older(request, tmp_path):
+    """A recording of three frames, whose bytes are not to change."""
+    stream(Feed(3), tmp_path / request.param)
+    return tmp_path / request.param
+
+
+def partial(path, number=1):
+    return path.with_name(f"{path.stem}-partial{'' if number == 1 else f'-{number}'}{path.suffix}")
+
+
+def test_an_older_file_is_refused_unless_it_may_be_replaced(older):
+    before, source = older.read_bytes(), Feed()
+    said = f"{older} exists and is a recording: add --overwrite to replace it, or choose another name with -o"
+    with pytest.raises(io.InputError, match=f"^{re.escape(said)}$"):
+        stream(source, older)
+    assert not source.entered
+    assert older.read_bytes() == before
+
+
+def test_an_older_file_is_replaced_by_a_complete_recording(older):
+    before = older.read_bytes()
+    with io.StreamRecorder(Feed(8), older, overwrite=True, period=0.0) as recorder:
+        while recorder.read() is not None:
+            assert older.read_bytes() == before
+    assert older.read_bytes() != before
+    assert names(older.parent) == [older.name]
+    assert (recorder.file, recorder.state, recorder.written) == (older, "complete", 8)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), io.InputError("the camera is lost: plug it in")])
+def test_a_run_that_fails_at_its_first_frame_leaves_an_older_file_and_nothing_else(older, error):
+    before = older.read_bytes()
+    with pytest.raises(type(error)):
+        stream(Feed(fails=(0, error)), older, overwrite=True)
     with pytest.raises(io.InputError, match="feed gave no frames: nothing was written"):
-        stream(Feed(0, announced=5), path)
-    assert path.read_bytes() == b"older"
+        stream(Feed(0, announced=5), older, overwrite=True)
+    assert older.read_bytes() == before
+    assert names(older.parent) == [older.name]
+
+
+def test_what_a_run_that_was_cut_short_recorded_has_a_name_of_its_own(older):
+    before = older.read_bytes()
+    for number in (1, 2):
+        recorder = io.StreamRecorder(Feed(fails=(4, SystemExit(1))), older, overwrite=True)
+        with pytest.raises(SystemExit), recorder:
+            drain(recorder)
+        assert recorder.file == partial(older, number)
+        assert recorder.written == 4
+    assert older.read_bytes() == before
+    assert names(older.parent) == sorted(path.name for path in (older, partial(older), partial(older, 2)))
+
+
+def test_a_recording_of_its_own_name_says_that_it_was_cut_short(tmp_path):
+    stream(Feed(3), tmp_path / "a.h5")
     with pytest.raises(KeyboardInterrupt):
-        stream(Feed(fails=(1, KeyboardInterrupt())), path)
-    assert len(held(path)["data"]) == 1
-    assert [one.name for one in tmp_path.iterdir()] == ["a.h5"]
+        stream(Feed(fails=(4, KeyboardInterrupt())), tmp_path / "a.h5", overwrite=True)
+    found = held(tmp_path / "a-partial.h5")
+    assert found["state"] == "cut short: stopped by the user"
+    np.testing.assert_array_equal(found["data"], frames_of(np.arange(4)))
+    assert len(held(tmp_path / "a.h5")["data"]) == 3
+
+
+def test_a_killed_run_leaves_an_older_file_and_what_it_recorded(tmp_path):
+    stream(Feed(3), tmp_path / "a.h5")
+    before = (tmp_path / "a.h5").read_bytes()
+    child = started(tmp_path / "a.h5", watched=tmp_path / "a-partial.h5")
+    child.kill()
+    child.wait(60)
+    assert (tmp_path / "a.h5").read_bytes() == before
+    with h5py.File(tmp_path / "a-partial.h5", swmr=True, locking=False) as file:
+        assert file["/entry/state"].asstr()[()] == "under way"
+        np.testing.assert_array_equal(file[f"{DETECTOR}/data"][:1], frames_of([0]))
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_of_two_runs_at_once_each_keeps_its_recording(tmp_path, overwrite):
+    path = tmp_path / "a.h5"
+    with io.StreamRecorder(Feed(6), path, overwrite=overwrite) as first:
+        second = io.StreamRecorder(Feed(4), path, overwrite=overwrite)
+        second.__enter__()
+        drain(first)
+        wait_for(path)
+        drain(second)
+        with pytest.raises(io.InputError, match=r"a\.h5 was made by another program meanwhile"):
+            second.__exit__(None, None, None)
+    assert (first.file, second.file) == (path, tmp_path / "a-partial.h5")
+    assert [len(held(one.file)["data"]) for one in (first, second)] == [6, 4]
+    assert [held(one.file)["state"] for one in (first, second)] == ["complete"] * 2
+
+
+def test_a_recording_without_hard_links_has_its_name_all_the_same(older, monkeypatch):
+    def unable(*_):
+        raise OSError(errno.EPERM, "unable")
+
+    monkeypatch.setattr(os, "link", unable)
+    stream(Feed(5), older, overwrite=True)
+    stream(Feed(5), older.with_stem("other"))
+    assert names(older.parent) == sorted([older.name, older.with_stem("other").name])
+
+
+def test_the_target_of_a_link_is_replaced_and_the_link_stays(tmp_path):
+    (tmp_path / "far").mkdir()
+    stream(Feed(3), tmp_path / "far" / "a.h5")
+    (tmp_path / "a.h5").symlink_to(tmp_path / "far" / "a.h5")
+    stream(Feed(7), tmp_path / "a.h5", overwrite=True)
+    assert (tmp_path / "a.h5").is_symlink()
+    assert len(held(tmp_path / "far" / "a.h5")["data"]) == 7
+    assert names(tmp_path / "far") == ["a.h5"]
+
+
+def drain(recorder):
+    while recorder.read() is not None:
+        pass
+
+
+def wait_for(path):
+    until = time.monotonic() + 60
+    while not path.exists():
+        assert time.monotonic() < until
+        time.sleep(0.001)
 
 
 # What is left when something fails.
@@ -174,8 +287,8 @@ def test_positions_that_cannot_be_corrected_stay_and_their_error_is_told(tmp_pat
     assert found["state"] == "cut short: no reports"
     np.testing.assert_array_equal(found["travel"], 0.01 * np.arange(5))
     with pytest.raises(io.InputError, match="camera"):
-        stream(Lost(5, fails=(3, io.InputError("camera"))), tmp_path / "a.h5")
-    assert held(tmp_path / "a.h5")["state"] == "cut short: camera"
+        stream(Lost(5, fails=(3, io.InputError("camera"))), tmp_path / "b.h5")
+    assert held(tmp_path / "b.h5")["state"] == "cut short: camera"
 
 
 def test_the_source_is_left_before_the_disk_is_waited_for(tmp_path, monkeypatch):

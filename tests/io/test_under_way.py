@@ -66,8 +66,9 @@ def test_others_watch_while_it_grows_and_what_is_left_when_it_is_killed_is_sound
         facts = io.describe(path)
         assert (facts["kind"], facts["state"]) == ("recording", "under way")
         assert re.fullmatch(r"(\d+) of \1 frames", facts["used"])
-        with pytest.raises(io.InputError, match="is being written by another program"):
-            io.check_output(path)
+        for replaces in ("nothing", "derived", "anything"):
+            with pytest.raises(io.InputError, match="is being written by another program"):
+                io.check_output(path, replaces=replaces)
     finally:
         kill(child)
     with io.open_recording(path) as recording:
@@ -78,7 +79,7 @@ def test_others_watch_while_it_grows_and_what_is_left_when_it_is_killed_is_sound
         assert recording.fingerprint() == left
     with io.open_recording(path, frames=(0, 2)) as recording:
         np.testing.assert_array_equal(read_all(recording, 5).frames, frames_of([0, 1]))
-    stream(Feed(4), path)  # its name is free again
+    stream(Feed(4), path, overwrite=True)  # since its writer is gone
     with io.open_recording(path) as recording:
         assert recording.fingerprint() != left
 

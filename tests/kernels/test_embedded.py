@@ -1,9 +1,10 @@
 """What stands between PoCL and its first kernel. Every try is a real child process."""
 
 import ctypes
-import importlib.metadata
+import hashlib
 import mmap
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -134,6 +135,13 @@ def test_a_device_that_never_answers(pocl, monkeypatch):
         embedded.verify(pocl)
 
 
+def test_a_python_that_does_not_start_is_named(pocl, monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    monkeypatch.setattr(embedded, "find_zig", lambda: None)
+    with pytest.raises(DeviceError, match=r"since .*/python does not start \(No such file or directory\)$"):
+        embedded.verify(pocl)
+
+
 def test_without_the_wheel_nothing_is_prepared(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     monkeypatch.setattr(embedded, "_processor", None)
@@ -204,6 +212,22 @@ def test_an_unwritable_cache_is_named(pocl, variable, below, tmp_path, monkeypat
     assert f"PoCL cannot write its cache folder {folder / below} (Not a directory)" in str(caught.value)
     assert f"set {remedy} to a writable folder" in str(caught.value)
     assert embedded.why_no_device() == str(caught.value)
+
+
+@pytest.mark.parametrize("home", ["/proc", "/dev/null"])  # where nobody can write, not even root
+def test_a_home_that_cannot_be_written_is_replaced_by_a_temporary_cache(tmp_path, home):
+    environment = {**os.environ, "HOME": home, "TMPDIR": str(tmp_path)}
+    del environment["XDG_CACHE_HOME"]
+    command = [sys.executable, "-c", _NEW_PROCESS]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.endswith(" 0 1 2 3 0 1 2 3\n")
+    (note,) = done.stderr.splitlines()
+    assert re.fullmatch(
+        rf"PoCL cannot write its cache folder {home}/.cache/pocl/kcache \(.+\); set XDG_CACHE_HOME to a"
+        " writable folder; until then kernels are compiled again by every command",
+        note,
+    )
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_pyopencl_needs_a_cache_too(pocl, tmp_path, monkeypatch):
@@ -280,34 +304,66 @@ def test_a_function_is_made_to_answer_with_a_copy_of_the_name(offset):
     assert [embedded._take_string(first), embedded._take_string(second)] == ["haswell"] * 2
 
 
-@pytest.mark.parametrize(
-    ("known", "version", "size", "patched"),
-    [
-        ("znver3", "3.0", 83, None),
-        ("generic", "3.0", 83, "skylake-avx512"),
-        ("generic", "3.1", 83, None),
-        ("generic", "3.0", 84, None),
-    ],
-)
-def test_only_a_known_function_that_names_no_processor_is_patched(
-    monkeypatch, caplog, known, version, size, patched
-):
-    libc = ctypes.CDLL(None)
-    libc.strdup.restype = ctypes.c_void_p
-    ask = ctypes.CFUNCTYPE(ctypes.c_void_p)(lambda: libc.strdup(known.encode()))
-    library = SimpleNamespace(pocl_get_llvm_cpu_name=ask)
-    given = []
-    monkeypatch.setattr(ctypes, "CDLL", lambda name, **_: libc if name is None else library)
-    monkeypatch.setattr(importlib.metadata, "version", lambda _: version)
-    monkeypatch.setattr(embedded, "_look_up", lambda _: (None, size))
-    monkeypatch.setattr(embedded, "_read_flags", lambda: SKYLAKE)
-    monkeypatch.setattr(embedded, "_answer_with", lambda _, name: given.append(name))
+@pytest.fixture
+def asked(monkeypatch):
+    """Begin as a new process does, with a library whose function is made up; return what it was given."""
+
+    def prepare(names, size=83, changed=False):
+        libc, given = ctypes.CDLL(None), []
+        libc.strdup.restype = ctypes.c_void_p
+        ask = ctypes.CFUNCTYPE(ctypes.c_void_p)(lambda: given.append("called") or libc.strdup(names.encode()))
+        library = SimpleNamespace(pocl_get_llvm_cpu_name=ask)
+        code = ctypes.string_at(embedded._address(ask), 83)
+        digest = hashlib.sha256(code[:-1] + b"?" if changed else code).hexdigest()
+        monkeypatch.setattr(ctypes, "CDLL", lambda name, **_: libc if name is None else library)
+        monkeypatch.setattr(embedded, "_NAME_FUNCTION_SHA256", digest)
+        monkeypatch.setattr(embedded, "_look_up", lambda _: (None, size))
+        monkeypatch.setattr(embedded, "_read_flags", lambda: SKYLAKE)
+        monkeypatch.setattr(embedded, "_answer_with", lambda _, name: given.append(name))
+        embedded.prepare()
+        return given
+
     monkeypatch.setattr(embedded, "_processor", None)
     monkeypatch.setattr(embedded, "_patched", False)
-    embedded.prepare()
-    assert given == ([patched] if patched else [])
-    assert ("patched" in embedded.note("3.0")) == bool(patched)
-    assert ("which is unknown" in caplog.text) == (known == "generic" and patched is None)
+    return prepare
+
+
+@pytest.mark.parametrize(
+    ("names", "given"), [("znver3", ["called"]), ("generic", ["called", "skylake-avx512"])]
+)
+def test_the_known_function_is_patched_where_it_knows_no_processor(asked, names, given):
+    assert asked(names) == given
+    assert ("patched" in embedded.note("3.0")) == (names == "generic")
+
+
+@pytest.mark.parametrize("other", [{"size": 84}, {"changed": True}], ids=["another size", "other bytes"])
+def test_another_function_of_that_name_is_neither_called_nor_patched(asked, other):
+    assert asked("generic", **other) == []
+    assert embedded.note("3.0") == ""
+
+
+def test_a_library_without_the_function_is_used_as_it_is(monkeypatch, caplog):
+    monkeypatch.setattr(embedded, "find_library", lambda: Path("libc.so.6"))
+    monkeypatch.setattr(embedded, "_processor", None)
+    with caplog.at_level("INFO"):
+        embedded.prepare()
+    assert "libc.so.6 has no function pocl_get_llvm_cpu_name" in caplog.text
+    assert embedded.note("3.0") == ""
+
+
+# Prints which of the two is in the place of PoCL's function, in a process that has not looked at it yet.
+_WHICH = """
+import ctypes
+from mirrorskin.kernels import embedded
+function = getattr(ctypes.CDLL(str(embedded.find_library())), embedded._NAME_FUNCTION)
+print(embedded._digest(embedded._address(function)) == embedded._NAME_FUNCTION_SHA256)
+"""
+
+
+@pytest.mark.usefixtures("pocl")
+def test_the_function_of_the_wheel_is_the_known_one():
+    done = subprocess.run([sys.executable, "-c", _WHICH], capture_output=True, text=True, check=True)
+    assert done.stdout == "True\n"
 
 
 def test_the_library_and_the_size_of_a_function_are_looked_up():

@@ -101,12 +101,15 @@ def stream(source, path, packing="raw", **given):
         return list(iter(recorder.read, None))
 
 
-def started(path, packing="raw", rate=400, period=0.1):
-    """Start a process that records for a long time, and wait until its file is there."""
+def started(path, packing="raw", rate=400, period=0.1, watched=None):
+    """Start a process that records for a long time, and wait until its file is there.
+
+    Where an older file of its name is to be replaced, its file has the name ``watched``.
+    """
     words = [sys.executable, __file__, path, packing, rate, period]
     child = subprocess.Popen([str(word) for word in words])
     until = time.monotonic() + 60
-    while not path.exists():
+    while not (watched or path).exists():
         assert child.poll() is None
         assert time.monotonic() < until
         time.sleep(0.005)
@@ -119,4 +122,5 @@ if __name__ == "__main__":
         sys.argv[1],
         sys.argv[2],
         period=float(sys.argv[4]),
+        overwrite=True,
     )

@@ -72,8 +72,8 @@ class MadeUp:
 
 
 def record(source, path, compression="raw", block=1, truth=None):
-    """Record a source in blocks of so many frames."""
-    with io.Recorder(source, path, compression, truth=truth) as recorder:
+    """Record a source in blocks of so many frames; an older file of that name is replaced."""
+    with io.Recorder(source, path, compression, truth=truth, overwrite=True) as recorder:
         out = np.empty((block, *source.shape[1:]), source.dtype)
         while recorder.read(out) is not None:
             pass

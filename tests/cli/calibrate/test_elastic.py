@@ -82,7 +82,7 @@ def test_a_ball_becomes_a_gel_in_the_file_and_is_told_in_a_line():
     [
         ([], "no recordings"),
         (["ball.h5", "--rig", "rig.toml"], "leave one of them out"),
-        (["ball.h5", "--press", "1mm"], "--press says how a rig is to press"),
+        (["ball.h5", "--press", "1mm"], "--press applies to presses on a rig"),
         (["ball.h5", "--sheet", "-1mm"], "--sheet -1mm cannot be"),
         (["turn.h5"], "axial motion"),
         (["none.h5"], "none.h5"),
@@ -99,7 +99,7 @@ def test_what_cannot_be_learned_from_is_refused_in_a_line(words, complaint):
 def test_a_rig_presses_the_ball_at_each_place(monkeypatch):
     asked = []
 
-    def take(rig, calibration, places, settle=None):
+    def take(rig, calibration, places, settle, overwrite):
         asked.extend(places)
         raise io.InputError("stop here")
 

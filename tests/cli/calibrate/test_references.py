@@ -108,7 +108,7 @@ def test_a_call_that_cannot_be_is_one_line(scene, tmp_path, monkeypatch, words, 
 def test_a_rig_is_asked_for_the_dark_and_for_the_ball_at_each_place(scene, tmp_path, monkeypatch):
     asked = []
 
-    def take(rig, calibration, places):
+    def take(rig, calibration, places, overwrite):
         assert (rig.name, calibration) == ("rig.toml", tmp_path / "cal.h5")
         asked.extend(places)
         return [scene / ("dark.h5" if place.name == "dark" else "ball.h5") for place in places]

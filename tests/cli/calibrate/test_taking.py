@@ -64,6 +64,24 @@ def test_who_does_not_press_enter_takes_nothing(rig_file, tmp_path, enter):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_recording_is_taken_in_the_place_of_another_only_where_that_is_asked_for(
+    rig_file, tmp_path, enter, monkeypatch
+):
+    enter(1)
+    older = tmp_path / "cal-dark.h5"
+    _record_flat_field(older)
+    before = older.read_bytes()
+    places = [inputs.Place("dark", "take everything off", inputs.still_plan(rig_file), frames=3)]
+    with monkeypatch.context() as patch:
+        patch.setattr(rigs, "open_rig", None)
+        with pytest.raises(io.InputError, match="exists and is a recording: add"):
+            inputs.take(rig_file, tmp_path / "cal.h5", places, settle="0s")
+    assert older.read_bytes() == before
+    inputs.take(rig_file, tmp_path / "cal.h5", places, settle="0s", overwrite=True)
+    with io.open_recording(older) as recording:
+        assert recording.shape == (6, *SHAPE)
+
+
 def test_references_are_taken_until_their_noise_is_as_stated(rig_file, tmp_path, enter):
     enter(9)
     bright = tmp_path / "bright.h5"

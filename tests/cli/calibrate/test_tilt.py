@@ -114,7 +114,7 @@ def test_what_the_file_knew_before_is_kept_and_what_the_user_says_of_the_scale_i
         ([], "no recordings"),
         (["ball.h5"], "half-angle is not determined"),
         (["--flat", "flat.h5"], "neither phases"),
-        (["ball.h5", "--press", "1mm"], "--press says how a rig is to press"),
+        (["ball.h5", "--press", "1mm"], "--press applies to presses on a rig"),
         (["--rig", "rig.toml"], "--press is missing"),
         (["ball.h5", "--flat", "other.h5"], "take all with one camera"),
         (["bare.h5"], "bare.h5: the recording has no zenith gain and offset"),
@@ -142,7 +142,7 @@ def test_what_cannot_be_is_one_line_and_writes_nothing(words, said):
 def test_a_rig_is_asked_for_balls_at_several_places(monkeypatch):
     asked = []
 
-    def take(rig, calibration, places, settle):
+    def take(rig, calibration, places, settle, overwrite):
         asked.extend(places)
         return [calibration.with_name("ball.h5")]
 

@@ -95,7 +95,7 @@ def test_without_a_calibration_one_is_made_and_told_as_json(folder, fitted):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--press", "1mm"), "--press says how a rig is to press"),
+        (("--press", "1mm"), "--press applies to presses on a rig"),
         (("--rig", "rig.toml", "--press", "1mm"), "both give the presses"),
     ],
 )

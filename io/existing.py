@@ -1,0 +1,58 @@
+"""What an existing file is, where a new file is to take its name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from mirrorskin.io.hdf5 import Hdf5File
+from mirrorskin.io.types import InputError
+
+Replaces = Literal["nothing", "derived", "calibration", "anything"]
+"""Which existing file a new one may replace.
+
+"nothing": none, the name must be free. "derived": one that can be computed again, such as a result, a picture
+or a table; not a recording, a calibration, or an HDF5 or MCAP file of another program. "calibration": these,
+and calibrations. "anything": every file, since the user asked for that.
+"""
+
+_HDF5, _MCAP = b"\x89HDF\r\n\x1a\n", b"\x89MCAP0\r\n"
+_USER_BLOCK = 512  # bytes; HDF5's signature is at 0, or at this times a power of two
+_KINDS = {"recording": "a recording", "calibration": "a calibration", "result": "a result"}
+_CALIBRATION = _KINDS["calibration"]
+
+
+def check_replaced(path: Path, replaces: Replaces) -> None:
+    """Raise InputError unless a new file may replace the existing one."""
+    if replaces == "anything":
+        return
+    kind = protected_kind(path)
+    if replaces == "nothing":
+        known = f" and is {kind}" if kind else ""
+        raise InputError(
+            f"{path} exists{known}: add --overwrite to replace it, or choose another name with -o"
+        )
+    if kind and not (kind == _CALIBRATION and replaces == "calibration"):
+        raise InputError(f"{path} is {kind}, which this command never replaces: choose another name with -o")
+
+
+def protected_kind(path: Path) -> str:
+    """Return what a file is, in a few words, if it cannot be computed again; else an empty text."""
+    with path.open("rb") as file:
+        if file.read(len(_MCAP)) == _MCAP:
+            from mirrorskin.io.mcap import is_surface
+
+            return "" if is_surface(path) else _KINDS["recording"]
+        file.seek(0)
+        place, size = 0, path.stat().st_size
+        while file.read(len(_HDF5)) != _HDF5:
+            place = 2 * place or _USER_BLOCK
+            if place >= size:
+                return ""
+            file.seek(place)
+    try:
+        with Hdf5File(path) as opened:
+            kind = next((text for name, text in _KINDS.items() if opened.marked(f"mirrorskin_{name}")), "")
+    except InputError:
+        return "an HDF5 file that cannot be read"
+    return "" if kind == _KINDS["result"] else kind or "an HDF5 file of another program"

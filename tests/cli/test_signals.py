@@ -1,0 +1,103 @@
+"""Signals that come more than once, and limits of the system: one line, and never an abort."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+
+import pytest
+from commands import run
+from stacks import record, sphere
+
+from mirrorskin import io
+
+
+@pytest.fixture
+def press(tmp_path):
+    return record(sphere(), tmp_path / "press.h5")
+
+
+@pytest.mark.parametrize("second", ["SIGINT", "SIGTERM"])
+def test_a_second_signal_does_not_interrupt_what_the_first_one_began(press, monkeypatch, capfd, second):
+    done = []
+
+    def describe(path):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        finally:
+            signal.raise_signal(getattr(signal, second))
+            done.append("cleaned up")
+
+    monkeypatch.setattr(io, "describe", describe)
+    ended = run("info", press)
+    assert (ended.code, ended.out, ended.said) == (130, "", "")
+    assert done == ["cleaned up"]
+    assert capfd.readouterr().err == "mirrorskin: it is being stopped; two more Ctrl-C end it at once\n"
+
+
+# Waits for a thread that never ends, as for OpenCL at work, while Ctrl-C is pressed four times.
+INSISTING = """
+import signal, sys, threading
+from mirrorskin import io
+from mirrorskin.cli.main import program
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+def describe(path):
+    try:
+        signal.raise_signal(signal.SIGINT)
+    finally:
+        for _ in range(3):
+            signal.raise_signal(signal.SIGINT)
+        threading.Event().wait()
+
+io.describe = describe
+sys.argv = ["mirrorskin", "info", "press.h5"]
+program()
+"""
+
+
+def test_who_insists_ends_a_program_that_hangs_at_once_and_without_an_abort(press):
+    command = [sys.executable, "-c", INSISTING]
+    done = subprocess.run(command, cwd=press.parent, capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr == "mirrorskin: it is being stopped; two more Ctrl-C end it at once\n"
+
+
+@pytest.mark.parametrize(("limit", "said"), [(400_000 << 10, "512 MB are needed"), (900 << 20, "PoCL needs")])
+def test_too_little_address_space_is_one_line(press, limit, said):
+    # 400 000 KB is 'ulimit -v 400000', with which PoCL's threads aborted; LLVM crashed with 900 MB.
+    done = subprocess.run(
+        [sys.executable, "-m", "mirrorskin.cli.main", "reconstruct", press, "-o", press.with_name("r.h5")],
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert f"the address space is limited to {limit >> 20} MB, and" in done.stderr
+    assert said in done.stderr
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ImportError("libscipy_openblas.so: failed to map segment from shared object"),
+        OSError(12, "Cannot allocate memory"),
+        RuntimeError("can't start new thread"),
+    ],
+)
+def test_memory_that_the_system_refuses_to_a_library_is_one_line(press, monkeypatch, error):
+    def describe(path):
+        raise error
+
+    monkeypatch.setattr(io, "describe", describe)
+    ended = run("info", press)
+    assert ended.code == 1
+    assert ended.said == (
+        f"mirrorskin: not enough memory ({error}): take a smaller region or fewer frames, or end other"
+        " programs\n"
+    )
