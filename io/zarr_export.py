@@ -15,7 +15,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from mirrorskin.io.hdf5 import Hdf5File, Node
+from mirrorskin.io.hdf5 import Hdf5File, Node, first_value
 from mirrorskin.io.layout import STACK
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.recording import is_recording, open_recording
@@ -120,8 +120,7 @@ def _write_nodes(file: Hdf5File, store: Any) -> None:
     """Write all datasets but the frames, several at once; links are left out."""
     import zarr
 
-    nodes: list[h5py.Dataset] = []
-    file.root.visititems(lambda _, node: nodes.append(node) if isinstance(node, h5py.Dataset) else None)
+    nodes = [node for _, node in file.objects() if isinstance(node, h5py.Dataset)]
 
     def write(node: h5py.Dataset) -> None:
         about: dict[str, Any] = {"name": node.name, "attributes": _attributes(file, node), "config": _WHOLE}
@@ -130,7 +129,7 @@ def _write_nodes(file: Hdf5File, store: Any) -> None:
             chunks = values.shape if values.size else "auto"
             zarr.create_array(store, data=values, chunks=chunks, **about)
         else:
-            texts = file.texts(node, "it is damaged") if node.ndim else file.value(node)
+            texts = file.texts(node, "copy it again") if node.ndim else file.value(node)
             made = zarr.create_array(store, shape=node.shape, dtype=str, **about)
             made[...] = np.array(texts, np.dtypes.StringDType())
 
@@ -139,14 +138,17 @@ def _write_nodes(file: Hdf5File, store: Any) -> None:
 
 
 def _attributes(file: Hdf5File, node: Node) -> dict[str, Any]:
+    """Return the attributes of an object that are numbers or texts."""
+    with as_input_error(f"{file.path}: {node.name}"):
+        # By number: h5py's names open an object again, which fails where its values are in raw files.
+        opened = [h5py.h5a.open(node.id, index=index) for index in range(h5py.h5a.get_num_attrs(node.id))]
     found: dict[str, Any] = {}
-    for name in node.attrs:
-        with as_input_error(f"{file.path}: {node.name}"):
-            value = np.asarray(node.attrs[name])
-            if value.dtype.kind == "S":
-                value = np.char.decode(value, "utf-8")
-        if value.dtype.kind in "biufU" or all(isinstance(one, str) for one in value.flat):
-            found[name] = value.tolist()
+    for attribute in opened:
+        if attribute.dtype.kind in "biuf" or h5py.check_string_dtype(attribute.dtype) is not None:
+            name = attribute.name.decode(errors="replace")
+            values = np.asarray(file.attribute_values(node, name))
+            plain = np.array([first_value(one) for one in values.reshape(-1)], object)
+            found[name] = plain.reshape(values.shape).tolist()
     return found
 
 
@@ -176,8 +178,7 @@ def _finish(file: Hdf5File, store: Any) -> None:
     """Write what the groups say, which makes it one of ours, and all metadata in one place."""
     import zarr
 
-    groups: list[h5py.Group] = []
-    file.root.visititems(lambda _, node: groups.append(node) if isinstance(node, h5py.Group) else None)
+    groups = [node for _, node in file.objects() if isinstance(node, h5py.Group)]
     root = zarr.open_group(store, mode="a")
     for group in groups:
         root.require_group(str(group.name)).attrs.update(_attributes(file, group))
