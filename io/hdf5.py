@@ -274,7 +274,7 @@ class Hdf5File(Closing):
         if (name := h5py.h5f.get_name(opened)) not in self._longest_text:
             self._longest_text[name] = _check_heaps(h5py.File(opened))
         # Many texts may refer to the same bytes.
-        return math.prod(node.shape) * self._longest_text[name]
+        return int(math.prod(node.shape)) * self._longest_text[name]
 
     def spend(self, size: int) -> None:
         """Count bytes of values that are read; InputError above `VALUES_LIMIT`."""

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import secrets
-import shutil
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -15,13 +13,15 @@ from typing import Any
 import h5py
 import numpy as np
 
-from mirrorskin.io.hdf5 import Hdf5File, Node, first_value
+from mirrorskin.io.atomic import new_folder
+from mirrorskin.io.hdf5 import VALUES_LIMIT, Hdf5File, Node, first_value
 from mirrorskin.io.layout import STACK
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.recording import is_recording, open_recording
 from mirrorskin.io.types import InputError, Source
 from mirrorskin.io.url import ZARR_SUFFIX, Url, path_of
-from mirrorskin.io.zarr import AT_ONCE, ZarrFile, naming, open_file, opened_store
+from mirrorskin.io.zarr import AT_ONCE, ZarrFile, open_file
+from mirrorskin.io.zarr_errors import naming
 
 _WHOLE: Any = {"write_empty_chunks": True}
 _CHUNK, _BLOCK = 4 << 20, 64 << 20  # bytes of frames, unpacked: of a chunk, and written at a time
@@ -81,6 +81,8 @@ def check_store(target: Path) -> None:
         with naming(f"{target} cannot be written"):
             from zarr.core.sync import sync
 
+            from mirrorskin.io.zarr_store import opened_store
+
             with opened_store(target, read_only=False) as store:
                 if not sync(store.is_empty("")):
                     raise InputError(taken)
@@ -97,30 +99,34 @@ def check_store(target: Path) -> None:
 def _new_store(target: Path) -> Iterator[Any]:
     """Make a store; what was written of it is removed after an error."""
     check_store(target)
-    if isinstance(target, Url):
+    with naming(f"{target} cannot be written"):
         from zarr.core.sync import sync
 
-        with naming(f"{target} cannot be written"), opened_store(target, read_only=False) as store:
+        from mirrorskin.io.zarr_store import opened_store
+
+        if not isinstance(target, Url):
+            with new_folder(target) as part, opened_store(part, read_only=False) as store:
+                yield store
+            return
+        with opened_store(target, read_only=False) as store:
             try:
                 yield store
             except BaseException:
                 sync(store.delete_dir(""))
                 raise
-        return
-    part = target.with_name(f".mirrorskin-{secrets.token_hex(8)}.part")
-    try:
-        with naming(f"{target} cannot be written"), opened_store(part, read_only=False) as store:
-            yield store
-        part.rename(target)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
 
 
 def _write_nodes(file: Hdf5File, store: Any) -> None:
     """Write all datasets but the frames, several at once; links are left out."""
     import zarr
 
-    nodes = [node for _, node in file.objects() if isinstance(node, h5py.Dataset)]
+    nodes = [node for _, node in file.objects() if isinstance(node, h5py.Dataset) and node.name != STACK]
+    size = sum(int(node.nbytes) for node in nodes if node.dtype.kind in "biuf")
+    if size > VALUES_LIMIT:
+        raise InputError(
+            f"{file.path} holds {size / 1e6:.4g} MB besides its frames; of Zarr at most "
+            f"{VALUES_LIMIT / 1e6:.4g} MB are read: keep it in HDF5"
+        )
 
     def write(node: h5py.Dataset) -> None:
         about: dict[str, Any] = {"name": node.name, "attributes": _attributes(file, node), "config": _WHOLE}
@@ -134,7 +140,7 @@ def _write_nodes(file: Hdf5File, store: Any) -> None:
             made[...] = np.array(texts, np.dtypes.StringDType())
 
     with ThreadPoolExecutor(AT_ONCE, "mirrorskin-zarr") as pool:
-        list(pool.map(write, (node for node in nodes if node.name != STACK)))
+        list(pool.map(write, nodes))
 
 
 def _attributes(file: Hdf5File, node: Node) -> dict[str, Any]:
