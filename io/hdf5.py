@@ -33,7 +33,7 @@ many bytes as it has itself, and ``memory_limit`` raises the limit.
 _LINKS_DEEP = 16
 _MOST_STEPS = 100_000  # along links, and to the sources of virtual datasets
 _GROUPS_DEEP = 64
-_MOST_OBJECTS = 100_000  # groups and datasets of a file
+_MOST_OBJECTS = 20_000  # groups and datasets of a file
 _MOST_NAMES = 10_000  # in a group whose members are all read
 
 

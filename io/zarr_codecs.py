@@ -1,6 +1,6 @@
-"""Arrays of Zarr whose chunks are unpacked to at most the bytes that they claim to have.
+"""Arrays of Zarr whose chunks are unpacked to at most the size that their metadata states.
 
-The codecs of zarr-python take what a chunk gives: a few kilobytes may become gigabytes.
+The codecs of zarr-python have no limit: a few kilobytes may become gigabytes.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _UNPACKED = 8  # times as many bytes as a chunk has may its blocks of Zstandard 
 
 
 def open_array(store: Any, array: ArrayMetadata, where: str) -> Array:
-    """Return an array of zarr-python, of which chunks are unpacked within bounds.
+    """Return an array of zarr-python whose chunks are unpacked within bounds.
 
     InputError where a codec is not allowed; see ``zarr_metadata.check_codecs``.
     """
@@ -63,7 +63,7 @@ def _bytes_of(array: ArrayMetadata, piece: Sequence[int]) -> int:
 
 
 def _bounded_codecs(codecs: Sequence[Any], array: ArrayMetadata, piece: Sequence[int]) -> tuple[Any, ...]:
-    """Return codecs of version 3 of which those that unpack are bounded, also inside of shards."""
+    """Replace the codecs of version 3 that unpack, also inside of shards, by bounded ones."""
     most, count, bounded = _bytes_of(array, piece), math.prod(piece), []
     for one in codecs:
         if isinstance(one, ShardingCodec):
@@ -92,7 +92,7 @@ def _bounded_version_2(metadata: Any, array: ArrayMetadata) -> Any:
 
 @dataclass(frozen=True)
 class _Unpacking(BytesBytesCodec):  # type: ignore[misc]  # where Zarr is not installed
-    """A codec of version 3 that unpacks to at most so many bytes."""
+    """A codec of version 3 that unpacks to at most ``most`` bytes."""
 
     unpack: Callable[[bytes, int], bytes]
     most: int
@@ -178,7 +178,7 @@ def _zstd(packed: bytes, most: int) -> bytes:
 
 
 def _zstd_head(packed: bytes, place: int) -> tuple[int | None, int, int]:
-    """Return how many bytes a frame of Zstandard gives, if it says so, those of its checksum, and its blocks.
+    """Return a frame's size when unpacked, if stated, the size of its checksum, and where its blocks start.
 
     See RFC 8878, 3.1.1.1.
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import secrets
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -24,6 +25,9 @@ from mirrorskin.io.zarr import AT_ONCE, ZarrFile, open_file
 from mirrorskin.io.zarr_errors import naming
 
 _WHOLE: Any = {"write_empty_chunks": True}
+_CLAIM = (
+    ".mirrorskin-writer-"  # how the name of an object begins that a writer puts into a store at an address
+)
 _CHUNK, _BLOCK = 4 << 20, 64 << 20  # bytes of frames, unpacked: of a chunk, and written at a time
 
 
@@ -109,11 +113,32 @@ def _new_store(target: Path) -> Iterator[Any]:
                 yield store
             return
         with opened_store(target, read_only=False) as store:
+            claim = _claim(store, target)
             try:
                 yield store
             except BaseException:
                 sync(store.delete_dir(""))
                 raise
+            sync(store.delete(claim))
+
+
+def _claim(store: Any, target: Url) -> str:
+    """Put an object into a store that tells other writers of this one, and return its name.
+
+    Stores cannot rename what is finished. Of two writers that start at once both may see the other's object,
+    and give up; they never write both.
+    """
+    from zarr.core.buffer import default_buffer_prototype
+    from zarr.core.sync import sync
+
+    from mirrorskin.io.zarr_store import LimitedStore
+
+    claim = f"{_CLAIM}{secrets.token_hex(8)}"
+    sync(store.set(claim, default_buffer_prototype().buffer.from_bytes(b"1")))
+    if any(name.startswith(_CLAIM) and name != claim for name in sync(LimitedStore(store, target).names(""))):
+        sync(store.delete(claim))
+        raise InputError(f"{target} is being written by another program: name another output with -o")
+    return claim
 
 
 def _write_nodes(file: Hdf5File, store: Any) -> None:

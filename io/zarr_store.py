@@ -57,24 +57,29 @@ def opened_store(path: Path, read_only: bool = True) -> Iterator[Any]:
 
 
 def options_of(address: Url) -> dict[str, Any]:
-    """Return what fsspec is given to open an address."""
+    """Return the options with which fsspec opens an address."""
     scheme = address.parts[0]
     if scheme in ("s3:", "s3a:"):
         # An object is fetched in one request, not after another for its size.
         return {"skip_instance_cache": True, "max_concurrency": 1}
-    if scheme in ("http:", "https:"):
-        from aiohttp import ClientTimeout
+    if scheme not in ("http:", "https:"):
+        return {"skip_instance_cache": True}
+    from aiohttp import ClientTimeout
+    from fsspec.config import conf
 
-        waiting = ClientTimeout(total=TRANSFER, sock_connect=SILENCE, sock_read=SILENCE)
+    given = conf.get("http", {}).get("client_kwargs", {})
+    settings = given | {
+        "timeout": ClientTimeout(total=TRANSFER, sock_connect=SILENCE, sock_read=SILENCE),
+        "response_class": _limited_response(),
         # Answers are taken as they are: unpacked by aiohttp, a small one could fill the memory.
-        settings = {"auto_decompress": False, "headers": {"Accept-Encoding": "identity"}}
-        response = {"response_class": _limited_response()}
-        return {"skip_instance_cache": True, "client_kwargs": {"timeout": waiting, **settings, **response}}
-    return {"skip_instance_cache": True}
+        "auto_decompress": False,
+        "headers": given.get("headers", {}) | {"Accept-Encoding": "identity"},
+    }
+    return {"skip_instance_cache": True, "client_kwargs": settings}
 
 
 def _limited_response() -> Any:
-    """Return aiohttp's class of responses, of which `_most_bytes` are read at most."""
+    """Return a class of aiohttp's responses that reads at most `_most_bytes`."""
     from aiohttp import ClientResponse
 
     class LimitedResponse(ClientResponse):

@@ -13,6 +13,8 @@ from commands import run
 
 from mirrorskin import io
 
+pytestmark = pytest.mark.slow
+
 SMALL = "--size", "96x80", "--pixel-size", "0.12mm"
 EXPORTS = "ply", "stl", "xyz", "png", "tif", "csv", "npz", "mcap", "zarr"
 

@@ -536,7 +536,7 @@ def test_a_document_that_comes_byte_by_byte_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(zarr_store, "SILENCE", 0.4)
     with served(tmp_path, Slow) as address:
         message = refused(Url(f"{address}/x.zarr"))
-    assert "the store does not answer (no whole answer within 0.4 s)" in message
+    assert "the store does not answer" in message
 
 
 def test_a_silent_server_is_refused(monkeypatch):

@@ -267,6 +267,22 @@ def test_of_two_writers_the_first_to_finish_wins(pair, tmp_path):
     assert not list(tmp_path.glob(".*"))
 
 
+def test_of_two_writers_at_an_address_the_second_gives_up(pair, memory, monkeypatch):
+    target, refused = "memory://bucket/new.zarr", []
+    monkeypatch.setattr(zarr_export, "check_store", lambda target: None)  # both looked before either wrote
+
+    def write_meanwhile(count):
+        with pytest.raises(io.InputError) as caught:
+            io.save_zarr(pair[0], target)
+        refused.append(str(caught.value))
+
+    io.save_zarr(pair[0], target, write_meanwhile)
+    assert refused == [f"{target} is being written by another program: name another output with -o"]
+    with io.open_recording(pair[0]) as first, io.open_recording(target) as second:
+        np.testing.assert_array_equal(read_all(second, 3).frames, read_all(first, 3).frames)
+    assert not [name for name in memory.find("/bucket") if ".mirrorskin" in name]
+
+
 WRITER = """
 import sys
 from mirrorskin import io
