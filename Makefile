@@ -1,10 +1,10 @@
-# make [demo|test|test-all|test-browser|test-cameras|test-hardware|docs|lint|types|fuzz|bench|portability|gpu-check|gpu|clean]; each sets up what it needs in .venv first.
+# make [demo|test|test-all|test-lowest|test-browser|test-cameras|test-hardware|docs|lint|types|fuzz|bench|portability|gpu-check|gpu|clean]; each sets up what it needs in .venv first.
 # PYTHON=/path/to/python3.12 chooses the interpreter (3.11 or newer).
 
 SHELL := /bin/sh
 .SHELLFLAGS := -ec
 .ONESHELL:
-.PHONY: demo test test-all test-browser test-cameras test-hardware docs lint types fuzz bench portability gpu-check gpu clean
+.PHONY: demo test test-all test-lowest test-browser test-cameras test-hardware docs lint types fuzz bench portability gpu-check gpu clean
 
 PYTHON ?= $(shell for python in python3.13 python3.12 python3.11 python3; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
@@ -13,6 +13,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist loadfile --ignore tests/browser
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+LOWEST := build/lowest
 
 demo: $(READY)
 	@$(BIN)/mirrorskin demo -o demo --overwrite
@@ -30,6 +31,20 @@ test-all: $(READY)
 	@$(BIN)/python -m pytest --ignore tests/browser -m 'slow and real_time'
 	$(PYTEST) -m 'slow and not real_time'
 	$(MAKE) --no-print-directory docs test-browser
+
+# Each command with the lowest versions of all dependencies that pyproject.toml allows, from the package index, in
+# an environment of their own; it needs Python 3.11.
+test-lowest: $(READY)
+	@$(PIP) install uv
+	mkdir -p $(LOWEST)
+	uv() { $(BIN)/python -m uv --quiet --no-python-downloads "$$@"; }
+	uv pip compile --resolution lowest-direct --python-version 3.11 --output-file $(LOWEST)/requirements.txt \
+	    $(addprefix --extra ,cluster live mcap mesh s3 view xarray zarr) pyproject.toml
+	uv venv --clear --python 3.11 $(LOWEST)/venv
+	uv pip install --python $(LOWEST)/venv --requirement $(LOWEST)/requirements.txt pytest
+	uv pip install --python $(LOWEST)/venv --no-deps --editable .
+	uv pip list --python $(LOWEST)/venv
+	$(LOWEST)/venv/bin/python -m pytest tests/test_smoke.py
 
 # Pages in a real browser, which the system brings: Debian's package chromium.
 test-browser: .venv/.browser

@@ -7,6 +7,7 @@ import fcntl
 import functools
 import os
 import secrets
+import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -208,6 +209,28 @@ def _rename(part: Path, path: Path, replaces: Replaces) -> None:
 
 
 @contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """Make a folder under a temporary name in that of ``path``, and rename it if all goes well.
+
+    What killed programs have left in that folder is removed, as in `new_file`. Whoever gives a folder the
+    name first keeps it: InputError for anyone else.
+    """
+    _tidy(path.parent)
+    part, descriptor = path.parent / f"{_PREFIX}{secrets.token_hex(8)}{_SUFFIX}", -1
+    try:
+        with as_input_error(f"{path} could not be written"):
+            descriptor = _make_folder(part)
+        yield part
+        with as_input_error(f"{path} could not be written", "choose another place with -o"):
+            if path.exists() or not _renamed(part, path):
+                raise InputError(f"{path} was made by another program meanwhile: name another output with -o")
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+        with suppress(OSError):
+            os.close(descriptor)
+
+
+@contextmanager
 def new_hdf5(path: Path, replaces: Replaces = "derived") -> Iterator[NewHdf5]:
     """Write an HDF5 file as ``new_file`` does."""
     with new_file(path, replaces) as descriptor, NewHdf5(path, descriptor) as new:
@@ -215,16 +238,23 @@ def new_hdf5(path: Path, replaces: Replaces = "derived") -> Iterator[NewHdf5]:
 
 
 def remove_leftovers(folder: Path) -> list[Path]:
-    """Remove the half-written files of a folder whose writers are gone, as those that were killed.
+    """Remove the half-written files and folders of writers that are gone, such as those that were killed.
 
-    A file that is being written is locked, and stays. Where a file system has no locks, all stay.
+    What is being written is locked, and stays. Where a file system has no locks, all stay.
     """
     removed = []
     for part in folder.glob(f"{_PREFIX}*{_SUFFIX}"):
-        with suppress(OSError), part.open("r+b") as file:  # locked, no one's to open, or gone by now
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            part.unlink()
-            removed.append(part)
+        with suppress(OSError):  # locked, no one's to open, or gone by now
+            descriptor = os.open(part, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if part.is_dir():
+                    shutil.rmtree(part)
+                else:
+                    part.unlink()
+                removed.append(part)
+            finally:
+                os.close(descriptor)
     return removed
 
 
@@ -240,6 +270,30 @@ def _make(part: Path) -> int:
         if os.fstat(descriptor).st_nlink:  # else someone took it for a leftover before it was locked
             return descriptor
         os.close(descriptor)
+
+
+def _renamed(part: Path, path: Path) -> bool:
+    """Give a folder its name, unless something of that name is there."""
+    try:
+        part.rename(path)
+    except OSError as error:
+        if error.errno in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR):
+            return False
+        raise
+    return True
+
+
+def _make_folder(part: Path) -> int:
+    """Make a folder, which is locked as long as it is open, and return its descriptor."""
+    while True:
+        part.mkdir(mode=0o777)
+        with suppress(FileNotFoundError):  # someone took it for a leftover before it was locked
+            descriptor = os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            with suppress(OSError):  # a file system without locks
+                fcntl.flock(descriptor, fcntl.LOCK_EX)
+            if os.path.samestat(os.fstat(descriptor), part.stat()):
+                return descriptor
+            os.close(descriptor)
 
 
 def _readable(path: Path) -> bool:

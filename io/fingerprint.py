@@ -49,7 +49,7 @@ def fingerprint(file: Hdf5File, dataset: h5py.Dataset, origins: Mapping[Path, St
     """
     if file.root.swmr_mode:
         with as_input_error(f"{file.path}: {dataset.name}"):
-            return _of_growing(file.root, dataset, frames)
+            return _of_growing(file, dataset, frames)
     spans: dict[Path, list[Spans]] = {path: [] for path in origins}
     with as_input_error(f"{file.path}: {dataset.name}"):
         for path, part, span in _parts(file, dataset):
@@ -78,25 +78,22 @@ def _compare(path: Path, found: os.stat_result, state: State) -> None:
         raise InputError(f"{path} was changed while it was open: start again")
 
 
-def _of_growing(file: h5py.File, dataset: h5py.Dataset, frames: int) -> str:
-    """Return a SHA-256 that stays the same however the file grows."""
+def _of_growing(file: Hdf5File, dataset: h5py.Dataset, frames: int) -> str:
+    """Return a SHA-256 that does not change while the file grows."""
     digest = hashlib.sha256()
-
-    def add(_: str, node: h5py.Dataset | h5py.Group) -> None:
+    for _, node in file.objects():
         if isinstance(node, h5py.Dataset) and node != dataset:
             grows = node.ndim and node.maxshape[0] is None
-            value = np.asarray(node[:frames] if grows else node[()])
+            value = np.asarray(file.load(node, min(frames, node.shape[0]) if grows else None)[()])
             digest.update(str(node.name).encode())
             digest.update(value.tobytes() if value.dtype.kind != "O" else str(value).encode())
-
-    file.visititems(add)
     before = 0
     for chunk in sorted(chunks_of(dataset), key=lambda one: one.chunk_offset):
         if chunk.chunk_offset[0] < frames:
             stop = chunk.byte_offset + chunk.size
             for taken in range(chunk.byte_offset + -before % _EVERY, stop, _EVERY):
                 size = min(_TAKEN, stop - taken)
-                digest.update(os.pread(file.id.get_vfd_handle(), size, taken))
+                digest.update(os.pread(file.root.id.get_vfd_handle(), size, taken))
             before += chunk.size
     return digest.hexdigest()
 

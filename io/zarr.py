@@ -1,19 +1,18 @@
 """Recordings and results in Zarr: groups and arrays of the names that they have in HDF5.
 
-All but the frames is held as HDF5 in memory, so that it is read and checked as if it came from such a file.
+Groups, attributes and the shapes of arrays are held as HDF5 in memory, so that a store is checked as if it
+were such a file. Values are read from the store when they are needed.
 """
 
 from __future__ import annotations
 
-import errno
-import functools
 import hashlib
 import json
 import math
 import secrets
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -21,27 +20,26 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.atomic import MAKE_ROOM, fixed_text
+from mirrorskin.io.atomic import fixed_text
 from mirrorskin.io.fingerprint import State, state_of
-from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
+from mirrorskin.io.hdf5 import VALUES_LIMIT, Hdf5File, Node, Shape
 from mirrorskin.io.layout import CHECKSUM, STACK
-from mirrorskin.io.os_errors import reason
 from mirrorskin.io.selection import Place, Region, Span
 from mirrorskin.io.types import Closing, InputError
 from mirrorskin.io.url import Url, is_zarr, path_of
+from mirrorskin.io.zarr_errors import MissingChunkError, naming
+from mirrorskin.io.zarr_metadata import METADATA, ArrayMetadata, compressors_of, read_nodes
 
 if TYPE_CHECKING:
     import zarr
 
 Array: TypeAlias = "zarr.Array[Any]"
 
-_DEEP, _MOST_NODES, _MOST_FRAMES = 8, 10_000, 1 << 26
-_LARGEST = 1 << 30  # bytes of an array that is no stack of frames
+_MOST_FRAMES = 1 << 26
+_MOST_PIECES = 1 << 16  # chunks or shards of an array that is read whole, or that hold a frame
+_SMALL, _MOST_EARLY = 1 << 16, 128  # bytes of an array that is read at once, and how many of them are
 AT_ONCE = 16  # requests
 _SAMPLE = 16  # frames that a fingerprint takes where there are no checksums
-_METADATA = "zarr.json", ".zarray", ".zgroup", ".zattrs", ".zmetadata"
-_REFUSED = {"PermissionError", "NoCredentialsError", "CredentialRetrievalError"}
-_UNREACHABLE = {"ConnectionError", "TimeoutError", "ClientError", "BotoCoreError", "FSTimeoutError"}
 
 
 def open_file(path: str | Path, memory_limit: int | None = None) -> Hdf5File:
@@ -50,90 +48,14 @@ def open_file(path: str | Path, memory_limit: int | None = None) -> Hdf5File:
     return (ZarrFile if is_zarr(known) else Hdf5File)(known, memory_limit)
 
 
-@contextmanager
-def naming(what: str) -> Iterator[None]:
-    """Turn what Zarr and the libraries of stores say, in errors of many kinds, into a line with a remedy."""
-    try:
-        yield
-    except (InputError, MemoryError):
-        raise
-    except Exception as error:
-        raise InputError(f"{what}: {_reason(error)}") from error
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return f"{reason(error)}: {MAKE_ROOM}"
-    if isinstance(error, PermissionError) and error.errno:
-        return f"{reason(error)}: check the permissions"
-    kinds = {kind.__name__ for kind in type(error).__mro__}
-    said = " ".join(str(error).split())[:200] or type(error).__name__
-    if isinstance(error, _MissingChunkError):
-        return said
-    if isinstance(error, ImportError):
-        return f"a package is missing ({said}): pip install 'mirrorskin[zarr]', of S3 'mirrorskin[s3]'"
-    if "rotocol not known" in said:
-        return f"{said}: check the address"
-    if isinstance(error, FileNotFoundError):
-        return "there is no Zarr array or group, or no such bucket: check the address"
-    if kinds & _REFUSED or getattr(error, "status", None) in (401, 403):
-        return f"access is refused ({said}): give the store's credentials, of S3 in AWS_PROFILE or the like"
-    if kinds & _UNREACHABLE:
-        return f"the store does not answer ({said}): check the address and the network, and start again"
-    return f"it is damaged ({said}): copy it again"
-
-
-class _MissingChunkError(Exception):
-    pass
-
-
-@functools.cache
-def _whole() -> Callable[[Any], Any]:
-    """Return what makes a store that refuses chunks that are missing: Zarr would make them up."""
-    from zarr.storage import WrapperStore
-
-    class Whole(WrapperStore[Any]):  # type: ignore[misc]  # where it is not installed
-        async def get(self, key: str, prototype: Any, byte_range: Any = None) -> Any:
-            found = await super().get(key, prototype, byte_range)
-            if found is None and not key.endswith(_METADATA):
-                raise _MissingChunkError(
-                    f"its chunk {key} is missing: copy it again, or write empty ones, too"
-                )
-            return found
-
-    return Whole
-
-
-@contextmanager
-def opened_store(path: Path, read_only: bool = True) -> Iterator[Any]:
-    """Open a store of Zarr; leaving it closes its connections, which fsspec leaves to whoever has them."""
-    from zarr.core.sync import sync
-    from zarr.storage import FsspecStore, LocalStore, ZipStore
-
-    if isinstance(path, Url):
-        # An object is fetched in one request, not after another for its size.
-        single = {"max_concurrency": 1} if path.parts[0] in ("s3:", "s3a:") else {}
-        store = FsspecStore.from_url(str(path), {"skip_instance_cache": True, **single}, read_only)
-    elif read_only and not path.exists():
-        raise InputError(f"{path}: no such file")
-    else:
-        store = ZipStore(path, mode="r") if path.is_file() else LocalStore(path, read_only=read_only)
-    try:
-        yield store
-    finally:
-        store.close()
-        for name in ("_s3", "_session"):
-            client = getattr(getattr(store, "fs", None), name, None)
-            if client is not None:
-                sync(client.close())
-
-
 def find_stores(pattern: Url) -> list[Path]:
     """Return the addresses that answer to a pattern such as ``s3://bucket/*.zarr``."""
     with naming(str(pattern)):
         from fsspec.core import url_to_fs
 
-        system, place = url_to_fs(str(pattern))
+        from mirrorskin.io.zarr_store import options_of
+
+        system, place = url_to_fs(str(pattern), **options_of(pattern))
         found = [path_of(system.unstrip_protocol(one)) for one in sorted(system.glob(place))]
     if not found:
         raise InputError(f"{pattern}: nothing answers to that: name recordings")
@@ -141,58 +63,92 @@ def find_stores(pattern: Url) -> list[Path]:
 
 
 class ZarrFile(Hdf5File):
-    """A Zarr group, or an array alone as ``/data``, of which all but the frames is read at once."""
+    """A Zarr group, or an array alone as ``/data``."""
 
     def __init__(self, path: Path, memory_limit: int | None = None) -> None:
-        with ExitStack() as opening, naming(str(path)):
-            import zarr
+        with naming(str(path)), ExitStack() as opening:
+            from zarr.core.sync import sync
 
-            store = opening.enter_context(opened_store(path))
-            node = zarr.open(_whole()(store), mode="r")
-            found = dict(node.members(max_depth=_DEEP)) if isinstance(node, zarr.Group) else {"data": node}
-            if len(found) > _MOST_NODES:
-                raise InputError(f"{path} holds over {_MOST_NODES} groups and arrays: copy what is wanted")
-            groups = {f"/{name}": one for name, one in found.items() if isinstance(one, zarr.Group)}
-            self.arrays = {f"/{name}": one for name, one in found.items() if f"/{name}" not in groups}
-            root = h5py.File(secrets.token_hex(8), "w", driver="core", backing_store=False)
+            from mirrorskin.io.zarr_store import LimitedStore, opened_store
+
+            self._store = LimitedStore(opening.enter_context(opened_store(path)), path)
+            nodes = sync(read_nodes(self._store, path))
+            groups = {f"/{name}": attributes for name, attributes in nodes.groups.items()}
+            self.arrays: dict[str, ArrayMetadata] = {
+                f"/{name or 'data'}": one for name, one in nodes.arrays.items()
+            }
+            self._known: dict[str, Array] = {}
+            self._early: dict[str, Future[NDArray[Any]]] = {}
+            memory = {"driver": "core", "backing_store": False, "libver": "latest"}
+            root = h5py.File(secrets.token_hex(8), "w", **memory)
             super().__init__(path, memory_limit, opening.enter_context(root))
-            self._fill(groups)
-            _set_attributes(self.root["/"], node.attrs if isinstance(node, zarr.Group) else {})
+            self._lay_out(groups)
+            self._ours = any(name.startswith("mirrorskin_") for name in groups.get("/entry", {}))
+            if self._ours:
+                self._read_early()
             self._opened = opening.pop_all()
 
     def close(self) -> None:
         """Close what is in memory, and all connections."""
         self._opened.close()
 
-    def _fill(self, groups: Mapping[str, Any]) -> None:
-        """Copy attributes, and values if the group is one of ours; of others, only shapes and types."""
-        entry = groups.get("/entry")
-        ours = entry is not None and any(name.startswith("mirrorskin_") for name in entry.attrs)
-        wanted = {name: one for name, one in self.arrays.items() if ours and name != STACK}
-        for name, one in wanted.items():
-            if one.nbytes > _LARGEST:
-                raise InputError(
-                    f"{self.path}: {name} claims {one.nbytes} bytes: it is damaged: copy it again"
-                )
-        with ThreadPoolExecutor(AT_ONCE, "mirrorskin-zarr") as pool:
-            values = dict(
-                zip(wanted, pool.map(lambda one: np.asarray(one[...]), wanted.values()), strict=True)
-            )
-        grows = any(name == "/entry/state" for name in self.arrays)
-        for name, one in groups.items():
-            _set_attributes(self.root.require_group(name), one.attrs)
+    def _lay_out(self, groups: Mapping[str, Mapping[str, Any]]) -> None:
+        """Make groups and datasets without values in memory."""
+        grows = "/entry/state" in self.arrays
+        for name, attributes in groups.items():
+            _set_attributes(self.root.require_group(name), attributes)
         for name, one in self.arrays.items():
-            if name in values:
-                value = (
-                    values[name] if values[name].dtype.kind in "biuf" else fixed_text(values[name].tolist())
+            if one.dtype is not None:
+                most = (None, *one.shape[1:]) if grows and one.shape and name != STACK else None
+                dtype = "S1" if one.is_text else one.dtype
+                made = self.root.create_dataset(name, one.shape, dtype, maxshape=most)
+                _set_attributes(made, one.attributes)
+
+    def _read_early(self) -> None:
+        """Read small arrays, several at once, as each takes a request; an error is kept until it matters."""
+        small = [
+            name
+            for name, one in self.arrays.items()
+            if one.dtype is not None and one.nbytes <= _SMALL and one.shape == one.chunks and name != STACK
+        ]
+        with ThreadPoolExecutor(AT_ONCE, "mirrorskin-zarr") as pool:
+            self._early = {name: pool.submit(self._decode, name) for name in small[:_MOST_EARLY]}
+
+    def _array(self, name: str) -> Array:
+        """Return an array of zarr-python, if all its codecs are allowed."""
+        if name not in self._known:
+            from mirrorskin.io.zarr_codecs import open_array
+
+            self._known[name] = open_array(self._store, self.arrays[name], f"{self.path}: {name}")
+        return self._known[name]
+
+    def _decode(self, name: str, rows: int | None = None) -> NDArray[Any]:
+        """Read an array, or its first rows."""
+        one, where = self.arrays[name], f"{self.path}: {name}"
+        most = max(VALUES_LIMIT, self.memory_limit or 0)
+        with naming(where):
+            array = self._array(name)
+            if one.nbytes > most:
+                raise InputError(
+                    f"{where} claims {one.nbytes} bytes, and at most {most} are read: it is damaged: copy it "
+                    "again, or raise --memory"
                 )
-                resizable = {"maxshape": (None, *value.shape[1:])} if grows and value.ndim else {}
-                made = self.root.create_dataset(name, data=value, **resizable)
-            elif one.dtype.kind in "biuf":
-                made = self.root.create_dataset(name, one.shape, one.dtype)
-            else:
-                continue
-            _set_attributes(made, one.attrs)
+            if (pieces := _count_pieces(one.shape, array.chunks)) > _MOST_PIECES:
+                raise InputError(
+                    f"{where} is in {pieces} chunks, and at most {_MOST_PIECES} are read: write it in fewer"
+                )
+            return np.asarray(array[...] if rows is None else array[:rows])
+
+    def load(self, node: h5py.Dataset, rows: int | None = None) -> NDArray[Any]:
+        """Read an array, or its first rows; see `Hdf5File.load`."""
+        name = str(node.name)
+        one = self.arrays[name]
+        self.spend(one.nbytes)
+        early = self._early.get(name)
+        values = self._decode(name, rows) if early is None else early.result().copy()
+        if one.is_text:
+            self.spend(sum(len(text) for text in values.flat))
+        return values if early is None or rows is None else values[:rows]
 
     def read(
         self,
@@ -208,56 +164,65 @@ class ZarrFile(Hdf5File):
 
     def check_frames(self, stack: h5py.Dataset, count: int) -> None:
         """Refuse frames that are not there, or in chunks that memory has no room for."""
-        array, where = self.arrays[str(stack.name)], self.where(stack)
+        one, where = self.arrays[str(stack.name)], self.where(stack)
+        with naming(where):
+            array = self._array(str(stack.name))
         size = math.prod(array.chunks) * array.dtype.itemsize
-        if size > max(self.memory_limit or _LARGEST, array.dtype.itemsize * math.prod(array.shape[1:])):
+        largest = max(self.memory_limit or VALUES_LIMIT, array.dtype.itemsize * math.prod(array.shape[1:]))
+        if size > largest:
             raise InputError(
                 f"{where} is in chunks of {size / 1e6:.3g} MB: raise --memory, or write smaller ones"
             )
+        pieces = _count_pieces(one.shape[1:], array.chunks[1:])
         if count > _MOST_FRAMES:
             raise InputError(f"{where} claims {count} frames: it is damaged: copy it again")
+        if pieces > _MOST_PIECES:
+            raise InputError(f"{where} claims {pieces} chunks a frame: write it in fewer, of whole frames")
+        self._store.largest_chunk = max(largest, VALUES_LIMIT)
         with naming(where):
             from zarr.core.sync import sync
 
-            pieces = array.shards or array.chunks
-            last = ((n - 1) // piece for n, piece in zip(array.shape, pieces, strict=True))
-            key = f"{array.path}/{array.metadata.encode_chunk_key(tuple(last))}".lstrip("/")
-            if not sync(array.store.exists(key)):
-                raise _MissingChunkError(
+            last = ((n - 1) // piece for n, piece in zip(one.shape, one.chunks, strict=True))
+            key = f"{one.path}/{array.metadata.encode_chunk_key(tuple(last))}".lstrip("/")
+            if not sync(self._store.exists(key)):
+                raise MissingChunkError(
                     f"its last chunk, {key}, is missing: copy it again, or write empty ones, too"
                 )
 
     def frames(self, stack: h5py.Dataset) -> ZarrFrames:
         """Return what fetches the frames."""
-        return ZarrFrames(self.arrays[str(stack.name)], Place(str(self.path), str(stack.name)))
+        return ZarrFrames(self._array(str(stack.name)), Place(str(self.path), str(stack.name)))
 
     def storage(self, stack: h5py.Dataset) -> str:
         """Tell how a stack is stored, for people."""
-        array = self.arrays[str(stack.name)]
-        names = ", ".join(type(one).__name__.removesuffix("Codec") for one in array.compressors)
-        return f"Zarr, chunks {array.chunks}, {names or 'raw'}"
+        name = str(stack.name)
+        return f"Zarr, chunks {self._array(name).chunks}, {compressors_of(self.arrays[name])}"
 
     def origins(self) -> dict[Path, State]:
         """Return what tells of a change: of a folder its metadata, of a zip itself, of an address nothing."""
         if isinstance(self.path, Url):
             return {}
-        files = [self.path] if self.path.is_file() else [self.path / name for name in _METADATA]
+        files = [self.path] if self.path.is_file() else [self.path / name for name in METADATA]
         files = [file for file in files if file.is_file()]
         return {file: state_of(file.stat()) for file in files}
 
     def fingerprint(self, stack: h5py.Dataset) -> str:
         """Return a SHA-256 of all but the frames, and of some frames if there are no checksums of them."""
         digest = hashlib.sha256()
-        for name, array in sorted(self.arrays.items()):
-            digest.update(f"{name} {array.shape} {array.dtype} {json.dumps(array.attrs.asdict())}".encode())
-            if array.dtype.kind in "biuf" and self.root[name].id.get_storage_size():
-                digest.update(self.root[name][()].tobytes())
+        for name, one in sorted(self.arrays.items()):
+            digest.update(f"{name} {one.shape} {one.dtype} {json.dumps(one.attributes)}".encode())
+            if self._ours and name != STACK and one.dtype is not None and not one.is_text:
+                digest.update(self._decode(name).tobytes())
         if self.find(CHECKSUM) is None:
-            array = self.arrays[str(stack.name)]
+            array = self._array(str(stack.name))
             for number in range(0, array.shape[0], -(-array.shape[0] // _SAMPLE)):
                 with naming(self.where(stack)):
                     digest.update(np.asarray(array[number]).tobytes())
         return digest.hexdigest()
+
+
+def _count_pieces(shape: Shape, chunks: Shape) -> int:
+    return math.prod(-(-n // piece) for n, piece in zip(shape, chunks, strict=True))
 
 
 def _set_attributes(node: h5py.Group | h5py.Dataset, attributes: Mapping[str, Any]) -> None:

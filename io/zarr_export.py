@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import secrets
-import shutil
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -15,15 +14,20 @@ from typing import Any
 import h5py
 import numpy as np
 
-from mirrorskin.io.hdf5 import Hdf5File, Node
+from mirrorskin.io.atomic import new_folder
+from mirrorskin.io.hdf5 import VALUES_LIMIT, Hdf5File, Node, first_value
 from mirrorskin.io.layout import STACK
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.recording import is_recording, open_recording
 from mirrorskin.io.types import InputError, Source
 from mirrorskin.io.url import ZARR_SUFFIX, Url, path_of
-from mirrorskin.io.zarr import AT_ONCE, ZarrFile, naming, open_file, opened_store
+from mirrorskin.io.zarr import AT_ONCE, ZarrFile, open_file
+from mirrorskin.io.zarr_errors import naming
 
 _WHOLE: Any = {"write_empty_chunks": True}
+_CLAIM = (
+    ".mirrorskin-writer-"  # how the name of an object begins that a writer puts into a store at an address
+)
 _CHUNK, _BLOCK = 4 << 20, 64 << 20  # bytes of frames, unpacked: of a chunk, and written at a time
 
 
@@ -81,6 +85,8 @@ def check_store(target: Path) -> None:
         with naming(f"{target} cannot be written"):
             from zarr.core.sync import sync
 
+            from mirrorskin.io.zarr_store import opened_store
+
             with opened_store(target, read_only=False) as store:
                 if not sync(store.is_empty("")):
                     raise InputError(taken)
@@ -97,31 +103,55 @@ def check_store(target: Path) -> None:
 def _new_store(target: Path) -> Iterator[Any]:
     """Make a store; what was written of it is removed after an error."""
     check_store(target)
-    if isinstance(target, Url):
+    with naming(f"{target} cannot be written"):
         from zarr.core.sync import sync
 
-        with naming(f"{target} cannot be written"), opened_store(target, read_only=False) as store:
+        from mirrorskin.io.zarr_store import opened_store
+
+        if not isinstance(target, Url):
+            with new_folder(target) as part, opened_store(part, read_only=False) as store:
+                yield store
+            return
+        with opened_store(target, read_only=False) as store:
+            claim = _claim(store, target)
             try:
                 yield store
             except BaseException:
                 sync(store.delete_dir(""))
                 raise
-        return
-    part = target.with_name(f".mirrorskin-{secrets.token_hex(8)}.part")
-    try:
-        with naming(f"{target} cannot be written"), opened_store(part, read_only=False) as store:
-            yield store
-        part.rename(target)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+            sync(store.delete(claim))
+
+
+def _claim(store: Any, target: Url) -> str:
+    """Put an object into a store that tells other writers of this one, and return its name.
+
+    Stores cannot rename what is finished. Of two writers that start at once both may see the other's object,
+    and give up; they never write both.
+    """
+    from zarr.core.buffer import default_buffer_prototype
+    from zarr.core.sync import sync
+
+    from mirrorskin.io.zarr_store import LimitedStore
+
+    claim = f"{_CLAIM}{secrets.token_hex(8)}"
+    sync(store.set(claim, default_buffer_prototype().buffer.from_bytes(b"1")))
+    if any(name.startswith(_CLAIM) and name != claim for name in sync(LimitedStore(store, target).names(""))):
+        sync(store.delete(claim))
+        raise InputError(f"{target} is being written by another program: name another output with -o")
+    return claim
 
 
 def _write_nodes(file: Hdf5File, store: Any) -> None:
     """Write all datasets but the frames, several at once; links are left out."""
     import zarr
 
-    nodes: list[h5py.Dataset] = []
-    file.root.visititems(lambda _, node: nodes.append(node) if isinstance(node, h5py.Dataset) else None)
+    nodes = [node for _, node in file.objects() if isinstance(node, h5py.Dataset) and node.name != STACK]
+    size = sum(int(node.nbytes) for node in nodes if node.dtype.kind in "biuf")
+    if size > VALUES_LIMIT:
+        raise InputError(
+            f"{file.path} holds {size / 1e6:.4g} MB besides its frames; of Zarr at most "
+            f"{VALUES_LIMIT / 1e6:.4g} MB are read: keep it in HDF5"
+        )
 
     def write(node: h5py.Dataset) -> None:
         about: dict[str, Any] = {"name": node.name, "attributes": _attributes(file, node), "config": _WHOLE}
@@ -130,23 +160,26 @@ def _write_nodes(file: Hdf5File, store: Any) -> None:
             chunks = values.shape if values.size else "auto"
             zarr.create_array(store, data=values, chunks=chunks, **about)
         else:
-            texts = file.texts(node, "it is damaged") if node.ndim else file.value(node)
+            texts = file.texts(node, "copy it again") if node.ndim else file.value(node)
             made = zarr.create_array(store, shape=node.shape, dtype=str, **about)
             made[...] = np.array(texts, np.dtypes.StringDType())
 
     with ThreadPoolExecutor(AT_ONCE, "mirrorskin-zarr") as pool:
-        list(pool.map(write, (node for node in nodes if node.name != STACK)))
+        list(pool.map(write, nodes))
 
 
 def _attributes(file: Hdf5File, node: Node) -> dict[str, Any]:
+    """Return the attributes of an object that are numbers or texts."""
+    with as_input_error(f"{file.path}: {node.name}"):
+        # By number: h5py's names open an object again, which fails where its values are in raw files.
+        opened = [h5py.h5a.open(node.id, index=index) for index in range(h5py.h5a.get_num_attrs(node.id))]
     found: dict[str, Any] = {}
-    for name in node.attrs:
-        with as_input_error(f"{file.path}: {node.name}"):
-            value = np.asarray(node.attrs[name])
-            if value.dtype.kind == "S":
-                value = np.char.decode(value, "utf-8")
-        if value.dtype.kind in "biufU" or all(isinstance(one, str) for one in value.flat):
-            found[name] = value.tolist()
+    for attribute in opened:
+        if attribute.dtype.kind in "biuf" or h5py.check_string_dtype(attribute.dtype) is not None:
+            name = attribute.name.decode(errors="replace")
+            values = np.asarray(file.attribute_values(node, name))
+            plain = np.array([first_value(one) for one in values.reshape(-1)], object)
+            found[name] = plain.reshape(values.shape).tolist()
     return found
 
 
@@ -176,8 +209,7 @@ def _finish(file: Hdf5File, store: Any) -> None:
     """Write what the groups say, which makes it one of ours, and all metadata in one place."""
     import zarr
 
-    groups: list[h5py.Group] = []
-    file.root.visititems(lambda _, node: groups.append(node) if isinstance(node, h5py.Group) else None)
+    groups = [node for _, node in file.objects() if isinstance(node, h5py.Group)]
     root = zarr.open_group(store, mode="a")
     for group in groups:
         root.require_group(str(group.name)).attrs.update(_attributes(file, group))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tracemalloc
@@ -14,6 +15,7 @@ from stacks import SHAPE, random_stack, read_all, record, sphere
 from mirrorskin import io
 from mirrorskin.io import hdf5
 from mirrorskin.io.hdf5 import Hdf5File
+from mirrorskin.io.zarr import open_file
 
 STACK = random_stack()
 GIVEN = {"motion": "vertical", "travel": io.Steps(0.3)}
@@ -232,7 +234,7 @@ def test_links_that_lead_nowhere_are_refused(path, tmp_path):
     refused(path, r"the external link loop in / leads to loop\.h5, which does not exist", dataset="loop")
     refused(path, r"text\.h5 is not an HDF5 file", dataset="text")
     refused(path, "the link inside leads to /x, which is not there", dataset="inside")
-    refused(path, r"the external link folder in / leads to \., which does not exist", dataset="folder")
+    refused(path, r"the external link folder in / leads to \., which is not a regular file", dataset="folder")
     refused(path, "the external link long in /: File name too long", dataset="long")
 
 
@@ -390,7 +392,7 @@ def test_a_damaged_heap_of_texts_is_refused(path):
 
 def test_what_is_neither_number_nor_text_is_refused(path):
     with h5py.File(path, "w") as file:
-        file.create_dataset("x", (), h5py.vlen_dtype(np.int32))
+        file.create_dataset("x", (), h5py.vlen_dtype(np.int32))[()] = [1, 2]
     with Hdf5File(path) as file, pytest.raises(io.InputError, match="neither numbers nor text"):
         file.value(file.find("/x"))
 
@@ -411,3 +413,172 @@ def test_a_unit_of_many_letters_is_refused_in_a_line(path):
     with Hdf5File(path) as file, pytest.raises(io.InputError, match="cannot be turned into mm") as caught:
         file.read(file.find("/x"), (3,), unit="mm")
     assert len(str(caught.value)) < 450
+
+
+SECRET = b"a line that nobody should see"
+
+
+def text_in_raw_file(file, name, raw):
+    """Write a single text whose bytes are in a raw file."""
+    file.create_dataset(name, (1,), f"S{len(SECRET)}", external=[(str(raw), 0, len(SECRET))])
+
+
+def virtual_text(file, name, source):
+    layout = h5py.VirtualLayout((1,), f"S{len(SECRET)}")
+    layout[...] = h5py.VirtualSource(str(source), "text", (1,))
+    file.create_virtual_dataset(name, layout)
+
+
+@pytest.fixture
+def secret(tmp_path):
+    """Two files outside of the recording's folder that hold a text: a plain one and one of HDF5."""
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "plain").write_bytes(SECRET)
+    with h5py.File(outside / "text.h5", "w") as file:
+        file["text"] = np.array([SECRET])
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home" / "link").symlink_to(outside)
+    return outside
+
+
+@pytest.mark.parametrize(
+    "kind", ["raw", "raw by a link", "raw by ..", "virtual", "virtual by a link", "linked"]
+)
+@pytest.mark.parametrize(
+    "place", ["/entry/title", "/entry/process/note", "/entry/instrument/detector/local_name"]
+)
+def test_no_text_outside_the_folder_is_read(tmp_path, secret, kind, place):
+    path = record(sphere(), tmp_path / "home" / "theirs.h5")
+    with h5py.File(path, "r+") as file:
+        if place in file:
+            del file[place]
+        if kind == "linked":
+            file[place] = h5py.ExternalLink(str(secret / "text.h5"), "/text")
+        elif kind.startswith("virtual"):
+            virtual_text(file, place, "link/text.h5" if kind.endswith("link") else secret / "text.h5")
+        else:
+            names = {"raw": secret / "plain", "raw by a link": "link/plain", "raw by ..": "../outside/plain"}
+            text_in_raw_file(file, place, names[kind])
+    with Hdf5File(path) as file, pytest.raises(io.InputError, match="leads out of its folder") as caught:
+        file.value(file.follow(place, "no remedy"))
+    assert SECRET.decode() not in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["raw", "virtual"])
+def test_no_list_of_texts_outside_the_folder_is_read(tmp_path, secret, kind):
+    path = tmp_path / "home" / "theirs.h5"
+    with h5py.File(path, "w") as file:
+        if kind == "raw":
+            text_in_raw_file(file, "x", secret / "plain")
+        else:
+            virtual_text(file, "x", secret / "text.h5")
+    with Hdf5File(path) as file, pytest.raises(io.InputError, match="leads out of its folder"):
+        file.texts(file.find("/x"), "no remedy")
+
+
+def test_no_text_outside_the_folder_is_shown(tmp_path, secret):
+    path = record(sphere(), tmp_path / "home" / "theirs.h5")
+    with h5py.File(path, "r+") as file:
+        del file["/entry/title"]
+        text_in_raw_file(file, "/entry/title", secret / "plain")
+    with pytest.raises(io.InputError, match="leads out of its folder"):
+        io.describe(path)
+
+
+def test_no_text_outside_the_folder_is_exported(tmp_path, secret):
+    path = record(sphere(), tmp_path / "home" / "theirs.h5")
+    with h5py.File(path, "r+") as file:
+        text_in_raw_file(file, "/entry/serial", secret / "plain")
+    with pytest.raises(io.InputError, match="leads out of its folder"):
+        io.save_zarr(path, tmp_path / "out.zarr")
+    assert not (tmp_path / "out.zarr").exists()
+
+
+def test_a_raw_file_of_that_name_in_the_working_directory_is_not_read(tmp_path, secret, monkeypatch):
+    """HDF5 itself looks for raw files in the working directory first."""
+    path = record(sphere(), tmp_path / "home" / "theirs.h5")
+    (path.parent / "plain").write_bytes(b"x" * len(SECRET))
+    with h5py.File(path, "r+") as file:
+        text_in_raw_file(file, "/entry/serial", "plain")
+    monkeypatch.chdir(secret)
+    io.save_zarr(path, tmp_path / "out.zarr")
+    with open_file(tmp_path / "out.zarr") as file:
+        assert file.texts(file.find("/entry/serial"), "") == ("x" * len(SECRET),)
+
+
+def test_a_pipe_in_place_of_a_raw_file_is_refused(tmp_path):
+    """It would be read for ever."""
+    os.mkfifo(tmp_path / "pipe")
+    path = record(sphere(), tmp_path / "theirs.h5")
+    with h5py.File(path, "r+") as file:
+        del file["/entry/title"]
+        text_in_raw_file(file, "/entry/title", "pipe")
+    refused(path, "the raw storage of /entry/title leads to pipe, which is not a regular file")
+
+
+def test_virtual_sources_in_raw_files_are_refused(path, tmp_path):
+    with h5py.File(tmp_path / "part.h5", "w") as file:
+        file.create_dataset("x", SHAPE, "u1", external=[("x.raw", 0, 280)])
+    (tmp_path / "x.raw").write_bytes(STACK.tobytes())
+    with h5py.File(path, "w") as file:
+        layout = h5py.VirtualLayout(SHAPE, "u1")
+        layout[...] = h5py.VirtualSource("part.h5", "x", SHAPE)
+        file.create_virtual_dataset("x", layout)
+    refused(path, "has sources in raw files, /x; copy the frames into one dataset")
+
+
+def test_virtual_sources_that_are_a_pattern_are_refused(path, tmp_path):
+    virtual(path, ["part%%b.h5"], length=8)
+    refused(path, "names its sources by a pattern; copy the frames into one dataset")
+
+
+def test_deeply_nested_groups_are_refused(path):
+    with h5py.File(path, "w") as file:
+        group = file
+        for _ in range(hdf5._GROUPS_DEEP + 1):
+            group = group.create_group("g")
+    message = refused(path, r"theirs\.h5 has groups nested more than 64 deep")
+    assert "Copy what is needed" in message
+
+
+def test_too_many_objects_are_refused(path, monkeypatch):
+    monkeypatch.setattr(hdf5, "_MOST_OBJECTS", 20)
+    with h5py.File(path, "w") as file:
+        for number in range(21):
+            file.create_group(f"g{number}")
+    refused(path, "has more than 20 groups, datasets and links")
+
+
+def test_objects_come_once_and_in_order(path):
+    with h5py.File(path, "w") as file:
+        file["b/two"], file["a/one"] = STACK, STACK
+        file["a/again"], file["b/round"] = file["b/two"], file["a"]
+        file["soft"] = h5py.SoftLink("/a/one")
+    with Hdf5File(path) as file:
+        assert [name for name, _ in file.objects()] == ["/a", "/a/again", "/a/one", "/b"]
+
+
+def packed_zeros(file, name, count):
+    file.create_dataset(name, (count,), "u1", chunks=(count,), compression="gzip")[...] = 0
+
+
+def test_values_of_a_small_file_take_limited_memory(path, monkeypatch):
+    monkeypatch.setattr(hdf5, "VALUES_LIMIT", 1_500_000)
+    with h5py.File(path, "w") as file:
+        packed_zeros(file, "x", 1_000_000)
+    with Hdf5File(path) as file:
+        file.read(file.find("/x"), (1_000_000,))
+        with pytest.raises(io.InputError, match=r"at least 2 MB in memory; at most 1\.5 MB are read"):
+            file.read(file.find("/x"), (1_000_000,))
+    with Hdf5File(path, memory_limit=3_000_000) as file:
+        file.read(file.find("/x"), (1_000_000,))
+        file.read(file.find("/x"), (1_000_000,))
+
+
+def test_texts_that_share_their_bytes_are_counted_each(path, monkeypatch):
+    monkeypatch.setattr(hdf5, "VALUES_LIMIT", 1_500_000)
+    with h5py.File(path, "w") as file:
+        file.create_dataset("x", (200,), h5py.string_dtype())[...] = ["x" * 10_000, *[""] * 199]
+    with Hdf5File(path) as file, pytest.raises(io.InputError, match="values other than frames take"):
+        file.texts(file.find("/x"), "no remedy")

@@ -73,7 +73,7 @@ def test_a_chunk_that_is_gone_leaves_no_result(bucket, tmp_path):
     bucket.rm("presses/short.zarr/entry/instrument/detector/data/c/0/0/0")
     before = sorted(tmp_path.iterdir())
     said = refused("reconstruct", "s3://presses/short.zarr", "-o", "s3.h5")
-    assert "data/c/0/0/0, is missing: it was cut short" in said
+    assert "data/c/0/0/0, is missing: copy it again" in said
     assert sorted(tmp_path.iterdir()) == before
 
 

@@ -6,6 +6,8 @@ import json
 import os
 import shutil
 import socket
+import subprocess
+import sys
 import threading
 
 import h5py
@@ -14,6 +16,8 @@ import pytest
 from stacks import SHAPE, random_stack, read_all, record, sphere
 
 from mirrorskin import engine, io
+from mirrorskin.io import zarr_export
+from mirrorskin.io.atomic import remove_leftovers
 from mirrorskin.io.hdf5 import Hdf5File
 from mirrorskin.io.url import Url, path_of
 from mirrorskin.io.zarr import ZarrFile, ZarrFrames
@@ -184,7 +188,7 @@ def test_a_fingerprint_tells_recordings_apart(pair, tmp_path):
         ({"shape": [-8, 5, 7]}, "it is damaged"),
         ({"shape": [800, 5, 7]}, "is missing: copy it again, or write empty ones, too"),
         ({"data_type": "float64"}, "is of type float64: frames are uint8, uint16 or float32"),
-        ({"codecs": [{"name": "unheard-of"}]}, "it is damaged"),
+        ({"codecs": [{"name": "unheard-of"}]}, "needs the codec 'unheard-of'; only blosc, bytes, crc32c"),
         ({"node_type": "sheep"}, ""),
     ],
 )
@@ -203,9 +207,9 @@ def test_positions_that_are_no_numbers_are_refused(pair):
     assert "stage/travel" in line(pair[1])
 
 
-def test_a_claim_of_more_than_memory_holds_is_refused(pair):
+def test_a_claim_of_another_size_is_refused(pair):
     edit(pair[1], "entry/instrument/detector/dark", shape=[1 << 20, 1 << 20])
-    assert "it is damaged: copy it again" in line(pair[1])
+    assert "has shape (1048576, 1048576) where (5, 7) is needed" in line(pair[1])
 
 
 @pytest.mark.parametrize(
@@ -247,6 +251,79 @@ def test_nothing_is_left_of_what_could_not_be_read(pair, memory, tmp_path, remot
     with pytest.raises(io.InputError, match="sideways"):
         io.save_zarr(pair[0], target)
     assert (sorted(tmp_path.iterdir()), memory.find("/bucket")) == before
+
+
+def test_of_two_writers_the_first_to_finish_wins(pair, tmp_path):
+    target, other = tmp_path / "new.zarr", record(sphere("uint16"), tmp_path / "other.h5")
+
+    def write_meanwhile(count):
+        if not target.exists():
+            io.save_zarr(other, target)
+
+    with pytest.raises(io.InputError, match=r"new\.zarr was made by another program meanwhile: name another"):
+        io.save_zarr(pair[0], target, write_meanwhile)
+    with io.open_recording(target) as recording:
+        assert recording.dtype == np.uint16
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_of_two_writers_at_an_address_the_second_gives_up(pair, memory, monkeypatch):
+    target, refused = "memory://bucket/new.zarr", []
+    monkeypatch.setattr(zarr_export, "check_store", lambda target: None)  # both looked before either wrote
+
+    def write_meanwhile(count):
+        with pytest.raises(io.InputError) as caught:
+            io.save_zarr(pair[0], target)
+        refused.append(str(caught.value))
+
+    io.save_zarr(pair[0], target, write_meanwhile)
+    assert refused == [f"{target} is being written by another program: name another output with -o"]
+    with io.open_recording(pair[0]) as first, io.open_recording(target) as second:
+        np.testing.assert_array_equal(read_all(second, 3).frames, read_all(first, 3).frames)
+    assert not [name for name in memory.find("/bucket") if ".mirrorskin" in name]
+
+
+WRITER = """
+import sys
+from mirrorskin import io
+
+def wait(count):
+    print("writing", flush=True)
+    sys.stdin.read()
+
+io.save_zarr(sys.argv[1], sys.argv[2], wait)
+"""
+
+
+def test_what_a_killed_writer_has_left_is_removed_by_the_next(pair, tmp_path):
+    command = [sys.executable, "-c", WRITER, str(pair[0]), str(tmp_path / "killed.zarr")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as writer:
+        assert writer.stdout.readline() == b"writing\n"
+        (part,) = tmp_path.glob(".mirrorskin-*.part")
+        assert remove_leftovers(tmp_path) == []  # it is being written
+        assert part.is_dir()
+        writer.kill()
+    assert remove_leftovers(tmp_path) == [part]
+    assert not part.exists()
+
+
+def test_a_folder_that_is_being_written_is_no_leftover_of_the_next_writer(pair, tmp_path):
+    seen = []
+
+    def write_another(count):
+        if not seen:
+            seen.append(count)
+            io.save_zarr(pair[0], tmp_path / "second.zarr")
+
+    io.save_zarr(pair[0], tmp_path / "first.zarr", write_another)
+    for name in ("first", "second"):
+        io.open_recording(tmp_path / f"{name}.zarr").close()
+
+
+def test_more_values_than_are_read_again_are_not_written(pair, tmp_path, monkeypatch):
+    monkeypatch.setattr(zarr_export, "VALUES_LIMIT", 100)
+    with pytest.raises(io.InputError, match=r"besides its frames; of Zarr at most 0\.0001 MB are read"):
+        io.save_zarr(pair[0], tmp_path / "new.zarr")
 
 
 def test_a_path_keeps_the_slashes_of_an_address():

@@ -1,0 +1,201 @@
+"""Stores of Zarr, from which limited bytes are read in limited time, and nothing from outside of them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from zarr.abc.store import RangeByteRequest
+from zarr.core.sync import sync
+from zarr.storage import FsspecStore, LocalStore, WrapperStore, ZipStore
+
+from mirrorskin.io.hdf5 import VALUES_LIMIT
+from mirrorskin.io.types import InputError
+from mirrorskin.io.url import Url
+from mirrorskin.io.zarr_errors import MissingChunkError
+from mirrorskin.io.zarr_metadata import METADATA, MOST_NODES, is_name, too_many
+
+SILENCE = 30.0
+"""Seconds within which a server must accept a connection, send more bytes, or send a metadata document."""
+
+TRANSFER = 300.0
+"""Seconds within which one chunk must have arrived."""
+
+LARGEST_DOCUMENT, ALL_DOCUMENTS = 8 << 20, 64 << 20
+"""Bytes of one metadata document or of the listing of a folder, and of all metadata documents of a store."""
+
+_SLACK = 1 << 20  # bytes that a chunk may take more when it is packed
+_most_bytes = contextvars.ContextVar("bytes that an answer may have", default=LARGEST_DOCUMENT)
+
+
+@contextmanager
+def opened_store(path: Path, read_only: bool = True) -> Iterator[Any]:
+    """Open a store of Zarr; at the end its connections are closed, which fsspec does not do itself."""
+    if isinstance(path, Url):
+        store = FsspecStore.from_url(str(path), options_of(path), read_only)
+    elif read_only and not path.exists():
+        raise InputError(f"{path}: no such file")
+    elif read_only and not (path.is_file() or path.is_dir()):
+        raise InputError(f"{path} is neither a folder nor a regular file: copy the store to a folder")
+    else:
+        store = ZipStore(path, mode="r") if path.is_file() else LocalStore(path, read_only=read_only)
+    sync(store._open())
+    try:
+        yield store
+    finally:
+        store.close()
+        for name in ("_s3", "_session"):
+            client = getattr(getattr(store, "fs", None), name, None)
+            if client is not None:
+                sync(client.close())
+
+
+def options_of(address: Url) -> dict[str, Any]:
+    """Return the options with which fsspec opens an address."""
+    scheme = address.parts[0]
+    if scheme in ("s3:", "s3a:"):
+        # An object is fetched in one request, not after another for its size.
+        return {"skip_instance_cache": True, "max_concurrency": 1}
+    if scheme not in ("http:", "https:"):
+        return {"skip_instance_cache": True}
+    from aiohttp import ClientTimeout
+    from fsspec.config import conf
+
+    given = conf.get("http", {}).get("client_kwargs", {})
+    settings = given | {
+        "timeout": ClientTimeout(total=TRANSFER, sock_connect=SILENCE, sock_read=SILENCE),
+        "response_class": _limited_response(),
+        # Answers are taken as they are: unpacked by aiohttp, a small one could fill the memory.
+        "auto_decompress": False,
+        "headers": given.get("headers", {}) | {"Accept-Encoding": "identity"},
+    }
+    return {"skip_instance_cache": True, "client_kwargs": settings}
+
+
+def _limited_response() -> Any:
+    """Return a class of aiohttp's responses that reads at most `_most_bytes`."""
+    from aiohttp import ClientResponse
+
+    class LimitedResponse(ClientResponse):
+        async def read(self) -> bytes:
+            if self._body is None:
+                try:
+                    self._body = await _read_within(self.content, str(self.url), _most_bytes.get())
+                except BaseException:
+                    self.close()
+                    raise
+            return self._body
+
+    return LimitedResponse
+
+
+async def _read_within(content: Any, what: str, most: int) -> bytes:
+    body = bytearray()
+    async for part in content.iter_any():
+        body += part
+        if len(body) > most:
+            raise _too_large(what, most)
+    return bytes(body)
+
+
+def _too_large(what: str, most: int) -> InputError:
+    return InputError(
+        f"{what} has more than {most / 1e6:.3g} MB, the most that is read: copy the store again"
+    )
+
+
+class LimitedStore(WrapperStore[Any]):  # type: ignore[misc]  # where it is not installed
+    """A store that refuses what is too large, too slow, missing, or outside of it."""
+
+    def __init__(self, store: Any, path: Path) -> None:
+        super().__init__(store)
+        self._path, self._home = path, os.path.realpath(path)
+        self.largest_chunk, self._documents = VALUES_LIMIT, 0
+        self._remote = isinstance(store, FsspecStore)
+        self._http = self._remote and "http" in store.fs.protocol
+
+    async def get(self, key: str, prototype: Any, byte_range: Any = None) -> Any:
+        """Read a document, None if it is missing, or a chunk or a part of one, which must be there."""
+        document = key.rpartition("/")[2] in METADATA
+        most = LARGEST_DOCUMENT if document else self.largest_chunk + _SLACK
+        if isinstance(byte_range, RangeByteRequest) and byte_range.end - byte_range.start > most:
+            raise self._damaged(key, most)
+        if byte_range is None and self._remote and not self._http:
+            byte_range = RangeByteRequest(0, most + 1)
+        self._check_place(key, most if byte_range is None else None)
+        answer = super().get(key, prototype, byte_range)
+        found = await self._in_time(answer, SILENCE if document else TRANSFER, most)
+        if found is None and not document:
+            raise MissingChunkError(f"its chunk {key} is missing: copy it again, or write empty ones, too")
+        if found is not None and len(found) > most:
+            raise self._damaged(key, most)
+        if found is not None and document:
+            self._documents += len(found)
+            if self._documents > ALL_DOCUMENTS:
+                raise _too_large(f"{self._path}: all its metadata", ALL_DOCUMENTS)
+        return found
+
+    async def exists(self, key: str) -> bool:
+        """Tell whether there is a chunk."""
+        self._check_place(key, None)
+        return bool(await self._in_time(super().exists(key), SILENCE, LARGEST_DOCUMENT))
+
+    async def names(self, folder: str) -> list[str]:
+        """Return the names in a folder that groups and arrays can have."""
+        self._check_place(folder, None)
+        return await self._in_time(self._listed(folder), SILENCE, LARGEST_DOCUMENT)  # type: ignore[no-any-return]
+
+    async def _listed(self, folder: str) -> list[str]:
+        names: set[str] = set()
+        count = 0
+        async for name in self._store.list_dir(folder):
+            count += 1
+            if count > MOST_NODES:
+                raise too_many(self._path)
+            names.add(name.strip("/"))
+        return sorted(name for name in names if is_name(name) and name not in METADATA)
+
+    async def _in_time(self, answer: Any, seconds: float, most: int) -> Any:
+        if not self._remote:
+            return await answer
+        token = _most_bytes.set(most)
+        try:
+            async with asyncio.timeout(seconds) as limit:
+                return await answer
+        except TimeoutError as error:
+            if limit.expired():
+                raise TimeoutError(f"no whole answer within {seconds:g} s") from error
+            raise
+        finally:
+            _most_bytes.reset(token)
+
+    def _check_place(self, key: str, most: int | None) -> None:
+        """Refuse a file outside of a folder, what is not a regular file, and one of too many bytes."""
+        size = 0
+        if isinstance(self._store, ZipStore):
+            info = self._store._zf.NameToInfo.get(key)
+            size = 0 if info is None else info.file_size
+        elif isinstance(self._store, LocalStore):
+            place = Path(os.path.realpath(self._store.root / key))
+            if not place.is_relative_to(self._home):
+                raise InputError(
+                    f"{self._path}: {key} leads out of the store, to {place}: copy that into the store"
+                )
+            try:
+                found = place.stat()
+            except OSError:
+                return
+            if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
+                raise InputError(f"{self._path}: {key} is not a regular file: copy the store again")
+            size = found.st_size
+        if most is not None and size > most:
+            raise self._damaged(key, most)
+
+    def _damaged(self, key: str, most: int) -> InputError:
+        return _too_large(f"{self._path}: {key}", most)

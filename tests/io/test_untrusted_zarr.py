@@ -1,0 +1,599 @@
+"""Zarr from unknown hands: it runs no code, takes limited memory and time, and is refused in one line."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import gzip
+import http.server
+import json
+import os
+import pickle
+import shutil
+import socket
+import threading
+import tracemalloc
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stacks import SHAPE, random_stack, read_all, record, sphere
+
+from mirrorskin import io
+from mirrorskin.io import hdf5
+from mirrorskin.io.url import Url
+
+zarr = pytest.importorskip("zarr")
+
+import numcodecs  # noqa: E402
+import numcodecs.pickles  # noqa: E402
+
+from mirrorskin.io import zarr_metadata, zarr_store  # noqa: E402
+
+STACK = "entry/instrument/detector/data"
+GIVEN = {"motion": "vertical", "travel": io.Steps(0.3)}
+UTF8, PICKLE = {"id": "vlen-utf8"}, {"id": "pickle", "protocol": 4}
+
+
+def refused(path, **options):
+    """Return the line with which a recording is refused, whatever is done with it."""
+    with pytest.raises(io.InputError) as caught, io.open_recording(path, **options) as recording:
+        read_all(recording, 3)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert len(message) < 600
+    assert message.startswith(str(path))
+    return message
+
+
+def put(folder, name, document):
+    place = folder / name
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.write_text(json.dumps(document))
+
+
+def put_array(folder, name, chunk, key=None, **document):
+    """Write an array of version 2 of one chunk."""
+    shape = document.get("shape", [])
+    defaults = {"zarr_format": 2, "shape": shape, "chunks": shape, "order": "C", "fill_value": None}
+    put(folder / name, ".zarray", defaults | {"filters": None, "compressor": None} | document)
+    (folder / name / (key or ".".join("0" for _ in shape) or "0")).write_bytes(chunk)
+
+
+def theirs(folder, ours=True):
+    """Write a recording of version 2 whose frames are plain bytes."""
+    put(folder, ".zgroup", {"zarr_format": 2})
+    put(folder, "entry/.zgroup", {"zarr_format": 2})
+    put(folder, "entry/.zattrs", {"mirrorskin_recording": 1} if ours else {})
+    put_array(folder, STACK, random_stack().tobytes(), dtype="|u1", shape=list(SHAPE))
+    if ours:
+        put_array(
+            folder,
+            "entry/instrument/stage/travel",
+            np.arange(8.0).tobytes(),
+            dtype="<f8",
+            shape=[8],
+        )
+        put_array(
+            folder,
+            "entry/instrument/stage/motion",
+            numcodecs.VLenUTF8().encode(np.array(["vertical"], object)),
+            dtype="|O",
+            filters=[UTF8],
+        )
+    for group in ("entry/instrument", "entry/instrument/detector", "entry/instrument/stage"):
+        put(folder, f"{group}/.zgroup", {"zarr_format": 2})
+    return folder
+
+
+@pytest.fixture
+def flag(tmp_path, monkeypatch):
+    """A file that is there once a pickle was decoded, which numcodecs is told to do."""
+    monkeypatch.setattr(numcodecs.pickles, "ALLOW_UNSAFE_PICKLE_DECODE", True, raising=False)
+    return tmp_path / "flag"
+
+
+class Trap:
+    def __init__(self, flag):
+        self.flag = flag
+
+    def __reduce__(self):
+        return Path.touch, (self.flag,)
+
+
+def trap(flag):
+    """Return a pickle that makes a file when it is decoded."""
+    data = pickle.dumps(Trap(flag))
+    numcodecs.pickles.Pickle().decode(data)
+    flag.unlink()  # it works
+    return data
+
+
+def consolidated_2(folder):
+    """Copy all metadata into one document, and remove what it was copied from."""
+    found = {
+        str(one.relative_to(folder)): json.loads(one.read_text())
+        for one in folder.rglob(".z*")
+        if one.parent != folder or one.name == ".zgroup"
+    }
+    put(folder, ".zmetadata", {"zarr_consolidated_format": 1, "metadata": found})
+    for name in found:
+        if name != ".zgroup":
+            (folder / name).unlink()
+
+
+@contextlib.contextmanager
+def served(folder, handler=http.server.SimpleHTTPRequestHandler, **settings):
+    """Serve a folder on this machine; yield the address."""
+
+    class Quiet(handler):
+        def log_message(self, *_):
+            pass
+
+    server = http.server.ThreadingHTTPServer(
+        ("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder), **settings)
+    )
+    server.daemon_threads = True
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_address[1]}"
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+@contextlib.contextmanager
+def delivered(folder, way):
+    """Yield the path or address of a store that was written to a folder."""
+    if way == "zip":
+        yield Path(shutil.make_archive(str(folder), "zip", folder))
+    elif way == "http":
+        with served(folder.parent) as address:
+            yield Url(f"{address}/{folder.name}")
+    else:
+        yield folder
+
+
+DANGEROUS = {
+    "compressor of a text": {"dtype": "|O", "filters": [UTF8], "compressor": PICKLE},
+    "filter of a text": {"dtype": "|O", "filters": [PICKLE]},
+    "filter of a text behind another": {"dtype": "|O", "filters": [UTF8, PICKLE]},
+    "compressor of a number": {"dtype": "<f8", "compressor": PICKLE},
+    "filter of a number": {"dtype": "<f8", "filters": [PICKLE]},
+}
+
+
+@pytest.mark.parametrize("consolidated", [False, True])
+@pytest.mark.parametrize("way", ["folder", "zip", "http"])
+@pytest.mark.parametrize("kind", DANGEROUS)
+def test_no_pickle_is_decoded(tmp_path, flag, kind, way, consolidated):
+    folder = theirs(tmp_path / "x.zarr")
+    name = "entry/title" if "text" in kind else "entry/instrument/stage/tilt"
+    put_array(folder, name, trap(flag), **DANGEROUS[kind])
+    if consolidated:
+        consolidated_2(folder)
+    with delivered(folder, way) as path:
+        assert f"/{name} needs the codec 'pickle'; only" in refused(path)
+        with pytest.raises(io.InputError, match="needs the codec 'pickle'"):
+            io.describe(path)
+        with pytest.raises(io.InputError, match="needs the codec 'pickle'"):
+            io.save_zarr(path, tmp_path / "copy.zarr")
+    assert not flag.exists()
+
+
+@pytest.mark.parametrize("ours", [True, False])
+@pytest.mark.parametrize("place", [{"compressor": PICKLE}, {"filters": [PICKLE]}])
+def test_no_pickle_of_frames_is_decoded(tmp_path, flag, ours, place):
+    folder = theirs(tmp_path / "x.zarr", ours)
+    put_array(folder, STACK, trap(flag), dtype="|u1", shape=list(SHAPE), **place)
+    assert f"/{STACK} needs the codec 'pickle'; only" in refused(folder, **GIVEN)
+    assert not flag.exists()
+
+
+def test_what_others_keep_beside_their_frames_is_not_decoded(tmp_path, flag):
+    folder = theirs(tmp_path / "x.zarr", ours=False)
+    put_array(folder, "entry/notes", trap(flag), **DANGEROUS["compressor of a text"])
+    put_array(folder, "entry/odd", b"", dtype=[["a", "<f8"]], compressor={"id": "unheard-of"})
+    with io.open_recording(folder, **GIVEN) as recording:
+        np.testing.assert_array_equal(read_all(recording, 3).frames, random_stack())
+    assert io.describe(folder)["stacks"] == "1"
+    assert not flag.exists()
+
+
+def codecs_3(*codecs):
+    return [{"name": "bytes", "configuration": {"endian": "little"}}, *codecs]
+
+
+def shards(codecs, index=None):
+    settings = {"chunk_shape": [1, 5, 7], "codecs": codecs, "index_location": "end"}
+    settings["index_codecs"] = index or codecs_3({"name": "crc32c"})
+    return [{"name": "sharding_indexed", "configuration": settings}]
+
+
+UNKNOWN = {"name": "numcodecs.pickle", "configuration": {}}
+
+
+@pytest.mark.parametrize("inline", [False, True])
+@pytest.mark.parametrize(
+    "codecs",
+    [
+        codecs_3(UNKNOWN),
+        [UNKNOWN],
+        ["numcodecs.pickle"],
+        codecs_3({"id": "zstd", **UNKNOWN}),
+        shards(codecs_3(UNKNOWN)),
+        shards(codecs_3(), codecs_3(UNKNOWN)),
+    ],
+)
+def test_codecs_of_version_3_are_those_that_are_allowed(tmp_path, codecs, inline):
+    folder = tmp_path / "x.zarr"
+    zarr.create_array(folder, name="x", data=random_stack(), chunks=(1, 5, 7), compressors=None)
+    zarr.open_group(folder, mode="a")
+    document = json.loads((folder / "x/zarr.json").read_text()) | {"codecs": codecs}
+    put(folder, "x/zarr.json", document)
+    if inline:
+        root = json.loads((folder / "zarr.json").read_text())
+        copies = {"kind": "inline", "must_understand": False, "metadata": {"x": document}}
+        put(folder, "zarr.json", root | {"consolidated_metadata": copies})
+        (folder / "x/zarr.json").unlink()
+    assert "/x needs the codec 'numcodecs.pickle'; only" in refused(folder, **GIVEN)
+
+
+def test_shards_inside_of_shards_are_refused(tmp_path):
+    folder = tmp_path / "x.zarr"
+    zarr.create_array(folder, data=random_stack(), chunks=(1, 5, 7), compressors=None)
+    edit(folder, codecs=shards(shards(codecs_3())))
+    assert "has shards inside of shards" in refused(folder, **GIVEN)
+
+
+def edit(folder, **changes):
+    put(folder, "zarr.json", json.loads((folder / "zarr.json").read_text()) | changes)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"compressor": numcodecs.Blosc("zstd")},
+        {"compressor": numcodecs.Zlib()},
+        {"compressor": numcodecs.GZip()},
+        {"compressor": numcodecs.LZ4()},
+        {"compressor": numcodecs.Zstd()},
+        {"compressor": None},
+        {"compressor": numcodecs.Zstd(), "filters": [numcodecs.Shuffle(2)]},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("dtype", ["<u2", ">u2"])
+def test_version_2_is_read_in_all_codecs_that_are_allowed(tmp_path, settings, dtype):
+    frames, folder = random_stack("uint16").astype(dtype), tmp_path / "x.zarr"
+    document = {"dtype": dtype, "shape": list(SHAPE)}
+    packed = frames.tobytes()
+    for one in settings.get("filters", []):
+        packed = bytes(one.encode(packed))
+    if settings["compressor"]:
+        packed = settings["compressor"].encode(packed)
+        document["compressor"] = settings["compressor"].get_config()
+    document["filters"] = [one.get_config() for one in settings.get("filters", [])]
+    put_array(folder, "", bytes(packed), key="0.0.0", **document)
+    with io.open_recording(folder, **GIVEN) as recording:
+        np.testing.assert_array_equal(read_all(recording, 3).frames, frames)
+
+
+@pytest.mark.parametrize("name", ["blosc", "gzip", "zstd"])
+@pytest.mark.parametrize("sharded", [False, True])
+def test_version_3_is_read_in_all_codecs_that_are_allowed(tmp_path, name, sharded):
+    from zarr.codecs import BloscCodec, GzipCodec, ZstdCodec
+
+    codec = {"blosc": BloscCodec(), "gzip": GzipCodec(), "zstd": ZstdCodec()}[name]
+    settings = {"chunks": (2, 5, 7), "shards": (4, 5, 7) if sharded else None, "compressors": codec}
+    zarr.create_array(tmp_path / "x.zarr", data=random_stack(), **settings)
+    with io.open_recording(tmp_path / "x.zarr", **GIVEN) as recording:
+        assert recording.storage.lower() == f"zarr, chunks (2, 5, 7), {name}"
+        np.testing.assert_array_equal(read_all(recording, 3).frames, random_stack())
+
+
+ZEROS = bytes(64 << 20)
+
+
+def streamed(data):
+    """Return a frame of Zstandard that does not say how many bytes it gives: blocks of repeated bytes."""
+    count = len(data) // (128 << 10)
+    block = (1 << 1 | (128 << 10) << 3).to_bytes(3, "little") + b"\0"
+    return b"\x28\xb5\x2f\xfd\x00\x58" + block * count + (1).to_bytes(3, "little")
+
+
+BOMBS = {
+    "zlib": zlib.compress(ZEROS),
+    "gzip": gzip.compress(ZEROS),
+    "blosc": numcodecs.Blosc().encode(ZEROS),
+    "lz4": numcodecs.LZ4().encode(ZEROS),
+    "zstd": numcodecs.Zstd().encode(ZEROS),
+    "zstd, streamed": streamed(ZEROS),
+    "zstd, twice": numcodecs.Zstd().encode(b"x") + streamed(ZEROS),
+}
+
+
+@contextlib.contextmanager
+def little_memory(most=8_000_000):
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < most
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("kind", BOMBS)
+def test_a_chunk_of_version_2_that_unpacks_to_more_takes_no_memory(tmp_path, kind):
+    folder, name = tmp_path / "x.zarr", kind.split(",")[0]
+    settings = {"dtype": "|u1", "shape": list(SHAPE), "compressor": {"id": name}}
+    put_array(folder, "", BOMBS[kind], key="0.0.0", **settings)
+    with little_memory():
+        message = refused(folder, **GIVEN)
+    assert "frames 0 to 7 of /data cannot be read" in message
+    assert "damaged" in message
+
+
+@pytest.mark.parametrize("sharded", [False, True])
+@pytest.mark.parametrize("name", ["gzip", "blosc", "zstd"])
+def test_a_chunk_of_version_3_that_unpacks_to_more_takes_no_memory(tmp_path, name, sharded):
+    from zarr.codecs import BloscCodec, GzipCodec, ZstdCodec
+
+    folder, large = tmp_path / "x.zarr", np.zeros((8, 2048, 2048), np.uint8)
+    codec = {"blosc": BloscCodec(), "gzip": GzipCodec(), "zstd": ZstdCodec()}[name]
+    sizes = {"chunks": large.shape, "shards": large.shape if sharded else None}
+    zarr.create_array(folder, data=large, compressors=codec, config={"write_empty_chunks": True}, **sizes)
+    text = (folder / "zarr.json").read_text()
+    (folder / "zarr.json").write_text(text.replace("2048", "16"))
+    with little_memory():
+        assert "cannot be read: it is damaged" in refused(folder, **GIVEN)
+
+
+@pytest.mark.parametrize("compressor", [None, {"id": "zlib"}])
+def test_a_text_that_claims_many_takes_no_memory(tmp_path, compressor):
+    folder, data = theirs(tmp_path / "x.zarr"), b"\xff\xff\xff\xff"
+    chunk = zlib.compress(data) if compressor else data
+    put_array(folder, "entry/title", chunk, dtype="|O", filters=[UTF8], compressor=compressor)
+    with little_memory():
+        assert "/entry/title: it is damaged (a chunk that does not hold 1 texts)" in refused(folder)
+
+
+def test_a_long_text_takes_no_memory(tmp_path):
+    folder, data = theirs(tmp_path / "x.zarr"), b"\1\0\0\0\0\0\0\4" + ZEROS
+    put_array(
+        folder, "entry/title", zlib.compress(data), dtype="|O", filters=[UTF8], compressor={"id": "zlib"}
+    )
+    with little_memory():
+        assert "/entry/title: it is damaged" in refused(folder)
+
+
+def test_only_what_is_needed_is_decoded(tmp_path):
+    folder = theirs(tmp_path / "x.zarr")
+    settings = {"dtype": "|u1", "compressor": {"id": "zlib"}}
+    for number in range(5):
+        put_array(folder, f"entry/x{number}", b"no chunk", key="0", shape=[1 << 29], **settings)
+    with little_memory(), io.open_recording(folder) as recording:
+        np.testing.assert_array_equal(read_all(recording, 3).frames, random_stack())
+
+
+@pytest.mark.parametrize("sharded", [False, True])
+def test_an_array_in_many_chunks_is_refused(tmp_path, sharded):
+    zarr.create_array(tmp_path / "x.zarr", data=random_stack(), chunks=(1, 1, 1))
+    edit(tmp_path / "x.zarr", shape=[8, 5, 70_000], **({"codecs": shards(codecs_3())} if sharded else {}))
+    if sharded:
+        small = json.loads((tmp_path / "x.zarr/zarr.json").read_text().replace("[1, 5, 7]", "[1, 1, 1]"))
+        grid = {"name": "regular", "configuration": {"chunk_shape": [8, 5, 70_000]}}
+        edit(tmp_path / "x.zarr", codecs=small["codecs"], chunk_grid=grid)
+    assert "/data claims 350000 chunks a frame: write it in fewer" in refused(tmp_path / "x.zarr", **GIVEN)
+
+
+def test_values_in_many_chunks_are_refused(tmp_path):
+    folder = theirs(tmp_path / "x.zarr")
+    put_array(folder, "entry/instrument/stage/travel", b"", dtype="<f8", shape=[8])
+    put_array(folder, "entry/instrument/detector/dark", b"", dtype="|u1", shape=[5, 70_000], chunks=[1, 1])
+    put_array(folder, STACK, bytes(8 * 5 * 70_000), dtype="|u1", shape=[8, 5, 70_000])
+    assert "/dark is in 350000 chunks, and at most 65536 are read" in refused(folder)
+
+
+def test_values_take_limited_memory(tmp_path, monkeypatch):
+    io.save_result(io.Result(height=np.zeros((200, 300), np.float32), filled=None), tmp_path / "r.zarr")
+    monkeypatch.setattr(hdf5, "VALUES_LIMIT", 200_000)
+    with pytest.raises(io.InputError, match=r"values other than frames take at least 0\.24\d* MB in memory"):
+        io.open_result(tmp_path / "r.zarr")
+
+
+@pytest.mark.parametrize("name", ["zarr.json", "c/0/0/0", "c/7/0/0"])
+def test_nothing_outside_of_a_folder_is_read(tmp_path, name):
+    folder = tmp_path / "x.zarr"
+    zarr.create_array(folder, data=random_stack(), chunks=(1, 5, 7), compressors=None)
+    (folder / name).rename(tmp_path / "outside")
+    (folder / name).symlink_to(tmp_path / "outside")
+    assert f"{name} leads out of the store, to" in refused(folder, **GIVEN)
+
+
+def test_links_inside_of_a_folder_are_followed(tmp_path):
+    zarr.create_array(tmp_path / "store", data=random_stack(), chunks=(1, 5, 7), compressors=None)
+    (tmp_path / "store/c/3/0/0").rename(tmp_path / "store/three")
+    (tmp_path / "store/c/3/0/0").symlink_to("../../../three")
+    (tmp_path / "x.zarr").symlink_to("store")
+    with io.open_recording(tmp_path / "x.zarr", **GIVEN) as recording:
+        np.testing.assert_array_equal(read_all(recording, 3).frames, random_stack())
+
+
+@pytest.mark.parametrize("name", ["zarr.json", "c/0/0/0"])
+def test_a_pipe_in_a_folder_is_refused(tmp_path, name):
+    folder = tmp_path / "x.zarr"
+    zarr.create_array(folder, data=random_stack(), chunks=(8, 5, 7), compressors=None)
+    (folder / name).unlink()
+    os.mkfifo(folder / name)
+    assert f"{name} is not a regular file" in refused(folder, **GIVEN)
+
+
+def test_a_pipe_in_place_of_a_store_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "x.zarr")
+    assert "is neither a folder nor a regular file" in refused(tmp_path / "x.zarr")
+
+
+@pytest.mark.parametrize("name", ["../x", "a/../../x", "/etc", "a//b", ".", "a/\0"])
+@pytest.mark.parametrize("version", [2, 3])
+def test_names_that_lead_out_of_a_store_are_refused(tmp_path, name, version):
+    folder = tmp_path / "x.zarr"
+    document = {"zarr_format": version, "shape": [8, 5, 7]}
+    if version == 2:
+        put(folder, ".zgroup", {"zarr_format": 2})
+        put(folder, ".zmetadata", {"metadata": {f"{name}/.zarray": document}})
+    else:
+        copies = {"kind": "inline", "metadata": {name: document | {"node_type": "array"}}}
+        group = {"zarr_format": 3, "node_type": "group", "consolidated_metadata": copies}
+        put(folder, "zarr.json", group)
+    assert "it is damaged (the name" in refused(folder)
+
+
+def test_large_documents_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(zarr_store, "LARGEST_DOCUMENT", 50_000)
+    folder = theirs(tmp_path / "x.zarr")
+    put(folder, "entry/.zattrs", {"x": "x" * 60_000})
+    for way in ("folder", "zip", "http"):
+        with delivered(folder, way) as path:
+            assert "/.zattrs has more than 0.05 MB, the most that is read" in refused(path)
+
+
+def test_many_documents_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(zarr_store, "ALL_DOCUMENTS", 300)
+    assert "all its metadata has more than 0.0003 MB" in refused(theirs(tmp_path / "x.zarr"))
+
+
+@pytest.mark.parametrize("consolidated", [False, True])
+def test_many_nodes_are_refused(tmp_path, monkeypatch, consolidated):
+    folder = theirs(tmp_path / "x.zarr")
+    if consolidated:
+        consolidated_2(folder)
+    monkeypatch.setattr(zarr_metadata, "MOST_NODES", 5)
+    assert "holds more than 5 groups and arrays" in refused(folder)
+
+
+def test_many_files_in_a_folder_are_refused(tmp_path, monkeypatch):
+    folder = theirs(tmp_path / "x.zarr")
+    for number in range(60):
+        (folder / f"x{number}").touch()
+    monkeypatch.setattr(zarr_store, "MOST_NODES", 50)
+    assert "groups and arrays: copy what is wanted" in refused(folder)
+
+
+def test_a_store_of_others_is_read_from_a_server_that_lists_its_folders(tmp_path):
+    folder = theirs(tmp_path / "x.zarr", ours=False)
+    with delivered(folder, "http") as path, io.open_recording(path, **GIVEN) as recording:
+        np.testing.assert_array_equal(read_all(recording, 3).frames, random_stack())
+
+
+class Endless(http.server.SimpleHTTPRequestHandler):
+    """Answers every request with bytes without end, as fast or as slowly as they are taken."""
+
+    pause = 0.0
+
+    def do_GET(self):
+        self.send_response(200)
+        self.send_header("Content-Type", "text/html")
+        self.end_headers()
+        waiting = threading.Event()
+        with contextlib.suppress(OSError):
+            while not waiting.wait(self.pause):
+                self.wfile.write(b" " * (1 if self.pause else 65536))
+
+
+class Slow(Endless):
+    pause = 0.05
+
+
+class Packed(http.server.SimpleHTTPRequestHandler):
+    """Answers with a small document that would be unpacked to a large one."""
+
+    body = gzip.compress(b" " * 100_000_000)
+
+    def do_GET(self):
+        self.send_response(200)
+        self.send_header("Content-Encoding", "gzip")
+        self.send_header("Content-Length", str(len(self.body)))
+        self.end_headers()
+        self.wfile.write(self.body)
+
+
+def test_a_document_without_end_is_refused(tmp_path):
+    with served(tmp_path, Endless) as address, little_memory(40_000_000):
+        assert "zarr.json has more than 8.39 MB, the most that is read" in refused(Url(f"{address}/x.zarr"))
+
+
+def test_a_packed_document_is_not_unpacked(tmp_path):
+    with served(tmp_path, Packed) as address, little_memory():
+        assert "it is damaged" in refused(Url(f"{address}/x.zarr"))
+
+
+def test_a_document_that_comes_byte_by_byte_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(zarr_store, "SILENCE", 0.4)
+    with served(tmp_path, Slow) as address:
+        message = refused(Url(f"{address}/x.zarr"))
+    assert "the store does not answer" in message
+
+
+def test_a_silent_server_is_refused(monkeypatch):
+    monkeypatch.setattr(zarr_store, "SILENCE", 0.2)
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        server.listen()  # connections are made, and nothing is ever read or sent
+        message = refused(Url(f"http://127.0.0.1:{server.getsockname()[1]}/x.zarr"))
+    assert "the store does not answer" in message
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory):
+    """A recording in a zip."""
+    folder = tmp_path_factory.mktemp("made")
+    io.save_zarr(record(sphere(), folder / "press.h5"), folder / "press.zarr")
+    return Path(shutil.make_archive(str(folder / "press.zarr"), "zip", folder / "press.zarr"))
+
+
+def test_a_zip_that_was_cut_is_refused_wherever(archive, tmp_path):
+    data, path = archive.read_bytes(), tmp_path / "x.zarr.zip"
+    for length in sorted({*range(0, len(data), 1 + len(data) // 40), 1, 21, 22, len(data) - 1}):
+        path.write_bytes(data[:length])
+        assert "it is damaged" in refused(path)
+
+
+def test_a_zip_with_damaged_bytes_is_read_or_refused_in_a_line(archive, tmp_path):
+    data, path = bytearray(archive.read_bytes()), tmp_path / "x.zarr.zip"
+    random = np.random.default_rng(1)
+    for _ in range(40):
+        damaged = bytearray(data)
+        for place in random.integers(0, len(data), 20):
+            damaged[place] ^= int(random.integers(1, 256))
+        path.write_bytes(damaged)
+        with contextlib.suppress(io.InputError), io.open_recording(path) as recording:
+            read_all(recording, 3)
+
+
+def test_a_zip_of_something_else_is_refused(tmp_path):
+    path = tmp_path / "x.zarr.zip"
+    path.write_text("no zip")
+    assert "it is damaged (File is not a zip file)" in refused(path)
+    for name, content in {
+        "x.zarr/zarr.json": "{}",
+        "readme.txt": "",
+        "zarr.json": "{",
+        ".zgroup": "[]",
+        "zarr.json/": "",
+    }.items():
+        with zipfile.ZipFile(path, "w") as file:
+            file.writestr(name, content)
+        assert "it is damaged" in refused(path) or "there is no Zarr array or group" in refused(path)
+
+
+def test_a_zip_whose_members_unpack_to_more_takes_no_memory(tmp_path):
+    path = tmp_path / "x.zarr.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("zarr.json", ZEROS)
+    with little_memory():
+        assert "zarr.json has more than 8.39 MB" in refused(path)
