@@ -12,6 +12,8 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
 
+from mirrorskin.io.os_errors import MAX_TEXT_BYTES, read_regular
+from mirrorskin.io.text import printable
 from mirrorskin.io.types import InputError
 
 _Model = TypeVar("_Model", bound=msgspec.Struct)
@@ -39,13 +41,9 @@ def load_toml(path: str | Path, model: type[_Model], page: str) -> _Model:
     2.0
     """
     path = Path(path)
-    if path.is_fifo():  # which may have no writer
-        raise InputError(f"{path} is no regular file: save what it gives in one first")
+    data = read_regular(path, f"write it as {page} describes", MAX_TEXT_BYTES)
     try:
-        with path.open("rb") as file:
-            tables = tomllib.load(file)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}; write it as {page} describes") from error
+        tables = tomllib.loads(data.decode())
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not text: write it in TOML, as {page} describes") from error
     except (ValueError, RecursionError) as error:
@@ -63,7 +61,7 @@ def quote(value: Any) -> str:
         text = f'"{value}"' if isinstance(value, str) else str(value)
     except ValueError:  # a whole number of thousands of digits
         return "too large a number"
-    text = "".join(letter if letter.isprintable() else "?" for letter in text)
+    text = printable(text)
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
