@@ -1,0 +1,14 @@
+"""Texts that come from files, for terminals and for files that are text."""
+
+from __future__ import annotations
+
+
+def printable(text: str) -> str:
+    r"""Return a text with "?" for each character that does not print, such as control codes.
+
+    Examples
+    --------
+    >>> printable("a\x1b[2Jb")
+    'a?[2Jb'
+    """
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
