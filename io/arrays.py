@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -245,8 +245,11 @@ def map_array(path: Path) -> NDArray[Any]:
             raise ValueError(f"it states {head.nbytes} bytes of values and has {size - head.size}")
         if not head.nbytes:
             return np.empty(head.shape, head.dtype)
-        order = "F" if head.fortran_order else "C"
-        return np.memmap(file, head.dtype, "r", head.size, head.shape, order)
+        # Their type is that of files for reading and writing.
+        opened: Any = file
+        order: Literal["C", "F"] = "F" if head.fortran_order else "C"
+        values: NDArray[Any] = np.memmap(opened, head.dtype, "r", head.size, head.shape, order)
+        return values
 
 
 def _read_members(
@@ -268,13 +271,15 @@ def _read_members(
 
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, head: _Head) -> NDArray[Any]:
     values = np.empty(math.prod(head.shape), head.dtype)
-    data = memoryview(values.view(np.uint8)) if values.size else memoryview(bytearray())
+    data = values.view(np.uint8).data if values.size else memoryview(b"")
     with archive.open(member) as opened:
         opened.read(head.size)
         for start in range(0, len(data), _PIECE):
             piece = data[start : start + _PIECE]
-            if opened.readinto(piece) != len(piece):
+            found = opened.read(len(piece))
+            if len(found) != len(piece):
                 raise ValueError(f"{member.filename} was cut off")
+            piece[:] = found
         if opened.read(1):
             raise ValueError(f"{member.filename} has bytes after its values")
     return values.reshape(head.shape, order="F" if head.fortran_order else "C")

@@ -12,3 +12,14 @@ def printable(text: str) -> str:
     'a?[2Jb'
     """
     return "".join(letter if letter.isprintable() else "?" for letter in text)
+
+
+def one_line(value: object) -> str:
+    r"""Return a value as one line of text that prints.
+
+    Examples
+    --------
+    >>> one_line("two\nlines\x07")
+    'two lines?'
+    """
+    return printable(" ".join(str(value).split()))

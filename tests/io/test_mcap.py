@@ -17,7 +17,13 @@ from mirrorskin import io
 
 HEIGHT = np.array([[1.0, np.nan, 0.5], [0.25, 0.0, -1.0]], np.float32)
 AXIS = {"x": np.array([-1.0, 0.0, 1.0]), "y": np.array([0.5, -0.5])}
-IMAGE = "uint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data"
+FIELDS = {
+    "sensor_msgs/msg/Image": "uint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n"
+    "uint32 step\nuint8[] data",
+    "sensor_msgs/msg/CompressedImage": "string format\nuint8[] data",
+}
+HEAD = "=" * 80 + "\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id"
+TIME = {"header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "camera"}}
 
 
 def messages(path):
@@ -82,9 +88,7 @@ def film(tmp_path):
         path = tmp_path / "film.mcap"
         with path.open("wb") as file:
             writer = Writer(file)
-            schema = writer.register_msgdef(
-                kind, IMAGE if kind.endswith("/Image") else "string format\nuint8[] data"
-            )
+            schema = writer.register_msgdef(kind, f"std_msgs/Header header\n{FIELDS[kind]}\n{HEAD}")
             for number in range(3):
                 for topic, picture in topics:
                     picture = picture + picture.dtype.type(number)
@@ -96,7 +100,7 @@ def film(tmp_path):
                             "step": picture[0].nbytes,
                             "data": picture.tobytes(),
                         }
-                    writer.write_message(topic, schema, data, number * 10_000_000)
+                    writer.write_message(topic, schema, TIME | data, number * 10_000_000)
             writer.finish()
         return path
 
