@@ -32,7 +32,7 @@ def command(
 ) -> None:
     """Make a recording of a video or pictures."""
     from mirrorskin import io
-    from mirrorskin.cli.output import progress
+    from mirrorskin.cli.output import printable, progress
     from mirrorskin.cli.stack import stack_options
 
     io.check_output(output, frames, phases, travel)
@@ -62,6 +62,6 @@ def command(
             err=True,
         )
     for name in source.left_out:
-        click.echo(f"left out: {name}", err=True)
+        click.echo(printable(f"left out: {name}"), err=True)
     count, rows, columns = source.shape
     click.echo(f"{output}: {count} frames of {columns} x {rows}, {source.dtype}, {motion.value} motion")

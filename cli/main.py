@@ -61,7 +61,7 @@ def _common(
     from mirrorskin.cli.output import printable
 
     class Formatter(logging.Formatter):
-        def formatMessage(self, record: logging.LogRecord) -> str:
+        def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  # overrides
             return printable(super().formatMessage(record))
 
     _OneLine.debug = debug
