@@ -565,6 +565,8 @@ def _frame(message: Any, name: str) -> NDArray[Any]:
             f"{name}: images of encoding {message.encoding!r} are not read: save them as mono8 or mono16"
         )
     kind = np.dtype(code).newbyteorder(">" if message.is_bigendian else "<")
+    if not (message.height and message.width):
+        raise InputError(f"{name}: an image has no pixels: remove it")
     rows = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)
     samples = np.ascontiguousarray(rows[:, : message.width * colours * kind.itemsize]).view(kind)
     frame = samples.astype(kind.newbyteorder("=")).reshape(message.height, message.width, colours)
