@@ -56,12 +56,13 @@ def command(
     ):
         recorder.drain(show)
     if header.pixel_size is None:
-        click.echo(
+        message = (
             f"{output}: no pixel size: holes are not filled, and normals, slip and measures need it;"
-            " give --pixel-size here or to 'reconstruct'",
-            err=True,
+            " give --pixel-size here or to 'reconstruct'"
         )
+        click.echo(printable(message), err=True)
     for name in source.left_out:
         click.echo(printable(f"left out: {name}"), err=True)
     count, rows, columns = source.shape
-    click.echo(f"{output}: {count} frames of {columns} x {rows}, {source.dtype}, {motion.value} motion")
+    size = f"{count} frames of {columns} x {rows}"
+    click.echo(printable(f"{output}: {size}, {source.dtype}, {motion.value} motion"))
