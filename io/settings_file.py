@@ -13,11 +13,10 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 import msgspec
 
 from mirrorskin.io.os_errors import MAX_TEXT_BYTES, read_regular
-from mirrorskin.io.text import printable
+from mirrorskin.io.text import printable, shortened
 from mirrorskin.io.types import InputError
 
 _Model = TypeVar("_Model", bound=msgspec.Struct)
-_LONGEST = 40  # letters of a value that a message quotes
 
 
 def load_toml(path: str | Path, model: type[_Model], page: str) -> _Model:
@@ -61,8 +60,7 @@ def quote(value: Any) -> str:
         text = f'"{value}"' if isinstance(value, str) else str(value)
     except ValueError:  # a whole number of thousands of digits
         return "too large a number"
-    text = printable(text)
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+    return shortened(printable(text))
 
 
 def _table(values: Any, model: type[_Model], where: str, name: str) -> _Model:

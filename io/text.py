@@ -23,3 +23,14 @@ def one_line(value: object) -> str:
     'two lines?'
     """
     return printable(" ".join(str(value).split()))
+
+
+def shortened(text: str, most: int = 40) -> str:
+    """Return a text, or its start where it is longer than a message should quote.
+
+    Examples
+    --------
+    >>> shortened("a line without end", 6)
+    'a line...'
+    """
+    return text if len(text) <= most else f"{text[:most]}..."

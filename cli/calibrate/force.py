@@ -83,6 +83,7 @@ def _table(path: Path) -> dict[str, float]:
     """Read newtons by the names of recordings; a first line may be a heading."""
     from mirrorskin.io import InputError
     from mirrorskin.io.os_errors import MAX_TEXT_BYTES, read_regular
+    from mirrorskin.io.text import shortened
 
     remedy = "write REC.h5,newtons, one a press"
     try:
@@ -96,7 +97,7 @@ def _table(path: Path) -> dict[str, float]:
             table[Path(row[0].strip()).name] = float(row[1])
         except (IndexError, ValueError) as error:
             if number:
-                line = ",".join(row)
+                line = shortened(",".join(row))
                 raise InputError(f"{path}: {line!r} is no press: write REC.h5,newtons") from error
     return table
 

@@ -244,7 +244,7 @@ def change_picture(data: bytes, chance: random.Random) -> bytes:
     memory = io.BytesIO()
     if data[:4] == b"\x89PNG":
         if values.dtype not in (np.uint8, np.uint16) or (values.ndim == 3 and values.shape[2] not in (3, 4)):
-            values = values.reshape(-1, shape[-1])[:, :3].astype(np.uint8)
+            values = values.real.reshape(-1, shape[-1])[:, :3].astype(np.uint8)
         options = [cv2.IMWRITE_PNG_BILEVEL, 1] if values.ndim == 2 and chance.random() < 0.3 else []
         return cv2.imencode(chance.choice([".png", ".jpg", ".webp", ".bmp", ".pbm"]), values, options[:0])[
             1
