@@ -9,6 +9,7 @@ kept.
 from __future__ import annotations
 
 import argparse
+import os
 import random
 import select
 import shutil
@@ -26,8 +27,8 @@ from typing import Any
 import mutations
 import numpy as np
 
-PATIENCE = 60.0
-"""Seconds after which a reader hangs."""
+PATIENCE = 30.0
+"""Seconds of a processor's time after which a reader hangs, or ten times as many by the clock."""
 
 MEMORY = 4 << 30
 """Bytes that a reader may take, the OpenCL driver's among them."""
@@ -469,7 +470,7 @@ class Reader:
         with suppress(BrokenPipeError):
             process.stdin.write(f"{path}\n")
             process.stdin.flush()
-        ready, _, _ = select.select([process.stdout], [], [], PATIENCE)
+        ready = self._wait(process)
         said = process.stdout.readline().rstrip("\n") if ready else "hang"
         if said and ready:
             return said
@@ -478,12 +479,29 @@ class Reader:
         self.close()
         return said
 
+    def _wait(self, process: subprocess.Popen[str]) -> bool:
+        """Wait for an answer; return whether it came."""
+        assert process.stdout is not None
+        end, begun = time.monotonic() + 10 * PATIENCE, _processor_time(process.pid)
+        while time.monotonic() < end and _processor_time(process.pid) < begun + PATIENCE:
+            if select.select([process.stdout], [], [], PATIENCE / 10)[0]:
+                return True
+        return False
+
     def close(self) -> None:
         """End the process."""
         if self._process is not None:
             self._process.kill()
             with suppress(BrokenPipeError), self._process:
                 self._process = None
+
+
+def _processor_time(process: int) -> float:
+    """Return the seconds that a process has computed, on all processors together."""
+    with suppress(OSError):
+        numbers = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+        return sum(map(int, numbers[11:13])) / os.sysconf("SC_CLK_TCK")
+    return 0.0
 
 
 def attack(
