@@ -218,7 +218,7 @@ def open_result(path: str | Path) -> Result:
         }
         for name in SERIES:
             if (node := file.find(f"{_RESULT}/{name}")) is not None:
-                series = (getattr(node, "shape", None) or ())[:1]
+                series = (getattr(node, "shape", None) or (0,))[:1]
                 maps[name] = file.read(node, series, remedy=_AGAIN).astype(np.float64, copy=False)
         _check_frames(path, maps)
         for name, direction in (("x", 1), ("y", -1)):

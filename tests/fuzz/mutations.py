@@ -6,7 +6,9 @@ import io
 import json
 import random
 import re
+import struct
 import zipfile
+import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -233,26 +235,49 @@ def change_npy(data: bytes, chance: random.Random) -> bytes:
     return head[:8] + (len(changed) % 65536).to_bytes(2, "little") + changed + rest[stop:]
 
 
-def change_picture(data: bytes, chance: random.Random) -> bytes:
-    """Make a picture of another kind: depth, channels, pages, packing."""
-    rows, columns = chance.choice([(1, 1), (20, 24), (24, 20), (3, 200)])
-    depth = chance.choice(["u1", "u2", "i2", "u4", "f2", "f4", "f8", "?", "c8"])
-    shape: tuple[int, ...] = chance.choice(
-        [(rows, columns), (rows, columns, 3), (rows, columns, 4), (2, rows, columns)]
+def change_png(data: bytes, chance: random.Random) -> bytes:
+    """Damage what the chunks of a PNG hold, with sound checksums; or make a picture of another kind."""
+    if chance.random() < 0.4:
+        values = np.asarray(odd_picture(chance))
+        return cv2.imencode(chance.choice([".png", ".jpg", ".webp", ".bmp"]), values)[1].tobytes()
+    chunks, at = [], 8
+    while at + 12 <= len(data):
+        size = int.from_bytes(data[at : at + 4], "big")
+        chunks.append((data[at + 4 : at + 8], data[at + 8 : at + 8 + size]))
+        at += 12 + size
+    victim = chance.randrange(len(chunks))
+    kind, body = chunks[victim]
+    chunks[victim] = kind, damage(body, chance)
+    if chance.random() < 0.2:
+        chunks.insert(victim, chance.choice(chunks))
+    return data[:8] + b"".join(
+        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+        for kind, body in chunks
     )
-    values = (np.arange(np.prod(shape)).reshape(shape) % 200).astype(depth)
-    memory = io.BytesIO()
-    if data[:4] == b"\x89PNG":
-        if values.dtype not in (np.uint8, np.uint16) or (values.ndim == 3 and values.shape[2] not in (3, 4)):
-            values = values.real.reshape(-1, shape[-1])[:, :3].astype(np.uint8)
-        options = [cv2.IMWRITE_PNG_BILEVEL, 1] if values.ndim == 2 and chance.random() < 0.3 else []
-        return cv2.imencode(chance.choice([".png", ".jpg", ".webp", ".bmp", ".pbm"]), values, options[:0])[
-            1
-        ].tobytes()
-    options = {"compression": chance.choice([None, "zlib"])}
-    if values.ndim == 3 and shape[-1] == 3:
-        options["photometric"] = chance.choice(["rgb", "minisblack"])
-    tifffile.imwrite(memory, values, description="\x1b[2J", bigtiff=chance.random() < 0.3, **options)
+
+
+def odd_picture(chance: random.Random) -> np.ndarray:
+    """Return a picture that OpenCV can write."""
+    rows, columns = chance.choice([(20, 24), (20, 24), (1, 1), (24, 20), (3, 200)])
+    shape: tuple[int, ...] = chance.choice(
+        [(rows, columns), (rows, columns), (rows, columns, 3), (rows, columns, 4)]
+    )
+    values = np.arange(np.prod(shape)).reshape(shape) * chance.choice([0, 1, 7, 255])
+    return values.astype(chance.choice([np.uint8, np.uint16]))
+
+
+def change_tiff(data: bytes, chance: random.Random) -> bytes:
+    """Make a TIFF of another kind: depth, channels, pages, packing."""
+    memory, values = io.BytesIO(), odd_picture(chance)
+    depth = chance.choice(["u1", "u2", "i2", "u4", "f2", "f4", "f8", "?", "c8"])
+    options: dict[str, Any] = {"compression": chance.choice([None, "zlib"]), "bigtiff": chance.random() < 0.3}
+    with tifffile.TiffWriter(memory, bigtiff=options.pop("bigtiff")) as file:
+        for _ in range(chance.choice([1, 1, 2, 4])):
+            if chance.random() < 0.1:
+                values = values[:-1] if len(values) > 1 else values
+            with np.errstate(over="ignore"):
+                page = values.astype(depth)
+            file.write(page, description="\x1b[2J", metadata=None, **options)
     return memory.getvalue()
 
 
@@ -260,8 +285,8 @@ SEMANTIC: dict[str, Mutation] = {
     ".h5": change_hdf5,
     ".npz": change_npz,
     ".npy": change_npy,
-    ".png": change_picture,
-    ".tif": change_picture,
+    ".png": change_png,
+    ".tif": change_tiff,
     ".json": change_json,
     ".toml": change_words,
     ".csv": change_words,
