@@ -17,6 +17,7 @@ from typing import Any, Never
 
 from mirrorskin.bench.harness import THREADS, Case, Row
 from mirrorskin.io import InputError
+from mirrorskin.io.os_errors import MAX_TEXT_BYTES, read_regular
 from mirrorskin.kernels.device import Device
 
 Run = dict[str, Any]
@@ -104,10 +105,9 @@ def open_run(path: Path) -> Run:
     InputError
         The file cannot be read, is no JSON, or is not a run of the benchmark.
     """
+    data = read_regular(path, limit=MAX_TEXT_BYTES)
     try:
-        run = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}") from error
+        run = json.loads(data.decode(), parse_constant=_refuse)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is no JSON: name a file that 'mirrorskin bench -o' wrote") from error
     try:

@@ -14,6 +14,7 @@ import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.groups import Argument, Group, Option, make_command
+from mirrorskin.cli.output import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -94,11 +95,11 @@ def compare_runs(
         return
     console = _console()
     titles = (f"{word}: {report.as_title(one)}" for word, one in zip("AB", runs, strict=True))
-    console.print(*titles, *(f"warning: {line}" for line in found.warnings), sep="\n", markup=False)
+    _print_lines(console, *titles, *(f"warning: {line}" for line in found.warnings))
     for name, rows in found.cases.items():
-        console.print(f"\n{name}", markup=False)
+        _print_lines(console, "", name)
         _print_table(console, comparing.HEAD, comparing.as_rows(rows))
-    console.print("", *found.targets, *found.apart, *found.summary, sep="\n", markup=False)
+    _print_lines(console, "", *found.targets, *found.apart, *found.summary)
 
 
 app.add(compare_runs, "compare")
@@ -194,13 +195,17 @@ def _print(data: Mapping[str, Any]) -> None:
     from mirrorskin.bench import report
 
     console = _console()
-    console.print(report.as_title(data), report.LEGEND, sep="\n", markup=False)
+    _print_lines(console, report.as_title(data), report.LEGEND)
     for case in data["cases"]:
-        console.print(f"\n{case['name']}: {case['title']}", markup=False)
+        _print_lines(console, "", f"{case['name']}: {case['title']}")
         _print_table(console, report.HEAD, report.as_rows(case))
         _print_table(console, report.TARGET_HEAD, report.as_targets(case), numbers=False)
         for note in report.as_notes(case):
-            console.print(note, markup=False)
+            _print_lines(console, note)
+
+
+def _print_lines(console: Console, *lines: str) -> None:
+    console.print(*map(printable, lines), sep="\n", markup=False)
 
 
 def _console() -> Console:
@@ -225,5 +230,5 @@ def _print_table(
         is_number = numbers and number > 0
         table.add_column(name, justify="right" if is_number else "left", no_wrap=is_number)
     for row in rows:
-        table.add_row(*(Text(cell) for cell in row))
+        table.add_row(*(Text(printable(cell)) for cell in row))
     console.print(table)

@@ -37,7 +37,7 @@ def command(
 ) -> None:
     """Write a result as meshes, points, pictures, tables or arrays."""
     from mirrorskin import io
-    from mirrorskin.cli.output import progress
+    from mirrorskin.cli.output import printable, progress
     from mirrorskin.cli.quantity import segment
     from mirrorskin.io.export import check_export
     from mirrorskin.io.frames import MCAP_SUFFIX
@@ -52,17 +52,18 @@ def command(
     if all(path.suffix.lower() == MCAP_SUFFIX for path in output) and is_recording(result):
         with io.open_recording(result) as recording:
             for path in output:
-                click.echo(f"{path}: {io.save_messages(recording, path)}")
+                click.echo(printable(f"{path}: {io.save_messages(recording, path)}"))
     elif output:
         found = io.select_turn(io.open_result(result), turn)
         for path in output:
             check_export(found, path)
         columns = _section(found, ends) if ".csv" in suffixes else None
         for path in output:
-            click.echo(f"{path}: {io.export_result(found, path, section=columns, points=points)}")
+            holds = io.export_result(found, path, section=columns, points=points)
+            click.echo(printable(f"{path}: {holds}"))
     for path in stores:
         with progress("exporting", None) as show:
-            click.echo(f"{path}: {io.save_zarr(result, path, show)}")
+            click.echo(printable(f"{path}: {io.save_zarr(result, path, show)}"))
 
 
 def _part(output: list[Path], result: Path, turn: int | None) -> tuple[list[Path], list[Path]]:

@@ -33,7 +33,7 @@ def command(
 ) -> None:
     """Make a recording of a video or pictures."""
     from mirrorskin import io
-    from mirrorskin.cli.output import progress
+    from mirrorskin.cli.output import printable, progress
     from mirrorskin.cli.stack import stack_options
 
     io.check_output(output, frames, phases, travel, replaces="anything" if overwrite else "nothing")
@@ -57,12 +57,13 @@ def command(
     ):
         recorder.drain(show)
     if header.pixel_size is None:
-        click.echo(
+        message = (
             f"{output}: no pixel size: holes are not filled, and normals, slip and measures need it;"
-            " give --pixel-size here or to 'reconstruct'",
-            err=True,
+            " give --pixel-size here or to 'reconstruct'"
         )
+        click.echo(printable(message), err=True)
     for name in source.left_out:
-        click.echo(f"left out: {name}", err=True)
+        click.echo(printable(f"left out: {name}"), err=True)
     count, rows, columns = source.shape
-    click.echo(f"{output}: {count} frames of {columns} x {rows}, {source.dtype}, {motion.value} motion")
+    size = f"{count} frames of {columns} x {rows}"
+    click.echo(printable(f"{output}: {size}, {source.dtype}, {motion.value} motion"))

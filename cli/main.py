@@ -6,14 +6,16 @@ must be quick.
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from io import BufferedWriter, FileIO, TextIOWrapper
 from types import FrameType, TracebackType
-from typing import Annotated
+from typing import Annotated, Any
 
 import click
 from click.shell_completion import shell_complete
@@ -62,11 +64,18 @@ PURPOSES = {
 def _common(
     debug: Annotated[bool, Option("--debug", help="Show tracebacks, and what is logged.")] = False,
 ) -> None:
-    import logging
+    from mirrorskin.cli.output import printable
 
     _check_address_space()
+
+    class Formatter(logging.Formatter):
+        def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  # overrides
+            return printable(super().formatMessage(record))
+
     _OneLine.debug = debug
-    logging.basicConfig(level=logging.INFO if debug else logging.WARNING, format="%(message)s")
+    handler = logging.StreamHandler()
+    handler.setFormatter(Formatter("%(message)s"))
+    logging.basicConfig(level=logging.INFO if debug else logging.WARNING, handlers=[handler])
 
 
 def _check_address_space() -> None:
@@ -114,9 +123,11 @@ class _OneLine:
         no_memory = isinstance(error, MemoryError) or bool(lacking)
         code = 1 if no_memory else getattr(error, "exit_code", None)
         usage = getattr(error, "format_message", None)
-        ours = no_memory or (kind is not None and kind.__module__.startswith("mirrorskin."))
+        ours = no_memory or (kind is not None and kind.__module__.startswith(("mirrorskin.", __name__)))
         if not isinstance(code, int) or not (ours or usage):
             return
+        if isinstance(error, OutputError) and not str(error):
+            sys.exit(code)
         if self.debug:
             traceback.print_exception(error)
         message = usage() if usage else lacking or str(error)
@@ -143,6 +154,8 @@ def _end(number: int, frame: FrameType | None) -> None:
     """End the program by an exception; leave what that began alone, unless the user insists."""
     if not _OneLine.signalled:
         _OneLine.signalled = 128 + number
+        if not _OneLine.debug:  # network reads that never finish would be reported when the program ends
+            logging.getLogger("asyncio").disabled = True
         if number == signal.SIGINT:
             raise KeyboardInterrupt
         sys.exit(128 + number)
@@ -198,6 +211,60 @@ def _complete(instruction: str) -> None:
         )
 
 
+class OutputError(Exception):
+    """Standard output did not take what was written: its disk is full, or its reader has ended."""
+
+    exit_code = 1
+
+
+class _StandardOutput(FileIO):
+    """Standard output whose errors are told apart from those of other files."""
+
+    def write(self, data: Any) -> int:
+        if not data:  # Click tries streams with nothing, which /dev/full refuses
+            return 0
+        try:
+            return super().write(data)
+        except OSError as error:
+            # What waits to be written goes nowhere: Python would report it once more when it ends.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
+            broken = isinstance(error, BrokenPipeError)
+            message = "" if broken else f"standard output could not be written: {error.strerror}"
+            raise OutputError(message) from error
+
+
+class _StandardError(FileIO):
+    """Standard error that drops what cannot be written: there is nowhere to report it."""
+
+    def write(self, data: Any) -> int:
+        with suppress(OSError):
+            return super().write(data)
+        return len(data)
+
+
+def _guard_streams() -> None:
+    """Make standard output and standard error usable where they are closed, full, or no longer read.
+
+    A closed one becomes ``/dev/null``: the next file that is opened would take its place otherwise.
+    """
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:
+            descriptor = os.open(os.devnull, os.O_RDWR)
+            mode = "r" if name == "stdin" else "w"
+            setattr(sys, name, os.fdopen(descriptor, mode, encoding="utf-8", closefd=False))
+    for name, kind in (("stdout", _StandardOutput), ("stderr", _StandardError)):
+        stream = getattr(sys, name)
+        raw = kind(stream.fileno(), "w", closefd=False)
+        guarded = TextIOWrapper(
+            raw if stream.write_through else BufferedWriter(raw),  # PYTHONUNBUFFERED
+            stream.encoding,
+            stream.errors,
+            line_buffering=stream.line_buffering,
+            write_through=stream.write_through,
+        )
+        setattr(sys, name, guarded)
+
+
 def main() -> None:
     """Run the command line, or answer a shell that completes one."""
     words = sys.argv[1:] or ["--help"]
@@ -211,15 +278,14 @@ def main() -> None:
                 app.invoke(context)
             sys.stdout.flush()
         except click.exceptions.Exit as ended:
+            sys.stdout.flush()
             sys.exit(ended.exit_code)
-        except BrokenPipeError:  # nobody reads on; Python would say so once more when it ends
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            sys.exit(1)
         sys.exit(0)
 
 
 def program() -> None:
     """Run the command line as a program of its own."""
+    _guard_streams()
     try:
         main()
     finally:  # all is said and put away: another Ctrl-C ends the interpreter without a traceback

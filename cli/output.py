@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from mirrorskin.io import text
+
 if TYPE_CHECKING:
     from mirrorskin.io import Result
 
@@ -59,14 +61,13 @@ def _words(components: int = 1, offset_unknown: int = 0) -> Iterator[str]:
         yield f"absolute height unknown{of}"
 
 
-def printable(text: object) -> str:
-    """Return a text of one line that any output takes.
+def printable(value: object) -> str:
+    """Return a text in the encoding of standard output, without characters that control terminals.
 
-    What comes from a file, and a file's name, may hold any letters: those that steer terminals, too.
+    Texts in files, and names of files, may hold any characters.
     """
     encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
-    known = str(text).encode(encoding, "replace").decode(encoding)
-    return "".join(letter if letter.isprintable() else "?" for letter in known)
+    return text.printable(str(value).encode(encoding, "replace").decode(encoding))
 
 
 def print_json(value: Any) -> None:

@@ -10,6 +10,7 @@ import math
 import re
 
 from mirrorskin.io import InputError
+from mirrorskin.io.text import shortened
 from mirrorskin.io.units import Kind, in_base
 
 _NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
@@ -135,7 +136,7 @@ def _scaled(
     try:
         factor = in_base(unit, kind)
     except ValueError as error:
-        raise _error(text, option, str(error), example) from error
+        raise _error(text, option, shortened(str(error), 100), example) from error
     value = number / factor if per_unit else number * factor
     if not math.isfinite(value):
         raise _error(text, option, "the number is too large", example)
@@ -143,4 +144,5 @@ def _scaled(
 
 
 def _error(text: str, option: str, wrong: str, example: str) -> InputError:
-    return InputError(f"{' '.join((option + ' ' + text).split())}: {wrong}; write e.g. {example}")
+    given = " ".join(f"{option} {shortened(text)}".split())
+    return InputError(f"{given}: {wrong}; write e.g. {example}")

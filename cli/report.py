@@ -9,6 +9,7 @@ import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.groups import Option
+from mirrorskin.cli.output import printable
 
 
 def command(
@@ -30,4 +31,4 @@ def command(
     page = output or result.with_name(f"{result.stem}-report.html")
     io.check_output(page, result)
     write_report(io.open_result(result), page, name=result.name, section=ends, turn=turn)
-    click.echo(f"{page}: {page.stat().st_size / 1e6:.1f} MB, open it in any browser")
+    click.echo(printable(f"{page}: {page.stat().st_size / 1e6:.1f} MB, open it in any browser"))

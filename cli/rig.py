@@ -13,7 +13,7 @@ import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.groups import Argument, Group, Option
-from mirrorskin.cli.output import print_json, print_table
+from mirrorskin.cli.output import print_json, print_table, printable
 
 if TYPE_CHECKING:
     from mirrorskin.hw.rig.check import Finding
@@ -177,7 +177,7 @@ def _opened(rig: Path, unlock: bool = False) -> Iterator[Stage]:
         report = stage.report()
         where = in_words(report.position, settings.stage)
         locked = "; locked: home it with 'mirrorskin rig home'" if report.state == "alarm" else ""
-        click.echo(f"{settings.name}: {where}{locked}")
+        click.echo(printable(f"{settings.name}: {where}{locked}"))
 
 
 def _print(settings: RigSettings, findings: Sequence[Finding], complete: bool, as_json: bool) -> None:
@@ -193,7 +193,9 @@ def _print(settings: RigSettings, findings: Sequence[Finding], complete: bool, a
     from rich.table import Table
     from rich.text import Text
 
-    table = Table("", "part", "what", "found", "remedy", title=settings.name, box=None, pad_edge=False)
+    table = Table(
+        "", "part", "what", "found", "remedy", title=Text(printable(settings.name)), box=None, pad_edge=False
+    )
     for verdict, *cells in rows:
-        table.add_row(Text(verdict, style=_COLOURS[verdict]), *map(Text, cells))
+        table.add_row(Text(verdict, style=_COLOURS[verdict]), *(Text(printable(cell)) for cell in cells))
     Console().print(table)

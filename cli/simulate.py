@@ -179,7 +179,7 @@ def command(
     import numpy as np
 
     from mirrorskin import hw, io
-    from mirrorskin.cli.output import progress
+    from mirrorskin.cli.output import printable, progress
     from mirrorskin.cli.quantity import angle, duration, frame_size, length, lengths, vector
     from mirrorskin.hw.twin import Body, Camera
 
@@ -232,7 +232,7 @@ def command(
         progress("simulating", count) as show,
     ):
         recorder.drain(show)
-    click.echo(f"{output}: {count} frames of {columns} x {rows}: {twin.header.title}")
+    click.echo(printable(f"{output}: {count} frames of {columns} x {rows}: {twin.header.title}"))
 
 
 def make_movement(

@@ -174,11 +174,10 @@ def _listed(
 ) -> Listed:
     """Read a text of positions; in a ``table``, commas and semicolons are blanks, and there may be a head."""
     from mirrorskin.io import InputError
+    from mirrorskin.io.os_errors import MAX_TEXT_BYTES, read_regular
 
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}; {remedy}") from error
+        lines = read_regular(path, remedy, MAX_TEXT_BYTES).decode().splitlines()
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is no text: {remedy}") from error
     if table:

@@ -9,6 +9,7 @@ import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.groups import Option
+from mirrorskin.cli.output import printable
 
 if TYPE_CHECKING:
     from mirrorskin.io import Result
@@ -86,7 +87,7 @@ def _show_in_space(path: Path, turn: int | None, where: str, name: str) -> None:
         io.check_output(Path(where), path)
     show_surface(io.select_turn(io.open_result(path), turn), where, name)
     if kept:
-        click.echo(f"written to {where}: 'rerun {where}' shows it")
+        click.echo(printable(f"written to {where}: 'rerun {where}' shows it"))
 
 
 def _is_picture(output: Path) -> bool:
@@ -132,7 +133,7 @@ def _show(
         click.echo("there is no screen for a window", err=True)
     for target, figure in figures.items():
         write_figure(figure, target)
-        click.echo(f"written to {target}")
+        click.echo(printable(f"written to {target}"))
 
 
 def _make_folder(folder: Path) -> None:

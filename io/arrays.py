@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import hashlib
+import math
+import os
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io.fingerprint import State, check_unchanged, modified, state_of
 from mirrorskin.io.layout import COMPLETE, POSITIONS
+from mirrorskin.io.os_errors import MAX_UNPACKED_BYTES, check_regular, check_unpacked, open_regular
 from mirrorskin.io.positions import Positions, along, check_finite
 from mirrorskin.io.recording import Recording, cut_out
 from mirrorskin.io.selection import Region
@@ -23,6 +27,8 @@ NUMPY_SUFFIXES = (".npy", ".npz")
 _KNOWN = {*POSITIONS.values(), "dark", "bright"}  # arrays of an archive that are no frames
 _NEEDED = "travel (--travel-step or --travel), phase (--phase-step or --phases)"
 _EVERY, _TAKEN = 4 << 20, 4 << 10  # bytes of frames, of which so many are hashed
+_HEAD_BYTES = 1 << 14  # of a member that hold its header: NumPy reads at most 10 000 characters
+_PIECE = 1 << 20  # bytes that are unpacked at a time
 
 
 class ArrayRecording(Recording):
@@ -167,36 +173,116 @@ def _naming(path: Path) -> Iterator[None]:
         raise
     except Exception as error:  # a damaged head is parsed as Python: its errors are of many kinds
         said = " ".join(str(error).split())
-        raise InputError(f"{path} is no array of NumPy's ({said}): write it with numpy.save") from error
+        raise InputError(
+            f"{path} is not a NumPy array of numbers ({said}): write it with numpy.save"
+        ) from error
+
+
+class _Head(NamedTuple):
+    """What the header of an array states."""
+
+    shape: tuple[int, ...]
+    fortran_order: bool
+    dtype: np.dtype[Any]
+    size: int  # bytes of the header, after which the values come
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the values."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+
+def _read_head(file: IO[bytes]) -> _Head:
+    # NumPy's own functions read as many bytes as a header states that it has.
+    start = BytesIO(file.read(_HEAD_BYTES))
+    version = np.lib.format.read_magic(start)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran_order, dtype = read(start)
+    if any(length < 0 for length in shape):
+        raise ValueError(f"its shape is {shape}")
+    return _Head(shape, fortran_order, dtype, start.tell())
 
 
 def list_arrays(path: Path) -> dict[str, str]:
     """Return the names of the arrays of a file, and the shape and type of each."""
-    with _naming(path), path.open("rb") as file:
+    with _naming(path), open_regular(path) as file:
         if path.suffix.lower() == ".npy":
-            return {"array": _head_of(file)}
+            return {"array": _describe(_read_head(file))}
         with zipfile.ZipFile(file) as archive:
-            found = {}
-            for name in archive.namelist():
-                with archive.open(name) as member:
-                    found[name.removesuffix(".npy")] = _head_of(member)
-            return found
+            return {name: _describe(_head_of(archive, member)) for name, member in _members(archive).items()}
 
 
-def _head_of(file: IO[bytes]) -> str:
-    version = np.lib.format.read_magic(file)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(file)
-    return f"{' x '.join(map(str, shape)) or 'one number'}, {dtype}"
+def _describe(head: _Head) -> str:
+    return f"{' x '.join(map(str, head.shape)) or 'one number'}, {head.dtype}"
+
+
+def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    """Return the members of an archive by the names of their arrays."""
+    return {one.filename.removesuffix(".npy"): one for one in archive.infolist() if not one.is_dir()}
+
+
+def _head_of(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> _Head:
+    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{member.filename} is compressed by method {member.compress_type}")
+    with archive.open(member) as opened:
+        return _read_head(opened)
 
 
 def read_array(path: Path) -> NDArray[Any]:
     """Read an array of numbers that ``numpy.save`` wrote."""
-    with _naming(path):
-        array = np.load(path, allow_pickle=False)
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "buif":
-        raise InputError(f"{path} is no array of numbers: write one with numpy.save")
-    return array
+    array = map_array(path)
+    check_unpacked(array.nbytes, str(path), "give a smaller array")
+    return np.array(array)
+
+
+def map_array(path: Path) -> NDArray[Any]:
+    """Map the array of numbers of a ``.npy`` file into memory; InputError if the file does not hold one."""
+    with _naming(path), open_regular(path) as file:
+        head, size = _read_head(file), os.fstat(file.fileno()).st_size
+        if head.dtype.kind not in "buif":
+            raise ValueError(f"it holds {head.dtype}")
+        if head.size + head.nbytes > size:
+            raise ValueError(f"it states {head.nbytes} bytes of values and has {size - head.size}")
+        if not head.nbytes:
+            return np.empty(head.shape, head.dtype)
+        # Their type is that of files for reading and writing.
+        opened: Any = file
+        order: Literal["C", "F"] = "F" if head.fortran_order else "C"
+        values: NDArray[Any] = np.memmap(opened, head.dtype, "r", head.size, head.shape, order)
+        return values
+
+
+def _read_members(
+    path: Path, archive: zipfile.ZipFile, members: Mapping[str, zipfile.ZipInfo], limit: int
+) -> dict[str, NDArray[Any]]:
+    """Read some arrays; those that are compressed may together take ``limit`` bytes."""
+    heads = {name: _head_of(archive, member) for name, member in members.items()}
+    for name, head in heads.items():
+        if head.dtype.kind not in "buif":
+            raise ValueError(f"{name} holds {head.dtype}")
+        if head.size + head.nbytes != members[name].file_size:
+            raise ValueError(f"{name} states {head.nbytes} bytes of values and has another number")
+    packed = [name for name, member in members.items() if member.compress_type != zipfile.ZIP_STORED]
+    unpacked = sum(heads[name].nbytes for name in packed)
+    remedy = "raise --memory, or write it with numpy.savez"
+    check_unpacked(unpacked, f"{path}: {', '.join(packed)}", remedy, limit)
+    return {name: _read_member(archive, members[name], head) for name, head in heads.items()}
+
+
+def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, head: _Head) -> NDArray[Any]:
+    values = np.empty(math.prod(head.shape), head.dtype)
+    data = values.view(np.uint8).data if values.size else memoryview(b"")
+    with archive.open(member) as opened:
+        opened.read(head.size)
+        for start in range(0, len(data), _PIECE):
+            piece = data[start : start + _PIECE]
+            found = opened.read(len(piece))
+            if len(found) != len(piece):
+                raise ValueError(f"{member.filename} was cut off")
+            piece[:] = found
+        if opened.read(1):
+            raise ValueError(f"{member.filename} has bytes after its values")
+    return values.reshape(head.shape, order="F" if head.fortran_order else "C")
 
 
 def open_array(
@@ -207,25 +293,31 @@ def open_array(
     motion: Motion | None,
     region: Region | None,
     wanted: tuple[int, int | None] | None,
+    memory_limit: int | None = None,
 ) -> ArrayRecording:
     """Open a stack that ``numpy.save`` or ``numpy.savez`` wrote; see ``open_recording``.
 
     An archive may also hold ``travel``, ``phase``, ``displacement`` or ``twist`` of each frame, and ``dark``
-    and ``bright``; what is given comes first.
+    and ``bright``. Arguments override them. Other arrays are not read. A compressed archive is refused where
+    these arrays take more than ``memory_limit`` and ``MAX_UNPACKED_BYTES``.
     """
     held: dict[str, NDArray[Any]] = {}
     with _naming(path):
+        check_regular(path)
         origins = {path: state_of(path.stat())}
         if path.suffix.lower() == ".npy":
-            frames = np.load(path, mmap_mode="r", allow_pickle=False)
+            frames: NDArray[Any] = map_array(path)
         else:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-                chosen = dataset or _stack_of(path, archive.files)
-                if chosen not in archive.files:
-                    names = ", ".join(archive.files)
+            with open_regular(path) as file, zipfile.ZipFile(file) as archive:
+                members = _members(archive)
+                chosen = dataset or _stack_of(path, members)
+                if chosen not in members:
+                    names = ", ".join(members)
                     raise InputError(f"{path} holds no array {chosen!r}: choose from {names}")
-                held = {one: archive[one] for one in archive.files if one in _KNOWN}
-                frames = archive[chosen]
+                limit = max(MAX_UNPACKED_BYTES, memory_limit or 0)
+                needed = {name: one for name, one in members.items() if name in _KNOWN or name == chosen}
+                held = _read_members(path, archive, needed, limit)
+                frames = held.pop(chosen)
     maps: dict[str, Any] = {one: held[one] for one in ("dark", "bright") if one in held}
     given = {one: value for one, value in positions.items() if value is not None}
     known = given or {one: value for one, value in held.items() if one in POSITIONS.values()}

@@ -18,8 +18,8 @@ from mirrorskin.io.arguments import checked
 from mirrorskin.io.atomic import write_new
 from mirrorskin.io.frames import MCAP_SUFFIX
 from mirrorskin.io.mesh import Mesh, face_vectors, normals_around, surface_mesh
-from mirrorskin.io.os_errors import legible
 from mirrorskin.io.result import save_result, unit_of
+from mirrorskin.io.text import one_line
 from mirrorskin.io.types import Floats, InputError, Result
 from mirrorskin.io.url import ZARR_SUFFIX, path_of
 
@@ -168,7 +168,7 @@ def save_table(
     """
     text = StringIO(newline="")
     for name, note in notes.items():
-        text.write(f"# {name}: {' '.join(note.split())}\n")
+        text.write(f"# {name}: {one_line(note)}\n")
     table = csv.writer(text, lineterminator="\n")
     table.writerow([f"{name} [{units[name]}]" if units.get(name) else name for name in columns])
     table.writerows(zip(*(_cells(values) for values in columns.values()), strict=True))
@@ -216,7 +216,7 @@ def _encode_stl(result: Result) -> _Encoded:
     )
     triangles["normal"] = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     triangles["corners"] = mesh.vertices[mesh.faces]
-    head = title.encode("ascii", "backslashreplace")[:_STL_HEAD].ljust(_STL_HEAD, b" ")
+    head = _ascii(title).encode()[:_STL_HEAD].ljust(_STL_HEAD, b" ")
     count = np.uint32(len(triangles)).astype("<u4").tobytes()
     return _Encoded([head, count, triangles.tobytes()], _size(mesh))
 
@@ -263,7 +263,7 @@ def _encode_tiff(result: Result) -> _Encoded:
         resolution=(_CENTIMETRE / width, _CENTIMETRE / height),
         resolutionunit="CENTIMETER",
         description=_description(counts, notes).encode(),
-        software=notes.get(_SOFTWARE, ""),
+        software=_ascii(notes.get(_SOFTWARE, "")),
         metadata=None,
         extratags=[(_NO_DATA, "s", 0, "0", True)],
     )
@@ -289,9 +289,9 @@ def _notes_of(result: Result) -> dict[str, str]:
     """Say in lines where heights come from, from where they count, and how many were not measured."""
     process = result.process
     maker = " ".join(str(process[name]) for name in ("program", "version") if name in process)
-    notes = {name: _line(process[key]) for name, key in _FROM_PROCESS.items() if key in process}
+    notes = {name: one_line(process[key]) for name, key in _FROM_PROCESS.items() if key in process}
     if maker:
-        notes[_SOFTWARE] = _line(maker)
+        notes[_SOFTWARE] = one_line(maker)
     notes["heights"] = _height_datum(result)
     if result.height is not None and result.filled is not None and result.filled.any():
         known = np.isfinite(result.height)
@@ -309,8 +309,8 @@ def _height_datum(result: Result) -> str:
     return f"relative{'' if count == of else f' in {count} of {of} pieces'}: the mean of a piece is 0"
 
 
-def _line(value: object) -> str:
-    return legible(" ".join(str(value).split()))
+def _ascii(text: str) -> str:
+    return text.encode("ascii", "backslashreplace").decode()
 
 
 def _grid(result: Result) -> tuple[NDArray[np.float32], Floats, Floats]:
@@ -360,9 +360,7 @@ def _ply(
     for name, values in columns.items():
         vertices[name] = values
     head = ["ply", "format binary_little_endian 1.0"]
-    head += [
-        f"comment {name}: {note.encode('ascii', 'backslashreplace').decode()}" for name, note in notes.items()
-    ]
+    head += [f"comment {name}: {_ascii(note)}" for name, note in notes.items()]
     head += [f"element vertex {len(vertices)}"]
     head += [f"property {_PLY_TYPES[values.dtype.str[1:]]} {name}" for name, values in columns.items()]
     body = [vertices.tobytes()]

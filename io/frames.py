@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from abc import ABC, abstractmethod
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io.arrays import NUMPY_SUFFIXES, open_array
+from mirrorskin.io.os_errors import check_regular, check_unpacked
 from mirrorskin.io.pictures import (
     PICTURE_SUFFIXES,
     TIFF_SUFFIXES,
@@ -31,7 +33,14 @@ from mirrorskin.io.url import is_zarr, path_of
 
 MCAP_SUFFIX = ".mcap"
 # OpenCV takes these from the environment only: no messages, and no frame of which the end is missing.
-_FFMPEG = {"OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_FFMPEG_CAPTURE_OPTIONS": "fflags;discardcorrupt"}
+# Playlists are not opened: they name other files, and addresses.
+_CONTAINERS = "avi,mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,mpeg,mpegts,asf,flv,ogg,nut"
+_FFMPEG = {
+    "OPENCV_FFMPEG_LOGLEVEL": "-8",
+    "OPENCV_FFMPEG_CAPTURE_OPTIONS": (
+        f"fflags;discardcorrupt|protocol_whitelist;file|format_whitelist;{_CONTAINERS}"
+    ),
+}
 
 
 def open_frames(
@@ -294,8 +303,7 @@ class Video(FrameSequence):
         progress: Callable[[int], None] | None = None,
     ) -> None:
         self._path = Path(path)
-        if not self._path.is_file():
-            raise InputError(f"{path}: there is no such file")
+        check_regular(self._path, "name a video, a TIFF or a folder of pictures")
         shape, time = self._survey(progress)
         super().__init__(str(path), header, shape, np.dtype(np.uint8), travel=travel, phase=phase, time=time)
         self._capture = self._open()
@@ -329,6 +337,8 @@ class Video(FrameSequence):
             capture = cv2.VideoCapture(str(self._path.absolute()), cv2.CAP_FFMPEG)
             if not capture.isOpened():
                 raise InputError(f"{self._path} cannot be opened as a video: it is damaged, cut off, or none")
+            size = [int(capture.get(one)) for one in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
+            check_unpacked(3 * math.prod(size), f"{self._path}: a frame", "encode it in a smaller size")
             # FFmpeg's tags of the deeper pixel formats end in the number of bits.
             bits = int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) >> 24
             if 8 < bits <= 16:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import os
+import struct
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime
+from io import BufferedReader
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,13 +19,15 @@ from mirrorskin.io.arguments import checked
 from mirrorskin.io.atomic import MAKE_ROOM, new_file
 from mirrorskin.io.export import check_heights, points_of
 from mirrorskin.io.frames import FrameSequence
-from mirrorskin.io.os_errors import as_input_error
-from mirrorskin.io.pictures import quiet_opencv
+from mirrorskin.io.os_errors import MAX_UNPACKED_BYTES, as_input_error, check_unpacked, open_regular
+from mirrorskin.io.pictures import decode_grey, quiet_opencv
 from mirrorskin.io.positions import Positions
 from mirrorskin.io.recording import Recording
+from mirrorskin.io.text import one_line
 from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, Result
 
 if TYPE_CHECKING:
+    from mcap.records import Chunk, ChunkIndex, Message
     from mcap_ros2.writer import Writer
 
 IMAGES = "/camera/image"
@@ -45,6 +49,13 @@ _CLOUD, _NUMBER, _WRENCH = (
 )
 _INSTALL = "MCAP needs packages that are not installed: pip install 'mirrorskin[mcap]'"
 
+_LONGEST = 100  # letters of a package's message
+_MOST_PACKED = 255  # to one that all chunks of a file are compressed at most: the limit of LZ4
+
+# Of the file format (https://mcap.dev/spec): opcode and length, then the fields.
+_RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
+_FOOTER, _FOOTER_CODE = struct.Struct("<BQQQI8s"), 2
+
 # The fields of ROS 2's own messages.
 _PARTS = {
     "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
@@ -59,6 +70,7 @@ _MESSAGES = {
         f"{_HEAD}uint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data",
         _TIMES,
     ),
+    _COMPRESSED: (f"{_HEAD}string format\nuint8[] data", _TIMES),
     _CLOUD: (
         f"{_HEAD}uint32 height\nuint32 width\nsensor_msgs/PointField[] fields\nbool is_bigendian\n"
         "uint32 point_step\nuint32 row_step\nuint8[] data\nbool is_dense",
@@ -81,6 +93,13 @@ def load_writer() -> type[Writer]:
     return Writer
 
 
+def _definition(kind: str) -> str:
+    """Return the definition of a message type and of the types within."""
+    text, parts = _MESSAGES[kind]
+    rule = "=" * 80
+    return "\n".join([text, *(f"{rule}\nMSG: {part}\n{_PARTS[part]}" for part in parts)])
+
+
 class _File:
     """Messages on their way into an MCAP file."""
 
@@ -91,10 +110,7 @@ class _File:
     def put(self, topic: str, kind: str, message: Mapping[str, Any], stamp: int) -> None:
         """Write a message of a time, nanoseconds; its header is made where it has one."""
         if kind not in self._schemas:
-            text, parts = _MESSAGES[kind]
-            rule = "=" * 80
-            whole = "\n".join([text, *(f"{rule}\nMSG: {part}\n{_PARTS[part]}" for part in parts)])
-            self._schemas[kind] = self._writer.register_msgdef(kind, whole)
+            self._schemas[kind] = self._writer.register_msgdef(kind, _definition(kind))
         seconds, rest = divmod(stamp, _SECOND)
         head = {"stamp": {"sec": seconds, "nanosec": rest}, "frame_id": _FRAME}
         whole_message = dict(message) if kind == _NUMBER else {"header": head, **message}
@@ -102,7 +118,7 @@ class _File:
 
     def note(self, notes: Mapping[str, Any]) -> None:
         """Add texts to the file's metadata."""
-        self._writer.add_metadata("mirrorskin", {name: str(value) for name, value in notes.items()})
+        self._writer.add_metadata("mirrorskin", {name: one_line(value) for name, value in notes.items()})
 
     def finish(self) -> None:
         """Write the index."""
@@ -336,18 +352,23 @@ class Messages(FrameSequence):
         topic: str | None = None,
     ) -> None:
         self._path = Path(path)
+        self._summary = self._read_summary()
+        self._times: dict[str, NDArray[np.uint64]] = {}
         self._topic = self._choose(topic)
-        times = [stamp for stamp, _ in self._messages(self._topic)]
-        first = _frame(next(self._messages(self._topic))[1], str(path))
+        times = self._times_of(self._topic)
+        if not len(times):
+            raise InputError(f"{path}: {self._topic} has no messages: name another topic with --topic")
+        self._left = self._messages(self._topic)
+        first = self._next_frame()
         if header.motion == "vertical" and travel is None:
             travel = self._numbers("travel", len(times))
         if header.motion == "axial" and phase is None:
             phase = self._numbers("phase", len(times))
-        seconds = (np.asarray(times) - times[0]) / _SECOND
+        seconds = (np.sort(times) - times.min()) / _SECOND
         known = seconds if len(times) == 1 or bool(np.all(np.diff(seconds) > 0)) else None
         shape = (len(times), first.shape[0], first.shape[1])
         super().__init__(str(path), header, shape, first.dtype, travel=travel, phase=phase, time=known)
-        self._left = self._messages(self._topic)
+        self.rewind()
 
     def rewind(self) -> None:
         """Go back to the first frame."""
@@ -356,7 +377,7 @@ class Messages(FrameSequence):
 
     def _fill(self, start: int, out: NDArray[Any]) -> None:
         for number, frame in enumerate(out, start):
-            picture = _frame(next(self._left)[1], f"{self.name}: {self._topic}")
+            picture = self._next_frame()
             if picture.shape != frame.shape or picture.dtype != frame.dtype:
                 raise InputError(
                     f"{self.name}: image {number} of {self._topic} has another size or type than the first:"
@@ -364,12 +385,16 @@ class Messages(FrameSequence):
                 )
             frame[...] = picture
 
+    def _next_frame(self) -> NDArray[Any]:
+        with self._naming():
+            return _frame(next(self._left), f"{self._path}: {self._topic}")
+
     def _choose(self, topic: str | None) -> str:
         """Return the topic of the images: that which was asked for, or the only one."""
-        found: dict[str, str] = {
-            channel.topic: schema.name
-            for channel, schema in self._channels()
-            if schema.name in (_IMAGE, _COMPRESSED)
+        found = {
+            channel.topic
+            for channel in self._summary.channels.values()
+            if channel.kind in (_IMAGE, _COMPRESSED)
         }
         if topic is None and IMAGES in found:
             return IMAGES
@@ -381,21 +406,9 @@ class Messages(FrameSequence):
         wrong = "name one with --topic" if topic is None else f"{topic} is none"
         raise InputError(f"{self._path}: its topics of images are {there}: {wrong}")
 
-    def _channels(self) -> list[tuple[Any, Any]]:
-        with self._reader() as reader:
-            summary = reader.get_summary()
-        if summary is None:
-            raise InputError(f"{self._path} has no index: it is cut off; 'mcap recover' mends it")
-        return [(one, summary.schemas[one.schema_id]) for one in summary.channels.values() if one.schema_id]
-
-    def _messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Yield the messages of a topic in the order of their times: nanoseconds, and what they say."""
-        with self._reader() as reader:
-            for _, _, message, said in reader.iter_decoded_messages(topics=[topic]):
-                yield message.log_time, said
-
     def _numbers(self, name: str, count: int) -> Floats:
-        values = [float(said.data) for _, said in self._messages(f"/{name}")]
+        with self._naming():
+            values = [float(message.data) for message in self._messages(f"/{name}")]
         if len(values) != count:
             option = {"travel": "--travel-step", "phase": "--phase-step or --phases"}[name]
             raise InputError(
@@ -403,42 +416,172 @@ class Messages(FrameSequence):
             )
         return np.asarray(values) / _SERIES[name]
 
-    @contextlib.contextmanager
-    def _reader(self) -> Iterator[Any]:
+    def _times_of(self, topic: str) -> NDArray[np.uint64]:
+        """Return when the messages of a topic were logged, in the order in which they are stored."""
+        if topic not in self._times:
+            with self._naming():
+                self._times[topic] = np.fromiter((one.log_time for one in self._stored(topic)), np.uint64)
+        return self._times[topic]
+
+    def _messages(self, topic: str) -> Iterator[Any]:
+        """Yield the messages of a topic in the order of their times, decoded."""
+        times, stored = self._times_of(topic), self._stored(topic)
+        if np.any(times[1:] < times[:-1]):
+            stored = iter(sorted(self._hold(topic), key=lambda one: one.log_time))
+        decoders = {name: _decoder(name) for name in _MESSAGES}
+        for message in stored:
+            yield decoders[self._summary.channels[message.channel_id].kind](message.data)
+
+    def _hold(self, topic: str) -> Iterator[Message]:
+        """Yield all messages of a topic as long as they fit into memory."""
+        size = 0
+        for message in self._stored(topic):
+            size += len(message.data)
+            unsorted = f"{self._path}: {topic}, whose messages are not stored in the order of their times,"
+            check_unpacked(size, unsorted, "sort it with 'mcap sort'")
+            yield message
+
+    def _stored(self, topic: str) -> Iterator[Message]:
+        """Yield the messages of a topic in the order in which they are stored."""
+        from mcap.records import Chunk, Message
+
+        wanted = {number for number, one in self._summary.channels.items() if one.topic == topic and one.kind}
+        total = 0
+        with open_regular(self._path) as file:
+            most = max(MAX_UNPACKED_BYTES, _MOST_PACKED * os.fstat(file.fileno()).st_size)
+            for record in self._records(file, wanted):
+                if isinstance(record, Message) and record.channel_id in wanted:
+                    yield record
+                if isinstance(record, Chunk):
+                    data = _unpack(record)
+                    total += len(data)
+                    check_unpacked(total, f"{self._path}, unpacked,", "repack it with 'mcap compress'", most)
+                    yield from _messages_in(data, wanted)
+
+    def _records(self, file: BufferedReader, wanted: set[int]) -> Iterator[Any]:
+        """Yield the chunks that hold messages of some channels; without an index, all records."""
+        from mcap.stream_reader import StreamReader
+
+        if not self._summary.chunks:
+            yield from StreamReader(file, emit_chunks=True).records
+        for chunk in sorted(self._summary.chunks, key=lambda one: one.chunk_start_offset):
+            if not chunk.message_index_offsets or wanted & chunk.message_index_offsets.keys():
+                file.seek(chunk.chunk_start_offset)
+                yield next(iter(StreamReader(file, skip_magic=True, emit_chunks=True).records))
+
+    def _read_summary(self) -> _Summary:
+        """Read which channels and chunks the file's index names."""
         try:
-            from mcap.reader import make_reader
-            from mcap_ros2.decoder import DecoderFactory
+            from mcap.records import Channel, ChunkIndex, Schema
+            from mcap.stream_reader import StreamReader
         except ImportError as error:
             raise InputError(_INSTALL) from error
+        schemas: dict[int, str] = {}
+        summary = _Summary({}, [])
+        with self._naming(), open_regular(self._path) as file:
+            file.seek(-_FOOTER.size, os.SEEK_END)
+            code, _, start, *_ = _FOOTER.unpack(file.read(_FOOTER.size))
+            if code != _FOOTER_CODE or not start:
+                raise InputError(f"{self._path} has no index: it is cut off; 'mcap recover' makes one")
+            file.seek(start)
+            for record in StreamReader(file, skip_magic=True, emit_chunks=True).records:
+                if isinstance(record, Schema):
+                    schemas[record.id] = record.name
+                elif isinstance(record, Channel) and record.message_encoding == "cdr":
+                    kind = schemas.get(record.schema_id, "")
+                    summary.channels[record.id] = _Channel(record.topic, kind if kind in _MESSAGES else "")
+                elif isinstance(record, ChunkIndex):
+                    summary.chunks.append(record)
+        return summary
+
+    @contextlib.contextmanager
+    def _naming(self) -> Iterator[None]:
+        """Turn what the packages raise on damaged bytes into a line that names the file."""
         try:
-            with self._path.open("rb") as file:
-                yield make_reader(file, decoder_factories=[DecoderFactory()])
-        except InputError:
+            yield
+        except (InputError, ImportError):
             raise
-        except Exception as error:  # whatever damaged bytes lead the packages to
+        except Exception as error:  # of many kinds
+            said = one_line(error) or type(error).__name__
             raise InputError(
-                f"{self._path} is damaged, or no MCAP of ROS 2 ({error}): copy it again"
+                f"{self._path} is damaged, or not an MCAP file of ROS 2 ({said[:_LONGEST]}): copy it again"
             ) from error
+
+
+class _Channel(NamedTuple):
+    topic: str
+    kind: str  # name of its message type, empty of one that is not read
+
+
+class _Summary(NamedTuple):
+    channels: dict[int, _Channel]
+    chunks: list[ChunkIndex]
+
+
+def _unpack(chunk: Chunk) -> bytes:
+    """Return the records of a chunk, which must be as long as it states; see ``MAX_UNPACKED_BYTES``."""
+    size = chunk.uncompressed_size
+    check_unpacked(size, "a chunk", "repack the file with 'mcap compress'")
+    if chunk.compression == "zstd":
+        import zstandard
+
+        with zstandard.ZstdDecompressor().stream_reader(chunk.data) as reader:
+            data = reader.read(size + 1)
+    elif chunk.compression == "lz4":
+        import lz4.frame  # type: ignore[import-untyped]
+
+        decompressor = lz4.frame.LZ4FrameDecompressor()
+        data = decompressor.decompress(chunk.data, max_length=size + 1)
+    elif not chunk.compression:
+        data = chunk.data
+    else:
+        raise ValueError(f"a chunk is compressed by {chunk.compression!r}")
+    if len(data) != size:
+        raise ValueError(f"a chunk states {size} bytes and has another number")
+    return data
+
+
+def _messages_in(records: bytes, wanted: set[int]) -> Iterator[Message]:
+    """Yield the messages of some channels in a chunk."""
+    from mcap.opcode import Opcode
+    from mcap.records import Message
+
+    at = 0
+    while at < len(records):
+        code, size = _RECORD.unpack_from(records, at)
+        start, at = at + _RECORD.size, at + _RECORD.size + size
+        if at > len(records):
+            raise ValueError("a record is longer than its chunk")
+        if code == Opcode.MESSAGE and size >= _MESSAGE.size:
+            number, sequence, logged, published = _MESSAGE.unpack_from(records, start)
+            data = records[start + _MESSAGE.size : at]
+            if number in wanted:
+                yield Message(number, logged, data, published, sequence)
+
+
+def _decoder(kind: str) -> Callable[[bytes], Any]:
+    """Return what decodes messages of a type of ROS 2: by its own definition, not by one in a file."""
+    from mcap.records import Schema
+    from mcap_ros2.decoder import DecoderFactory
+
+    schema = Schema(data=_definition(kind).encode(), encoding="ros2msg", id=1, name=kind)
+    decoder = DecoderFactory().decoder_for("cdr", schema)
+    assert decoder is not None
+    return decoder
 
 
 def _frame(message: Any, name: str) -> NDArray[Any]:
     """Return an image as grey samples, (H, W)."""
     if not hasattr(message, "encoding"):
-        with quiet_opencv() as cv2:
-            picture = cv2.imdecode(
-                np.frombuffer(message.data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
-            )
-        if picture is None:
-            raise InputError(
-                f"{name}: an image of format {message.format!r} cannot be decoded: save it as PNG or JPEG"
-            )
-        return np.asarray(picture)
+        return decode_grey(bytes(message.data), f"{name}: an image of format {message.format!r}")
     code, colours = _ENCODINGS.get(message.encoding, "u1"), len(_COLOURS.get(message.encoding, "Y"))
     if message.encoding not in (*_ENCODINGS, *_COLOURS):
         raise InputError(
             f"{name}: images of encoding {message.encoding!r} are not read: save them as mono8 or mono16"
         )
     kind = np.dtype(code).newbyteorder(">" if message.is_bigendian else "<")
+    if not (message.height and message.width):
+        raise InputError(f"{name}: an image has no pixels: remove it")
     rows = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)
     samples = np.ascontiguousarray(rows[:, : message.width * colours * kind.itemsize]).view(kind)
     frame = samples.astype(kind.newbyteorder("=")).reshape(message.height, message.width, colours)

@@ -1,11 +1,14 @@
-"""What HDF5 and the system say of a file, in words that can be read."""
+"""Opening files that others made, and what HDF5 and the system report of them, in words that can be read."""
 
 from __future__ import annotations
 
 import errno
 import os
+import stat
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from io import BufferedReader, FileIO
+from pathlib import Path
 from typing import Any
 
 from mirrorskin.io.types import InputError
@@ -13,6 +16,15 @@ from mirrorskin.io.types import InputError
 # A damaged file shows itself in h5py by any of these.
 _ERRORS = (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError)
 _LONGEST = 100
+
+MAX_UNPACKED_BYTES = 1 << 30
+"""Bytes of memory that one file may ask for at once by what it states: a picture, a compressed array.
+
+A file of kilobytes can state sizes of gigabytes: they are compared with this before anything is decoded.
+"""
+
+MAX_TEXT_BYTES = 64 << 20
+"""Bytes of a text or a table that is read whole: settings, positions, readings."""
 
 
 class as_input_error(AbstractContextManager[None]):  # noqa: N801  # as contextlib names its own
@@ -48,6 +60,58 @@ def reason(error: Exception) -> str:
 def is_flagged(error: Exception) -> bool:
     """Tell whether HDF5 refused a file because a writer left its mark in it, or this process writes it."""
     return any(said in str(error) for said in ("already open for write", "locking flag values don't match"))
+
+
+def check_regular(path: Path, remedy: str = "") -> None:
+    """Raise InputError unless a path leads to a regular file.
+
+    Opening a FIFO waits for its writer without end, and opening a device may act on it.
+    """
+    remedy = remedy and f"; {remedy}"
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError) as error:  # ValueError: a null in its name
+        raise InputError(f"{path} cannot be read: {getattr(error, 'strerror', error)}{remedy}") from error
+    if stat.S_ISDIR(mode):
+        raise InputError(f"{path} cannot be read: {os.strerror(errno.EISDIR)}{remedy}")
+    if not stat.S_ISREG(mode):
+        raise InputError(f"{path} is not a regular file: save its contents in one first{remedy}")
+
+
+class _BoundedReader(BufferedReader):
+    """A file that reads at most ``MAX_UNPACKED_BYTES`` at once: lengths that it states may be wrong."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is not None and size > MAX_UNPACKED_BYTES:
+            raise ValueError(f"it states a length of {size} bytes")
+        return super().read(size)
+
+
+def open_regular(path: Path, remedy: str = "") -> BufferedReader:
+    """Open a regular file to read; InputError for anything else."""
+    check_regular(path, remedy)
+    try:
+        return _BoundedReader(FileIO(path))
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}{remedy and f'; {remedy}'}") from error
+
+
+def read_regular(path: Path, remedy: str = "", limit: int = MAX_UNPACKED_BYTES) -> bytes:
+    """Read a regular file whole; InputError for anything else, and for one of more bytes than the limit."""
+    with open_regular(path, remedy) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > limit:
+            raise InputError(f"{path} has {size} bytes, and at most {limit} are read of such a file")
+        try:
+            return file.read(limit)
+        except OSError as error:
+            raise InputError(f"{path} cannot be read: {error.strerror}{remedy and f'; {remedy}'}") from error
+
+
+def check_unpacked(size: int, what: str, remedy: str, limit: int = MAX_UNPACKED_BYTES) -> None:
+    """Raise InputError if a file states that it takes more memory than it may."""
+    if size > limit:
+        raise InputError(f"{what} takes {size} bytes of memory, and at most {limit} are allowed: {remedy}")
 
 
 def legible(text: str) -> str:

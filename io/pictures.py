@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import logging
+import math
 import struct
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.atomic import write_new
+from mirrorskin.io.os_errors import check_regular, check_unpacked, open_regular, read_regular
 from mirrorskin.io.types import FRAME_DTYPES, InputError
 
 TIFF_SUFFIXES = (".tif", ".tiff")
@@ -25,6 +27,9 @@ _TIFF_MARKS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _PNG_HEAD = 33  # bytes of the mark and the first chunk, after which the pixels' size may be written
 _INCH = 0.0254  # m
 _FORMATS = {1: "uint", 2: "int", 3: "float"}  # of samples (TIFF 6.0, section 19)
+_JPEG_MARK = b"\xff\xd8"
+_JPEG_BYTES = 8  # a pixel that a decoder takes: a progressive JPEG has three coefficients of 2 bytes
+_SMALLER = "save it as smaller pictures"
 _UNDECODABLE = "cannot be decoded: it is damaged, or of a kind that OpenCV does not read"
 
 
@@ -34,37 +39,71 @@ def read_picture(path: Path) -> NDArray[Any]:
     Colour becomes grey: where the channels are equal, their common value; else the luma of ITU-R BT.601,
     0.299 R + 0.587 G + 0.114 B, as OpenCV computes it. Opacity is ignored.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}") from error
-    if data[:8] != _PNG_MARK:
-        if count_pages(path) != 1:
-            raise InputError(f"{path} holds several pages: put it alone, or save each page as a picture")
-        return next(read_pages(path, 0, 1))[1]
+    return _grey(decode_picture(path))
+
+
+def decode_picture(path: Path, dtypes: Sequence[str] = _DTYPES) -> NDArray[Any]:
+    """Decode the only picture of a PNG or TIFF as it is stored, (H, W) or (H, W, channels)."""
+    data = read_regular(path)
+    if data[:8] == _PNG_MARK:
+        return _decode_png(data, str(path), -1)
+    if count_pages(path, dtypes) != 1:
+        raise InputError(f"{path} holds several pages: put it alone, or save each page as a picture")
+    return _decode(data, str(path), -1)
+
+
+def decode_grey(data: bytes, name: str) -> NDArray[Any]:
+    """Decode a PNG or JPEG that lies in memory as grey samples, (H, W), of 8 or 16 bits."""
+    import cv2
+
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+    if data[:8] == _PNG_MARK:
+        return _decode_png(data, name, flags)
+    check_unpacked(_JPEG_BYTES * math.prod(_jpeg_size(data, name)), name, _SMALLER)
+    return _decode(data, name, flags)
+
+
+def _decode(data: bytes, name: str, flags: int) -> NDArray[Any]:
     with quiet_opencv() as cv2:
         try:
-            picture = cv2.imdecode(np.frombuffer(_essential_png(data, path), np.uint8), cv2.IMREAD_UNCHANGED)
+            picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
         except cv2.error:
             picture = None
     if picture is None:
-        raise InputError(f"{path} {_UNDECODABLE}")
-    return _grey(picture)
+        raise InputError(f"{name} {_UNDECODABLE}")
+    return np.asarray(picture)
 
 
-def count_pages(path: Path) -> int:
-    """Count the pages of a TIFF, all of samples that frames can have."""
+def _decode_png(data: bytes, name: str, flags: int) -> NDArray[Any]:
+    essential = _essential_png(data, name)
+    width, height, depth, colour = struct.unpack_from(">IIBB", essential.ljust(_PNG_HEAD, b"\0"), 16)
+    size = width * height * (2 if depth == 16 else 1) * (1 if colour == 0 else 4)
+    check_unpacked(size, f"{name}: a picture of {width} x {height}", _SMALLER)
+    return _decode(essential, name, flags)
+
+
+def _jpeg_size(data: bytes, name: str) -> tuple[int, int]:
+    """Return the rows and columns that a JPEG states (ITU-T T.81, B.2.2)."""
+    at = 2 if data[:2] == _JPEG_MARK else len(data)
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            rows, columns = struct.unpack_from(">HH", data, at + 5)
+            return rows, columns
+        at += 1 if marker == 0xFF else 2 + length
+    raise InputError(f"{name} is neither a PNG nor a JPEG, or is damaged: save it as PNG or JPEG")
+
+
+def count_pages(path: Path, dtypes: Sequence[str] = _DTYPES) -> int:
+    """Count the pages of a TIFF, all of one size and of samples that frames can have."""
     import tifffile
 
     remedy = "copy it again, or save it anew"
+    check_regular(path, remedy)
     with _quiet_tifffile():
         try:
             with tifffile.TiffFile(path) as file:
-                pages: list[Any] = [file.pages.get(number) for number in range(len(file.pages))]
-                kinds = [
-                    (page.samplesperpixel, f"{_FORMATS.get(page.sampleformat, '')}{page.bitspersample}")
-                    for page in pages
-                ]
+                kinds = [_page_kind(file.pages.get(number)) for number in range(len(file.pages))]
                 file.filehandle.seek(file.pages.next_page_offset or 0)
                 end = file.filehandle.read(file.tiff.offsetsize)
                 complete = len(end) == file.tiff.offsetsize and not any(end)
@@ -73,17 +112,37 @@ def count_pages(path: Path) -> int:
         except Exception:  # of many kinds
             complete = False
     if not complete:
-        with path.open("rb") as unread:
+        with open_regular(path) as unread:
             known = unread.read(4) in _TIFF_MARKS
         wrong = "is damaged or cut off" if known else "is neither a PNG nor a TIFF"
         raise InputError(f"{path} {wrong}: {remedy}")
-    for number, (samples, dtype) in enumerate(kinds, 1):
-        if samples not in (1, 3, 4) or dtype not in _DTYPES:
+    for number, kind in enumerate(kinds, 1):
+        if kind.samples not in (1, 3, 4) or kind.dtype not in dtypes:
             raise InputError(
-                f"{path} (page {number}) has {samples} {dtype} a pixel: "
+                f"{path} (page {number}) has {kind.samples} {kind.dtype} a pixel: "
                 "save it in grey, as uint8, uint16 or float32"
             )
+        size = kind.rows * kind.columns * kind.samples * np.dtype(kind.dtype).itemsize
+        check_unpacked(size, f"{path} (page {number}): a picture of {kind.columns} x {kind.rows}", _SMALLER)
+        if (kind.rows, kind.columns) != (kinds[0].rows, kinds[0].columns):
+            raise InputError(
+                f"{path} (page {number}) is {kind.columns} x {kind.rows} {kind.dtype}, but "
+                f"{path} (page 1) is {kinds[0].columns} x {kinds[0].rows} {kinds[0].dtype}: "
+                "all frames must have the same size and depth"
+            )
     return len(kinds)
+
+
+class _PageKind(NamedTuple):
+    rows: int
+    columns: int
+    samples: int
+    dtype: str
+
+
+def _page_kind(page: Any) -> _PageKind:
+    dtype = f"{_FORMATS.get(page.sampleformat, '')}{page.bitspersample}"
+    return _PageKind(page.imagelength, page.imagewidth, page.samplesperpixel, dtype)
 
 
 def read_pages(path: Path, start: int, stop: int) -> Iterator[tuple[str, NDArray[Any]]]:
@@ -129,7 +188,7 @@ def _png_chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-def _essential_png(data: bytes, path: Path) -> bytes:
+def _essential_png(data: bytes, name: str) -> bytes:
     """Check each chunk of a PNG, and keep those that make the picture: libpng prints about the others."""
     kept, at, kind = [data[:8]], 8, b""
     while kind != b"IEND":
@@ -137,7 +196,7 @@ def _essential_png(data: bytes, path: Path) -> bytes:
         chunk, at = data[at : at + 12 + size], at + 12 + size
         kind = chunk[4:8]
         if at > len(data) or zlib.crc32(chunk[4:-4]) != int.from_bytes(chunk[-4:], "big"):
-            raise InputError(f"{path} is damaged or cut off: copy it again")
+            raise InputError(f"{name} is damaged or cut off: copy it again")
         if kind[:1].isupper():
             kept.append(chunk)
     return b"".join(kept)

@@ -293,7 +293,8 @@ def open_recording(
         if live:
             raise InputError(f"{path} is no recording of a live run: leave --live out")
         known = {"tilt": tilt, "pixel_size": pixel_size}
-        return open_array(path, dataset, {"travel": travel, "phase": phase}, known, motion, region, frames)
+        given_positions = {"travel": travel, "phase": phase}
+        return open_array(path, dataset, given_positions, known, motion, region, frames, memory_limit)
     with ExitStack() as opening:
         file = opening.enter_context(open_file(path, memory_limit))
         ours = file.marked(MARK)

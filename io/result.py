@@ -218,13 +218,24 @@ def open_result(path: str | Path) -> Result:
         }
         for name in SERIES:
             if (node := file.find(f"{_RESULT}/{name}")) is not None:
-                series = (getattr(node, "shape", None) or ())[:1]
+                series = (getattr(node, "shape", None) or (0,))[:1]
                 maps[name] = file.read(node, series, remedy=_AGAIN).astype(np.float64, copy=False)
+        _check_frames(path, maps)
         for name, direction in (("x", 1), ("y", -1)):
             if name in maps and not np.all(direction * np.diff(maps[name]) > 0):
                 raise InputError(f"{path}: {_RESULT}/{name} does not run as pixels do: {_AGAIN}")
         carried = Result(process=read_process(file, _PROCESS), calibration=carried_by(file))
         return with_fields(carried, maps)
+
+
+def _check_frames(path: str | Path, maps: Mapping[str, NDArray[Any]]) -> None:
+    """Refuse what is known of each frame if it is of different numbers of frames."""
+    counts = {name: len(maps[name]) for name in SERIES if name in maps}
+    if maps.get(_MOVED, np.empty(0)).ndim == 4:
+        counts[_MOVED] = len(maps[_MOVED])
+    if len(set(counts.values())) > 1:
+        found = ", ".join(f"{name} of {count}" for name, count in counts.items())
+        raise InputError(f"{path}: {_RESULT} has values of different numbers of frames ({found}): {_AGAIN}")
 
 
 def open_process(path: str | Path, *names: str) -> dict[str, ProcessValue]:

@@ -12,10 +12,11 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
 
+from mirrorskin.io.os_errors import MAX_TEXT_BYTES, read_regular
+from mirrorskin.io.text import printable, shortened
 from mirrorskin.io.types import InputError
 
 _Model = TypeVar("_Model", bound=msgspec.Struct)
-_LONGEST = 40  # letters of a value that a message quotes
 
 
 def load_toml(path: str | Path, model: type[_Model], remedy: str) -> _Model:
@@ -39,13 +40,9 @@ def load_toml(path: str | Path, model: type[_Model], remedy: str) -> _Model:
     2.0
     """
     path = Path(path)
-    if path.is_fifo():  # which may have no writer
-        raise InputError(f"{path} is no regular file: save what it gives in one first")
+    data = read_regular(path, remedy, MAX_TEXT_BYTES)
     try:
-        with path.open("rb") as file:
-            tables = tomllib.load(file)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}; {remedy}") from error
+        tables = tomllib.loads(data.decode())
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not text, but must be TOML; {remedy}") from error
     except (ValueError, RecursionError) as error:
@@ -63,8 +60,7 @@ def quote(value: Any) -> str:
         text = f'"{value}"' if isinstance(value, str) else str(value)
     except ValueError:  # a whole number of thousands of digits
         return "too large a number"
-    text = "".join(letter if letter.isprintable() else "?" for letter in text)
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+    return shortened(printable(text))
 
 
 def _table(values: Any, model: type[_Model], where: str, name: str) -> _Model:

@@ -82,18 +82,22 @@ def _forces(presses: list[Path], texts: list[str], readings: Path | None) -> lis
 def _table(path: Path) -> dict[str, float]:
     """Read newtons by the names of recordings; a first line may be a heading."""
     from mirrorskin.io import InputError
+    from mirrorskin.io.os_errors import MAX_TEXT_BYTES, read_regular
+    from mirrorskin.io.text import shortened
 
+    remedy = "write REC.h5,newtons, one a press"
     try:
-        rows = [row for row in csv.reader(path.read_text(encoding="utf-8").splitlines()) if row]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}; write REC.h5,newtons, one a press") from error
+        text = read_regular(path, remedy, MAX_TEXT_BYTES).decode()
+        rows = [row for row in csv.reader(text.splitlines()) if row]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path} cannot be read: {error}; {remedy}") from error
     table = {}
     for number, row in enumerate(rows):
         try:
             table[Path(row[0].strip()).name] = float(row[1])
         except (IndexError, ValueError) as error:
             if number:
-                line = ",".join(row)
+                line = shortened(",".join(row))
                 raise InputError(f"{path}: {line!r} is no press: write REC.h5,newtons") from error
     return table
 

@@ -57,7 +57,7 @@ def command(
 
 
 def _print(name: str, rows: Sequence[Row]) -> None:
-    from mirrorskin.cli.output import print_table
+    from mirrorskin.cli.output import print_table, printable
 
     cells = [row.cells() for row in rows]
     if not sys.stdout.isatty():
@@ -67,11 +67,13 @@ def _print(name: str, rows: Sequence[Row]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=name, box=None, pad_edge=False, title_justify="left", title_style="bold")
+    table = Table(
+        title=Text(printable(name)), box=None, pad_edge=False, title_justify="left", title_style="bold"
+    )
     for head in _HEAD:
         table.add_column(head, justify="right" if head in _NUMBERS else "left")
     before = ""
-    for part, *others in cells:
+    for part, *others in [[printable(cell) for cell in row] for row in cells]:
         table.add_row(Text("" if part == before else part, style="bold cyan"), *map(Text, others))
         before = part
     Console().print(table)

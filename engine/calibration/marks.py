@@ -148,6 +148,8 @@ def _find_dots(grey: NDArray[np.uint8], board: Dots) -> tuple[Doubles, Doubles] 
 
     settings = cv2.SimpleBlobDetector_Params()  # type: ignore[attr-defined]
     settings.minArea, settings.maxArea = _LEAST_DOT, grey.size / (board.columns * board.rows)
+    if settings.maxArea <= settings.minArea:  # too few pixels for so many dots
+        return None
     settings.minDistBetweenBlobs = 3.0
     detector = cv2.SimpleBlobDetector_create(settings)  # type: ignore[attr-defined]
     for picture in (grey, 255 - grey):

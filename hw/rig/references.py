@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import stat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -10,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import InputError
+from mirrorskin.io.arrays import read_array
+from mirrorskin.io.os_errors import check_regular
 from mirrorskin.io.pictures import PICTURE_SUFFIXES, read_picture
 
 if TYPE_CHECKING:
@@ -62,28 +63,10 @@ def check_references(camera: CameraSettings, rig_file: str | Path) -> None:
 
 def _read(path: Path, where: str) -> NDArray[Any]:
     try:
-        mode = path.stat().st_mode
-    except OSError as error:
-        raise InputError(
-            f"{where}: {path} cannot be read: {error.strerror}; put it beside the rig file, or leave it out"
-        ) from error
-    if not stat.S_ISREG(mode):
-        raise InputError(f"{where}: {path} is no file; name a picture beside the rig file")
-    try:
-        return _read_npy(path) if path.suffix.lower() == ".npy" else read_picture(path)
+        check_regular(path, "name an array or a picture beside the rig file, or leave it out")
+        return read_array(path) if path.suffix.lower() == ".npy" else read_picture(path)
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
-
-
-def _read_npy(path: Path) -> NDArray[Any]:
-    try:
-        counts = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path} is not an array: {error}; write it with numpy.save") from error
-    if not isinstance(counts, np.ndarray):  # an archive of several
-        counts.close()
-        raise InputError(f"{path} holds several arrays; write one with numpy.save")
-    return counts
 
 
 def _check_fits(counts: NDArray[Any], path: str, camera: CameraSettings, where: str) -> None:

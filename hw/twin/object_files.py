@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.hw.twin.objects import difference_slope
+from mirrorskin.io.arrays import read_array
+from mirrorskin.io.os_errors import read_regular
+from mirrorskin.io.pictures import decode_picture
 from mirrorskin.io.types import Floats, InputError, pixel_axes
 
 if TYPE_CHECKING:
@@ -18,6 +22,8 @@ if TYPE_CHECKING:
 
 HEIGHT_MAP_SUFFIXES = (".npy", ".png", ".tif", ".tiff")
 DEFAULT_SCALE = 0.001
+
+_DTYPES = ("uint8", "uint16", "float32", "float64")  # of TIFFs; those of height maps are checked later
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,35 +124,13 @@ def load_height_map(
 
 
 def _read_array(path: Path) -> NDArray[Any]:
-    try:
-        if path.suffix.lower() == ".npy":
-            array: NDArray[Any] = np.load(path, allow_pickle=False)
-            return array
-        encoded = np.fromfile(path, np.uint8)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except Exception as error:  # a damaged head is parsed as Python: its errors are of many kinds
-        raise InputError(f"{path}: is no NumPy array of numbers: save it with numpy.save") from error
-    return _decode_picture(path, encoded)
-
-
-def _decode_picture(path: Path, encoded: NDArray[np.uint8]) -> NDArray[Any]:
-    import cv2
-
-    try:
-        picture: NDArray[Any] | None = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        picture = None
-    if picture is None:
-        raise InputError(
-            f"{path}: is no PNG or TIFF picture that can be decoded: save it again as 16-bit PNG"
-        )
-    return picture
+    return read_array(path) if path.suffix.lower() == ".npy" else decode_picture(path, _DTYPES)
 
 
 MESH_SUFFIXES = (".stl", ".ply", ".obj")
 
 _SAMPLES_MAX = 20_000_000
+_FARTHEST = 1e9  # mm from the origin: differences of coordinates stay finite, and heights have digits left
 
 
 def load_mesh(path: str | Path, shape: tuple[int, int], pixel_size: tuple[float, float]) -> HeightMap:
@@ -202,13 +186,19 @@ def load_mesh(path: str | Path, shape: tuple[int, int], pixel_size: tuple[float,
 def _read_triangles(path: Path) -> Floats:
     mesh = _read_mesh(path)
     faces, vertices = np.asarray(mesh.faces), np.asarray(mesh.vertices, np.float64)
-    if len(faces) == 0:
+    if len(faces) == 0 or len(vertices) == 0:
         raise InputError(f"{path}: holds no triangles, and points alone are no surface: export it as a mesh")
+    if faces.shape[1:] != (3,) or vertices.shape[1:] != (3,):
+        raise InputError(
+            f"{path}: needs three coordinates a corner and three corners a triangle: export it again"
+        )
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"{path}: has triangles without corners: export the mesh again")
     triangles: Floats = vertices[faces]
-    if not np.isfinite(triangles).all():
-        raise InputError(f"{path}: has corners that are not finite: repair the mesh")
+    if not (np.abs(triangles) <= _FARTHEST).all():
+        raise InputError(
+            f"{path}: has corners that are not finite, or beyond {_FARTHEST:g} mm: repair the mesh"
+        )
     return triangles
 
 
@@ -236,11 +226,10 @@ def _read_mesh(path: Path) -> Trimesh:
     except ImportError:
         raise InputError(f"{path}: meshes need trimesh: pip install 'mirrorskin[mesh]'") from None
 
+    # From memory: of a file with a name, trimesh opens the files that it names, such as materials.
+    data = BytesIO(read_regular(path))
     try:
-        with path.open("rb") as file:
-            return trimesh.load_mesh(file, file_type=path.suffix[1:].lower(), process=False)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+        return trimesh.load_mesh(data, file_type=path.suffix[1:].lower(), process=False)
     except Exception as error:  # what its parsers raise on a broken file has no common base
         raise InputError(
             f"{path}: is no {path.suffix[1:].upper()} mesh that can be read: export it again"

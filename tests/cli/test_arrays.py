@@ -110,8 +110,8 @@ def test_the_travel_of_a_real_stage_places_heights():
         (["ball.npy", "--travel", "t.txt"], "t.txt lists 2 travels for 12 frames: one a frame is needed"),
         (["ball.npy", "--travel", "t.txt", *STEPS], "leave --travel-step and --travel-start out"),
         (["ball.npy", "--travel", "ball.npy"], "lists 2304 travels for 12 frames"),
-        (["cut.npy", *STEPS], "cut.npy is no array of NumPy's"),
-        (["cut.npz", *STEPS], "cut.npz is no array of NumPy's"),
+        (["cut.npy", *STEPS], "cut.npy is not a NumPy array"),
+        (["cut.npz", *STEPS], "cut.npz is not a NumPy array"),
         (["double.npy", *STEPS], "double.npy is of type float64: frames are uint8, uint16 or float32"),
         (["flat.npy", *STEPS], "flat.npy has shape (4, 5): frames, (T, H, W)"),
         (["two.npz", *STEPS], "two.npz holds the arrays a, b: choose the frames with --dataset"),
@@ -134,7 +134,7 @@ def test_what_an_array_or_an_archive_holds_is_told():
     told = json.loads(run("info", "ball.npz", "--json").out)
     assert (told["travel"], told["dark"]) == ("12, float64", "one number, float64")
     Path("cut.npz").write_bytes(Path("ball.npz").read_bytes()[:700])
-    assert run("info", "cut.npz").said.startswith("mirrorskin: cut.npz is no array of NumPy's")
+    assert run("info", "cut.npz").said.startswith("mirrorskin: cut.npz is not a NumPy array")
 
 
 def test_an_import_without_the_pixel_size_says_what_needs_it():

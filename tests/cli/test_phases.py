@@ -48,6 +48,7 @@ def test_another_number_of_phases_than_of_frames_is_refused(tmp_path):
         (b"10 deg", ", line 1: 10: a unit is needed; write e.g. 2.5deg"),
         (b"10mm", ", line 1: 10mm: millimeters are not an angle; write e.g. 2.5deg"),
         (b"nandeg", ", line 1: nandeg: a number and a unit are needed; write e.g. 2.5deg"),
+        (b"x" * 9999, f", line 1: {'x' * 40}...: a number and a unit are needed; write e.g. 2.5deg"),
         (b"1e999deg", ", line 1: 1e999deg: the number is too large; write e.g. 2.5deg"),
         (b"", " lists no phases: write one angle a frame in it, such as 178.1deg"),
         (b"# 10deg\n", " lists no phases: write one angle a frame in it, such as 178.1deg"),

@@ -1,32 +1,40 @@
 """Damaged files of every kind, read as users read them: nothing may crash, hang, or end in a traceback.
 
-``make fuzz`` damages recordings, results, calibrations, settings, lists of phases, height maps, what a
-controller says, and the arrays that public functions are given, and has a process of its own read each. What
-is neither read nor refused in one line is kept.
+``make fuzz`` damages every kind of file that a command reads, what a controller says, and the arrays that
+public functions are given, and has a process of its own read each. What was accepted is exported in every
+format. Every exception but the documented ones counts, and what was neither read nor refused in one line is
+kept.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import random
 import select
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import mutations
 import numpy as np
 
-PATIENCE = 20.0
-"""Seconds after which a reader hangs."""
+PATIENCE = 30.0
+"""Seconds of a processor's time after which a reader hangs, or ten times as many by the clock."""
 
 MEMORY = 4 << 30
 """Bytes that a reader may take, the OpenCL driver's among them."""
+
+AT_ONCE = 3
+"""Commands that read each damaged file, besides the functions that do."""
 
 BATCH = """[stack]
 pixel-size = "0.1mm"
@@ -47,84 +55,289 @@ error:9
 ALARM:1
 <Hold:0|MPos:0.000,1.500,-2.000|Bf:15,128|FS:0,0>
 """
-
-NUMBERS = [0, 1, 2, 7, 8, 0xFF, 1 << 15, 1 << 31, (1 << 31) - 1, (1 << 32) - 1, 1 << 62, (1 << 63) - 1]
+TRIANGLES = """solid ball
+facet normal 0 0 1
+outer loop
+vertex 0 0 0
+vertex 2 0 0
+vertex 0 2 1
+endloop
+endfacet
+facet normal 0 0 1
+outer loop
+vertex 2 0 0
+vertex 2 2 0
+vertex 0 2 1
+endloop
+endfacet
+endsolid ball
+"""
+OBJ = "# a roof\nmtllib roof.mtl\nv 0 0 0\nv 2 0 0\nv 0 2 1\nv 2 2 0.5\nf 1 2 3\nf 2/1 4/2/3 3//1\n"
+PLY = """ply
+format ascii 1.0
+comment made by hand
+element vertex 4
+property float x
+property float y
+property float z
+element face 2
+property list uchar int vertex_indices
+end_header
+0 0 0
+2 0 0
+0 2 1
+2 2 0.5
+3 0 1 2
+3 1 3 2
+"""
+OPTIONS = """--travel-step 0.1mm
+--pixel-size 0.03mm,0.04mm
+--region 2,3,10x8
+--frames 1:8
+--phase-step 45deg
+--tilt 2.5deg
+--noise 2.5
+--threshold 0.5
+--memory 256MB
+--dark 10
+--bright 180
+"""
+BOARDS = """charuco:7x5:2mm:1.5mm
+dots:11x9:1mm
+"""
+EXPORTS = (".ply", ".stl", ".xyz", ".png", ".tif", ".npz", ".csv", ".mcap", ".zarr")
 
 
 def make_samples(folder: Path) -> list[Path]:
     """Write a small file of every kind and packing."""
-    from calibrations import a_calibration
     from calls import calls, to_bytes
+
+    _make_recordings(folder)
+    _make_frames(folder)
+    _make_texts(folder)
+    for name in calls():
+        if arrays := to_bytes(name):
+            (folder / f"{name}.call").write_bytes(arrays)
+    return sorted(folder.iterdir())
+
+
+def _make_recordings(folder: Path) -> None:
+    """Write recordings, results, a calibration, and what is exported from them."""
+    from calibrations import a_calibration
     from commands import run
 
     from mirrorskin import io
-    from mirrorskin.hw.rig_file import TEMPLATE
 
     small = ["--size", "24x20", "--pixel-size", "0.4mm", "-o"]
     for motion in ("vertical", "axial", "horizontal", "twist"):
         for compression in ("raw", "gzip", "bitshuffle"):
             path = folder / f"{motion}-{compression}.h5"
-            ended = run("simulate", motion, "--compression", compression, "--frames", 12, *small, path)
-            assert ended.code == 0, ended.said
-    for motion in ("vertical", "axial"):
-        ended = run("reconstruct", folder / f"{motion}-raw.h5", "-o", folder / f"{motion}-result.h5")
-        assert ended.code == 0, ended.said
+            _do(run("simulate", motion, "--compression", compression, "--frames", 12, *small, path))
+        _do(run("reconstruct", folder / f"{motion}-raw.h5", "-o", folder / f"{motion}-result.h5"))
     io.save_calibration(a_calibration(), folder / "calibration.h5")
+    result = folder / "vertical-result.h5"
+    for suffix in (".ply", ".stl", ".zarr", ".npz"):
+        _do(run("export", result, "-o", folder / f"result{suffix}"))
+    for suffix in (".mcap", ".zarr"):
+        _do(run("export", folder / "vertical-raw.h5", "-o", folder / f"recording{suffix}"))
+    shutil.make_archive(str(folder / "packed.zarr"), "zip", folder / "recording.zarr")
+
+
+def _do(ended: Any) -> None:
+    assert ended.code == 0, ended.said
+
+
+def _make_frames(folder: Path) -> None:
+    """Write frames as other programs do: arrays, pictures, videos, messages."""
+    import cv2
+    import tifffile
+    from mcap_ros2.writer import Writer
+
+    from mirrorskin import io
+
+    with io.open_recording(folder / "vertical-raw.h5") as recording:
+        block = recording.read(np.empty(recording.shape, recording.dtype))
+        assert block is not None
+        frames, travel = block.frames.copy(), recording.travel
+    np.save(folder / "frames.npy", frames)
+    np.savez(folder / "frames.npz", frames=frames, travel=travel, dark=np.float32(16))
+    np.savez_compressed(folder / "packed.npz", frames=frames, travel=travel)
+    np.save(folder / "travel.npy", travel)
+    np.save(folder / "heights.npy", np.linspace(0, 1, 300).reshape(15, 20))
+    cv2.imwrite(str(folder / "picture.png"), frames[-1])
+    cv2.imwrite(str(folder / "deep.png"), frames[-1].astype(np.uint16) * 200)
+    tifffile.imwrite(folder / "pages.tif", frames[:4], photometric="minisblack", compression="zlib")
+    tifffile.imwrite(folder / "heights.tif", np.linspace(-1, 0, 480, dtype=np.float32).reshape(20, 24))
+    for name, code in (("film.avi", "MJPG"), ("film.mp4", "mp4v")):
+        writer = cv2.VideoWriter(str(folder / name), cv2.VideoWriter.fourcc(*code), 25.0, (64, 48), True)
+        for number in range(8):
+            writer.write(np.full((48, 64, 3), 20 * number, np.uint8))
+        writer.release()
+    image = "std_msgs/Header header\nstring format\nuint8[] data\n" + "=" * 80
+    image += "\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id"
+    with (folder / "compressed.mcap").open("wb") as file:
+        messages = Writer(file)
+        schema = messages.register_msgdef("sensor_msgs/msg/CompressedImage", image)
+        for number, frame in enumerate(frames[:4]):
+            data = cv2.imencode((".png", ".jpg")[number % 2], frame)[1].tobytes()
+            head = {"stamp": {"sec": number, "nanosec": 0}, "frame_id": "a"}
+            message = {"header": head, "format": "png", "data": data}
+            messages.write_message("/camera", schema, message, number * 10**7)
+        messages.finish()
+
+
+def _make_texts(folder: Path) -> None:
+    """Write settings, tables, meshes and replies."""
+    from mirrorskin.hw.rig_file import TEMPLATE
+
     (folder / "rig.toml").write_text(TEMPLATE)
     (folder / "batch.toml").write_text(BATCH)
-    (folder / "phases.csv").write_text("0deg\n45deg 90.5deg\n3.1rad # last\n")
+    (folder / "phases.csv").write_text(
+        "".join(f"{30 * number}deg\n" for number in range(11)) + "5.7rad # last\n"
+    )
+    (folder / "travel.csv").write_text("travel [mm]\n" + "".join(f"{0.1 * number}\n" for number in range(12)))
+    (folder / "readings.csv").write_text("recording,newtons\nvertical-raw.h5,1.5\n")
+    (folder / "ascii.stl").write_text(TRIANGLES)
+    (folder / "ascii.ply").write_text(PLY)
+    (folder / "roof.obj").write_text(OBJ)
+    (folder / "options.words").write_text(OPTIONS)
+    (folder / "boards.words").write_text(BOARDS)
     (folder / "controller.txt").write_bytes(REPLIES)
-    for name in calls():
-        if arrays := to_bytes(name):
-            (folder / f"{name}.call").write_bytes(arrays)
-    np.save(folder / "heights.npy", np.linspace(0, 1, 300).reshape(15, 20))
-    return sorted(folder.iterdir())
 
 
-def damage(data: bytearray, chance: random.Random) -> str:
-    """Damage a file in one of the ways that files are; return which."""
-    kind = chance.choice(["bits", "bytes", "number", "copy", "zeros", "cut"])
-    for _ in range(chance.choice([1, 1, 1, 2, 4, 16])):
-        at = chance.randrange(len(data))
-        if kind == "bits":
-            data[at] ^= 1 << chance.randrange(8)
-        elif kind == "bytes":
-            data[at] = chance.randrange(256)
-        elif kind == "number":
-            width, number = chance.choice([2, 4, 8]), chance.choice(NUMBERS)
-            data[at : at + width] = (number % (1 << 8 * width)).to_bytes(width, "little")
-        elif kind == "copy":
-            start, length = chance.randrange(len(data)), chance.choice([8, 64, 512])
-            data[at : at + length] = data[start : start + length]
-        elif kind == "zeros":
-            data[at : at + chance.choice([8, 64, 512])] = bytes(8)
-        else:
-            del data[at:]
-            break
-    return kind
+Line = tuple[object, ...]
 
 
-def read(path: str) -> bool:
-    """Read a file in every way; tell whether one of them took it for good."""
-    from calls import call_with
+def _of_hdf5(path: Path, sound: Path, out: Path) -> list[Line]:
+    """Return the commands that read recordings, results and calibrations."""
+    press, turn, result = (sound / f"{name}.h5" for name in ("vertical-raw", "axial-raw", "vertical-result"))
+    exports = [("export", path, "-o", out / f"a{suffix}") for suffix in EXPORTS]
+    return [
+        *exports,
+        *exports,
+        ("info", path),
+        ("info", path, "--json"),
+        ("info", path, "--verify"),
+        ("export", path, "-o", out / "a.ply", "--points", "--turn", 0),
+        ("view", path, "-o", out / "a.png"),
+        ("view", path, "-o", out),
+        ("view", path, "--3d", out / "a.rrd"),
+        ("report", path, "-o", out / "a.html"),
+        ("report", path, "-o", out / "a.html"),
+        ("measure", path),
+        ("measure", path, "--json", "--form", "sphere"),
+        ("score", path, "--truth", press),
+        ("score", result, "--truth", path),
+        ("stitch", path, result, "-o", out / "a.h5"),
+        ("fuse", path, turn, "-o", out / "a.h5"),
+        ("fuse", press, path, "-o", out / "a.h5"),
+        ("correlate", path, "--phase-step", "45deg", "-o", out / "a.h5"),
+        ("reconstruct", path, "-o", out / "a.h5"),
+        ("reconstruct", path, "-o", out / "a.zarr"),
+        ("reconstruct", path, "-o", out / "a.h5", "--json", "--method", "change-point"),
+        ("reconstruct", press, "--calibration", path, "-o", out / "a.h5"),
+        ("reconstruct", turn, "--heights", path, "-o", out / "a.h5"),
+        ("calibrate", "show", path),
+        ("calibrate", "show", path, "-o", out / "maps"),
+        ("batch", path, "-o", out / "results"),
+    ]
 
+
+def _of_frames(path: Path, sound: Path, out: Path) -> list[Line]:
+    """Return the commands that read frames of other programs."""
+    press = ("--motion", "vertical", "--pixel-size", "0.4mm", "-o", out / "a.h5")
+    return [
+        ("info", path),
+        ("import", path, *press, "--travel-step", "0.1mm"),
+        ("import", path, *press),
+        ("import", path, *press, "--travel", sound / "travel.csv"),
+        ("import", path, "--motion", "axial", "--phase-step", "30deg", "-o", out / "a.h5"),
+        ("reconstruct", path, "--travel-step", "0.1mm", "-o", out / "a.h5"),
+        ("correlate", path, "--phase-step", "45deg", "-o", out / "a.h5"),
+    ]
+
+
+def _of_objects(path: Path, sound: Path, out: Path) -> list[Line]:
+    """Return the commands that read meshes, height maps and pictures."""
+    small = ("--size", "24x20", "--pixel-size", "0.4mm", "--frames", 3, "-o", out / "a.h5")
+    given = [("simulate", "vertical", "--object", path, *small)]
+    if path.suffix in (".png", ".tif"):
+        folder = out / "frames"
+        folder.mkdir()
+        shutil.copy(sound / "picture.png", folder / "frame1.png")
+        shutil.copy(path, folder / f"frame2{path.suffix}")
+        board = ("--board", "dots:5x4:1mm", "-o", out / "cal.h5")
+        given += [
+            ("import", folder, "--motion", "vertical", "--travel-step", "0.1mm", "-o", out / "b.h5"),
+            ("simulate", "axial", "--pattern", path, *small),
+            ("calibrate", "scale", path, *board),
+        ]
+    return given
+
+
+def _of_tables(path: Path, sound: Path, out: Path) -> list[Line]:
+    """Return the commands that read positions and readings."""
+    press, out = sound / "vertical-raw.h5", out / "a.h5"
+    return [
+        ("reconstruct", sound / "frames.npy", "--travel", path, "-o", out),
+        ("correlate", press, "--phases", path, "-o", out),
+        ("calibrate", "force", press, "--readings", path, "-o", out),
+    ]
+
+
+def _of_words(path: Path, sound: Path, out: Path) -> list[Line]:
+    """Return the commands that take options which a file holds, a line each."""
+    press, frames = sound / "vertical-raw.h5", sound / "frames.npy"
+    lines = [line.replace("\0", "") for line in path.read_text("utf-8", "replace").splitlines()]
+    if path.stem == "boards":
+        return [("calibrate", "scale", "board", "--board", line, "-o", out / "a.png") for line in lines] + [
+            ("calibrate", "scale", sound / "picture.png", "--board", line, "-o", out / "a.h5")
+            for line in lines
+        ]
+    steps = ("--travel-step", "0.1mm", "-o", out / "a.h5")
+    return [
+        command
+        for line in lines
+        for words in [line.partition(" ")]
+        for command in (
+            ("reconstruct", press, "-o", out / "a.h5", words[0], words[2]),
+            ("reconstruct", frames, *steps, words[0], words[2]),
+            ("view", sound / "vertical-result.h5", "-o", out / "a.png", "--section", words[2]),
+        )
+    ]
+
+
+Commands = Callable[[Path, Path, Path], list[Line]]
+COMMANDS: dict[str, list[Commands]] = {
+    ".h5": [_of_hdf5],
+    ".zarr": [_of_hdf5],
+    ".zip": [_of_hdf5],
+    ".mcap": [_of_frames],
+    ".npz": [_of_frames],
+    ".npy": [_of_frames, _of_objects, _of_tables],
+    ".png": [_of_objects],
+    ".tif": [_of_frames, _of_objects],
+    ".avi": [_of_frames],
+    ".mp4": [_of_frames],
+    ".stl": [_of_objects],
+    ".ply": [_of_objects],
+    ".obj": [_of_objects],
+    ".csv": [_of_tables],
+    ".words": [_of_words],
+}
+"""The commands that read files, by their suffix."""
+
+
+def read(path: str, sound: Path | None = None) -> bool:
+    """Read a file in every way, and with some of the commands; return whether one of them accepted it.
+
+    Commands need a folder of sound files.
+    """
     from mirrorskin import engine, io
-    from mirrorskin.cli.settings import read_settings
-    from mirrorskin.cli.stack import read_phases
-    from mirrorskin.hw.rig_file import load_rig
-    from mirrorskin.hw.twin.object_files import load_height_map
     from mirrorskin.kernels.errors import DeviceError
 
     good = False
-    readers: dict[str, list[Callable[[Any], object]]] = {
-        ".h5": [io.describe, io.open_heights, io.open_result, io.open_calibration, reconstruct],
-        ".toml": [load_rig, lambda path: read_settings(Path(path), 1 << 28)],
-        ".csv": [lambda path: read_phases(Path(path))],
-        ".npy": [lambda path: load_height_map(path, (0.1, 0.1))],
-        ".txt": [listen],
-        ".call": [lambda path: call_with(Path(path).stem, Path(path).read_bytes())],
-    }
-    for reader in readers[Path(path).suffix]:
+    for reader in _readers(Path(path).suffix):
         try:
             reader(path)
             good = True
@@ -132,7 +345,72 @@ def read(path: str) -> bool:
             said = str(error)
             if "\n" in said or len(said) > 1000:
                 raise AssertionError(f"no line: {said[:200]}") from error
+    if sound is not None:
+        good |= _command(Path(path), sound)
     return good
+
+
+def _readers(suffix: str) -> list[Callable[[Any], object]]:
+    from calls import call_with
+
+    from mirrorskin import io
+    from mirrorskin.cli.settings import read_settings
+    from mirrorskin.cli.stack import read_phases, read_travel
+    from mirrorskin.hw.rig_file import load_rig
+    from mirrorskin.hw.twin.object_files import load_height_map
+
+    stores = [io.describe, io.open_heights, io.open_result, io.open_calibration, reconstruct, show]
+    readers: dict[str, list[Callable[[Any], object]]] = {
+        ".h5": stores,
+        ".zarr": stores,
+        ".zip": stores,
+        ".toml": [load_rig, lambda path: read_settings(Path(path), 1 << 28)],
+        ".csv": [lambda path: read_phases(Path(path)), lambda path: read_travel(Path(path))],
+        ".npy": [lambda path: load_height_map(path, (0.1, 0.1))],
+        ".txt": [listen],
+        ".call": [lambda path: call_with(Path(path).stem, Path(path).read_bytes())],
+    }
+    return readers.get(suffix, [])
+
+
+def _command(path: Path, sound: Path) -> bool:
+    """Run some commands on a file; return whether one of them did it."""
+    from commands import run
+
+    data = path.read_bytes() if path.is_file() else str(path).encode()
+    chance, good = random.Random(zlib.crc32(data)), False
+    for _ in range(AT_ONCE):
+        with tempfile.TemporaryDirectory() as folder:
+            choices = [
+                one for make in COMMANDS.get(path.suffix, []) for one in make(path, sound, Path(folder))
+            ]
+            if not choices:
+                return good
+            words = chance.choice(choices)
+            try:
+                ended = run(*words)
+            except BaseException as error:
+                raise AssertionError(f"mirrorskin {' '.join(map(str, words))[:200]}") from error
+        said = ended.out + ended.said
+        if ended.code not in (0, 1, 2) or not said.replace("\n", "").isprintable():
+            raise AssertionError(f"mirrorskin {' '.join(map(str, words))[:200]}: {ended.code} {said[:200]!r}")
+        lines = ended.said.splitlines()
+        if ended.code and words[0] != "batch" and not (lines and lines[-1].startswith("mirrorskin: ")):
+            raise AssertionError(
+                f"mirrorskin {' '.join(map(str, words))[:200]}: no reason {ended.said[:200]!r}"
+            )
+        good |= ended.code == 0
+    return good
+
+
+def show(path: str) -> None:
+    """Show a result as notebooks do."""
+    from mirrorskin import io
+
+    result = io.open_result(path)
+    assert str(result)
+    assert result._repr_html_()
+    assert result.to_xarray().sizes is not None
 
 
 def reconstruct(path: str) -> object:
@@ -154,30 +432,35 @@ def listen(path: str) -> None:
             salvage(line)
 
 
-def serve() -> None:
+def serve(sound: Path | None) -> None:
     """Read the files that are named on standard input, and say how it went."""
     import resource
     import traceback
 
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
+    answers = sys.stdout
     for line in sys.stdin:
         try:
-            outcome = "read" if read(line.rstrip("\n")) else "refused"
-        except BaseException:
-            outcome = "traceback " + " | ".join(traceback.format_exc().splitlines()[-4:])
-        print(outcome, flush=True)
+            outcome = "read" if read(line.rstrip("\n"), sound) else "refused"
+        except BaseException as error:
+            cause = error.__cause__ if isinstance(error, AssertionError) and error.__cause__ else error
+            lines = "".join(traceback.format_exception(cause, chain=False)).splitlines()[-16:]
+            outcome = f"traceback {error} | " + " | ".join(one.strip() for one in lines if one.strip("^~ "))
+            outcome = " ".join(outcome.split())
+        print(outcome, file=answers, flush=True)
 
 
 class Reader:
     """A process that reads files, begun anew when it did not survive one."""
 
-    def __init__(self) -> None:
+    def __init__(self, sound: Path | None = None) -> None:
+        self._words = ["--serve", *([] if sound is None else ["--sound", str(sound)])]
         self._process: subprocess.Popen[str] | None = None
 
     def read(self, path: Path) -> str:
         """Return "read", "refused", or what is wrong."""
         if self._process is None:
-            command = [sys.executable, __file__, "--serve"]
+            command = [sys.executable, __file__, *self._words]
             self._process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
             )
@@ -187,7 +470,7 @@ class Reader:
         with suppress(BrokenPipeError):
             process.stdin.write(f"{path}\n")
             process.stdin.flush()
-        ready, _, _ = select.select([process.stdout], [], [], PATIENCE)
+        ready = self._wait(process)
         said = process.stdout.readline().rstrip("\n") if ready else "hang"
         if said and ready:
             return said
@@ -195,6 +478,15 @@ class Reader:
             said = f"crash {process.wait()}"
         self.close()
         return said
+
+    def _wait(self, process: subprocess.Popen[str]) -> bool:
+        """Wait for an answer; return whether it came."""
+        assert process.stdout is not None
+        end, begun = time.monotonic() + 10 * PATIENCE, _processor_time(process.pid)
+        while time.monotonic() < end and _processor_time(process.pid) < begun + PATIENCE:
+            if select.select([process.stdout], [], [], PATIENCE / 10)[0]:
+                return True
+        return False
 
     def close(self) -> None:
         """End the process."""
@@ -204,27 +496,51 @@ class Reader:
                 self._process = None
 
 
+def _processor_time(process: int) -> float:
+    """Return the seconds that a process has computed, on all processors together."""
+    with suppress(OSError):
+        numbers = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+        return sum(map(int, numbers[11:13])) / os.sysconf("SC_CLK_TCK")
+    return 0.0
+
+
 def attack(
     samples: list[Path], seed: int, go_on: Callable[[int], bool], keep: Path
 ) -> Iterator[tuple[str, str]]:
     """Yield each damaged file's kind and outcome."""
-    whole = {path: path.read_bytes() for path in samples}
-    reader, number = Reader(), 0
+    whole = {path: path.read_bytes() for path in samples if path.is_file()}
+    reader, number = Reader(samples[0].parent), 0
     with tempfile.TemporaryDirectory() as folder:
         while go_on(number):
             chance = random.Random(f"{seed} {number}")
             sample = chance.choice(samples)
-            data = bytearray(whole[sample])
-            damage(data, chance)
             mutant = Path(folder) / sample.name
-            mutant.write_bytes(data)
+            if sample.is_dir():
+                damage_store(sample, mutant, chance)
+            else:
+                mutant.write_bytes(mutations.mutate(sample, whole, chance))
             outcome = reader.read(mutant)
             if outcome not in ("read", "refused"):
                 keep.mkdir(parents=True, exist_ok=True)
-                (keep / f"{seed}-{number}-{sample.name}").write_bytes(data)
+                mutant.rename(keep / f"{seed}-{number}-{sample.name}")
+            elif mutant.is_dir():
+                shutil.rmtree(mutant)
             number += 1
             yield sample.suffix, outcome
     reader.close()
+
+
+def damage_store(sample: Path, mutant: Path, chance: random.Random) -> None:
+    """Copy a folder, and drop or damage one of its files."""
+    shutil.copytree(sample, mutant)
+    victim = chance.choice(sorted(path for path in mutant.rglob("*") if path.is_file()))
+    data = victim.read_bytes()
+    if chance.random() < 0.1:
+        victim.unlink()
+    elif victim.suffix == ".json" and chance.random() < 0.7:
+        victim.write_bytes(mutations.change_json(data, chance))
+    else:
+        victim.write_bytes(mutations.damage(data, chance))
 
 
 def main() -> int:
@@ -235,9 +551,11 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep", type=Path, default=Path("fuzz-findings"))
     parser.add_argument("--serve", action="store_true")
+    parser.add_argument("--sound", type=Path)
+    parser.add_argument("--kinds", nargs="*", help="suffixes of the files to damage, instead of all")
     given = parser.parse_args()
     if given.serve:
-        serve()
+        serve(given.sound)
         return 0
     end = time.monotonic() + 60 * given.minutes
     found: dict[str, Counter[str]] = {}
@@ -246,7 +564,10 @@ def main() -> int:
         return number < given.count if given.count is not None else time.monotonic() < end
 
     with tempfile.TemporaryDirectory() as folder:
-        for kind, outcome in attack(make_samples(Path(folder)), given.seed, go_on, given.keep):
+        samples = make_samples(Path(folder))
+        if given.kinds:
+            samples = [path for path in samples if path.suffix in given.kinds]
+        for kind, outcome in attack(samples, given.seed, go_on, given.keep):
             word = outcome.split()[0]
             found.setdefault(kind, Counter())[word] += 1
             if word not in ("read", "refused"):

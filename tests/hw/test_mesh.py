@@ -184,3 +184,32 @@ def test_without_trimesh_the_remedy_is_told(tmp_path: Path, monkeypatch: pytest.
     path = save(tmp_path / "box.stl", box((1, 1, 1), (0, 0, 0)))
     monkeypatch.setitem(sys.modules, "trimesh", None)
     refused(path, r"pip install 'mirrorskin\[mesh\]'")
+
+
+TRIANGLE = "v 0 0 0\nv 2 0 0\nv 0 2 1\nv 2 2 0.5\nf 1 2 3\nf 2 4 3\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("v 0 0\nv 2 0\nv 0 2\nf 1 2 3\n", "export it again"),
+        ("v 0 0 0 1\nv 2 0 0 1\n" * 2 + "f 1 2 9\n", "mesh"),
+        (TRIANGLE.replace("0.5", "1e308"), "beyond 1e.09 mm"),
+        (TRIANGLE.replace("0.5", "nan"), "not finite"),
+        ("v\nf 1 2 3\n", "export it"),
+        ("", "export it"),
+    ],
+)
+def test_a_text_that_is_not_a_mesh_is_refused(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "a.obj").write_text(text)
+    with pytest.raises(InputError, match=words) as refusal:
+        load(tmp_path / "a.obj")
+    assert "\n" not in str(refusal.value)
+
+
+def test_files_that_a_mesh_names_are_not_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr(trimesh.resolvers.FilePathResolver, "get", lambda self, name: asked.append(name))
+    (tmp_path / "a.obj").write_text(f"mtllib ../secret.mtl\nusemtl gold\n{TRIANGLE}")
+    load(tmp_path / "a.obj")
+    assert asked == []

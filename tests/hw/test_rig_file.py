@@ -406,7 +406,7 @@ def test_a_reference_of_a_camera_of_floats_may_lie_anywhere(rig, tmp_path):
         (np.uint8(3), "b.npy is a single number, and the camera's pictures"),
         (PICTURE.astype(np.uint16), "b.npy is of uint16, and the camera of uint8; take"),
         (PICTURE > 105, "b.npy is of bool, and the camera of uint8"),
-        (PICTURE.astype(np.complex64), "b.npy is of complex64"),
+        (PICTURE.astype(np.complex64), "b.npy is not a NumPy array of numbers .it holds complex64."),
         (PICTURE * np.nan, "b.npy holds nothing but NaN"),
         (PICTURE + 200.0, "b.npy holds 300 to 311, and counts of uint8 go from 0 to 255"),
         (np.where(PICTURE == 105, np.inf, PICTURE), "b.npy holds 100 to inf, and counts of uint8"),
@@ -422,14 +422,14 @@ def test_a_damaged_reference_is_refused(refusal, tmp_path):
     (tmp_path / "b.png").write_bytes((tmp_path / "b.png").read_bytes()[:50])
     assert "camera.bright: b.png is damaged or cut off" in refusal(with_reference("b.png"))
     (tmp_path / "b.npy").write_bytes(b"")
-    assert "camera.bright: b.npy is not an array" in refusal(with_reference("b.npy"))
+    assert "camera.bright: b.npy is not a NumPy array" in refusal(with_reference("b.npy"))
     np.save(tmp_path / "b.npy", np.array([{}], object))
-    assert "camera.bright: b.npy is not an array" in refusal(with_reference("b.npy"))
+    assert "camera.bright: b.npy is not a NumPy array" in refusal(with_reference("b.npy"))
     with (tmp_path / "b.npy").open("wb") as file:
         np.savez(file, PICTURE, PICTURE)
-    assert "camera.bright: b.npy holds several arrays" in refusal(with_reference("b.npy"))
+    assert "camera.bright: b.npy is not a NumPy array" in refusal(with_reference("b.npy"))
     (tmp_path / "b.tif").mkdir()
-    assert "camera.bright: b.tif is no file" in refusal(with_reference("b.tif"))
+    assert "camera.bright: b.tif cannot be read: Is a directory" in refusal(with_reference("b.tif"))
 
 
 # The documentation

@@ -1,14 +1,22 @@
 """ROS 2 messages in MCAP files, read back by the reader of their own packages, and by ours."""
 
+import tracemalloc
 from contextlib import suppress
+from dataclasses import replace
 
 import cv2
+import lz4.frame
 import numpy as np
 import pytest
+import zstandard
 from commands import run
 from growing import Feed
 from growing import frames_of as feed_of
+from mcap.data_stream import RecordBuilder
 from mcap.reader import make_reader
+from mcap.records import Chunk, Footer
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
 from stacks import record, sphere
@@ -17,7 +25,13 @@ from mirrorskin import io
 
 HEIGHT = np.array([[1.0, np.nan, 0.5], [0.25, 0.0, -1.0]], np.float32)
 AXIS = {"x": np.array([-1.0, 0.0, 1.0]), "y": np.array([0.5, -0.5])}
-IMAGE = "uint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data"
+FIELDS = {
+    "sensor_msgs/msg/Image": "uint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n"
+    "uint32 step\nuint8[] data",
+    "sensor_msgs/msg/CompressedImage": "string format\nuint8[] data",
+}
+HEAD = "=" * 80 + "\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id"
+TIME = {"header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "camera"}}
 
 
 def messages(path):
@@ -82,9 +96,7 @@ def film(tmp_path):
         path = tmp_path / "film.mcap"
         with path.open("wb") as file:
             writer = Writer(file)
-            schema = writer.register_msgdef(
-                kind, IMAGE if kind.endswith("/Image") else "string format\nuint8[] data"
-            )
+            schema = writer.register_msgdef(kind, f"std_msgs/Header header\n{FIELDS[kind]}\n{HEAD}")
             for number in range(3):
                 for topic, picture in topics:
                     picture = picture + picture.dtype.type(number)
@@ -96,7 +108,7 @@ def film(tmp_path):
                             "step": picture[0].nbytes,
                             "data": picture.tobytes(),
                         }
-                    writer.write_message(topic, schema, data, number * 10_000_000)
+                    writer.write_message(topic, schema, TIME | data, number * 10_000_000)
             writer.finish()
         return path
 
@@ -180,3 +192,118 @@ def test_a_calibration_has_no_place_in_it(tmp_path):
             tmp_path / "a.mcap",
             calibration=io.Calibration(io.CameraId("c", (5, 7), np.dtype(np.uint8))),
         )
+
+
+def write_messages(path, topic, kind, values, **options):
+    """Write messages with headers; each value is that of the fields without header."""
+    with path.open("wb") as file:
+        writer = Writer(file, **options)
+        schema = writer.register_msgdef(kind, f"std_msgs/Header header\n{FIELDS[kind]}\n{HEAD}")
+        for stamp, fields in values:
+            writer.write_message(topic, schema, TIME | fields, stamp)
+        writer.finish()
+    return path
+
+
+def grey(value, **changed):
+    size = {"height": 2, "width": 3, "is_bigendian": 0, "step": 3, "encoding": "mono8"}
+    return size | {"data": bytes([value]) * 6} | changed
+
+
+IMAGE = "sensor_msgs/msg/Image"
+
+
+def test_a_topic_without_messages_is_refused(tmp_path):
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = McapWriter(file)
+        writer.start()
+        schema = writer.register_schema(IMAGE, "ros2msg", b"uint8 x")
+        writer.register_channel("/camera", "cdr", schema)
+        writer.finish()
+    with pytest.raises(io.InputError, match=r"a\.mcap: /camera has no messages: name another topic"):
+        frames_of(tmp_path / "a.mcap")
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"step": 0},
+        {"step": 2},
+        {"height": 7},
+        {"width": 1 << 31},
+        {"height": 0, "width": 0, "step": 0, "data": b""},
+        {"data": b"ab"},
+        {"encoding": "rgb8"},
+        {"encoding": ""},
+    ],
+)
+def test_an_image_whose_fields_disagree_is_refused(tmp_path, changed):
+    values = [(number, grey(number, **changed)) for number in range(3)]
+    with pytest.raises(io.InputError) as refusal:
+        frames_of(write_messages(tmp_path / "a.mcap", "/a", IMAGE, values))
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+@pytest.mark.parametrize("chunk_size", [50, 1 << 20])
+def test_images_come_in_the_order_of_their_times(tmp_path, compression, chunk_size):
+    values = [(stamp * 10**7, grey(stamp)) for stamp in (2, 0, 1)]
+    options = {"compression": compression, "chunk_size": chunk_size}
+    block = frames_of(write_messages(tmp_path / "a.mcap", "/a", IMAGE, values, **options))
+    assert block.frames[:, 0, 0].tolist() == [0, 1, 2]
+    np.testing.assert_allclose(block.time, [0, 0.01, 0.02])
+
+
+def test_messages_are_decoded_as_ros_defines_them_and_not_as_the_file_does(tmp_path):
+    path = write_messages(tmp_path / "a.mcap", "/a", IMAGE, [(number, grey(number)) for number in range(3)])
+    with path.open("rb") as file:
+        messages = list(make_reader(file).iter_messages())
+    with path.open("wb") as file:
+        writer = McapWriter(file, use_chunking=False)
+        writer.start()
+        schema = writer.register_schema(IMAGE, "ros2msg", b"uint8[<=1000000000] \x1b not a definition")
+        channel = writer.register_channel("/a", "cdr", schema)
+        for _, _, one in messages:
+            writer.add_message(channel, one.log_time, one.data, one.publish_time)
+        writer.finish()
+    assert frames_of(path).frames[:, 0, 0].tolist() == [0, 1, 2]
+
+
+def chunk_bomb(path, compression):
+    """Write a chunk of 8 MB of zeros, which states a size of 100 bytes."""
+    data = bytes(8 << 20)
+    packed = lz4.frame.compress(data) if compression == "lz4" else zstandard.compress(data)
+    write_messages(path, "/a", IMAGE, [(number, grey(number)) for number in range(3)])
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+        file.seek(0)
+        whole = file.read()
+    index = summary.chunk_indexes[0]
+    record = RecordBuilder()
+    Chunk(compression, packed, 9, 0, 0, 100).write(record)
+    body = record.end()
+    moved = replace(index, chunk_start_offset=len(whole), chunk_length=len(body), compression=compression)
+    tail = RecordBuilder()
+    start = len(whole) + len(body)
+    for one in (*summary.schemas.values(), *summary.channels.values(), moved):
+        one.write(tail)
+    Footer(summary_crc=0, summary_offset_start=0, summary_start=start).write(tail)
+    path.write_bytes(whole + body + tail.end() + whole[:8])
+    return path
+
+
+@pytest.mark.parametrize("compression", ["lz4", "zstd"])
+def test_a_chunk_that_unpacks_to_more_than_it_states_is_refused(tmp_path, compression):
+    path = chunk_bomb(tmp_path / "a.mcap", compression)
+    tracemalloc.start()
+    with pytest.raises(io.InputError, match="a chunk states 100 bytes and has another number"):
+        frames_of(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 << 20
+
+
+def test_a_chunk_that_states_gigabytes_is_refused(film, monkeypatch):
+    monkeypatch.setattr("mirrorskin.io.os_errors.check_unpacked.__defaults__", (100,))
+    with pytest.raises(io.InputError, match=r"a chunk takes \d+ bytes of memory"):
+        frames_of(film(("/a", np.zeros((20, 30), np.uint8))))

@@ -236,3 +236,18 @@ def test_a_damaged_result_is_one_line(path, name, value, line):
             read(path)
         assert str(caught.value).startswith(str(path))
         assert "\n" not in str(caught.value)
+
+
+def test_a_number_in_place_of_a_series_is_refused(path):
+    io.save_result(io.Result(status=np.zeros((5, 7), np.uint8), way=np.ones(5)), path)
+    with h5py.File(path, "r+") as file:
+        del file["entry/result/way"]
+        file["entry/result/way"] = 1.0
+    with pytest.raises(io.InputError, match=r"way has shape \(\) where \(0,\) is needed"):
+        io.open_result(path)
+
+
+def test_values_of_different_numbers_of_frames_are_refused(path):
+    io.save_result(io.Result(status=np.zeros((5, 7), np.uint8), stick_ratio=np.ones(4), way=np.ones(5)), path)
+    with pytest.raises(io.InputError, match=r"different numbers of frames \(.* of [45], .* of [45]\)"):
+        io.open_result(path)

@@ -95,5 +95,5 @@ def test_a_file_that_is_no_text_or_missing(tmp_path):
 
 def test_a_pipe_that_nobody_writes_to_is_refused(tmp_path):
     os.mkfifo(tmp_path / "rig.toml")
-    with pytest.raises(io.InputError, match="is no regular file: save what it gives in one first"):
+    with pytest.raises(io.InputError, match="is not a regular file: save its contents in one first"):
         load_toml(tmp_path / "rig.toml", Rig, "write it anew")

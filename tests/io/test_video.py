@@ -200,3 +200,27 @@ assert not [name for name in os.environ if name.startswith("OPENCV_FFMPEG")]
     done = subprocess.run(arguments, capture_output=True, text=True, check=True, env=clean)
     assert done.stdout.split() == ["read", "refused", "refused"]
     assert done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "ffconcat version 1.0\nfile other.avi\n",
+        "#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:1,\nother.avi\n#EXT-X-ENDLIST\n",
+        "v=0\no=- 0 0 IN IP4 127.0.0.1\ns=a\nc=IN IP4 127.0.0.1\nt=0 0\nm=video 9 RTP/AVP 26\n",
+    ],
+    ids=["concatenation", "playlist", "session"],
+)
+@pytest.mark.parametrize("name", ["list.avi", "list.mp4", "list.m3u8"])
+def test_a_list_that_names_other_files_or_addresses_is_not_followed(tmp_path, name, text):
+    encode(tmp_path / "other.avi", "MJPG")
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match="cannot be opened as a video"):
+        open_frames(tmp_path / name, HEADER, phase=np.arange(COUNT))
+
+
+def test_frames_that_take_gigabytes_are_refused(tmp_path, monkeypatch):
+    encode(tmp_path / "a.avi", "MJPG")
+    monkeypatch.setattr("mirrorskin.io.os_errors.check_unpacked.__defaults__", (3 * SHAPE[0] * SHAPE[1] - 1,))
+    with pytest.raises(InputError, match="a frame takes 9216 bytes of memory"):
+        open_frames(tmp_path / "a.avi", HEADER, phase=np.arange(COUNT))

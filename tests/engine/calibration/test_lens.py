@@ -210,6 +210,12 @@ def test_a_picture_of_something_else_is_refused_in_one_line(shown, said):
     assert "\n" not in str(refused.value)
 
 
+def test_a_picture_with_fewer_pixels_than_dots_need_is_refused():
+    noise = np.random.default_rng(0).integers(0, 255, (20, 24)).astype(np.uint8)
+    with pytest.raises(InputError, match=r"^a\.png shows no board dots"):
+        calibrate_lens([("a.png", noise)], Dots(11, 9, 1.0))
+
+
 def test_pictures_of_different_sizes_are_refused():
     with pytest.raises(InputError, match=r"a.png and b.png differ: 40 x 30 and 30 x 40 pixels"):
         calibrate_lens([("a.png", np.zeros((30, 40))), ("b.png", np.zeros((40, 30)))], DOTS)

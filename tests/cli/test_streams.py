@@ -1,0 +1,101 @@
+"""Standard streams that are closed, full or not read to the end, and interruptions: no traceback."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from commands import run
+
+LIMIT = 120  # seconds
+PROGRAM = str(Path(sys.executable).with_name("mirrorskin"))
+FULL = "mirrorskin: standard output could not be written: No space left on device\n"
+UNBUFFERED = pytest.mark.parametrize("unbuffered", ["", "1"])
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    path = tmp_path_factory.mktemp("streams") / "press.h5"
+    assert run("simulate", "vertical", "--size", "8x8", "--frames", "4", "-o", path).code == 0
+    return path
+
+
+def shell(line, unbuffered=""):
+    """Run a line of shell, in which $M is the program; return its exit code and what standard error got."""
+    environment = {**os.environ, "M": PROGRAM, "PYTHONUNBUFFERED": unbuffered}
+    done = subprocess.run(
+        ["bash", "-c", line], env=environment, capture_output=True, text=True, timeout=LIMIT
+    )
+    return done.returncode, done.stderr
+
+
+@UNBUFFERED
+@pytest.mark.parametrize(
+    "words", ["info {}", "info {} --json", "--help", "--version", "info --help", "devices --json"]
+)
+def test_a_full_disk_for_output_is_one_line(recording, words, unbuffered):
+    assert shell(f"$M {words.format(recording)} > /dev/full", unbuffered) == (1, FULL)
+
+
+@UNBUFFERED
+def test_a_reader_that_ends_early_is_no_error_to_report(recording, unbuffered):
+    # The reader is gone before anything is written: it holds no end of the pipe.
+    line = f"exec 3> >(exec true); wait $!; $M info {recording} >&3"
+    assert shell(line, unbuffered) == (1, "")
+
+
+@UNBUFFERED
+@pytest.mark.parametrize("closed", [">&-", "<&- >&-", "<&-", ">&- 2>&-", "<&- >&- 2>&-"])
+def test_closed_streams_are_nothing_to_stumble_over(recording, tmp_path, closed, unbuffered):
+    result = tmp_path / "result.h5"
+    code, said = shell(f"$M reconstruct {recording} -o {result} {closed}", unbuffered)
+    assert code == 0, said
+    assert run("info", result).code == 0  # nothing was printed into the file in place of a closed stream
+
+
+@UNBUFFERED
+@pytest.mark.parametrize("stream", ["2>&-", "2> /dev/full"])
+def test_an_error_that_cannot_be_printed_keeps_its_exit_code(stream, unbuffered):
+    assert shell(f"$M info gone.h5 {stream}", unbuffered) == (2, "")
+
+
+def test_notes_that_cannot_be_printed_do_not_end_a_command(recording, tmp_path):
+    result = tmp_path / "result.h5"
+    assert shell(f"$M reconstruct {recording} -o {result} 2> /dev/full") == (0, "")
+    assert result.exists()
+
+
+@pytest.mark.parametrize(
+    "begun", [b"", b"HTTP/1.1 200 OK\r\nContent-Length: 1000\r\n\r\n{"], ids=["silent", "begun"]
+)
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupted_read_from_a_network_is_quiet(begun, number, code):
+    asked, connections = threading.Event(), []
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve():
+            while True:
+                try:
+                    connections.append(server.accept()[0])
+                except OSError:  # closed
+                    return
+                connections[-1].recv(4096)
+                connections[-1].sendall(begun)
+                asked.set()
+
+        threading.Thread(target=serve, daemon=True).start()
+        address = f"http://127.0.0.1:{server.getsockname()[1]}/press.zarr"
+        with subprocess.Popen(
+            [PROGRAM, "info", address], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as process:
+            assert asked.wait(LIMIT)
+            process.send_signal(number)
+            out, said = process.communicate(timeout=LIMIT)
+        server.shutdown(socket.SHUT_RDWR)
+    for one in connections:
+        one.close()
+    assert (process.returncode, out, said) == (code, "", "")

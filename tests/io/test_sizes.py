@@ -1,0 +1,175 @@
+"""Files of kilobytes that state gigabytes: refused by what they state, before memory is taken."""
+
+import io as memory
+import struct
+import tracemalloc
+import zipfile
+import zlib
+
+import numpy as np
+import pytest
+import tifffile
+
+from mirrorskin import io
+from mirrorskin.io import os_errors
+from mirrorskin.io.arrays import read_array
+from mirrorskin.io.pictures import count_pages, decode_grey, read_picture
+
+POSITIONS = {"motion": "vertical", "travel": io.Steps(0.1)}
+
+
+def head(shape, dtype="|u1"):
+    """Return the header that NumPy writes before an array."""
+    file = memory.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        file, {"descr": dtype, "fortran_order": False, "shape": tuple(shape)}
+    )
+    return file.getvalue()
+
+
+def bomb(path, shape, stated=None):
+    """Write an archive of zeros, of which another shape may be stated."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("frames.npy", head(stated or shape) + bytes(np.prod(shape, dtype=int)))
+    return path
+
+
+def small_archive(path, **more):
+    np.savez_compressed(path, frames=np.zeros((3, 8, 8), np.uint8), travel=np.arange(3.0), **more)
+    return path
+
+
+def test_an_archive_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
+    path = bomb(tmp_path / "bomb.npz", (64, 1024, 1024))
+    assert path.stat().st_size < 1 << 20
+    monkeypatch.setattr("mirrorskin.io.arrays.MAX_UNPACKED_BYTES", 1 << 20)
+    tracemalloc.start()
+    with pytest.raises(io.InputError, match=f"takes {64 << 20} bytes of memory, and at most {1 << 20} are"):
+        io.open_recording(path, **POSITIONS)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8 << 20
+
+
+def test_the_memory_limit_raises_what_an_archive_may_take(tmp_path, monkeypatch):
+    path = small_archive(tmp_path / "a.npz")
+    monkeypatch.setattr("mirrorskin.io.arrays.MAX_UNPACKED_BYTES", 100)
+    with pytest.raises(io.InputError, match=r"raise --memory, or write it with numpy\.savez"):
+        io.open_recording(path, **POSITIONS)
+    with io.open_recording(path, memory_limit=300, **POSITIONS) as recording:
+        assert recording.shape == (3, 8, 8)
+
+
+def test_an_archive_that_is_not_compressed_has_no_limit(tmp_path, monkeypatch):
+    np.savez(tmp_path / "a.npz", frames=np.zeros((3, 8, 8), np.uint8))
+    monkeypatch.setattr("mirrorskin.io.arrays.MAX_UNPACKED_BYTES", 10)
+    with io.open_recording(tmp_path / "a.npz", **POSITIONS) as recording:
+        assert recording.shape == (3, 8, 8)
+
+
+def test_arrays_that_are_not_needed_are_not_read(tmp_path):
+    path = small_archive(tmp_path / "a.npz")
+    with zipfile.ZipFile(path, "a") as file:
+        file.writestr("other.npy", head((1 << 40,)))
+    with io.open_recording(path, **POSITIONS) as recording:
+        assert recording.frame(2).shape == (8, 8)
+
+
+@pytest.mark.parametrize("stated", [(1 << 40, 8, 8), (2, 8, 8), (1 << 62, 1 << 62, 8), (0, 8, 8)])
+def test_a_header_that_disagrees_with_the_archive_is_refused(tmp_path, stated):
+    path = bomb(tmp_path / "a.npz", (3, 8, 8), stated)
+    with pytest.raises(io.InputError, match="bytes of values and has another number"):
+        io.open_recording(path, **POSITIONS)
+
+
+def test_a_header_without_end_is_refused(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("frames.npy", b"\x93NUMPY\x02\x00" + struct.pack("<I", 1 << 31) + bytes(1 << 26))
+    for read in (io.describe, lambda path: io.open_recording(path, **POSITIONS)):
+        with pytest.raises(io.InputError, match="is not a NumPy array"):
+            read(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_an_archive_that_numpy_does_not_write_is_refused(tmp_path, method):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", method) as archive:
+        archive.writestr("frames.npy", head((3, 8, 8)) + bytes(192))
+    with pytest.raises(io.InputError, match="is compressed by method"):
+        io.open_recording(tmp_path / "a.npz", **POSITIONS)
+
+
+@pytest.mark.parametrize("shape", [(1 << 40, 8, 8), (1 << 62, 1 << 62, 1 << 62), (-1, 8, 8)])
+def test_an_array_file_that_states_more_than_it_has_is_refused(tmp_path, shape):
+    (tmp_path / "a.npy").write_bytes(head(shape) + bytes(64))
+    for read in (lambda path: io.open_recording(path, **POSITIONS), read_array):
+        with pytest.raises(io.InputError, match="is not a NumPy array of numbers"):
+            read(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize("name", ["a.npy", "b.npy"])
+def test_an_array_file_that_is_an_archive_is_refused(tmp_path, name):
+    with (tmp_path / name).open("wb") as file:
+        (np.savez if name == "a.npy" else np.savez_compressed)(file, frames=np.zeros((3, 8, 8)))
+    for read in (io.describe, read_array, lambda path: io.open_recording(path, **POSITIONS)):
+        with pytest.raises(io.InputError, match="is not a NumPy array"):
+            read(tmp_path / name)
+
+
+def png(width, height, depth=16, colour=2):
+    """Return a PNG that states its size and holds a few bytes of zeros."""
+
+    def chunk(kind, data):
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    start = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", start)
+        + chunk(b"IDAT", zlib.compress(bytes(99)))
+        + chunk(b"IEND", b"")
+    )
+
+
+def jpeg(width, height):
+    """Return the start of a progressive JPEG that states its size."""
+    frame = struct.pack(">BHHB", 8, height, width, 1) + b"\x01\x11\x00"
+    return b"\xff\xd8\xff\xe0\x00\x04ab\xff\xc2" + struct.pack(">H", len(frame) + 2) + frame + b"\xff\xd9"
+
+
+def test_a_picture_that_states_gigabytes_is_refused(tmp_path):
+    (tmp_path / "a.png").write_bytes(png(30_000, 30_000))
+    tifffile.imwrite(tmp_path / "a.tif", np.zeros((9, 9), np.uint8))
+    data = (tmp_path / "a.tif").read_bytes()
+    for tag in (256, 257):  # width and height
+        at = data.index(struct.pack("<HH", tag, 3 if struct.pack("<HH", tag, 3) in data else 4))
+        data = data[: at + 2] + struct.pack("<HII", 4, 1, 60_000) + data[at + 12 :]
+    (tmp_path / "a.tif").write_bytes(data)
+    for name in ("a.png", "a.tif"):
+        with pytest.raises(io.InputError, match=rf"{name}.*a picture of .*000 takes \d+ bytes of memory"):
+            read_picture(tmp_path / name)
+
+
+def test_a_compressed_image_that_states_gigabytes_is_refused():
+    for data in (png(60_000, 60_000, 8, 0), jpeg(60_000, 60_000)):
+        with pytest.raises(io.InputError, match="bytes of memory"):
+            decode_grey(data, "an image")
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\xff\xd8", b"\xff\xd8\xff\xff\xff", b"BM" + bytes(60), b"GIF89a" + bytes(60)]
+)
+def test_a_compressed_image_of_another_kind_is_refused(data):
+    with pytest.raises(io.InputError, match="is neither a PNG nor a JPEG"):
+        decode_grey(data, "an image")
+
+
+def test_pages_of_several_sizes_are_refused_before_they_are_decoded(tmp_path):
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        for size in (8, 8, 9):
+            file.write(np.zeros((size, 8), np.uint8), photometric="minisblack", metadata=None)
+    with pytest.raises(io.InputError, match=r"page 3\) is 8 x 9 uint8, but .*page 1\) is 8 x 8"):
+        count_pages(tmp_path / "a.tif")
+
+
+def test_the_limit_is_what_the_documentation_states():
+    assert os_errors.MAX_UNPACKED_BYTES == 1 << 30
