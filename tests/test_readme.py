@@ -42,7 +42,7 @@ def desk(tmp_path_factory):
     while SERVERS:
         with SERVERS.pop() as server:
             server.terminate()
-            assert server.wait(timeout=30) == 128 + signal.SIGTERM
+            assert server.wait(timeout=60) == 128 + signal.SIGTERM
 
 
 def test_there_are_commands_to_run():

@@ -420,7 +420,8 @@ class Link:
         if self._times.silence(now) > self._limit() and not self._has_unread():
             self.halt("it no longer answers; the stage may move on: look at the plug, and switch it off")
         idle = self.seen is not None and self.seen.status.state == "idle"
-        if idle and self.patience is None and self.window.busy and now - self._last_line > _ANSWER_LOST:
+        late = self.rests > 0 and now - self._last_line > _ANSWER_LOST  # and it was asked since
+        if idle and self.patience is None and self.window.busy and late:
             self.halt("it rests without having answered all lines; look at the cable")
 
     def _limit(self) -> float:

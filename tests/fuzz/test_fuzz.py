@@ -49,10 +49,12 @@ def test_damaged_files_are_read_or_refused_in_one_line(tmp_path):
     assert [one for one in outcomes if one[1] not in ("read", "refused")] == []
 
 
-@pytest.mark.parametrize(("does", "outcome"), [("os._exit(3)", "crash 3"), ("time.sleep(60)", "hang")])
-def test_a_reader_that_dies_or_hangs_is_seen(tmp_path, monkeypatch, does, outcome):
+@pytest.mark.parametrize(
+    ("does", "outcome", "patience"), [("os._exit(3)", "crash 3", 60.0), ("time.sleep(60)", "hang", 1.0)]
+)
+def test_a_reader_that_dies_or_hangs_is_seen(tmp_path, monkeypatch, does, outcome, patience):
     program = tmp_path / "program.py"
     program.write_text(f"import os, time; input(); {does}")
     monkeypatch.setattr(fuzz, "__file__", str(program))
-    monkeypatch.setattr(fuzz, "PATIENCE", 1.0)
+    monkeypatch.setattr(fuzz, "PATIENCE", patience)
     assert fuzz.Reader().read(tmp_path) == outcome

@@ -45,7 +45,7 @@ def test_noise_is_borne_until_it_is_too_much_within_a_second():
 def test_a_flood_of_noise_is_counted_as_quickly_as_it_comes():
     noise, begun = Noise(), time.process_time()
     assert all(noise.add(1, 0.0) == (k >= 256) for k in range(30_000))
-    assert time.process_time() - begun < 2
+    assert time.process_time() - begun < 10  # quadratic work would take minutes
 
 
 @given(
