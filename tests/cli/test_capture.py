@@ -156,7 +156,6 @@ def test_a_capture_that_is_cut_short_says_what_it_kept(emulated, tmp_path, monke
     assert not rig.machine.moving()
 
 
-@pytest.mark.slow
 @pytest.mark.real_time
 def test_a_file_that_fails_ends_a_capture_in_a_line(emulated, tmp_path):
     # Reads alone: the emulated stage's line and camera write and close in this process, as files do.

@@ -216,7 +216,6 @@ def test_a_camera_that_is_lost_ends_it_with_its_own_complaint(fake, tmp_path):
     assert output.exists()
 
 
-@pytest.mark.slow
 @pytest.mark.real_time
 @pytest.mark.parametrize("kind", ["device lost", "no resources", "allocation", "read"])
 def test_a_call_that_fails_stops_the_stage_and_keeps_what_there_is(fake, tmp_path, kind):

@@ -150,6 +150,7 @@ def test_a_report_from_beyond_the_limits_stops_it(moving, place):
     stage, port = moving
     with port._lock:
         port.place[:] = place
+        port._plan[:] = [(list(place), 60.0)]
     assert "beyond its limits" in failure(stage)[0]
     assert "beyond its limits" in str(stage.error)
     assert port.held_at
@@ -210,10 +211,10 @@ def test_a_work_offset_that_changes_stops_it():
 def test_a_refused_move_stops_the_stage():
     port = ScriptedGrbl()
     with GrblStage(stage_settings(), port) as stage:
-        stage.move(Position(-1), 1.0)
+        stage.move(Position(-1), 4.0)
         port._run = lambda line: port.say("error:15")
         with pytest.raises(HardwareError, match="error:15") as caught:
-            stage.move(Position(2), 1.0)
+            stage.move(Position(2), 20.0)
         assert "G53G1Z8" in str(caught.value)
         assert port.held_at
 
@@ -330,7 +331,7 @@ def test_whatever_interrupts_a_wait_stops_the_stage(moving, monkeypatch, error):
 def test_a_move_that_is_interrupted_stops_the_stage():
     port = ScriptedGrbl()
     with GrblStage(stage_settings(), port) as stage:
-        stage.move(Position(-1), 0.5)
+        stage.move(Position(-0.1), 0.5)
         port.on_move = lambda: (_ for _ in ()).throw(KeyboardInterrupt)
         with pytest.raises(KeyboardInterrupt):
             stage.move(Position(1), 0.5)
