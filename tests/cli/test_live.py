@@ -32,7 +32,7 @@ from mirrorskin.kernels.errors import DeviceError
 
 SHAPE, SHAPED = (24, 32), (48, 56)
 OFFSET, GAIN = 20.0, 200.0
-ALL = ["--latency", "5s"]  # no frame is skipped, even on a busy machine
+ALL = ["--latency", "60s"]  # no frame is skipped, even on a busy machine
 PRESS = ["vertical", "--stop", "1mm", "--speed", "2mm/s", *ALL]
 TURN = ["axial", "--press", "1mm", "--tilt", "2.5deg", "--rate", "2.5", "--turns", "2", *ALL]
 

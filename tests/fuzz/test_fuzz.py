@@ -12,6 +12,11 @@ STRUCTURES = (b"OHDR", b"OCHK", b"GCOL", b"TREE", b"HEAP", b"SNOD", b"FRHP", b"F
 """What HDF5 begins its structures with."""
 
 
+@pytest.fixture(autouse=True)
+def patience(monkeypatch):
+    monkeypatch.setattr(fuzz, "PATIENCE", 120.0)  # for a busy machine, on which the reader begins late
+
+
 def test_a_file_that_is_cut_short_is_refused(tmp_path):
     reader, mutant = fuzz.Reader(), tmp_path / "mutant.h5"
     outcomes = {}
