@@ -425,8 +425,10 @@ class Link:
         if self._times.silence(now) > self._limit() and not self._has_unread():
             self.halt("it no longer answers; the stage may move on: look at the plug, and switch it off")
         idle = self.seen is not None and self.seen.status.state == "idle"
-        late = self.rests > 0 and now - self._last_line > _ANSWER_LOST  # and it was asked since
-        if idle and self.patience is None and self.window.unanswered and late:
+        # By the time of the question: a busy computer may hand over old reports and answers late.
+        since = -math.inf if self.seen is None else self.seen.answer.asked - self._last_line
+        lost = self.window.unanswered and since > _ANSWER_LOST
+        if idle and self.patience is None and lost:
             self.halt("it rests without having answered all lines; look at the cable")
 
     def _limit(self) -> float:

@@ -98,7 +98,7 @@ def test_a_rocking_body_becomes_a_recording_with_a_tilt_of_each_frame(emulated, 
 
 def test_of_a_rig_that_rocks_the_slope_is_known_along_that_direction(tmp_path):
     path, folder = tmp_path / "rock.h5", tmp_path / "rig"
-    words = ("--rock", "--press", "0.8mm", "--tilt", "3deg", "--step", "1deg", "--settle", "0s")
+    words = ("--rock", "--press", "0.8mm", "--tilt", "3deg", "--step", "1deg", "--settle", "1s")
     with served_rig(folder, SHAPE, rate=40.0, delay=0.02, pattern="linear") as served:
         ended = capture(served, "axial", "-o", path, *words)
         truth = served[0].twin(Axial([0.0], np.radians(3), 0.8)).truth

@@ -50,8 +50,8 @@ def test_the_stage_goes_round_on_its_circle_and_ends_where_it_should(stage):
     opened, machine, _ = stage
     opened.move(Position(1.0, LEAN))
     opened.wait()
-    opened.precess(LEAN, -1.25, 2.0)
     begun = time.monotonic()
+    opened.precess(LEAN, -1.25, 2.0)
     report = opened.wait()
     assert report.position.travel == pytest.approx(1, abs=2e-3)
     assert report.position.phase == pytest.approx(-math.pi / 2, abs=2e-3)
