@@ -42,13 +42,18 @@ def pytest_xdist_auto_num_workers():
 def pytest_configure(config):
     config.addinivalue_line("markers", "device: runs on each OpenCL device")
     config.addinivalue_line("markers", "slow: only 'make test-all' runs it")
-    config.addinivalue_line("markers", "real_time: it goes by the clock, so 'make test-all' runs it alone")
+    config.addinivalue_line(
+        "markers", "real_time: it measures time, so that 'make test-all' runs it alone; this makes it slow"
+    )
 
 
+@pytest.hookimpl(tryfirst=True)  # before tests are chosen by their markers
 def pytest_collection_modifyitems(items):
     for item in items:
         if "device" in item.fixturenames:
             item.add_marker("device")
+        if item.get_closest_marker("real_time"):  # 'make test' runs tests beside others
+            item.add_marker("slow")
 
 
 def _way(number, shared, layout):

@@ -51,6 +51,7 @@ SHIFT, TURN = 2.0, 45.0
 
 _SILENCE, _STALL = 0.07, 0.1  # seconds that the emulators may be silent in motion
 _SERVED = 0.5  # the same for emulators in another process, which competes for the processor
+_TIMEOUT = 2.0  # seconds that the emulated controller may take for an answer at rest
 _LIFT = 4.0  # how far above the object the body begins, mm
 _HIGHEST = 4.5  # and how far it can be lifted
 # GRBL's settings of homing, in units a minute, ms and units; and of its axes X, Y, Z, A, B and C, which are
@@ -181,6 +182,7 @@ class EmulatedRig:
         stage = StageSettings(
             port=self.port.url,
             home=self._home,
+            timeout=_TIMEOUT,
             silence=_SILENCE,
             press=PRESS,
             pivot=self._pivot,

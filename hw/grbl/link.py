@@ -14,6 +14,7 @@ from typing import TypeVar
 import serial
 
 from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.grbl.moves import Command
 from mirrorskin.hw.grbl.replies import (
     Alarm,
     Banner,
@@ -215,11 +216,14 @@ class Link:
             self._active = True
             self.noise = Noise()
 
-    def enqueue(self, *lines: str) -> int:
-        """Send lines as soon as the controller has room; return `window.done` once the first is answered."""
+    def enqueue(self, *commands: Command) -> int:
+        """Send lines, each as soon as the controller has room and its motion is due.
+
+        Return the value of `window.done` once the first is answered.
+        """
         with self.lock:
             self._check()
-            numbers = [self.window.add(line) for line in lines]
+            numbers = [self.window.add(one.line, one.duration, one.ramp) for one in commands]
             self.rests = 0
             self._pump()
         return numbers[0]
@@ -228,7 +232,7 @@ class Link:
         """Send a line, wait until it is answered, and return what was said in between."""
         with self.lock:
             self._replies = []
-            number = self.enqueue(line)
+            number = self.enqueue(Command(line))
         self.until(lambda: self.window.done >= number or None, timeout, f"take {line}")
         with self.lock:
             if self._refused is not None:
@@ -382,7 +386,7 @@ class Link:
         self._pump()
 
     def _pump(self) -> None:
-        while self.error is None and (data := self.window.next()) is not None:
+        while self.error is None and (data := self.window.next(time.monotonic())) is not None:
             self._last_line = time.monotonic()
             try:
                 self._port.write(data)
@@ -398,6 +402,7 @@ class Link:
                     self._check_answers(now)
                 if self.stopping.begun:
                     self._advance_stop(now)
+                self._pump()
                 self._times.period = self._poll_period()
                 ask = self._times.due(now) and not self.gone
                 if ask:
@@ -420,7 +425,10 @@ class Link:
         if self._times.silence(now) > self._limit() and not self._has_unread():
             self.halt("it no longer answers; the stage may move on: look at the plug, and switch it off")
         idle = self.seen is not None and self.seen.status.state == "idle"
-        if idle and self.patience is None and self.window.busy and now - self._last_line > _ANSWER_LOST:
+        # By the time of the question: a busy computer may hand over old reports and answers late.
+        since = -math.inf if self.seen is None else self.seen.answer.asked - self._last_line
+        lost = self.window.unanswered and since > _ANSWER_LOST
+        if idle and self.patience is None and lost:
             self.halt("it rests without having answered all lines; look at the cable")
 
     def _limit(self) -> float:

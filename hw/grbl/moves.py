@@ -23,14 +23,28 @@ _NO_TRAVEL = 1e-3  # mm that count as none where the body turns as well
 _SHORT_ARC = math.radians(1)  # of an arc that is as good as straight
 _ROUNDING = 1e-9  # of a half turn
 _TURNS_MAX = 10_000  # turns at a time, since all their lines are made beforehand
+_HOURS_MAX = 24.0  # of a precession, for the same reason
+
+PIECE = 0.25
+"""Seconds of motion in one line at most: what was sent cannot be revoked when this program is killed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A line of G-code, and the seconds that it takes at the speed it names."""
+    """A line of G-code.
+
+    Attributes
+    ----------
+    line : str
+    duration : float
+        Seconds that its motion takes; 0 if nothing moves.
+    ramp : float
+        Seconds in which the axes reach its speed from rest.
+    """
 
     line: str
-    duration: float
+    duration: float = 0.0
+    ramp: float = 0.0
 
 
 class Axes:
@@ -42,6 +56,7 @@ class Axes:
         self._straight = straight  # what a line of a straight move begins with
         self.speeds: dict[str, float] = {motion: axis.top_speed for motion, axis in self._axes.items()}
         self._steps = dict.fromkeys(self.letters.values(), math.inf)
+        self._accelerations = dict.fromkeys(self.letters.values(), math.inf)
 
     @property
     def letters(self) -> dict[str, str]:
@@ -66,6 +81,10 @@ class Axes:
         """Refuse speeds that are too low for a controller whose axis makes so many steps a machine unit."""
         self._steps[self._axes[motion].letter] = steps
 
+    def limit_acceleration(self, motion: str, acceleration: float) -> None:
+        """Set the acceleration of a motion, machine units/s^2; it is infinite unless it is set."""
+        self._accelerations[self._axes[motion].letter] = acceleration
+
     def distance(self, one: Position, other: Position) -> float:
         """Return by how much two places differ in the axis where they differ most, machine units."""
         a, b = self.machine(one), self.machine(other)
@@ -77,15 +96,36 @@ class Axes:
         The speed is in mm/s, or rad/s if the body only turns; None for the greatest. The line of GRBL names
         the machine's coordinates, whatever the work coordinates are.
         """
+        commands = self._straight_pieces(start, place, speed, math.inf)
+        return commands[0] if commands else None
+
+    def pieces(self, start: Position, place: Position, speed: float | None) -> list[Command]:
+        """Return the straight move from one place to another in pieces of `PIECE` seconds; see ``straight``.
+
+        The controller joins them without a halt, since they have one direction and one speed.
+        """
+        return self._straight_pieces(start, place, speed, PIECE)
+
+    def _straight_pieces(
+        self, start: Position, place: Position, speed: float | None, longest: float
+    ) -> list[Command]:
         before, after = self.machine(start), self.machine(place)
         length = math.dist(list(before.values()), list(after.values()))
         if length < 1e-6:
-            return None
+            return []
         duration = self._duration(start, place, speed)
         feed = self._feed(length / duration)
-        steps = max(self._steps[letter] * abs(after[letter] - before[letter]) for letter in after)
+        way = {letter: after[letter] - before[letter] for letter in after}
+        steps = max(self._steps[letter] * abs(way[letter]) for letter in way)
         self._check_steps(steps / duration, length / duration)
-        return Command(f"{self._straight}{_words(after)}{feed}", duration)
+        count = _count(duration, longest)
+        ends = [
+            {letter: after[letter] - way[letter] * (1 - number / count) for letter in way}
+            for number in range(1, count + 1)
+        ]
+        ramp = max(abs(way[letter]) / duration / self._accelerations[letter] for letter in way)
+        lines = [f"{self._straight}{_words(end)}{feed}" for end in ends]
+        return _timed(lines, duration, ramp)
 
     def check_way(self, start: Position, place: Position, speed: float | None) -> None:
         """Refuse a straight move that is too fast, or too slow for the controller; see ``straight``."""
@@ -98,7 +138,9 @@ class Axes:
     def arcs(
         self, tilt: float, turns: float, rate: float, start: float, offset: Mapping[str, float]
     ) -> list[Command]:
-        """Return the arcs of a precession: pieces of half a turn at most, after the choice of their plane.
+        """Return the arcs of a precession, after the choice of their plane.
+
+        Each is half a turn at most, and takes `PIECE` seconds at most.
 
         It turns from phase `start`, counter-clockwise if `turns` are positive, `rate` times a second;
         `offset` is where the work coordinates begin, in machine units.
@@ -110,18 +152,20 @@ class Axes:
         feed = self._feed(along)
         steps = min(self._steps[self._axes[motion].letter] for motion in ("pitch", "roll"))
         self._check_steps(steps * along / math.sqrt(2), along)  # where both axes go alike
-        count = max(1, math.ceil(2 * abs(turns) - _ROUNDING))
+        duration = abs(turns) / rate
+        count = max(math.ceil(2 * abs(turns) - _ROUNDING), _count(duration, PIECE))
         step = math.tau * turns / count
         word = "G3" if step * sense > 0 else "G2"
-        commands = [Command(plane, 0.0)]
+        lines = []
         for k in range(count):
             ends = [self._lean(tilt, start + step * number) for number in (k, k + 1)]
             if abs(step) < _SHORT_ARC:
                 line = f"{_STRAIGHT}{_words(ends[1])}{feed}"
             else:
                 line = f"{word}{self._arc(ends[0], ends[1], offset)}{feed}"
-            commands.append(Command(line, abs(turns) / rate / count))
-        return commands
+            lines.append(line)
+        weakest = min(self._accelerations[self._axes[motion].letter] for motion in ("pitch", "roll"))
+        return [Command(plane), *_timed(lines, duration, along / weakest)]
 
     def _arc(self, begin: Mapping[str, float], end: Mapping[str, float], offset: Mapping[str, float]) -> str:
         """Return the words of an arc about the upright body: GRBL takes its end in work coordinates only."""
@@ -160,6 +204,12 @@ class Axes:
         if abs(turns) > _TURNS_MAX:
             raise InputError(
                 f"{self._name}: {turns:g} turns are too many; go round {_TURNS_MAX} times at most"
+            )
+        hours = abs(turns) / rate / 3600
+        if hours > _HOURS_MAX:
+            raise InputError(
+                f"{self._name}: {turns:g} turns at {rate:g} a second take {hours:.3g} hours; go round for "
+                f"{_HOURS_MAX:g} hours at most"
             )
         greatest = min(self.speeds["pitch"], self.speeds["roll"]) / (math.tau * tilt)
         if rate > greatest * (1 + _ROUNDING):
@@ -208,6 +258,24 @@ class Axes:
                 f"{speed * 60:.4g} was asked for; go faster, or in steps"
             )
         return f"F{speed * 60:.4f}"
+
+
+def _count(duration: float, longest: float) -> int:
+    """Return into how many parts a duration is divided so that none is longer than allowed."""
+    return max(1, math.ceil(duration / longest - _ROUNDING))
+
+
+def _timed(lines: list[str], duration: float, ramp: float) -> list[Command]:
+    """Return the commands of a motion from rest to rest, in lines of equal length.
+
+    The motion takes `duration` at its speed. Speeding up and slowing down take a ramp longer in all; on a way
+    that is shorter than both, the speed is not reached.
+    """
+    added = ramp if ramp <= duration else 2 * math.sqrt(ramp * duration) - duration
+    seconds = [duration / len(lines)] * len(lines)
+    seconds[0] += added / 2
+    seconds[-1] += added / 2
+    return [Command(line, part, ramp) for line, part in zip(lines, seconds, strict=True)]
 
 
 def _words(values: Mapping[str, float]) -> str:

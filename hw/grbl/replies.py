@@ -248,34 +248,61 @@ class Noise:
         return self._recent > _BEARABLE
 
 
+AHEAD = 0.5
+"""Seconds of motion that the controller has in store when the next line is sent.
+
+When this program is killed, the stage moves on for this long and for one line more. When this program pauses
+for longer, the stage comes to rest; `Rig` then ends a timed move.
+"""
+
+
 class Window:
-    """Character counting: sends ahead as many lines as the controller's buffer holds, and no byte more."""
+    """Lines on their way to the controller: no byte more than its buffer holds, and no motion far ahead.
+
+    Bytes are counted until a line is answered. The motion of a line is assumed to begin when that of the line
+    before it ends, and to last for its duration.
+    """
 
     def __init__(self, size: int = BUFFER) -> None:
         self.size = size  # bytes of the controller's buffer
         self.done: int = 0  # lines answered
-        self._waiting: deque[bytes] = deque()
+        self._waiting: deque[tuple[bytes, float, float]] = deque()  # with their duration and ramp
         self._sent: deque[bytes] = deque()
         self._filled = 0
+        self._ends = -math.inf  # when the motion that was sent ends, seconds of time.monotonic
 
     @property
     def busy(self) -> bool:
         """Whether any line waits or is unanswered."""
         return bool(self._waiting or self._sent)
 
-    def add(self, line: str) -> int:
-        """Let a line wait for its turn; return the value of `done` once it is answered."""
+    @property
+    def unanswered(self) -> bool:
+        """Whether a line was sent and not answered yet."""
+        return bool(self._sent)
+
+    def add(self, line: str, duration: float = 0.0, ramp: float = 0.0) -> int:
+        """Append a line, whose motion takes some seconds, `ramp` of which to reach its speed or to stop.
+
+        Return the value of `done` once it is answered.
+        """
         data = line.encode("ascii") + b"\n"
         if len(data) > self.size:
             raise ValueError(f"a line of {len(data)} bytes does not fit a buffer of {self.size}")
-        self._waiting.append(data)
+        self._waiting.append((data, duration, ramp))
         return self.done + len(self._sent) + len(self._waiting)
 
-    def next(self) -> bytes | None:
-        """Return the next line, to be sent now, if the buffer has room for it."""
-        if not self._waiting or self._filled + len(self._waiting[0]) > self.size:
+    def next(self, now: float) -> bytes | None:
+        """Return the next line, to be sent now, if the buffer has room for it and its motion is due."""
+        if not self._waiting:
             return None
-        data = self._waiting.popleft()
+        data, duration, ramp = self._waiting[0]
+        # What the controller has in store must be enough to slow down, or it does not reach its speed.
+        early = duration > 0 and self._ends - now > AHEAD + ramp / 2
+        if early or self._filled + len(data) > self.size:
+            return None
+        self._waiting.popleft()
+        self._ends = max(self._ends, now) + duration
         self._sent.append(data)
         self._filled += len(data)
         return data
@@ -294,3 +321,4 @@ class Window:
         self._waiting.clear()
         self._sent.clear()
         self._filled = 0
+        self._ends = -math.inf

@@ -198,9 +198,9 @@ class GrblStage(Closing):
         for place in places:
             self.limits.check(place, self.name)
         ways = itertools.pairwise([self._destination(), *places])
-        commands = [line for way in ways if (line := self.axes.straight(*way, speed)) is not None]
-        if commands:
-            self._send(commands, places[-1], ramps=len(commands))
+        legs = [pieces for way in ways if (pieces := self.axes.pieces(*way, speed))]
+        if legs:
+            self._send([one for pieces in legs for one in pieces], places[-1], ramps=len(legs))
         else:
             self._target = places[-1]
 
@@ -346,6 +346,7 @@ class GrblStage(Closing):
                 self.axes.limit(motion, rate)
             if acceleration > 0:
                 self._ramp = max(self._ramp, rate / acceleration)
+                self.axes.limit_acceleration(motion, acceleration)
         self._link.stopping.holding = max(HOLDING, _SLOWING * self._ramp)
         if controller.on(20):
             self.limits = _within_soft_limits(self._settings, controller, self.name).limits
@@ -403,7 +404,7 @@ class GrblStage(Closing):
         duration = sum(command.duration for command in commands) + ramps * self._ramp
         with self._guarded():
             with self._link.lock:
-                number = self._link.enqueue(*(command.line for command in commands)) + int(len(commands) > 1)
+                number = self._link.enqueue(*commands) + int(not commands[0].duration)
                 self._target = target
             self._due = max(self._due, time.monotonic()) + duration
             left = self._due - time.monotonic()

@@ -9,7 +9,7 @@ import pytest
 from firmware import PROGRAM, Firmware
 from msgspec import structs
 from scripted_grbl import stage_settings
-from served_rig import allow_delays
+from served_rig import LATE, allow_delays
 
 from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
 from mirrorskin.hw.emulator.rig import EmulatedRig
@@ -18,12 +18,13 @@ from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.hw.stage import Position
 
 LEAN = math.radians(2.5)
+SOON = 30.0  # seconds: a limit for a busy machine
 QUICK = dict.fromkeys((110, 111, 112), 6000) | dict.fromkeys((120, 121, 122), 2000)
 
 
 @pytest.fixture(autouse=True)
 def patience(monkeypatch):
-    allow_delays(monkeypatch, 1.0)
+    allow_delays(monkeypatch)
 
 
 @pytest.fixture(params=["emulator", "firmware"] if PROGRAM else ["emulator"])
@@ -33,15 +34,15 @@ def stage(request, tmp_path):
     machine = GrblMachine(QUICK) if emulated else Firmware(PROGRAM, tmp_path, QUICK)
     with nullcontext() if emulated else machine, GrblPort(machine) as port:
         axes = {name: structs.replace(axis, zero=0.0) for name, axis in stage_settings().axes.items()}
-        borne = {"silence": 0.3, "timeout": 2.0 if emulated else 10.0}  # beside other tests
-        with GrblStage(stage_settings(port=port.url, **borne, **axes)) as opened:
+        silence = getattr(request.function, "silence", LATE)
+        with GrblStage(stage_settings(port=port.url, silence=silence, **axes)) as opened:
             yield opened, machine, port
 
 
-def _until(moving, machine, seconds=3.0):
-    end = time.monotonic() + seconds
-    while machine.moving() != moving:
-        assert time.monotonic() < end, "the stage moves on" if machine.moving() else "it does not move"
+def _until(condition):
+    end = time.monotonic() + SOON
+    while not condition():
+        assert time.monotonic() < end
         time.sleep(0.002)
 
 
@@ -49,15 +50,15 @@ def test_the_stage_goes_round_on_its_circle_and_ends_where_it_should(stage):
     opened, machine, _ = stage
     opened.move(Position(1.0, LEAN))
     opened.wait()
-    opened.precess(LEAN, -1.25, 2.0)
     begun = time.monotonic()
+    opened.precess(LEAN, -1.25, 2.0)
     report = opened.wait()
     assert report.position.travel == pytest.approx(1, abs=2e-3)
     assert report.position.phase == pytest.approx(-math.pi / 2, abs=2e-3)
     truth = machine.position()
     assert (truth["X"], truth["Y"], truth["Z"]) == pytest.approx((0, -2.5, -1), abs=2e-3)
+    _until(lambda: len(opened.history(begun)) > 5)
     tilts = [at.position.tilt for at in opened.history(begun)]
-    assert len(tilts) > 5
     assert tilts == pytest.approx([LEAN] * len(tilts), abs=math.radians(5e-3))
     assert time.monotonic() - begun > 1.25 / 2
 
@@ -84,30 +85,35 @@ def test_a_stage_that_was_homed_knows_its_place_at_once_and_goes_on():
 
 def test_reports_tell_where_the_machine_was(stage):
     opened, machine, _ = stage
-    begun = time.monotonic()
-    opened.move(Position(2.0), 4.0)
-    opened.wait()
-    off = sorted(abs(-machine.position(at.time)["Z"] - at.position.travel) for at in opened.history(begun))
-    assert len(off) > 5
-    assert off[len(off) // 2] < 4.0 * 0.01
+    begun, reports, speed = time.monotonic(), [], 4.0
+    while len(reports) <= 5:  # a busy machine may give few in each move
+        assert time.monotonic() < begun + SOON
+        opened.move(Position(2.0 if opened.report().position.travel < 1 else 0.0), speed)
+        opened.wait()
+        reports = [at for at in opened.history(begun) if 0.1 < at.position.travel < 1.9]
+    off = sorted(abs(-machine.position(at.time)["Z"] - at.position.travel) for at in reports)
+    assert off[len(off) // 2] < speed * max(0.01, opened.longest_trip)
 
 
 @pytest.mark.parametrize("fault", ["silence", "garble"])
 def test_whatever_fails_the_machine_is_stopped(stage, fault):
     opened, machine, port = stage
-    opened.move(Position(-4.5), 0.5)
-    _until(True, machine)
+    opened.move(Position(-4.5), 0.25)
+    _until(lambda: machine.position()["Z"] > 0)
     {"silence": port.silence, "garble": lambda: port.garble(100_000)}[fault]()
     with pytest.raises(HardwareError):
         opened.wait()
-    _until(False, machine)
+    _until(lambda: not machine.moving())
     assert machine.position()["Z"] < 4
+
+
+test_whatever_fails_the_machine_is_stopped.silence = 0.3
 
 
 def test_a_stop_keeps_the_place(stage):
     opened, machine, _ = stage
-    opened.move(Position(-4.5), 5.0)
-    time.sleep(0.1)
+    opened.move(Position(-4.5), 0.25)
+    _until(lambda: machine.position()["Z"] > 0.1)
     opened.stop()
     opened.close()
     assert machine.state == "Idle"

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scripted_grbl import stage_settings
 
-from mirrorskin.hw.grbl.moves import Axes
+from mirrorskin.hw.grbl.moves import PIECE, Axes
+from mirrorskin.hw.rig.plans import Trapezoid
 from mirrorskin.hw.rig_file import TiltAxis, TravelAxis
 from mirrorskin.hw.stage import Position
 from mirrorskin.io import InputError
@@ -64,6 +65,36 @@ def test_a_straight_move_names_the_machines_coordinates():
     assert command.line.startswith("G53G1")
     assert words(command.line) == pytest.approx({"G": 1, "Z": 8.0, "X": 30.0, "Y": 40.0, "F": 240.0})
     assert command.duration == pytest.approx(0.5)
+
+
+def test_a_long_straight_move_is_sent_in_short_pieces_that_end_where_it_does():
+    start, place = Position(), Position(2.0, math.radians(1), math.radians(-3))
+    rig = axes()
+    whole, pieces = rig.straight(start, place, 0.5), rig.pieces(start, place, 0.5)
+    assert pieces[-1].line == whole.line
+    assert sum(one.duration for one in pieces) == pytest.approx(whole.duration)
+    assert max(one.duration for one in pieces) <= PIECE + 1e-9
+    share = np.arange(1, len(pieces) + 1)[:, None] / len(pieces)
+    ends = [[words(one.line)[letter] for letter in "XYZ"] for one in pieces]
+    np.testing.assert_allclose(ends, [30, 40, 10] + share * [1.0, -3.0, -2.0], atol=1e-5)
+    assert {words(one.line)["F"] for one in pieces} == {words(whole.line)["F"]}
+
+
+@pytest.mark.parametrize(("speed", "ramp"), [(2.0, 0.5), (20.0, 5.0)])
+def test_the_time_of_a_move_includes_that_to_speed_up_and_to_slow_down(speed, ramp):
+    rig, path = axes(), Trapezoid(4.0, speed, 4.0)
+    rig.limit_acceleration("travel", 4.0)
+    rig.limit_acceleration("pitch", 0.001)  # it does not move
+    pieces = rig.pieces(Position(), Position(4.0), speed)
+    assert sum(one.duration for one in pieces) == pytest.approx(path.duration)
+    assert {one.ramp for one in pieces} == {ramp}
+
+
+@pytest.mark.parametrize("rate", [0.01, 0.1, 1.0, 5.0])
+def test_no_arc_takes_long_however_slow_it_is(rate):
+    arcs = axes().arcs(LEAN, 1.5, rate, 0.3, NONE)[1:]
+    assert max(one.duration for one in arcs) <= PIECE + 1e-9
+    assert sum(one.duration for one in arcs) == pytest.approx(1.5 / rate)
 
 
 def test_without_a_speed_the_slowest_axis_sets_the_time():
@@ -136,6 +167,7 @@ def test_every_line_of_a_precession_fits_a_line_of_the_controller():
         (LEAN, math.inf, 1.0, "no precession"),
         (LEAN, 1e300, 1.0, "too many"),
         (LEAN, -10_001.0, 1.0, "too many"),
+        (LEAN, 9_000.0, 0.01, "take 250 hours; go round for 24 hours at most"),
         (LEAN, 1.0, math.nan, "no precession"),
         (LEAN, 1.0, 6.4, "at most 6.366"),
         (math.radians(0.01), 1.0, 0.1, "no slower than"),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from commands import run
 from rig_fakes import FakeCamera, settings
+from served_rig import allow_delays
 
 from mirrorskin import io
 from mirrorskin.hw.errors import HardwareError
@@ -56,6 +57,11 @@ class Controller:
 
     def close(self):
         self.closed = True
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch):
+    allow_delays(monkeypatch)
 
 
 @pytest.fixture
@@ -116,7 +122,7 @@ def test_silence_stops_it(lab):
     stage.move(Position(1.0), 0.5)
     line.silent = True
     with pytest.raises(HardwareError, match="no longer answers"):
-        stage.wait(timeout=5.0)
+        stage.wait(timeout=60.0)
     assert line.stopped
 
 
@@ -145,7 +151,7 @@ def test_a_report_that_cannot_be_stops_it(lab, answer, said):
     stage.move(Position(1.0), 0.5)
     line.instead["WHERE?"] = answer
     with pytest.raises(HardwareError, match=said):
-        stage.wait(timeout=5.0)
+        stage.wait(timeout=60.0)
     assert line.stopped
 
 
@@ -176,6 +182,7 @@ speed = 50.0
 source = "film.y4m"
 size = [8, 6]
 rate = 50
+stall = 5
 dark = 0
 delay = 0
 """
@@ -183,14 +190,14 @@ delay = 0
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A rig file, the page's class beside it, a film of 20 s, and the controller behind the port."""
+    """A rig file, the page's class beside it, a film of 200 s, and the controller behind the port."""
     line = Controller()
     monkeypatch.setattr("serial.serial_for_url", lambda *_words, **_named: line)
     monkeypatch.delitem(sys.modules, "my_stage", raising=False)
     monkeypatch.setattr(sys, "path", [*sys.path])
     (tmp_path / "my_stage.py").write_text(EXAMPLE)
     (tmp_path / "rig.toml").write_text(RIG)
-    film = b"YUV4MPEG2 W8 H6 F50:1 Ip A1:1 Cmono\n" + (b"FRAME\n" + bytes(range(48))) * 1000
+    film = b"YUV4MPEG2 W8 H6 F50:1 Ip A1:1 Cmono\n" + (b"FRAME\n" + bytes(range(48))) * 10_000
     (tmp_path / "film.y4m").write_bytes(film)
     return tmp_path
 

@@ -21,7 +21,7 @@ from mirrorskin.hw.rig.sweep import SweepScan
 from mirrorskin.hw.twin import Axial, Vertical
 from mirrorskin.io.types import Block, Closing
 
-pytestmark = [pytest.mark.slow, pytest.mark.real_time]
+pytestmark = pytest.mark.real_time
 
 TILT = math.radians(2.5)
 DELAY = 0.05

@@ -9,7 +9,7 @@ import pytest
 from firmware import PROGRAM, is_hal
 from rig_faults import FAULTS, FIRMWARE_ONLY, HAL_SETTINGS, LATE, SETTINGS, try_capture
 
-pytestmark = [pytest.mark.slow, pytest.mark.real_time]
+pytestmark = pytest.mark.real_time
 
 SOON = 1.0  # seconds; it is 0.2 on a machine that has nothing else to do
 PRESS = 7.0  # seconds, of a whole one

@@ -26,6 +26,7 @@ from mirrorskin.hw.rig.sweep import SweepScan
 from mirrorskin.io import InputError
 
 SCENE = {"shape": (24, 32), "pixel_size": 0.2, "rate": 40.0}
+PATIENCE = 30.0  # seconds, for a busy machine
 STEPS = ("--stop", "1mm", "--step", "500um", "--settle", "0s", "--frames", "2")
 
 
@@ -33,7 +34,7 @@ STEPS = ("--stop", "1mm", "--step", "500um", "--settle", "0s", "--frames", "2")
 def emulated(monkeypatch):
     """A rig whose camera is triggered by the coolant's line, or a freely running one as if it were."""
     allow_delays(monkeypatch)
-    monkeypatch.setattr(triggers, "_PATIENCE", 20.0)  # for a busy machine
+    monkeypatch.setattr(triggers, "_PATIENCE", PATIENCE)
     opened = []
 
     def make(line="coolant", free=False):
@@ -61,7 +62,7 @@ def drain(scan):
 
 
 def wait_until_off(rig):
-    until = time.monotonic() + 5.0
+    until = time.monotonic() + PATIENCE
     while is_on(rig):
         assert time.monotonic() < until
         time.sleep(0.01)
@@ -123,7 +124,12 @@ def test_a_surplus_frame_after_the_last_trigger_is_a_fault(emulated):
     ):
         for _ in range(2):
             scan.read()
+        came = rig.camera.counts.frames
         stage.switch("coolant", True)
+        until = time.monotonic() + PATIENCE
+        while rig.camera.counts.frames == came:
+            assert time.monotonic() < until
+            time.sleep(0.005)
         with pytest.raises(HardwareError, match="gave 1 frames more than it was triggered for"):
             scan.read()
 

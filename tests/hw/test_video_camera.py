@@ -262,8 +262,9 @@ def test_a_camera_that_is_lost_comes_back(driver, open_camera, caplog) -> None:
     opened.take(1, SOON)
     driver.there = False
     driver.pictures.put(None)
+    wait_until(lambda: "was lost after 1 frames" in caplog.text)
     with pytest.raises(HardwareError, match="was lost"):
-        opened.take(1, 0.3)
+        opened.take(1, 0.0)
     assert opened.error is None
     driver.there = True
     driver.pictures.put(second)

@@ -7,7 +7,7 @@ import pytest
 import soak
 
 ATTEMPTS = 5  # a machine that is busy with other things may be too late for the emulators
-pytestmark = [pytest.mark.slow, pytest.mark.real_time]
+pytestmark = pytest.mark.real_time
 
 
 @pytest.mark.parametrize("seed", soak.seeds())

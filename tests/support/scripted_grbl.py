@@ -35,7 +35,8 @@ def stage_settings(**changes):
         "port": "in memory",
         "baud": 115200,
         "home": False,
-        "timeout": 1.0,
+        "timeout": 30.0,
+        "silence": 5.0,  # for a busy machine
         "report_rate": 100.0,
         "travel": TravelAxis(letter="Z", direction=-1, zero=10.0, limits=(-5.0, 6.0), speed=20.0),
         "pitch": TiltAxis(letter="X", zero=30.0, limits=(-5.0, 5.0), speed=100.0),

@@ -15,13 +15,20 @@ from mirrorskin.hw.grbl import link as links
 from mirrorskin.hw.rig import rig as rigs
 from mirrorskin.hw.rig_file import CameraSettings
 
+LATE = 5.0
+"""Seconds that an emulator may be late; a rig file allows no more."""
 
-def allow_delays(patch: pytest.MonkeyPatch, seconds: float = 5.0) -> None:
-    """Let emulators be late, where other programs have the processors; that is no fault of the rig."""
-    patch.setattr(rigs, "_PAUSE", seconds)
-    patch.setattr(emulators, "_SILENCE", seconds)
-    patch.setattr(emulators, "_STALL", seconds)
-    patch.setattr(links, "_WRITE", seconds)
+_LATER = 60.0  # seconds, where no rig file sets a limit
+
+
+def allow_delays(patch: pytest.MonkeyPatch) -> None:
+    """Accept that threads and emulators are late while other programs use the processors."""
+    for name in ("_SILENCE", "_STALL"):
+        patch.setattr(emulators, name, LATE)
+    patch.setattr(emulators, "_TIMEOUT", _LATER)
+    patch.setattr(links, "_WRITE", _LATER)
+    for name in ("_PAUSE", "_PATIENCE"):
+        patch.setattr(rigs, name, _LATER)
 
 
 @contextmanager

@@ -92,7 +92,7 @@ def test_a_viewer_in_the_browser_listens_on_this_machine_only(monkeypatch):
     try:
         view.show(known(), STATUS)
         view.close()
-        assert time.monotonic() - begun < 20
+        assert time.monotonic() - begun < 60
         assert words[words.index("--bind") + 1] == "127.0.0.1"
         assert process.poll() is None  # it stays open for its user
     finally:

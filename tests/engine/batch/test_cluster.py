@@ -113,7 +113,7 @@ def slow_jobs(monkeypatch):
 
 def test_a_worker_of_many_threads_does_one_job_at_a_time(recordings, address, tmp_path, slow_jobs):
     assert states(run_cluster(make_jobs(recordings, tmp_path) * 3, PLAN, address)) == ["done"] * 12
-    assert list(slow_jobs.values()) == [1, 1]
+    assert set(slow_jobs.values()) == {1}  # a busy machine may leave all to one of the workers
 
 
 def test_paths_are_those_of_here(recordings, address, tmp_path, monkeypatch, slow_jobs):
@@ -130,7 +130,7 @@ def test_leaving_early_ends_the_batch(recordings, two_workers, tmp_path, slow_jo
         run_cluster(make_jobs(recordings, tmp_path) * 5, PLAN, two_workers.scheduler_address)
     ) as run:
         next(run)
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + 60
     while two_workers.scheduler.tasks:
         assert time.monotonic() < deadline, "the scheduler still has jobs"
         time.sleep(0.01)

@@ -37,7 +37,7 @@ def test_several_devices_work_at_the_same_time(jobs):
     def watch(job, frames):
         if frames > 0 and len(threads) < 2:
             threads[job] = threading.get_ident()
-            met.wait(timeout=30)
+            met.wait(timeout=120)
 
     outcomes = list(run_local(jobs, Plan(), devices, watch))
     assert {one.job for one in outcomes if one.state == "done"} == set(jobs)
@@ -55,13 +55,14 @@ def test_leaving_early_ends_the_batch(jobs, device):
     assert not half_written(jobs[0].target.parent)
 
 
-def test_ctrl_c_gives_up_the_job_under_way_and_keeps_the_finished_ones(jobs, device):
-    done = []
+def test_ctrl_c_gives_up_the_job_under_way_and_keeps_the_finished_ones(jobs, device, monkeypatch):
+    done, ending, finish = [], threading.Event(), local._finish
+    monkeypatch.setattr(local, "_finish", lambda *threads: (ending.set(), finish(*threads)))
 
     def interrupt(job, frames):
         if job == jobs[1] and 0 < frames < 8:
             signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
-            time.sleep(0.5)
+            assert ending.wait(60)
 
     outcomes = run_local(jobs, Plan(memory_limit=5 * 7), [device], interrupt)
     with pytest.raises(KeyboardInterrupt):
