@@ -73,7 +73,8 @@ def plot(result: Shown, name: str | None, axes: Axes | None) -> Axes:
     image = axes.imshow(maps[chosen], extent=extent, interpolation="nearest")
     places = ("column", "row") if extent is None else ("x [mm]", "y [mm]")
     axes.set(xlabel=places[0], ylabel=places[1])
-    axes.figure.colorbar(image, ax=axes, label=f"{chosen} {_unit(chosen, result)}".strip())
+    label = f"{chosen} {_unit(chosen, result)}".strip()
+    axes.figure.colorbar(image, ax=axes).set_label(label, parse_math=False)  # a name may have a "$"
     return axes
 
 

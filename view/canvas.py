@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from io import BytesIO
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io import InputError
 from mirrorskin.io.atomic import write_new
+from mirrorskin.io.text import printable
 from mirrorskin.io.types import Floats
 from mirrorskin.view.colours import FILLED_SHADES, MISSING
 
@@ -60,9 +62,32 @@ def write_figure(figure: Figure, path: Path) -> None:
 
 def encode_figure(figure: Figure, dpi: float) -> bytes:
     """Return a figure as a PNG."""
+    _print_texts_as_they_are(figure)
     target = BytesIO()
-    figure.savefig(target, format="png", dpi=dpi)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")
+        figure.savefig(target, format="png", dpi=dpi)
     return target.getvalue()
+
+
+def _print_texts_as_they_are(figure: Figure) -> None:
+    """Take "$" in titles, labels and legends for itself: names of files and maps may not be formulas.
+
+    Labels of ticks are formulas of Matplotlib's own.
+    """
+    from matplotlib.axes import Axes
+    from matplotlib.text import Text
+
+    of_ticks = {
+        label
+        for axes in figure.findobj(Axes)
+        for axis in (axes.xaxis, axes.yaxis)
+        for label in (*axis.get_ticklabels(which="both"), axis.get_offset_text())
+    }
+    for text in figure.findobj(Text):
+        if text not in of_ticks:
+            text.set_parse_math(False)
+            text.set_text("\n".join(map(printable, text.get_text().split("\n"))))
 
 
 def extent(x: Floats, y: Floats) -> Extent:
@@ -166,6 +191,7 @@ def show_figure(figure: Figure, title: str) -> None:
     def ready(*_: Any, **__: Any) -> Figure:
         return figure
 
+    _print_texts_as_they_are(figure)
     figure.set_dpi(min(figure.get_dpi(), *np.divide(_SCREEN, figure.get_size_inches())))
     # pyplot makes a window only for what it makes itself.
     pyplot.figure(num=title, FigureClass=cast("type[Figure]", ready))

@@ -332,7 +332,7 @@ def _draw_key(axes: Axes) -> None:
     colours = (np.stack([across, up, height, np.ones_like(up)], axis=-1) + 1) / 2
     colours[across**2 + up**2 > 1, 3] = 0
     axes.imshow(colours, extent=(-1, 1, -1, 1), origin="lower")
-    axes.set(xticks=[-1, 0, 1], yticks=[-1, 0, 1], xlabel="$n_x$", ylabel="$n_y$", title="normal")
+    axes.set(xticks=[-1, 0, 1], yticks=[-1, 0, 1], xlabel="n_x", ylabel="n_y", title="normal")
     axes.yaxis.tick_right()
     axes.yaxis.set_label_position("right")
     axes.spines[:].set_visible(False)

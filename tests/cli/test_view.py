@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from commands import run
 from shown import ball
 
 from mirrorskin import io
@@ -142,3 +143,12 @@ def test_without_matplotlib_the_remedy_is_named(result, monkeypatch):
 def test_the_help_names_every_map_there_is():
     told = " ".join(view("--help").output.split())
     assert [name for name in MAPS if name not in told] == []
+
+
+@pytest.mark.parametrize("name", [r"$\frac{$", "$x$ $", "\x1b[2J\x07", "\u5de5\u5177"])
+def test_a_name_that_is_a_formula_or_a_control_code_is_a_title_like_any_other(tmp_path, name):
+    recording, result = tmp_path / "press.h5", tmp_path / f"{name}.h5"
+    assert run("simulate", "vertical", "--size", "16x16", "--frames", "6", "-o", recording).code == 0
+    assert run("reconstruct", recording, "-o", result).code == 0
+    ended = run("view", result, "-o", tmp_path / "a.png")
+    assert (ended.code, ended.said) == (0, "")

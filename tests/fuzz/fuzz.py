@@ -105,6 +105,9 @@ OPTIONS = """--travel-step 0.1mm
 BOARDS = """charuco:7x5:2mm:1.5mm
 dots:11x9:1mm
 """
+NAMES = ["\x1b[2J", "$\\frac{$", "\u5de5\u5177", "<b>", "-", "a b"]
+"""How names of files may begin."""
+
 EXPORTS = (".ply", ".stl", ".xyz", ".png", ".tif", ".npz", ".csv", ".mcap", ".zarr")
 
 
@@ -514,7 +517,8 @@ def attack(
         while go_on(number):
             chance = random.Random(f"{seed} {number}")
             sample = chance.choice(samples)
-            mutant = Path(folder) / sample.name
+            odd = sample.suffix not in (".call", ".words") and chance.random() < 0.2
+            mutant = Path(folder) / f"{chance.choice(NAMES) if odd else ''}{sample.name}"
             if sample.is_dir():
                 damage_store(sample, mutant, chance)
             else:
@@ -522,7 +526,7 @@ def attack(
             outcome = reader.read(mutant)
             if outcome not in ("read", "refused"):
                 keep.mkdir(parents=True, exist_ok=True)
-                mutant.rename(keep / f"{seed}-{number}-{sample.name}")
+                shutil.move(mutant, keep / f"{seed}-{number}-{sample.name}")
             elif mutant.is_dir():
                 shutil.rmtree(mutant)
             number += 1
