@@ -24,9 +24,9 @@ def command(
         Option(
             "--map",
             metavar="NAME",
-            help="Only height, section, normals, edges, status, sigma, histogram, displacement, slip, slope,"
-            " hysteresis, growth, azimuth, modulation or a map of your own; may be given again.",
-            show_default="all that the result has",
+            help="Only this map ('mirrorskin info RES' lists the names), 'section' or 'histogram'; may be given"
+            " again.",
+            show_default="those of the overview",
         ),
     ] = None,
     section: options.Section = None,
@@ -50,7 +50,7 @@ def command(
         ),
     ] = None,
 ) -> None:
-    """Show heights, a section, normals, edges, status, expected errors."""
+    """Show heights, a section, normals, edges, status, standard deviations."""
     from mirrorskin import io, view
     from mirrorskin.cli.quantity import segment
 

@@ -12,7 +12,7 @@ from mirrorskin.engine.frames import check_dtype, check_frames
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
 from mirrorskin.io.positions import check_strokes
-from mirrorskin.io.types import Shown
+from mirrorskin.io.result import Shown
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
 
 Doubles = NDArray[np.float64]

@@ -17,7 +17,7 @@ from mirrorskin.engine.rotation.correlation import Correlation, Correlator, corr
 from mirrorskin.engine.rotation.design_matrix import Doubles, fit_matrix
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
-from mirrorskin.io.types import Shown
+from mirrorskin.io.result import Shown
 from mirrorskin.kernels.device import Device
 
 _TURN = 2 * np.pi

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.slip.status import NO_CONTACT, SLIPPED, STICKS
 from mirrorskin.io import Result
-from mirrorskin.io.result import unit_of
+from mirrorskin.io.maps import SlipStatus, is_builtin
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,9 +113,9 @@ def summarise(result: Result) -> Summary:
         answers, values, names = result.zenith, np.degrees(result.zenith), ("normals", "zenith", "deg")
     elif result.height is None and result.azimuth is not None and result.modulation is not None:
         answers, values, names = result.azimuth, result.modulation, ("azimuth", "modulation", "counts")
-    elif result.height is None and result.own_maps:
-        name, answers = next(iter(result.own_maps.items()))
-        values, names = answers, (name, name, "")
+    elif result.height is None and (own := [name for name in result.maps() if not is_builtin(name)]):
+        answers = values = result[own[0]]
+        names = own[0], own[0], result.declaration(own[0]).unit
     what, quantity, unit = names
     answered = np.isfinite(answers)
     lowest, highest = _range(values if answers is height else values[answered]) or (np.nan, np.nan)
@@ -140,18 +139,18 @@ def summarise(result: Result) -> Summary:
 def _summarise_slip(result: Result) -> Summary:
     assert result.slip_onset is not None
     status = np.zeros(result.slip_onset.shape, np.uint8) if result.status is None else result.status
-    touched = status != NO_CONTACT if result.contact is None else result.contact != 0
+    touched = status != SlipStatus.NO_CONTACT if result.contact is None else result.contact != 0
     ratio = np.empty(0) if result.stick_ratio is None else result.stick_ratio[np.isfinite(result.stick_ratio)]
     lowest, highest = _range(result.slip_onset) or (np.nan, np.nan)
     return Summary(
         "slip",
         int(np.count_nonzero(touched)),
-        int(np.count_nonzero(touched & np.isin(status, (SLIPPED, STICKS)))),
+        int(np.count_nonzero(touched & np.isin(status, (SlipStatus.SLIPPED, SlipStatus.STICKS)))),
         "slip onset",
-        unit_of("slip_onset", result.process) or "",
+        result.declaration("slip_onset").unit,
         lowest,
         highest,
-        slipped=int(np.count_nonzero(touched & (status == SLIPPED))),
+        slipped=int(np.count_nonzero(touched & (status == SlipStatus.SLIPPED))),
         stick_ratio=float(ratio[-1]) if ratio.size else None,
         force_x=result.force_x,
         force_y=result.force_y,

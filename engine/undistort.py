@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.resample import SamplePoints
 from mirrorskin.io import InputError, Lens, Result, pixel_axes
-from mirrorskin.io.result import map_shape, with_fields
+from mirrorskin.io.maps import Map
+from mirrorskin.io.result import map_shape
 from mirrorskin.io.selection import source_region
 from mirrorskin.io.types import UNDISTORTED
 
@@ -61,9 +63,6 @@ def _rays(lens: Lens, points: Doubles) -> Doubles:
 
 Maps = dict[str, NDArray[Any]]
 
-_NOTHING = {"status": 0, "edges": 0, "filled": 0, "contact": 0, "component": -1}
-_BOUNDS = ("slope_min", "slope_max")  # of a few values: nothing lies between two
-_OF_PIECES = ("height", "height_sigma")
 _BAND = 1 << 14  # pixels that are worked on at once
 
 
@@ -107,7 +106,8 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
     if not maps:
         raise InputError("there are no maps to undistort: reconstruct first")
     *turns, rows, columns = map_shape(result)
-    if "displacement" in maps and maps["displacement"].ndim == 4:
+    declared = {name: result.declaration(name) for name in maps}
+    if any(maps[name].ndim > len(turns) + 2 + bool(one.components) for name, one in declared.items()):
         raise InputError("displacements of each frame cannot be undistorted: leave per_frame out")
     region = source_region(result.process)
     row, column = (region.origin if region else (0, 0)) if origin is None else origin
@@ -125,41 +125,44 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
         points = SamplePoints.at(seen[0].ravel() - column, seen[1].ravel() - row, (rows, columns))
         turn: Any
         for turn in range(turns[0]) if turns else [...]:
-            found = _resampled({name: values[turn] for name, values in maps.items()}, points)
+            found = _resampled({name: values[turn] for name, values in maps.items()}, declared, points)
             for name, values in found.items():
                 room = made[name][turn][band]
                 room[...] = values.reshape(room.shape)
-    changed: dict[str, Any] = {**made, "x": x, "y": y, "process": {**result.process, UNDISTORTED: True}}
-    return with_fields(result, changed)
+    return result.assign(made, x=x, y=y, process={**result.process, UNDISTORTED: True})
 
 
-def _resampled(maps: Maps, points: SamplePoints) -> Maps:
-    """Return all maps of one picture at some places, (n,) or (n, 3)."""
-    touched, pieces = (
-        points.same_label(maps[name]) if name in maps else None for name in ("contact", "component")
-    )
-    made: Maps = {}
-    for name, values in maps.items():
-        if name in _BOUNDS:
-            made[name] = points.nearest_values(values, np.nan)
-        elif name in _NOTHING:
-            made[name] = points.nearest_values(values, _NOTHING[name])
-        elif name == "normals":
-            made[name] = points.interpolate_vectors(values, touched)
-        elif name in ("displacement", "traction"):
-            parts = (points.interpolate(values[..., part], touched) for part in range(2))
-            made[name] = np.stack(list(parts), axis=-1)
-        elif name == "azimuth":
-            if "normals" not in maps:
-                made[name] = points.interpolate_angles(values, touched)
-        elif name != "zenith" or "normals" not in maps:
-            made[name] = points.interpolate(values, pieces if name in _OF_PIECES else touched)
-    return made | _directions(maps, made["normals"], points) if "normals" in maps else made
+def _resampled(maps: Maps, declared: Mapping[str, Map], points: SamplePoints) -> Maps:
+    """Return all maps of one picture at some places, (n,) or (n, components)."""
+    labels = {one.within for one in declared.values() if one.within in maps}
+    same = {name: points.same_label(maps[name]) for name in labels}
+    resampled = {name: _sample(values, declared[name], same, points) for name, values in maps.items()}
+    return resampled | _directions(maps, resampled, points)
 
 
-def _directions(maps: Maps, normals: NDArray[np.float32], points: SamplePoints) -> Maps:
-    """Return those maps of zenith and azimuth that there were, of vectors; a pixel's own are kept."""
-    x, y, z = normals.T
+def _sample(
+    values: NDArray[Any], declared: Map, same: Mapping[str, NDArray[np.bool_]], points: SamplePoints
+) -> NDArray[Any]:
+    """Return one map at some places, by its declaration; ``same`` are the neighbours with equal labels."""
+    count = same.get(declared.within)
+    if declared.codes or declared.sampling == "nearest" or values.dtype.kind != "f":
+        outside = declared.undefined_value if values.dtype.kind == "f" else int(declared.undefined or 0)
+        return points.nearest_values(values, outside)
+    if declared.sampling == "direction":
+        return points.interpolate_vectors(values, count)
+    if declared.components:
+        parts = [points.interpolate(part, count) for part in np.moveaxis(values, -1, 0)]
+        return np.stack(parts, axis=-1)
+    if declared.sampling == "angle":
+        return points.interpolate_angles(values, count)
+    return points.interpolate(values, count)
+
+
+def _directions(maps: Maps, resampled: Maps, points: SamplePoints) -> Maps:
+    """Return zenith and azimuth, if there are any, of the resampled normals; a pixel's own are kept."""
+    if "normals" not in maps:
+        return {}
+    x, y, z = resampled["normals"].T
     across = np.hypot(x, y)
     level = np.where(across == 0, np.float32(np.nan), np.float32(0))
     angles = {"zenith": np.arctan2(across, z), "azimuth": np.arctan2(y, x) + level}

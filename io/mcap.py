@@ -21,7 +21,8 @@ from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.pictures import quiet_opencv
 from mirrorskin.io.positions import Positions
 from mirrorskin.io.recording import Recording
-from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, Result
+from mirrorskin.io.result import Result
+from mirrorskin.io.types import Block, Closing, Floats, Header, InputError
 
 if TYPE_CHECKING:
     from mcap_ros2.writer import Writer

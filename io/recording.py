@@ -21,8 +21,9 @@ from mirrorskin.io.layout import CHECKSUM, MARK, SERIES, STACK, Layout, Recordin
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.positions import Positions, along
 from mirrorskin.io.recorder import checksums
-from mirrorskin.io.result import MARK as RESULT_MARK
-from mirrorskin.io.result import open_result
+from mirrorskin.io.result import Result
+from mirrorskin.io.result_file import MARK as RESULT_MARK
+from mirrorskin.io.result_file import open_result
 from mirrorskin.io.selection import Region, Selection, source_region
 from mirrorskin.io.stack import Stack
 from mirrorskin.io.types import (
@@ -34,7 +35,6 @@ from mirrorskin.io.types import (
     Header,
     InputError,
     Motion,
-    Result,
     Truth,
     block_memory,
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -206,7 +206,7 @@ def _judge(result: io.Result, truth: io.Truth, shared: NDArray[np.bool_]) -> Out
 
     height = _height(result)
     parts = height, np.where(shared, height, np.float32(np.nan))
-    whole, shared_part = (engine.score(replace(result, height=part), truth).height for part in parts)
+    whole, shared_part = (engine.score(result.assign(height=part), truth).height for part in parts)
     assert whole is not None
     assert shared_part is not None
     return {

@@ -53,7 +53,7 @@ def test_the_maps_are_written_and_told_in_a_line(place):
     span = f"from {light.min():.3f} to {light.max():.3f}"
     assert (ended.code, ended.said) == (0, "")
     assert ended.out == f"press-Light.h5: light at 35 of 35 pixels, {span}\n"
-    np.testing.assert_array_equal(io.open_result("press-Light.h5").own_maps["light"], light)
+    np.testing.assert_array_equal(io.open_result("press-Light.h5")["light"], light)
 
 
 def test_files_of_one_name_are_two_modules():
@@ -123,4 +123,4 @@ def test_what_the_page_says_runs():
             assert ended.code == 0, ended.said
     known = {}
     exec(own + code, known)
-    assert known["result"].own_maps["light"].any()
+    assert known["result"]["light"].any()

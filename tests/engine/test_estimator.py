@@ -118,7 +118,7 @@ def test_maps_of_one_s_own_are_exported_and_told(tmp_path):
 
 
 def test_one_turn_of_maps_of_one_s_own_is_chosen():
-    turns = io.Result(zenith=np.zeros((2, 5, 7), np.float32), own_maps={"total": FRAMES[:2]})
+    turns = io.Result(zenith=np.zeros((2, 5, 7), np.float32), total=FRAMES[:2])
     same(io.select_turn(turns, 1).own_maps, {"total": FRAMES[1]})
 
 
@@ -128,7 +128,7 @@ def test_ours_are_run_as_well(device):
     onset = engine.find_onset(frames, TRAVEL, device=device)
     found = engine.run(press, engine.OnsetSearch(press.shape[1:], press.dtype, device=device), memory_limit=1)
     np.testing.assert_array_equal(found.height, onset.height)
-    np.testing.assert_array_equal(found.own_maps["frame"], onset.frame)
+    np.testing.assert_array_equal(found["frame"], onset.frame)
     assert found.process["noise"] == onset.noise
     assert found.process["device"] == device.info.title
 
@@ -144,7 +144,7 @@ def test_a_kernel_of_the_user_s_gives_the_same_as_numpy(device, tmp_path, dtype)
     for at_once in (1, 3, 100):
         with io.open_recording(tmp_path / "rec.h5") as recording:
             found = engine.run(recording, estimator, memory_limit=2 * at_once * frames[0].nbytes)
-        np.testing.assert_array_equal(found.own_maps["light"], light)
+        np.testing.assert_array_equal(found["light"], light)
     assert found.process["device"] == device.info.title
 
 

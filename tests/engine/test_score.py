@@ -85,7 +85,7 @@ def test_the_error_of_a_normal_is_the_angle_to_the_true_one():
     )
     found = normals([[33, 26, 0], [85, 45, 45]], [[50, 190, 77], [10, 225, np.nan]])
     sigma = np.full((2, 3), np.radians(2), np.float32)
-    score = engine.score(io.Result(normals=found, normal_sigma=sigma), truth)
+    score = engine.score(io.Result(normals=found, normals_sigma=sigma), truth)
     assert score.parts().keys() == {"normal"}
     part = score.normal
     assert (part.answered, part.touched) == (4, 5)

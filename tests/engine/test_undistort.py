@@ -45,7 +45,7 @@ def maps_of(shape, turns=(), seed=0):
     normals = (normals / np.linalg.norm(normals, axis=-1, keepdims=True)).astype(np.float32)
     normals[random.random(size) < 0.2] = np.nan
     x, y, z = np.moveaxis(normals, -1, 0)
-    names = ["height", "height_sigma", "normal_sigma", "mean", "cosine", "sine", "modulation", "residual"]
+    names = ["height", "height_sigma", "normals_sigma", "mean", "cosine", "sine", "modulation", "residual"]
     labels = {
         name: random.integers(0, 3, size).astype(np.uint8)
         for name in ("status", "edges", "filled", "contact")

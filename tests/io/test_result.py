@@ -16,7 +16,7 @@ PROCESS = {"program": "mirrorskin", "threshold": 0.5, "hold": 2, "subframe": Tru
 
 
 PLACES = dict(zip("xy", io.pixel_axes((5, 7), (0.5, 0.6)), strict=True))
-FLOATS = ("zenith", "azimuth", "normal_sigma", "mean", "cosine", "sine", "modulation", "residual")
+FLOATS = ("zenith", "azimuth", "normals_sigma", "mean", "cosine", "sine", "modulation", "residual")
 
 
 def a_press(**changes):

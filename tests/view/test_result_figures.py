@@ -13,7 +13,7 @@ from mirrorskin import io
 from mirrorskin.view.result import figures_of, overview, png_of
 
 PRESS = ("height", "height_sigma", "status", "filled", "x", "y")
-TURN = ("height", "height_sigma", "normals", "normal_sigma", "azimuth", "modulation", "edges", "contact")
+TURN = ("height", "height_sigma", "normals", "normals_sigma", "azimuth", "modulation", "edges", "contact")
 
 
 def only(*names, **maps):
@@ -51,7 +51,7 @@ def test_a_fused_result_has_all_pictures_but_those_that_tell_less(alone):
         (only("azimuth", "modulation", "x", "y"), ["azimuth", "modulation"]),
         (only("status"), ["status"]),
         (
-            io.Result(own_maps={"light": np.eye(24, 32), "count": np.ones((24, 32), np.uint8)}),
+            io.Result(light=np.eye(24, 32), count=np.ones((24, 32), np.uint8)),
             ["light", "count"],
         ),
         (only("height", "x", "y", height=np.full((24, 32), np.nan, np.float32)), ["height", "histogram"]),

@@ -275,7 +275,7 @@ def test_a_share_that_is_not_nothing_does_not_look_like_nothing():
     ("draw", "unit", "factor", "name"),
     [
         (draw_height_sigma, "µm", 1e3, "height_sigma"),
-        (draw_normal_sigma, "deg", 180 / np.pi, "normal_sigma"),
+        (draw_normal_sigma, "deg", 180 / np.pi, "normals_sigma"),
         (draw_modulation, "counts", 1, "modulation"),
     ],
 )

@@ -61,7 +61,7 @@ def test_the_surface_in_contact_is_that_of_the_normals(ball):
     normals = np.stack([x / RADIUS, y / RADIUS, up], axis=-1).astype(np.float32)
     normals[np.isnan(ball.height)] = NAN
     told = engine.measure(
-        dataclasses.replace(ball, normals=normals, normal_sigma=np.full(SHAPE, 1e-3, np.float32))
+        dataclasses.replace(ball, normals=normals, normals_sigma=np.full(SHAPE, 1e-3, np.float32))
     ).quantities["contact surface area"]
     assert told.value == pytest.approx(2 * np.pi * RADIUS * SAG, rel=1e-3)
     assert 0.5e-3 < told.sigma / told.value < 1e-2

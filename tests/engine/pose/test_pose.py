@@ -99,7 +99,7 @@ def test_heights_alone_are_enough() -> None:
     rng = np.random.default_rng(3)
     vector, shift = draw(rng)
     pair = [sampled(bumpy, *way, rng=rng) for way in ((), (vector, shift))]
-    pose = engine.estimate_pose(*(dataclasses.replace(one, normals=None, normal_sigma=None) for one in pair))
+    pose = engine.estimate_pose(*(dataclasses.replace(one, normals=None, normals_sigma=None) for one in pair))
     assert np.abs(error_of(pose, vector, shift)).max() < 0.005
 
 
@@ -157,8 +157,8 @@ def refusals() -> dict[str, tuple[io.Result, io.Result, str]]:
     rng = np.random.default_rng(6)
     good = sampled(bumpy, rng=rng)
     no_height = dataclasses.replace(good, height=None)
-    unsure = dataclasses.replace(good, height_sigma=None, normal_sigma=None)
-    odd = dataclasses.replace(good, normal_sigma=good.normal_sigma[:5])
+    unsure = dataclasses.replace(good, height_sigma=None, normals_sigma=None)
+    odd = dataclasses.replace(good, normals_sigma=good.normals_sigma[:5])
     nowhere = dataclasses.replace(good, x=None, y=None)
     far = dataclasses.replace(good, x=good.x + 100)
     return {

@@ -75,7 +75,7 @@ def test_a_touch_of_unknown_offset_takes_that_of_the_others():
         height=second.height + np.float32(0.4),
         height_sigma=second.height_sigma,
         normals=second.normals,
-        normal_sigma=second.normal_sigma,
+        normals_sigma=second.normals_sigma,
         x=second.x,
         y=second.y,
         **relative,
@@ -114,7 +114,7 @@ def test_touches_that_differ_say_so():
         height=dented,
         height_sigma=second.height_sigma,
         normals=second.normals,
-        normal_sigma=second.normal_sigma,
+        normals_sigma=second.normals_sigma,
         x=second.x,
         y=second.y,
     )
@@ -138,7 +138,7 @@ def test_a_single_result_is_refused():
 def test_heights_without_sigma_are_refused_by_name():
     first, second = touches(moves=MOVES[:2])
     bare = io.Result(
-        height=second.height, normals=second.normals, normal_sigma=second.normal_sigma, x=second.x, y=second.y
+        height=second.height, normals=second.normals, normals_sigma=second.normals_sigma, x=second.x, y=second.y
     )
     with pytest.raises(io.InputError, match=r"two\.h5 has no height_sigma"):
         engine.stitch([first, bare], names=["one.h5", "two.h5"])

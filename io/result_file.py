@@ -1,0 +1,264 @@
+"""Result files: the maps of a reconstruction, their declarations, and how they came about."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.io.arguments import checked
+from mirrorskin.io.atomic import Item, fixed_text, process_items, write_file
+from mirrorskin.io.calibration.file import CARRIED, calibration_items, carried_by
+from mirrorskin.io.hdf5 import Hdf5File, Node, Shape, read_process
+from mirrorskin.io.maps import (
+    FORMER_NAMES,
+    SIGMA,
+    TABLE,
+    TWIST,
+    FocusStatus,
+    Map,
+    PoseStatus,
+    PressStatus,
+    ReleaseStatus,
+    SlipStatus,
+    declaration_of,
+    is_builtin,
+    status_of,
+)
+from mirrorskin.io.result import Result, map_shape, may_name_a_map, size_of_maps
+from mirrorskin.io.types import InputError, ProcessValue
+from mirrorskin.io.url import is_zarr, path_of
+from mirrorskin.io.zarr import open_file
+
+MARK = "mirrorskin_result"
+_RESULT, _PROCESS, _OWN = "/entry/result", "/entry/process", "own_maps"
+_DECLARATION = "declaration"  # attribute of a map whose declaration is not in the table
+_AGAIN = "reconstruct it again"
+_AXES = {"x": Map(unit="mm", dtype="float64"), "y": Map(unit="mm", dtype="float64")}
+_WAY = "way"  # what the distance of a slide and the angle of a twist were called in files of earlier versions
+
+
+@checked
+def save_result(result: Result, path: str | Path) -> None:
+    """Write a result; the file exists whole or not at all (``docs/formats.md``).
+
+    Parameters
+    ----------
+    result : Result
+    path : str or Path
+        HDF5, or ``NAME.zarr``, also at an address such as ``s3://bucket/NAME.zarr``.
+
+    Raises
+    ------
+    InputError
+        It cannot be written there.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mirrorskin import io
+    >>> io.save_result(io.Result(height=np.zeros((2, 3), np.float32)), "flat.h5")  # doctest: +SKIP
+    """
+    target = path_of(path)
+    if not is_zarr(target):
+        write_file(target, _items(result))
+        return
+    from mirrorskin.io.zarr_export import save_zarr
+
+    with tempfile.TemporaryDirectory() as folder:
+        write_file(Path(folder, "result.h5"), _items(result))
+        save_zarr(Path(folder, "result.h5"), target)
+
+
+def _items(result: Result) -> Iterator[Item]:
+    yield Item("/", None, {"NX_class": "NXroot", "default": "entry"})
+    yield Item("/entry", None, {"NX_class": "NXentry", "default": "result", MARK: 1})
+    yield Item(_RESULT, None, {"NX_class": "NXdata", **_plot(result)})
+    yield Item(_PROCESS, None, {"NX_class": "NXprocess"})
+    yield from _map_items(result)
+    yield from process_items(_PROCESS, result.process)
+    if result.calibration is not None:
+        yield from calibration_items(result.calibration, CARRIED)
+    if result.height_sigma is not None:  # where viewers look for errors
+        yield Item(f"{_RESULT}/height_errors", f"{_RESULT}/{result.name_of(f'height{SIGMA}')}", {})
+
+
+def _map_items(result: Result) -> Iterator[Item]:
+    """Yield the maps, and the axes of a plot: the turns, and the places of the pixels."""
+    for name, values in result.items():
+        declared = result.declaration(name)
+        attributes = declared.attributes()
+        if declared.axes == "pixels" and not declared.components:
+            attributes["interpretation"] = "image"
+        if name in result.declarations:
+            attributes[_DECLARATION] = fixed_text(declared.encode())
+        yield Item(f"{_RESULT}/{name}", np.asarray(values), attributes)
+    own = [name for name in result if not is_builtin(name)]
+    if own:
+        yield Item(f"{_RESULT}/{_OWN}", fixed_text(own), {})
+    for name, positions in _axes(result).items():
+        yield Item(f"{_RESULT}/{name}", positions, {"units": "mm"} if name in _AXES else {})
+
+
+def _axes(result: Result) -> dict[str, NDArray[Any]]:
+    size = map_shape(result)
+    axes: dict[str, NDArray[Any]] = {}
+    if len(size) == 3:
+        axes["turn"] = np.arange(size[0], dtype=np.int32)
+    if result.x is not None and result.y is not None:
+        axes |= {"y": result.y, "x": result.x}
+    return axes
+
+
+def _plot(result: Result) -> dict[str, Any]:
+    """Return the attributes by which viewers plot the maps; NeXus has no picture of vectors."""
+    plotted = [name for name in result.maps() if not result.declaration(name).components]
+    axes = list(_axes(result))
+    plot: dict[str, Any] = {"signal": plotted[0], "auxiliary_signals": plotted[1:]} if plotted else {}
+    if axes:
+        plot["axes"] = [*axes, *["."] * ((result[plotted[0]].ndim if plotted else 0) - len(axes))]
+    return plot
+
+
+@checked
+def open_result(path: str | Path) -> Result:
+    """Read a result.
+
+    Raises
+    ------
+    InputError
+        There is no such file, it is no result, or it is damaged.
+
+    Examples
+    --------
+    >>> open_result("press-result.h5").height.shape  # doctest: +SKIP
+    (480, 640)
+    """
+    with _opened(path_of(path)) as file:
+        found, declarations = _find_maps(file)
+        maps: dict[str, Any] = {}
+        for name, (node, shape) in found.items():
+            declared = _AXES.get(name) or declaration_of(name, declarations)
+            if declared.axes == "pieces":
+                continue
+            unit = declared.unit if declared.axes == "none" else None
+            values = file.read(node, shape, unit=unit, remedy=_AGAIN)
+            known = is_builtin(name) or name in declarations or name in _AXES
+            maps[name] = values.astype(declared.dtype if known else values.dtype, copy=False)
+            if declared.axes == "none":
+                maps[name] = float(values)
+        maps |= _read_offsets(file, found, maps.get("component"))
+        for name, direction in (("x", 1), ("y", -1)):
+            if name in maps and not np.all(direction * np.diff(maps[name]) > 0):
+                raise InputError(f"{path}: {_RESULT}/{name} does not run as pixels do: {_AGAIN}")
+        process = read_process(file, _PROCESS)
+        x, y = maps.pop("x", None), maps.pop("y", None)
+        if "status" in maps and "status" not in declarations:
+            declarations |= _status_of_earlier_versions(maps, process)
+        return Result(
+            maps, x=x, y=y, process=process, calibration=carried_by(file), declarations=declarations
+        )
+
+
+def open_process(path: str | Path, *names: str) -> dict[str, ProcessValue]:
+    """Read how a result came about, or only some of that; its maps are looked for, and not read.
+
+    What is not there is missing. See ``open_result``.
+    """
+    with _opened(path_of(path)) as file:
+        for node, shape in _find_maps(file)[0].values():
+            if getattr(node, "shape", None) != shape:
+                raise InputError(f"{file.where(node)} is not of shape {shape}: {_AGAIN}")
+        return read_process(file, _PROCESS, names or None)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Hdf5File]:
+    with open_file(path) as file:
+        if not file.marked(MARK):
+            raise InputError(f"{path} is no result: 'mirrorskin reconstruct' makes one from a recording")
+        file.check_layout(MARK)
+        yield file
+
+
+Found = dict[str, tuple[Node, Shape]]
+
+
+def _find_maps(file: Hdf5File) -> tuple[Found, dict[str, Map]]:
+    """Find the maps and axes that a file has, with the shapes that they must have, and their declarations."""
+    group = file.find(_RESULT)
+    listed = file.find(f"{_RESULT}/{_OWN}")
+    own = () if listed is None else filter(may_name_a_map, file.texts(listed, _AGAIN))
+    builtin = (one for name in TABLE for one in (name, f"{name}{SIGMA}"))
+    names = {name: name for name in dict.fromkeys((*builtin, *own, *_AXES))}
+    names |= {former: name for former, name in FORMER_NAMES.items()}
+    turned = file.find(f"{_PROCESS}/motion")
+    twist = turned is not None and file.value(turned) == "twist"
+    names[_WAY] = "twist_angle" if twist else "slide_distance"
+    nodes: dict[str, Node] = {}
+    declarations: dict[str, Map] = {}
+    for stored, name in names.items():
+        node = None if group is None else file.walk(group, stored)
+        if node is not None:
+            nodes[name] = node
+            text = file.attribute(f"{_RESULT}/{stored}", _DECLARATION)
+            if text is not None:
+                declarations[name] = Map.decode(str(text), file.where(node))
+            elif twist and name in TWIST:
+                declarations[name] = TWIST[name]
+    return _shaped(file, nodes, declarations), declarations
+
+
+def _shaped(file: Hdf5File, nodes: Mapping[str, Node], declarations: Mapping[str, Map]) -> Found:
+    """Return the maps with the shapes that they must have, which follow from that of the first."""
+    shapes: dict[str, Shape] = {name: getattr(node, "shape", None) or () for name, node in nodes.items()}
+    declared = {name: declaration_of(name, declarations) for name in nodes if name not in _AXES}
+    size = next(
+        (size_of_maps(one, shapes[name]) for name, one in declared.items() if one.axes == "pixels"), ()
+    )
+    if len(size) not in (2, 3):
+        raise InputError(f"{file.path}: {_RESULT} holds no maps: {_AGAIN}")
+    needed: dict[str, Shape] = {"x": size[-1:], "y": size[-2:-1]}
+    for name, one in declared.items():
+        if one.axes == "pixels":
+            needed[name] = (*size, len(one.components)) if one.components else size
+            if len(one.components) == 2 and len(shapes[name]) == 4 and len(size) == 2:  # of each frame
+                needed[name] = (shapes[name][0], *needed[name])
+        else:
+            needed[name] = () if one.axes == "none" else shapes[name][:1]
+    return {name: (node, needed[name]) for name, node in nodes.items()}
+
+
+def _read_offsets(file: Hdf5File, found: Found, component: NDArray[np.int32] | None) -> dict[str, Any]:
+    """Read the maps with one value per component; those of a result without components are left out."""
+    if component is not None and component.min(initial=-1) < -1:
+        raise InputError(f"{file.path}: {_RESULT}/component has numbers below -1: {_AGAIN}")
+    pieces = {name: node for name, (node, _) in found.items() if declaration_of(name).axes == "pieces"}
+    if component is None:
+        return {}
+    count = int(component.max(initial=-1)) + 1
+    return {
+        name: file.read(node, (count,), remedy=_AGAIN).astype(declaration_of(name).dtype)
+        for name, node in pieces.items()
+    }
+
+
+def _status_of_earlier_versions(
+    maps: Mapping[str, Any], process: Mapping[str, ProcessValue]
+) -> dict[str, Map]:
+    """Return the legend of a status of a file that does not declare it: the program wrote these five."""
+    if "slip_onset" in maps:
+        return {"status": status_of(SlipStatus)}
+    if "zenith" in maps and "height" not in maps:
+        return {"status": status_of(PoseStatus)}
+    if "sharpness" in maps:
+        return {"status": status_of(FocusStatus)}
+    if "event" in process or "vertical_event" in process:
+        released = "release" in (process.get("event"), process.get("vertical_event"))
+        return {"status": status_of(ReleaseStatus if released else PressStatus)}
+    return {}
