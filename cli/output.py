@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from mirrorskin.io import Result
 
 _NO_GEL = "none: the calibration has no gel"
-_LEFT_OUT = ("slipped", "stick_ratio", "force", "force_sigma", "force_x", "force_y")  # if unknown
 _UNTOLD = "none: "  # how a result's process says that a map is missing, before it says why
 
 
@@ -31,12 +30,7 @@ def save_and_report(result: Result, path: Path, device: str | None, as_json: boo
     summary, pieces = summarise(result), _pieces(result)
     if as_json:
         profile = open_device(device).profile.records() if "device" in result.process else []
-        told = {
-            name: value
-            for name, value in dataclasses.asdict(summary).items()
-            if value is not None or name not in _LEFT_OUT
-        }
-        facts = {"summary": told | result.numbers() | pieces, "process": result.process}
+        facts = {"summary": summary.as_dict() | pieces, "process": result.process}
         print_json({"output": str(path), **facts, "profile": profile})
     else:
         click.echo(printable(", ".join([f"{path}: {summary}", *_words(**pieces)])))

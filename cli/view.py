@@ -24,8 +24,8 @@ def command(
         Option(
             "--map",
             metavar="NAME",
-            help="Only this map ('mirrorskin info RES' lists the names), 'section' or 'histogram'; may be given"
-            " again.",
+            help="Only this map of those that 'mirrorskin info RES' lists, 'section' or 'histogram'; may be"
+            " given again.",
             show_default="those of the overview",
         ),
     ] = None,
@@ -50,7 +50,7 @@ def command(
         ),
     ] = None,
 ) -> None:
-    """Show heights, a section, normals, edges, status, standard deviations."""
+    """Show the maps of a result, a section and a histogram of heights."""
     from mirrorskin import io, view
     from mirrorskin.cli.quantity import segment
 

@@ -16,6 +16,7 @@ from mirrorskin.engine.provenance import attach_provenance, signature
 from mirrorskin.engine.streaming import Estimator, Progress
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Result
+from mirrorskin.io.maps import declaration_of
 from mirrorskin.io.result import result_of
 
 if TYPE_CHECKING:
@@ -55,8 +56,8 @@ def run(
     Returns
     -------
     Result
-        The maps by name, with the estimator's own declarations; see `mirrorskin.io.Map`. Numbers and texts are
-        in ``process``.
+        The maps by name, with the declarations in the estimator's attribute ``maps``, a mapping from names to
+        `mirrorskin.io.Map`. Numbers and texts that are not declared are in ``process``.
 
     Raises
     ------
@@ -109,12 +110,15 @@ def finish(estimator: Estimator, shape: tuple[int, ...], source: Source | None) 
         found = {field.name: getattr(found, field.name) for field in fields(found)}
     if not isinstance(found, Mapping):
         raise InputError(f"{name}.result() returns a {type(found).__name__}: maps by name are needed")
+    declarations = getattr(estimator, "maps", {})
     numbers = {
-        one: value for one, value in found.items() if isinstance(value, str | int | float | np.generic)
+        one: value
+        for one, value in found.items()
+        if isinstance(value, str | int | float | np.generic)
+        and declaration_of(one, declarations).axes != "none"
     }
     try:
         maps = {one: value for one, value in found.items() if one not in numbers}
-        declarations = getattr(estimator, "maps", {})
         result = result_of(maps, (shape[0], shape[1]), signature() | {"estimator": name}, declarations)
     except InputError as error:
         raise InputError(f"{name}.result(): {error}") from error

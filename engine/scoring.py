@@ -286,9 +286,6 @@ def score(result: Result, truth: Truth) -> Score:
     if result.process.get(UNDISTORTED):
         remedy = "score one that was made without a scale in its calibration"
         raise InputError(f"the result is undistorted, the truth is that of the camera's pixels: {remedy}")
-    known = ("height", "azimuth", "normals", "contact", "edges", "slip_onset", "displacement")
-    if all(getattr(result, name) is None for name in known):
-        raise InputError("the result has no heights, normals, azimuths, contact, edges or slip to score")
     size = map_shape(result)[-2:]
     if size != truth.height.shape:
         raise InputError(f"the result is {size} pixels, the truth {truth.height.shape}: not of one stack")
@@ -311,6 +308,8 @@ def score(result: Result, truth: Truth) -> Score:
     )
     if not found.parts() and left_out is not None:
         raise InputError(f"slip, all that the result has, cannot be scored: {left_out}")
+    if not found.parts():
+        raise InputError("the result has no heights, normals, azimuths, contact, edges or slip to score")
     return found
 
 

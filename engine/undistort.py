@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -67,24 +68,25 @@ _BAND = 1 << 14  # pixels that are worked on at once
 
 
 def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None) -> Result:
-    """Bring the maps of a result from the camera's pixels to even ones on the sheet.
+    """Resample the maps of a result from the camera's pixels to equal pixels on the sheet.
 
-    Numbers are interpolated between the four pixels around. A pixel has no answer where the nearest one has
-    none; otherwise those without one do not count, nor do, of heights, those of another component, and of
-    everything else, those that differ in contact: nothing creeps over a border. Flags, states and components
-    are those of the nearest pixel. What the camera did not see is NaN, 0, and in no component. Where a place
-    is a pixel's own to a millionth, its value is taken as it is.
+    Each map is sampled as its declaration says; see `mirrorskin.io.Map`. Numbers are interpolated between
+    four pixels. A pixel has no answer where the nearest one has none. Of the other three, those are left out
+    that have no answer or another label: heights are not interpolated between components, nor other maps
+    across the border of contact. Integers, such as codes and components, are those of the nearest pixel.
+    Pixels that the camera did not see are undefined. Where a position is that of a pixel to a millionth, its
+    value is copied.
 
-    Vectors are made unit again. They are not turned: a normal came from brightness, in the directions of
-    the sensor's light, and not from where it lies in the picture; it is only shown elsewhere. The axes of the
-    map run as those of the picture do at its centre. Zenith and azimuth are those of the vectors; without
-    vectors, azimuths are interpolated the short way round.
+    Directions are normalised after interpolation. They are not rotated: a normal is estimated from
+    brightness, in the directions of the sensor's light, and does not depend on its position in the picture.
+    The axes of the map are parallel to those of the picture at its centre. Zenith and azimuth are computed
+    from the normals; without normals, azimuths are interpolated the short way round.
 
-    Standard deviations are interpolated as numbers are: right where neighbours are wrong in common, and too
-    much, never too little, where they are not.
+    Standard deviations are interpolated as numbers are: this is correct if neighbours have a common error,
+    and too large, never too small, if their errors are independent.
 
-    Heights that were integrated from normals in the camera's pixels took these to be of one size. Where that
-    is too wrong, undistort the normals alone, and integrate them on the sheet.
+    Heights that were integrated from normals in the camera's pixels assumed pixels of equal size. If that is
+    too inaccurate, undistort the normals alone, and integrate them on the sheet.
 
     Parameters
     ----------
@@ -145,9 +147,13 @@ def _sample(
 ) -> NDArray[Any]:
     """Return one map at some places, by its declaration; ``same`` are the neighbours with equal labels."""
     count = same.get(declared.within)
-    if declared.codes or declared.sampling == "nearest" or values.dtype.kind != "f":
+    if values.dtype.kind != "f" or declared.sampling == "nearest":
         outside = declared.undefined_value if values.dtype.kind == "f" else int(declared.undefined or 0)
         return points.nearest_values(values, outside)
+    if declared.undefined is not None:  # interpolation skips NaN
+        known = np.where(values == declared.undefined, values.dtype.type(np.nan), values)
+        sampled = _sample(known, msgspec.structs.replace(declared, undefined=None), same, points)
+        return np.where(np.isnan(sampled), values.dtype.type(declared.undefined), sampled)
     if declared.sampling == "direction":
         return points.interpolate_vectors(values, count)
     if declared.components:

@@ -272,15 +272,15 @@ def _encode_tiff(result: Result) -> _Encoded:
 
 
 def _encode_npz(result: Result) -> _Encoded:
-    """Encode the maps, where the pixels are, and as JSON their units and how they came about.
+    """Encode the maps, the positions of the pixels, and as JSON units, legends and process.
 
     Nothing in it needs ``allow_pickle``.
     """
-    arrays: dict[str, Any] = dict(result)
-    arrays |= {name: values for name, values in (("x", result.x), ("y", result.y)) if values is not None}
+    axes = {name: values for name, values in (("x", result.x), ("y", result.y)) if values is not None}
+    arrays: dict[str, Any] = {**result, **axes}
     declared = {name: result.declaration(name) for name in result}
     texts = {
-        "units": {name: one.unit for name, one in declared.items() if one.unit},
+        "units": {name: one.unit for name, one in declared.items() if one.unit} | dict.fromkeys(axes, "mm"),
         "legends": {name: one.codes for name, one in declared.items() if one.codes},
         "process": dict(result.process),
     }

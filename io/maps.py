@@ -6,24 +6,32 @@ of a map from its declaration.
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from enum import IntEnum
 from typing import Any, Literal
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from mirrorskin.io.types import InputError
-from mirrorskin.io.units import conversion_factor
+from mirrorskin.io.units import ratio
 
 SIGMA = "_sigma"
 """What the name of a map's standard deviation ends in."""
 
-LONGEST_DECLARATION = 100_000
-"""Bytes of a declaration in a file."""
+LONGEST_DECLARATION = 60_000
+"""Bytes of a declaration in a file: an attribute in HDF5 has at most 64 kB."""
 
+Axes = Literal["pixels", "frames", "pieces", "none"]
+Sampling = Literal["linear", "nearest", "angle", "direction"]
+Colours = Literal["sequential", "positive", "signed", "error"]
+
+_DTYPES = (*("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64"), "float32", "float64")
+_MOST_CODES = 255
 _DISPLAYED = {"rad": "deg"}  # units of figures, unless a declaration names another
-_PLAIN = {"µm": "um"}  # of units, as conversions name them
 
 
 class Map(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
@@ -36,7 +44,7 @@ class Map(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields
     unit : str
         Unit of the values in memory and in files; empty for none.
     dtype : str
-        NumPy's name of the type.
+        NumPy's name of the type; by default ``"uint8"`` for a map with codes, otherwise ``"float32"``.
     axes : {"pixels", "frames", "pieces", "none"}
         One value per pixel, (H, W); per frame, (T,); per connected component, (n,); or a single number.
     components : tuple of str
@@ -46,49 +54,87 @@ class Map(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields
     undefined : float or None
         The value that marks a pixel without an answer; None is NaN.
     quantity : str
-        Name of the map that this one stands for: a map of quantity ``"height"`` is a result's `height` for
-        everything that consumes heights.
+        Name of the map in the table that this one stands for: a map of quantity ``"height"`` is a result's
+        `height` for everything that consumes heights.
     sampling : {"linear", "nearest", "angle", "direction"}
         How the map is interpolated when the picture is undistorted: between pixels, by the nearest pixel, the
-        short way round the circle, or as unit vectors. A map with codes is always sampled at the nearest.
+        short way round the circle, or as unit vectors. Integers are always sampled at the nearest pixel.
     within : str
-        The label map across whose borders nothing is interpolated.
+        The label map across whose borders nothing is interpolated; by default that of the quantity, or
+        ``"contact"``.
+    per_frame : bool
+        Whether a result may have the map of each frame, with a leading axis (T, H, W).
     title : str
         Title of the figure; by default the name.
-    colours : {"sequential", "positive", "signed", "cyclic", "error"}
+    colours : {"sequential", "positive", "signed", "error"}
         Colours of the figure: sequential, the same with a logarithmic scale where the values span decades,
-        diverging about zero, for angles all the way round, or those of standard deviations.
+        diverging about zero, or those of standard deviations. Angles have cyclic colours.
     displayed : str
         Unit of figures; by default degrees for radians, otherwise `unit`.
     overview : bool
         Whether the figure of a whole result includes the map.
     included_in : str
         Name of a map whose figure shows this one as well, so that the overview leaves this one out.
+    summary : str
+        What the one-line summary of a result calls the pixels that have a value, if it reports this map.
+    counted : bool
+        Whether the summary counts the pixels of each code.
+
+    Raises
+    ------
+    InputError
+        A field has another type, or the fields contradict each other.
 
     Examples
     --------
     >>> wear = Map("depth of the wear", "mm", colours="signed", displayed="µm")
     >>> wear.figure_unit, wear.figure_scale
     ('µm', 1000.0)
-    >>> Map("material", dtype="uint8", codes={0: "unknown", 1: "steel"}).codes[1]
+    >>> Map("material", codes={0: "unknown", 1: "steel"}).codes[1]
     'steel'
     """
 
     caption: str = ""
     unit: str = ""
-    dtype: str = "float32"
-    axes: Literal["pixels", "frames", "pieces", "none"] = "pixels"
+    dtype: str = ""
+    axes: Axes = "pixels"
     components: tuple[str, ...] = ()
     codes: dict[int, str] = {}
     undefined: float | None = None
     quantity: str = ""
-    sampling: Literal["linear", "nearest", "angle", "direction"] = "linear"
-    within: str = "contact"
+    sampling: Sampling = "linear"
+    within: str = ""
+    per_frame: bool = False
     title: str = ""
-    colours: Literal["sequential", "positive", "signed", "cyclic", "error"] = "sequential"
+    colours: Colours = "sequential"
     displayed: str = ""
     overview: bool = True
     included_in: str = ""
+    summary: str = ""
+    counted: bool = False
+
+    def __post_init__(self) -> None:
+        for name, kind in _field_types().items():
+            value = getattr(self, name)
+            if type(value) is kind:  # texts and flags, most of all fields
+                continue
+            try:
+                msgspec.structs.force_setattr(self, name, msgspec.convert(value, kind))
+            except msgspec.ValidationError as error:
+                raise InputError(f"{name} of a map is invalid: {error}") from error
+        if not self.dtype:
+            msgspec.structs.force_setattr(self, "dtype", "uint8" if self.codes else "float32")
+        problem = next((text for check in _CHECKS for text in check(self)), None)
+        if problem is not None:
+            raise InputError(problem)
+        if not self.within:
+            within = TABLE[self.quantity].within if self.quantity else "contact"
+            msgspec.structs.force_setattr(self, "within", within)
+
+    @property
+    def is_integer(self) -> bool:
+        """Whether the values are integers."""
+        return not self.dtype.startswith("float")
 
     @property
     def figure_unit(self) -> str:
@@ -98,15 +144,19 @@ class Map(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields
     @property
     def figure_scale(self) -> float:
         """Number that values are multiplied by in figures."""
-        if self.figure_unit == self.unit:
-            return 1.0
-        shown, own = (_PLAIN.get(unit, unit) for unit in (self.figure_unit, self.unit))
-        return 1 / conversion_factor(shown, own, "a figure")
+        return ratio(self.unit, self.figure_unit)
 
     @property
     def undefined_value(self) -> float:
         """The value that marks a pixel without an answer."""
         return math.nan if self.undefined is None else self.undefined
+
+    def has_answer(self, values: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return which pixels have an answer: none of their components is NaN or the undefined value."""
+        known: NDArray[np.bool_] = np.isfinite(values)
+        if self.undefined is not None:
+            known &= values != self.undefined
+        return np.asarray(known.all(axis=-1)) if self.components else known
 
     def title_of(self, name: str) -> str:
         """Return the title of the figure of a map of this name."""
@@ -115,28 +165,28 @@ class Map(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields
     def deviation(self, name: str) -> Map:
         """Return the declaration of the standard deviation of a map of this name."""
         title = self.title_of(name)
+        title = f"{title[:1].lower()}{title[1:]}"
         return Map(
-            f"standard deviation of the {title[:1].lower()}{title[1:]}",
+            f"standard deviation of the {title}",
             self.unit,
             axes=self.axes,
-            quantity=f"{self.quantity}{SIGMA}" if self.quantity else "",
-            sampling="linear",
+            dtype="float64" if self.dtype == "float64" else "float32",
             within=self.within,
-            title=f"Standard deviation of {title[:1].lower()}{title[1:]}",
+            title=f"Standard deviation of the {title}",
             colours="error",
             displayed=self.displayed or ("µm" if self.unit == "mm" else ""),
             overview="height" in (name, self.quantity),
         )
 
     def attributes(self) -> dict[str, Any]:
-        """Return what a file says of the map to other programs, by the names of the CF conventions."""
-        found: dict[str, Any] = {"units": self.unit} if self.unit else {}
+        """Return the attributes of the map in files of other conventions: units, and those of CF."""
+        attributes: dict[str, Any] = {"units": self.unit} if self.unit else {}
         if self.caption:
-            found["long_name"] = self.caption
+            attributes["long_name"] = self.caption
         if self.codes:
-            found["flag_values"] = [*self.codes]
-            found["flag_meanings"] = " ".join(text.replace(" ", "_") for text in self.codes.values())
-        return found
+            attributes["flag_values"] = np.array([*self.codes], self.dtype)
+            attributes["flag_meanings"] = " ".join(text.replace(" ", "_") for text in self.codes.values())
+        return attributes
 
     def encode(self) -> str:
         """Return the declaration as JSON, for files."""
@@ -153,12 +203,78 @@ class Map(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields
         """
         try:
             if len(text) > LONGEST_DECLARATION:
-                raise ValueError(f"{len(text)} characters")
+                raise ValueError(f"it has {len(text)} characters")
             return msgspec.json.decode(text.encode(), type=cls)
-        except (msgspec.MsgspecError, UnicodeError, ValueError) as error:
+        except (msgspec.MsgspecError, ValueError) as error:
+            said = " ".join(str(error).split())
             raise InputError(
-                f"{where}: the declaration of the map is invalid ({error}). Reconstruct it again"
+                f"{where}: the declaration of the map is invalid ({said}). Reconstruct it again"
             ) from error
+
+
+@functools.cache
+def _field_types() -> dict[str, Any]:
+    return {field.name: field.type for field in msgspec.structs.fields(Map)}
+
+
+def _text_problems(one: Map) -> Iterator[str]:
+    for name in ("caption", "unit", "title", "displayed", "within", "included_in", "summary"):
+        if not getattr(one, name).isprintable():
+            yield f"the {name} of a map has a line break or another control character. Use one line"
+    if not all(text.isprintable() for text in one.codes.values()):
+        yield "a legend has a line break or another control character. Use one line for each code"
+    if len(msgspec.json.encode(one)) > LONGEST_DECLARATION:
+        yield f"the declaration of a map is longer than {LONGEST_DECLARATION} bytes. Shorten its texts"
+
+
+def _type_problems(one: Map) -> Iterator[str]:
+    if one.dtype not in _DTYPES:
+        yield f"the dtype of a map is {one.dtype[:40]!r}. Use one of {', '.join(_DTYPES)}"
+        return
+    numbers = [*one.codes] if one.undefined is None else [*one.codes, one.undefined]
+    if one.is_integer:
+        limits = np.iinfo(one.dtype)
+        wrong = [n for n in numbers if n != int(n) or not limits.min <= n <= limits.max]
+        if wrong:
+            yield f"{wrong[0]:g} is not a value of {one.dtype}. Declare another dtype"
+    elif one.codes:
+        yield f"a map of {one.dtype} has codes. Declare a dtype of integers"
+    if len(one.codes) > _MOST_CODES:
+        yield f"a legend has {len(one.codes)} codes; at most {_MOST_CODES} are supported"
+
+
+def _shape_problems(one: Map) -> Iterator[str]:
+    names = one.components
+    if names and (one.axes != "pixels" or one.codes):
+        yield "a map has components, but is not a map of vectors: leave axes and codes out"
+    if names and not (
+        2 <= len(set(names)) == len(names) <= 16 and all(name.isidentifier() for name in names)
+    ):
+        yield "the components of a map are not 2 to 16 different names"
+    if one.sampling == "direction" and len(names) != 3:
+        yield "a map sampled as a direction needs three components"
+    if one.sampling == "angle" and (names or one.unit != "rad"):
+        yield f"a map sampled as an angle is in {one.unit or 'no unit'}. Use radians, without components"
+
+
+def _unit_problems(one: Map) -> Iterator[str]:
+    if one.displayed:
+        ratio(one.unit, one.displayed)
+    if one.quantity and one.quantity not in TABLE:
+        yield f"the quantity of a map is {one.quantity[:40]!r}. Use a built-in map's name, such as 'height'"
+    elif one.quantity:
+        yield from conflicts(one, TABLE[one.quantity], f"a map of quantity {one.quantity}")
+
+
+_CHECKS = (_text_problems, _type_problems, _shape_problems, _unit_problems)
+
+
+def conflicts(one: Map, other: Map, what: str) -> Iterator[str]:
+    """Yield why a declaration cannot stand for another: consumers rely on its unit, axes and components."""
+    for name in ("unit", "axes", "components"):
+        wrong, right = getattr(one, name), getattr(other, name)
+        if wrong != right:
+            yield f"{what} has the {name} {wrong or 'none'}. Declare {right or 'none'}"
 
 
 class PressStatus(IntEnum):
@@ -218,12 +334,12 @@ class StitchStatus(IntEnum):
 def status_of(codes: type[IntEnum]) -> Map:
     """Return the declaration of a map ``status`` with the legend of these codes."""
     legend = {int(code): code.name.lower().replace("_", " ") for code in codes}
-    return Map("outcome at each pixel", dtype="uint8", codes=legend, undefined=0, title="Status")
+    return Map("outcome at each pixel", codes=legend, undefined=0, counted=codes is SlipStatus)
 
 
 def _flag(yes: str, no: str, caption: str, **more: Any) -> Map:
     legend = {0: no, 1: yes}
-    return Map(caption, dtype="uint8", codes=legend, undefined=0, **{"overview": False, **more})
+    return Map(caption, codes=legend, **{"overview": False, **more})
 
 
 _ALONG = ("x", "y")
@@ -233,6 +349,7 @@ TABLE: Mapping[str, Map] = {
         "height of the surface; 0 is the sheet at rest, and z points towards the camera",
         "mm",
         within="component",
+        summary="height",
     ),
     "status": Map("outcome at each pixel", dtype="uint8", undefined=0),
     "hysteresis": Map(
@@ -257,32 +374,38 @@ TABLE: Mapping[str, Map] = {
         "rise of the surface per unit of length along the direction of rocking",
         title="Slope along the rocking",
         colours="signed",
+        summary="slope",
     ),
     "normals": Map(
         "unit normals of the surface",
         components=("x", "y", "z"),
         sampling="direction",
     ),
-    "zenith": Map("angle between the normal and the direction to the camera", "rad", overview=False),
+    "zenith": Map(
+        "angle between the normal and the direction to the camera", "rad", overview=False, summary="normals"
+    ),
     "azimuth": Map(
         "direction in which the normal leans, counter-clockwise from x",
         "rad",
         title="Azimuth of the normal",
         sampling="angle",
-        colours="cyclic",
         included_in="normals",
     ),
     "normals_sigma": Map(
         "RMS angle between the estimated and the true normal",
         "rad",
-        title="Standard deviation of normals",
+        title="Standard deviation of the normals",
         colours="error",
     ),
     "mean": Map("mean brightness over the turn", "counts", overview=False),
     "cosine": Map("coefficient of the cosine of the phase in the brightness", "counts", overview=False),
     "sine": Map("coefficient of the sine of the phase in the brightness", "counts", overview=False),
     "modulation": Map(
-        "amplitude of the brightness over the turn", "counts", colours="positive", included_in="normals"
+        "amplitude of the brightness over the turn",
+        "counts",
+        colours="positive",
+        included_in="normals",
+        summary="modulation",
     ),
     "residual": Map(
         "standard deviation of the brightness that the fit does not explain", "counts", overview=False
@@ -320,6 +443,7 @@ TABLE: Mapping[str, Map] = {
         "displacement of the skin along x and y since the first frame",
         "mm",
         components=_ALONG,
+        per_frame=True,
         title="Displacement of the skin",
         displayed="µm",
     ),
@@ -328,6 +452,7 @@ TABLE: Mapping[str, Map] = {
         "mm",
         title="Onset of slip",
         displayed="µm",
+        summary="slip onset",
     ),
     "traction": Map(
         "tangential stress that the object exerts on the sensor at the end; 0 outside the contact",
@@ -341,7 +466,10 @@ TABLE: Mapping[str, Map] = {
     "slide_distance": Map("distance that the body has slid", "mm", "float64", "frames"),
     "twist_angle": Map("angle that the body has turned", "rad", "float64", "frames"),
     "stick_ratio": Map(
-        "share of the contact that sticks; undefined after the body turns back", "", "float64", "frames"
+        "share of the contact that sticks; undefined after the body turns back",
+        dtype="float64",
+        axes="frames",
+        summary="stick ratio",
     ),
     "force": Map("normal force at the greatest travel", "N", "float64", "none"),
     "force_x": Map("force along x that the object exerts on the sensor at the end", "N", "float64", "none"),
@@ -356,12 +484,10 @@ TWIST: Mapping[str, Map] = {
         "angle that the body has turned when the skin breaks loose; undefined where it does not",
         "rad",
         title="Onset of slip",
+        summary="slip onset",
     )
 }
 """Declarations that differ from the table's when the body twists."""
-
-FORMER_NAMES: Mapping[str, str] = {"normal_sigma": "normals_sigma"}
-"""Names that maps had in files of earlier versions, and their names today."""
 
 
 def is_deviation(name: str) -> bool:
@@ -392,11 +518,36 @@ def declaration_of(name: str, declared: Mapping[str, Map] | None = None) -> Map:
     >>> declaration_of("anything").unit
     ''
     """
-    declared = declared or {}
-    if name in declared or name in TABLE:
-        return declared[name] if name in declared else TABLE[name]
-    if is_deviation(name):
-        base = name.removesuffix(SIGMA)
-        if base in declared or base in TABLE:
-            return declaration_of(base, declared).deviation(base)
-    return Map()
+    for table in (declared or {}, TABLE):
+        if name in table:
+            return table[name]
+    base = name.removesuffix(SIGMA)
+    if is_deviation(name) and (base in TABLE or base in (declared or {})):
+        return declaration_of(base, declared).deviation(base)
+    return UNDECLARED
+
+
+UNDECLARED = Map()
+"""What is known of a map that nobody declares: nothing."""
+
+
+def check_declarations(declarations: Mapping[str, Map]) -> None:
+    """Raise InputError where declarations give a built-in name another meaning, or two maps one quantity.
+
+    Only the legend and the texts of a built-in map may differ from the table's, and the unit of what a twist
+    has as an angle.
+    """
+    stands_for: dict[str, str] = {}
+    for name, one in declarations.items():
+        if not isinstance(one, Map):
+            raise InputError(f"the declaration of {name} is {one!r:.40}. Use mirrorskin.io.Map(...)")
+        table = TWIST if name in TWIST and one.unit == TWIST[name].unit else TABLE
+        if name in table:
+            for problem in conflicts(one, table[name], f"the map {name}"):
+                raise InputError(f"{problem}, as the built-in map has, or choose another name")
+        if one.quantity and one.quantity != name:
+            other = stands_for.setdefault(one.quantity, name)
+            if other != name:
+                raise InputError(
+                    f"both {other} and {name} have the quantity {one.quantity}. Leave it out of one"
+                )

@@ -137,8 +137,8 @@ def from_xarray(dataset: xarray.Dataset) -> Result:
 def _first(result: Shown) -> str | None:
     """Return the map that shows most."""
     pictures = [name for name, values in result.maps().items() if values.ndim == 2 or values.shape[-1] > 3]
-    best = ("height", "zenith", "modulation", "slip_onset")
-    return next((name for name in (*best, *pictures) if name in pictures), None)
+    summarised = [name for name in pictures if result.declaration(name).summary]
+    return next(iter([*summarised, *pictures]), None)
 
 
 def _unit(name: str, result: Shown) -> str:
@@ -150,10 +150,11 @@ def _rows(result: Shown) -> list[tuple[str, str, str]]:
     rows = []
     for name, values in result.maps().items():
         shape = " x ".join(map(str, values.shape))
-        known = values[np.isfinite(values)] if values.dtype.kind == "f" else values.ravel()
+        declared = result.declaration(name)
+        known = values.ravel() if declared.codes else values[declared.has_answer(values)]
         span = f"{known.min():.4g} to {known.max():.4g}" if known.size else "nothing known"
         share = f", {known.size / values.size:.0%} known" if 0 < known.size < values.size else ""
-        unit = f" {_unit(name, result)}".rstrip() if known.size else ""
+        unit = f" {declared.unit}".rstrip() if known.size else ""
         rows.append((name, shape, f"{span}{unit}{share}"))
     numbers = result.numbers().items()
     return rows + [(name, "", f"{value:.4g} {_unit(name, result)}".rstrip()) for name, value in numbers]
@@ -179,6 +180,6 @@ def _picture(name: str, values: NDArray[Any], unit: str) -> str:
     colours = cv2.applyColorMap((255 * grey).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
     picture = np.dstack([colours, 255 * known.astype(np.uint8)])
     data = base64.b64encode(cv2.imencode(".png", picture)[1].tobytes()).decode()
-    caption = f"{name}, {low:.4g} to {high:.4g} {unit}".rstrip()
+    caption = escape(f"{name}, {low:.4g} to {high:.4g} {unit}".rstrip())
     image = f"<img alt='{caption}' src='data:image/png;base64,{data}'>"
     return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"

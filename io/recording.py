@@ -467,7 +467,8 @@ def _cut_heights(
 
 def _absolute(result: Result) -> NDArray[np.float32] | None:
     """Return the heights of a result without the pieces whose offset nobody knows."""
-    height, piece, unknown = result.height, result.component, result.offset_unknown
+    height: NDArray[np.float32] | None = result.height
+    piece, unknown = result.component, result.offset_unknown
     if height is None or piece is None or unknown is None or not unknown.any():
         return height
     return np.where((piece >= 0) & (unknown[piece] == 0), height, np.float32(np.nan))

@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io.maps import SIGMA, Map, declaration_of, is_builtin, is_deviation, place_of
+from mirrorskin.io.maps import (
+    SIGMA,
+    UNDECLARED,
+    Map,
+    check_declarations,
+    declaration_of,
+    is_builtin,
+    is_deviation,
+    place_of,
+)
 from mirrorskin.io.types import Floats, InputError, ProcessValue
 
 if TYPE_CHECKING:
@@ -21,8 +30,10 @@ if TYPE_CHECKING:
 FIELDS = ("x", "y", "process", "calibration", "declarations")
 """What a result has besides maps."""
 
-RESERVED = frozenset({*FIELDS, "own_maps", "turn", "height_errors", "units", "file", "allow_pickle"})
-"""Names that no map can have: they are taken in files, or by what writes them."""
+RESERVED = frozenset(
+    {*FIELDS, "own_maps", "turn", "height_errors", "units", "legends", "file", "allow_pickle"}
+)
+"""Names that no map can have: files use them for other purposes."""
 
 
 class Shown:
@@ -93,7 +104,7 @@ class Result(Shown, Mapping[str, Any]):
 
     Parameters
     ----------
-    maps : mapping of str to array_like, optional
+    maps : mapping of str to ndarray or float, optional
         Maps, series (T,) and numbers by name; those that are None are left out.
     x, y : ndarray, (W,) and (H,), float64, optional
         Millimetres of the pixel centres from the picture's centre; y points up the picture.
@@ -102,12 +113,14 @@ class Result(Shown, Mapping[str, Any]):
     calibration : Calibration, optional
         The calibration that was used, of the camera's whole picture.
     declarations : mapping of str to Map, optional
-        Declarations of maps that are not in the table, and of those that differ from it.
+        Declarations of maps that are not in the table, and of those whose legend or texts differ from it.
     **named
-        Maps by name, too.
+        Maps by name, too. A map whose name is that of a method is only accessible as ``result[name]``.
 
     Raises
     ------
+    InputError
+        A declaration gives a built-in map another unit, or two maps are declared to be the same quantity.
     AttributeError
         An attribute is neither a map of this result nor one of the table.
 
@@ -144,6 +157,7 @@ class Result(Shown, Mapping[str, Any]):
         values = {**(maps or {}), **named}
         kept = {name: values[name] for name in sorted(values, key=place_of) if values[name] is not None}
         known = {name: one for name, one in (declarations or {}).items() if name in kept}
+        check_declarations(known)
         for name, value in {
             "_maps": kept,
             "x": x,
@@ -164,7 +178,7 @@ class Result(Shown, Mapping[str, Any]):
         return len(self._maps)
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):
+        if name in Result.__slots__:  # of an object whose construction failed
             raise AttributeError(name)
         own = self.name_of(name)
         if own is not None:
@@ -188,32 +202,35 @@ class Result(Shown, Mapping[str, Any]):
 
         Examples
         --------
-        >>> declared = {"wear": Map("wear", "mm", quantity="height")}
-        >>> Result(wear=np.ones((2, 3)), wear_sigma=np.ones((2, 3)), declarations=declared).name_of("height_sigma")
+        >>> maps = {"wear": np.ones((2, 3)), "wear_sigma": np.ones((2, 3))}
+        >>> worn = Result(maps, declarations={"wear": Map("wear", "mm", quantity="height")})
+        >>> worn.name_of("height_sigma")
         'wear_sigma'
         """
+        name = self._own_name(quantity)
+        return name if name in self._maps else None
+
+    def _own_name(self, quantity: str) -> str:
+        """Return the name that a quantity has in this result, if it has the quantity."""
         if quantity in self._maps:
             return quantity
         base = quantity.removesuffix(SIGMA) if is_deviation(quantity) else quantity
-        for name, one in self.declarations.items():
-            full = name + quantity.removeprefix(base)
-            if one.quantity == base and full in self._maps:
-                return full
-        return None
+        own = (name for name, one in self.declarations.items() if one.quantity == base)
+        return next(own, base) + quantity.removeprefix(base)
 
     def declaration(self, name: str) -> Map:
         """Return the declaration of a map: its unit, meaning, legend and more."""
         return declaration_of(name, self.declarations)
 
     def assign(self, maps: Mapping[str, Any] | None = None, /, **changes: Any) -> Result:
-        """Return a result in which some maps or fields are others; a map that is None is removed.
+        """Return a copy of the result in which maps or fields are replaced; a map that is None is removed.
 
         Parameters
         ----------
-        maps : mapping of str to array_like, optional
+        maps : mapping of str to ndarray or float, optional
         **changes
-            Maps by name; ``x``, ``y``, ``process``, ``calibration`` and ``declarations``. Declarations are
-            added to those of the result.
+            Maps by name or quantity; ``x``, ``y``, ``process``, ``calibration`` and ``declarations``.
+            Declarations are added to those of the result.
 
         Examples
         --------
@@ -222,10 +239,10 @@ class Result(Shown, Mapping[str, Any]):
         ['slope']
         """
         values = {**(maps or {}), **changes}
-        kept = {name: getattr(self, name) for name in FIELDS}
-        kept |= {name: values.pop(name) for name in FIELDS if name in values}
-        kept["declarations"] = {**self.declarations, **(kept["declarations"] or {})}
-        return Result({**self._maps, **values}, **kept)
+        fields = {name: values.pop(name, getattr(self, name)) for name in FIELDS}
+        fields["declarations"] = {**self.declarations, **(fields["declarations"] or {})}
+        replaced = {self._own_name(name): value for name, value in values.items()}
+        return Result({**self._maps, **replaced}, **fields)
 
     def maps(self) -> dict[str, NDArray[Any]]:
         """Return the maps, by name: built-in ones in the order of the table, then others."""
@@ -296,7 +313,8 @@ def result_of(
     Raises
     ------
     InputError
-        A map has another shape, does not hold numbers, or has a name that is not allowed.
+        A map has another shape or values that its type cannot hold, does not hold numbers, or has a name that
+        is not allowed.
 
     Examples
     --------
@@ -304,23 +322,42 @@ def result_of(
     [[7, 8]]
     """
     declarations = declarations or {}
-    copies: dict[str, NDArray[Any]] = {}
-    for name, given in maps.items():
+    if not isinstance(declarations, Mapping):
+        raise InputError(f"maps are declared as {declarations!r:.40}. Use a dictionary of names and Map(...)")
+    check_declarations(declarations)
+    for name in (*maps, *declarations):
         if not may_name_a_map(name):
             taken = ", ".join(sorted(RESERVED))
             raise InputError(f"a map cannot be called {name!r}: use letters, digits and _, but not {taken}")
-        declared = declaration_of(name, declarations)
-        values, size = np.array(given), (*shape, len(declared.components)) if declared.components else shape
-        if values.shape != size or values.dtype.kind not in "buif":
-            raise InputError(f"map {name} is {values.dtype} {values.shape}: numbers {size} are needed")
-        own = "uint8" if values.dtype.kind == "b" else values.dtype.name
-        known = is_builtin(name) or name in declarations or declared.colours == "error"
-        copies[name] = values.astype(declared.dtype if known else own, copy=False)
+    copies = {
+        name: _checked_map(name, np.array(values), declaration_of(name, declarations), shape)
+        for name, values in maps.items()
+    }
     return Result(copies, process=process, declarations=declarations)
 
 
+def _checked_map(name: str, values: NDArray[Any], declared: Map, shape: tuple[int, int]) -> Any:
+    """Return a map in its declared type, or raise InputError if its shape or values do not fit."""
+    size = (*shape, len(declared.components)) if declared.components else shape
+    if declared.axes != "pixels":
+        size = () if declared.axes == "none" else values.shape[:1] or (1,)
+    own = values.shape[1:] if declared.per_frame and values.ndim > len(size) else values.shape
+    if values.dtype.kind not in "buif" or own != size:
+        raise InputError(f"map {name} is {values.dtype} {values.shape}: numbers {size} are needed")
+    if declared is UNDECLARED:
+        return values.astype(np.uint8) if values.dtype.kind == "b" else values
+    if declared.is_integer and values.size:
+        limits, low, high = np.iinfo(declared.dtype), values.min(), values.max()
+        if not (limits.min <= low and high <= limits.max and np.all(values == np.floor(values))):
+            raise InputError(
+                f"map {name} has values from {low:g} to {high:g}, which {declared.dtype} cannot hold. "
+                "Declare another dtype"
+            )
+    return values.astype(declared.dtype, copy=False) if values.ndim else float(values)
+
+
 def may_name_a_map(name: str) -> bool:
-    """Return whether a map of a user's own can have a name."""
+    """Return whether a map can have a name."""
     return str(name).isidentifier() and name not in RESERVED
 
 
@@ -334,7 +371,7 @@ def map_shape(result: Result) -> tuple[int, ...]:
 def size_of_maps(declared: Map, shape: tuple[int, ...]) -> tuple[int, ...]:
     """Return the size of the maps of a result, (H, W) or (turns, H, W), that has a map of this shape."""
     size = shape[:-1] if declared.components else shape
-    return size[-2:] if len(declared.components) == 2 else size  # which may have a leading axis of frames
+    return size[-2:] if declared.per_frame else size
 
 
 def select_turn(result: Result, turn: int | None) -> Result:

@@ -16,16 +16,17 @@ from mirrorskin.io.atomic import Item, fixed_text, process_items, write_file
 from mirrorskin.io.calibration.file import CARRIED, calibration_items, carried_by
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape, read_process
 from mirrorskin.io.maps import (
-    FORMER_NAMES,
     SIGMA,
     TABLE,
     TWIST,
+    UNDECLARED,
     FocusStatus,
     Map,
     PoseStatus,
     PressStatus,
     ReleaseStatus,
     SlipStatus,
+    check_declarations,
     declaration_of,
     is_builtin,
     status_of,
@@ -39,8 +40,8 @@ MARK = "mirrorskin_result"
 _RESULT, _PROCESS, _OWN = "/entry/result", "/entry/process", "own_maps"
 _DECLARATION = "declaration"  # attribute of a map whose declaration is not in the table
 _AGAIN = "reconstruct it again"
-_AXES = {"x": Map(unit="mm", dtype="float64"), "y": Map(unit="mm", dtype="float64")}
-_WAY = "way"  # what the distance of a slide and the angle of a twist were called in files of earlier versions
+_AXES = dict.fromkeys("xy", Map(unit="mm", dtype="float64"))
+_LAYOUT = 2  # of the files that are written; in layout 1 maps were not declared, and some had other names
 
 
 @checked
@@ -77,7 +78,7 @@ def save_result(result: Result, path: str | Path) -> None:
 
 def _items(result: Result) -> Iterator[Item]:
     yield Item("/", None, {"NX_class": "NXroot", "default": "entry"})
-    yield Item("/entry", None, {"NX_class": "NXentry", "default": "result", MARK: 1})
+    yield Item("/entry", None, {"NX_class": "NXentry", "default": "result", MARK: _LAYOUT})
     yield Item(_RESULT, None, {"NX_class": "NXdata", **_plot(result)})
     yield Item(_PROCESS, None, {"NX_class": "NXprocess"})
     yield from _map_items(result)
@@ -140,29 +141,26 @@ def open_result(path: str | Path) -> Result:
     (480, 640)
     """
     with _opened(path_of(path)) as file:
-        found, declarations = _find_maps(file)
+        stored, declarations = _find_maps(file)
         maps: dict[str, Any] = {}
-        for name, (node, shape) in found.items():
+        for name, (node, shape) in stored.items():
             declared = _AXES.get(name) or declaration_of(name, declarations)
-            if declared.axes == "pieces":
-                continue
+            if declared.axes == "pieces" and "component" in stored:
+                shape = (int(maps["component"].max(initial=-1)) + 1,)
             unit = declared.unit if declared.axes == "none" else None
             values = file.read(node, shape, unit=unit, remedy=_AGAIN)
-            known = is_builtin(name) or name in declarations or name in _AXES
-            maps[name] = values.astype(declared.dtype if known else values.dtype, copy=False)
-            if declared.axes == "none":
-                maps[name] = float(values)
-        maps |= _read_offsets(file, found, maps.get("component"))
+            dtype = values.dtype if declared is UNDECLARED else declared.dtype
+            maps[name] = values.astype(dtype, copy=False) if declared.axes != "none" else float(values)
+            if name == "component" and maps[name].min(initial=-1) < -1:
+                raise InputError(f"{file.where(node)} has numbers below -1: {_AGAIN}")
         for name, direction in (("x", 1), ("y", -1)):
             if name in maps and not np.all(direction * np.diff(maps[name]) > 0):
                 raise InputError(f"{path}: {_RESULT}/{name} does not run as pixels do: {_AGAIN}")
         process = read_process(file, _PROCESS)
-        x, y = maps.pop("x", None), maps.pop("y", None)
-        if "status" in maps and "status" not in declarations:
-            declarations |= _status_of_earlier_versions(maps, process)
-        return Result(
-            maps, x=x, y=y, process=process, calibration=carried_by(file), declarations=declarations
-        )
+        if _layout(file) < _LAYOUT and "status" in maps:
+            declarations |= _status_of_layout_1(maps, process)
+        axes = {name: maps.pop(name, None) for name in _AXES}
+        return Result(maps, **axes, process=process, calibration=carried_by(file), declarations=declarations)
 
 
 def open_process(path: str | Path, *names: str) -> dict[str, ProcessValue]:
@@ -182,8 +180,13 @@ def _opened(path: Path) -> Iterator[Hdf5File]:
     with open_file(path) as file:
         if not file.marked(MARK):
             raise InputError(f"{path} is no result: 'mirrorskin reconstruct' makes one from a recording")
-        file.check_layout(MARK)
+        file.check_layout(MARK, _LAYOUT)
         yield file
+
+
+def _layout(file: Hdf5File) -> int:
+    layout = file.attribute("/entry", MARK)
+    return layout if isinstance(layout, int) else 1
 
 
 Found = dict[str, tuple[Node, Shape]]
@@ -196,12 +199,13 @@ def _find_maps(file: Hdf5File) -> tuple[Found, dict[str, Map]]:
     own = () if listed is None else filter(may_name_a_map, file.texts(listed, _AGAIN))
     builtin = (one for name in TABLE for one in (name, f"{name}{SIGMA}"))
     names = {name: name for name in dict.fromkeys((*builtin, *own, *_AXES))}
-    names |= {former: name for former, name in FORMER_NAMES.items()}
-    turned = file.find(f"{_PROCESS}/motion")
-    twist = turned is not None and file.value(turned) == "twist"
-    names[_WAY] = "twist_angle" if twist else "slide_distance"
-    nodes: dict[str, Node] = {}
     declarations: dict[str, Map] = {}
+    if _layout(file) < _LAYOUT:
+        motion = file.find(f"{_PROCESS}/motion")
+        twist = motion is not None and file.value(motion) == "twist"
+        names |= {"normal_sigma": "normals_sigma", "way": "twist_angle" if twist else "slide_distance"}
+        declarations |= TWIST if twist else {}
+    nodes: dict[str, Node] = {}
     for stored, name in names.items():
         node = None if group is None else file.walk(group, stored)
         if node is not None:
@@ -209,8 +213,10 @@ def _find_maps(file: Hdf5File) -> tuple[Found, dict[str, Map]]:
             text = file.attribute(f"{_RESULT}/{stored}", _DECLARATION)
             if text is not None:
                 declarations[name] = Map.decode(str(text), file.where(node))
-            elif twist and name in TWIST:
-                declarations[name] = TWIST[name]
+    try:
+        check_declarations(declarations)
+    except InputError as error:
+        raise InputError(f"{file.path}: {error}") from error
     return _shaped(file, nodes, declarations), declarations
 
 
@@ -227,37 +233,23 @@ def _shaped(file: Hdf5File, nodes: Mapping[str, Node], declarations: Mapping[str
     for name, one in declared.items():
         if one.axes == "pixels":
             needed[name] = (*size, len(one.components)) if one.components else size
-            if len(one.components) == 2 and len(shapes[name]) == 4 and len(size) == 2:  # of each frame
+            if one.per_frame and len(shapes[name]) > len(needed[name]):
                 needed[name] = (shapes[name][0], *needed[name])
         else:
             needed[name] = () if one.axes == "none" else shapes[name][:1]
     return {name: (node, needed[name]) for name, node in nodes.items()}
 
 
-def _read_offsets(file: Hdf5File, found: Found, component: NDArray[np.int32] | None) -> dict[str, Any]:
-    """Read the maps with one value per component; those of a result without components are left out."""
-    if component is not None and component.min(initial=-1) < -1:
-        raise InputError(f"{file.path}: {_RESULT}/component has numbers below -1: {_AGAIN}")
-    pieces = {name: node for name, (node, _) in found.items() if declaration_of(name).axes == "pieces"}
-    if component is None:
+def _status_of_layout_1(maps: Mapping[str, Any], process: Mapping[str, ProcessValue]) -> dict[str, Map]:
+    """Return the declaration of ``status`` in a file of layout 1, which follows from what else is there."""
+    if "sharpness" in maps:
+        return {"status": status_of(FocusStatus)}
+    if "estimator" in process:  # of a user's own
         return {}
-    count = int(component.max(initial=-1)) + 1
-    return {
-        name: file.read(node, (count,), remedy=_AGAIN).astype(declaration_of(name).dtype)
-        for name, node in pieces.items()
-    }
-
-
-def _status_of_earlier_versions(
-    maps: Mapping[str, Any], process: Mapping[str, ProcessValue]
-) -> dict[str, Map]:
-    """Return the legend of a status of a file that does not declare it: the program wrote these five."""
     if "slip_onset" in maps:
         return {"status": status_of(SlipStatus)}
     if "zenith" in maps and "height" not in maps:
         return {"status": status_of(PoseStatus)}
-    if "sharpness" in maps:
-        return {"status": status_of(FocusStatus)}
     if "event" in process or "vertical_event" in process:
         released = "release" in (process.get("event"), process.get("vertical_event"))
         return {"status": status_of(ReleaseStatus if released else PressStatus)}

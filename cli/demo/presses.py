@@ -220,10 +220,9 @@ def _height(result: io.Result) -> NDArray[np.float32]:
     """Return the measured heights; filled ones are in the table of surfaces."""
     import numpy as np
 
-    assert result.height is not None
-    if result.filled is None:
-        return result.height
-    return np.where(result.filled, np.float32(np.nan), result.height)
+    height: NDArray[np.float32] | None = result.height
+    assert height is not None
+    return height if result.filled is None else np.where(result.filled, np.float32(np.nan), height)
 
 
 def _rows(name: str, by_sensor: Outcomes) -> list[list[str]]:

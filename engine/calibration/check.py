@@ -269,7 +269,7 @@ def _check_enough(pixels: Any, what: str = "could be judged") -> None:
 def _measured(found: Result) -> NDArray[np.bool_]:
     """Return where a height was measured, not filled in."""
     assert found.height is not None
-    measured = np.isfinite(found.height)
+    measured: NDArray[np.bool_] = np.isfinite(found.height)
     return measured if found.filled is None else measured & (found.filled == 0)
 
 

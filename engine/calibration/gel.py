@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.press.elastic import threshold_at
-from mirrorskin.io.maps import PressStatus
 from mirrorskin.io import Gel, InputError, Result, Source, pixel_axes
+from mirrorskin.io.maps import PressStatus
 
 Doubles = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ from mirrorskin.engine.press.press import add_hysteresis, finish_press
 from mirrorskin.engine.press.strokes import StrokeSearch
 from mirrorskin.engine.provenance import attach_provenance, level_origin
 from mirrorskin.engine.reconstruction import undistorted
-from mirrorskin.io.maps import PressStatus
 from mirrorskin.io import InputError, LiveSource, Result
+from mirrorskin.io.maps import PressStatus
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.device import Device
 

@@ -55,7 +55,7 @@ class Patch:
 
 def heights_of(result: Result) -> NDArray[np.float32]:
     """Return the heights of one picture, (H, W); InputError where there are none, or a map for each turn."""
-    height = select_turn(result, None).height
+    height: NDArray[np.float32] | None = select_turn(result, None).height
     if height is None:
         raise InputError("the result has no heights: take one of a press or of 'mirrorskin fuse'")
     return height

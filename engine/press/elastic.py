@@ -23,8 +23,8 @@ from mirrorskin.engine.press.halfspace import (
     sweep,
 )
 from mirrorskin.engine.press.spline import CellSplines
-from mirrorskin.io.maps import PressStatus
 from mirrorskin.io import Gel, InputError, Result, Source, pixel_axes
+from mirrorskin.io.maps import PressStatus
 
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.press.onset import Onset, OnsetSearch
-from mirrorskin.io.maps import PressStatus
 from mirrorskin.io import InputError
+from mirrorskin.io.maps import PressStatus
 from mirrorskin.kernels.device import Device
 
 

@@ -19,8 +19,8 @@ from mirrorskin.engine.press.strokes import Strokes, StrokeSearch
 from mirrorskin.engine.provenance import attach_provenance, estimated_level, level_origin
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.engine.tiling import MEMORY_LIMIT
-from mirrorskin.io.maps import PressStatus, ReleaseStatus, status_of
 from mirrorskin.io import InputError, Result
+from mirrorskin.io.maps import PressStatus, ReleaseStatus, status_of
 from mirrorskin.io.positions import stroke_starts
 
 if TYPE_CHECKING:

@@ -32,9 +32,9 @@ from mirrorskin.engine.rotation.registration import Registered, check_heights
 from mirrorskin.engine.rotation.response import HALF_WAY, Response, initial_response, wall_response_of
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.engine.tiling import MEMORY_LIMIT
-from mirrorskin.io.maps import PoseStatus, status_of
 from mirrorskin.io import Block, Header, InputError, Result, Source, WallResponse
 from mirrorskin.io.frames import FrameSequence
+from mirrorskin.io.maps import PoseStatus, status_of
 from mirrorskin.io.positions import check_phase
 from mirrorskin.io.types import Closing, ProcessValue
 from mirrorskin.kernels.device import Device, open_device

@@ -25,10 +25,10 @@ from mirrorskin.engine.slip.displacement import (
     node_status,
 )
 from mirrorskin.engine.slip.onset_map import Expected, OnsetMap, fit_onsets
-from mirrorskin.io.maps import SlipStatus
 from mirrorskin.engine.slip.tracking import NodeField, Tracker
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, pixel_axes
+from mirrorskin.io.maps import SlipStatus
 from mirrorskin.io.result import Shown
 from mirrorskin.kernels.device import Device, open_device
 

@@ -16,8 +16,8 @@ from mirrorskin.engine.slip.displacement import STEP
 from mirrorskin.engine.slip.search import MOTIONS, WINDOW, SlipSearch, check_contact
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.engine.tiling import MEMORY_LIMIT
-from mirrorskin.io.maps import TWIST, SlipStatus, status_of
 from mirrorskin.io import InputError, Result
+from mirrorskin.io.maps import TWIST, SlipStatus, status_of
 from mirrorskin.io.types import UNDISTORTED
 
 if TYPE_CHECKING:

@@ -11,6 +11,7 @@ from stacks import assert_same, plot_of, record, sphere
 
 from mirrorskin import io
 from mirrorskin.io import atomic
+from mirrorskin.io.maps import declaration_of
 
 PROCESS = {"program": "mirrorskin", "threshold": 0.5, "hold": 2, "subframe": True, "source": "Münze 五円.h5"}
 
@@ -48,7 +49,7 @@ def test_a_result_has_the_layout_of_the_design(path):
         assert dict(file["entry"].attrs) == {
             "NX_class": "NXentry",
             "default": "result",
-            "mirrorskin_result": 1,
+            "mirrorskin_result": 2,
         }
         assert list(file["entry"]) == ["process", "result"]
         maps = file["entry/result"]
@@ -59,11 +60,14 @@ def test_a_result_has_the_layout_of_the_design(path):
             "axes": ["y", "x"],
         }
         image, mm = {"interpretation": "image"}, {"units": "mm"}
+        height, sigma, status = (
+            {"long_name": declaration_of(name).caption} for name in ("height", "height_sigma", "status")
+        )
         assert {name: (node.shape, node.dtype.str[1:], dict(node.attrs)) for name, node in maps.items()} == {
-            "height": ((5, 7), "f4", image | mm),
-            "height_sigma": ((5, 7), "f4", image | mm),
-            "height_errors": ((5, 7), "f4", image | mm),  # a link to it, for viewers
-            "status": ((5, 7), "u1", image),
+            "height": ((5, 7), "f4", image | mm | height),
+            "height_sigma": ((5, 7), "f4", image | mm | sigma),
+            "height_errors": ((5, 7), "f4", image | mm | sigma),  # a link to it, for viewers
+            "status": ((5, 7), "u1", image | status),
             "x": ((7,), "f8", mm),
             "y": ((5,), "f8", mm),
         }

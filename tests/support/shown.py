@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from mirrorskin import io
+from mirrorskin.io.maps import PressStatus, status_of
 
 
 def ball(shape=(24, 32), pixel_size=(0.1, 0.12), radius=2.0, **maps):
@@ -35,6 +36,7 @@ def ball(shape=(24, 32), pixel_size=(0.1, 0.12), radius=2.0, **maps):
         "offset_unknown": np.zeros(1, np.uint8),
         "x": x,
         "y": y,
+        "declarations": {"status": status_of(PressStatus)},
     }
     return io.Result(**(known | maps))
 

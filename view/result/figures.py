@@ -157,8 +157,8 @@ def _figure(sheet: Sheet, panels: Sequence[_Panel], name: str) -> Figure:
         panel.draw(figure.add_axes(place))
     (title, above), (line, _) = words
     side, top = _MARGIN / size[0], 1 - _MARGIN / size[1]
-    figure.text(side, top, title, fontsize=_NAME, weight="bold", va="top")
-    figure.text(side, top - above / size[1], line, fontsize=TEXT, color="0.3", va="top")
+    figure.text(side, top, title, fontsize=_NAME, weight="bold", va="top", parse_math=False)
+    figure.text(side, top - above / size[1], line, fontsize=TEXT, color="0.3", va="top", parse_math=False)
     return figure
 
 

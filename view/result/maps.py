@@ -199,42 +199,44 @@ def draw_declared(axes: Axes, sheet: Sheet, name: str) -> None:
     """Draw a map as its declaration says: heights, directions, vectors, codes, or numbers by colour."""
     result = sheet.result
     declared = result.declaration(name)
+    values = result[name]
     if name == result.name_of("height"):
         draw_height(axes, sheet)
     elif declared.sampling == "direction":
         draw_normals(axes, sheet, name)
-    elif declared.components:
-        _draw_vectors(axes, sheet, name)
     elif declared.codes:
         _draw_codes(axes, sheet, name)
     else:
-        values = declared.figure_scale * result[name].astype(np.float64)
-        draw = {"signed": _draw_signed, "cyclic": _draw_cyclic}.get(declared.colours, _draw_numbers)
-        draw(axes, sheet, values, name, declared)
+        last = values[-1] if declared.per_frame and values.ndim > 2 + bool(declared.components) else values
+        known = declared.has_answer(last).reshape(*last.shape[:2], *[1] * (last.ndim - 2))
+        shown = np.where(known, declared.figure_scale * last.astype(np.float64), np.nan)
+        draw = _draw_signed if declared.colours == "signed" else _draw_numbers
+        draw = _draw_angles if declared.sampling == "angle" else draw
+        draw = _draw_vectors if declared.components else draw
+        draw(axes, sheet, shown, name, declared)
 
 
 def _label(text: str, declared: Map) -> str:
     return f"{text} ({declared.figure_unit})" if declared.figure_unit else text
 
 
-def _draw_vectors(axes: Axes, sheet: Sheet, name: str) -> None:
-    """Draw the length of vectors, in the last frame, and arrows along their first two components."""
-    declared, values = sheet.result.declaration(name), sheet.result[name]
-    last = declared.figure_scale * (values if values.ndim == 3 else values[-1]).astype(np.float64)
-    length = np.sqrt(np.sum(last**2, axis=-1))
+def _draw_vectors(axes: Axes, sheet: Sheet, values: Floats, name: str, declared: Map) -> None:
+    """Draw the length of vectors, and arrows if they have the components x and y."""
+    length = np.sqrt(np.sum(values**2, axis=-1))
     draw_map(axes, sheet, length, _label("length", declared), cmap=SEQUENTIAL)
+    entitle(axes, declared.title_of(name), _missing_note(length))
+    if declared.components[:2] != ("x", "y"):
+        return
     rows, columns = (slice(step // 2, None, step) for step in (max(1, n // _ARROWS) for n in length.shape))
     x, y = np.meshgrid(sheet.x[columns], sheet.y[rows])
-    arrows = last[rows, columns]
+    arrows = values[rows, columns]
     axes.quiver(x, y, arrows[..., 0], arrows[..., 1], color="white", edgecolor="black", linewidth=0.3)
-    entitle(axes, declared.title_of(name), _missing_note(length))
 
 
 def _draw_numbers(axes: Axes, sheet: Sheet, values: Floats, name: str, declared: Map) -> None:
     """Draw numbers by colour; positive ones that span decades by their logarithm."""
     from matplotlib.colors import LogNorm, Normalize
 
-    values = np.where(np.isfinite(values), values, np.nan)
     known = values[np.isfinite(values)]
     low, high = (float(v) for v in np.percentile(known, _SHOWN)) if known.size else (0.0, 1.0)
     decades = declared.colours != "sequential" and low > 0 and high > _DECADES * low
@@ -244,7 +246,7 @@ def _draw_numbers(axes: Axes, sheet: Sheet, values: Floats, name: str, declared:
     beyond = exceeded(known, low, high)
     draw_map(axes, sheet, values, _label(text, declared), extend=beyond, cmap=colours, norm=scale)
     notes = [f"median {np.median(known):.3g} {declared.figure_unit}".rstrip()] if known.size else []
-    entitle(axes, declared.title_of(name), "; ".join(notes + [one for one in [_missing_note(values)] if one]))
+    entitle(axes, declared.title_of(name), "; ".join(filter(None, [*notes, _missing_note(values)])))
 
 
 def _draw_signed(axes: Axes, sheet: Sheet, values: Floats, name: str, declared: Map) -> None:
@@ -257,11 +259,10 @@ def _draw_signed(axes: Axes, sheet: Sheet, values: Floats, name: str, declared: 
     entitle(axes, declared.title_of(name), _missing_note(values))
 
 
-def _draw_cyclic(axes: Axes, sheet: Sheet, values: Floats, name: str, declared: Map) -> None:
+def _draw_angles(axes: Axes, sheet: Sheet, values: Floats, name: str, declared: Map) -> None:
     """Draw angles, in degrees, by colours that are the same at both ends of the scale."""
-    angle = np.degrees(np.angle(np.exp(1j * np.radians(values))))
-    label = _label(name.replace("_", " "), declared)
-    draw_map(axes, sheet, angle, label, cmap=CYCLIC, vmin=-180, vmax=180)
+    angle = np.degrees(np.angle(np.exp(1j * values / declared.figure_scale)))
+    draw_map(axes, sheet, angle, f"{name.replace('_', ' ')} (deg)", cmap=CYCLIC, vmin=-180, vmax=180)
     axes.child_axes[0].set_yticks(range(-180, 181, 90))
     entitle(axes, declared.title_of(name), "0: to the right; 90: up")
 
@@ -306,4 +307,5 @@ def _draw_shares(
     assert legend is not None
     for text in legend.get_texts():
         text.set_fontsize(SMALL)
+        text.set_parse_math(False)
     lay_out(axes, sheet)

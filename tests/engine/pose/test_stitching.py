@@ -138,7 +138,11 @@ def test_a_single_result_is_refused():
 def test_heights_without_sigma_are_refused_by_name():
     first, second = touches(moves=MOVES[:2])
     bare = io.Result(
-        height=second.height, normals=second.normals, normals_sigma=second.normals_sigma, x=second.x, y=second.y
+        height=second.height,
+        normals=second.normals,
+        normals_sigma=second.normals_sigma,
+        x=second.x,
+        y=second.y,
     )
     with pytest.raises(io.InputError, match=r"two\.h5 has no height_sigma"):
         engine.stitch([first, bare], names=["one.h5", "two.h5"])

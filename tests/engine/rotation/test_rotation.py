@@ -79,7 +79,7 @@ def test_a_rotation_becomes_normals_and_what_goes_with_them(tmp_path):
     assert done == sorted(done)
     io.save_result(result, tmp_path / "out.h5")
     found = io.open_result(tmp_path / "out.h5")
-    assert_same(found, replace(result, process=found.process))
+    assert_same(found, result.assign(process=found.process))
 
 
 def test_it_is_the_normals_of_the_frames():
