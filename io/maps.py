@@ -410,11 +410,20 @@ TABLE: Mapping[str, Map] = {
     "residual": Map(
         "standard deviation of the brightness that the fit does not explain", "counts", overview=False
     ),
-    "edges": _flag("edge", "no edge", "lines where the normal jumps or contact ends", overview=True),
-    "filled": _flag(
-        "filled", "measured", "1 where the height was not measured but interpolated from its surroundings"
+    "edges": _flag(
+        "edge",
+        "no edge",
+        "thin lines where the normal jumps, contact ends or the surface is discontinuous",
+        overview=True,
     ),
-    "contact": _flag("in contact", "no lasting contact", "1 where the sheet was in contact in every frame"),
+    "filled": _flag(
+        "filled", "measured", "pixels whose height was not measured but interpolated from their surroundings"
+    ),
+    "contact": _flag(
+        "in contact",
+        "no lasting contact",
+        "pixels where the sheet was in contact in every frame; of a slide or a twist, in the first",
+    ),
     "component": Map(
         "number of the connected piece; heights of two pieces are independent of each other",
         dtype="int32",
