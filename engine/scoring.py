@@ -287,7 +287,7 @@ def score(result: Result, truth: Truth) -> Score:
         remedy = "score one that was made without a scale in its calibration"
         raise InputError(f"the result is undistorted, the truth is that of the camera's pixels: {remedy}")
     size = map_shape(result)[-2:]
-    if size != truth.height.shape:
+    if result.maps() and size != truth.height.shape:
         raise InputError(f"the result is {size} pixels, the truth {truth.height.shape}: not of one stack")
     touched = truth.contact.astype(bool)
     azimuth = result.azimuth if result.normals is None else None

@@ -136,7 +136,7 @@ def test_ours_are_run_as_well(device):
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
 def test_a_kernel_of_the_user_s_gives_the_same_as_numpy(device, tmp_path, dtype):
     page = (Path(__file__).parents[2] / "docs" / "estimators.md").read_text(encoding="utf-8")
-    exec(re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)[2], known := {})
+    exec(re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)[-1], known := {})
     frames = random_stack(dtype)
     record(MadeUp(frames, HEADER, travel=TRAVEL), tmp_path / "rec.h5")
     estimator = known["LightOnDevice"](frames.shape[1:], frames.dtype, device=device)

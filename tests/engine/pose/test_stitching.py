@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from moved_surfaces import bumpy, sampled
@@ -94,8 +92,7 @@ def test_the_offset_and_the_pose_of_a_levelled_touch_are_in_its_sigma(relative):
             sampled(bumpy, rng=rng, shape=(60, 70), height_sigma=2e-2),
             sampled(bumpy, (0.01, -0.01, 0.02), (-1, 0.2, 0), rng=rng, shape=(60, 70), height_sigma=2e-4),
         ]
-        pair[relative] = replace(
-            pair[relative],
+        pair[relative] = pair[relative].assign(
             height=pair[relative].height + np.float32(0.4),
             component=np.zeros((60, 70), np.int32),
             offset_unknown=np.ones(1, np.uint8),
