@@ -51,13 +51,16 @@ def draw_height(axes: Axes, sheet: Sheet, cut: Section | None = None) -> None:
     if cut is not None:
         _draw_line(axes, sheet, cut)
     lay_out(axes, sheet)
-    entitle(axes, quantity(sheet).capitalize(), "; ".join(_notes(sheet)))
+    entitle(axes, f"{quantity(sheet)[:1].upper()}{quantity(sheet)[1:]}", "; ".join(_notes(sheet)))
 
 
 def quantity(sheet: Sheet) -> str:
-    """Return the quantity's name: relative height if the absolute offset is unknown."""
-    unknown = sheet.result.offset_unknown
-    return "relative height" if unknown is not None and unknown.size and unknown.all() else "height"
+    """Return the title of the heights in lower case: relative ones if the absolute offset is unknown."""
+    result = sheet.result
+    name = result.name_of("height") or "height"
+    title, unknown = result.declaration(name).title_of(name), result.offset_unknown
+    title = f"{title[:1].lower()}{title[1:]}"
+    return f"relative {title}" if unknown is not None and unknown.size and unknown.all() else title
 
 
 def _notes(sheet: Sheet) -> Iterator[str]:
