@@ -125,7 +125,7 @@ $(READY): pyproject.toml
 	# mypy and editors do not follow an editable install; they do follow links.
 	site=$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
 	mkdir -p "$$site/mirrorskin"
-	for package in $(PACKAGES); do ln -sfn "$$PWD/$$package" "$$site/mirrorskin/$$package"; done
+	for name in __init__.py py.typed $(PACKAGES); do ln -sfn "$$PWD/$$name" "$$site/mirrorskin/$$name"; done
 	touch $@
 
 # What only some need comes with the first of them.

@@ -214,7 +214,7 @@ def run_turns(name: str, wanted: Literal["normals", "wave"], device: Device, qui
 
             def check(results: dict[str, Any]) -> None:
                 found = results[kernels]
-                words = {"normals": "vectors", "normal_sigma": "sigma", "contact": "contact"}
+                words = {"normals": "vectors", "normals_sigma": "sigma", "contact": "contact"}
                 words = words if wanted == "normals" else {"cosine": "cosine", "sine": "sine"}
                 words |= {"mean": "mean", "residual": "residual"}
                 expected = {word: getattr(found, mine) for word, mine in words.items()}

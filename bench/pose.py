@@ -79,7 +79,7 @@ def _surface(shape: tuple[int, int], right: float, up: float, turn: float, seed:
         height=(height + rng.normal(0, _SIGMA, shape)).astype(np.float32),
         height_sigma=np.full(shape, _SIGMA, np.float32),
         normals=normals.astype(np.float32),
-        normal_sigma=np.full(shape, _NORMAL_SIGMA, np.float32),
+        normals_sigma=np.full(shape, _NORMAL_SIGMA, np.float32),
         x=x,
         y=y,
     )

@@ -158,7 +158,7 @@ def _is_result(path: Path, folder: Path) -> bool:
     """Tell whether a file is a result, or was one of those in a folder before it was damaged."""
     from mirrorskin.io import InputError
     from mirrorskin.io.hdf5 import Hdf5File
-    from mirrorskin.io.result import MARK
+    from mirrorskin.io.result_file import MARK
 
     if not path.name.endswith(_RESULTS) or not path.is_file():
         return False

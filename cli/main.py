@@ -46,7 +46,7 @@ PURPOSES = {
     "fuse": "Make one surface of a press and a rotation.",
     "stitch": "Make one larger surface of several touches.",
     "batch": "Reconstruct many recordings.",
-    "view": "Show heights, a section, normals, edges, status, expected errors.",
+    "view": "Show the maps of a result, a section and a histogram of heights.",
     "measure": "Measure a height map: heights, areas, volumes, plane or sphere, roughness, steps.",
     "report": "Write a page with pictures, numbers and the surface.",
     "export": "Write a result as meshes, points, pictures, tables or arrays.",

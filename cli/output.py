@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from mirrorskin.io import Result
 
 _NO_GEL = "none: the calibration has no gel"
-_OF_SLIP = ("slipped", "stick_ratio")  # in a summary
 _UNTOLD = "none: "  # how a result's process says that a map is missing, before it says why
 
 
@@ -27,16 +26,13 @@ def save_and_report(result: Result, path: Path, device: str | None, as_json: boo
     """Write a result and say in a line what it holds, or in JSON how it came about as well."""
     from mirrorskin import io
     from mirrorskin.engine.summary import summarise
-    from mirrorskin.io.types import SCALARS
     from mirrorskin.kernels.device import open_device
 
     io.save_result(result, path)
     summary, pieces = summarise(result), _pieces(result)
     if as_json:
         profile = open_device(device).profile.records() if "device" in result.process else []
-        told, some = dataclasses.asdict(summary), (*SCALARS, *_OF_SLIP)
-        told = {name: value for name, value in told.items() if value is not None or name not in some}
-        facts = {"summary": told | pieces, "process": result.process}
+        facts = {"summary": summary.as_dict() | pieces, "process": result.process}
         print_json({"output": str(path), **facts, "profile": profile})
     else:
         click.echo(printable(", ".join([f"{path}: {summary}", *_words(**pieces)])))

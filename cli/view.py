@@ -25,9 +25,9 @@ def command(
         Option(
             "--map",
             metavar="NAME",
-            help="Only height, section, normals, edges, status, sigma, histogram, displacement, slip, slope,"
-            " hysteresis, growth, azimuth, modulation or a map of your own; may be given again.",
-            show_default="all that the result has",
+            help="Only this map of those that 'mirrorskin info RES' lists, 'section' or 'histogram'; may be"
+            " given again.",
+            show_default="those of the overview",
         ),
     ] = None,
     section: options.Section = None,
@@ -51,7 +51,7 @@ def command(
         ),
     ] = None,
 ) -> None:
-    """Show heights, a section, normals, edges, status, expected errors."""
+    """Show the maps of a result, a section and a histogram of heights."""
     from mirrorskin import io, view
     from mirrorskin.cli.quantity import segment
 

@@ -6,7 +6,7 @@ import inspect
 import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -16,6 +16,7 @@ from mirrorskin.engine.provenance import attach_provenance, signature
 from mirrorskin.engine.streaming import Estimator, Progress
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Result
+from mirrorskin.io.maps import declaration_of
 from mirrorskin.io.result import result_of
 
 if TYPE_CHECKING:
@@ -55,8 +56,8 @@ def run(
     Returns
     -------
     Result
-        Maps that results know have their places there, such as a ``height``, mm; others are in ``own_maps``.
-        Numbers and texts are in ``process``.
+        The maps by name, with the declarations in the estimator's attribute ``maps``, a mapping from names to
+        `mirrorskin.io.Map`. Numbers and texts that are not declared are in ``process``.
 
     Raises
     ------
@@ -74,7 +75,7 @@ def run(
     ...         np.maximum(self.most, frames.max(axis=0), out=self.most)
     ...     def result(self):
     ...         return {"brightest": self.most}
-    >>> run(np.arange(12).reshape(3, 2, 2), Brightest).own_maps["brightest"].tolist()
+    >>> run(np.arange(12).reshape(3, 2, 2), Brightest)["brightest"].tolist()
     [[8, 9], [10, 11]]
     """
     own = cast("Source", source) if hasattr(source, "read") and hasattr(source, "header") else None
@@ -109,12 +110,16 @@ def finish(estimator: Estimator, shape: tuple[int, ...], source: Source | None) 
         found = {field.name: getattr(found, field.name) for field in fields(found)}
     if not isinstance(found, Mapping):
         raise InputError(f"{name}.result() returns a {type(found).__name__}: maps by name are needed")
+    declarations = getattr(estimator, "maps", {})
     numbers = {
-        one: value for one, value in found.items() if isinstance(value, str | int | float | np.generic)
+        one: value
+        for one, value in found.items()
+        if isinstance(value, str | int | float | np.generic)
+        and declaration_of(one, declarations).axes != "none"
     }
     try:
         maps = {one: value for one, value in found.items() if one not in numbers}
-        result = result_of(maps, (shape[0], shape[1]), signature() | {"estimator": name})
+        result = result_of(maps, (shape[0], shape[1]), signature() | {"estimator": name}, declarations)
     except InputError as error:
         raise InputError(f"{name}.result(): {error}") from error
     if source is not None:
@@ -123,7 +128,7 @@ def finish(estimator: Estimator, shape: tuple[int, ...], source: Source | None) 
     if twice := numbers.keys() & result.process.keys():
         raise InputError(f"{name}.result(): {', '.join(sorted(twice))} is said of every result: rename it")
     told = {one: value.item() if isinstance(value, np.generic) else value for one, value in numbers.items()}
-    return replace(result, process={**result.process, **told})
+    return result.assign(process={**result.process, **told})
 
 
 def prepare(estimator: Estimator | Maker, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Estimator:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -12,8 +12,9 @@ from mirrorskin.engine.frames import check_dtype, check_frames
 from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
+from mirrorskin.io.maps import FocusStatus, Map, status_of
 from mirrorskin.io.positions import check_strokes
-from mirrorskin.io.types import Shown
+from mirrorskin.io.result import Shown
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
 
 Doubles = NDArray[np.float64]
@@ -65,6 +66,10 @@ class FocusEstimator(ThreadSafe):
     """
 
     device: Device
+    maps: ClassVar[dict[str, Map]] = {
+        "status": status_of(FocusStatus),
+        "sharpness": Map("standard deviation of the samples around the pixel in the best frame", "counts"),
+    }
 
     def __init__(
         self,
@@ -123,12 +128,13 @@ class FocusEstimator(ThreadSafe):
             beside = place[self._reach - 1 : self._reach + 2]
             found &= (beside.min(axis=0) < peak.vertex) & (peak.vertex < beside.max(axis=0))
             sharpness = np.sqrt(np.maximum(top, 0) / np.maximum(freedom, 1))
-        status = np.where(found, 1, 2)
-        status[(best == 0) | (best == len(self._travel) - 1)] = 3
-        status[~np.isfinite(squares[self._reach])] = 0
+        status = np.where(found, FocusStatus.IN_FOCUS, FocusStatus.NO_PEAK)
+        status[(best == 0) | (best == len(self._travel) - 1)] = FocusStatus.PEAK_AT_AN_END
+        status[~np.isfinite(squares[self._reach])] = FocusStatus.INVALID_INPUT
         height = -(self._travel[best] + peak.vertex)
         sigma = np.sqrt(variance * peak.variance + misfit * peak.gain)
-        height, sigma = (np.where(status == 1, one, np.nan).astype(np.float32) for one in (height, sigma))
+        in_focus = status == FocusStatus.IN_FOCUS
+        height, sigma = (np.where(in_focus, one, np.nan).astype(np.float32) for one in (height, sigma))
         return Focus(height, sigma, status.astype(np.uint8), sharpness.astype(np.float32))
 
     def reset(self) -> None:

@@ -18,7 +18,7 @@ from mirrorskin.engine.rotation.design_matrix import Doubles, fit_matrix
 from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
-from mirrorskin.io.types import Shown
+from mirrorskin.io.result import Shown
 from mirrorskin.kernels.device import Device
 
 _TURN = 2 * np.pi

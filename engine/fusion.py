@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -212,7 +211,7 @@ def fuse_sources(
     if register:
         process |= {"heights": "fused", "registrations": number + 1, "last_move_in_pixels": moved}
     together = _put_together(heights, found, surface)
-    return undistorted(replace(together, process=process, calibration=turned.calibration), axial)
+    return undistorted(together.assign(process=process, calibration=turned.calibration), axial)
 
 
 def frames_to_read(vertical: Source, axial: Source, register: bool = True) -> int:
@@ -282,8 +281,7 @@ def _slopes_of(rotation: Rotation) -> Slopes:
 def _put_together(heights: Result, rotation: Rotation, surface: Surface) -> Result:
     """Return the maps of a press, a rotation and the surface of both."""
     edges = rotation.edges if surface.edges is None else rotation.edges | surface.edges
-    return replace(
-        rotation_maps(rotation),
+    return rotation_maps(rotation).assign(
         height=surface.height,
         height_sigma=surface.sigma,
         status=heights.status,
@@ -293,6 +291,7 @@ def _put_together(heights: Result, rotation: Rotation, surface: Surface) -> Resu
         offset_unknown=surface.offset_unknown.astype(np.uint8),
         x=heights.x,
         y=heights.y,
+        declarations={"status": heights.declaration("status")},
     )
 
 

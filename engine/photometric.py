@@ -13,7 +13,7 @@ from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import as_array, checked
 from mirrorskin.io.positions import check_phase
-from mirrorskin.io.types import Shown
+from mirrorskin.io.result import Shown
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
 
 Doubles = NDArray[np.float64]
@@ -29,7 +29,7 @@ class Lambertian(Shown):
     ----------
     normals : ndarray, (H, W, 3), float32
         Unit vectors along x, y and z.
-    normal_sigma : ndarray, (H, W), float32
+    normals_sigma : ndarray, (H, W), float32
         Radians: the RMS angle to the true normal that is expected.
     albedo, albedo_sigma : ndarray, (H, W), float32
         Counts under a lamp of length 1 that faces the surface, and the standard error.
@@ -43,7 +43,7 @@ class Lambertian(Shown):
     """
 
     normals: NDArray[np.float32]
-    normal_sigma: NDArray[np.float32]
+    normals_sigma: NDArray[np.float32]
     albedo: NDArray[np.float32]
     albedo_sigma: NDArray[np.float32]
     residual: NDArray[np.float32]
@@ -142,11 +142,11 @@ class PhotometricStereo(ThreadSafe):
             radial = (a * x) ** 2 + (b * x + d * y) ** 2 + (c * x + e * y + f * z) ** 2
             whole = a**2 + b**2 + c**2 + d**2 + e**2 + f**2
             noise = noise_of_residual(residual, freedom) if self._noise is None else self._noise
-            normal_sigma, albedo_sigma = noise * np.sqrt(whole - radial) / albedo, noise * np.sqrt(radial)
+            normals_sigma, albedo_sigma = noise * np.sqrt(whole - radial) / albedo, noise * np.sqrt(radial)
         known = solid & np.isfinite(albedo) & (albedo > 0)
-        normals[~known] = normal_sigma[~known] = albedo[~known] = albedo_sigma[~known] = np.nan
+        normals[~known] = normals_sigma[~known] = albedo[~known] = albedo_sigma[~known] = np.nan
         shown, spread, gain, gain_spread, left = (
-            one.astype(np.float32) for one in (normals, normal_sigma, albedo, albedo_sigma, residual)
+            one.astype(np.float32) for one in (normals, normals_sigma, albedo, albedo_sigma, residual)
         )
         kept = noise if np.ndim(noise) else float(noise)
         return Lambertian(shown, spread, gain, gain_spread, left, used.astype(np.int32), kept)
@@ -211,7 +211,7 @@ def photometric_stereo(
     >>> azimuth = np.arange(6) * np.pi / 3
     >>> frames = (70 + 20 * np.cos(azimuth - 1))[:, None, None] * np.ones((2, 3), np.float32)
     >>> found = engine.photometric_stereo(frames.astype(np.float32), azimuth, zenith=0.6, noise=1)
-    >>> [round(float(part), 3) for part in found.normals[0, 0]], round(float(found.normal_sigma[0, 0]), 4)
+    >>> [round(float(part), 3) for part in found.normals[0, 0]], round(float(found.normals_sigma[0, 0]), 4)
     ([0.208, 0.324, 0.923], 0.0153)
     """
     if frames.ndim != 3 or 0 in frames.shape:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Literal
@@ -62,8 +61,8 @@ def attach_provenance(
         }
     if isinstance(source, io.Calibrated):
         known |= {"calibration": source.whole.name, "calibration_parts": source.whole.contents}
-        result = replace(result, calibration=source.whole)
-    return replace(result, x=x, y=y, process=known | process)
+        result = result.assign(calibration=source.whole)
+    return result.assign(x=x, y=y, process=known | process)
 
 
 def level_origin(

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from mirrorskin.engine.slip.status import SLIPPED, STICKS
 from mirrorskin.io import InputError, Result, Truth
 from mirrorskin.io.arguments import checked
-from mirrorskin.io.result import map_shape, unit_of
+from mirrorskin.io.maps import SlipStatus
+from mirrorskin.io.result import map_shape
 from mirrorskin.io.types import UNDISTORTED
 
 Doubles = NDArray[np.float64]
@@ -287,11 +287,8 @@ def score(result: Result, truth: Truth) -> Score:
     if result.process.get(UNDISTORTED):
         remedy = "score one that was made without a scale in its calibration"
         raise InputError(f"the result is undistorted, the truth is that of the camera's pixels: {remedy}")
-    known = ("height", "azimuth", "normals", "contact", "edges", "slip_onset", "displacement")
-    if all(getattr(result, name) is None for name in known):
-        raise InputError("the result has no heights, normals, azimuths, contact, edges or slip to score")
     size = map_shape(result)[-2:]
-    if size != truth.height.shape:
+    if result.maps() and size != truth.height.shape:
         raise InputError(f"the result is {size} pixels, the truth {truth.height.shape}: not of one stack")
     touched = truth.contact.astype(bool)
     azimuth = result.azimuth if result.normals is None else None
@@ -312,23 +309,27 @@ def score(result: Result, truth: Truth) -> Score:
     )
     if not found.parts() and left_out is not None:
         raise InputError(f"slip, all that the result has, cannot be scored: {left_out}")
+    if not found.parts():
+        raise InputError("the result has no heights, normals, azimuths, contact, edges or slip to score")
     return found
 
 
-_SLIP_MAPS = ("displacement", "slip_onset", "status", "way")
+_SLIP_MAPS = ("displacement", "slip_onset", "status")
 
 
 def _why_slip_is_left_out(result: Result, truth: Truth) -> str | None:
     """Say why slip that a result has cannot be compared with the truth; None if it can, or there is none."""
     if result.slip_onset is None and result.displacement is None:
         return None
-    missing = [name for name in _SLIP_MAPS if getattr(result, name) is None]
+    missing = [name for name in _SLIP_MAPS if name not in result]
+    distance = _distance(result)
+    missing += ["slide_distance"] if distance is None else []
     if missing:
         return f"the result lacks {' and '.join(missing)}; reconstruct it again"
     if truth.slip_onset is None or truth.displacement is None:
         return "the truth has none; simulate a slide or a twist with --contact elastic"
-    assert result.way is not None
-    count, whole = len(result.way), len(truth.displacement)
+    assert distance is not None
+    count, whole = len(distance), len(truth.displacement)
     frames = str(result.process.get("source_frames", f"0:{whole}"))
     if frames.partition(",")[0] != f"0:{count}" or count > whole:
         return (
@@ -338,23 +339,29 @@ def _why_slip_is_left_out(result: Result, truth: Truth) -> str | None:
     return None
 
 
+def _distance(result: Result) -> Doubles | None:
+    """Return how far the body has slid or turned in each frame, mm or radians."""
+    distance: Doubles | None = result.slide_distance if result.twist_angle is None else result.twist_angle
+    return distance
+
+
 def _score_slip(result: Result, truth: Truth, touched: Mask) -> SlipScore:
     """Score what slides and twists tell in the frames of the result, which are the truth's first."""
-    onset, moved, way = result.slip_onset, result.displacement, result.way
+    onset, moved, distance = result.slip_onset, result.displacement, _distance(result)
     assert onset is not None
     assert moved is not None
-    assert way is not None
+    assert distance is not None
     assert result.status is not None
     assert truth.displacement is not None
     assert truth.slip_onset is not None
-    true_onset = np.where(truth.slip_onset <= way[-1], truth.slip_onset, np.nan)
-    answered = touched & np.isin(result.status, (SLIPPED, STICKS))
-    found, true = result.status == SLIPPED, np.isfinite(true_onset)
+    true_onset = np.where(truth.slip_onset <= distance[-1], truth.slip_onset, np.nan)
+    answered = touched & np.isin(result.status, (SlipStatus.SLIPPED, SlipStatus.STICKS))
+    found, true = result.status == SlipStatus.SLIPPED, np.isfinite(true_onset)
     inside = answered & ~_around(~touched) & ~(_around(true) & _around(~true & touched))
     both = answered & found & true
     error = onset.astype(np.float64) - true_onset
     last = moved if moved.ndim == 3 else moved[-1]
-    off = last.astype(np.float64) - truth.displacement[len(way) - 1]
+    off = last.astype(np.float64) - truth.displacement[len(distance) - 1]
     seen = touched & np.isfinite(off).all(axis=-1)
     sigma = result.displacement_sigma
     along = None if sigma is None else np.repeat(sigma[..., np.newaxis], 2, axis=-1)
@@ -366,7 +373,7 @@ def _score_slip(result: Result, truth: Truth, touched: Mask) -> SlipScore:
         precision=_share(true, inside & found),
         stick_radius=math.sqrt(_share(~found, answered)),
         true_stick_radius=math.sqrt(_share(~true, answered)),
-        unit=unit_of("slip_onset", result.process) or "",
+        unit=result.declaration("slip_onset").unit,
         onset_rms=_spread(np.abs(error[both]))["rms"],
         onset_chi_square=_chi_square(error, result.slip_onset_sigma, both),
         displacement_rms=_spread(np.abs(off[seen]))["rms"],
@@ -422,7 +429,7 @@ def _score_normals(result: Result, truth: Truth, touched: Mask) -> AngleScore:
     error = angle_between(result.normals.astype(np.float64), true_normals(truth))
     if result.contact is not None:  # normals of pixels that lose contact are not claimed
         error = np.where(result.contact == 0, np.nan, error)
-    return _score_angles(error, result.normal_sigma, touched)
+    return _score_angles(error, result.normals_sigma, touched)
 
 
 def _score_angles(error: Doubles, sigma: NDArray[np.float32] | None, touched: Mask) -> AngleScore:

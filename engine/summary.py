@@ -2,47 +2,44 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.slip.status import NO_CONTACT, SLIPPED, STICKS
 from mirrorskin.io import Result
-from mirrorskin.io.result import unit_of
+from mirrorskin.io.maps import SIGMA, is_builtin, is_deviation, place_of
 
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """How much of a result was answered; ``str()`` of it is one line.
+    """How many pixels of a result have an answer; ``str()`` of it is one line.
 
     Attributes
     ----------
-    what : {"height", "slope", "normals", "azimuth", "slip"}
-        The maps that count; or the name of the first of a user's own.
+    what : str
+        The maps that are summarised, such as ``"height"`` or ``"normals"``.
     pixels, answered : int
-        All (of slip those in contact), and those with an answer; in each turn, where each has maps of its
-        own.
+        All pixels, and those with an answer; in all turns, if there are maps for each.
     quantity, unit : str
-        What ``lowest`` and ``highest`` are of.
+        The map that ``lowest`` and ``highest`` are the range of, and its unit.
     lowest, highest : float
         NaN without an answer.
     in_contact : int or None
         Pixels in contact in every frame, if that was estimated.
     turns : int or None
-        How many have maps of their own.
+        Number of turns, if there are maps for each.
     filled : int or None
-        Of the pixels with a height, those that were filled, if holes were looked for.
+        Pixels whose height was filled, if holes were searched for.
     relief : (float, float) or None
         Lowest and highest of the heights that go with normals and are relative, mm.
-    slipped : int or None
-        Of the pixels that tell of slip, those that slipped.
-    stick_ratio : float or None
-        Share of the contact that sticks in the last frame for which that is known.
-    force_x, force_y : float or None
-        Along the sheet, N.
-    force, force_sigma : float or None
-        Of a press, and the standard deviation that is expected, N.
+    counts : dict of str to int
+        Pixels of each code of the status, where the status matters most, as for slip.
+    numbers : dict of str to (float, float or None, str)
+        Value, standard deviation and unit of each single number, such as a force, and the last known value of
+        each series that is summarised.
     """
 
     what: str
@@ -56,109 +53,107 @@ class Summary:
     turns: int | None = None
     filled: int | None = None
     relief: tuple[float, float] | None = None
-    slipped: int | None = None
-    stick_ratio: float | None = None
-    force: float | None = None
-    force_sigma: float | None = None
-    force_x: float | None = None
-    force_y: float | None = None
+    counts: dict[str, int] = field(default_factory=dict)
+    numbers: dict[str, tuple[float, float | None, str]] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        turns = "" if self.turns is None else f" in {self.turns} turns"
-        if self.slipped is not None:
-            return self._slip()
-        if self.answered == 0:
-            return f"no {self.what} at any of {self.pixels} pixels{turns}"
-        quantity = "" if self.quantity == self.what else f"{self.quantity} "
-        filled = f" ({self.filled} filled)" if self.filled else ""
-        parts = [
-            f"{self.what} at {self.answered} of {self.pixels} pixels{turns}{filled}",
-            f"{quantity}from {self.lowest:.3f} to {self.highest:.3f} {self.unit}".rstrip(),
-        ]
-        if self.in_contact is not None:
-            parts.append(f"in contact at {self.in_contact}")
-        if self.relief is not None:
-            parts.append("relative height from {:.3f} to {:.3f} mm".format(*self.relief))
-        if self.force is not None and self.force_sigma is not None:
-            parts.append(f"force {self.force:.4g} +- {self.force_sigma:.2g} N")
-        return ", ".join(parts)
+        return ", ".join(self._parts())
 
-    def _slip(self) -> str:
-        parts = [
-            f"slip known at {self.answered} of {self.pixels} pixels in contact",
-            f"{self.slipped} slipped",
-        ]
-        if self.slipped:
-            parts.append(f"from {self.lowest:.3f} to {self.highest:.3f} {self.unit} of the way")
-        if self.stick_ratio is not None:
-            parts.append(f"{100 * self.stick_ratio:.1f} % of the contact sticks")
-        if self.force_x is not None and self.force_y is not None:
-            parts.append(f"force along the sheet {self.force_x:.4g}, {self.force_y:.4g} N")
-        return ", ".join(parts)
+    def _parts(self) -> Iterator[str]:
+        turns = "" if self.turns is None else f" in {self.turns} turns"
+        if self.answered:
+            filled = f" ({self.filled} filled)" if self.filled else ""
+            yield f"{self.what} at {self.answered} of {self.pixels} pixels{turns}{filled}"
+            quantity = self.quantity.replace("_", " ")
+            quantity = "" if quantity == self.what else f"{quantity} "
+            yield f"{quantity}from {self.lowest:.3f} to {self.highest:.3f} {self.unit}".rstrip()
+        else:
+            yield f"no {self.what} at any of {self.pixels} pixels{turns}"
+        if self.in_contact is not None and self.answered:
+            yield f"in contact at {self.in_contact}"
+        if self.relief is not None:
+            yield "relative height from {:.3f} to {:.3f} mm".format(*self.relief)
+        yield from (f"{count} {name}" for name, count in self.counts.items())
+        for name, (value, sigma, unit) in self.numbers.items():
+            spread = "" if sigma is None else f" ± {sigma:.2g}"
+            yield f"{name.replace('_', ' ')} {value:.4g}{spread} {unit}".rstrip()
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything by name, for JSON; counts and numbers are entries of their own."""
+        facts = asdict(self)
+        facts |= {name.replace(" ", "_"): count for name, count in facts.pop("counts").items()}
+        for name, (value, sigma, _) in facts.pop("numbers").items():
+            facts[name] = value
+            facts |= {} if sigma is None else {f"{name}{SIGMA}": sigma}
+        return facts
 
 
 def summarise(result: Result) -> Summary:
     """Count the pixels of a result that have an answer, and find the range of the answers.
 
-    They are slip; heights; slopes of a body that rocked; normals where there are some and all heights are
-    relative; else azimuths, whose modulation is given; else the first map of the user's own.
+    It is about the first map whose declaration has a text for the summary; heights that are all relative come
+    last. Without such a map it is about the first one that is not built-in, or the first of all.
     """
-    if result.slip_onset is not None:
-        return _summarise_slip(result)
-    height = np.empty(0, np.float32) if result.height is None else result.height
     relative = result.offset_unknown is not None and bool(np.all(result.offset_unknown))
-    answers, values, names = height, height, ("height", "height", "mm")
-    if result.slope is not None:
-        answers, values, names = result.slope, result.slope, ("slope", "slope", "along it")
-    elif result.zenith is not None and (result.height is None or relative):
-        answers, values, names = result.zenith, np.degrees(result.zenith), ("normals", "zenith", "deg")
-    elif result.height is None and result.azimuth is not None and result.modulation is not None:
-        answers, values, names = result.azimuth, result.modulation, ("azimuth", "modulation", "counts")
-    elif result.height is None and result.own_maps:
-        name, answers = next(iter(result.own_maps.items()))
-        values, names = answers, (name, name, "")
-    what, quantity, unit = names
-    answered = np.isfinite(answers)
-    lowest, highest = _range(values if answers is height else values[answered]) or (np.nan, np.nan)
+    name, what = _leading(result, relative)
+    if name is None:
+        return Summary("answer", 0, 0, "", "", np.nan, np.nan)
+    declared, values = result.declaration(name), result[name]
+    answered = declared.has_answer(values)
+    size = np.linalg.norm(values, axis=-1) if declared.components else values
+    lowest, highest = _range(size[answered], declared.figure_scale) or (np.nan, np.nan)
     return Summary(
         what,
-        answers.size,
+        answered.size,
         int(np.count_nonzero(answered)),
-        quantity,
-        unit,
+        name,
+        declared.figure_unit,
         lowest,
         highest,
         in_contact=None if result.contact is None else int(np.count_nonzero(result.contact)),
-        turns=len(answers) if answers.ndim == 3 else None,
+        turns=len(answered) if answered.ndim == 3 and not declared.per_frame else None,
         filled=None if result.filled is None else int(np.count_nonzero(result.filled)),
-        relief=_range(height) if relative else None,
-        force=result.force,
-        force_sigma=result.force_sigma,
+        relief=None if result.height is None or not relative else _range(result.height),
+        counts=dict(_counts(result)),
+        numbers=dict(_numbers(result)),
     )
 
 
-def _summarise_slip(result: Result) -> Summary:
-    assert result.slip_onset is not None
-    status = np.zeros(result.slip_onset.shape, np.uint8) if result.status is None else result.status
-    touched = status != NO_CONTACT if result.contact is None else result.contact != 0
-    ratio = np.empty(0) if result.stick_ratio is None else result.stick_ratio[np.isfinite(result.stick_ratio)]
-    lowest, highest = _range(result.slip_onset) or (np.nan, np.nan)
-    return Summary(
-        "slip",
-        int(np.count_nonzero(touched)),
-        int(np.count_nonzero(touched & np.isin(status, (SLIPPED, STICKS)))),
-        "slip onset",
-        unit_of("slip_onset", result.process) or "",
-        lowest,
-        highest,
-        slipped=int(np.count_nonzero(touched & (status == SLIPPED))),
-        stick_ratio=float(ratio[-1]) if ratio.size else None,
-        force_x=result.force_x,
-        force_y=result.force_y,
-    )
+def _leading(result: Result, relative: bool) -> tuple[str | None, str]:
+    """Return the name of the map that the summary is about, and what it calls the pixels with a value."""
+    maps = {name: result.declaration(name) for name in result.maps()}
+    heights = result.name_of("height") if relative else None
+    called = {name: one.summary or (name if one.quantity else "") for name, one in maps.items()}
+    order = sorted(maps, key=lambda name: (name == heights, place_of(maps[name].quantity or name)))
+    for name in order:
+        if called[name]:
+            return name, called[name]
+    own = [name for name in maps if not is_builtin(name)] or [*maps]
+    return (own[0], own[0].replace("_", " ")) if own else (None, "")
 
 
-def _range(values: NDArray[np.float32]) -> tuple[float, float] | None:
+def _counts(result: Result) -> Iterator[tuple[str, int]]:
+    """Yield the number of pixels of each code of the maps whose declaration asks for it."""
+    for name, values in result.maps().items():
+        declared = result.declaration(name)
+        for code, text in declared.codes.items() if declared.counted else ():
+            count = int(np.count_nonzero(values == code))
+            if count and code != declared.undefined:
+                yield text, count
+
+
+def _numbers(result: Result) -> Iterator[tuple[str, tuple[float, float | None, str]]]:
+    numbers = result.numbers()
+    for name, values in result.series().items():
+        known = values[np.isfinite(values)]
+        if result.declaration(name).summary and known.size:
+            yield name, (float(known[-1]), None, result.declaration(name).unit)
+    for name, value in numbers.items():
+        if not is_deviation(name):
+            yield name, (value, numbers.get(f"{name}{SIGMA}"), result.declaration(name).unit)
+
+
+def _range(values: NDArray[Any], scale: float = 1.0) -> tuple[float, float] | None:
     """Return the lowest and the highest finite value, if there is any."""
     finite = values[np.isfinite(values)]
-    return (float(finite.min()), float(finite.max())) if finite.size else None
+    return (scale * float(finite.min()), scale * float(finite.max())) if finite.size else None

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.resample import SamplePoints
 from mirrorskin.io import InputError, Lens, Result, pixel_axes
-from mirrorskin.io.result import map_shape, with_fields
+from mirrorskin.io.maps import Map
+from mirrorskin.io.result import map_shape
 from mirrorskin.io.selection import source_region
 from mirrorskin.io.types import UNDISTORTED
 
@@ -61,31 +64,29 @@ def _rays(lens: Lens, points: Doubles) -> Doubles:
 
 Maps = dict[str, NDArray[Any]]
 
-_NOTHING = {"status": 0, "edges": 0, "filled": 0, "contact": 0, "component": -1}
-_BOUNDS = ("slope_min", "slope_max")  # of a few values: nothing lies between two
-_OF_PIECES = ("height", "height_sigma")
 _BAND = 1 << 14  # pixels that are worked on at once
 
 
 def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None) -> Result:
-    """Bring the maps of a result from the camera's pixels to even ones on the sheet.
+    """Resample the maps of a result from the camera's pixels to equal pixels on the sheet.
 
-    Numbers are interpolated between the four pixels around. A pixel has no answer where the nearest one has
-    none; otherwise those without one do not count, nor do, of heights, those of another component, and of
-    everything else, those that differ in contact: nothing creeps over a border. Flags, states and components
-    are those of the nearest pixel. What the camera did not see is NaN, 0, and in no component. Where a place
-    is a pixel's own to a millionth, its value is taken as it is.
+    Each map is sampled as its declaration says; see `mirrorskin.io.Map`. Numbers are interpolated between
+    four pixels. A pixel has no answer where the nearest one has none. Of the other three, those are left out
+    that have no answer or another label: heights are not interpolated between components, nor other maps
+    across the border of contact. Integers, such as codes and components, are those of the nearest pixel.
+    Pixels that the camera did not see are undefined. Where a position is that of a pixel to a millionth, its
+    value is copied.
 
-    Vectors are made unit again. They are not turned: a normal came from brightness, in the directions of
-    the sensor's light, and not from where it lies in the picture; it is only shown elsewhere. The axes of the
-    map run as those of the picture do at its centre. Zenith and azimuth are those of the vectors; without
-    vectors, azimuths are interpolated the short way round.
+    Directions are normalised after interpolation. They are not rotated: a normal is estimated from
+    brightness, in the directions of the sensor's light, and does not depend on its position in the picture.
+    The axes of the map are parallel to those of the picture at its centre. Zenith and azimuth are computed
+    from the normals; without normals, azimuths are interpolated the short way round.
 
-    Standard deviations are interpolated as numbers are: right where neighbours are wrong in common, and too
-    much, never too little, where they are not.
+    Standard deviations are interpolated as numbers are: this is correct if neighbours have a common error,
+    and too large, never too small, if their errors are independent.
 
-    Heights that were integrated from normals in the camera's pixels took these to be of one size. Where that
-    is too wrong, undistort the normals alone, and integrate them on the sheet.
+    Heights that were integrated from normals in the camera's pixels assumed pixels of equal size. If that is
+    too inaccurate, undistort the normals alone, and integrate them on the sheet.
 
     Parameters
     ----------
@@ -107,7 +108,8 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
     if not maps:
         raise InputError("there are no maps to undistort: reconstruct first")
     *turns, rows, columns = map_shape(result)
-    if "displacement" in maps and maps["displacement"].ndim == 4:
+    declared = {name: result.declaration(name) for name in maps}
+    if any(maps[name].ndim > len(turns) + 2 + bool(one.components) for name, one in declared.items()):
         raise InputError("displacements of each frame cannot be undistorted: leave per_frame out")
     region = source_region(result.process)
     row, column = (region.origin if region else (0, 0)) if origin is None else origin
@@ -125,41 +127,48 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
         points = SamplePoints.at(seen[0].ravel() - column, seen[1].ravel() - row, (rows, columns))
         turn: Any
         for turn in range(turns[0]) if turns else [...]:
-            found = _resampled({name: values[turn] for name, values in maps.items()}, points)
+            found = _resampled({name: values[turn] for name, values in maps.items()}, declared, points)
             for name, values in found.items():
                 room = made[name][turn][band]
                 room[...] = values.reshape(room.shape)
-    changed: dict[str, Any] = {**made, "x": x, "y": y, "process": {**result.process, UNDISTORTED: True}}
-    return with_fields(result, changed)
+    return result.assign(made, x=x, y=y, process={**result.process, UNDISTORTED: True})
 
 
-def _resampled(maps: Maps, points: SamplePoints) -> Maps:
-    """Return all maps of one picture at some places, (n,) or (n, 3)."""
-    touched, pieces = (
-        points.same_label(maps[name]) if name in maps else None for name in ("contact", "component")
-    )
-    made: Maps = {}
-    for name, values in maps.items():
-        if name in _BOUNDS:
-            made[name] = points.nearest_values(values, np.nan)
-        elif name in _NOTHING:
-            made[name] = points.nearest_values(values, _NOTHING[name])
-        elif name == "normals":
-            made[name] = points.interpolate_vectors(values, touched)
-        elif name in ("displacement", "traction"):
-            parts = (points.interpolate(values[..., part], touched) for part in range(2))
-            made[name] = np.stack(list(parts), axis=-1)
-        elif name == "azimuth":
-            if "normals" not in maps:
-                made[name] = points.interpolate_angles(values, touched)
-        elif name != "zenith" or "normals" not in maps:
-            made[name] = points.interpolate(values, pieces if name in _OF_PIECES else touched)
-    return made | _directions(maps, made["normals"], points) if "normals" in maps else made
+def _resampled(maps: Maps, declared: Mapping[str, Map], points: SamplePoints) -> Maps:
+    """Return all maps of one picture at some places, (n,) or (n, components)."""
+    labels = {one.within for one in declared.values() if one.within in maps}
+    same = {name: points.same_label(maps[name]) for name in labels}
+    resampled = {name: _sample(values, declared[name], same, points) for name, values in maps.items()}
+    return resampled | _directions(maps, resampled, points)
 
 
-def _directions(maps: Maps, normals: NDArray[np.float32], points: SamplePoints) -> Maps:
-    """Return those maps of zenith and azimuth that there were, of vectors; a pixel's own are kept."""
-    x, y, z = normals.T
+def _sample(
+    values: NDArray[Any], declared: Map, same: Mapping[str, NDArray[np.bool_]], points: SamplePoints
+) -> NDArray[Any]:
+    """Return one map at some places, by its declaration; ``same`` are the neighbours with equal labels."""
+    count = same.get(declared.within)
+    if values.dtype.kind != "f" or declared.sampling == "nearest":
+        outside = declared.undefined_value if values.dtype.kind == "f" else int(declared.undefined or 0)
+        return points.nearest_values(values, outside)
+    if declared.undefined is not None:  # interpolation skips NaN
+        known = np.where(values == declared.undefined, values.dtype.type(np.nan), values)
+        sampled = _sample(known, msgspec.structs.replace(declared, undefined=None), same, points)
+        return np.where(np.isnan(sampled), values.dtype.type(declared.undefined), sampled)
+    if declared.sampling == "direction":
+        return points.interpolate_vectors(values, count)
+    if declared.components:
+        parts = [points.interpolate(part, count) for part in np.moveaxis(values, -1, 0)]
+        return np.stack(parts, axis=-1)
+    if declared.sampling == "angle":
+        return points.interpolate_angles(values, count)
+    return points.interpolate(values, count)
+
+
+def _directions(maps: Maps, resampled: Maps, points: SamplePoints) -> Maps:
+    """Return zenith and azimuth, if there are any, of the resampled normals; a pixel's own are kept."""
+    if "normals" not in maps:
+        return {}
+    x, y, z = resampled["normals"].T
     across = np.hypot(x, y)
     level = np.where(across == 0, np.float32(np.nan), np.float32(0))
     angles = {"zenith": np.arctan2(across, z), "azimuth": np.arctan2(y, x) + level}

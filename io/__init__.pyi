@@ -14,12 +14,14 @@ from .calibration.types import (
 from .description import describe
 from .export import export_result, save_table
 from .frames import open_frames
+from .maps import Map
 from .mcap import save_messages
 from .mesh import Mesh, surface_mesh
 from .positions import Steps
 from .recorder import Recorder
 from .recording import Recording, open_heights, open_recording
-from .result import open_result, save_result, select_turn
+from .result import Result, select_turn
+from .result_file import open_result, save_result
 from .selection import Region
 from .streaming import StreamRecorder
 from .types import (
@@ -28,7 +30,6 @@ from .types import (
     InputError,
     LiveSource,
     Motion,
-    Result,
     Source,
     Truth,
     pixel_axes,
@@ -45,6 +46,7 @@ __all__ = [
     "InputError",
     "Lens",
     "LiveSource",
+    "Map",
     "Mesh",
     "Motion",
     "Precession",

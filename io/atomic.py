@@ -341,7 +341,7 @@ def write_new(path: Path, parts: Sequence[bytes], replaces: Replaces = "derived"
 class Item(NamedTuple):
     """Something to write: its full name; the values of a dataset, None of a group; its attributes.
 
-    A dataset's attributes are texts. Text instead of values is where a soft link leads.
+    Text instead of values is where a soft link leads.
     """
 
     name: str
@@ -365,8 +365,13 @@ def write_item(root: h5py.Group, item: Item) -> int | None:
     node = h5py.h5d.create(root.id, item.name.encode(), kind, space, _UNDATED, _WITH_GROUPS)
     if values.size:
         node.write(h5py.h5s.ALL, h5py.h5s.ALL, values, kind)
-    for name, text in item.attributes.items():
-        h5py.h5a.create(node, name.encode(), _STORED_TEXT, _ONE).write(np.array(text, _TEXT))
+    for name, attribute in item.attributes.items():
+        if isinstance(attribute, str):
+            h5py.h5a.create(node, name.encode(), _STORED_TEXT, _ONE).write(np.array(attribute, _TEXT))
+        else:
+            stored = np.asarray(attribute)
+            kind, space = h5py.h5t.py_create(stored.dtype, logical=True), h5py.h5s.create_simple(stored.shape)
+            h5py.h5a.create(node, name.encode(), kind, space).write(stored)
     place: int | None = node.get_offset()
     return place
 

@@ -11,11 +11,11 @@ from mirrorskin.io.arrays import NUMPY_SUFFIXES, list_arrays
 from mirrorskin.io.calibration.file import MARK as CALIBRATION_MARK
 from mirrorskin.io.calibration.file import open_calibration, words_of
 from mirrorskin.io.calibration.types import GROUPS, Calibration
-from mirrorskin.io.layout import MARK, TRUTH_UNITS
+from mirrorskin.io.layout import MARK, TRUTH_MAPS
 from mirrorskin.io.recording import Recording, open_recording
-from mirrorskin.io.result import MARK as RESULT_MARK
-from mirrorskin.io.result import open_result
-from mirrorskin.io.types import Result
+from mirrorskin.io.result import Result
+from mirrorskin.io.result_file import MARK as RESULT_MARK
+from mirrorskin.io.result_file import open_result
 from mirrorskin.io.url import is_zarr, path_of
 from mirrorskin.io.zarr import open_file
 
@@ -94,7 +94,7 @@ def _recording(recording: Recording) -> dict[str, str]:
     for name in ("dark", "bright"):
         facts[f"{name} reference"] = _counts(getattr(header, name), "counts")
     truth = recording.truth
-    known = [] if truth is None else [name for name in TRUTH_UNITS if getattr(truth, name) is not None]
+    known = [] if truth is None else [name for name in TRUTH_MAPS if getattr(truth, name) is not None]
     facts["truth"] = ", ".join(known) or "none"
     return facts
 
@@ -117,9 +117,12 @@ def _range(name: str, values: NDArray[np.float64] | None, unit: str) -> dict[str
 
 
 def _result(result: Result) -> dict[str, str]:
-    maps = {f"map {name}": f"{' x '.join(map(str, m.shape))} {m.dtype}" for name, m in result.maps().items()}
-    facts = {"kind": "result", **maps}
-    facts |= {name: f"{value:.4g} N" for name, value in result.numbers().items()}
+    facts = {"kind": "result"}
+    for name, values in result.maps().items():
+        unit = result.declaration(name).unit
+        facts[f"map {name}"] = f"{' x '.join(map(str, values.shape))} {values.dtype} {unit}".rstrip()
+    for name, value in result.numbers().items():
+        facts[name] = f"{value:.4g} {result.declaration(name).unit}".rstrip()
     if result.filled is not None:
         facts["filled"] = f"{np.count_nonzero(result.filled)} pixels"
     if result.offset_unknown is not None:

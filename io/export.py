@@ -18,9 +18,10 @@ from mirrorskin.io.arguments import checked
 from mirrorskin.io.atomic import write_new
 from mirrorskin.io.frames import MCAP_SUFFIX
 from mirrorskin.io.mesh import Mesh, face_vectors, normals_around, surface_mesh
-from mirrorskin.io.result import save_result, unit_of
+from mirrorskin.io.result import Result
+from mirrorskin.io.result_file import save_result
 from mirrorskin.io.text import one_line
-from mirrorskin.io.types import Floats, InputError, Result
+from mirrorskin.io.types import Floats, InputError
 from mirrorskin.io.url import ZARR_SUFFIX, path_of
 
 _SECTION, _ARRAYS = ".csv", ".npz"
@@ -271,15 +272,19 @@ def _encode_tiff(result: Result) -> _Encoded:
 
 
 def _encode_npz(result: Result) -> _Encoded:
-    """Encode the maps, where the pixels are, and as JSON their units and how they came about.
+    """Encode the maps, the positions of the pixels, and as JSON units, legends and process.
 
     Nothing in it needs ``allow_pickle``.
     """
-    arrays: dict[str, Any] = {**result.maps(), **result.series()}
-    more = {"x": result.x, "y": result.y, "offset_unknown": result.offset_unknown}
-    arrays |= {name: values for name, values in more.items() if values is not None}
-    units = {name: unit for name in arrays if (unit := unit_of(name, result.process)) is not None}
-    arrays |= {"units": json.dumps(units), "process": json.dumps(dict(result.process))}
+    axes = {name: values for name, values in (("x", result.x), ("y", result.y)) if values is not None}
+    arrays: dict[str, Any] = {**result, **axes}
+    declared = {name: result.declaration(name) for name in result}
+    texts = {
+        "units": {name: one.unit for name, one in declared.items() if one.unit} | dict.fromkeys(axes, "mm"),
+        "legends": {name: one.codes for name, one in declared.items() if one.codes},
+        "process": dict(result.process),
+    }
+    arrays |= {name: json.dumps(text) for name, text in texts.items()}
     file = BytesIO()
     np.savez(file, **arrays)
     return _Encoded([file.getvalue()], ", ".join(result.maps()))

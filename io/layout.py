@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io.atomic import is_locked
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
+from mirrorskin.io.maps import TWIST, declaration_of
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.positions import check_finite
 from mirrorskin.io.selection import Selection
@@ -20,17 +21,9 @@ from mirrorskin.io.types import MOTIONS, Floats, Header, InputError, Motion, Tru
 MARK = "mirrorskin_recording"
 STACK = "/entry/instrument/detector/data"
 DETECTOR, STAGE, TRUTH = "/entry/instrument/detector", "/entry/instrument/stage", "/entry/truth"
-# What a simulation's truth holds, and its units.
-TRUTH_UNITS: dict[str, str | None] = {
-    "height": "mm",
-    "zenith": "rad",
-    "azimuth": "rad",
-    "contact": None,
-    "slip": None,
-    "force": "N",
-    "displacement": "mm",
-    "slip_onset": None,
-}
+TRUTH_MAPS = tuple(field.name for field in fields(Truth))
+"""What the truth of a simulation contains."""
+
 # What is known of each frame: where that is written, and in what unit.
 SERIES = {
     "time": (f"{DETECTOR}/frame_time", "s"),
@@ -181,7 +174,7 @@ class Layout:
 
     def truth(self) -> Truth | None:
         """Read what a simulation knew, if it was one."""
-        found = {name: self._find(f"{TRUTH}/{name}") for name in TRUTH_UNITS}
+        found = {name: self._find(f"{TRUTH}/{name}") for name in TRUTH_MAPS}
         present = {name: node for name, node in found.items() if node is not None}
         if not present:
             return None
@@ -192,7 +185,7 @@ class Layout:
 
     def _known(self, name: str, node: Node) -> NDArray[Any]:
         """Read one part of the truth: a series of frames, or a map."""
-        unit = TRUTH_UNITS[name]
+        unit = None if name in TWIST else declaration_of(name).unit or None  # that of a twist differs
         if name == "force":
             forces = self._file.read(node, (self._count, 3), unit=unit)
             return forces[slice(*self._part.frames)].astype(np.float64, copy=False)

@@ -23,8 +23,9 @@ from mirrorskin.io.os_errors import MAX_UNPACKED_BYTES, as_input_error, check_un
 from mirrorskin.io.pictures import decode_grey, quiet_opencv
 from mirrorskin.io.positions import Positions
 from mirrorskin.io.recording import Recording
+from mirrorskin.io.result import Result
 from mirrorskin.io.text import one_line
-from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, Result
+from mirrorskin.io.types import Block, Closing, Floats, Header, InputError
 
 if TYPE_CHECKING:
     from mcap.records import Chunk, ChunkIndex, Message

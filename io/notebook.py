@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.result import UNITS, map_shape, unit_of
-from mirrorskin.io.types import InputError, Result, Shown
+from mirrorskin.io.maps import Map
+from mirrorskin.io.result import Result, Shown, map_shape, may_name_a_map
+from mirrorskin.io.types import InputError
 
 if TYPE_CHECKING:
     import xarray
@@ -78,46 +79,71 @@ def plot(result: Shown, name: str | None, axes: Axes | None) -> Axes:
     return axes
 
 
+_DECLARATION = "declaration"  # attribute of a variable whose declaration is not in the table
+
+
 def as_xarray(result: Result) -> xarray.Dataset:
     """Return the maps as an `xarray.Dataset`; see `Result.to_xarray`."""
     import xarray
 
-    maps = result.maps()
-    lead = ("turn",) if len(map_shape(result)) == 3 else ()
-    dimensions = dict.fromkeys(maps, (*lead, "y", "x")) | dict.fromkeys(result.series(), ("frame",))
-    dimensions["normals"] = (*lead, "y", "x", "vector")
-    each = ("frame",) if "displacement" in maps and maps["displacement"].ndim == 4 else ()
-    dimensions["displacement"] = (*each, "y", "x", "direction")
-    dimensions["traction"] = ("y", "x", "direction")
-    data: dict[str, Any] = {
-        name: (dimensions[name], values, {} if unit is None else {"units": unit})
-        for name, values in {**maps, **result.series()}.items()
-        for unit in [unit_of(name, result.process)]
-    }
-    data |= {name: ((), value, {"units": UNITS[name]}) for name, value in result.numbers().items()}
-    if result.offset_unknown is not None:
-        data["offset_unknown"] = ("components", result.offset_unknown)
+    data: dict[str, Any] = {}
     coordinates: dict[str, Any] = {
         name: (name, values, {"units": "mm"})
         for name, values in (("x", result.x), ("y", result.y))
         if values is not None
     }
-    if "normals" in maps:
-        coordinates["vector"] = ["x", "y", "z"]
-    if "displacement" in maps:
-        coordinates["direction"] = ["x", "y"]
+    lead = ("turn",) if len(map_shape(result)) == 3 else ()
+    for name, values in result.items():
+        declared = result.declaration(name)
+        dimensions, components = _dimensions(declared, np.ndim(values), lead)
+        attributes = declared.attributes()
+        if name in result.declarations:
+            attributes[_DECLARATION] = declared.encode()
+        data[name] = (dimensions, values, attributes)
+        coordinates |= components
     return xarray.Dataset(data, coordinates, attrs=dict(result.process))
+
+
+def _dimensions(
+    declared: Map, count: int, lead: tuple[str, ...]
+) -> tuple[tuple[str, ...], dict[str, list[str]]]:
+    """Return the dimensions of a variable, and the coordinate that names the components of a vector."""
+    if declared.axes != "pixels":
+        return {"frames": ("frame",), "pieces": ("components",), "none": ()}[declared.axes], {}
+    if not declared.components:
+        return (*lead, "y", "x"), {}
+    name = {("x", "y", "z"): "vector", ("x", "y"): "direction"}.get(declared.components)
+    name = name or "_".join(declared.components)
+    frames = ("frame",) if count - len(lead) == 4 else ()
+    return (*frames, *lead, "y", "x", name), {name: [*declared.components]}
+
+
+def from_xarray(dataset: xarray.Dataset) -> Result:
+    """Return the result that `as_xarray` converted; see `Result.from_xarray`."""
+    maps: dict[str, Any] = {}
+    declarations: dict[str, Map] = {}
+    for name, variable in dataset.data_vars.items():
+        if not may_name_a_map(str(name)):
+            raise InputError(f"the dataset's variable {name!r} cannot name a map. Rename it")
+        values = variable.to_numpy()
+        maps[str(name)] = values if values.ndim else values.item()
+        if _DECLARATION in variable.attrs:
+            text = str(variable.attrs[_DECLARATION])
+            declarations[str(name)] = Map.decode(text, f"variable {name} of the dataset")
+    x, y = (dataset[name].to_numpy() if name in dataset.variables else None for name in "xy")
+    process = {str(name): one for name, one in dataset.attrs.items()}
+    return Result(maps, x=x, y=y, process=process, declarations=declarations)
 
 
 def _first(result: Shown) -> str | None:
     """Return the map that shows most."""
     pictures = [name for name, values in result.maps().items() if values.ndim == 2 or values.shape[-1] > 3]
-    best = ("height", "zenith", "modulation", "slip_onset")
-    return next((name for name in (*best, *pictures) if name in pictures), None)
+    summarised = [name for name in pictures if result.declaration(name).summary]
+    return next(iter([*summarised, *pictures]), None)
 
 
 def _unit(name: str, result: Shown) -> str:
-    return unit_of(name, getattr(result, "process", {})) or ""
+    return result.declaration(name).unit
 
 
 def _rows(result: Shown) -> list[tuple[str, str, str]]:
@@ -125,12 +151,14 @@ def _rows(result: Shown) -> list[tuple[str, str, str]]:
     rows = []
     for name, values in result.maps().items():
         shape = " x ".join(map(str, values.shape))
-        known = values[np.isfinite(values)] if values.dtype.kind == "f" else values.ravel()
+        declared = result.declaration(name)
+        known = values.ravel() if declared.codes else values[declared.has_answer(values)]
         span = f"{known.min():.4g} to {known.max():.4g}" if known.size else "nothing known"
         share = f", {known.size / values.size:.0%} known" if 0 < known.size < values.size else ""
-        unit = f" {_unit(name, result)}".rstrip() if known.size else ""
+        unit = f" {declared.unit}".rstrip() if known.size else ""
         rows.append((name, shape, f"{span}{unit}{share}"))
-    return rows + [(name, "", f"{value:.4g} {UNITS[name]}") for name, value in result.numbers().items()]
+    numbers = result.numbers().items()
+    return rows + [(name, "", f"{value:.4g} {_unit(name, result)}".rstrip()) for name, value in numbers]
 
 
 def _origin(result: Shown) -> str:
@@ -153,6 +181,6 @@ def _picture(name: str, values: NDArray[Any], unit: str) -> str:
     colours = cv2.applyColorMap((255 * grey).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
     picture = np.dstack([colours, 255 * known.astype(np.uint8)])
     data = base64.b64encode(cv2.imencode(".png", picture)[1].tobytes()).decode()
-    caption = f"{name}, {low:.4g} to {high:.4g} {unit}".rstrip()
+    caption = escape(f"{name}, {low:.4g} to {high:.4g} {unit}".rstrip())
     image = f"<img alt='{caption}' src='data:image/png;base64,{data}'>"
     return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"

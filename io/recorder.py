@@ -18,7 +18,8 @@ from mirrorskin.io.atomic import fixed_text, new_hdf5
 from mirrorskin.io.calibration.file import CARRIED, write_calibration
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.existing import Replaces
-from mirrorskin.io.layout import CHECKSUM, MARK, POSITIONS, SERIES, STACK, TRUTH, TRUTH_UNITS
+from mirrorskin.io.layout import CHECKSUM, MARK, POSITIONS, SERIES, STACK, TRUTH, TRUTH_MAPS
+from mirrorskin.io.maps import TWIST, declaration_of
 from mirrorskin.io.types import Block, Floats, Header, InputError, Motion, Source, Truth
 
 Compression = Literal["raw", "bitshuffle", "blosc", "gzip", "lzf"]
@@ -262,6 +263,6 @@ class Recorder(TeeSource[Source]):
 
 def _write_truth(file: h5py.File, truth: Truth, motion: Motion) -> None:
     group = new_group(file["entry"], TRUTH, "NXdata", signal="height")
-    _, travelled = SERIES[POSITIONS[motion]]
-    for name, unit in (TRUTH_UNITS | {"slip_onset": travelled}).items():
-        put(group, name, unit, getattr(truth, name))
+    for name in TRUTH_MAPS:
+        declared = declaration_of(name, TWIST if motion == "twist" else {})
+        put(group, name, declared.unit or None, getattr(truth, name))

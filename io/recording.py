@@ -21,8 +21,9 @@ from mirrorskin.io.layout import CHECKSUM, MARK, SERIES, STACK, Layout, Recordin
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.positions import Positions, along
 from mirrorskin.io.recorder import checksums
-from mirrorskin.io.result import MARK as RESULT_MARK
-from mirrorskin.io.result import open_result
+from mirrorskin.io.result import Result
+from mirrorskin.io.result_file import MARK as RESULT_MARK
+from mirrorskin.io.result_file import open_result
 from mirrorskin.io.selection import Region, Selection, source_region
 from mirrorskin.io.stack import Stack
 from mirrorskin.io.types import (
@@ -34,7 +35,6 @@ from mirrorskin.io.types import (
     Header,
     InputError,
     Motion,
-    Result,
     Truth,
     block_memory,
 )
@@ -468,7 +468,8 @@ def _cut_heights(
 
 def _absolute(result: Result) -> NDArray[np.float32] | None:
     """Return the heights of a result without the pieces whose offset nobody knows."""
-    height, piece, unknown = result.height, result.component, result.offset_unknown
+    height: NDArray[np.float32] | None = result.height
+    piece, unknown = result.component, result.offset_unknown
     if height is None or piece is None or unknown is None or not unknown.any():
         return height
     return np.where((piece >= 0) & (unknown[piece] == 0), height, np.float32(np.nan))

@@ -1,328 +1,392 @@
-"""Result files: the maps of a reconstruction, how they came about, and one turn of many."""
+"""The result of a reconstruction: maps by name, with the declarations of what they mean."""
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import fields, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io.arguments import checked
-from mirrorskin.io.atomic import Item, fixed_text, process_items, write_file
-from mirrorskin.io.calibration.file import CARRIED, calibration_items, carried_by
-from mirrorskin.io.hdf5 import Hdf5File, Node, Shape, read_process
-from mirrorskin.io.types import NO_MAPS, SCALARS, SERIES, InputError, ProcessValue, Result
-from mirrorskin.io.url import is_zarr, path_of
-from mirrorskin.io.zarr import open_file
-
-MARK = "mirrorskin_result"
-UNITS = (
-    dict.fromkeys(("height", "height_sigma", "hysteresis", "hysteresis_sigma"), "mm")
-    | dict.fromkeys(("zenith", "azimuth", "normal_sigma", "slope_min", "slope_max"), "rad")
-    | {"pressure": "MPa", "traction": "MPa", "growth": "1/mm", "growth_sigma": "1/mm"}
-    | dict.fromkeys(("displacement", "displacement_sigma"), "mm")
-    | dict.fromkeys(SCALARS, "N")
-    | dict.fromkeys(("x", "y"), "mm")
-    | dict.fromkeys(("mean", "cosine", "sine", "modulation", "residual"), "counts")
+from mirrorskin.io.maps import (
+    SIGMA,
+    UNDECLARED,
+    Map,
+    check_declarations,
+    declaration_of,
+    is_builtin,
+    is_deviation,
+    place_of,
 )
-_DTYPES = (
-    dict.fromkeys(("status", "edges", "filled", "contact", "offset_unknown"), np.uint8)
-    | {"component": np.int32, "strokes": np.uint16}
-    | dict.fromkeys(("x", "y", *SERIES), np.float64)
+from mirrorskin.io.types import Floats, InputError, ProcessValue
+
+if TYPE_CHECKING:
+    import xarray
+    from matplotlib.axes import Axes
+
+    from mirrorskin.io.calibration.types import Calibration
+
+FIELDS = ("x", "y", "process", "calibration", "declarations")
+"""What a result has besides maps."""
+
+RESERVED = frozenset(
+    {*FIELDS, "own_maps", "turn", "height_errors", "units", "legends", "file", "allow_pickle"}
 )
-_MAPS = [field.name for field in fields(Result) if field.name not in NO_MAPS]
-_TAKEN = {*NO_MAPS, "turn", "height_errors", "units", "file", "allow_pickle"}  # in files, or to write them
-_VECTORS = {"normals": 3, "displacement": 2, "traction": 2}  # and how many components they have
-_MOVED, _OFFSETS, _OWN = "displacement", "offset_unknown", "own_maps"
-_ALONG_THE_WAY = ("slip_onset", "slip_onset_sigma", "way")
-_RESULT, _PROCESS = "/entry/result", "/entry/process"
-_AGAIN = "reconstruct it again"
+"""Names that no map can have: files use them for other purposes."""
 
 
-def unit_of(name: str, process: Mapping[str, ProcessValue]) -> str | None:
-    """Return the unit of a map, a number or a series of a result; the way of a twist is an angle."""
-    if name in _ALONG_THE_WAY:
-        return "rad" if process.get("motion") == "twist" else "mm"
-    return UNITS.get(name)
+class Shown:
+    """Maps that display themselves: as text, in a notebook, and as figures."""
+
+    __slots__ = ()
+
+    def maps(self) -> dict[str, NDArray[Any]]:
+        """Return the maps that there are, by name."""
+        values = {one.name: getattr(self, one.name) for one in fields(self)}  # type: ignore[arg-type]
+        return {name: one for name, one in values.items() if isinstance(one, np.ndarray) and one.ndim > 1}
+
+    def numbers(self) -> dict[str, float]:
+        """Return the single numbers that there are, by name."""
+        return {}
+
+    def declaration(self, name: str) -> Map:
+        """Return the declaration of a map: its unit, meaning, legend and more."""
+        return declaration_of(name)
+
+    def plot(self, name: str | None = None, axes: Axes | None = None) -> Axes:
+        """Draw a map with its scale, in millimetres if the pixel size is known.
+
+        Parameters
+        ----------
+        name : str, optional
+            Name of the map; by default the height, or the first other map.
+        axes : matplotlib.axes.Axes, optional
+            Where to draw; by default in a new figure.
+
+        Raises
+        ------
+        InputError
+            There is no such map, or it is not a picture: it has vectors, or several turns.
+        ImportError
+            Matplotlib is not installed: ``pip install 'mirrorskin[view]'``.
+
+        Examples
+        --------
+        >>> result = Result(height=np.zeros((2, 3), np.float32), x=np.arange(3.0), y=np.arange(2.0))
+        >>> result.plot("height").get_xlabel()
+        'x [mm]'
+        """
+        from mirrorskin.io.notebook import plot
+
+        return plot(self, name, axes)
+
+    def __repr__(self) -> str:
+        from mirrorskin.io.notebook import as_text
+
+        return as_text(self)
+
+    def _repr_html_(self) -> str:
+        from mirrorskin.io.notebook import as_html
+
+        return as_html(self)
+
+
+class Result(Shown, Mapping[str, Any]):
+    """The maps of a reconstruction: a read-only mapping from names to arrays, with attribute access.
+
+    The table in `mirrorskin.io.maps` declares the maps of built-in operations: ``result.height`` is an array,
+    or None if that map was not computed. A map that a user's own operation declares with the quantity
+    ``"height"`` is ``result.height``, too. The standard deviation of a map ``x`` is ``x_sigma``.
+
+    If a rotation is evaluated turn by turn, all maps have a leading axis, (turns, H, W), and components are
+    numbered through all turns.
+
+    Parameters
+    ----------
+    maps : mapping of str to ndarray or float, optional
+        Maps, series (T,) and numbers by name; those that are None are left out.
+    x, y : ndarray, (W,) and (H,), float64, optional
+        Millimetres of the pixel centres from the picture's centre; y points up the picture.
+    process : mapping, optional
+        Program, version, date, every parameter, device, source and its hash.
+    calibration : Calibration, optional
+        The calibration that was used, of the camera's whole picture.
+    declarations : mapping of str to Map, optional
+        Declarations of maps that are not in the table, and of those whose legend or texts differ from it.
+    **named
+        Maps by name, too. A map whose name is that of a method is only accessible as ``result[name]``.
+
+    Raises
+    ------
+    InputError
+        A declaration gives a built-in map another unit, or two maps are declared to be the same quantity.
+    AttributeError
+        An attribute is neither a map of this result nor one of the table.
+
+    Examples
+    --------
+    >>> result = Result(height=np.zeros((2, 3), np.float32))
+    >>> result.height.shape, result.normals is None, list(result)
+    ((2, 3), True, ['height'])
+    >>> wear = Result(wear=np.ones((2, 3)), declarations={"wear": Map("wear", "mm", quantity="height")})
+    >>> wear.height is wear["wear"], wear.declaration("wear").unit
+    (True, 'mm')
+    """
+
+    __slots__ = ("_maps", "calibration", "declarations", "process", "x", "y")
+
+    x: Floats | None
+    y: Floats | None
+    process: Mapping[str, ProcessValue]
+    calibration: Calibration | None
+    declarations: Mapping[str, Map]
+
+    def __init__(
+        self,
+        maps: Mapping[str, Any] | None = None,
+        /,
+        *,
+        x: Floats | None = None,
+        y: Floats | None = None,
+        process: Mapping[str, ProcessValue] | None = None,
+        calibration: Calibration | None = None,
+        declarations: Mapping[str, Map] | None = None,
+        **named: Any,
+    ) -> None:
+        values = {**(maps or {}), **named}
+        kept = {name: values[name] for name in sorted(values, key=place_of) if values[name] is not None}
+        known = {name: one for name, one in (declarations or {}).items() if name in kept}
+        check_declarations(known)
+        for name, value in {
+            "_maps": kept,
+            "x": x,
+            "y": y,
+            "process": process or {},
+            "calibration": calibration,
+            "declarations": known,
+        }.items():
+            object.__setattr__(self, name, value)
+
+    def __getitem__(self, name: str) -> Any:
+        return self._maps[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._maps)
+
+    def __len__(self) -> int:
+        return len(self._maps)
+
+    def __getattr__(self, name: str) -> Any:
+        if name in Result.__slots__:  # of an object whose construction failed
+            raise AttributeError(name)
+        own = self.name_of(name)
+        if own is not None:
+            return self._maps[own]
+        if is_builtin(name):
+            return None
+        has = ", ".join(self._maps) or "no maps"
+        raise AttributeError(f"the result has no map {name!r}: it has {has}")
+
+    def __setattr__(self, name: str, value: object) -> NoReturn:
+        raise AttributeError(f"results are read-only: use result.assign({name}=...)")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restore, (self._maps, {name: getattr(self, name) for name in FIELDS})
+
+    __eq__ = object.__eq__
+    __hash__ = object.__hash__
+
+    def name_of(self, quantity: str) -> str | None:
+        """Return the name of the map of a quantity: of that name, or declared to stand for it.
+
+        Examples
+        --------
+        >>> maps = {"wear": np.ones((2, 3)), "wear_sigma": np.ones((2, 3))}
+        >>> worn = Result(maps, declarations={"wear": Map("wear", "mm", quantity="height")})
+        >>> worn.name_of("height_sigma")
+        'wear_sigma'
+        """
+        name = self._own_name(quantity)
+        return name if name in self._maps else None
+
+    def _own_name(self, quantity: str) -> str:
+        """Return the name that a quantity has in this result, if it has the quantity."""
+        if quantity in self._maps:
+            return quantity
+        base = quantity.removesuffix(SIGMA) if is_deviation(quantity) else quantity
+        own = (name for name, one in self.declarations.items() if one.quantity == base)
+        return next(own, base) + quantity.removeprefix(base)
+
+    def declaration(self, name: str) -> Map:
+        """Return the declaration of a map: its unit, meaning, legend and more."""
+        return declaration_of(name, self.declarations)
+
+    def assign(self, maps: Mapping[str, Any] | None = None, /, **changes: Any) -> Result:
+        """Return a copy of the result in which maps or fields are replaced; a map that is None is removed.
+
+        Parameters
+        ----------
+        maps : mapping of str to ndarray or float, optional
+        **changes
+            Maps by name or quantity; ``x``, ``y``, ``process``, ``calibration`` and ``declarations``.
+            Declarations are added to those of the result.
+
+        Examples
+        --------
+        >>> flat = Result(height=np.zeros((2, 3), np.float32), process={"source": "a"})
+        >>> list(flat.assign(height=None, slope=np.zeros((2, 3))))
+        ['slope']
+        """
+        values = {**(maps or {}), **changes}
+        fields = {name: values.pop(name, getattr(self, name)) for name in FIELDS}
+        fields["declarations"] = {**self.declarations, **(fields["declarations"] or {})}
+        replaced = {self._own_name(name): value for name, value in values.items()}
+        return Result({**self._maps, **replaced}, **fields)
+
+    def maps(self) -> dict[str, NDArray[Any]]:
+        """Return the maps, by name: built-in ones in the order of the table, then others."""
+        return self._along("pixels")
+
+    def numbers(self) -> dict[str, float]:
+        """Return the single numbers, by name."""
+        return {name: float(value) for name, value in self._along("none").items()}
+
+    def series(self) -> dict[str, Floats]:
+        """Return what was computed for each frame, by name."""
+        return self._along("frames")
+
+    def _along(self, axes: str) -> dict[str, Any]:
+        return {name: one for name, one in self._maps.items() if self.declaration(name).axes == axes}
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return the result as an `xarray.Dataset`: coordinates ``x`` and ``y`` in mm, units as attributes.
+
+        The process becomes the dataset's attributes. It needs the package xarray:
+        ``pip install 'mirrorskin[xarray]'``.
+
+        Examples
+        --------
+        >>> result = Result(height=np.zeros((2, 3), np.float32), x=np.arange(3.0), y=np.arange(2.0))
+        >>> float(result.to_xarray().height.sel(x=1, y=0))
+        0.0
+        """
+        from mirrorskin.io.notebook import as_xarray
+
+        return as_xarray(self)
+
+    @classmethod
+    def from_xarray(cls, dataset: xarray.Dataset) -> Result:
+        """Return the result that ``to_xarray`` converted, without its calibration.
+
+        Examples
+        --------
+        >>> result = Result(height=np.zeros((2, 3), np.float32), x=np.arange(3.0), y=np.arange(2.0))
+        >>> Result.from_xarray(result.to_xarray()).height.shape
+        (2, 3)
+        """
+        from mirrorskin.io.notebook import from_xarray
+
+        return from_xarray(dataset)
+
+
+def _restore(maps: Mapping[str, Any], others: Mapping[str, Any]) -> Result:
+    return Result(maps, **others)
 
 
 def result_of(
-    maps: Mapping[str, ArrayLike], shape: tuple[int, int], process: Mapping[str, ProcessValue]
+    maps: Mapping[str, ArrayLike],
+    shape: tuple[int, int],
+    process: Mapping[str, ProcessValue],
+    declarations: Mapping[str, Map] | None = None,
 ) -> Result:
-    """Return a result of copies of maps by name; names that results do not know become ``own_maps``.
+    """Return a result of copies of maps by name, checked against their declarations.
 
     Parameters
     ----------
-    maps : mapping of array_like, (H, W), or of vectors as in `Result`
-        Those that results know get the type that they have there.
+    maps : mapping of array_like, (H, W), or of vectors, (H, W, components)
+        Built-in and declared maps get the declared type.
     shape : (int, int)
     process : mapping
+    declarations : mapping of str to Map, optional
 
     Raises
     ------
     InputError
-        A map is of another shape, holds no numbers, or has a name that cannot be.
+        A map has another shape or values that its type cannot hold, does not hold numbers, or has a name that
+        is not allowed.
 
     Examples
     --------
-    >>> result_of({"height": [[0.5, 1.0]], "total": [[7, 8]]}, (1, 2), {}).own_maps["total"].tolist()
+    >>> result_of({"height": [[0.5, 1.0]], "total": [[7, 8]]}, (1, 2), {})["total"].tolist()
     [[7, 8]]
     """
-    found: dict[str, NDArray[Any]] = {}
-    for name, given in maps.items():
-        if not _may_be_own(name):
-            taken = ", ".join(sorted(_TAKEN))
+    declarations = declarations or {}
+    if not isinstance(declarations, Mapping):
+        raise InputError(f"maps are declared as {declarations!r:.40}. Use a dictionary of names and Map(...)")
+    check_declarations(declarations)
+    for name in (*maps, *declarations):
+        if not may_name_a_map(name):
+            taken = ", ".join(sorted(RESERVED))
             raise InputError(f"a map cannot be called {name!r}: use letters, digits and _, but not {taken}")
-        values, size = np.array(given), (*shape, _VECTORS[name]) if name in _VECTORS else shape
-        if values.shape != size or values.dtype.kind not in "buif":
-            raise InputError(f"map {name} is {values.dtype} {values.shape}: numbers {size} are needed")
-        own = np.uint8 if values.dtype.kind == "b" else values.dtype
-        found[name] = values.astype(_DTYPES.get(name, np.float32) if name in _MAPS else own, copy=False)
-    return with_fields(Result(process=process), found)
+    copies = {
+        name: _checked_map(name, np.array(values), declaration_of(name, declarations), shape)
+        for name, values in maps.items()
+    }
+    return Result(copies, process=process, declarations=declarations)
 
 
-def _may_be_own(name: str) -> bool:
-    return str(name).isidentifier() and name not in _TAKEN
+def _checked_map(name: str, values: NDArray[Any], declared: Map, shape: tuple[int, int]) -> Any:
+    """Return a map in its declared type, or raise InputError if its shape or values do not fit."""
+    size = (*shape, len(declared.components)) if declared.components else shape
+    if declared.axes != "pixels":
+        size = () if declared.axes == "none" else values.shape[:1] or (1,)
+    own = values.shape[1:] if declared.per_frame and values.ndim > len(size) else values.shape
+    if values.dtype.kind not in "buif" or own != size:
+        raise InputError(f"map {name} is {values.dtype} {values.shape}: numbers {size} are needed")
+    if declared is UNDECLARED:
+        return values.astype(np.uint8) if values.dtype.kind == "b" else values
+    if declared.is_integer and values.size:
+        limits, low, high = np.iinfo(declared.dtype), values.min(), values.max()
+        if not (limits.min <= low and high <= limits.max and np.all(values == np.floor(values))):
+            raise InputError(
+                f"map {name} has values from {low:g} to {high:g}, which {declared.dtype} cannot hold. "
+                "Declare another dtype"
+            )
+    return values.astype(declared.dtype, copy=False) if values.ndim else float(values)
 
 
-def with_fields(result: Result, values: Mapping[str, Any]) -> Result:
-    """Return a result with other maps and fields; what is no field's name is a map of the user's own."""
-    known = {field.name for field in fields(Result)}
-    own = {name: one for name, one in values.items() if name not in known}
-    return replace(result, **{name: one for name, one in values.items() if name in known}, own_maps=own)
-
-
-@checked
-def save_result(result: Result, path: str | Path) -> None:
-    """Write a result; the file exists whole or not at all.
-
-    Parameters
-    ----------
-    result : Result
-    path : str or Path
-        HDF5, or ``NAME.zarr``, also at an address such as ``s3://bucket/NAME.zarr``.
-
-    Raises
-    ------
-    InputError
-        It cannot be written there.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from mirrorskin import io
-    >>> io.save_result(io.Result(height=np.zeros((2, 3), np.float32)), "flat.h5")  # doctest: +SKIP
-    """
-    target = path_of(path)
-    if not is_zarr(target):
-        write_file(target, _items(result))
-        return
-    from mirrorskin.io.zarr_export import save_zarr
-
-    with tempfile.TemporaryDirectory() as folder:
-        write_file(Path(folder, "result.h5"), _items(result))
-        save_zarr(Path(folder, "result.h5"), target)
-
-
-def _items(result: Result) -> Iterator[Item]:
-    maps = result.maps()
-    yield Item("/", None, {"NX_class": "NXroot", "default": "entry"})
-    yield Item("/entry", None, {"NX_class": "NXentry", "default": "result", MARK: 1})
-    yield Item(_RESULT, None, {"NX_class": "NXdata", **_plot(result, maps)})
-    yield Item(_PROCESS, None, {"NX_class": "NXprocess"})
-    yield from _map_items(result, maps)
-    yield from process_items(_PROCESS, result.process)
-    if result.calibration is not None:
-        yield from calibration_items(result.calibration, CARRIED)
-    if result.height_sigma is not None:
-        yield Item(f"{_RESULT}/height_errors", f"{_RESULT}/height_sigma", {})  # where viewers look for them
-
-
-def _map_items(result: Result, maps: Mapping[str, NDArray[Any]]) -> Iterator[Item]:
-    """Yield the maps and a plot's axes: the turns, and where the pixels are."""
-    for name, values in maps.items():
-        attributes = {} if name in _VECTORS else {"interpretation": "image"}
-        yield Item(f"{_RESULT}/{name}", values, attributes | _units(name, result))
-    if result.offset_unknown is not None:
-        yield Item(f"{_RESULT}/{_OFFSETS}", result.offset_unknown, {})
-    if result.own_maps:
-        yield Item(f"{_RESULT}/{_OWN}", fixed_text([*result.own_maps]), {})
-    for name, value in result.numbers().items():
-        yield Item(f"{_RESULT}/{name}", np.asarray(value, np.float64), {"units": UNITS[name]})
-    for name, series in result.series().items():
-        yield Item(f"{_RESULT}/{name}", series, _units(name, result))
-    for name, positions in _axes(result, maps).items():
-        yield Item(f"{_RESULT}/{name}", positions, _units(name, result))
-
-
-def _units(name: str, result: Result) -> dict[str, str]:
-    unit = unit_of(name, result.process)
-    return {} if unit is None else {"units": unit}
-
-
-def _axes(result: Result, maps: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    plotted = _plotted(maps)
-    axes: dict[str, NDArray[Any]] = {}
-    if plotted and maps[plotted[0]].ndim == 3:
-        axes["turn"] = np.arange(len(maps[plotted[0]]), dtype=np.int32)
-    if result.x is not None and result.y is not None:
-        axes |= {"y": result.y, "x": result.x}
-    return axes
-
-
-def _plot(result: Result, maps: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    """Return the attributes that make a viewer plot the maps unasked."""
-    plotted, axes = _plotted(maps), list(_axes(result, maps))
-    plot: dict[str, Any] = {"signal": plotted[0], "auxiliary_signals": plotted[1:]} if plotted else {}
-    if axes:
-        plot["axes"] = [*axes, *["."] * ((maps[plotted[0]].ndim if plotted else 0) - len(axes))]
-    return plot
-
-
-def _plotted(maps: Mapping[str, NDArray[Any]]) -> list[str]:
-    """Name the maps that are plotted together; NeXus has no picture of vectors."""
-    return [name for name in maps if name not in _VECTORS]
-
-
-@checked
-def open_result(path: str | Path) -> Result:
-    """Read a result.
-
-    Raises
-    ------
-    InputError
-        There is no such file, it is no result, or it is damaged.
-
-    Examples
-    --------
-    >>> open_result("press-result.h5").height.shape  # doctest: +SKIP
-    (480, 640)
-    """
-    with _opened(path_of(path)) as file:
-        maps: dict[str, Any] = {}
-        for name, (node, shape) in _find_maps(file).items():
-            values = file.read(node, shape, remedy=_AGAIN)
-            own = values.dtype if name not in (*_MAPS, "x", "y") else np.float32
-            maps[name] = values.astype(_DTYPES.get(name, own), copy=False)
-        maps |= _read_offsets(file, maps.get("component"))
-        numbers = {name: file.find(f"{_RESULT}/{name}") for name in SCALARS}
-        maps |= {
-            name: float(file.read(node, (), unit=UNITS[name], remedy=_AGAIN))
-            for name, node in numbers.items()
-            if node is not None
-        }
-        for name in SERIES:
-            if (node := file.find(f"{_RESULT}/{name}")) is not None:
-                series = (getattr(node, "shape", None) or (0,))[:1]
-                maps[name] = file.read(node, series, remedy=_AGAIN).astype(np.float64, copy=False)
-        _check_frames(path, maps)
-        for name, direction in (("x", 1), ("y", -1)):
-            if name in maps and not np.all(direction * np.diff(maps[name]) > 0):
-                raise InputError(f"{path}: {_RESULT}/{name} does not run as pixels do: {_AGAIN}")
-        carried = Result(process=read_process(file, _PROCESS), calibration=carried_by(file))
-        return with_fields(carried, maps)
-
-
-def _check_frames(path: str | Path, maps: Mapping[str, NDArray[Any]]) -> None:
-    """Refuse what is known of each frame if it is of different numbers of frames."""
-    counts = {name: len(maps[name]) for name in SERIES if name in maps}
-    if maps.get(_MOVED, np.empty(0)).ndim == 4:
-        counts[_MOVED] = len(maps[_MOVED])
-    if len(set(counts.values())) > 1:
-        found = ", ".join(f"{name} of {count}" for name, count in counts.items())
-        raise InputError(f"{path}: {_RESULT} has values of different numbers of frames ({found}): {_AGAIN}")
-
-
-def open_process(path: str | Path, *names: str) -> dict[str, ProcessValue]:
-    """Read how a result came about, or only some of that; its maps are looked for, and not read.
-
-    What is not there is missing. See ``open_result``.
-    """
-    with _opened(path_of(path)) as file:
-        for node, shape in _find_maps(file).values():
-            if getattr(node, "shape", None) != shape:
-                raise InputError(f"{file.where(node)} is not of shape {shape}: {_AGAIN}")
-        return read_process(file, _PROCESS, names or None)
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[Hdf5File]:
-    with open_file(path) as file:
-        if not file.marked(MARK):
-            raise InputError(f"{path} is no result: 'mirrorskin reconstruct' makes one from a recording")
-        file.check_layout(MARK)
-        yield file
-
-
-def _find_maps(file: Hdf5File) -> dict[str, tuple[Node, Shape]]:
-    """Find the maps and axes that are there, and the shapes of a result, or of one for each turn."""
-    group = file.find(_RESULT)
-    listed = file.find(f"{_RESULT}/{_OWN}")
-    own = () if listed is None else filter(_may_be_own, file.texts(listed, _AGAIN))
-    names = dict.fromkeys((*_MAPS, *own, "x", "y"))
-    found = {} if group is None else {name: file.walk(group, name) for name in names}
-    there = {name: node for name, node in found.items() if node is not None}
-    size = _size_of(there)
-    if size is None:
-        raise InputError(f"{file.path}: {_RESULT} holds no maps: {_AGAIN}")
-    shapes = {"x": size[-1:], "y": size[-2:-1]}
-    shapes |= {name: (*size, components) for name, components in _VECTORS.items()}
-    moved: Shape = getattr(there.get(_MOVED), "shape", None) or ()
-    if len(moved) == 4 and len(size) == 2:  # of each frame
-        shapes[_MOVED] = (moved[0], *shapes[_MOVED])
-    return {name: (node, shapes.get(name, size)) for name, node in there.items()}
-
-
-def _read_offsets(file: Hdf5File, component: NDArray[np.int32] | None) -> dict[str, NDArray[Any]]:
-    """Read which components have an unknown offset, if that is known: a list, one number a component."""
-    node = file.find(f"{_RESULT}/{_OFFSETS}")
-    if component is not None and component.min(initial=-1) < -1:
-        raise InputError(f"{file.path}: {_RESULT}/component has numbers below -1: {_AGAIN}")
-    if node is None or component is None:
-        return {}
-    count = int(component.max(initial=-1)) + 1
-    return {_OFFSETS: file.read(node, (count,), remedy=_AGAIN).astype(_DTYPES[_OFFSETS])}
-
-
-def _size_of(found: Mapping[str, Node]) -> Shape | None:
-    """Return (H, W) or (turns, H, W), the size of the first map, if it is one."""
-    for name in found:
-        if name not in ("x", "y"):
-            shape: Shape = getattr(found[name], "shape", None) or ()
-            size = _size(name, shape)
-            return size if len(size) in (2, 3) else None
-    return None
-
-
-def _size(name: str, shape: Shape) -> Shape:
-    """Return the size of the result that has a map of a shape: (H, W), or (turns, H, W)."""
-    size = shape[:-1] if name in _VECTORS else shape
-    return size[-2:] if name == _MOVED else size
+def may_name_a_map(name: str) -> bool:
+    """Return whether a map can have a name."""
+    return str(name).isidentifier() and name not in RESERVED
 
 
 def map_shape(result: Result) -> tuple[int, ...]:
     """Return the size of a result's maps: (H, W), or (turns, H, W)."""
-    return next((_size(name, values.shape) for name, values in result.maps().items()), (0, 0))
+    for name, values in result.maps().items():
+        return size_of_maps(result.declaration(name), values.shape)
+    return (0, 0)
+
+
+def size_of_maps(declared: Map, shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the size of the maps of a result, (H, W) or (turns, H, W), that has a map of this shape."""
+    size = shape[:-1] if declared.components else shape
+    return size[-2:] if declared.per_frame else size
 
 
 def select_turn(result: Result, turn: int | None) -> Result:
-    """Return the maps of one turn, or those of a result that has no turns.
+    """Return the maps of one turn, or those of a result without turns.
 
     Parameters
     ----------
     result : Result
     turn : int or None
-        Number of the turn, from 0; None of a result whose maps are of all turns together.
+        Number of the turn, from 0; None for a result whose maps belong to all turns together.
 
     Returns
     -------
     Result
-        With maps (H, W); its components are numbered from 0, and its process has the turn.
+        With maps (H, W); its components are numbered from 0, and its process contains the turn.
 
     Raises
     ------
@@ -347,7 +411,7 @@ def select_turn(result: Result, turn: int | None) -> Result:
     chosen: dict[str, Any] = {name: values[turn] for name, values in maps.items()}
     if result.component is not None:
         chosen |= _renumbered(result.component[turn], result.offset_unknown)
-    return with_fields(result, chosen | {"process": {**result.process, "turn": turn}})
+    return result.assign(chosen, process={**result.process, "turn": turn})
 
 
 def _renumbered(

@@ -83,6 +83,32 @@ def conversion_factor(unit: str, wanted: str, where: str) -> float:
     return 1 / factor if over else factor
 
 
+def ratio(unit: str, other: str) -> float:
+    """Return the number that converts a value from one unit to another.
+
+    Raises
+    ------
+    InputError
+        They do not measure the same quantity, or one is unknown.
+
+    Examples
+    --------
+    >>> ratio("mm", "um")
+    1000.0
+    """
+    if unit == other:
+        return 1.0
+    for kind in BASE:
+        try:
+            if max(len(unit), len(other)) <= _LONGEST:
+                return in_base(unit, kind) / in_base(other, kind)
+        except ValueError:
+            continue
+    raise InputError(
+        f"{unit[:_LONGEST]!r} cannot be converted to {other[:_LONGEST]!r}. Use units of one quantity"
+    )
+
+
 def _pint_factor(symbol: str, kind: Kind) -> float:
     import pint  # its table of units takes most of a second to load
 

@@ -1,8 +1,12 @@
 """The house's import rule (pyproject.toml, importlinter) holds."""
 
+import importlib.metadata
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parent.parent
 
@@ -16,6 +20,17 @@ def test_imports_follow_the_layers():
 
 
 def test_every_folder_is_under_the_rule():
-    packages = {path.parent.name for path in ROOT.glob("*/py.typed")}
-    rule = (ROOT / "pyproject.toml").read_text(encoding="utf-8").split("root_packages = ")[1].splitlines()[0]
-    assert packages == {name.split(".")[1].strip('"') for name in rule.strip("[]").split(", ")}
+    packages = {path.parent.name for path in ROOT.glob("*/__init__.py")}
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    layers = settings["tool"]["importlinter"]["contracts"][0]["layers"]
+    assert packages == {name.removeprefix("mirrorskin.") for layer in layers for name in layer.split(" | ")}
+
+
+def test_the_package_has_its_parts_and_its_version():
+    import mirrorskin
+
+    assert mirrorskin.__version__ == importlib.metadata.version("mirrorskin")
+    assert callable(mirrorskin.engine.reconstruct)
+    assert {"engine", "hw", "io", "view"} <= set(dir(mirrorskin))
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = mirrorskin.nothing

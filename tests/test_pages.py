@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 from pathlib import Path
 
 import h5py
@@ -78,6 +79,12 @@ def test_all_that_is_in_a_result_is_described(tmp_path, per_turn):
     found = datasets(tmp_path / "turn.h5")
     assert {"height", "normals", "contact", "offset_unknown", "x"} < found
     assert found <= named("formats.md")
+
+
+def test_the_tables_of_maps_are_those_of_the_declarations():
+    page = (DOCS / "formats.md").read_text(encoding="utf-8")
+    made = runpy.run_path(str(DOCS / "site/map_tables.py"))
+    assert made["with_tables"](page) == page, "python docs/site/map_tables.py writes them"
 
 
 def test_all_that_is_in_a_recording_is_described(tmp_path):

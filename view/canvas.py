@@ -121,6 +121,7 @@ def explain_colours(axes: Axes, picture: ScalarMappable, label: str, extend: str
     """Draw the colours of a map right beside it."""
     bar = axes.inset_axes((1.03, 0, 0.04, 1))
     axes.figure.colorbar(picture, cax=bar, label=label, extend=extend)
+    bar.yaxis.label.set_parse_math(False)
 
 
 def exceeded(values: NDArray[Any], low: float, high: float) -> str:

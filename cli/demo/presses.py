@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -208,7 +208,7 @@ def _judge(result: io.Result, truth: io.Truth, shared: NDArray[np.bool_]) -> Out
 
     height = _height(result)
     parts = height, np.where(shared, height, np.float32(np.nan))
-    whole, shared_part = (engine.score(replace(result, height=part), truth).height for part in parts)
+    whole, shared_part = (engine.score(result.assign(height=part), truth).height for part in parts)
     assert whole is not None
     assert shared_part is not None
     return {
@@ -222,10 +222,9 @@ def _height(result: io.Result) -> NDArray[np.float32]:
     """Return the measured heights; filled ones are in the table of surfaces."""
     import numpy as np
 
-    assert result.height is not None
-    if result.filled is None:
-        return result.height
-    return np.where(result.filled, np.float32(np.nan), result.height)
+    height: NDArray[np.float32] | None = result.height
+    assert height is not None
+    return height if result.filled is None else np.where(result.filled, np.float32(np.nan), height)
 
 
 def _rows(name: str, by_sensor: Outcomes) -> list[list[str]]:

@@ -29,5 +29,5 @@ for name in ("sphere radius", "sphere top", "sphere residual RMS"):
 
 io.export_result(result, "ball.ply")  # triangles in mm, for any program that shows meshes
 figures = figures_of(result, name="a ball of 10 mm, fused")
-for what in ("height", "section", "normals", "sigma"):
+for what in ("height", "section", "normals", "height_sigma"):
     figures[what].savefig(f"{what}.png", dpi=110)

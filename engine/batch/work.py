@@ -18,7 +18,7 @@ from mirrorskin.engine.streaming import Progress
 from mirrorskin.engine.summary import summarise
 from mirrorskin.io import InputError, Recording
 from mirrorskin.io.os_errors import as_input_error
-from mirrorskin.io.result import open_process
+from mirrorskin.io.result_file import open_process
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.io.url import Url
 from mirrorskin.kernels.device import Device, open_device
@@ -102,7 +102,7 @@ def _done(
     with naming(source):  # raises if the file was written to meanwhile
         result = reconstruct(source, device=opened, progress=progress, **plan.options(source.motion))
     signed: dict[str, ProcessValue] = {**result.process, "batch_parameters": digest}
-    io.save_result(replace(result, process=signed), target)
+    io.save_result(result.assign(process=signed), target)
     return replace(
         outcome,
         state="done",

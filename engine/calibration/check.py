@@ -240,7 +240,7 @@ def _normal_errors(found: Result, truth: _Truth, cells: int) -> dict[str, Errors
     lean, turn = found.zenith - truth.zenith, np.arctan2(np.sin(around), np.cos(around))
     sine = np.sqrt(np.sin(found.zenith) * np.sin(truth.zenith))
     apart = 2 * np.arcsin(np.sqrt(np.sin(lean / 2) ** 2 + (sine * np.sin(turn / 2)) ** 2))  # haversines
-    sigma = None if found.normal_sigma is None else np.degrees(found.normal_sigma)
+    sigma = None if found.normals_sigma is None else np.degrees(found.normals_sigma)
     errors = {
         "zenith": _errors(np.degrees(lean), "deg", cells),
         "azimuth": _errors(np.degrees(turn), "deg", cells),
@@ -269,7 +269,7 @@ def _check_enough(pixels: Any, what: str = "could be judged") -> None:
 def _measured(found: Result) -> NDArray[np.bool_]:
     """Return where a height was measured, not filled in."""
     assert found.height is not None
-    measured = np.isfinite(found.height)
+    measured: NDArray[np.bool_] = np.isfinite(found.height)
     return measured if found.filled is None else measured & (found.filled == 0)
 
 

@@ -12,13 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.press.elastic import threshold_at
 from mirrorskin.io import Gel, InputError, Result, Source, pixel_axes
+from mirrorskin.io.maps import PressStatus
 
 Doubles = NDArray[np.float64]
 
 _NODES = 24
 _THINNEST = 1e-3  # radii of the ball: the depth of a mirror on the very surface
 
-_LIT, _DARK = 1, 2  # of an onset's status
 _RIM = 0.1  # square of a rim pixel's error, by its circumference
 _MOST = 600  # pixels of a press that are used
 _FEWEST = 50
@@ -118,7 +118,7 @@ def ball_onset(result: Result, source: Source, radius: float) -> BallOnset:
         raise InputError(f"{source.name} has no pixel size: calibrate the scale first, or give --pixel-size")
     if not (math.isfinite(radius) and radius > 0):
         raise InputError(f"a ball of radius {radius:g} mm cannot be: give one above 0")
-    lit = np.flatnonzero((status == _LIT) & np.isfinite(height))
+    lit = np.flatnonzero((status == PressStatus.ONSET) & np.isfinite(height))
     if len(lit) < _FEWEST:
         raise InputError(
             f"{source.name}: {len(lit)} pixels turned light, too few to learn from: press the ball deeper"
@@ -128,12 +128,12 @@ def ball_onset(result: Result, source: Source, radius: float) -> BallOnset:
     x, y = np.meshgrid(*pixel_axes((height.shape[0], height.shape[1]), size))
     travel, error, across, up = (part.ravel()[some].astype(np.float64) for part in (-height, sigma, x, y))
     # The dark top is the largest dark patch that light surrounds.
-    closed = ndimage.binary_closing(np.pad(status == _LIT, 1), np.ones((3, 3), bool))[1:-1, 1:-1]
+    closed = ndimage.binary_closing(np.pad(status == PressStatus.ONSET, 1), np.ones((3, 3), bool))[1:-1, 1:-1]
     patches, count = ndimage.label(ndimage.binary_fill_holes(closed) & ~closed)
     if count == 0:
         return BallOnset(travel, error, across, up, radius)
     largest = patches == 1 + np.argmax(np.bincount(patches.ravel())[1:])
-    area = float(np.count_nonzero(largest & (status == _DARK))) * size[0] * size[1]
+    area = float(np.count_nonzero(largest & (status == PressStatus.NEVER_LIGHT))) * size[0] * size[1]
     inner = math.sqrt(area / math.pi)
     # The rim falls at random within a pixel, in as many places as it has pixels.
     pixel = max(size)

@@ -25,7 +25,7 @@ from mirrorskin.engine.integration.rectangle import Rectangle, seems_full
 from mirrorskin.engine.integration.robust import solve_robust
 from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
 from mirrorskin.io import InputError
-from mirrorskin.io.types import Shown
+from mirrorskin.io.result import Shown
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.links import DOWN, KNOWN, LOST, RIGHT, SLOPE

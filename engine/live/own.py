@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -79,4 +78,4 @@ class LiveOwn(ThreadSafe):
     def result(self) -> Result:
         """Return the maps of all frames; see `mirrorskin.engine.run`."""
         found = finish(self._estimator, self._shape, self._source)
-        return replace(found, process={**found.process, "live": True})
+        return found.assign(process={**found.process, "live": True})

@@ -15,12 +15,12 @@ from mirrorskin.engine.provenance import attach_provenance, level_origin
 from mirrorskin.engine.reconstruction import undistorted
 from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError, LiveSource, Result
+from mirrorskin.io.maps import PressStatus
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.device import Device
 
 _ROOM = 64  # frames that may wait to be taken at once
 _UPDATES = 15.0  # a second, as many as people follow; each costs as much as many frames
-_ONSET, _LIGHT_AT_START = 1, 3  # of an onset's status
 
 
 class LivePress(ThreadSafe):
@@ -102,7 +102,7 @@ class LivePress(ThreadSafe):
         if len(self._search.travel) < 2:
             return {}
         onset = self._search.onset()
-        contact = np.asarray((onset.status == _ONSET) | (onset.status == _LIGHT_AT_START), np.uint8)
+        contact = np.asarray(np.isin(onset.status, (PressStatus.ONSET, PressStatus.LIGHT_AT_START)), np.uint8)
         return {"height": onset.height, "contact": contact, "contact_area": area_of(contact, self._source)}
 
     def spare(self, seconds: float) -> None:

@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -230,12 +229,12 @@ class LiveRotation(ThreadSafe):
         process |= self._provenance(normals)
         if self._header.pixel_size is None:
             process["height"] = _NO_PIXEL_SIZE
-            return self._signed(replace(result, **maps), process)
+            return self._signed(result.assign(**maps), process)
         with naming(self._source):
             relief = integrate_normals(normals, normals.sigma, self._header.pixel_size, device=self.device)
         maps |= {"height": relief.height, "height_sigma": relief.height_sigma, "component": relief.component}
         maps["offset_unknown"] = relief.offset_unknown
-        return self._signed(replace(result, **maps), {**process, **relief.process})
+        return self._signed(result.assign(**maps), {**process, **relief.process})
 
     def _signed(self, result: Result, process: dict[str, ProcessValue]) -> Result:
         return undistorted(attach_provenance(result, self._source, self.device, process), self._source)

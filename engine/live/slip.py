@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -114,4 +113,4 @@ class LiveSlip(ThreadSafe):
             See `SlipSearch.result`.
         """
         found = slip_result(self._source, self._search, contact=self._contact)
-        return undistorted(replace(found, process={**found.process, "live": True}), self._source)
+        return undistorted(found.assign(process={**found.process, "live": True}), self._source)

@@ -190,7 +190,7 @@ def _surface(patch: Patch, known: Mask, secant: Doubles) -> Quantity:
     value = float(np.sum(secant[known]))
     edge = 0.5 * _UNIFORM * float(np.sum(secant[border(known)]))
     errors = np.nan
-    if patch.normal_sigma is not None:
+    if patch.normals_sigma is not None:
         tangent = np.sqrt(np.maximum(secant**2 - 1, 0))
-        errors = float(np.nansum((secant * tangent * patch.normal_sigma)[known]))
+        errors = float(np.nansum((secant * tangent * patch.normals_sigma)[known]))
     return Quantity(patch.pixel_area * value, patch.pixel_area * math.hypot(edge, errors), "mm2")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ class Patch:
     contact_given: bool
     # (H, W), float64: surface for each area of the picture, from the normals; NaN where they are unknown.
     secant: Doubles | None
-    normal_sigma: Doubles | None  # (H, W), float64: standard deviations of the normals, radians
+    normals_sigma: Doubles | None  # (H, W), float64: standard deviations of the normals, radians
     # (W,) and (H,), float64: millimetres of the pixel centres.
     x: Doubles
     y: Doubles
@@ -55,7 +55,7 @@ class Patch:
 
 def heights_of(result: Result) -> NDArray[np.float32]:
     """Return the heights of one picture, (H, W); InputError where there are none, or a map for each turn."""
-    height = select_turn(result, None).height
+    height: NDArray[np.float32] | None = select_turn(result, None).height
     if height is None:
         raise InputError("the result has no heights: take one of a press or of 'mirrorskin fuse'")
     return height
@@ -70,7 +70,7 @@ def patch_of(result: Result, region: Region | None = None) -> tuple[Patch, Resul
     """
     height = heights_of(result)
     if result.height_sigma is not None and not np.isfinite(result.height_sigma).any():
-        result = replace(result, height_sigma=None)
+        result = result.assign(height_sigma=None)
     if result.x is None or result.y is None:
         raise InputError("the result has no pixel size: reconstruct it again with --pixel-size")
     pixel_size = pixel_size_of(result.x, result.y)
@@ -91,14 +91,14 @@ def patch_of(result: Result, region: Region | None = None) -> tuple[Patch, Resul
         contact=contact[part],
         contact_given=result.contact is not None,
         secant=None if result.normals is None else _secant(result.normals[part]),
-        normal_sigma=None if result.normal_sigma is None else result.normal_sigma[part].astype(np.float64),
+        normals_sigma=None if result.normals_sigma is None else result.normals_sigma[part].astype(np.float64),
         x=result.x[part[1]],
         y=result.y[part[0]],
         pixel_size=pixel_size,
         absolute=absolute,
         notes=(*left_out, *notes),
     )
-    return patch, replace(result, height=np.where(known, height, np.float32(np.nan)))
+    return patch, result.assign(height=np.where(known, height, np.float32(np.nan)))
 
 
 def _known(result: Result, height: NDArray[np.float32], filled: Mask) -> tuple[Mask, list[str]]:

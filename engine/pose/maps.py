@@ -57,7 +57,7 @@ class PoseMap:
         if not ((variance < FAR) & usable).any() and not ((square < _UNTOLD) & usable).any():
             raise InputError(
                 "a map has no usable pixel with a sigma: give heights with height_sigma, or with normals and "
-                "normal_sigma"
+                "normals_sigma"
             )
         records = np.zeros((*height.shape, 8), np.float32)
         records[..., :2], records[..., 2], records[..., 3] = normals[..., :2], square, height
@@ -133,9 +133,9 @@ def _normals(
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
         return normals.astype(np.float32), np.full(height.shape, _UNTOLD, np.float32)
     normals = np.asarray(_same(result.normals, (*height.shape, 3), "normals"), np.float32)
-    if result.normal_sigma is None:
+    if result.normals_sigma is None:
         return normals, np.full(height.shape, _UNTOLD, np.float32)
-    sigma = np.asarray(_same(result.normal_sigma, height.shape, "normal_sigma"), np.float32)
+    sigma = np.asarray(_same(result.normals_sigma, height.shape, "normals_sigma"), np.float32)
     return normals, np.where(sigma > 0, sigma, np.float32(np.nan)) ** 2
 
 

@@ -115,7 +115,7 @@ def estimate_pose(
     Parameters
     ----------
     first, second : Result
-        ``height``, (H, W), mm, with ``height_sigma``, or ``normals``, (H, W, 3), with ``normal_sigma``, or
+        ``height``, (H, W), mm, with ``height_sigma``, or ``normals``, (H, W, 3), with ``normals_sigma``, or
         both; also `Result(height=..., ...)` of any arrays. The sizes may differ.
     pixel_size : float or (float, float), optional
         mm; by default as the results say.
@@ -142,7 +142,7 @@ def estimate_pose(
     ...     z = np.sqrt(25 - (x - at) ** 2 - y**2)
     ...     normals = np.dstack([(x - at) / 5, y / 5, z / 5])
     ...     sure = np.full(x.shape, 0.01)
-    ...     return io.Result(height=z - 5, height_sigma=0.1 * sure, normals=normals, normal_sigma=sure)
+    ...     return io.Result(height=z - 5, height_sigma=0.1 * sure, normals=normals, normals_sigma=sure)
     >>> pose = engine.estimate_pose(ball(0.0), ball(0.2), pixel_size=0.1)
     >>> pose.apply([0, 0, -5]).round(3).tolist()  # the ball's centre; about its spin nothing is known
     [0.2, 0.0, -5.0]

@@ -17,11 +17,9 @@ from mirrorskin.engine.pose.pose import Pose, pose_of
 from mirrorskin.engine.provenance import signature
 from mirrorskin.engine.resample import SamplePoints
 from mirrorskin.io import InputError, Result, select_turn
+from mirrorskin.io.maps import StitchStatus, status_of
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.device import Device, open_device
-
-AGREES, DISAGREES = 1, 2
-"""What the status says of a height that touches make together."""
 
 _SHARED = 0.2  # of the smaller map's pixels, from which on two touches are compared
 _ALIKE = 4.0  # of chi square, that two touches which are compared may have for a link
@@ -93,7 +91,7 @@ def stitch(
     ...     normals = np.dstack([-p, -q, np.ones_like(p)]) / np.sqrt(1 + p * p + q * q)[..., None]
     ...     sure = np.full(x.shape, 0.01)
     ...     height = 0.2 * np.sin(x - at) * np.cos(y)
-    ...     return io.Result(height=height, height_sigma=0.1 * sure, normals=normals, normal_sigma=sure)
+    ...     return io.Result(height=height, height_sigma=0.1 * sure, normals=normals, normals_sigma=sure)
     >>> whole = engine.stitch([waves(0.0), waves(-1.0)], pixel_size=0.1)
     >>> whole.result.height.shape, whole.poses[1].translation.round(2).tolist()
     ((41, 71), [-1.0, 0.0, 0.0])
@@ -229,7 +227,7 @@ def _merged(
     if shape[0] * shape[1] > _LARGEST:
         raise InputError(f"the whole would have {shape[1]} x {shape[0]} pixels: give results that overlap")
     sums = _Sums(shape)
-    with_normals = all(touch.normals is not None and touch.normal_sigma is not None for touch in touches)
+    with_normals = all(touch.normals is not None and touch.normals_sigma is not None for touch in touches)
     unknown = touches[0].offset_unknown is not None and bool(np.any(touches[0].offset_unknown))
     placed: list[_Moved] = []
     for touch, known, pose in zip(touches, maps, poses, strict=True):
@@ -317,9 +315,9 @@ class _Moved:
         normals = square = None
         if with_normals:
             assert touch.normals is not None
-            assert touch.normal_sigma is not None
+            assert touch.normals_sigma is not None
             normals = points.interpolate_vectors(np.asarray(touch.normals, np.float32)) @ motion.turn
-            square = points.interpolate(np.asarray(touch.normal_sigma, np.float32)).astype(np.float64) ** 2
+            square = points.interpolate(np.asarray(touch.normals_sigma, np.float32)).astype(np.float64) ** 2
             normals, square = normals.reshape(*size, 3), square.reshape(size)
         return cls(
             np.where(answered, above, np.nan).reshape(size),
@@ -400,7 +398,11 @@ class _Sums:
         differs = known & (apart > _APART**2)
         with np.errstate(invalid="ignore", divide="ignore"):
             sigma = np.where(differs, np.maximum(sigma, np.sqrt(spread / self._weight)), sigma)
-        status = np.where(differs, DISAGREES, np.where(known, AGREES, 0)).astype(np.uint8)
+        status = np.where(
+            differs,
+            StitchStatus.INCONSISTENT,
+            np.where(known, StitchStatus.CONSISTENT, StitchStatus.NO_HEIGHT),
+        ).astype(np.uint8)
         maps: dict[str, Any] = {}
         if self._normal_weight.any():
             with np.errstate(invalid="ignore", divide="ignore"):
@@ -408,7 +410,7 @@ class _Sums:
                 spread = 1 / np.sqrt(self._normal_weight)
             told = self._normal_weight > 0
             maps["normals"] = normals.astype(np.float32)
-            maps["normal_sigma"] = np.where(told, spread, np.nan).astype(np.float32)
+            maps["normals_sigma"] = np.where(told, spread, np.nan).astype(np.float32)
         if unknown:
             maps["component"] = np.where(known, 0, -1).astype(np.int32)
             maps["offset_unknown"] = np.ones(1, np.uint8)
@@ -425,5 +427,6 @@ class _Sums:
             x=x,
             y=y,
             process=process,
+            declarations={"status": status_of(StitchStatus)},
             **maps,
         )

@@ -49,7 +49,7 @@ class PoseTracker(ThreadSafe):
     ...     normals = np.dstack([-p, -q, np.ones_like(p)]) / np.sqrt(1 + p * p + q * q)[..., None]
     ...     sure = np.full(x.shape, 0.01)
     ...     height = 0.2 * np.sin(x - at) * np.cos(y)
-    ...     return io.Result(height=height, height_sigma=0.1 * sure, normals=normals, normal_sigma=sure)
+    ...     return io.Result(height=height, height_sigma=0.1 * sure, normals=normals, normals_sigma=sure)
     >>> tracker = engine.PoseTracker(pixel_size=0.1)
     >>> [float(tracker.push(waves(0.05 * number)).translation[0].round(2)) for number in range(3)]
     [0.0, 0.05, 0.1]

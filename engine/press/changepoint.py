@@ -14,6 +14,7 @@ from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Staged, cut_into_bands, join_rows, room_of
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
+from mirrorskin.io.maps import PressStatus, ReleaseStatus, status_of
 from mirrorskin.io.positions import check_travel
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.changepoint import DECIDED, INVALID, REACH, SLOTS, UNIT
@@ -147,6 +148,7 @@ class ChangePointSearch(ThreadSafe):
             raise InputError(f"hold {hold}: a change-point needs a number of frames from 1 to {REACH}")
         self._shape, self._dtype = shape, check_dtype(dtype)
         self._release, self._hold = check_event(event) == "release", hold
+        self.maps = {"status": status_of(ReleaseStatus if self._release else PressStatus)}
         self._noise = Noise(noise, self._dtype.kind == "u")
         self.passes = 2 if dark is None or bright is None else 1
         self.device: Device = open_device(device)

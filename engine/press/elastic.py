@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +24,7 @@ from mirrorskin.engine.press.halfspace import (
 )
 from mirrorskin.engine.press.spline import CellSplines
 from mirrorskin.io import Gel, InputError, Result, Source, pixel_axes
+from mirrorskin.io.maps import PressStatus
 
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -32,7 +32,6 @@ Mask = NDArray[np.bool_]
 LEARNED_AT = 0.5
 """Share of the way from dark to bright that gels are learned with."""
 
-_LIT, _DARK, _HIDDEN = 1, 2, 3  # of an onset's status
 _FEWEST = 12  # cells that must have turned light
 _SAMPLED = 250  # cells whose onsets are used; more add nothing to so few splines
 _TRAVELS = 16  # at which the press is gone through
@@ -114,9 +113,9 @@ def correct_press(
         fit = fit_press(*maps, pixel_size, gel, deepest=deepest)
     except NotConverged as error:
         return result, f"none: {error}", None
-    lost = np.count_nonzero((result.status == _LIT) & np.isnan(fit.height))
+    lost = np.count_nonzero((result.status == PressStatus.ONSET) & np.isnan(fit.height))
     said = f"corrected for the gel; {lost} pixels turned light too far from the touch"
-    return replace(result, height=fit.height, height_sigma=fit.sigma), said, fit
+    return result.assign(height=fit.height, height_sigma=fit.sigma), said, fit
 
 
 def correct_onset(
@@ -185,7 +184,7 @@ def fit_press(
             f"sigma {sigmas.shape} and status {state.shape} do not fit heights of shape {heights.shape}:"
             " give one a pixel"
         )
-    heights = np.where(state == _LIT, heights, np.nan)
+    heights = np.where(state == PressStatus.ONSET, heights, np.nan)
     scene = _scene_of(heights, state, check_pixel_size(pixel_size), gel, deepest)
     smooth = _interpolate(scene, scene.height)
     factors, fit, form = _fit_surface(scene, _initial_surface(scene))
@@ -269,8 +268,8 @@ def _scene_of(
         raise NotConverged(
             f"light in {len(onsets)} places is too little to determine a surface: {_FEWEST} are needed"
         )
-    dark = cells.share(status == _DARK) == 1
-    hidden = cells.inside(cells.share(status == _HIDDEN)) >= 0.5
+    dark = cells.share(status == PressStatus.NEVER_LIGHT) == 1
+    hidden = cells.inside(cells.share(status == PressStatus.LIGHT_AT_START)) >= 0.5
     surface = cells.outward(touched(cells.inside(means), cells.inside(dark), hidden))
     last = max(float(onsets.max()), -math.inf if deepest is None else deepest)
     travel = np.unique([*np.quantile(onsets, np.linspace(0, 1, _TRAVELS)), last])

@@ -15,9 +15,8 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from mirrorskin.engine.press.onset import Onset, OnsetSearch
 from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError
+from mirrorskin.io.maps import PressStatus
 from mirrorskin.kernels.device import Device
-
-_LIGHT, _LIGHT_AT_START = 1, 3  # of an onset's status
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +144,6 @@ class LevelSearch(ThreadSafe):
     def result(self) -> Levels:
         """Return the maps of the frames so far; more may follow."""
         found = [search.result() for search in self._searches]
-        light = [np.isin(one.status, (_LIGHT, _LIGHT_AT_START)) for one in found]
+        light = [np.isin(one.status, (PressStatus.ONSET, PressStatus.LIGHT_AT_START)) for one in found]
         passed = np.sum(np.logical_and.accumulate(light), axis=0).astype(np.int8)
         return Levels(found[0], np.where(found[0].status == 0, np.int8(-1), passed))

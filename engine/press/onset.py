@@ -14,8 +14,9 @@ from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_into_bands, join_rows, room_of
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
+from mirrorskin.io.maps import PressStatus, ReleaseStatus, status_of
 from mirrorskin.io.positions import check_travel
-from mirrorskin.io.types import Shown
+from mirrorskin.io.result import Shown
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
 from mirrorskin.kernels.onset import DARK, complement
 
@@ -166,6 +167,7 @@ class OnsetSearch(ThreadSafe):
             )
         self._shape, self._dtype = shape, check_dtype(dtype)
         self._release, self._subframe = check_event(event) == "release", subframe
+        self.maps = {"status": status_of(ReleaseStatus if self._release else PressStatus)}
         self._hold = min(hold, _LONGEST)
         self._noise = Noise(noise, self._dtype.kind == "u")
         self.device: Device = open_device(device)

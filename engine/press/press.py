@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
@@ -21,6 +20,7 @@ from mirrorskin.engine.provenance import attach_provenance, estimated_level, lev
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Result
+from mirrorskin.io.maps import PressStatus, ReleaseStatus, status_of
 from mirrorskin.io.positions import stroke_starts
 
 if TYPE_CHECKING:
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
 PressMethod = Literal["threshold", "change-point"]
 METHODS: tuple[PressMethod, ...] = get_args(PressMethod)
-
-_LIGHT_AT_START = 3  # of an onset's status
 
 
 def reconstruct_press(
@@ -161,7 +159,7 @@ def reconstruct_press(
         result, done = add_hysteresis(result, found, event), done | {"strokes": found.strokes}
     if isinstance(found, Levels) and levels is not None:
         lower, upper = found.bounds(levels[1])
-        result = replace(result, slope_min=lower, slope_max=upper)
+        result = result.assign(slope_min=lower, slope_max=upper)
         done |= {"thresholds": str(levels[0]), "inclinations": str(levels[1])}
     return attach_provenance(result, source, search.device, process | done)
 
@@ -173,8 +171,7 @@ def choose_event(strokes: Strokes, event: Event) -> Onset:
 
 def add_hysteresis(result: Result, strokes: Strokes, event: Event) -> Result:
     """Add to a press's maps what only strokes tell: hysteresis, and in how many there was the event."""
-    return replace(
-        result,
+    return result.assign(
         hysteresis=strokes.hysteresis,
         hysteresis_sigma=strokes.hysteresis_sigma,
         strokes=strokes.onsets if event == "onset" else strokes.releases,
@@ -194,7 +191,12 @@ def finish_press(
 
     Travel, (T,), mm, is that of the frames that the onsets were made of. What was done is for the process.
     """
-    result = Result(height=onset.height, height_sigma=onset.sigma, status=onset.status)
+    result = Result(
+        height=onset.height,
+        height_sigma=onset.sigma,
+        status=onset.status,
+        declarations={"status": status_of(PressStatus if event == "onset" else ReleaseStatus)},
+    )
     done: dict[str, ProcessValue] = {"fill": "none: not asked"}
     if isinstance(source, io.Calibrated):
         from mirrorskin.engine.press.elastic import correct_press  # splines, a tenth of a second to load
@@ -215,7 +217,7 @@ def finish_press(
         assert result.height_sigma is not None
         above = None
         if event == "onset":  # what is light at start was touched before
-            above = np.where(result.status == _LIGHT_AT_START, -travel[0], np.nan)
+            above = np.where(result.status == PressStatus.LIGHT_AT_START, -travel[0], np.nan)
         height, filled = fill_holes(
             result.height,
             result.height_sigma,
@@ -223,7 +225,7 @@ def finish_press(
             above=above,
             deepest=-float(np.max(travel)),
         )
-        result, done["fill"] = replace(result, height=height, filled=filled), "holes"
+        result, done["fill"] = result.assign(height=height, filled=filled), "holes"
     return result, done
 
 
@@ -251,7 +253,7 @@ def _with_force(
         found = force_of_press(fit, known)
     except NotConverged as error:
         return result, {"force": f"none: {error}"}
-    made = replace(result, pressure=found.pressure, force=found.force, force_sigma=found.sigma)
+    made = result.assign(pressure=found.pressure, force=found.force, force_sigma=found.sigma)
     if isinstance(known, float):
         return made, {"modulus": f"{known:g} MPa, given"}
     return made, {"modulus": f"{known.modulus:.4g} MPa of the calibration"}

@@ -14,10 +14,10 @@ from scipy import special
 from mirrorskin.engine.frames import check_frames
 from mirrorskin.engine.press.onset import Onset, OnsetSearch
 from mirrorskin.engine.thread_safe import ThreadSafe
+from mirrorskin.io.maps import PressStatus
 from mirrorskin.io.positions import check_strokes, stroke_starts
 from mirrorskin.kernels.device import Device
 
-_FOUND = 1  # of an onset's status
 _ALIKE = 1e-3  # relative difference of numbers that are the same but for rounding
 _CONTRADICT = 0.001  # share of pixels without a place in all their intervals from which travel is not exact
 _NOISY = 2.0  # standard deviations by which noise may move a crossing out of its interval
@@ -216,7 +216,7 @@ class _JoinedOnsets:
         if self.strokes > 1:
             return self._count.reshape(self._shape)
         none = np.zeros(self._shape, np.uint16)
-        return none if self._first is None else (self._first.status == _FOUND).astype(np.uint16)
+        return none if self._first is None else (self._first.status == PressStatus.ONSET).astype(np.uint16)
 
     def add(self, found: Onset, travel: NDArray[np.float64], end: int) -> None:
         """Take in a stroke: its travel, and the number of the frame after it."""
@@ -239,7 +239,7 @@ class _JoinedOnsets:
         self._frame = np.full(pixels, -1, np.int32)
 
     def _sum(self, found: Onset, travel: NDArray[np.float64], end: int) -> None:
-        at = np.flatnonzero(found.status == _FOUND)
+        at = np.flatnonzero(found.status == PressStatus.ONSET)
         frame = found.frame.reshape(-1)[at]
         height = found.height.reshape(-1)[at].astype(np.float64)
         sigma = found.sigma.reshape(-1)[at].astype(np.float64)
@@ -306,5 +306,5 @@ class _JoinedOnsets:
         found = self.count > 0
         maps = (one.astype(np.float32).reshape(self._shape) for one in (height, sigma))
         height_map, sigma_map = (np.where(found, one, np.float32(np.nan)) for one in maps)
-        status = np.where(found, np.uint8(_FOUND), self._first.status)
+        status = np.where(found, np.uint8(PressStatus.ONSET), self._first.status)
         return Onset(height_map, sigma_map, status, self._frame.reshape(self._shape), noise)

@@ -23,7 +23,7 @@ from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_int
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
 from mirrorskin.io.positions import check_phase
-from mirrorskin.io.types import Shown
+from mirrorskin.io.result import Shown
 from mirrorskin.kernels.array import Array, Operand
 from mirrorskin.kernels.correlation import WINDOW
 from mirrorskin.kernels.device import C_TYPES, Device, open_device

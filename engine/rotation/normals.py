@@ -34,7 +34,7 @@ from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, cut_into_bands, join_ro
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
 from mirrorskin.io.positions import check_phase
-from mirrorskin.io.types import Shown
+from mirrorskin.io.result import Shown
 from mirrorskin.kernels.device import Device
 
 

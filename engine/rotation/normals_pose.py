@@ -15,6 +15,7 @@ from mirrorskin.engine.rotation.normals import NormalEstimator, Normals
 from mirrorskin.engine.rotation.normals_kernel import MAPS, SLOPE_MAPS
 from mirrorskin.engine.rotation.poses import PoseFit, check_poses, pose_fit
 from mirrorskin.io import InputError
+from mirrorskin.io.maps import PoseStatus
 
 
 @dataclass(frozen=True)
@@ -131,8 +132,9 @@ class PoseEstimator(NormalEstimator):
         normals, (slope, sigma, zenith) = super()._found(maps[:-3]), maps[-3:]
         known = {one.name: getattr(normals, one.name) for one in fields(normals)}
         if self._direction is None:
-            return PoseNormals(**known, status=np.where(np.isfinite(normals.sigma), 1, 2).astype(np.uint8))
-        status = np.where(np.isfinite(sigma), 4, 2).astype(np.uint8)
+            status = np.where(np.isfinite(normals.sigma), PoseStatus.NORMAL, PoseStatus.NONE)
+            return PoseNormals(**known, status=status.astype(np.uint8))
+        status = np.where(np.isfinite(sigma), PoseStatus.SLOPE_ONLY, PoseStatus.NONE).astype(np.uint8)
         return PoseNormals(
             **known,
             status=status,

@@ -34,6 +34,7 @@ from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import Block, Header, InputError, Result, Source, WallResponse
 from mirrorskin.io.frames import FrameSequence
+from mirrorskin.io.maps import PoseStatus, status_of
 from mirrorskin.io.positions import check_phase
 from mirrorskin.io.types import Closing, ProcessValue
 from mirrorskin.kernels.device import Device, open_device
@@ -157,8 +158,7 @@ def reconstruct_rotation(
         surface = integrate_normals(
             found.normals, found.independent_sigma, pixel_size, robust=robust, device=found.device
         )
-    result = replace(
-        result,
+    result = result.assign(
         height=surface.height,
         height_sigma=surface.height_sigma,
         component=surface.component,
@@ -279,7 +279,7 @@ def correlate_source(
     if dither:
         header = source.header
         grown = Growth.of(wave, travel, header.dark, header.bright, source.dtype, header.pixel_size)
-        result = replace(result, growth=grown.growth, growth_sigma=grown.sigma)
+        result = result.assign(growth=grown.growth, growth_sigma=grown.sigma)
         process |= {"travel": grown.travel, "travel_amplitude": grown.amplitude}
         if grown.area is not None and grown.area_sigma is not None:
             process |= {"area_growth": grown.area, "area_growth_sigma": grown.area_sigma}
@@ -309,7 +309,7 @@ def rotation_maps(rotation: Rotation) -> Result:
         normals=normals.vectors,
         zenith=normals.zenith,
         azimuth=normals.azimuth,
-        normal_sigma=normals.sigma if systematic is None else np.hypot(normals.sigma, systematic),
+        normals_sigma=normals.sigma if systematic is None else np.hypot(normals.sigma, systematic),
         mean=normals.mean,
         modulation=normals.modulation,
         residual=normals.residual,
@@ -318,10 +318,15 @@ def rotation_maps(rotation: Rotation) -> Result:
     )
     if not isinstance(normals, PoseNormals):
         return result
-    result = replace(result, status=normals.status, slope=normals.slope, slope_sigma=normals.slope_sigma)
+    result = result.assign(
+        status=normals.status,
+        slope=normals.slope,
+        slope_sigma=normals.slope_sigma,
+        declarations={"status": status_of(PoseStatus)},
+    )
     if normals.direction is None:
         return result
-    return replace(result, normals=None, azimuth=None, normal_sigma=None, edges=None)
+    return result.assign(normals=None, azimuth=None, normals_sigma=None, edges=None)
 
 
 def at_poses(source: Source, tilt: float | Literal["estimate"] | None = None) -> bool:

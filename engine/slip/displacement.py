@@ -15,7 +15,7 @@ from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.slip.tracking import GRADIENT_NOISE, NodeField, Tracker
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
-from mirrorskin.io.types import Shown
+from mirrorskin.io.result import Shown
 from mirrorskin.kernels.device import Device, open_device
 
 Doubles = NDArray[np.float64]

@@ -25,12 +25,12 @@ from mirrorskin.engine.slip.displacement import (
     node_status,
 )
 from mirrorskin.engine.slip.onset_map import Expected, OnsetMap, fit_onsets
-from mirrorskin.engine.slip.status import CLEAR, NO_CONTACT, SLIPPED, STICKS, UNKNOWN
 from mirrorskin.engine.slip.tracking import NodeField, Tracker
 from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, pixel_axes
-from mirrorskin.io.types import Shown
+from mirrorskin.io.maps import SlipStatus
+from mirrorskin.io.result import Shown
 from mirrorskin.kernels.device import Device, open_device
 
 Doubles = NDArray[np.float64]
@@ -265,7 +265,7 @@ class SlipSearch(ThreadSafe):
                 tracker.to_pixels(onsets.onset) > 0
             )
         status, onset = self._pixels(tracker, codes, onsets, contact, course.end)
-        slipped = status == SLIPPED
+        slipped = status == SlipStatus.SLIPPED
         noisy = np.einsum("yxii->yxi", self._covariance(texture))
         bent = bending_variance(moved[-1], noisy, self.step, self.window)
         noisy = noisy * misfit(fields[-1], texture, self.window) ** 2
@@ -284,7 +284,9 @@ class SlipSearch(ThreadSafe):
             status=status,
             contact=contact.astype(np.uint8),
             way=np.append(0.0, course.way),
-            stick_ratio=course.stick_ratio(onset[(status == SLIPPED) | (status == STICKS)]),
+            stick_ratio=course.stick_ratio(
+                onset[(status == SlipStatus.SLIPPED) | (status == SlipStatus.STICKS)]
+            ),
             centre=centre,
             angle=angle,
             noise=texture.noise,
@@ -371,10 +373,12 @@ class SlipSearch(ThreadSafe):
         """Return the status, and the onset that it is of."""
         onset = tracker.to_pixels(onsets.onset)
         near = tracker.nearest(codes)
-        status = np.where(onset < end, SLIPPED, STICKS)
-        status = np.where(np.isfinite(onset), status, UNKNOWN)
-        status = np.where(near == FOUND, status, np.where(near == NO_TEXTURE, CLEAR, UNKNOWN))
-        return np.where(contact, status, NO_CONTACT).astype(np.uint8), onset
+        status = np.where(onset < end, SlipStatus.SLIPPED, SlipStatus.STICKS)
+        status = np.where(np.isfinite(onset), status, SlipStatus.UNKNOWN)
+        status = np.where(
+            near == FOUND, status, np.where(near == NO_TEXTURE, SlipStatus.NO_TEXTURE, SlipStatus.UNKNOWN)
+        )
+        return np.where(contact, status, SlipStatus.NO_CONTACT).astype(np.uint8), onset
 
     def _turn(
         self,

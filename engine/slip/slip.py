@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +17,7 @@ from mirrorskin.engine.slip.search import MOTIONS, WINDOW, SlipSearch, check_con
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Result
+from mirrorskin.io.maps import TWIST, SlipStatus, status_of
 from mirrorskin.io.types import UNDISTORTED
 
 if TYPE_CHECKING:
@@ -140,6 +140,7 @@ def slip_result(source: Source, search: SlipSearch, *, contact: str, modulus: fl
     if found.centre is not None and found.angle is not None:
         (right, up), (x, y) = _off_centre(source), found.centre
         process |= {"angle": found.angle, "centre_x": x + right, "centre_y": y + up}
+    twist = source.motion == "twist"
     result = Result(
         displacement=found.displacement,
         displacement_sigma=found.displacement_sigma,
@@ -147,8 +148,10 @@ def slip_result(source: Source, search: SlipSearch, *, contact: str, modulus: fl
         slip_onset_sigma=found.slip_onset_sigma,
         status=found.status,
         contact=found.contact,
-        way=found.way,
         stick_ratio=found.stick_ratio,
+        slide_distance=None if twist else found.way,
+        twist_angle=found.way if twist else None,
+        declarations={"status": status_of(SlipStatus), **(TWIST if twist else {})},
     )
     result, said = _with_force(result, source, search, modulus)
     return attach_provenance(result, source, search.device, process | said)
@@ -173,14 +176,13 @@ def _with_force(
             source.header.pixel_size,
             young,
             contact=result.contact,
-            sigma=result.displacement_sigma,  # type: ignore[arg-type]
+            sigma=result.displacement_sigma,
             window=search.window,
             modulus_sigma=0.0 if known is None else math.sqrt(known.covariance[0, 0]),
         )
     except (InputError, NotConverged) as error:
         return result, {"force": f"none: {error}"}
-    result = replace(
-        result,
+    result = result.assign(
         traction=found.traction,
         force_x=float(found.force[0]),
         force_x_sigma=float(found.sigma[0]),

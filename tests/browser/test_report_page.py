@@ -41,7 +41,7 @@ def a_result(shape=SHAPE, pixel=PIXEL):
         "normals": normals.astype(np.float32),
         "zenith": np.arccos(normals[..., 2]).astype(np.float32),
         "azimuth": np.arctan2(normals[..., 1], normals[..., 0]).astype(np.float32),
-        "normal_sigma": np.full(shape, 0.01, np.float32),
+        "normals_sigma": np.full(shape, 0.01, np.float32),
         "status": np.where(known, 1, 2).astype(np.uint8),
         "edges": (np.abs(np.hypot(grid[0] - HOLE[0], grid[1] - HOLE[1]) - 0.6) < 0.05).astype(np.uint8),
         "contact": known.astype(np.uint8),

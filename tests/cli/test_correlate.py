@@ -66,7 +66,7 @@ def test_what_was_written_is_told_in_a_line_and_plotted():
     ended = run("correlate", theirs(), "--phases", "phases.txt", "-o", "out.h5")
     reach = io.open_result("out.h5").modulation
     assert ended.out == (
-        f"out.h5: azimuth at 35 of 35 pixels, modulation from {reach.min():.3f} to {reach.max():.3f} counts\n"
+        f"out.h5: modulation at 35 of 35 pixels, from {reach.min():.3f} to {reach.max():.3f} counts\n"
     )
     assert ended.said == ""
     assert plot_of("out.h5")[1].name == "/entry/result/azimuth"

@@ -1,6 +1,5 @@
 """``mirrorskin measure``: numbers with units and uncertainties, to read and for programs."""
 
-import dataclasses
 import json
 
 import numpy as np
@@ -83,7 +82,7 @@ def test_one_turn_of_several_is_measured(tmp_path):
     path = tmp_path / "turns.h5"
     height = cap(SHAPE, SIZE, 5.0, 2.5).astype(np.float32)
     one = result_of(height, SIZE)
-    io.save_result(dataclasses.replace(one, height=np.stack([height, height - 1])), path)
+    io.save_result(one.assign(height=np.stack([height, height - 1])), path)
     first, second = (told(path, "--turn", n)["quantities"]["highest point"]["value"] for n in (0, 1))
     assert first - second == pytest.approx(1)
     assert "choose one with --turn" in refused(path)
@@ -92,7 +91,7 @@ def test_one_turn_of_several_is_measured(tmp_path):
 
 def test_what_cannot_be_measured_is_told_in_a_line(ball, tmp_path):
     result = io.open_result(ball)
-    io.save_result(dataclasses.replace(result, x=None, y=None), tmp_path / "unsized.h5")
+    io.save_result(result.assign(x=None, y=None), tmp_path / "unsized.h5")
     assert "reconstruct it again with --pixel-size" in refused(tmp_path / "unsized.h5")
     io.save_result(io.Result(azimuth=np.zeros(SHAPE, np.float32)), tmp_path / "wave.h5")
     assert "has no heights" in refused(tmp_path / "wave.h5")

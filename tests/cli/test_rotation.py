@@ -179,9 +179,9 @@ def test_without_a_gain_there_is_no_zenith_and_a_line_says_why():
     turn(zenith_gain=None)
     result, ended = reconstruct()
     assert ended.said == "turn.h5: no zenith: the recording has no zenith gain; give --zenith-gain\n"
-    assert ended.out.startswith("out.h5: azimuth at 99 of 99 pixels, modulation from ")
+    assert ended.out.startswith("out.h5: modulation at 99 of 99 pixels, from ")
     assert {"azimuth", "modulation"} <= set(result.maps())
-    assert not {"zenith", "normals", "normal_sigma"} & set(result.maps())
+    assert not {"zenith", "normals", "normals_sigma"} & set(result.maps())
     np.testing.assert_allclose(np.cos(result.azimuth - AZIMUTH), 1, atol=0.01)
     json.loads(reconstruct("--json")[1].out)
     score = json.loads(run("score", "out.h5", "--truth", "turn.h5", "--json").out)

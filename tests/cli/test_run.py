@@ -53,7 +53,7 @@ def test_the_maps_are_written_and_told_in_a_line(place):
     span = f"from {light.min():.3f} to {light.max():.3f}"
     assert (ended.code, ended.said) == (0, "")
     assert ended.out == f"press-Light.h5: light at 35 of 35 pixels, {span}\n"
-    np.testing.assert_array_equal(io.open_result("press-Light.h5").own_maps["light"], light)
+    np.testing.assert_array_equal(io.open_result("press-Light.h5")["light"], light)
 
 
 def test_files_of_one_name_are_two_modules():
@@ -113,7 +113,7 @@ def test_what_a_module_itself_lacks_is_not_hidden():
 
 def test_what_the_page_says_runs():
     page = (ROOT / "docs" / "estimators.md").read_text(encoding="utf-8")
-    own, code, with_kernel = re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
+    own, code, declared, with_kernel = re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
     Path("light.py").write_text(own)
     Path("light_on_device.py").write_text(with_kernel)
     for line in "".join(re.findall(r"^```sh\n(.*?)^```", page, re.DOTALL | re.MULTILINE)).splitlines():
@@ -122,5 +122,6 @@ def test_what_the_page_says_runs():
             ended = run(*words)
             assert ended.code == 0, ended.said
     known = {}
-    exec(own + code, known)
-    assert known["result"].own_maps["light"].any()
+    exec(own + code + declared, known)
+    assert known["result"]["light"].any()
+    assert known["Wear"].maps["wear"].quantity == "height"

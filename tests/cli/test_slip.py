@@ -41,7 +41,8 @@ def contact(slide):
 def found(slide, contact):
     ended = run("reconstruct", slide, "--contact", contact, "--per-frame", "-o", slide.with_name("found.h5"))
     assert (ended.code, ended.said) == (0, "")
-    assert "slipped, from" in ended.out
+    assert "slip onset at " in ended.out
+    assert " slipped, " in ended.out
     return io.open_result(slide.with_name("found.h5"))
 
 
@@ -54,7 +55,7 @@ def test_a_slide_is_told_as_the_search_finds_it_in_its_frames(slide, contact, fo
     told = search.result()
     for name in ("displacement", "displacement_sigma", "slip_onset", "slip_onset_sigma", "status", "contact"):
         np.testing.assert_array_equal(getattr(found, name), getattr(told, name), err_msg=name)
-    np.testing.assert_allclose(found.way, np.arange(12) * 0.02, atol=1e-12)
+    np.testing.assert_allclose(found.slide_distance, np.arange(12) * 0.02, atol=1e-12)
     np.testing.assert_array_equal(found.stick_ratio, told.stick_ratio)
 
 
@@ -122,7 +123,7 @@ def stuck_within(radius, truth):
         displacement=truth.displacement[-1],
         slip_onset=np.where(slipped, 0.0, np.nan).astype(np.float32),
         status=np.where(touched, np.where(slipped, 1, 2), 3).astype(np.uint8),
-        way=np.arange(12) * 0.02,
+        slide_distance=np.arange(12) * 0.02,
     )
 
 
@@ -164,14 +165,18 @@ def test_a_part_of_a_twist_turns_about_the_whole_pictures_centre(tmp_path):
     found = io.open_result(tmp_path / "found.h5")
     assert found.process["angle"] == pytest.approx(-math.radians(2.5), rel=0.05)
     assert (found.process["centre_x"], found.process["centre_y"]) == pytest.approx((0, 0), abs=0.06)
-    assert found.to_xarray()["way"].attrs["units"] == "rad"
-    assert found.way[-1] == pytest.approx(math.radians(2.5))
+    assert found.to_xarray()["twist_angle"].attrs["units"] == "rad"
+    assert found.twist_angle[-1] == pytest.approx(math.radians(2.5))
 
 
 def test_pictures_and_tables_know_slip(slide, found, tmp_path):
     result = slide.with_name("found.h5")
     assert run("view", result, "-o", tmp_path / "pictures").code == 0
-    assert {path.stem for path in (tmp_path / "pictures").iterdir()} == {"status", "displacement", "slip"}
+    assert {path.stem for path in (tmp_path / "pictures").iterdir()} == {
+        "status",
+        "displacement",
+        "slip_onset",
+    }
     assert run("report", result, "-o", tmp_path / "page.html").code == 0
     assert run("export", result, "-o", tmp_path / "maps.npz").code == 0
     with np.load(tmp_path / "maps.npz") as arrays:

@@ -11,7 +11,6 @@ from mirrorskin import io
 from mirrorskin.cli import view as command
 from mirrorskin.cli.groups import make_command
 from mirrorskin.view import canvas, space, viewer
-from mirrorskin.view.result.figures import MAPS
 
 app = make_command(None, command.command)
 
@@ -140,9 +139,9 @@ def test_without_matplotlib_the_remedy_is_named(result, monkeypatch):
     assert "pip install 'mirrorskin[view]'" in str(view(result).exception)
 
 
-def test_the_help_names_every_map_there_is():
+def test_the_help_says_where_the_names_of_maps_are_listed():
     told = " ".join(view("--help").output.split())
-    assert [name for name in MAPS if name not in told] == []
+    assert all(text in told for text in ("mirrorskin info", "section", "histogram"))
 
 
 @pytest.mark.parametrize("name", [r"$\frac{$", "$x$ $", "\x1b[2J\x07", "\u5de5\u5177"])

@@ -50,7 +50,7 @@ def same(found, expected):
 
 @pytest.fixture(scope="module")
 def whole():
-    return engine.run(FRAMES, Moments, travel=TRAVEL).own_maps
+    return engine.run(FRAMES, Moments, travel=TRAVEL)
 
 
 def test_the_answer_is_that_of_numpy(whole):
@@ -67,22 +67,22 @@ def test_a_recording_gives_the_same_bits_however_it_is_cut(tmp_path, whole, comp
     with io.open_recording(tmp_path / "rec.h5") as recording:
         found = engine.run(recording, estimator, memory_limit=2 * at_once * FRAME)
     assert max(estimator.pushes) == min(at_once, 8)
-    same(found.own_maps, whole)
+    same(found, whole)
 
 
 def test_frames_that_come_one_by_one_give_the_same_bits(whole):
-    same(engine.run((frame for frame in FRAMES), Moments, travel=TRAVEL).own_maps, whole)
+    same(engine.run((frame for frame in FRAMES), Moments, travel=TRAVEL), whole)
 
 
 def test_a_second_run_begins_anew_and_leaves_the_first_result_alone(whole):
     estimator = Moments((5, 7), np.uint16)
     first = engine.run(FRAMES, estimator, travel=TRAVEL)
     engine.run(FRAMES[:3], estimator, travel=TRAVEL[:3])
-    same(first.own_maps, whole)
-    same(engine.run(stack(), estimator).own_maps, whole)
+    same(first, whole)
+    same(engine.run(stack(), estimator), whole)
 
 
-def test_maps_numbers_and_where_they_come_from_are_kept_in_a_file(tmp_path):
+def test_maps_numbers_and_provenance_are_kept_in_a_file(tmp_path):
     class Mixed(Moments):
         def result(self):
             count = sum(self.pushes)
@@ -103,23 +103,23 @@ def test_maps_numbers_and_where_they_come_from_are_kept_in_a_file(tmp_path):
     assert (found.process["estimator"], found.process["count"]) == ("Mixed", 8)
     assert {"source_fingerprint", "date", "version"} < set(found.process)
     assert found.height.dtype == found.normals.dtype == np.float32
-    same(found.maps(), made.maps())
-    assert found.own_maps.keys() == {"light"}
+    same(found, made)
+    assert list(found) == ["height", "normals", "light"]
     np.testing.assert_array_equal(found.x, made.x)
 
 
-def test_maps_of_one_s_own_are_exported_and_told(tmp_path):
+def test_maps_that_are_not_built_in_are_exported_and_displayed(tmp_path):
     made = engine.run(FRAMES, Moments, travel=TRAVEL)
     io.export_result(made, tmp_path / "maps.npz")
     with np.load(tmp_path / "maps.npz") as arrays:
-        same({name: arrays[name] for name in made.own_maps}, made.own_maps)
+        same({name: arrays[name] for name in made}, made)
     assert made.to_xarray().total.dims == ("y", "x")
     assert "total" in repr(made)
 
 
-def test_one_turn_of_maps_of_one_s_own_is_chosen():
-    turns = io.Result(zenith=np.zeros((2, 5, 7), np.float32), own_maps={"total": FRAMES[:2]})
-    same(io.select_turn(turns, 1).own_maps, {"total": FRAMES[1]})
+def test_select_turn_includes_maps_that_are_not_built_in():
+    turns = io.Result(zenith=np.zeros((2, 5, 7), np.float32), total=FRAMES[:2])
+    np.testing.assert_array_equal(io.select_turn(turns, 1)["total"], FRAMES[1])
 
 
 def test_ours_are_run_as_well(device):
@@ -128,7 +128,7 @@ def test_ours_are_run_as_well(device):
     onset = engine.find_onset(frames, TRAVEL, device=device)
     found = engine.run(press, engine.OnsetSearch(press.shape[1:], press.dtype, device=device), memory_limit=1)
     np.testing.assert_array_equal(found.height, onset.height)
-    np.testing.assert_array_equal(found.own_maps["frame"], onset.frame)
+    np.testing.assert_array_equal(found["frame"], onset.frame)
     assert found.process["noise"] == onset.noise
     assert found.process["device"] == device.info.title
 
@@ -136,7 +136,7 @@ def test_ours_are_run_as_well(device):
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
 def test_a_kernel_of_the_user_s_gives_the_same_as_numpy(device, tmp_path, dtype):
     page = (Path(__file__).parents[2] / "docs" / "estimators.md").read_text(encoding="utf-8")
-    exec(re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)[2], known := {})
+    exec(re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)[-1], known := {})
     frames = random_stack(dtype)
     record(MadeUp(frames, HEADER, travel=TRAVEL), tmp_path / "rec.h5")
     estimator = known["LightOnDevice"](frames.shape[1:], frames.dtype, device=device)
@@ -144,7 +144,7 @@ def test_a_kernel_of_the_user_s_gives_the_same_as_numpy(device, tmp_path, dtype)
     for at_once in (1, 3, 100):
         with io.open_recording(tmp_path / "rec.h5") as recording:
             found = engine.run(recording, estimator, memory_limit=2 * at_once * frames[0].nbytes)
-        np.testing.assert_array_equal(found.own_maps["light"], light)
+        np.testing.assert_array_equal(found["light"], light)
     assert found.process["device"] == device.info.title
 
 

@@ -58,8 +58,8 @@ def test_frames_that_come_one_by_one_give_the_same():
     frames = shown(TURN * FIELD, UNEVEN, 2, "uint8")
     whole = engine.fit_fringes(frames, UNEVEN)
     result = engine.run(list(frames), engine.FringeEstimator, phase=UNEVEN)
-    np.testing.assert_allclose(result.own_maps["phase"], whole.phase, atol=1e-6)
-    np.testing.assert_allclose(result.own_maps["sigma"], whole.sigma, rtol=1e-4)
+    np.testing.assert_allclose(result["phase"], whole.phase, atol=1e-6)
+    np.testing.assert_allclose(result["sigma"], whole.sigma, rtol=1e-4)
     assert result.process["noise"] == pytest.approx(whole.noise, rel=1e-4)
 
 

@@ -319,7 +319,7 @@ def fused():
 def test_a_result_of_both_has_the_maps_of_both():
     result = fused()
     assert set(result.maps()) == {
-        *("height", "height_sigma", "status", "normals", "zenith", "azimuth", "normal_sigma", "mean"),
+        *("height", "height_sigma", "status", "normals", "zenith", "azimuth", "normals_sigma", "mean"),
         *("modulation", "residual", "edges", "filled", "contact", "component"),
     }
     assert {values.shape[:2] for values in result.maps().values()} == {SMALL}

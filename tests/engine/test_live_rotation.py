@@ -100,7 +100,7 @@ def test_a_replay_in_other_cuts_is_the_same_bit_by_bit(dtype):
         results.append(live.result())
     first = results[0]
     for other in results[1:]:
-        for name in ("normals", "normal_sigma", "contact", "mean", "cosine", "sine", "residual", "edges"):
+        for name in ("normals", "normals_sigma", "contact", "mean", "cosine", "sine", "residual", "edges"):
             np.testing.assert_array_equal(getattr(first, name), getattr(other, name), err_msg=name)
         span = np.nanmax(first.height) - np.nanmin(first.height)
         np.testing.assert_allclose(first.height, other.height, atol=1e-3 * span)

@@ -34,7 +34,7 @@ def test_slip_is_bit_by_bit_that_of_the_same_frames_offline():
         live.push(FRAMES[part], displacement=PLACES[part])
         live.maps()
     found, offline = live.result(), reconstruct_slip(source(), contact=CONTACT)
-    for name in ("displacement", "slip_onset", "status", "stick_ratio", "way"):
+    for name in ("displacement", "slip_onset", "status", "stick_ratio", "slide_distance"):
         np.testing.assert_array_equal(getattr(found, name), getattr(offline, name), err_msg=name)
     assert (found.status == 2).mean() > 0.5
     assert found.process["live"] is True

@@ -70,7 +70,7 @@ def test_the_standard_error_is_the_cramer_rao_bound():
     lit_by_all = np.all(np.einsum("hwk,tk->thw", BALL, lamps) > 0, axis=0)[INSIDE]
     found = engine.photometric_stereo(lit(lamps), lamps, noise=2)
     np.testing.assert_allclose(
-        found.normal_sigma[INSIDE][lit_by_all], 2 * bound(lamps)[lit_by_all], rtol=1e-4
+        found.normals_sigma[INSIDE][lit_by_all], 2 * bound(lamps)[lit_by_all], rtol=1e-4
     )
 
 
@@ -78,7 +78,7 @@ def test_the_standard_errors_are_the_scatter():
     lamps = round_lamps(0.5)
     found = engine.photometric_stereo(lit(lamps, noise=0.5), lamps, shadow=2)
     assert found.noise == pytest.approx(0.5, rel=0.03)
-    assert np.mean((angle(found.normals) / found.normal_sigma[INSIDE]) ** 2) == pytest.approx(1, abs=0.07)
+    assert np.mean((angle(found.normals) / found.normals_sigma[INSIDE]) ** 2) == pytest.approx(1, abs=0.07)
     error = (found.albedo - ALBEDO)[INSIDE] / found.albedo_sigma[INSIDE]
     assert np.mean(error**2) == pytest.approx(1, abs=0.07)
 
@@ -99,8 +99,8 @@ def test_frames_that_come_one_by_one_give_the_same():
     stereo.push(frames[:5], light=lamps[:5])
     result = engine.run(list(frames), stereo, light=lamps)  # which resets it
     np.testing.assert_array_equal(result.normals, whole.normals)
-    np.testing.assert_array_equal(result.normal_sigma, whole.normal_sigma)
-    np.testing.assert_array_equal(result.own_maps["albedo"], whole.albedo)
+    np.testing.assert_array_equal(result.normals_sigma, whole.normals_sigma)
+    np.testing.assert_array_equal(result["albedo"], whole.albedo)
 
 
 FRAMES = lit(LAMPS)
@@ -127,4 +127,4 @@ def test_bad_input_is_one_line(arguments, line):
 def test_lamps_in_a_plane_determine_no_normal(azimuth):
     found = engine.photometric_stereo(lit(round_lamps(0.6, np.array(azimuth))), azimuth, zenith=0.6, noise=1)
     assert np.isnan(found.normals).all()
-    assert np.isnan(found.normal_sigma).all()
+    assert np.isnan(found.normals_sigma).all()

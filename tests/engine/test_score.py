@@ -1,13 +1,12 @@
 """Scores against errors that were put in by hand."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from rotations import direction
 
 from mirrorskin import engine, io
 from mirrorskin.engine.summary import summarise
+from mirrorskin.io.maps import SlipStatus, status_of
 from mirrorskin.io.types import UNDISTORTED
 
 NAN = np.float32(np.nan)
@@ -85,7 +84,7 @@ def test_the_error_of_a_normal_is_the_angle_to_the_true_one():
     )
     found = normals([[33, 26, 0], [85, 45, 45]], [[50, 190, 77], [10, 225, np.nan]])
     sigma = np.full((2, 3), np.radians(2), np.float32)
-    score = engine.score(io.Result(normals=found, normal_sigma=sigma), truth)
+    score = engine.score(io.Result(normals=found, normals_sigma=sigma), truth)
     assert score.parts().keys() == {"normal"}
     part = score.normal
     assert (part.answered, part.touched) == (4, 5)
@@ -224,7 +223,7 @@ def test_filled_heights_are_scored_separately():
     assert np.isnan(score.filled.chi_square)  # of what is filled nothing tells how sure it is
     assert score.table()["filled RMS error"] == "0.3000 mm"
     assert "filled offset" not in score.table()
-    assert engine.score(dataclasses.replace(result, filled=result.filled * 0), truth).filled is None
+    assert engine.score(result.assign(filled=result.filled * 0), truth).filled is None
 
 
 def test_each_component_of_each_turn_has_its_own_difference():
@@ -255,7 +254,7 @@ ZENITH = np.radians(np.array([[10, NAN, 45.5], [0, 20, NAN]], np.float32))
         ({"zenith": ZENITH * NAN}, "no normals at any of 6 pixels"),
         (
             {"azimuth": ZENITH, "modulation": np.full((2, 3), 7.25, np.float32)},
-            "azimuth at 4 of 6 pixels, modulation from 7.250 to 7.250 counts",
+            "modulation at 6 of 6 pixels, from 7.250 to 7.250 counts",
         ),
         ({"height": ZENITH * 0 - 1, "zenith": ZENITH}, "height at 4 of 6 pixels, from -1.000 to -1.000 mm"),
         (
@@ -279,6 +278,23 @@ ZENITH = np.radians(np.array([[10, NAN, 45.5], [0, 20, NAN]], np.float32))
 )
 def test_a_result_in_one_line(maps, line):
     assert str(summarise(io.Result(**maps))) == line
+
+
+def test_the_line_of_slip_has_the_counts_of_the_status_and_the_forces():
+    status = np.array([[0, 1, 1], [2, 3, 4]], np.uint8)
+    result = io.Result(
+        slip_onset=np.where(status == 1, np.float32(0.05), NAN),
+        contact=(status != 3).astype(np.uint8),
+        status=status,
+        stick_ratio=np.array([1.0, 0.25, NAN]),
+        force_x=0.5,
+        force_x_sigma=0.01,
+        declarations={"status": status_of(SlipStatus)},
+    )
+    assert str(summarise(result)) == (
+        "slip onset at 2 of 6 pixels, from 50.000 to 50.000 µm, in contact at 5, 2 slipped, 1 sticks, "
+        "1 no contact, 1 no texture, stick ratio 0.25, force x 0.5 ± 0.01 N"
+    )
 
 
 def test_undistorted_maps_are_not_of_the_truth_s_pixels():

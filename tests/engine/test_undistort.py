@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import boards
 import cv2
 import numpy as np
@@ -45,7 +43,7 @@ def maps_of(shape, turns=(), seed=0):
     normals = (normals / np.linalg.norm(normals, axis=-1, keepdims=True)).astype(np.float32)
     normals[random.random(size) < 0.2] = np.nan
     x, y, z = np.moveaxis(normals, -1, 0)
-    names = ["height", "height_sigma", "normal_sigma", "mean", "cosine", "sine", "modulation", "residual"]
+    names = ["height", "height_sigma", "normals_sigma", "mean", "cosine", "sine", "modulation", "residual"]
     labels = {
         name: random.integers(0, 3, size).astype(np.uint8)
         for name in ("status", "edges", "filled", "contact")
@@ -195,7 +193,7 @@ def test_each_turn_is_undistorted_as_if_alone():
     result, lens = maps_of((17, 21), (3,)), bent((17, 21))
     found = undistort(result, lens)
     for turn in range(3):
-        alone = replace(result, **{name: values[turn] for name, values in result.maps().items()})
+        alone = result.assign({name: values[turn] for name, values in result.maps().items()})
         for name, values in undistort(alone, lens).maps().items():
             np.testing.assert_array_equal(found.maps()[name][turn], values)
 
@@ -203,10 +201,10 @@ def test_each_turn_is_undistorted_as_if_alone():
 @pytest.mark.parametrize("said", [True, False])
 def test_a_part_of_the_picture_is_that_part_of_the_map(said):
     shape, top, left = (41, 57), 9, 15
-    result = replace(maps_of(shape), component=None, contact=None)
+    result = maps_of(shape).assign(component=None, contact=None)
     part = slice(top, 30), slice(left, 49)
     process = {"source_region": f"{left},{top},34x21"} if said else {}
-    cut = replace(result, **{name: values[part] for name, values in result.maps().items()}, process=process)
+    cut = result.assign({name: values[part] for name, values in result.maps().items()}, process=process)
     whole = undistort(result, bent(shape))
     found = undistort(cut, bent(shape), None if said else (top, left))
     np.testing.assert_array_equal(found.x, whole.x[part[1]])

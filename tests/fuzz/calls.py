@@ -51,7 +51,7 @@ def calls() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
     normals = (normals / np.linalg.norm(normals, axis=-1, keepdims=True)).astype(np.float32)
     flat, contact = np.zeros(SHAPE, np.float32), np.ones(SHAPE, np.uint8)
     places = {"x": 0.1 * (np.arange(20) - 9.5), "y": 0.1 * (7.5 - np.arange(16))}
-    result = io.Result(height=height, height_sigma=sure, normals=normals, normal_sigma=sure, **places)
+    result = io.Result(height=height, height_sigma=sure, normals=normals, normals_sigma=sure, **places)
     wave = 0.5 + 0.1 * np.sin(np.arange(64) * 0.8)
     dither = (100 + 40 * (wave[:, None, None] - 0.5) + 0 * _FAR).astype(np.float32)
     onset, turned = Maps(height=height, sigma=sure), Maps(vectors=normals, sigma=sure, contact=contact)

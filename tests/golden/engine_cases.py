@@ -383,9 +383,9 @@ def find_focus() -> Answer:
     return named(**answers)
 
 
-@case(normals=NORMAL, normal_sigma=SIGMA, albedo=FITTED, albedo_sigma=SIGMA, residual=(1e-3, 1e-6))
+@case(normals=NORMAL, normals_sigma=SIGMA, albedo=FITTED, albedo_sigma=SIGMA, residual=(1e-3, 1e-6))
 def photometric_stereo() -> Answer:
-    known = ("normals", "normal_sigma", "albedo", "albedo_sigma", "residual", "samples", "noise")
+    known = ("normals", "normals_sigma", "albedo", "albedo_sigma", "residual", "samples", "noise")
     _, along_x, along_y = dome(SMALL)
     normal = np.stack([-along_x, -along_y, np.ones(SMALL)]) / np.sqrt(1 + along_x**2 + along_y**2)
     light = np.stack([0.7 * np.cos(EIGHTHS), 0.7 * np.sin(EIGHTHS), np.full(8, 0.714)], axis=1)
@@ -494,7 +494,7 @@ RECONSTRUCTED = {
     "normals": NORMAL,
     "zenith": NORMAL,
     "azimuth": (1e-5, 1e-4),
-    "normal_sigma": (1e-4, 1e-7),
+    "normals_sigma": (1e-4, 1e-7),
     "process": (1e-3, 1e-6),
 }
 

@@ -47,11 +47,14 @@ def test_a_recording_of_any_layout_is_read(name):
 
 @pytest.mark.parametrize("name", of("result"))
 def test_a_result_of_any_layout_is_read(name):
-    expected = make.PRESS if "press-" in name else make.ROTATION
+    expected = make.DECLARED if "press-" in name else make.ROTATION
     found = io.open_result(make.FOLDER / name)
     for one in ("height", "height_sigma", "status", "normals", "zenith", "azimuth"):
         np.testing.assert_array_equal(getattr(found, one), getattr(expected, one), err_msg=one)
     assert found.process == expected.process
+    if name.endswith("-2.h5"):
+        assert list(found) == list(expected)
+        assert found.declarations == expected.declarations
 
 
 @pytest.mark.parametrize("name", of("calibration"))

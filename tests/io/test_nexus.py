@@ -34,7 +34,7 @@ ALONG = {
 }
 OF_A_PRESS = ("height", "height_sigma", "status", "filled")
 OF_A_ROTATION = (
-    *("height", "height_sigma", "normals", "zenith", "azimuth", "normal_sigma"),
+    *("height", "height_sigma", "normals", "zenith", "azimuth", "normals_sigma"),
     *("mean", "modulation", "residual", "edges", "contact", "component"),
 )
 OF_A_WAVE = ("azimuth", "mean", "cosine", "sine", "modulation", "residual")
@@ -198,7 +198,7 @@ def test_every_map_of_a_result_has_its_unit(tmp_path):
         units = {name: file["entry/result"][name].attrs.get("units") for name in file["entry/result"]}
     millimetres, radians = (
         ("height", "height_sigma", "height_errors", "x", "y"),
-        ("zenith", "azimuth", "normal_sigma"),
+        ("zenith", "azimuth", "normals_sigma"),
     )
     counts, bare = (
         ("mean", "cosine", "sine", "modulation", "residual"),

@@ -11,12 +11,13 @@ from stacks import assert_same, plot_of, record, sphere
 
 from mirrorskin import io
 from mirrorskin.io import atomic
+from mirrorskin.io.maps import declaration_of
 
 PROCESS = {"program": "mirrorskin", "threshold": 0.5, "hold": 2, "subframe": True, "source": "Münze 五円.h5"}
 
 
 PLACES = dict(zip("xy", io.pixel_axes((5, 7), (0.5, 0.6)), strict=True))
-FLOATS = ("zenith", "azimuth", "normal_sigma", "mean", "cosine", "sine", "modulation", "residual")
+FLOATS = ("zenith", "azimuth", "normals_sigma", "mean", "cosine", "sine", "modulation", "residual")
 
 
 def a_press(**changes):
@@ -48,7 +49,7 @@ def test_a_result_has_the_layout_of_the_design(path):
         assert dict(file["entry"].attrs) == {
             "NX_class": "NXentry",
             "default": "result",
-            "mirrorskin_result": 1,
+            "mirrorskin_result": 2,
         }
         assert list(file["entry"]) == ["process", "result"]
         maps = file["entry/result"]
@@ -59,11 +60,14 @@ def test_a_result_has_the_layout_of_the_design(path):
             "axes": ["y", "x"],
         }
         image, mm = {"interpretation": "image"}, {"units": "mm"}
+        height, sigma, status = (
+            {"long_name": declaration_of(name).caption} for name in ("height", "height_sigma", "status")
+        )
         assert {name: (node.shape, node.dtype.str[1:], dict(node.attrs)) for name, node in maps.items()} == {
-            "height": ((5, 7), "f4", image | mm),
-            "height_sigma": ((5, 7), "f4", image | mm),
-            "height_errors": ((5, 7), "f4", image | mm),  # a link to it, for viewers
-            "status": ((5, 7), "u1", image),
+            "height": ((5, 7), "f4", image | mm | height),
+            "height_sigma": ((5, 7), "f4", image | mm | sigma),
+            "height_errors": ((5, 7), "f4", image | mm | sigma),  # a link to it, for viewers
+            "status": ((5, 7), "u1", image | status),
             "x": ((7,), "f8", mm),
             "y": ((5,), "f8", mm),
         }
@@ -239,15 +243,16 @@ def test_a_damaged_result_is_one_line(path, name, value, line):
 
 
 def test_a_number_in_place_of_a_series_is_refused(path):
-    io.save_result(io.Result(status=np.zeros((5, 7), np.uint8), way=np.ones(5)), path)
+    io.save_result(io.Result(status=np.zeros((5, 7), np.uint8), slide_distance=np.ones(5)), path)
     with h5py.File(path, "r+") as file:
-        del file["entry/result/way"]
-        file["entry/result/way"] = 1.0
-    with pytest.raises(io.InputError, match=r"way has shape \(\) where \(0,\) is needed"):
+        del file["entry/result/slide_distance"]
+        file["entry/result/slide_distance"] = 1.0
+    with pytest.raises(io.InputError, match=r"slide_distance has shape \(\) where \(0,\) is needed"):
         io.open_result(path)
 
 
 def test_values_of_different_numbers_of_frames_are_refused(path):
-    io.save_result(io.Result(status=np.zeros((5, 7), np.uint8), stick_ratio=np.ones(4), way=np.ones(5)), path)
+    maps = {"status": np.zeros((5, 7), np.uint8), "stick_ratio": np.ones(4), "slide_distance": np.ones(5)}
+    io.save_result(io.Result(**maps), path)
     with pytest.raises(io.InputError, match=r"different numbers of frames \(.* of [45], .* of [45]\)"):
         io.open_result(path)

@@ -56,7 +56,7 @@ def sampled(
     shape: tuple[int, int] = (60, 80),
     pixel: float = 0.05,
     height_sigma: float = 1e-3,
-    normal_sigma: float = 0.01,
+    normals_sigma: float = 0.01,
 ) -> Result:
     """Return maps of a moved surface, with noise of the sigmas that they name."""
     x, y = pixel_axes(shape, (pixel, pixel))
@@ -70,13 +70,13 @@ def sampled(
         place[..., 2] -= step
         if np.abs(step).max() < 1e-9:
             break
-    normals = upright + normal_sigma / np.sqrt(2) * across(upright, rng)
+    normals = upright + normals_sigma / np.sqrt(2) * across(upright, rng)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     return Result(
         height=(place[..., 2] + rng.normal(0, height_sigma, shape)).astype(np.float32),
         height_sigma=np.full(shape, height_sigma, np.float32),
         normals=normals.astype(np.float32),
-        normal_sigma=np.full(shape, normal_sigma, np.float32),
+        normals_sigma=np.full(shape, normals_sigma, np.float32),
         x=x,
         y=y,
     )

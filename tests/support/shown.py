@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from mirrorskin import io
+from mirrorskin.io.maps import PressStatus, status_of
 
 
 def ball(shape=(24, 32), pixel_size=(0.1, 0.12), radius=2.0, **maps):
@@ -25,7 +26,7 @@ def ball(shape=(24, 32), pixel_size=(0.1, 0.12), radius=2.0, **maps):
         "height_sigma": np.where(hole | (filled == 1), np.nan, 0.002).astype(np.float32),
         "status": np.where(hole, 2, 1).astype(np.uint8),
         "normals": normals.astype(np.float32),
-        "normal_sigma": np.where(hole, np.nan, np.radians(0.5)).astype(np.float32),
+        "normals_sigma": np.where(hole, np.nan, np.radians(0.5)).astype(np.float32),
         "azimuth": np.arctan2(up, across).astype(np.float32),
         "modulation": np.full(shape, 40, np.float32),
         "edges": edges,
@@ -35,6 +36,7 @@ def ball(shape=(24, 32), pixel_size=(0.1, 0.12), radius=2.0, **maps):
         "offset_unknown": np.zeros(1, np.uint8),
         "x": x,
         "y": y,
+        "declarations": {"status": status_of(PressStatus)},
     }
     return io.Result(**(known | maps))
 

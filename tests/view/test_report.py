@@ -7,7 +7,6 @@ import hashlib
 import importlib.util
 import json
 import re
-from dataclasses import replace
 from html.parser import HTMLParser
 
 import calibrations
@@ -20,7 +19,7 @@ from mirrorskin.view import report
 from mirrorskin.view.report import contents
 from mirrorskin.view.report.contents import align
 from mirrorskin.view.report.surface import sample, surface_data
-from mirrorskin.view.report.words import MAPS, PICTURES, split_process
+from mirrorskin.view.report.words import split_process
 
 SHAPE = (23, 31)
 HOSTILE = '"><script>alert(1)</script>&$x'
@@ -100,8 +99,8 @@ def written(folder, result, name="a.h5", **asked):
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
     """A page with all there is, of a file and a source that mean harm."""
-    result = replace(
-        cap(), status=np.ones(SHAPE, np.uint8), calibration=calibrations.a_calibration(name=HOSTILE)
+    result = cap().assign(
+        status=np.ones(SHAPE, np.uint8), calibration=calibrations.a_calibration(name=HOSTILE)
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(contents, "FINENESS", 70)  # quick to draw
@@ -180,12 +179,8 @@ def test_a_page_tells_numbers_parameters_and_where_they_come_from(page):
     assert "zenith" not in page.texts["code"]
 
 
-def test_every_map_and_every_picture_has_its_words():
-    from mirrorskin.view.result.figures import MAPS as DRAWN
-
-    maps = [name for name in io.Result.__dataclass_fields__ if name not in io.types.NO_MAPS]
-    assert list(MAPS) == maps
-    assert set(PICTURES) == set(DRAWN)
+def test_every_built_in_map_has_a_caption():
+    assert [name for name, declared in io.maps.TABLE.items() if not declared.caption] == []
 
 
 def decoded(data):
@@ -234,7 +229,7 @@ def test_a_row_a_column_and_a_pixel_make_no_surface(tmp_path, quick, shape):
 
 
 def test_heights_of_which_none_is_known_make_no_surface(tmp_path, quick):
-    page = written(tmp_path, replace(cap(), height=np.full(SHAPE, np.nan, np.float32)))
+    page = written(tmp_path, cap().assign(height=np.full(SHAPE, np.nan, np.float32)))
     assert page.surface is None
     assert "make no surface" in page.words
 
@@ -251,7 +246,7 @@ def test_a_result_without_heights_says_so(tmp_path, monkeypatch):
 
 
 def test_without_a_pixel_size_places_are_pixels(tmp_path, quick):
-    page = written(tmp_path, replace(cap(), x=None, y=None))
+    page = written(tmp_path, cap().assign(x=None, y=None))
     assert page.surface["unit"] == "px"
     assert (
         page.surface["y"][0]
@@ -264,7 +259,7 @@ def test_without_a_pixel_size_places_are_pixels(tmp_path, quick):
 
 @pytest.mark.parametrize(("unknown", "said"), [([1], "The height is relative"), ([1, 0, 1], "2 of 3 pieces")])
 def test_what_is_relative_is_told(tmp_path, quick, unknown, said):
-    result = replace(cap(), offset_unknown=np.array(unknown, np.uint8))
+    result = cap().assign(offset_unknown=np.array(unknown, np.uint8))
     assert said in written(tmp_path, result).words
     assert "relative" not in written(tmp_path, cap()).texts["p"]
 
@@ -274,7 +269,7 @@ def test_one_turn_of_several_is_shown(tmp_path, quick):
     each = {name: np.stack([values, values]) for name, values in one.maps().items()}
     each["height"][1] += np.float32(0.25)
     each["component"][1][each["component"][1] >= 0] += 1
-    turns = replace(one, **each, offset_unknown=np.array([0, 1], np.uint8))
+    turns = one.assign(each, offset_unknown=np.array([0, 1], np.uint8))
     page = written(tmp_path, turns, turn=1)
     assert page.texts["h1"] == ["a.h5, turn 1"]
     assert page.surface["highest"] == pytest.approx(float(np.nanmax(one.height)) + 0.25)

@@ -13,12 +13,12 @@ from mirrorskin import io
 from mirrorskin.view.result import figures_of, overview, png_of
 
 PRESS = ("height", "height_sigma", "status", "filled", "x", "y")
-TURN = ("height", "height_sigma", "normals", "normal_sigma", "azimuth", "modulation", "edges", "contact")
+TURN = ("height", "height_sigma", "normals", "normals_sigma", "azimuth", "modulation", "edges", "contact")
 
 
 def only(*names, **maps):
     whole = ball(**maps)
-    return io.Result(**{name: getattr(whole, name) for name in names})
+    return io.Result(**{name: getattr(whole, name) for name in names}, declarations=whole.declarations)
 
 
 @pytest.fixture(scope="module")
@@ -39,34 +39,37 @@ def page(drawn):
     return overview(drawn, name="ball.h5")
 
 
-def test_a_fused_result_has_all_pictures_but_those_that_tell_less(alone):
-    assert list(alone) == ["height", "section", "normals", "edges", "status", "sigma", "histogram"]
+FIRST = ["height", "section", "histogram"]
+
+
+def test_the_overview_leaves_out_maps_that_other_pictures_include(alone):
+    assert list(alone) == [*FIRST, "height_sigma", "status", "normals", "normals_sigma", "edges"]
 
 
 @pytest.mark.parametrize(
     ("result", "names"),
     [
-        (only(*PRESS), ["height", "section", "status", "sigma", "histogram"]),
-        (only(*TURN), ["height", "section", "normals", "edges", "sigma", "histogram"]),
+        (only(*PRESS), [*FIRST, "height_sigma", "status"]),
+        (only(*TURN), [*FIRST, "height_sigma", "normals", "normals_sigma", "edges"]),
         (only("azimuth", "modulation", "x", "y"), ["azimuth", "modulation"]),
         (only("status"), ["status"]),
         (
-            io.Result(own_maps={"light": np.eye(24, 32), "count": np.ones((24, 32), np.uint8)}),
+            io.Result(light=np.eye(24, 32), count=np.ones((24, 32), np.uint8)),
             ["light", "count"],
         ),
         (only("height", "x", "y", height=np.full((24, 32), np.nan, np.float32)), ["height", "histogram"]),
     ],
     ids=["press", "rotation", "correlation", "status", "own", "no height known"],
 )
-def test_what_a_result_has_is_drawn_and_nothing_else(result, names):
+def test_the_maps_of_a_result_are_drawn_and_nothing_else(result, names):
     figures = figures_of(result, name="it")
     assert list(figures) == names
     assert all(isinstance(figure, Figure) for figure in figures.values())
 
 
-def test_both_kinds_of_errors_are_one_figure(alone):
-    titles = [axes.get_title("left") for axes in alone["sigma"].axes]
-    assert titles == ["Expected error of heights", "Expected error of normals"]
+def test_a_standard_deviation_is_a_figure_with_the_title_of_its_map(alone):
+    titles = [alone[name].axes[0].get_title("left") for name in ("height_sigma", "normals_sigma")]
+    assert titles == ["Standard deviation of the height", "Standard deviation of the normals"]
 
 
 def test_the_page_has_all_pictures_under_a_title_with_a_summary(alone, page):
@@ -80,14 +83,14 @@ def test_the_page_has_all_pictures_under_a_title_with_a_summary(alone, page):
 def test_only_what_is_asked_for_is_drawn_in_the_usual_order():
     figure = overview(ball(), name="it", maps=["status", "height"])
     assert [axes.get_title("left") for axes in figure.axes] == ["Height", "Status"]
-    assert list(figures_of(ball(), name="it", maps=["sigma"])) == ["sigma"]
+    assert list(figures_of(ball(), name="it", maps=["modulation"])) == ["modulation"]
 
 
 def test_what_a_result_does_not_have_is_said_and_what_it_has():
     with pytest.raises(io.InputError, match=r"^it has no normals to draw: it has status$"):
         overview(only("status"), name="it", maps=["status", "normals"])
     with pytest.raises(io.InputError, match=r"^it has no map to draw: 'mirrorskin export' writes all"):
-        figures_of(io.Result(mean=np.zeros((3, 4), np.float32)), name="it")
+        figures_of(io.Result(force=1.0), name="it")
 
 
 def test_a_section_is_cut_where_it_is_asked_and_that_is_drawn_on_the_heights():

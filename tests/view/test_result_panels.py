@@ -8,18 +8,9 @@ from shown import ball, colours_at, rendered
 
 from mirrorskin import io
 from mirrorskin.engine.metrology import section
+from mirrorskin.io.maps import FocusStatus, PoseStatus, PressStatus, ReleaseStatus, SlipStatus, status_of
 from mirrorskin.view.colours import MISSING_RGB, normal_colours
-from mirrorskin.view.result.maps import (
-    draw_azimuth,
-    draw_edges,
-    draw_height,
-    draw_height_sigma,
-    draw_modulation,
-    draw_normal_sigma,
-    draw_normals,
-    draw_signed,
-    draw_status,
-)
+from mirrorskin.view.result.maps import draw_declared, draw_height, draw_normals
 from mirrorskin.view.result.section import draw_histogram, draw_section
 from mirrorskin.view.result.sheet import percent, sheet_of
 
@@ -28,6 +19,10 @@ def panel_of(draw, result, *more):
     axes = Figure(figsize=(5, 4)).add_axes((0.15, 0.15, 0.6, 0.65))
     draw(axes, sheet_of(result), *more)
     return axes
+
+
+def map_of(name, result):
+    return panel_of(draw_declared, result, name)
 
 
 def note(axes):
@@ -66,9 +61,9 @@ def test_the_height_lies_as_the_picture_does():
     np.testing.assert_allclose(hole, MISSING_RGB, atol=2)
 
 
-@pytest.mark.parametrize("draw", [draw_height, draw_normals, draw_edges, draw_status, draw_azimuth])
-def test_a_millimetre_is_as_long_up_as_it_is_across(draw):
-    axes = panel_of(draw, ball())
+@pytest.mark.parametrize("name", ["height", "normals", "edges", "status", "azimuth", "height_sigma"])
+def test_a_millimetre_is_as_long_up_as_it_is_across(name):
+    axes = map_of(name, ball())
     axes.apply_aspect()
     (x0, y0), (x1, y1) = axes.transData.transform([(0, 0), (1, 1)])
     assert x1 - x0 == pytest.approx(y1 - y0)
@@ -221,49 +216,59 @@ def test_normals_have_the_customary_colours_and_the_key_explains_them():
     assert note(axes) == "black: edges; blue: no answer"
 
 
-def test_edges_lie_on_contact():
-    contact = np.ones((4, 10), np.uint8)
-    contact[:, 5:] = 0
+def test_flags_are_grey_and_black_with_the_share_of_each():
     edges = np.zeros((4, 10), np.uint8)
     edges[1] = 1
-    axes = panel_of(draw_edges, io.Result(edges=edges, contact=contact))
+    result = io.Result(edges=edges, contact=1 - edges)
+    axes = map_of("edges", result)
     shown = axes.images[0].get_array()
     assert shown[1].max() == 0
-    assert tuple(shown[0, 9]) == MISSING_RGB
-    assert shown[0, 0].min() > 200
-    assert named(axes) == {"in contact\n37.5 %", "edge\n25.0 %", "no lasting contact\n37.5 %"}
-    alone = panel_of(draw_edges, io.Result(edges=edges))
-    assert named(alone) == {"no edge\n75.0 %", "edge\n25.0 %"}
+    assert shown[0].min() > 200
+    assert named(axes) == {"no edge\n75.0 %", "edge\n25.0 %"}
+    assert named(map_of("contact", result)) == {"no lasting contact\n25.0 %", "in contact\n75.0 %"}
 
 
 @pytest.mark.parametrize(
-    ("event", "words"),
+    ("codes", "texts"),
     [
-        ("onset", ["invalid input", "onset", "never light", "light at start"]),
-        ("release", ["invalid input", "release", "dark at start", "light to the end"]),
+        (PressStatus, ["invalid input", "onset", "never light", "light at start"]),
+        (ReleaseStatus, ["invalid input", "release", "dark at start", "light to the end"]),
+        (PoseStatus, ["invalid input", "normal", "none", "slope only"]),
+        (SlipStatus, ["unknown", "slipped", "sticks", "no contact", "no texture"]),
+        (FocusStatus, ["invalid input", "in focus", "no peak", "peak at an end"]),
     ],
 )
-def test_status_is_told_in_the_words_of_the_event(event, words):
-    status = np.repeat(np.arange(4, dtype=np.uint8), [1, 2, 3, 4])[np.newaxis]
-    axes = panel_of(draw_status, io.Result(status=status, process={"event": event}))
-    shares = zip(words, ("10.0 %", "20.0 %", "30.0 %", "40.0 %"), strict=True)
-    assert named(axes) == {f"{word}\n{share}" for word, share in shares}
+def test_codes_have_the_legend_of_their_declaration(codes, texts):
+    counts = range(1, len(codes) + 1)
+    status = np.repeat(np.array([*codes], np.uint8), counts)[np.newaxis]
+    axes = map_of("status", io.Result(status=status, declarations={"status": status_of(codes)}))
+    shares = (percent(count, status.size) for count in counts)
+    assert named(axes) == {f"{text}\n{share}" for text, share in zip(texts, shares, strict=True)}
     colours = [tuple(colour) for colour in axes.images[0].get_array()[0]]
-    assert len(set(colours)) == 4
+    assert len(set(colours)) == len(codes)
+    assert colours[0] == MISSING_RGB
     legend = [np.multiply(255, patch.get_facecolor()[:3]) for patch in axes.get_legend().get_patches()]
-    np.testing.assert_allclose(legend, [colours[place] for place in (0, 1, 3, 6)], atol=1)
+    firsts = np.cumsum([0, *counts])[:-1]
+    np.testing.assert_allclose(legend, [colours[place] for place in firsts], atol=1)
 
 
-def test_a_status_that_has_no_word_is_shown_as_such():
+def test_a_code_that_is_not_in_the_legend_is_shown_as_unknown():
     status = np.array([[1, 1, 4, 255]], np.uint8)
-    axes = panel_of(draw_status, io.Result(status=status))
+    axes = map_of("status", io.Result(status=status, declarations={"status": status_of(PressStatus)}))
     assert named(axes) == {"onset\n50.0 %", "unknown number\n50.0 %"}
     np.testing.assert_array_equal(axes.images[0].get_array()[0, 2:], 255)
 
 
-def test_a_status_that_no_pixel_has_is_not_explained():
-    axes = panel_of(draw_status, io.Result(status=np.full((3, 4), 2, np.uint8)))
+def test_the_legend_leaves_out_codes_that_no_pixel_has():
+    status = np.full((3, 4), 2, np.uint8)
+    axes = map_of("status", io.Result(status=status, declarations={"status": status_of(PressStatus)}))
     assert named(axes) == {"never light\n100.0 %"}
+
+
+def test_a_status_without_a_legend_is_shown_as_numbers():
+    axes = map_of("status", io.Result(status=np.array([[0, 1, 5]], np.uint8)))
+    assert axes.get_legend() is None
+    np.testing.assert_array_equal(np.ma.filled(axes.images[0].get_array(), np.nan), [[np.nan, 1, 5]])
 
 
 def test_a_share_that_is_not_nothing_does_not_look_like_nothing():
@@ -272,17 +277,18 @@ def test_a_share_that_is_not_nothing_does_not_look_like_nothing():
 
 
 @pytest.mark.parametrize(
-    ("draw", "unit", "factor", "name"),
+    ("unit", "factor", "name"),
     [
-        (draw_height_sigma, "µm", 1e3, "height_sigma"),
-        (draw_normal_sigma, "deg", 180 / np.pi, "normal_sigma"),
-        (draw_modulation, "counts", 1, "modulation"),
+        ("µm", 1e3, "height_sigma"),
+        ("deg", 180 / np.pi, "normals_sigma"),
+        ("counts", 1, "modulation"),
+        ("µm", 1e3, "slip_onset"),
     ],
 )
-def test_numbers_are_shown_in_the_units_people_speak_of(draw, unit, factor, name):
+def test_numbers_are_shown_in_the_unit_that_the_declaration_displays(unit, factor, name):
     values = np.linspace(0.002, 0.003, 12, dtype=np.float32).reshape(3, 4)
     values[0, 0] = np.nan
-    axes = panel_of(draw, io.Result(**{name: values}))
+    axes = map_of(name, io.Result(**{name: values}))
     shown = np.ma.filled(axes.images[0].get_array(), np.nan)
     np.testing.assert_allclose(shown, factor * values, rtol=1e-6)
     assert axes.child_axes[0].get_ylabel().endswith(f"({unit})")
@@ -292,19 +298,19 @@ def test_numbers_are_shown_in_the_units_people_speak_of(draw, unit, factor, name
 
 def test_errors_that_span_decades_are_shown_by_their_logarithm():
     values = np.geomspace(1e-4, 1e-1, 60, dtype=np.float32).reshape(6, 10)
-    assert isinstance(panel_of(draw_height_sigma, io.Result(height_sigma=values)).images[0].norm, LogNorm)
+    assert isinstance(map_of("height_sigma", io.Result(height_sigma=values)).images[0].norm, LogNorm)
 
 
 @pytest.mark.parametrize("value", [0.0, np.inf])
 def test_errors_that_are_all_the_same_are_shown(value):
-    axes = panel_of(draw_height_sigma, io.Result(height_sigma=np.full((3, 4), value, np.float32)))
+    axes = map_of("height_sigma", io.Result(height_sigma=np.full((3, 4), value, np.float32)))
     rendered(axes.figure)
-    assert (note(axes) == "no answer") == (not np.isfinite(value))
+    assert (note(axes) == "blue: no answer") == (not np.isfinite(value))
 
 
 def test_azimuths_go_round():
     azimuth = np.radians([[0, 90, 180, 270, 359, -90]]).astype(np.float32)
-    picture = panel_of(draw_azimuth, io.Result(azimuth=azimuth)).images[0]
+    picture = map_of("azimuth", io.Result(azimuth=azimuth)).images[0]
     shown = np.asarray(picture.get_array())[0]
     np.testing.assert_allclose(np.abs(shown[2]), 180, atol=1e-4)
     np.testing.assert_allclose(shown[[0, 1, 3, 4, 5]], [0, 90, -90, -1, -90], atol=1e-4)
@@ -334,16 +340,24 @@ def test_heights_that_are_all_the_same_are_shown(value):
 def test_a_map_of_either_sign_has_colours_that_are_white_at_zero(name):
     values = np.linspace(-1, 2, 12 * 16).reshape(12, 16).astype(np.float32)
     values[0, 0] = np.nan
-    axes = panel_of(draw_signed, io.Result(**{name: values}), name)
+    axes = map_of(name, io.Result(**{name: values}))
     low, high = axes.images[0].get_clim()
     assert low == -high < 0
 
 
-def test_the_status_of_poses_has_its_own_words():
-    status = np.array([[1, 2], [4, 4]], np.uint8)
-    axes = panel_of(draw_status, io.Result(status=status, zenith=np.zeros((2, 2), np.float32)))
-    said = [text.get_text() for text in axes.get_legend().get_texts()]
-    assert [text.splitlines()[0] for text in said] == ["normal", "none", "slope only"]
+@pytest.mark.parametrize("shape", [(12, 16, 2), (3, 12, 16, 2)], ids=["one", "of each frame"])
+def test_vectors_are_shown_by_their_length_and_arrows(shape):
+    moved = np.zeros(shape, np.float32)
+    moved[..., :, :, 0] = 0.003
+    moved[..., :, :, 1] = -0.004
+    moved[..., 0, 0, :] = np.nan
+    axes = map_of("displacement", io.Result(displacement=moved))
+    length = np.ma.filled(axes.images[0].get_array(), np.nan)
+    assert np.isnan(length[0, 0])
+    np.testing.assert_allclose(length[1:], 5, rtol=1e-6)
+    assert axes.child_axes[0].get_ylabel() == "length (µm)"
+    (arrows,) = (one for one in axes.collections if hasattr(one, "U"))
+    np.testing.assert_allclose([arrows.U[-1], arrows.V[-1]], [3, -4], rtol=1e-6)
 
 
 def test_a_histogram_leaves_out_a_few_pixels_far_from_all_others():

@@ -15,7 +15,7 @@ from mirrorskin.engine.metrology import Quantity
 from mirrorskin.engine.summary import summarise
 from mirrorskin.io import InputError, Result
 from mirrorskin.view.report.surface import surface_data
-from mirrorskin.view.report.words import MAPS, PICTURES, PIXELS, UNITS, Rows, split_process
+from mirrorskin.view.report.words import PIXELS, UNITS, Rows, map_rows, picture_texts, split_process
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -58,8 +58,7 @@ def contents_of(result: Result, name: str, section: Ends | None, turn: int | Non
         "parameters": _groups(parameters),
         "provenance": _groups(provenance),
         "calibration": _calibration_of(result),
-        "maps": [(which, *MAPS[which]) for which in MAPS if which in result.maps()]
-        + [(which, "", "of your own estimator") for which in result.own_maps],
+        "maps": map_rows(result),
         "units": UNITS,
         "citation": _citation(name, result.process),
     }
@@ -232,7 +231,7 @@ def pictures_of(result: Result, name: str, section: Ends | None) -> list[Picture
     for which, figure in figures.items():
         width = figure.get_figwidth()
         png = png_of(_untitled(figure), round(FINENESS * width))
-        pictures.append(_picture(which, png, wide=width > _TWO))
+        pictures.append(_picture(*picture_texts(result, which), png, wide=width > _TWO))
     return pictures
 
 
@@ -244,9 +243,8 @@ def _untitled(figure: Figure) -> Figure:
     return figure
 
 
-def _picture(name: str, png: bytes, wide: bool) -> Picture:
+def _picture(caption: str, alt: str, png: bytes, wide: bool) -> Picture:
     pixels = _trimmed(np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR), np.uint8))
-    caption, alt = PICTURES.get(name) or (f"{name}, of your own estimator.", f"Map of {name}")
     kind, data = packed(pixels)
     source = f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
     return Picture(caption, alt, source, pixels.shape[1], pixels.shape[0], wide)

@@ -3,96 +3,50 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
-PICTURES: Mapping[str, tuple[str, str]] = {
-    "height": (
-        "Height. Blue has no answer, and orange was filled, not measured.",
-        "Map of the height in millimetres, seen from above",
-    ),
+if TYPE_CHECKING:
+    from mirrorskin.io import Result
+
+_GRAPHS: Mapping[str, tuple[str, str]] = {
     "section": (
-        "Cut along the line from A to B; the band is as many expected standard deviations as it says.",
+        "Section along the line from A to B; the band is as wide as the number of standard deviations in its"
+        " legend.",
         "Cross-section: height along the line from A to B",
     ),
-    "normals": (
-        "Normals: red, green and blue stand for their parts along x, y and z; edges are black.",
-        "Map of the surface normals in colours",
-    ),
-    "azimuth": (
-        "Azimuth: which way the surface faces, counter-clockwise from x.",
-        "Map of the azimuth in the colours of a circle",
-    ),
-    "modulation": (
-        "Modulation: how far the brightness swings in a turn.",
-        "Map of the modulation in counts",
-    ),
-    "edges": ("Edges: where the normal jumps or contact ends.", "Map of the edges"),
-    "status": ("What became of each pixel.", "Map of the status of the pixels, with a legend"),
-    "sigma": (
-        "Expected errors: the standard deviation that is expected of each pixel's answer.",
-        "Map of the expected errors",
-    ),
-    "slope": ("Slope along the direction in which the body rocked.", "Map of the slope along one direction"),
-    "hysteresis": (
-        "Hysteresis: by how much the release is higher than the onset.",
-        "Map of the hysteresis in micrometres",
-    ),
-    "growth": (
-        "Growth: the share of full light that a pixel gains with the travel of a dithering press.",
-        "Map of the growth of the light, per millimetre",
-    ),
-    "displacement": (
-        "Displacement of the skin since the first frame, in the last one; arrows point along it.",
-        "Map of the skin's displacement in micrometres, with arrows",
-    ),
-    "slip": ("How far the body had come when the skin broke loose.", "Map of the onset of slip"),
-    "histogram": ("How often each height occurs.", "Histogram of the heights"),
+    "histogram": ("Number of pixels with each height.", "Histogram of the heights"),
 }
-"""Caption and alternative text of each picture."""
+_ADDITIONS: Mapping[str, str] = {  # what the declarations of maps do not say about the colours of a figure
+    "height": "Blue has no answer, and orange was filled, not measured.",
+    "direction": "Red, green and blue are the components along x, y and z; edges are black.",
+    "vectors": "Arrows show the direction.",
+}
 
-MAPS: Mapping[str, tuple[str, str]] = {
-    "height": ("mm", "height of the surface; 0 is the sheet at rest, and z runs towards the camera"),
-    "height_sigma": ("mm", "the standard deviation that is expected of the height"),
-    "status": (
-        "",
-        "0 invalid input, 1 onset, 2 never light, 3 light at start; of a release: 1 release, "
-        "2 dark at start, 3 light to the end; of a tilt of each frame: 1 normal, 2 none, 4 only a slope; "
-        "of a slide or a twist: 0 unknown, 1 slipped, 2 sticks, 3 no contact, 4 no texture; "
-        "of a focus stack: 1 in focus, 2 no peak, 3 peak at an end of the stack",
-    ),
-    "hysteresis": ("mm", "by how much the release is higher than the onset, in a press that oscillates"),
-    "hysteresis_sigma": ("mm", "the standard deviation that is expected of the hysteresis"),
-    "strokes": ("", "in how many strokes there was what the height is made of"),
-    "growth": ("1/mm", "share of full light that a pixel gains with the travel of a dithering press"),
-    "growth_sigma": ("1/mm", "the standard deviation that is expected of the growth"),
-    "slope": ("", "how much the surface rises along the direction in which the body rocked"),
-    "slope_sigma": ("", "the standard deviation that is expected of the slope"),
-    "normals": ("", "unit normals of the surface: x, y and z"),
-    "zenith": ("rad", "angle between the normal and the direction to the camera"),
-    "azimuth": ("rad", "direction in which the normal leans, counter-clockwise from x"),
-    "normal_sigma": ("rad", "the angle by which the normal is expected to be wrong (RMS)"),
-    "mean": ("counts", "mean brightness over the turn"),
-    "cosine": ("counts", "part of the brightness that goes with the cosine of the phase"),
-    "sine": ("counts", "part of the brightness that goes with the sine of the phase"),
-    "modulation": ("counts", "amplitude of the brightness over the turn"),
-    "residual": ("counts", "standard deviation of the brightness that the turn does not explain"),
-    "edges": ("", "1 where the normal jumps or contact ends"),
-    "filled": ("", "1 where nothing was measured, and the height is a smooth surface between those around"),
-    "contact": ("", "1 where the sheet was in contact in every frame"),
-    "component": (
-        "",
-        "connected pixels are one piece, and share a number; heights of two pieces say nothing of "
-        "each other. -1: no height",
-    ),
-    "slope_min": ("rad", "least inclination of the sheet, by the highest level of light that it passes"),
-    "slope_max": ("rad", "greatest inclination of the sheet, by the lowest level that it does not pass"),
-    "pressure": ("MPa", "between sensor and object at the greatest travel; 0 where nothing touches"),
-    "displacement": ("mm", "how far the skin has moved along x and y since the first frame"),
-    "displacement_sigma": ("mm", "the standard deviation that is expected of that along either axis"),
-    "slip_onset": ("mm, of a twist rad", "the way of the body after which the skin broke loose"),
-    "slip_onset_sigma": ("mm, of a twist rad", "the standard deviation that is expected of the onset"),
-    "traction": ("MPa", "what the object exerts on the sensor along x and y at the end"),
-}
-"""Of each map its unit in the file, and what it says."""
+
+def picture_texts(result: Result, name: str) -> tuple[str, str]:
+    """Return the caption and the alternative text of a picture."""
+    if name in _GRAPHS:
+        return _GRAPHS[name]
+    declared, title = result.declaration(name), result.declaration(name).title_of(name)
+    kind = "vectors" if declared.components else ""
+    kind = "direction" if declared.sampling == "direction" else kind
+    kind = "height" if name == result.name_of("height") else kind
+    sentences = [f"{title}: {declared.caption}." if declared.caption else f"{title}."]
+    sentences += [_ADDITIONS[kind]] if kind else []
+    unit = f" in {declared.figure_unit}" if declared.figure_unit else ""
+    return " ".join(sentences), f"Map: {title[:1].lower()}{title[1:]}{unit}"
+
+
+def map_rows(result: Result) -> list[tuple[str, str, str]]:
+    """Return name, unit and meaning of each map, with the legend of its codes."""
+    rows = []
+    for name in result.maps():
+        declared = result.declaration(name)
+        legend = ", ".join(f"{code} {text}" for code, text in declared.codes.items())
+        meaning = ": ".join(part for part in (declared.caption, legend) if part)
+        rows.append((name, declared.unit, meaning or "no description"))
+    return rows
+
 
 UNITS = (
     "Lengths are in millimetres. x runs to the right and y up the picture, both from its centre to the "

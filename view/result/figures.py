@@ -14,20 +14,7 @@ import numpy as np
 from mirrorskin.engine.summary import summarise
 from mirrorskin.io import InputError, Result
 from mirrorskin.view.canvas import encode_figure, new_figure
-from mirrorskin.view.result.maps import (
-    draw_azimuth,
-    draw_displacement,
-    draw_edges,
-    draw_height,
-    draw_height_sigma,
-    draw_modulation,
-    draw_normal_sigma,
-    draw_normals,
-    draw_own,
-    draw_signed,
-    draw_slip_onset,
-    draw_status,
-)
+from mirrorskin.view.result.maps import draw_declared, draw_height
 from mirrorskin.view.result.section import draw_histogram, draw_section
 from mirrorskin.view.result.sheet import BOX, TEXT, Sheet, sheet_of
 
@@ -39,12 +26,6 @@ if TYPE_CHECKING:
 
 Ends = tuple[tuple[float, float], tuple[float, float]]
 """Where a section begins and ends, x and y, mm."""
-
-MAPS = (
-    *("height", "section", "normals", "edges", "status", "sigma", "histogram", "displacement", "slip"),
-    *("slope", "hysteresis", "growth", "azimuth", "modulation"),
-)
-"""What can be drawn, where a result has it; besides, a user's own maps by their names."""
 
 _GRAPHS = "section", "histogram"  # which are no maps
 _IN_A_ROW = 3  # panels
@@ -58,10 +39,11 @@ _LETTER, _LINE = 0.65 / 72, 1.45 / 72  # inches across and down that a letter ta
 
 @dataclass(frozen=True, slots=True)
 class _Panel:
-    """A picture of a result: what it is called, and what draws it."""
+    """A picture of a result: its name, the function that draws it, and whether the overview includes it."""
 
     name: str
     draw: Callable[[Axes], None]
+    overview: bool = True
 
 
 def figures_of(
@@ -78,12 +60,12 @@ def figures_of(
     section : ((float, float), (float, float)), optional
         Where the section begins and ends, x and y, mm; without it, the row through the apex.
     maps : sequence of str, optional
-        Only these, of `MAPS` or a user's own.
+        Names of maps, ``"section"`` or ``"histogram"``; by default those of the overview.
 
     Returns
     -------
     dict of str to Figure
-        Only of what the result has, in the order of `MAPS`; a user's own follow.
+        By name: heights, section, histogram, then the other maps in the result's order.
 
     Raises
     ------
@@ -92,10 +74,8 @@ def figures_of(
         cannot be placed.
     """
     sheet = sheet_of(result)
-    panels: dict[str, list[_Panel]] = {}
-    for panel in _chosen(sheet, name, section, maps):
-        panels.setdefault(panel.name, []).append(panel)
-    return {which: _figure(sheet, same, name) for which, same in panels.items()}
+    panels = _chosen(sheet, name, section, maps)
+    return {panel.name: _figure(sheet, [panel], name) for panel in panels}
 
 
 def overview(
@@ -112,7 +92,7 @@ def png_of(figure: Figure, width_px: int) -> bytes:
 
 
 def _chosen(sheet: Sheet, name: str, section: Ends | None, maps: Sequence[str] | None) -> list[_Panel]:
-    """Return the requested panels, or raise InputError."""
+    """Return the requested panels, by default those of the overview; or raise InputError."""
     panels = list(_panels_of(sheet, section))
     has = list(dict.fromkeys(panel.name for panel in panels))
     lacking = [one for one in maps or () if one not in has]
@@ -122,38 +102,24 @@ def _chosen(sheet: Sheet, name: str, section: Ends | None, maps: Sequence[str] |
         raise InputError(f"{name} has no {' and no '.join(lacking)} to draw: it has {', '.join(has)}")
     if section is not None and "section" not in has:
         raise InputError(f"{name} has no heights to cut: leave the section out")
-    return [panel for panel in panels if maps is None or panel.name in maps]
+    return [panel for panel in panels if (panel.overview if maps is None else panel.name in maps)]
 
 
 def _panels_of(sheet: Sheet, section: Ends | None) -> Iterator[_Panel]:
-    """Yield what a result has, in the order of `MAPS`."""
+    """Yield what a result has: heights, their section and histogram, and all other maps."""
     result = sheet.result
-    cut = _cut(sheet, section)
-    if result.height is not None:
-        yield _Panel("height", partial(draw_height, sheet=sheet, cut=cut))
+    height, cut = result.name_of("height"), _cut(sheet, section)
+    if height is not None:
+        yield _Panel(height, partial(draw_height, sheet=sheet, cut=cut))
     if cut is not None:
         yield _Panel("section", partial(draw_section, sheet=sheet, cut=cut))
-    for name, values, draw in (
-        ("normals", result.normals, draw_normals),
-        ("edges", result.edges, draw_edges),
-        ("status", result.status, draw_status),
-        ("sigma", result.height_sigma, draw_height_sigma),
-        ("sigma", result.normal_sigma, draw_normal_sigma),
-        ("histogram", result.height, draw_histogram),
-        ("displacement", result.displacement, draw_displacement),
-        ("slip", result.slip_onset, draw_slip_onset),
-    ):
-        if values is not None:
-            yield _Panel(name, partial(draw, sheet=sheet))
-    for name in ("slope", "hysteresis", "growth"):
-        if getattr(result, name) is not None:
-            yield _Panel(name, partial(draw_signed, sheet=sheet, name=name))
-    if result.normals is None:  # normals show more
-        if result.azimuth is not None:
-            yield _Panel("azimuth", partial(draw_azimuth, sheet=sheet))
-        if result.modulation is not None:
-            yield _Panel("modulation", partial(draw_modulation, sheet=sheet))
-    yield from (_Panel(name, partial(draw_own, sheet=sheet, name=name)) for name in result.own_maps)
+    if height is not None:
+        yield _Panel("histogram", partial(draw_histogram, sheet=sheet))
+    for name in result.maps():
+        declared = result.declaration(name)
+        if name != height:
+            overview = declared.overview and declared.included_in not in result
+            yield _Panel(name, partial(draw_declared, sheet=sheet, name=name), overview)
 
 
 def _cut(sheet: Sheet, ends: Ends | None) -> Section | None:
@@ -191,8 +157,8 @@ def _figure(sheet: Sheet, panels: Sequence[_Panel], name: str) -> Figure:
         panel.draw(figure.add_axes(place))
     (title, above), (line, _) = words
     side, top = _MARGIN / size[0], 1 - _MARGIN / size[1]
-    figure.text(side, top, title, fontsize=_NAME, weight="bold", va="top")
-    figure.text(side, top - above / size[1], line, fontsize=TEXT, color="0.3", va="top")
+    figure.text(side, top, title, fontsize=_NAME, weight="bold", va="top", parse_math=False)
+    figure.text(side, top - above / size[1], line, fontsize=TEXT, color="0.3", va="top", parse_math=False)
     return figure
 
 

@@ -1,14 +1,15 @@
-"""Maps of a result: heights, normals, expected errors, modulation, edges, status."""
+"""Maps of a result, drawn as their declarations say: heights, normals, vectors, codes and numbers."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.result import unit_of
+from mirrorskin.io.maps import Map
 from mirrorskin.io.types import Floats
 from mirrorskin.view.canvas import draw_classes, exceeded, explain_colours, filled_colours, round_length
 from mirrorskin.view.colours import (
@@ -50,17 +51,20 @@ def draw_height(axes: Axes, sheet: Sheet, cut: Section | None = None) -> None:
     if cut is not None:
         _draw_line(axes, sheet, cut)
     lay_out(axes, sheet)
-    entitle(axes, quantity(sheet).capitalize(), "; ".join(_notes(sheet)))
+    entitle(axes, f"{quantity(sheet)[:1].upper()}{quantity(sheet)[1:]}", "; ".join(_notes(sheet)))
 
 
 def quantity(sheet: Sheet) -> str:
-    """Return the quantity's name: relative height if the absolute offset is unknown."""
-    unknown = sheet.result.offset_unknown
-    return "relative height" if unknown is not None and unknown.size and unknown.all() else "height"
+    """Return the title of the heights in lower case: relative ones if the absolute offset is unknown."""
+    result = sheet.result
+    name = result.name_of("height") or "height"
+    title, unknown = result.declaration(name).title_of(name), result.offset_unknown
+    title = f"{title[:1].lower()}{title[1:]}"
+    return f"relative {title}" if unknown is not None and unknown.size and unknown.all() else title
 
 
 def _notes(sheet: Sheet) -> Iterator[str]:
-    """Tell what colours mean, and what a level is worth."""
+    """Yield what the colours mean, and from where heights are measured."""
     result, filled = sheet.result, sheet.filled
     assert result.height is not None
     if filled.any():
@@ -150,17 +154,17 @@ def height_picture(
 _KEY = 129  # pixels of the key along a side
 
 
-def draw_normals(axes: Axes, sheet: Sheet) -> None:
-    """Draw normals as colours, edges black, and beside them a half-ball that explains the colours."""
+def draw_normals(axes: Axes, sheet: Sheet, name: str = "normals") -> None:
+    """Draw unit vectors as colours, edges black, and next to them a half-ball that explains the colours."""
     result = sheet.result
-    assert result.normals is not None
-    colours = normal_colours(result.normals, result.edges)
+    normals = result[name]
+    colours = normal_colours(normals, result.edges)
     draw_map(axes, sheet, colours, interpolation="antialiased")
     _draw_key(axes)
-    missing = bool(np.isnan(result.normals[..., 2]).any())
+    missing = bool(np.isnan(normals[..., 2]).any())
     edges = result.edges is not None and bool(result.edges.any())
     notes = (["black: edges"] if edges else []) + (["blue: no answer"] if missing else [])
-    entitle(axes, "Normals", "; ".join(notes))
+    entitle(axes, result.declaration(name).title_of(name), "; ".join(notes))
 
 
 def _draw_key(axes: Axes) -> None:
@@ -181,168 +185,124 @@ def _draw_key(axes: Axes) -> None:
 
 
 _ARROWS = 12  # along a side
-_MICROMETRES = 1e3  # in a millimetre
 _SHOWN = 1, 99  # percentiles at the ends of the colour scale
-_DECADES = 30.0  # times between these, from which on colours are of the logarithm
+_DECADES = 30.0  # ratio of these from which colours show the logarithm
+_SIGNED_SHOWN = 99.0  # percentile of the magnitude at the ends of a diverging scale
+_UNDEFINED_NOTE = "blue: no answer"
+_UNKNOWN_CODE = "unknown number"
+_FLAG_COLOURS = "0.85", "black"
+_CODE_COLOURS = (
+    *("#009e73", "0.25", "#f0e442", "#56b4e9", "#d55e00", "#cc79a7", "#0072b2", "#e69f00"),
+    *("#999999", "#661100", "#117733", "#88ccee", "#ddcc77", "#aa4499", "#44aa99", "#332288"),
+)
+"""Colours of codes, but the one that marks an undefined pixel; more codes than these repeat them."""
 
 
-def draw_height_sigma(axes: Axes, sheet: Sheet) -> None:
-    """Draw the standard deviation that is expected of heights, in micrometres."""
-    assert sheet.result.height_sigma is not None
-    sigma = _MICROMETRES * sheet.result.height_sigma.astype(np.float64)
-    _draw_positive(
-        axes, sheet, sigma, "Expected error of heights", "standard deviation", "\N{MICRO SIGN}m", ERROR
-    )
+def draw_declared(axes: Axes, sheet: Sheet, name: str) -> None:
+    """Draw a map as its declaration says: heights, directions, vectors, codes, or numbers by colour."""
+    result = sheet.result
+    declared = result.declaration(name)
+    values = result[name]
+    if name == result.name_of("height"):
+        draw_height(axes, sheet)
+    elif declared.sampling == "direction":
+        draw_normals(axes, sheet, name)
+    elif declared.codes:
+        _draw_codes(axes, sheet, name)
+    else:
+        last = values[-1] if declared.per_frame and values.ndim > 2 + bool(declared.components) else values
+        known = declared.has_answer(last).reshape(*last.shape[:2], *[1] * (last.ndim - 2))
+        shown = np.where(known, declared.figure_scale * last.astype(np.float64), np.nan)
+        draw = _draw_signed if declared.colours == "signed" else _draw_numbers
+        draw = _draw_angles if declared.sampling == "angle" else draw
+        draw = _draw_vectors if declared.components else draw
+        draw(axes, sheet, shown, name, declared)
 
 
-def draw_normal_sigma(axes: Axes, sheet: Sheet) -> None:
-    """Draw the angular error that is expected of normals, in degrees."""
-    assert sheet.result.normal_sigma is not None
-    sigma = np.degrees(sheet.result.normal_sigma.astype(np.float64))
-    _draw_positive(axes, sheet, sigma, "Expected error of normals", "RMS angle", "deg", ERROR)
+def _label(text: str, declared: Map) -> str:
+    return f"{text} ({declared.figure_unit})" if declared.figure_unit else text
 
 
-def draw_modulation(axes: Axes, sheet: Sheet) -> None:
-    """Draw how far the light swings in a turn, in counts."""
-    assert sheet.result.modulation is not None
-    _draw_positive(
-        axes,
-        sheet,
-        sheet.result.modulation.astype(np.float64),
-        "Modulation",
-        "swing of the light",
-        "counts",
-        SEQUENTIAL,
-    )
-
-
-def draw_slip_onset(axes: Axes, sheet: Sheet) -> None:
-    """Draw how far the body had come when the skin broke loose, in micrometres or degrees."""
-    onset = sheet.result.slip_onset
-    assert onset is not None
-    turned = unit_of("slip_onset", sheet.result.process) == "rad"
-    unit, scale = ("deg", np.degrees(1.0)) if turned else ("\N{MICRO SIGN}m", _MICROMETRES)
-    draw_map(axes, sheet, scale * onset.astype(np.float64), f"way of the body ({unit})", cmap=SEQUENTIAL)
-    entitle(axes, "Onset of slip", "blue: no slip, or no answer")
-
-
-def draw_displacement(axes: Axes, sheet: Sheet) -> None:
-    """Draw how far the skin has moved in the last frame, with arrows along its way."""
-    moved = sheet.result.displacement
-    assert moved is not None
-    last = _MICROMETRES * (moved if moved.ndim == 3 else moved[-1]).astype(np.float64)
-    length = np.sqrt(np.sum(last**2, axis=-1))
-    draw_map(axes, sheet, length, "length (\N{MICRO SIGN}m)", cmap=SEQUENTIAL)
+def _draw_vectors(axes: Axes, sheet: Sheet, values: Floats, name: str, declared: Map) -> None:
+    """Draw the length of vectors, and arrows if they have the components x and y."""
+    length = np.sqrt(np.sum(values**2, axis=-1))
+    draw_map(axes, sheet, length, _label("length", declared), cmap=SEQUENTIAL)
+    entitle(axes, declared.title_of(name), _missing_note(length))
+    if declared.components[:2] != ("x", "y"):
+        return
     rows, columns = (slice(step // 2, None, step) for step in (max(1, n // _ARROWS) for n in length.shape))
     x, y = np.meshgrid(sheet.x[columns], sheet.y[rows])
-    arrows = last[rows, columns]
+    arrows = values[rows, columns]
     axes.quiver(x, y, arrows[..., 0], arrows[..., 1], color="white", edgecolor="black", linewidth=0.3)
-    entitle(axes, "Displacement of the skin", "since the first frame")
 
 
-def draw_signed(axes: Axes, sheet: Sheet, name: str) -> None:
-    """Draw a map whose values may be of either sign: a slope, a hysteresis or a growth."""
-    title, label, unit = _SIGNED[name]
-    values = unit * getattr(sheet.result, name).astype(np.float64)
-    known = np.abs(values[np.isfinite(values)])
-    side = float(np.percentile(known, _SPAN)) if known.any() else 1.0
-    ends = exceeded(values, -side, side)
-    draw_map(axes, sheet, values, label, extend=ends, cmap=DIVERGING, vmin=-side, vmax=side)
-    entitle(axes, title.capitalize())
-
-
-def draw_own(axes: Axes, sheet: Sheet, name: str) -> None:
-    """Draw a map of a user's own estimator."""
-    values = sheet.result.own_maps[name].astype(np.float64)
-    draw_map(axes, sheet, values, name, cmap=SEQUENTIAL)
-    entitle(axes, name, "" if np.isfinite(values).all() else "blue: no answer")
-
-
-def draw_azimuth(axes: Axes, sheet: Sheet) -> None:
-    """Draw the azimuth of the normal, in degrees, in colours that go round as it does."""
-    assert sheet.result.azimuth is not None
-    azimuth = np.degrees(np.angle(np.exp(1j * sheet.result.azimuth.astype(np.float64))))
-    draw_map(axes, sheet, azimuth, "azimuth (deg)", cmap=CYCLIC, vmin=-180, vmax=180)
-    axes.child_axes[0].set_yticks(range(-180, 181, 90))
-    entitle(axes, "Azimuth of the normal", "0: to the right; 90: up")
-
-
-def _draw_positive(
-    axes: Axes, sheet: Sheet, values: Floats, title: str, quantity: str, unit: str, colours: str
-) -> None:
-    """Draw numbers above zero; where they span decades, by their logarithm."""
+def _draw_numbers(axes: Axes, sheet: Sheet, values: Floats, name: str, declared: Map) -> None:
+    """Draw numbers by colour; positive ones that span decades by their logarithm."""
     from matplotlib.colors import LogNorm, Normalize
 
-    values = np.where(np.isfinite(values), values, np.nan)
     known = values[np.isfinite(values)]
     low, high = (float(v) for v in np.percentile(known, _SHOWN)) if known.size else (0.0, 1.0)
-    scale = LogNorm if low > 0 and high > _DECADES * low else Normalize
-    if not high > low:
-        low, high = low - 0.5, high + 0.5
+    decades = declared.colours != "sequential" and low > 0 and high > _DECADES * low
+    scale = (LogNorm if decades else Normalize)(*_apart(low, high))
+    colours = ERROR if declared.colours == "error" else SEQUENTIAL
+    text = "standard deviation" if declared.colours == "error" else name.replace("_", " ")
     beyond = exceeded(known, low, high)
-    label = f"{quantity} ({unit})"
-    draw_map(axes, sheet, values, label, extend=beyond, cmap=colours, norm=scale(low, high))
-    missing = "; blue: no answer" if 0 < known.size < values.size else ""
-    entitle(axes, title, f"median {np.median(known):.3g} {unit}{missing}" if known.size else "no answer")
+    draw_map(axes, sheet, values, _label(text, declared), extend=beyond, cmap=colours, norm=scale)
+    notes = [f"median {np.median(known):.3g} {declared.figure_unit}".rstrip()] if known.size else []
+    entitle(axes, declared.title_of(name), "; ".join(filter(None, [*notes, _missing_note(values)])))
 
 
-_ONSET = "invalid input", "onset", "never light", "light at start"
-_RELEASE = "invalid input", "release", "dark at start", "light to the end"
-_POSES = "invalid input", "normal", "none", "", "slope only"
-_FOCUS = "invalid input", "in focus", "no peak", "peak at an end"
-_SLIP = "unknown", "slipped", "sticks", "no contact", "no texture"
-_UNKNOWN = "unknown number"
-_STATUS_COLOURS = "#d55e00", "#009e73", "0.25", "#f0e442", "white"
-_POSE_COLOURS = *_STATUS_COLOURS[:4], "#56b4e9", "white"
-_SLIP_COLOURS = "#f0e442", "#d55e00", "#009e73", "0.85", "#56b4e9", "white"
-_SIGNED = {  # what colours say, in a unit of so many
-    "slope": ("slope along the rocking", "slope", 1.0),
-    "hysteresis": ("hysteresis", "release less onset (µm)", 1e3),
-    "growth": ("growth of the light", "growth (1/mm)", 1.0),
-}
-_SPAN = 99.0  # per cent of the values that colours tell apart
-_EDGE_COLOURS = "0.85", "black", MISSING
+def _draw_signed(axes: Axes, sheet: Sheet, values: Floats, name: str, declared: Map) -> None:
+    """Draw numbers of either sign, by colours that diverge about zero."""
+    known = np.abs(values[np.isfinite(values)])
+    side = float(np.percentile(known, _SIGNED_SHOWN)) if known.any() else 1.0
+    ends = exceeded(values, -side, side)
+    label = _label(name.replace("_", " "), declared)
+    draw_map(axes, sheet, values, label, extend=ends, cmap=DIVERGING, vmin=-side, vmax=side)
+    entitle(axes, declared.title_of(name), _missing_note(values))
 
 
-def draw_edges(axes: Axes, sheet: Sheet) -> None:
-    """Draw edges, and where the sheet was in contact in every frame, if known."""
-    edges, contact = sheet.result.edges, sheet.result.contact
-    assert edges is not None
-    classes = np.zeros(edges.shape, np.uint8)
-    if contact is not None:
-        classes[contact == 0] = 2
-    classes[edges > 0] = 1
-    names = ("no edge" if contact is None else "in contact", "edge", "no lasting contact")
-    _draw_shares(axes, sheet, classes, _EDGE_COLOURS, names)
-    entitle(axes, "Edges" if contact is None else "Edges and contact")
+def _draw_angles(axes: Axes, sheet: Sheet, values: Floats, name: str, declared: Map) -> None:
+    """Draw angles, in degrees, by colours that are the same at both ends of the scale."""
+    angle = np.degrees(np.angle(np.exp(1j * values / declared.figure_scale)))
+    draw_map(axes, sheet, angle, f"{name.replace('_', ' ')} (deg)", cmap=CYCLIC, vmin=-180, vmax=180)
+    axes.child_axes[0].set_yticks(range(-180, 181, 90))
+    entitle(axes, declared.title_of(name), "0: to the right; 90: up")
 
 
-def draw_status(axes: Axes, sheet: Sheet) -> None:
-    """Draw what became of each pixel in a press or a release, or of what poses determine."""
-    status = sheet.result.status
-    assert status is not None
-    released = sheet.result.process.get("event") == "release"
-    names: tuple[str, ...] = _RELEASE if released else _ONSET
-    colours: tuple[str, ...] = _STATUS_COLOURS
-    if sheet.result.slip_onset is not None:
-        names, colours = _SLIP, _SLIP_COLOURS
-    elif sheet.result.zenith is not None:
-        names, colours = _POSES, _POSE_COLOURS
-    elif "sharpness" in sheet.result.own_maps:
-        names = _FOCUS
-    classes = np.minimum(status, len(names)).astype(np.uint8)
-    _draw_shares(axes, sheet, classes, colours, (*names, _UNKNOWN))
-    entitle(axes, "Status")
+def _missing_note(values: Floats) -> str:
+    return "" if np.isfinite(values).all() else _UNDEFINED_NOTE
+
+
+def _draw_codes(axes: Axes, sheet: Sheet, name: str) -> None:
+    """Draw a categorical map, with its legend and the share of pixels that each code has."""
+    declared, values = sheet.result.declaration(name), sheet.result[name]
+    codes = sorted(declared.codes)
+    places = np.clip(np.searchsorted(codes, values), 0, len(codes) - 1)
+    classes = np.where(np.asarray(codes)[places] == values, places, len(codes)).astype(np.uint8)
+    _draw_shares(axes, sheet, classes, _colours_of(declared), (*(declared.codes[one] for one in codes),))
+    entitle(axes, declared.title_of(name))
+
+
+def _colours_of(declared: Map) -> tuple[str, ...]:
+    """Return the colours of codes in their order, and that of numbers which are not in the legend."""
+    if len(declared.codes) == 2:
+        return (*_FLAG_COLOURS, "white")
+    others = itertools.cycle(_CODE_COLOURS)
+    return (
+        *(MISSING if code == declared.undefined else next(others) for code in sorted(declared.codes)),
+        "white",
+    )
 
 
 def _draw_shares(
     axes: Axes, sheet: Sheet, classes: NDArray[np.uint8], colours: tuple[str, ...], names: tuple[str, ...]
 ) -> None:
     """Draw classes with the share of pixels that each has."""
-    counts = np.bincount(classes.ravel(), minlength=len(names))
+    counts = np.bincount(classes.ravel(), minlength=len(names) + 1)
     labels = {
         number: f"{name}\n{percent(int(counts[number]), classes.size)}"
-        for number, name in enumerate(names)
+        for number, name in enumerate((*names, _UNKNOWN_CODE))
         if counts[number]
     }
     draw_classes(axes, classes, colours, labels, sheet.place, "antialiased")
@@ -350,4 +310,5 @@ def _draw_shares(
     assert legend is not None
     for text in legend.get_texts():
         text.set_fontsize(SMALL)
+        text.set_parse_math(False)
     lay_out(axes, sheet)

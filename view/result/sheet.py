@@ -100,10 +100,17 @@ def lay_out(axes: Axes, sheet: Sheet) -> None:
 
 def entitle(axes: Axes, title: str, note: str = "") -> None:
     """Write a title above a panel, and a note in smaller letters below it."""
-    axes.set_title(title, loc="left", fontsize=TITLE, weight="bold", pad=18)
+    axes.set_title(title, loc="left", fontsize=TITLE, weight="bold", pad=18, parse_math=False)
     axes.set_anchor("NW")  # the titles of a row in line
     axes.annotate(
-        note, (0, 1), (0, 5), "axes fraction", textcoords="offset points", fontsize=SMALL, color="0.3"
+        note,
+        (0, 1),
+        (0, 5),
+        "axes fraction",
+        textcoords="offset points",
+        fontsize=SMALL,
+        color="0.3",
+        parse_math=False,
     )
 
 

@@ -1,7 +1,5 @@
 """All numbers of a height map, of surfaces whose numbers are known in closed form."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from height_maps import cap, places, result_of
@@ -61,7 +59,7 @@ def test_the_surface_in_contact_is_that_of_the_normals(ball):
     normals = np.stack([x / RADIUS, y / RADIUS, up], axis=-1).astype(np.float32)
     normals[np.isnan(ball.height)] = NAN
     told = engine.measure(
-        dataclasses.replace(ball, normals=normals, normal_sigma=np.full(SHAPE, 1e-3, np.float32))
+        ball.assign(normals=normals, normals_sigma=np.full(SHAPE, 1e-3, np.float32))
     ).quantities["contact surface area"]
     assert told.value == pytest.approx(2 * np.pi * RADIUS * SAG, rel=1e-3)
     assert 0.5e-3 < told.sigma / told.value < 1e-2
@@ -71,7 +69,7 @@ def test_the_surface_in_contact_is_that_of_the_normals(ball):
 def test_a_map_of_contact_gives_the_contact_area(ball):
     x, y = places(SHAPE, SIZE)
     contact = (x**2 + y**2 < 4).astype(np.uint8)
-    told = engine.measure(dataclasses.replace(ball, contact=contact)).quantities
+    told = engine.measure(ball.assign(contact=contact)).quantities
     assert told["contact area"].value == pytest.approx(4 * np.pi, rel=1e-3)
     # Half a pixel all around, to one side.
     assert told["contact area"].sigma == pytest.approx(4 * np.pi * 0.015 / np.sqrt(3), rel=0.15)
@@ -114,7 +112,7 @@ def test_the_lowest_of_many_noisy_pixels_is_known_to_be_too_low():
 def test_filled_heights_are_measured_separately(ball):
     filled = np.asarray(ball.height > -0.1).astype(np.uint8)
     sigma = np.where(filled, np.float32(NAN), ball.height_sigma)
-    part = engine.measure(dataclasses.replace(ball, filled=filled, height_sigma=sigma))
+    part = engine.measure(ball.assign(filled=filled, height_sigma=sigma))
     whole, told = engine.measure(ball).quantities, part.quantities
     for name in ("measured area", "volume above rim", "volume below rest plane"):
         assert told[f"{name} with filled"].value == pytest.approx(whole[name].value)
@@ -125,7 +123,7 @@ def test_filled_heights_are_measured_separately(ball):
     assert told["contact area with filled"] == whole["contact area"]
     assert "contact area" not in told
     contact = np.isfinite(ball.height).astype(np.uint8)
-    sure = dataclasses.replace(ball, filled=filled, height_sigma=sigma, contact=contact)
+    sure = ball.assign(filled=filled, height_sigma=sigma, contact=contact)
     assert engine.measure(sure).quantities["contact area"] == whole["contact area"]
     assert told["highest point"].value < -0.09
     assert told["highest point with filled"].value == pytest.approx(0, abs=1e-4)
@@ -197,7 +195,7 @@ def test_components_whose_height_is_relative_are_not_compared_with_others():
 def test_what_the_pixel_size_is_known_by_goes_into_all_that_depends_on_it(ball):
     lens = io.Lens(SIZE, np.eye(3), np.zeros(5), np.eye(3), SHAPE, 0.1, 0.01)
     plain = engine.measure(ball)
-    with_lens = engine.measure(dataclasses.replace(ball, calibration=io.Calibration(camera=None, lens=lens)))
+    with_lens = engine.measure(ball.assign(calibration=io.Calibration(camera=None, lens=lens)))
     for name, power in {
         "measured area": 2,
         "sphere radius": 2,
@@ -282,7 +280,7 @@ def test_what_cannot_be_measured_is_refused_in_a_line(ball):
     refused = {
         "has no heights": io.Result(azimuth=np.zeros((3, 3), np.float32)),
         "maps of 2 turns": io.Result(height=np.zeros((2, 3, 3), np.float32)),
-        "no pixel size: .*--pixel-size": dataclasses.replace(ball, x=None, y=None),
+        "no pixel size: .*--pixel-size": ball.assign(x=None, y=None),
         "no height was measured": result_of(np.full((3, 3), NAN)),
         "no height was measured there": result_of(np.zeros((3, 3)), filled=np.ones((3, 3), np.uint8)),
         "a single pixel": result_of(np.zeros((1, 1))),

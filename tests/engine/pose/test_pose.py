@@ -99,7 +99,7 @@ def test_heights_alone_are_enough() -> None:
     rng = np.random.default_rng(3)
     vector, shift = draw(rng)
     pair = [sampled(bumpy, *way, rng=rng) for way in ((), (vector, shift))]
-    pose = engine.estimate_pose(*(dataclasses.replace(one, normals=None, normal_sigma=None) for one in pair))
+    pose = engine.estimate_pose(*(one.assign(normals=None, normals_sigma=None) for one in pair))
     assert np.abs(error_of(pose, vector, shift)).max() < 0.005
 
 
@@ -109,7 +109,7 @@ def test_integrated_heights_leave_z_open() -> None:
     for way in ((), draw(rng)):
         made = sampled(bumpy, *way, rng=rng)
         pieces = np.zeros(made.height.shape, np.int32), np.ones(1, np.uint8)
-        pair.append(dataclasses.replace(made, component=pieces[0], offset_unknown=pieces[1]))
+        pair.append(made.assign(component=pieces[0], offset_unknown=pieces[1]))
     (free,) = engine.estimate_pose(*pair).undetermined
     np.testing.assert_allclose(np.abs(free), [0, 0, 0, 0, 0, 1], atol=1e-6)
 
@@ -124,7 +124,7 @@ def test_pixels_near_the_border_of_contact_do_not_count() -> None:
         contact[:, 30:34] = 0
         normals = made.normals.copy()
         normals[:, 28:36, 0] += 0.2
-        pair.append(dataclasses.replace(made, contact=contact, normals=normals))
+        pair.append(made.assign(contact=contact, normals=normals))
     pose = engine.estimate_pose(*pair)
     assert pose.chi_square == pytest.approx(1, abs=0.1)
     assert np.abs(error_of(pose, vector, shift)).max() < 0.005
@@ -156,11 +156,11 @@ def test_errors_on_results_from_frames_are_as_large_as_the_covariance_says(
 def refusals() -> dict[str, tuple[io.Result, io.Result, str]]:
     rng = np.random.default_rng(6)
     good = sampled(bumpy, rng=rng)
-    no_height = dataclasses.replace(good, height=None)
-    unsure = dataclasses.replace(good, height_sigma=None, normal_sigma=None)
-    odd = dataclasses.replace(good, normal_sigma=good.normal_sigma[:5])
-    nowhere = dataclasses.replace(good, x=None, y=None)
-    far = dataclasses.replace(good, x=good.x + 100)
+    no_height = good.assign(height=None)
+    unsure = good.assign(height_sigma=None, normals_sigma=None)
+    odd = good.assign(normals_sigma=good.normals_sigma[:5])
+    nowhere = good.assign(x=None, y=None)
+    far = good.assign(x=good.x + 100)
     return {
         "no height": (no_height, good, "needs heights"),
         "no sigma": (good, unsure, "with a sigma"),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from moved_surfaces import bumpy, sampled
@@ -75,7 +73,7 @@ def test_a_touch_of_unknown_offset_takes_that_of_the_others():
         height=second.height + np.float32(0.4),
         height_sigma=second.height_sigma,
         normals=second.normals,
-        normal_sigma=second.normal_sigma,
+        normals_sigma=second.normals_sigma,
         x=second.x,
         y=second.y,
         **relative,
@@ -94,8 +92,7 @@ def test_the_offset_and_the_pose_of_a_levelled_touch_are_in_its_sigma(relative):
             sampled(bumpy, rng=rng, shape=(60, 70), height_sigma=2e-2),
             sampled(bumpy, (0.01, -0.01, 0.02), (-1, 0.2, 0), rng=rng, shape=(60, 70), height_sigma=2e-4),
         ]
-        pair[relative] = replace(
-            pair[relative],
+        pair[relative] = pair[relative].assign(
             height=pair[relative].height + np.float32(0.4),
             component=np.zeros((60, 70), np.int32),
             offset_unknown=np.ones(1, np.uint8),
@@ -114,7 +111,7 @@ def test_touches_that_differ_say_so():
         height=dented,
         height_sigma=second.height_sigma,
         normals=second.normals,
-        normal_sigma=second.normal_sigma,
+        normals_sigma=second.normals_sigma,
         x=second.x,
         y=second.y,
     )
@@ -138,7 +135,11 @@ def test_a_single_result_is_refused():
 def test_heights_without_sigma_are_refused_by_name():
     first, second = touches(moves=MOVES[:2])
     bare = io.Result(
-        height=second.height, normals=second.normals, normal_sigma=second.normal_sigma, x=second.x, y=second.y
+        height=second.height,
+        normals=second.normals,
+        normals_sigma=second.normals_sigma,
+        x=second.x,
+        y=second.y,
     )
     with pytest.raises(io.InputError, match=r"two\.h5 has no height_sigma"):
         engine.stitch([first, bare], names=["one.h5", "two.h5"])

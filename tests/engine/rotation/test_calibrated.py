@@ -74,7 +74,7 @@ class Scene(NamedTuple):
         assert good.sum() > 600
         zenith = np.degrees(result.zenith - self.truth.zenith)[good]
         angle = rotations.between(result.normals.astype(float), true)[good]
-        return zenith, angle / result.normal_sigma[good]
+        return zenith, angle / result.normals_sigma[good]
 
 
 @cache
@@ -151,8 +151,8 @@ def test_without_a_pivot_frames_are_not_registered_but_heights_are_found():
 def test_what_the_calibration_is_wrong_by_counts_in_the_errors_that_are_told():
     wall = walls.response_of_twin(SHAPE, PIXEL, BODY, DISTANCE, sigma=(0.003, 0.004))
     known = replace(scene().calibration, zenith=wall)
-    doubtful = engine.reconstruct(scene().source(calibration=known)).normal_sigma
-    np.testing.assert_allclose(doubtful, np.sqrt(plain().normal_sigma ** 2 + 0.005**2), rtol=1e-5)
+    doubtful = engine.reconstruct(scene().source(calibration=known)).normals_sigma
+    np.testing.assert_allclose(doubtful, np.sqrt(plain().normals_sigma ** 2 + 0.005**2), rtol=1e-5)
 
 
 @pytest.mark.parametrize("missing", ["pixel_size", "press"])

@@ -216,6 +216,6 @@ def test_a_recorded_spiral_gives_normals_and_heights(tmp_path):
     error = np.arccos(np.clip(result.normals @ normal, -1, 1))
     known = result.contact == 1
     assert known.sum() > 900
-    assert np.mean((error / result.normal_sigma)[known] ** 2) == pytest.approx(1, abs=0.2)
+    assert np.mean((error / result.normals_sigma)[known] ** 2) == pytest.approx(1, abs=0.2)
     assert np.isfinite(result.height[known]).all()
     assert set(np.unique(result.status)) <= {1, 2}

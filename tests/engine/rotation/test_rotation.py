@@ -63,11 +63,11 @@ def alike(one, other):
 def test_a_rotation_becomes_normals_and_what_goes_with_them(tmp_path):
     done = []
     result = reconstruct(OF_A_SURFACE, progress=done.append)
-    maps = "zenith", "azimuth", "normal_sigma", "mean", "modulation", "residual", "edges", "contact"
+    maps = "zenith", "azimuth", "normals_sigma", "mean", "modulation", "residual", "edges", "contact"
     maps = (*maps, "height", "height_sigma", "component")
     shapes = {name: values.shape for name, values in result.maps().items()}
     assert shapes == {**dict.fromkeys(maps, SHAPE), "normals": (*SHAPE, 3)}
-    assert np.mean((errors(result) / result.normal_sigma) ** 2) == pytest.approx(1, abs=0.25)
+    assert np.mean((errors(result) / result.normals_sigma) ** 2) == pytest.approx(1, abs=0.25)
     assert result.contact.all()
     assert (result.x.shape, result.y.shape) == ((SHAPE[1],), (SHAPE[0],))
     said = {"method": "exact", "tilt_from": "recording", "turns": TURNS, "frames": 8 * TURNS}
@@ -79,7 +79,7 @@ def test_a_rotation_becomes_normals_and_what_goes_with_them(tmp_path):
     assert done == sorted(done)
     io.save_result(result, tmp_path / "out.h5")
     found = io.open_result(tmp_path / "out.h5")
-    assert_same(found, replace(result, process=found.process))
+    assert_same(found, result.assign(process=found.process))
 
 
 def test_it_is_the_normals_of_the_frames():
@@ -87,7 +87,7 @@ def test_it_is_the_normals_of_the_frames():
     known = {"tilt": TILT, "gain": SETUP.slope, "offset": SETUP.offset, "noise": 20.0}
     found = engine.estimate_normals(frames(), PHASE, **known, method="paper")
     np.testing.assert_array_equal(result.normals, found.vectors)
-    np.testing.assert_array_equal(result.normal_sigma, found.sigma)
+    np.testing.assert_array_equal(result.normals_sigma, found.sigma)
     for name in ("zenith", "azimuth", "contact", "mean", "modulation", "residual"):
         np.testing.assert_array_equal(getattr(result, name), getattr(found, name))
 
@@ -116,8 +116,8 @@ def test_each_turn_may_be_returned_alone():
         part = slice(8 * turn, 8 * turn + 8)
         alone = engine.reconstruct(source(frames=frames()[part], phase=PHASE[part]), noise=noise)
         away = rotations.between(result.normals[turn].astype(float), alone.normals.astype(float))
-        assert np.median(away / alone.normal_sigma) < 0.05
-    assert np.median(mean.normal_sigma / result.normal_sigma[0]) == pytest.approx(3**-0.5, rel=0.02)
+        assert np.median(away / alone.normals_sigma) < 0.05
+    assert np.median(mean.normals_sigma / result.normals_sigma[0]) == pytest.approx(3**-0.5, rel=0.02)
 
 
 def test_without_a_gain_there_is_the_wave_alone():
@@ -173,7 +173,7 @@ def test_the_tilt_is_estimated_on_request_only():
     result = reconstruct(unknown, tilt="estimate")
     assert result.process["tilt_from"] == "estimate"
     assert result.process["tilt"] == pytest.approx(TILT, rel=0.01)
-    assert np.median(errors(result) / result.normal_sigma) < 1.2
+    assert np.median(errors(result) / result.normals_sigma) < 1.2
     assert reconstruct(tilt="estimate").process["tilt"] == result.process["tilt"]
 
 
@@ -266,7 +266,7 @@ def test_registered_frames_of_the_twin_have_honest_errors(camera):
         assert smooth.sum() > 2500
         found.append(np.sqrt(np.mean(error[smooth] ** 2)))
         if heights is not None:
-            square = np.where(smooth, (error / result.normal_sigma) ** 2, np.nan)
+            square = np.where(smooth, (error / result.normals_sigma) ** 2, np.nan)
             for low, high in ((8, 15), (15, 22), (22, 29)):
                 mean = np.nanmean(square[(zenith > low) & (zenith < high)])
                 assert mean == pytest.approx(1, abs=0.25 if camera else 0.15)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
@@ -96,7 +94,7 @@ def test_a_tiff_tells_imagej_and_gdal_what_they_ask_for(slope, tmp_path):
 def test_a_png_tells_gwyddion_what_it_asks_for(slope, tmp_path):
     path = tmp_path / "out.png"
     # Of a part of the picture, so that the middle of it is not the origin.
-    io.export_result(replace(slope, x=slope.x + 3, y=slope.y + 7), path)
+    io.export_result(slope.assign(x=slope.x + 3, y=slope.y + 7), path)
     with Image.open(path) as picture:
         told = {
             name.removeprefix("Gwy::"): text for name, text in picture.text.items() if name[:5] == "Gwy::"

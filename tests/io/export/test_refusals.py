@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-from dataclasses import replace
 from io import BytesIO
 
 import numpy as np
@@ -45,7 +44,7 @@ def test_a_suffix_that_is_unknown_names_those_that_are_known(slope, tmp_path, na
     ],
 )
 def test_what_needs_millimetres_is_not_made_without(slope, tmp_path, name, change, line):
-    lacking = replace(slope, **change)
+    lacking = slope.assign(**change)
     assert line in refused(lacking, tmp_path / name)
     with pytest.raises(io.InputError, match=r"as \.npz"):
         check_export(lacking, tmp_path / name)

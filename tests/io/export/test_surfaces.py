@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import trimesh
@@ -63,7 +61,7 @@ def test_a_hole_stays_one(slope, path):
 
 def test_pieces_are_not_joined(slope, path):
     component = np.where(np.isnan(slope.height), -1, np.arange(9) // 5).astype(np.int32)
-    io.export_result(replace(slope, component=component, offset_unknown=np.zeros(2, np.uint8)), path)
+    io.export_result(slope.assign(component=component, offset_unknown=np.zeros(2, np.uint8)), path)
     mesh = trimesh.load(path)  # with corners at one place made one
     parts = trimesh.graph.connected_component_labels(mesh.face_adjacency, len(mesh.faces))
     assert sorted(np.bincount(parts)) == [2 * 5 * 3, 2 * 5 * 4 - 4]
@@ -102,7 +100,7 @@ def test_a_ply_says_its_unit_and_its_origin_in_ascii(slope, tmp_path):
 
 def test_an_stl_says_its_unit_and_does_not_pass_for_text(slope, tmp_path):
     path = tmp_path / "out.stl"
-    io.export_result(replace(slope, process=slope.process | {"source": "ü" * 200}), path)
+    io.export_result(slope.assign(process=slope.process | {"source": "ü" * 200}), path)
     data = path.read_bytes()
     assert data[:80].startswith(b"unit mm, mirrorskin 1.2.3, 2026-01-02T03:04:05+00:00, ")
     assert len(data) == 84 + 50 * 76
@@ -113,7 +111,7 @@ def test_an_stl_says_its_unit_and_does_not_pass_for_text(slope, tmp_path):
 
 @pytest.mark.parametrize("suffix", ["ply", "stl", "png", "csv"])
 def test_relative_heights_are_told(slope, tmp_path, suffix):
-    relative = replace(slope, offset_unknown=np.ones(1, np.uint8))
+    relative = slope.assign(offset_unknown=np.ones(1, np.uint8))
     section = {"distance": np.arange(3.0), "height": np.arange(3.0)}
     told = io.export_result(relative, tmp_path / f"out.{suffix}", section=section)
     assert told.endswith(", heights relative: the mean of a piece is 0")
