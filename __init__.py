@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
+import importlib
 from typing import TYPE_CHECKING, Any
-
-import lazy_loader
 
 if TYPE_CHECKING:
     from mirrorskin import cli, engine, hw, io, kernels, view
 
     __version__: str
 
-_submodule, _names, _ = lazy_loader.attach(__name__, ["cli", "engine", "hw", "io", "kernels", "view"])
+__all__ = ["__version__", "cli", "engine", "hw", "io", "kernels", "view"]
 
 
 def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     if name == "__version__":
-        from importlib.metadata import version
-
-        return version("mirrorskin")
-    return _submodule(name)
+        return importlib.import_module("importlib.metadata").version("mirrorskin")
+    return importlib.import_module(f"{__name__}.{name}")
 
 
 def __dir__() -> list[str]:
-    return [*_names(), "__version__"]
-
-
-__all__ = ["__version__", "cli", "engine", "hw", "io", "kernels", "view"]
+    return [*__all__]

@@ -172,7 +172,11 @@ def test_a_part_of_a_twist_turns_about_the_whole_pictures_centre(tmp_path):
 def test_pictures_and_tables_know_slip(slide, found, tmp_path):
     result = slide.with_name("found.h5")
     assert run("view", result, "-o", tmp_path / "pictures").code == 0
-    assert {path.stem for path in (tmp_path / "pictures").iterdir()} == {"status", "displacement", "slip_onset"}
+    assert {path.stem for path in (tmp_path / "pictures").iterdir()} == {
+        "status",
+        "displacement",
+        "slip_onset",
+    }
     assert run("report", result, "-o", tmp_path / "page.html").code == 0
     assert run("export", result, "-o", tmp_path / "maps.npz").code == 0
     with np.load(tmp_path / "maps.npz") as arrays:
