@@ -106,8 +106,12 @@ class Hdf5File(Closing):
     def attribute(self, name: str, attribute: str) -> Any:
         """Return an attribute of an object, a text or a number; None if it is missing."""
         node = self.find(name)
-        values = None if node is None else self.attribute_values(node, attribute)
-        return None if values is None else first_value(values)
+        return None if node is None else self._attribute_of(node, attribute)
+
+    def _attribute_of(self, node: Node, attribute: str) -> Any:
+        values = self.attribute_values(node, attribute)
+        with as_input_error(lambda: self.where(node)):
+            return None if values is None else first_value(values)
 
     def attribute_values(self, node: Node, attribute: str) -> NDArray[Any] | None:
         """Return all values of an attribute of an object; None if it is missing."""
@@ -165,8 +169,8 @@ class Hdf5File(Closing):
         values = self._map(node) if mapped else None
         if values is None:
             values = self.load(node, rows)
-        stated = None if unit is None else self.attribute_values(node, "units")
-        given = unit if stated is None else str(first_value(stated) or unit)
+        stated = None if unit is None else self._attribute_of(node, "units")
+        given = unit if stated is None else str(stated or unit)
         if given is None or unit is None or given == unit:
             return values
         return values * conversion_factor(given, unit, self.where(node))

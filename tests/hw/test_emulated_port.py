@@ -36,9 +36,9 @@ def ask(line: serial.Serial) -> dict[str, str]:
 
 
 def test_it_answers_moves_and_reports_right_in_time(port: GrblPort, line: serial.Serial) -> None:
+    begun = time.monotonic()
     line.write(b"G1X2F600\n")
     assert line.read_until() == b"ok\r\n"
-    begun = time.monotonic()
     while port.machine.moving() and time.monotonic() < begun + SOON:
         before, told, after = (
             port.machine.position()["X"],

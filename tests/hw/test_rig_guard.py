@@ -44,8 +44,8 @@ def begin(rig, timed=False):
 @pytest.mark.parametrize(("timed", "stall"), [(True, 0.1), (False, 0.3)])
 def test_a_camera_that_stalls_stops_the_stage_while_everyone_is_busy(rig, timed, stall):
     begin(rig, timed)
-    rig.camera.stall()
     began = time.monotonic()
+    rig.camera.stall()
     assert stopped(rig.stage)  # nobody asked the rig for anything
     assert rig.stage.stops[0] - began > stall / 2
     with pytest.raises(HardwareError, match=rf"fake camera gave no frame for {stall}"):

@@ -582,3 +582,10 @@ def test_texts_that_share_their_bytes_are_counted_each(path, monkeypatch):
         file.create_dataset("x", (200,), h5py.string_dtype())[...] = ["x" * 10_000, *[""] * 199]
     with Hdf5File(path) as file, pytest.raises(io.InputError, match="values other than frames take"):
         file.texts(file.find("/x"), "no remedy")
+
+
+def test_an_attribute_without_values_is_refused(path):
+    with h5py.File(path, "w") as file:
+        file.create_group("entry").attrs["mirrorskin_recording"] = np.empty(0, "S4")
+    with pytest.raises(io.InputError, match="/entry: it is damaged"):
+        io.describe(path)
