@@ -7,6 +7,7 @@ import json
 import random
 import re
 import struct
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -299,6 +300,12 @@ SEMANTIC: dict[str, Mutation] = {
 
 def mutate(path: Path, whole: dict[Path, bytes], chance: random.Random) -> bytes:
     """Return a file of this name that is damaged, spliced, empty, of another kind, or means something odd."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # NumPy and tifffile warn of what is meant to be odd
+        return _mutated(path, whole, chance)
+
+
+def _mutated(path: Path, whole: dict[Path, bytes], chance: random.Random) -> bytes:
     data = whole[path]
     semantic = SEMANTIC.get(path.suffix)
     ascii_mesh = path.suffix in (".ply", ".stl") and path.stem.startswith("ascii")
