@@ -55,7 +55,7 @@ def test_strokes_become_a_recording_of_which_heights_and_hysteresis_are_made(emu
         "--step",
         "0.4mm",
         "--settle",
-        "0s",
+        "1s",  # frames of a stream come late on a busy machine
     )
     ended = capture(emulated, "vertical", "-o", path, *words)
     assert ended.code == 0, ended.said
@@ -65,7 +65,7 @@ def test_strokes_become_a_recording_of_which_heights_and_hysteresis_are_made(emu
     assert run("reconstruct", path, "-o", tmp_path / "heights.h5").code == 0
     result = io.open_result(tmp_path / "heights.h5")
     assert np.nanmax(result.strokes) >= 2
-    assert np.nanmedian(abs(result.hysteresis)) < 0.05  # a frame that is late shows the step before
+    assert np.nanmedian(abs(result.hysteresis)) < 0.05
 
 
 def test_a_slide_in_steps_becomes_a_recording(emulated, tmp_path):
