@@ -9,8 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
+from mirrorskin.io.os_errors import open_regular
+
 _HEADING = re.compile(r"# Emulated rig: port (\S+), process (\d+), started at (\d+)\.")
-_LONGEST = 1 << 20  # characters of a rig file
+_LONGEST = 1 << 20  # bytes of a rig file
 _STARTED = 18  # index, after state, of the start time in /proc/PID/stat; see proc(5)
 
 
@@ -44,8 +46,8 @@ class Emulator:
 
         None if the twin did not write it, or if the stage's port has been changed: then it is a user's own.
         """
-        with path.open(encoding="utf-8", errors="replace") as file:
-            text = file.read(_LONGEST)
+        with open_regular(path) as file:
+            text = file.read(_LONGEST).decode(errors="replace")
         found = _HEADING.match(text)
         if found is None or f'\nport = "{found[1]}"\n' not in text:
             return None

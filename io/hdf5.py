@@ -16,14 +16,14 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.os_errors import as_input_error, is_flagged
+from mirrorskin.io.os_errors import MAX_UNPACKED_BYTES, as_input_error, is_flagged
 from mirrorskin.io.types import Closing, InputError, ProcessValue
 from mirrorskin.io.units import conversion_factor
 
 Node: TypeAlias = "h5py.Group | h5py.Dataset | h5py.Datatype"
 Shape = tuple[int, ...]
 
-VALUES_LIMIT = 1 << 30
+VALUES_LIMIT = MAX_UNPACKED_BYTES
 """Bytes that everything but the frames of one file may take in memory, unpacked.
 
 It applies to HDF5 and Zarr: maps, texts, attributes and process values together. A larger file may take as

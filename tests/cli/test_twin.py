@@ -110,6 +110,14 @@ def test_someone_elses_rig_file_is_kept(background: tuple[str, ...], terminal: T
     assert path.read_text() == "# mine\n"
 
 
+def test_a_pipe_in_place_of_a_rig_file_is_refused(terminal: Terminal) -> None:
+    (terminal.folder / "rig").mkdir()
+    os.mkfifo(terminal.folder / "rig" / "rig.toml")
+    ended = terminal("twin", "serve", "-o", "rig", *SMALL)
+    assert (ended.returncode, ended.stderr.count("\n")) == (2, 1)
+    assert "rig.toml is not a regular file" in ended.stderr
+
+
 class Terminal:
     """Runs commands in a folder, as a terminal does, and ends what goes on in the background."""
 
