@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 from typing import Literal
 
@@ -12,11 +13,23 @@ Replaces = Literal["nothing", "derived", "calibration", "anything"]
 """Which existing file a new one may replace.
 
 "nothing": none, the name must be free. "derived": one that can be computed again, such as a result, a picture
-or a table; not a recording, a calibration, or an HDF5 or MCAP file of another program. "calibration": these,
+or a table; not a recording, a calibration, an HDF5 or MCAP file of another program, a video, arrays or an
+archive that ``export`` did not write, or settings. "calibration": these,
 and calibrations. "anything": every file, since the user asked for that.
 """
 
 _HDF5, _MCAP = b"\x89HDF\r\n\x1a\n", b"\x89MCAP0\r\n"
+_NPY, _ZIP, _HEAD = b"\x93NUMPY", b"PK\3\4", 16
+_VIDEOS = (
+    (0, b"RIFF"),
+    (4, b"ftyp"),
+    (0, b"\x1a\x45\xdf\xa3"),
+    (0, b"OggS"),
+    (0, b"FLV"),
+    (0, b"\0\0\1\xba"),
+)
+"""Where videos have which bytes: AVI, MP4 and MOV, Matroska and WebM, Ogg, Flash, MPEG."""
+
 _USER_BLOCK = 512  # bytes; HDF5's signature is at 0, or at this times a power of two
 _KINDS = {"recording": "a recording", "calibration": "a calibration", "result": "a result"}
 _CALIBRATION = _KINDS["calibration"]
@@ -36,13 +49,32 @@ def check_replaced(path: Path, replaces: Replaces) -> None:
         raise InputError(f"{path} is {kind}, which this command never replaces: choose another name with -o")
 
 
+def _is_exported(path: Path) -> bool:
+    """Tell whether an archive holds the maps of a result, as ``export`` writes them."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = set(archive.namelist())
+    except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile):
+        return False
+    return {"units.npy", "legends.npy", "process.npy"} <= names
+
+
 def protected_kind(path: Path) -> str:
     """Return what a file is, in a few words, if it cannot be computed again; else an empty text."""
     with path.open("rb") as file:
-        if file.read(len(_MCAP)) == _MCAP:
+        head = file.read(_HEAD)
+        if head.startswith(_MCAP):
             from mirrorskin.io.mcap import is_surface
 
             return "" if is_surface(path) else _KINDS["recording"]
+        if any(head[place:].startswith(mark) for place, mark in _VIDEOS):
+            return "a video"
+        if head.startswith(_NPY):
+            return "an array"
+        if head.startswith(_ZIP):
+            return "" if _is_exported(path) else "an archive"
+        if path.suffix.lower() == ".toml":
+            return "a file of settings"
         file.seek(0)
         place, size = 0, path.stat().st_size
         while file.read(len(_HDF5)) != _HDF5:

@@ -275,6 +275,9 @@ class Hdf5File(Closing):
             raise ValueError("a text longer than its file")
         if text.length is not None:
             return 0
+        if isinstance(node, h5py.h5d.DatasetID) and node.get_create_plist().get_layout() == h5py.h5d.VIRTUAL:
+            # HDF5 would read it from the heaps of other files, which are not checked.
+            raise ValueError("texts of any length in a virtual dataset")
         if (name := h5py.h5f.get_name(opened)) not in self._longest_text:
             self._longest_text[name] = _check_heaps(h5py.File(opened))
         # Many texts may refer to the same bytes.

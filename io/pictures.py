@@ -25,6 +25,9 @@ _DTYPES = [dtype.name for dtype in FRAME_DTYPES]
 _PNG_MARK = b"\x89PNG\r\n\x1a\n"
 _TIFF_MARKS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _PNG_HEAD = 33  # bytes of the mark and the first chunk, after which the pixels' size may be written
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # of each colour type
+_ADAM7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
+_PIECE = 1 << 20  # bytes that are unpacked at once
 _INCH = 0.0254  # m
 _FORMATS = {1: "uint", 2: "int", 3: "float"}  # of samples (TIFF 6.0, section 19)
 _JPEG_MARK = b"\xff\xd8"
@@ -76,10 +79,37 @@ def _decode(data: bytes, name: str, flags: int) -> NDArray[Any]:
 
 def _decode_png(data: bytes, name: str, flags: int) -> NDArray[Any]:
     essential = _essential_png(data, name)
-    width, height, depth, colour = struct.unpack_from(">IIBB", essential.ljust(_PNG_HEAD, b"\0"), 16)
+    head = struct.unpack_from(">IIBB2xB", essential.ljust(_PNG_HEAD, b"\0"), 16)
+    width, height, depth, colour, interlaced = head
     size = width * height * (2 if depth == 16 else 1) * (1 if colour == 0 else 4)
     check_unpacked(size, f"{name}: a picture of {width} x {height}", _SMALLER)
+    needed = _png_bytes(width, height, depth * _PNG_CHANNELS.get(colour, 1), bool(interlaced))
+    if essential.count(b"IHDR") != 1 or not _unpacks_to(essential, needed):
+        raise InputError(f"{name} is damaged: it is not one picture of {width} x {height}. Copy it again")
     return _decode(essential, name, flags)
+
+
+def _png_bytes(width: int, height: int, bits: int, interlaced: bool) -> int:
+    """Return the bytes that the pixels of a PNG take before they are packed (PNG, section 7)."""
+    passes = _ADAM7 if interlaced else ((0, 0, 1, 1),)
+    sizes = ((-((left - width) // across), -((top - height) // down)) for left, top, across, down in passes)
+    return sum(rows * (1 + -(-columns * bits // 8)) for columns, rows in sizes if columns > 0)
+
+
+def _unpacks_to(png: bytes, size: int) -> bool:
+    """Tell whether the pixels of a PNG have so many bytes or more: libpng prints about fewer."""
+    unpacker, at = zlib.decompressobj(), 8
+    try:
+        while at < len(png) and size > 0:
+            end = at + 8 + int.from_bytes(png[at : at + 4], "big")
+            packed = png[at + 8 : end] if png[at + 4 : at + 8] == b"IDAT" else b""
+            while packed and size > 0:
+                size -= len(unpacker.decompress(packed, _PIECE))
+                packed = unpacker.unconsumed_tail
+            at = end + 4
+    except zlib.error:
+        return False
+    return size <= 0
 
 
 def _jpeg_size(data: bytes, name: str) -> tuple[int, int]:

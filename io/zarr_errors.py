@@ -6,6 +6,8 @@ import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import numpy as np
+
 from mirrorskin.io.atomic import MAKE_ROOM
 from mirrorskin.io.os_errors import reason
 from mirrorskin.io.types import InputError
@@ -22,7 +24,9 @@ class MissingChunkError(Exception):
 def naming(what: str) -> Iterator[None]:
     """Turn errors of Zarr and of the libraries of stores, of many classes, into one line with a remedy."""
     try:
-        yield
+        # Zarr adds the places that a damaged shard states without a check.
+        with np.errstate(over="ignore"):
+            yield
     except (InputError, MemoryError):
         raise
     except Exception as error:

@@ -6,7 +6,7 @@ import asyncio
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Coroutine, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -100,7 +100,7 @@ async def _walk(store: Any, path: Path, version: int, documents: dict[str, dict[
 
     groups = [""]
     for _ in range(_DEEP + 1):
-        names = await asyncio.gather(*(gated(store.names(group)) for group in groups))
+        names = await _all_of(gated(store.names(group)) for group in groups)
         places = [
             f"{group}/{name}".lstrip("/")
             for group, members in zip(groups, names, strict=True)
@@ -108,7 +108,7 @@ async def _walk(store: Any, path: Path, version: int, documents: dict[str, dict[
         ]
         if len(documents) + len(places) > MOST_NODES:
             raise too_many(path)
-        found = await asyncio.gather(*(gated(_read_document(store, place, version)) for place in places))
+        found = await _all_of(gated(_read_document(store, place, version)) for place in places)
         present = {place: one for place, one in zip(places, found, strict=True) if one is not None}
         documents |= present
         groups = [place for place, one in present.items() if not _is_array(one)]
@@ -116,12 +116,22 @@ async def _walk(store: Any, path: Path, version: int, documents: dict[str, dict[
             return
 
 
+async def _all_of(works: Iterable[Coroutine[Any, Any, Any]]) -> list[Any]:
+    """Do all at once; if one fails, end the others and raise its error."""
+    try:
+        async with asyncio.TaskGroup() as group:
+            tasks = [group.create_task(work) for work in works]
+    except BaseExceptionGroup as errors:
+        raise errors.exceptions[0] from None
+    return [task.result() for task in tasks]
+
+
 async def _read_document(store: Any, place: str, version: int) -> dict[str, Any] | None:
     """Read the document of a group or an array; of version 2, one with the attributes as in version 3."""
     if version == 3:
         return await _read_json(store, place, "zarr.json")
-    array, group, attributes = await asyncio.gather(
-        *(_read_json(store, place, name) for name in (".zarray", ".zgroup", ".zattrs"))
+    array, group, attributes = await _all_of(
+        _read_json(store, place, name) for name in (".zarray", ".zgroup", ".zattrs")
     )
     found = group if array is None else array
     return None if found is None else found | {"attributes": attributes or {}}

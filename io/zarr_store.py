@@ -6,12 +6,13 @@ import asyncio
 import contextvars
 import os
 import stat
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from zarr.abc.store import RangeByteRequest
+from zarr.abc.store import OffsetByteRequest, RangeByteRequest, SuffixByteRequest
 from zarr.core.sync import sync
 from zarr.storage import FsspecStore, LocalStore, WrapperStore, ZipStore
 
@@ -30,6 +31,9 @@ TRANSFER = 300.0
 LARGEST_DOCUMENT, ALL_DOCUMENTS = 8 << 20, 64 << 20
 """Bytes of one metadata document or of the listing of a folder, and of all metadata documents of a store."""
 
+SCHEMES = ("http", "https", "s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "hdfs", "webhdfs", "memory")
+"""What addresses begin with: those of fsspec that are stores, not views of other files."""
+
 _SLACK = 1 << 20  # bytes that a chunk may take more when it is packed
 _most_bytes = contextvars.ContextVar("bytes that an answer may have", default=LARGEST_DOCUMENT)
 
@@ -38,6 +42,9 @@ _most_bytes = contextvars.ContextVar("bytes that an answer may have", default=LA
 def opened_store(path: Path, read_only: bool = True) -> Iterator[Any]:
     """Open a store of Zarr; at the end its connections are closed, which fsspec does not do itself."""
     if isinstance(path, Url):
+        if path.parts[0].rstrip(":") not in SCHEMES or "::" in str(path):
+            known = ", ".join(SCHEMES)
+            raise InputError(f"{path} cannot be opened: addresses of stores begin with one of {known}")
         store = FsspecStore.from_url(str(path), options_of(path), read_only)
     elif read_only and not path.exists():
         raise InputError(f"{path}: no such file")
@@ -124,8 +131,13 @@ class LimitedStore(WrapperStore[Any]):  # type: ignore[misc]  # where it is not 
         """Read a document, None if it is missing, or a chunk or a part of one, which must be there."""
         document = key.rpartition("/")[2] in METADATA
         most = LARGEST_DOCUMENT if document else self.largest_chunk + _SLACK
-        if isinstance(byte_range, RangeByteRequest) and byte_range.end - byte_range.start > most:
-            raise self._damaged(key, most)
+        if isinstance(self._store, ZipStore):
+            byte_range = self._range_of_member(key, byte_range)
+        if isinstance(byte_range, RangeByteRequest):
+            if not 0 <= byte_range.start <= byte_range.end:
+                raise InputError(f"{self._path}: {key} states a place that it does not have: copy it again")
+            if byte_range.end - byte_range.start > most:
+                raise self._damaged(key, most)
         if byte_range is None and self._remote and not self._http:
             byte_range = RangeByteRequest(0, most + 1)
         self._check_place(key, most if byte_range is None else None)
@@ -174,6 +186,22 @@ class LimitedStore(WrapperStore[Any]):  # type: ignore[misc]  # where it is not 
             raise
         finally:
             _most_bytes.reset(token)
+
+    def _range_of_member(self, key: str, byte_range: Any) -> Any:
+        """Return the bytes of an archive's member that are asked for.
+
+        Python unpacks all of a member at once, however little it states to hold, unless a number is given.
+        """
+        info = self._store._zf.NameToInfo.get(key)
+        if info is None:
+            return byte_range
+        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise InputError(f"{self._path}: {key} is neither stored nor deflated: pack the store again")
+        if isinstance(byte_range, SuffixByteRequest):
+            return RangeByteRequest(max(0, info.file_size - byte_range.suffix), info.file_size)
+        if isinstance(byte_range, OffsetByteRequest):
+            return RangeByteRequest(byte_range.offset, info.file_size)
+        return byte_range or RangeByteRequest(0, info.file_size)
 
     def _check_place(self, key: str, most: int | None) -> None:
         """Refuse a file outside of a folder, what is not a regular file, and one of too many bytes."""

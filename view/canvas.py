@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
@@ -39,6 +40,8 @@ def check_drawing() -> None:
     """Raise InputError if nothing can be drawn, before any work is done for a figure."""
     if find_spec("matplotlib") is None:
         raise InputError("figures need Matplotlib: pip install 'mirrorskin[view]'")
+    # It warns where the home cannot be written, and goes on with a temporary folder.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
 
 
 def new_figure(width: float, height: float) -> Figure:

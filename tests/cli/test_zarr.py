@@ -46,7 +46,7 @@ def test_a_result_is_written_as_zarr_and_read_as_a_file(bucket, output):
     assert {name: one.tobytes() for name, one in first.maps().items()} == {
         name: one.tobytes() for name, one in second.maps().items()
     }
-    assert dict(first.process) == dict(second.process)
+    assert {**first.process, "date": ""} == {**second.process, "date": ""}  # they may be a second apart
     scores = [run("score", name, "--truth", "press.h5").out for name in ("press-result.h5", output)]
     assert scores[0] == scores[1]
 
@@ -103,7 +103,10 @@ def test_import_makes_hdf5_of_an_address(bucket):
             "memory://bucket/press-result.h5: this is written as HDF5: name a local file",
         ),
         (("info", "gone.zarr"), "gone.zarr: no such file"),
-        (("info", "unheard://of"), "unheard://of: Protocol not known: unheard: check the address"),
+        (
+            ("info", "unheard://of"),
+            "unheard://of cannot be opened: addresses of stores begin with one of http, https",
+        ),
         (("export", "press.h5", "-o", ADDRESS), f"{ADDRESS} is there already: remove it, or name another"),
         (
             ("reconstruct", "press.h5", "-o", ADDRESS),

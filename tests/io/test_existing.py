@@ -41,11 +41,23 @@ def messages_without_an_index(path):
     path.write_bytes(path.read_bytes()[:200])
 
 
+def bytes_of(path, write, *arrays, **named):
+    with path.open("wb") as file:
+        write(file, *arrays, **named)
+
+
 PROTECTED = {
     "a recording": [lambda path: record(sphere(), path), lambda path: stream(Feed(3), path), messages],
     "a calibration": [lambda path: io.save_calibration(io.Calibration(CAMERA), path)],
     "an HDF5 file of another program": [foreign, behind_a_user_block],
     "an HDF5 file that cannot be read": [cut_off],
+    "an array": [lambda path: bytes_of(path, np.save, np.zeros((3, 4, 4)))],
+    "an archive": [lambda path: bytes_of(path, np.savez, frames=np.zeros((3, 4, 4)))],
+    "a video": [
+        lambda path: path.write_bytes(b"RIFF\0\1\0\0AVI LIST"),
+        lambda path: path.write_bytes(b"\0\0\0\x18ftypisom"),
+        lambda path: path.write_bytes(b"\x1a\x45\xdf\xa3matroska"),
+    ],
 }
 CASES = [(kind, make) for kind, makers in PROTECTED.items() for make in makers]
 CASES += [("a recording", messages_without_an_index)]

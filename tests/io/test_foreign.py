@@ -589,3 +589,17 @@ def test_an_attribute_without_values_is_refused(path):
         file.create_group("entry").attrs["mirrorskin_recording"] = np.empty(0, "S4")
     with pytest.raises(io.InputError, match="/entry: it is damaged"):
         io.describe(path)
+
+
+def test_texts_of_any_length_in_a_virtual_dataset_are_refused(path, tmp_path):
+    """HDF5 would read the heaps of other files, which may not end."""
+    kind = h5py.string_dtype()
+    with h5py.File(tmp_path / "part.h5", "w") as file:
+        file.create_dataset("x", data=["a text"], dtype=kind)
+    io.save_result(io.Result(height=np.zeros((4, 4), np.float32)), path)
+    with h5py.File(path, "r+") as file:
+        layout = h5py.VirtualLayout((1,), kind)
+        layout[:] = h5py.VirtualSource("part.h5", "x", (1,), kind)
+        file.create_virtual_dataset("/entry/process/source", layout)
+    with pytest.raises(io.InputError, match="texts of any length in a virtual dataset"):
+        io.open_result(path)

@@ -9,6 +9,7 @@ import zlib
 import numpy as np
 import pytest
 import tifffile
+from PIL import Image as pil  # noqa: N813
 
 from mirrorskin import io
 from mirrorskin.io import os_errors
@@ -173,3 +174,60 @@ def test_pages_of_several_sizes_are_refused_before_they_are_decoded(tmp_path):
 
 def test_the_limit_is_what_the_documentation_states():
     assert os_errors.MAX_UNPACKED_BYTES == 1 << 30
+
+
+HEAD = struct.pack(">IIBBBBB", 16, 16, 8, 0, 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    "chunks",
+    [
+        [(b"IHDR", HEAD), (b"IHDR", HEAD), (b"IDAT", zlib.compress(bytes(16 * 17)))],
+        [(b"IHDR", HEAD), (b"IDAT", zlib.compress(bytes(16 * 17 - 1)))],
+        [(b"IHDR", HEAD), (b"IDAT", b"no deflate")],
+        [(b"IHDR", HEAD)],
+    ],
+)
+def test_a_png_that_is_not_one_whole_picture_is_refused_before_libpng_prints(chunks, capfd):
+    whole = [(b"IHDR", HEAD), (b"IDAT", zlib.compress(bytes(16 * 17)))]
+    assert decode_grey(png_of(whole), "an image").shape == (16, 16)
+    with pytest.raises(io.InputError, match="it is not one picture of 16 x 16"):
+        decode_grey(png_of(chunks), "an image")
+    assert capfd.readouterr().err == ""
+
+
+def png_of(chunks):
+    """Return a PNG of these chunks, and its end."""
+    found = b"\x89PNG\r\n\x1a\n"
+    for kind, data in [*chunks, (b"IEND", b"")]:
+        found += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    return found
+
+
+@pytest.mark.parametrize("kind", ["L", "LA", "RGB", "RGBA", "P", "1", "I;16"])
+def test_pngs_of_every_kind_are_read(tmp_path, kind):
+    picture = pil.new(kind, (13, 7))
+    picture.save(tmp_path / "a.png")
+    assert read_picture(tmp_path / "a.png").shape == (7, 13)
+
+
+@pytest.mark.parametrize("columns", [1, 2, 3, 5, 8, 13])
+def test_interlaced_pngs_are_read(columns):
+    rows = 9
+    passes = [
+        (0, 0, 8, 8),
+        (4, 0, 8, 8),
+        (0, 4, 4, 8),
+        (2, 0, 4, 4),
+        (0, 2, 2, 4),
+        (1, 0, 2, 2),
+        (0, 1, 1, 2),
+    ]
+    sizes = [(len(range(x, columns, dx)), len(range(y, rows, dy))) for x, y, dx, dy in passes]
+    size = sum(high * (1 + wide) for wide, high in sizes if wide)
+    head = struct.pack(">IIBBBBB", columns, rows, 8, 0, 0, 0, 1)
+    assert decode_grey(
+        png_of([(b"IHDR", head), (b"IDAT", zlib.compress(bytes(size)))]), "an image"
+    ).shape == (rows, columns)
+    with pytest.raises(io.InputError, match="it is not one picture"):
+        decode_grey(png_of([(b"IHDR", head), (b"IDAT", zlib.compress(bytes(size - 1)))]), "an image")

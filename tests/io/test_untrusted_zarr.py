@@ -11,6 +11,9 @@ import os
 import pickle
 import shutil
 import socket
+import struct
+import subprocess
+import sys
 import threading
 import tracemalloc
 import zipfile
@@ -27,6 +30,7 @@ from mirrorskin.io.url import Url
 
 zarr = pytest.importorskip("zarr")
 
+import google_crc32c  # noqa: E402
 import numcodecs  # noqa: E402
 import numcodecs.pickles  # noqa: E402
 
@@ -597,3 +601,76 @@ def test_a_zip_whose_members_unpack_to_more_takes_no_memory(tmp_path):
         file.writestr("zarr.json", ZEROS)
     with little_memory():
         assert "zarr.json has more than 8.39 MB" in refused(path)
+
+
+@pytest.mark.parametrize("name", ["zarr.json", "c/0/0/0"])
+def test_a_zip_whose_members_state_less_than_they_unpack_to_takes_no_memory(tmp_path, name):
+    array = {"zarr_format": 3, "node_type": "array", "shape": list(SHAPE), "data_type": "uint8"}
+    grid = {"name": "regular", "configuration": {"chunk_shape": list(SHAPE)}}
+    keys = {"name": "default", "configuration": {"separator": "/"}}
+    rest = {"fill_value": 0, "attributes": {}, "codecs": [{"name": "bytes"}]}
+    members = {
+        "zarr.json": json.dumps({**array, "chunk_grid": grid, "chunk_key_encoding": keys, **rest}).encode(),
+        "c/0/0/0": random_stack().tobytes(),
+    }
+    stated = len(members[name])
+    members[name] = members[name] + bytes(100_000_000)
+    path = tmp_path / "x.zarr.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        for one, content in members.items():
+            file.writestr(one, content)
+    data = path.read_bytes()
+    path.write_bytes(data.replace(struct.pack("<I", len(members[name])), struct.pack("<I", stated)))
+    with little_memory():
+        assert "it is damaged" in refused(path, **GIVEN)
+
+
+def test_a_zip_of_members_that_are_packed_otherwise_is_refused(tmp_path):
+    path = tmp_path / "x.zarr.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_BZIP2) as file:
+        file.writestr("zarr.json", "{}")
+    assert "zarr.json is neither stored nor deflated" in refused(path)
+
+
+@pytest.mark.parametrize("place", [(200, 2**64 - 150), (2**64 - 2, 2**64 - 2)])
+def test_places_that_a_shard_cannot_have_are_refused(tmp_path, place):
+    folder = tmp_path / "x.zarr"
+    zarr.create_array(folder, data=random_stack(), chunks=(4, *SHAPE[1:]), shards=SHAPE, compressors=None)
+    chunk = folder / "c" / "0" / "0" / "0"
+    data = chunk.read_bytes()
+    index = len(data) - 2 * 16 - 4
+    index_bytes = struct.pack("<QQQQ", *place, *place)
+    checksum = struct.pack("<I", google_crc32c.value(index_bytes))
+    chunk.write_bytes(data[:index] + index_bytes + checksum)
+    assert "damaged" in (message := refused(folder, **GIVEN)) or "that it does not have" in message
+    assert "overflow" not in message
+
+
+def test_a_damaged_document_ends_all_that_is_read_beside_it(tmp_path):
+    """Errors of what goes on would be printed at the end of the program."""
+    folder = tmp_path / "x.zarr"
+    folder.mkdir()
+    (folder / ".zarray").write_text("{")
+    ended = subprocess.run(
+        [sys.executable, "-c", REPEATED, str(folder)], capture_output=True, text=True, check=True
+    )
+    assert ended.stderr == ""
+
+
+REPEATED = """
+import sys
+from mirrorskin import io
+for _ in range(200):
+    try:
+        io.describe(sys.argv[1])
+    except io.InputError as error:
+        assert "it is damaged" in str(error)
+"""
+
+
+@pytest.mark.parametrize(
+    "address", ["github://a:b@c/x.zarr", "reference://x", "zip://x.zarr::s3://b/x.zip", "data://x"]
+)
+def test_addresses_of_anything_but_stores_are_refused(address):
+    with pytest.raises(io.InputError, match="addresses of stores begin with one of http, https"):
+        io.describe(address)
