@@ -15,6 +15,7 @@ import pytest
 from msgspec import structs
 from scripted_grbl import stage_settings
 
+from mirrorskin.hw.emulator.motion import BLOCKS
 from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
 from mirrorskin.hw.grbl.moves import PIECE, Axes
 from mirrorskin.hw.grbl.replies import AHEAD, Window
@@ -127,5 +128,6 @@ def test_a_host_that_is_killed_leaves_a_stage_that_soon_rests():
         while machine.moving():
             assert time.monotonic() < until
             time.sleep(0.005)
-        assert machine.position()["Z"] - killed < speed * 1.0
+        # A controller that was late, on a busy machine, has more in store, but not more than its planner holds.
+        assert machine.position()["Z"] - killed < speed * PIECE * (BLOCKS + 3)
         assert machine.state == "Idle"
