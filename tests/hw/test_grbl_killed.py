@@ -128,6 +128,6 @@ def test_a_host_that_is_killed_leaves_a_stage_that_soon_rests():
         while machine.moving():
             assert time.monotonic() < until
             time.sleep(0.005)
-        # A controller that was late, on a busy machine, has more in store, but not more than its planner holds.
+        # A controller that is late, on a busy machine, has more in store: as much as its planner holds.
         assert machine.position()["Z"] - killed < speed * PIECE * (BLOCKS + 3)
         assert machine.state == "Idle"
