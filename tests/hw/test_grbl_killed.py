@@ -15,6 +15,7 @@ import pytest
 from msgspec import structs
 from scripted_grbl import stage_settings
 
+from mirrorskin.hw.emulator.motion import BLOCKS
 from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
 from mirrorskin.hw.grbl.moves import PIECE, Axes
 from mirrorskin.hw.grbl.replies import AHEAD, Window
@@ -111,7 +112,7 @@ stage.wait()
 
 
 def test_a_host_that_is_killed_leaves_a_stage_that_soon_rests():
-    support = Path(__file__).parents[1] / "support"
+    support, speed = Path(__file__).parents[1] / "support", 0.1
     machine = GrblMachine(SETTINGS)
     with GrblPort(machine) as port:
         words = [sys.executable, "-c", HOST, port.url]
@@ -127,6 +128,6 @@ def test_a_host_that_is_killed_leaves_a_stage_that_soon_rests():
         while machine.moving():
             assert time.monotonic() < until
             time.sleep(0.005)
-        # Of 4.4 mm that are left. An emulator on a busy computer is late; the tests above hold the second.
-        assert machine.position()["Z"] - killed < 1.0
+        # A controller that is late, on a busy machine, has more in store: as much as its planner holds.
+        assert machine.position()["Z"] - killed < speed * PIECE * (BLOCKS + 3)
         assert machine.state == "Idle"
