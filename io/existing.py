@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Literal
 
@@ -49,6 +50,12 @@ def check_replaced(path: Path, replaces: Replaces) -> None:
         raise InputError(f"{path} is {kind}, which this command never replaces: choose another name with -o")
 
 
+def _was_result(path: Path) -> bool:
+    """Tell whether a damaged HDF5 file was a result: it can be made anew."""
+    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
+        return content.find(b"mirrorskin_result") >= 0 and content.find(b"mirrorskin_recording") < 0
+
+
 def _is_exported(path: Path) -> bool:
     """Tell whether an archive holds the maps of a result, as ``export`` writes them."""
     try:
@@ -86,5 +93,5 @@ def protected_kind(path: Path) -> str:
         with Hdf5File(path) as opened:
             kind = next((text for name, text in _KINDS.items() if opened.marked(f"mirrorskin_{name}")), "")
     except InputError:
-        return "an HDF5 file that cannot be read"
+        return "" if _was_result(path) else "an HDF5 file that cannot be read"
     return "" if kind == _KINDS["result"] else kind or "an HDF5 file of another program"

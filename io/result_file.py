@@ -46,7 +46,7 @@ _LAYOUT = 2  # of the files that are written; in layout 1 maps were not declared
 
 @checked
 def save_result(result: Result, path: str | Path) -> None:
-    """Write a result; the file exists whole or not at all (``docs/formats.md``).
+    """Write a result; the file exists whole or not at all.
 
     Parameters
     ----------

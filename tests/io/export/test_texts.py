@@ -4,7 +4,6 @@ import csv
 import json
 import struct
 import zipfile
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -26,7 +25,7 @@ SUFFIXES = (".ply", ".stl", ".xyz", ".png", ".tif", ".tiff", ".csv", ".npz", ".m
 @pytest.fixture
 def odd(slope):
     """A result whose texts hold control codes, line ends and letters beyond ASCII."""
-    return replace(slope, process={**slope.process, **ODD})
+    return slope.assign(process={**slope.process, **ODD})
 
 
 def texts_of(path):
@@ -70,7 +69,7 @@ def test_every_format_takes_any_text(odd, tmp_path, suffix):
 
 
 def test_a_program_beyond_ascii_is_escaped_in_a_tiff(slope, tmp_path):
-    io.export_result(replace(slope, process={**slope.process, "program": "\u5de5\u5177"}), tmp_path / "a.tif")
+    io.export_result(slope.assign(process={**slope.process, "program": "\u5de5\u5177"}), tmp_path / "a.tif")
     with tifffile.TiffFile(tmp_path / "a.tif") as file:
         assert file.pages[0].tags["Software"].value.startswith(r"\u5de5\u5177")
 
