@@ -176,7 +176,7 @@ class LimitedStore(WrapperStore[Any]):  # type: ignore[misc]  # where it is not 
     async def _in_time(self, answer: Any, seconds: float, most: int) -> Any:
         if not self._remote:
             return await answer
-        token = _most_bytes.set(most)
+        _most_bytes.set(most)
         try:
             async with asyncio.timeout(seconds) as limit:
                 return await answer
@@ -184,8 +184,6 @@ class LimitedStore(WrapperStore[Any]):  # type: ignore[misc]  # where it is not 
             if limit.expired():
                 raise TimeoutError(f"no whole answer within {seconds:g} s") from error
             raise
-        finally:
-            _most_bytes.reset(token)
 
     def _range_of_member(self, key: str, byte_range: Any) -> Any:
         """Return the bytes of an archive's member that are asked for.

@@ -16,9 +16,6 @@ from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # A test opens no window, which nobody would close.
 os.environ["MPLBACKEND"] = "agg"
-# Shells start what runs in the background deaf to Ctrl-C, which some tests send.
-signal.signal(signal.SIGINT, signal.default_int_handler)
-
 FOUND = list_devices()
 if not FOUND:
     raise RuntimeError("no OpenCL device found: the tests need one; 'make test' brings PoCL")
@@ -31,6 +28,12 @@ WAYS = [
     for number, info in enumerate(FOUND)
     for shared, layout in [(info.shares_memory, "cpu"), (False, "gpu")]
 ]
+
+
+@pytest.fixture(autouse=True)
+def _default_interrupt():
+    """Shells start what runs in the background deaf to Ctrl-C; a command in this process leaves its handler."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.hookimpl(optionalhook=True)
