@@ -32,7 +32,7 @@ WAYS = [
 
 @pytest.fixture(autouse=True)
 def _default_interrupt():
-    """Shells start what runs in the background deaf to Ctrl-C; a command in this process leaves its handler."""
+    """Shells start what runs in the background deaf to Ctrl-C, and commands leave their own handler."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
