@@ -252,8 +252,8 @@ class EmulatedRig:
             self._leaving.callback(_remove, folder, emulator)
             array = BytesIO()
             np.save(array, self.references()[1])
-            write_new(picture, [array.getvalue()])
-            write_new(path, [f"{emulator.heading}{text}\n".encode()])
+            write_new(picture, [array.getvalue()], replaces="anything")  # of an emulated rig, as was checked
+            write_new(path, [f"{emulator.heading}{text}\n".encode()], replaces="anything")
         return path
 
     def _camera_settings(self) -> CameraSettings:

@@ -102,6 +102,14 @@ def test_a_recording_that_came_meanwhile_is_not_replaced(tmp_path, replaces):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_settings_are_not_replaced(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text("a = 1")
+    with pytest.raises(io.InputError, match="is a file of settings, which this command never replaces"):
+        write_new(path, [b"text"])
+    assert path.read_text() == "a = 1"
+
+
 def test_results_and_what_is_exported_are_replaced(tmp_path):
     for path in (tmp_path / "a.h5", tmp_path / "a.txt"):
         save(path)
