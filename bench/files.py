@@ -120,7 +120,7 @@ def new_folder(name: str, needed: int) -> Iterator[Path]:
 def record(source: Frames, path: Path, compression: Compression = "raw") -> None:
     """Write a recording, and wait until the disk has it: nothing is left to write while others are timed."""
     source.rewind()
-    with io.Recorder(source, path, compression) as recorder:
+    with io.Recorder(source, path, compression, overwrite=True) as recorder:
         recorder.drain(lambda count: None)
     sync(path)
 
