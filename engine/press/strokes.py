@@ -214,7 +214,7 @@ class _JoinedOnsets:
     def count(self) -> NDArray[np.uint16]:
         """Strokes that had one, (H, W)."""
         if self.strokes > 1:
-            return self._count.reshape(self._shape)
+            return self._count.reshape(self._shape).copy()  # the next stroke is counted in place
         none = np.zeros(self._shape, np.uint16)
         return none if self._first is None else (self._first.status == PressStatus.ONSET).astype(np.uint16)
 
