@@ -63,8 +63,7 @@ def check_output(
     or_zarr : bool
         Whether it may be a Zarr store, too, which must be a new one.
     replaces : {"nothing", "derived", "calibration", "anything"}
-        Which existing file may be replaced. By default one that can be computed again: not a recording, a
-        calibration, or an HDF5 or MCAP file of another program.
+        Which existing file may be replaced; see `mirrorskin.io.existing.Replaces`.
 
     Raises
     ------

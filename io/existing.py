@@ -15,8 +15,8 @@ Replaces = Literal["nothing", "derived", "calibration", "anything"]
 
 "nothing": none, the name must be free. "derived": one that can be computed again, such as a result, a picture
 or a table; not a recording, a calibration, an HDF5 or MCAP file of another program, a video, arrays or an
-archive that ``export`` did not write, or settings. "calibration": these,
-and calibrations. "anything": every file, since the user asked for that.
+archive that ``export`` did not write, or settings. "calibration": these, and calibrations. "anything": every
+file, since the user asked for that.
 """
 
 _HDF5, _MCAP = b"\x89HDF\r\n\x1a\n", b"\x89MCAP0\r\n"

@@ -78,13 +78,15 @@ def _decode(data: bytes, name: str, flags: int) -> NDArray[Any]:
 
 
 def _decode_png(data: bytes, name: str, flags: int) -> NDArray[Any]:
-    essential = _essential_png(data, name)
+    chunks = _essential_chunks(data, name)
+    essential = b"".join([_PNG_MARK, *chunks])
     head = struct.unpack_from(">IIBB2xB", essential.ljust(_PNG_HEAD, b"\0"), 16)
     width, height, depth, colour, interlaced = head
     size = width * height * (2 if depth == 16 else 1) * (1 if colour == 0 else 4)
     check_unpacked(size, f"{name}: a picture of {width} x {height}", _SMALLER)
     needed = _png_bytes(width, height, depth * _PNG_CHANNELS.get(colour, 1), bool(interlaced))
-    if essential.count(b"IHDR") != 1 or not _unpacks_to(essential, needed):
+    packed = (chunk[8:-4] for chunk in chunks if chunk[4:8] == b"IDAT")
+    if [chunk[4:8] for chunk in chunks].count(b"IHDR") != 1 or not _unpack_to(packed, needed):
         raise InputError(f"{name} is damaged: it is not one picture of {width} x {height}. Copy it again")
     return _decode(essential, name, flags)
 
@@ -96,17 +98,14 @@ def _png_bytes(width: int, height: int, bits: int, interlaced: bool) -> int:
     return sum(rows * (1 + -(-columns * bits // 8)) for columns, rows in sizes if columns > 0)
 
 
-def _unpacks_to(png: bytes, size: int) -> bool:
-    """Tell whether the pixels of a PNG have so many bytes or more: libpng prints about fewer."""
-    unpacker, at = zlib.decompressobj(), 8
+def _unpack_to(pieces: Iterable[bytes], size: int) -> bool:
+    """Tell whether a PNG's packed pixels have so many bytes or more: libpng prints about fewer."""
+    unpacker = zlib.decompressobj()
     try:
-        while at < len(png) and size > 0:
-            end = at + 8 + int.from_bytes(png[at : at + 4], "big")
-            packed = png[at + 8 : end] if png[at + 4 : at + 8] == b"IDAT" else b""
+        for packed in pieces:
             while packed and size > 0:
                 size -= len(unpacker.decompress(packed, _PIECE))
                 packed = unpacker.unconsumed_tail
-            at = end + 4
     except zlib.error:
         return False
     return size <= 0
@@ -218,9 +217,9 @@ def _png_chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-def _essential_png(data: bytes, name: str) -> bytes:
+def _essential_chunks(data: bytes, name: str) -> list[bytes]:
     """Check each chunk of a PNG, and keep those that make the picture: libpng prints about the others."""
-    kept, at, kind = [data[:8]], 8, b""
+    kept, at, kind = list[bytes](), len(_PNG_MARK), b""
     while kind != b"IEND":
         size = int.from_bytes(data[at : at + 4], "big")
         chunk, at = data[at : at + 12 + size], at + 12 + size
@@ -229,7 +228,7 @@ def _essential_png(data: bytes, name: str) -> bytes:
             raise InputError(f"{name} is damaged or cut off: copy it again")
         if kind[:1].isupper():
             kept.append(chunk)
-    return b"".join(kept)
+    return kept
 
 
 @contextmanager

@@ -10,6 +10,7 @@ import numpy as np
 
 from mirrorskin.io.atomic import MAKE_ROOM
 from mirrorskin.io.os_errors import reason
+from mirrorskin.io.text import one_line
 from mirrorskin.io.types import InputError
 
 _REFUSED = {"PermissionError", "NoCredentialsError", "CredentialRetrievalError"}
@@ -39,8 +40,7 @@ def _reason(error: Exception) -> str:
     if isinstance(error, PermissionError) and error.errno:
         return f"{reason(error)}: check the permissions"
     kinds = {kind.__name__ for kind in type(error).__mro__}
-    text = " ".join(str(error).split())[:200] or type(error).__name__
-    text = "".join(letter if letter.isprintable() else "?" for letter in text)
+    text = one_line(error)[:200] or type(error).__name__
     if isinstance(error, MissingChunkError):
         return text
     if isinstance(error, ImportError):

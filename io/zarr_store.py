@@ -203,24 +203,20 @@ class LimitedStore(WrapperStore[Any]):  # type: ignore[misc]  # where it is not 
 
     def _check_place(self, key: str, most: int | None) -> None:
         """Refuse a file outside of a folder, what is not a regular file, and one of too many bytes."""
-        size = 0
-        if isinstance(self._store, ZipStore):
-            info = self._store._zf.NameToInfo.get(key)
-            size = 0 if info is None else info.file_size
-        elif isinstance(self._store, LocalStore):
-            place = Path(os.path.realpath(self._store.root / key))
-            if not place.is_relative_to(self._home):
-                raise InputError(
-                    f"{self._path}: {key} leads out of the store, to {place}: copy that into the store"
-                )
-            try:
-                found = place.stat()
-            except OSError:
-                return
-            if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
-                raise InputError(f"{self._path}: {key} is not a regular file: copy the store again")
-            size = found.st_size
-        if most is not None and size > most:
+        if not isinstance(self._store, LocalStore):
+            return
+        place = Path(os.path.realpath(self._store.root / key))
+        if not place.is_relative_to(self._home):
+            raise InputError(
+                f"{self._path}: {key} leads out of the store, to {place}: copy that into the store"
+            )
+        try:
+            found = place.stat()
+        except OSError:
+            return
+        if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
+            raise InputError(f"{self._path}: {key} is not a regular file: copy the store again")
+        if most is not None and found.st_size > most:
             raise self._damaged(key, most)
 
     def _damaged(self, key: str, most: int) -> InputError:

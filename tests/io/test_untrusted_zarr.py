@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from stacks import SHAPE, random_stack, read_all, record, sphere
+from traps import Trap
 
 from mirrorskin import io
 from mirrorskin.io import hdf5
@@ -97,14 +98,6 @@ def flag(tmp_path, monkeypatch):
     """A file that is there once a pickle was decoded, which numcodecs is told to do."""
     monkeypatch.setattr(numcodecs.pickles, "ALLOW_UNSAFE_PICKLE_DECODE", True, raising=False)
     return tmp_path / "flag"
-
-
-class Trap:
-    def __init__(self, flag):
-        self.flag = flag
-
-    def __reduce__(self):
-        return Path.touch, (self.flag,)
 
 
 def trap(flag):
