@@ -352,6 +352,12 @@ TABLE: Mapping[str, Map] = {
         summary="height",
     ),
     "status": Map("outcome at each pixel", dtype="uint8", undefined=0),
+    "frame": Map(
+        "number of the first frame after the event, from 0",
+        dtype="int32",
+        undefined=-1,
+        overview=False,
+    ),
     "hysteresis": Map(
         "height of the release minus height of the onset, in a press that oscillates",
         "mm",

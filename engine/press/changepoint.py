@@ -2,204 +2,113 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.frames import Noise, check_dtype, check_frames, reference_pair
-from mirrorskin.engine.press.onset import Event, Onset, check_event, check_stack
-from mirrorskin.engine.thread_safe import ThreadSafe
-from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Staged, cut_into_bands, join_rows, room_of
-from mirrorskin.io import InputError
-from mirrorskin.io.arguments import checked
-from mirrorskin.io.maps import PressStatus, ReleaseStatus, status_of
+from mirrorskin.engine.frames import Noise, reference_pair
+from mirrorskin.engine.operation import travel_function
+from mirrorskin.engine.press.crossing import Event, PressOperation
+from mirrorskin.engine.press.onset import STATUS, Onset
+from mirrorskin.engine.tiling import Band, Staged, cut_into_bands, join_rows, room_of
+from mirrorskin.io import InputError, Map, Result
+from mirrorskin.io.maps import TABLE
 from mirrorskin.io.positions import check_travel
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.changepoint import DECIDED, INVALID, REACH, SLOTS, UNIT
-from mirrorskin.kernels.device import C_TYPES, Device, Kernel, open_device
+from mirrorskin.kernels.device import C_TYPES, Kernel
 
 _EVIDENCE = 12.0  # log of how much likelier the samples must be with a change than without
 _RELEASED = np.array([0, 1, 3, 2], np.uint8)  # what never turns dark is light to the end, and so on
 
 
-@checked
-def find_change_point(
-    frames: NDArray[Any],
-    travel: ArrayLike,
-    *,
-    dark: ArrayLike | None = None,
-    bright: ArrayLike | None = None,
-    threshold: float = 0.5,
-    hold: int = 2,
-    noise: float | None = None,
-    event: Event = "onset",
-    device: str | Device | None = None,
-) -> Onset:
-    """Find the change from dark to light, or back, in a stack that fits in memory.
+class ChangePoint(PressOperation):
+    """Height from a press or a release, by the most likely change of each pixel's brightness.
 
-    With known levels it is a CUSUM of each pixel's samples (Page, Biometrika 41, 1954, 100-115); with unknown
-    ones the split of its samples that leaves the least squares.
-
-    Parameters
-    ----------
-    frames : ndarray, (T, H, W), uint8, uint16 or float32
-        Raw counts of a vertical press, or of a release.
-    travel : array_like, (T,)
-        Millimetres that the body has been lowered, one a frame: never decreasing in a press, never increasing
-        in a release.
-    dark, bright : array_like, scalar or (H, W), optional
-        Counts without and with full light. With one of them missing, both are estimated from each pixel's own
-        samples before and after the change.
-    threshold : float
-        Share of the way from dark to bright whose crossing is looked for.
-    hold : int
-        Fully light frames, or dark ones of a release, that it takes to make sure of a change, 1 to 12.
-    noise : float, optional
-        Standard deviation of a sample in counts; by default estimated from the first two frames.
-    event : {"onset", "release"}
-        Whether to look for the light state's begin or its end.
-    device : str or Device, optional
-        See ``mirrorskin.kernels.device.open_device``.
-
-    Returns
-    -------
-    Onset
-        Its ``frame`` is the first frame after the most likely change.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        Frames, travel, references or parameters that cannot be used.
-    mirrorskin.kernels.errors.DeviceError
-        No device, or one that cannot hold a single row.
+    With `dark` and `bright`, it is a CUSUM of each pixel's samples (Page, Biometrika 41, 1954, 100-115). If
+    one of them is missing, both are estimated from each pixel's own samples before and after the change: the
+    split of the samples that leaves the least squares. This takes two passes over the frames.
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from mirrorskin import engine
     >>> frames = np.zeros((6, 1, 2), np.uint8)
     >>> frames[3:, 0, 0] = 200
-    >>> find_change_point(frames, 0.1 * np.arange(6), dark=0, bright=200).frame
+    >>> engine.run(frames, engine.ChangePoint(), travel=0.1 * np.arange(6)).frame
     array([[ 3, -1]], dtype=int32)
     """
-    search = ChangePointSearch(
-        check_stack(frames),
-        frames.dtype,
-        dark=dark,
-        bright=bright,
-        threshold=threshold,
-        hold=hold,
-        noise=noise,
-        event=event,
-        device=device,
-        memory_limit=min(MEMORY_LIMIT, 2 * frames.nbytes),
-    )
-    search.push(frames, travel=travel)
-    if search.passes == 2:
-        search.start_second_pass()
-        search.push(frames, travel=travel)
-    return search.result()
 
+    threshold: float = Onset.threshold
+    event: Event = Onset.event
 
-class ChangePointSearch(ThreadSafe):
-    """Find the change in frames that come block by block; see `mirrorskin.engine.streaming.Estimator`.
+    height = TABLE["height"]
+    status = TABLE["status"]
+    frame = TABLE["frame"]
 
-    With known levels one pass is enough, and ``result`` may be called at any time. With unknown ones all
-    frames are pushed twice, with ``start_second_pass`` in between.
+    @property
+    def passes(self) -> int:
+        """How often all frames are pushed: twice if a level is unknown."""
+        return 2 if self.dark is None or self.bright is None else 1
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns of a frame.
-    dtype : dtype
-        uint8, uint16 or float32.
-    dark, bright, threshold, hold, noise, event, device
-        As for `find_change_point`.
-    memory_limit : int
-        Bytes of host memory for frames on the move; half of it is the room for one block.
+    @property
+    def declarations(self) -> Mapping[str, Map]:
+        """Declarations of the maps; the legend of the status depends on the event."""
+        return {**self.maps, "status": STATUS[self.event]}
 
-    Attributes
-    ----------
-    passes : int
-        How often the frames are needed: 1, or 2 where a level is unknown.
-    """
-
-    position = "travel"
-
-    def __init__(
-        self,
-        shape: tuple[int, int],
-        dtype: DTypeLike,
-        *,
-        dark: ArrayLike | None = None,
-        bright: ArrayLike | None = None,
-        threshold: float = 0.5,
-        hold: int = 2,
-        noise: float | None = None,
-        event: Event = "onset",
-        device: str | Device | None = None,
-        memory_limit: int = MEMORY_LIMIT,
-    ) -> None:
-        if not 0 < threshold < 1:
-            raise InputError(
-                f"threshold {threshold}: a change-point needs a share between 0 and 1, such as 0.5"
-            )
-        if not 1 <= hold <= REACH:
-            raise InputError(f"hold {hold}: a change-point needs a number of frames from 1 to {REACH}")
-        self._shape, self._dtype = shape, check_dtype(dtype)
-        self._release, self._hold = check_event(event) == "release", hold
-        self.maps = {"status": status_of(ReleaseStatus if self._release else PressStatus)}
-        self._noise = Noise(noise, self._dtype.kind == "u")
-        self.passes = 2 if dark is None or bright is None else 1
-        self.device: Device = open_device(device)
-        self._length = max(1, memory_limit // (2 * shape[0] * shape[1] * self._dtype.itemsize))
-        self._bands = cut_into_bands(self.device, shape, self._dtype, self._maps(), self._length)
+    def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
+        """Prepare for frames of a shape and type."""
+        if not 0 < self.threshold < 1:
+            what = "a change-point needs a share between 0 and 1, such as 0.5"
+            raise InputError(f"threshold {self.threshold:g}: {what}")
+        if self.hold > REACH:
+            raise InputError(f"hold {self.hold}: a change-point needs a number of frames from 1 to {REACH}")
+        self._release = self.event == "release"
+        self._noise = Noise(self.noise, dtype.kind == "u")
+        self._length = max(1, self.memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))
+        self._bands = cut_into_bands(self.device, shape, dtype, self._planes(), self._length)
         # A release is a change as well, from bright to dark: its first level is the bright one.
-        self._level = 1 - threshold if self._release else threshold
+        self._level = 1 - self.threshold if self._release else self.threshold
         self._travel: list[float] = []
         self._start = np.zeros(shape, np.int32)
         if self.passes == 1:
-            references = reference_pair(dark, bright, shape, self._dtype)
+            references = reference_pair(self.dark, self.bright, shape, dtype)
             first, second = reversed(references) if self._release else references
             self._start = np.where(np.isnan(first), INVALID, 0).astype(np.int32)
             self._fill(dark=np.nan_to_num(first), gain=1 / np.where(np.isnan(first), 1, second - first))
-        self.reset()
+        self.clear()
 
     @cached_property
     def room(self) -> NDArray[Any]:
-        """Where a source may write the next frames, (n, H, W), not to be copied."""
+        """Array in which the next frames may be written before they are pushed, (n, H, W)."""
         return room_of(self._bands, self._length)
 
-    def _maps(self) -> dict[str, DTypeLike]:
+    def _planes(self) -> dict[str, DTypeLike]:
         """Return what is kept of each pixel."""
         integers = dict.fromkeys(("start", "excess", "below", "since"), np.int32)
         floats = dict.fromkeys(("dark", "gain", "height", "sigma"), np.float32)
         twice = dict.fromkeys(("mean", "mean_rest", "total", "total_rest", "score"), np.float32)
-        ring = np.dtype((np.void, SLOTS * self._dtype.itemsize))  # the last samples
+        ring = np.dtype((np.void, SLOTS * self.dtype.itemsize))  # the last samples
         return {
             "ring": ring, "status": np.uint8, **integers, **floats, **(twice if self.passes == 2 else {})
         }  # fmt: skip
 
-    def reset(self) -> None:
-        """Forget the frames so far, and be ready for another press with the same references."""
+    def clear(self) -> None:
+        """Forget the frames so far."""
         self._travel.clear()
         self._noise.reset()
         self._weight: Array | None = None
-        zeros = np.zeros(self._shape, np.int32)
+        zeros = np.zeros(self.shape, np.int32)
         self._fill(start=self._start, excess=zeros, below=zeros, since=zeros)
         if self.passes == 2:
             self._fill(total=zeros, total_rest=zeros)
 
     def start_second_pass(self) -> None:
-        """Be ready for the same frames once more, when unknown levels need a second pass.
-
-        Raises
-        ------
-        mirrorskin.io.InputError
-            Fewer than two frames came in the first pass.
-        """
+        """Prepare for the same frames once more, to find each pixel's best split."""
         count = len(self._travel)
-        self._known_noise()
         self._travel.clear()
         split = np.arange(1.0, count)
         self._weight = self.device.array("weight", (count + 1,), np.float32)
@@ -215,19 +124,11 @@ class ChangePointSearch(ThreadSafe):
             for name in ("total", "total_rest", "score"):
                 band.write(name, np.zeros_like(mean))
 
-    def push(self, frames: NDArray[Any], *, travel: ArrayLike | None, lent: bool = False) -> None:
-        """Take in the next frames, (n, H, W), and the travel of each.
-
-        Raises
-        ------
-        mirrorskin.io.InputError
-            Frames of another shape or type; travel is missing, or runs back; or there are more frames in the
-            second pass than in the first.
-        """
+    def push(self, frames: NDArray[Any], *, travel: ArrayLike, lent: bool = False) -> None:
+        """Take in the next frames, (n, H, W), and the travel of each, (n,) mm."""
         first = len(self._travel)
         if self._weight is not None and first + len(frames) >= len(self._weight.host):
-            raise InputError("there are more frames in the second pass than in the first: give the same ones")
-        check_frames(frames, self._dtype, self._shape)
+            raise InputError("the second pass has more frames than the first. Push the same frames twice")
         last = self._travel[-1:]
         self._travel.extend(check_travel(travel, len(frames), "travel", after=last, falls=self._release))
         self._noise.look(frames)
@@ -242,7 +143,7 @@ class ChangePointSearch(ThreadSafe):
         if self.passes == 1:
             name, maps = "changepoint_scan", "dark gain start excess below ring"
             level = round(self._level * UNIT)
-            known |= {"level": level, "least": self._hold * (UNIT - level), "quiet": self._quiet()}
+            known |= {"level": level, "least": self.hold * (UNIT - level), "quiet": self._quiet()}
         elif self._weight is None:
             name, maps, known = "changepoint_sum", "total total_rest", {}
         else:
@@ -255,25 +156,20 @@ class ChangePointSearch(ThreadSafe):
             count=staged.count,
             pixels=band.pixels,
             **known,
-            moved=staged.count * band.pixels * self._dtype.itemsize,
+            moved=staged.count * band.pixels * self.dtype.itemsize,
         )
 
-    def result(self) -> Onset:
-        """Return the maps of the frames so far.
-
-        Raises
-        ------
-        mirrorskin.io.InputError
-            There are fewer than two frames, or the second pass over them is missing.
-        """
-        count, noise = len(self._travel), self._known_noise()
-        if self.passes == 2 and (self._weight is None or count + 1 != len(self._weight.host)):
-            raise InputError("a change between unknown levels needs all frames twice: give dark and bright")
+    def result(self) -> Result:
+        """Return height, status and frame of the frames so far."""
+        noise = self._noise.value
+        assert noise is not None  # there are two frames
         maps = [self._finish(band, noise) for band in self._bands]
         height, sigma, status, frame = (join_rows(parts) for parts in zip(*maps, strict=True))
         answered = (status == 1) | (status == 3)
         status = _RELEASED[status] if self._release else status
-        return Onset(height, sigma, status, np.where(answered, frame, np.int32(-1)), noise)
+        frame = np.where(answered, frame, np.int32(-1))
+        found = {"height": height, "height_sigma": sigma, "status": status, "frame": frame}
+        return Result(found, process={"noise": noise}, declarations=self.declarations)
 
     def _finish(self, band: Band, noise: float) -> list[NDArray[Any]]:
         """Return height, sigma, status and frame of a band's rows."""
@@ -301,7 +197,7 @@ class ChangePointSearch(ThreadSafe):
         """Hand the travel to the device as (T, 2) floats, whose sums are as good as float64."""
         pairs = self.device.array("travel", (len(self._travel), 2), np.float32)
         pairs.host[:, 0] = self._travel
-        pairs.host[:, 1] = self.travel - pairs.host[:, 0]
+        pairs.host[:, 1] = np.array(self._travel, np.float64) - pairs.host[:, 0]
         pairs.upload()
         return pairs
 
@@ -322,19 +218,6 @@ class ChangePointSearch(ThreadSafe):
         for name, values in (("excess", excess), ("below", start), ("dark", dark), ("gain", gain)):
             band.write(name, values)
 
-    @property
-    def travel(self) -> NDArray[np.float64]:
-        """The travel of the frames so far, (T,), mm."""
-        return np.array(self._travel, np.float64)
-
-    def _known_noise(self) -> float:
-        """Return the noise, or raise InputError where there are fewer than two frames."""
-        if len(self._travel) < 2 or self._noise.value is None:
-            raise InputError(
-                f"a press of {len(self._travel)} frames has no change-point: at least 2 are needed"
-            )
-        return self._noise.value
-
     def _fill(self, **maps: NDArray[Any]) -> None:
         for band in self._bands:
             for name, values in maps.items():
@@ -352,5 +235,34 @@ class ChangePointSearch(ThreadSafe):
         return int(-(-band.pixels // self.device.layout.tile))
 
     def _kernel(self, name: str) -> Kernel:
-        top = {} if self._dtype.kind == "f" else {"TOP": int(np.iinfo(self._dtype).max)}
-        return self.device.kernel("changepoint", name, FRAME=C_TYPES[self._dtype.name], **top)
+        top = {} if self.dtype.kind == "f" else {"TOP": int(np.iinfo(self.dtype).max)}
+        return self.device.kernel("changepoint", name, FRAME=C_TYPES[self.dtype.name], **top)
+
+
+find_change_point = travel_function(
+    ChangePoint,
+    "find_change_point",
+    """Find the most likely change from dark to light, or back, in a stack that fits in memory.
+
+    Returns
+    -------
+    Result
+        As of `find_onset`; ``frame`` is the first frame after the most likely change.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        Frames, travel, references or parameters that cannot be used.
+    mirrorskin.kernels.errors.DeviceError
+        No device, or one that cannot hold a single row.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> frames = np.zeros((6, 1, 2), np.uint8)
+    >>> frames[3:, 0, 0] = 200
+    >>> find_change_point(frames, 0.1 * np.arange(6), dark=0, bright=200).frame
+    array([[ 3, -1]], dtype=int32)
+    """,
+    "Millimetres that the body has been lowered: never decreasing in a press, never increasing in a release.",
+)

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from copy import copy
-from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
-from mirrorskin.engine.frames import check_frames
-from mirrorskin.engine.press.onset import Onset, OnsetSearch
-from mirrorskin.engine.thread_safe import ThreadSafe
-from mirrorskin.io.maps import PressStatus
+from mirrorskin.engine.press.crossing import Crossing, CrossingOperation, Event, Found
+from mirrorskin.engine.press.onset import STATUS, Onset
+from mirrorskin.io import Map, Result
+from mirrorskin.io.maps import TABLE, PressStatus
 from mirrorskin.io.positions import check_strokes, stroke_starts
-from mirrorskin.kernels.device import Device
 
 _ALIKE = 1e-3  # relative difference of numbers that are the same but for rounding
 _CONTRADICT = 0.001  # share of pixels without a place in all their intervals from which travel is not exact
@@ -24,58 +22,13 @@ _NOISY = 2.0  # standard deviations by which noise may move a crossing out of it
 _UNLIKELY = 1e-3  # chance of a scatter that is taken to be more than what is predicted
 
 
-@dataclass(frozen=True, slots=True)
-class Strokes:
-    """Where a press that oscillates turned the pixels light, and dark again.
-
-    Attributes
-    ----------
-    onset, release : Onset
-        Heights of all strokes down, and of all strokes up, together; ``frame`` is that of the last stroke in
-        which there was one, -1 without one.
-    onsets, releases : ndarray, (H, W), uint16
-        Strokes in which there was one.
-    strokes : int
-        Strokes that there were.
-    """
-
-    onset: Onset
-    release: Onset
-    onsets: NDArray[np.uint16]
-    releases: NDArray[np.uint16]
-    strokes: int
-
-    @property
-    def hysteresis(self) -> NDArray[np.float32]:
-        """Height of the release less that of the onset, (H, W) float32, mm; NaN without both."""
-        return self.release.height - self.onset.height
-
-    @property
-    def hysteresis_sigma(self) -> NDArray[np.float32]:
-        """Standard deviation of the hysteresis, (H, W) float32, mm."""
-        return np.hypot(self.onset.sigma, self.release.sigma)
-
-
-class StrokeSearch(ThreadSafe):
-    """Find onsets and releases in a press that oscillates; see `mirrorskin.engine.streaming.Estimator`.
+class Strokes(CrossingOperation):
+    """Height and hysteresis from a press that oscillates: the onsets and releases of all strokes.
 
     A stroke is a run of frames in which travel does not change its direction; its turning points belong to
-    both strokes. Each is searched by `OnsetSearch`. The documentation, "Vibration", describes how strokes
-    are joined.
-
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns of a frame.
-    dtype : dtype
-        uint8, uint16 or float32.
-    **options
-        Those of `OnsetSearch`, but ``event``. An unknown noise is estimated in the first stroke.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        Parameters that cannot be used.
+    both strokes. The documentation, "Vibration", describes how strokes are joined. An unknown noise is
+    estimated in the first stroke. ``height``, ``status`` and ``frame`` are those of the onsets; ``frame`` is
+    that of the last stroke in which there was an onset.
 
     Examples
     --------
@@ -83,60 +36,51 @@ class StrokeSearch(ThreadSafe):
     >>> from mirrorskin import engine
     >>> travel = 0.5 - 0.5 * np.cos(0.8 * np.arange(60))
     >>> frames = np.where(travel > 0.3, 255, 0).astype(np.uint8)[:, np.newaxis, np.newaxis]
-    >>> search = engine.StrokeSearch((1, 1), "uint8", noise=1.0)
-    >>> search.push(frames, travel=travel)
-    >>> strokes = search.result()
-    >>> int(strokes.onsets[0, 0]), bool(abs(strokes.onset.height[0, 0] + 0.3) < 0.03)
+    >>> found = engine.run(frames, engine.Strokes(noise=1.0), travel=travel)
+    >>> int(found.strokes[0, 0]), bool(abs(found.height[0, 0] + 0.3) < 0.03)
     (8, True)
     """
 
-    device: Device
+    threshold: float = Onset.threshold
+    event: Event = Onset.event
 
-    position = "travel"
+    height = TABLE["height"]
+    status = TABLE["status"]
+    frame = TABLE["frame"]
+    hysteresis = TABLE["hysteresis"]
+    strokes = TABLE["strokes"]
 
-    def __init__(
-        self,
-        shape: tuple[int, int],
-        dtype: DTypeLike,
-        *,
-        device: str | Device | None = None,
-        **options: Any,
-    ) -> None:
-        down = OnsetSearch(shape, dtype, device=device, **options)
-        up = OnsetSearch(shape, dtype, device=down.device, **options, event="release")
-        self.device, self._searches = down.device, {1: down, -1: up}
-        self._shape, self._dtype = shape, np.dtype(dtype)
-        self.reset()
+    @property
+    def declarations(self) -> Mapping[str, Map]:
+        """Declarations of the maps; the legend of the status depends on the event."""
+        return {**self.maps, "status": STATUS[self.event]}
 
-    @cached_property
+    def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
+        """Prepare a search for each direction."""
+        directions: Mapping[int, Event] = {1: "onset", -1: "release"}
+        self._searches = {
+            sign: Crossing(self, shape, dtype, threshold=self.threshold, event=event)
+            for sign, event in directions.items()
+        }
+        self.clear()
+
+    @property
     def room(self) -> NDArray[Any]:
-        """Where a source may write the next frames, (n, H, W), not to be copied."""
+        """Array in which the next frames may be written before they are pushed, (n, H, W)."""
         return self._searches[1].room
 
-    def reset(self) -> None:
+    def clear(self) -> None:
         """Forget the frames so far."""
         for search in self._searches.values():
             search.reset()
         self._direction = 1  # a rest at the start is that before a press
-        self._joined = {sign: _JoinedOnsets(self._shape) for sign in self._searches}
+        self._joined = {sign: _JoinedOnsets(self.shape) for sign in self._searches}
         self._travel: list[float] = []
         self._last: NDArray[Any] | None = None
         self._noise: float | None = None
 
-    @property
-    def travel(self) -> NDArray[np.float64]:
-        """The travel of the frames so far, (T,), mm."""
-        return np.array(self._travel, np.float64)
-
-    def push(self, frames: NDArray[Any], *, travel: ArrayLike | None, lent: bool = False) -> None:
-        """Take in the next frames, (n, H, W), and the travel of each, mm.
-
-        Raises
-        ------
-        mirrorskin.io.InputError
-            Frames of another shape or type; travel is missing or not finite.
-        """
-        check_frames(frames, self._dtype, self._shape)
+    def push(self, frames: NDArray[Any], *, travel: ArrayLike, lent: bool = False) -> None:
+        """Take in the next frames, (n, H, W), and the travel of each, (n,) mm."""
         values = check_strokes(travel, len(frames), "travel")
         before = self._travel[-1:]
         turns = (stroke_starts(np.concatenate([before, values]), self._direction) - len(before)).tolist()
@@ -144,25 +88,31 @@ class StrokeSearch(ThreadSafe):
             if start in turns and stop > start:
                 self._turn(frames[start - 1] if start > 0 else self._last)
             if stop > start:
-                self._searches[self._direction].push(frames[start:stop], travel=values[start:stop], lent=lent)
+                self._searches[self._direction].push(frames[start:stop], values[start:stop], lent)
                 self._travel += values[start:stop].tolist()
         self._last = frames[-1].copy()
 
-    def result(self) -> Strokes:
-        """Return the maps of all strokes so far, the last of which is taken to end here; more may follow.
-
-        Raises
-        ------
-        mirrorskin.io.InputError
-            There were fewer than two frames.
-        """
-        down, up = (self._with_open(sign) for sign in self._searches)
+    def result(self) -> Result:
+        """Return the maps of all strokes so far, the last of which is assumed to end here."""
         noise = self._known_noise
-        return Strokes(down.onset(noise), up.onset(noise), down.count, up.count, down.strokes + up.strokes)
+        joined = {sign: self._with_open(sign) for sign in self._searches}
+        onset, release = (joined[sign].found() for sign in (1, -1))
+        chosen, strokes = (onset, joined[1]) if self.event == "onset" else (release, joined[-1])
+        maps: dict[str, Any] = {
+            "height": chosen.height,
+            "height_sigma": chosen.sigma,
+            "status": chosen.status,
+            "frame": chosen.frame,
+            "hysteresis": release.height - onset.height,
+            "hysteresis_sigma": np.hypot(onset.sigma, release.sigma),
+            "strokes": strokes.count,
+        }
+        count = sum(one.strokes for one in joined.values())
+        return Result(maps, process={"noise": noise, "strokes": count}, declarations=self.declarations)
 
-    def onset(self) -> Onset:
-        """Return only the onsets so far; see `result`."""
-        return self._with_open(1).onset(self._known_noise)
+    def onset(self) -> Found:
+        """Return only what was found on the strokes down so far."""
+        return self._with_open(1).found()
 
     @property
     def _known_noise(self) -> float:
@@ -170,11 +120,11 @@ class StrokeSearch(ThreadSafe):
         return self._searches[self._direction].noise if self._noise is None else self._noise
 
     def _with_open(self, sign: int) -> _JoinedOnsets:
-        """Return the onsets of a direction's strokes, that of the open one included."""
+        """Return the onsets of a direction's strokes, including the open one."""
         if sign != self._direction:
             return self._joined[sign]
         joined, search = self._joined[sign].copy(), self._searches[sign]
-        joined.add(search.result(), search.travel, len(self._travel))
+        joined.add(search.found(), search.travel, len(self._travel))
         return joined
 
     def _turn(self, turning: NDArray[Any] | None) -> None:
@@ -182,14 +132,13 @@ class StrokeSearch(ThreadSafe):
         assert turning is not None  # a turn needs a frame before
         search = self._searches[self._direction]
         if len(search.travel) > 1:
-            found = search.result()
-            self._noise = found.noise if self._noise is None else self._noise
+            self._noise = search.noise if self._noise is None else self._noise
             if np.ptp(search.travel) > 0:  # else it was a rest
-                self._joined[self._direction].add(found, search.travel, len(self._travel))
+                self._joined[self._direction].add(search.found(), search.travel, len(self._travel))
         self._direction = -self._direction
         search = self._searches[self._direction]
         search.reset(self._noise)
-        search.push(turning[np.newaxis], travel=self._travel[-1:])
+        search.push(turning[np.newaxis], self._travel[-1:])
 
 
 class _JoinedOnsets:
@@ -200,7 +149,7 @@ class _JoinedOnsets:
 
     def __init__(self, shape: tuple[int, int]) -> None:
         self._shape, self.strokes = shape, 0
-        self._first: Onset | None = None
+        self._first: Found | None = None
 
     def copy(self) -> _JoinedOnsets:
         """Return the same, to which more can be added."""
@@ -218,7 +167,7 @@ class _JoinedOnsets:
         none = np.zeros(self._shape, np.uint16)
         return none if self._first is None else (self._first.status == PressStatus.ONSET).astype(np.uint16)
 
-    def add(self, found: Onset, travel: NDArray[np.float64], end: int) -> None:
+    def add(self, found: Found, travel: NDArray[np.float64], end: int) -> None:
         """Take in a stroke: its travel, and the number of the frame after it."""
         self.strokes += 1
         if self._first is None:
@@ -238,7 +187,7 @@ class _JoinedOnsets:
         self._low, self._high = np.full(pixels, -np.inf), np.full(pixels, np.inf)
         self._frame = np.full(pixels, -1, np.int32)
 
-    def _sum(self, found: Onset, travel: NDArray[np.float64], end: int) -> None:
+    def _sum(self, found: Found, travel: NDArray[np.float64], end: int) -> None:
         at = np.flatnonzero(found.status == PressStatus.ONSET)
         frame = found.frame.reshape(-1)[at]
         height = found.height.reshape(-1)[at].astype(np.float64)
@@ -270,16 +219,16 @@ class _JoinedOnsets:
         self._high[at] = np.minimum(self._high[at], high + noisy)
         self._frame[at] = end - len(travel) + frame
 
-    def onset(self, noise: float) -> Onset:
-        """Join what was found in all strokes; noise is that of a sample, counts."""
+    def found(self) -> Found:
+        """Join what was found in all strokes."""
         if self._first is None:
             nothing, frame = np.full(self._shape, np.nan, np.float32), np.full(self._shape, -1, np.int32)
-            return Onset(nothing, nothing.copy(), np.zeros(self._shape, np.uint8), frame, noise)
+            return Found(nothing, nothing.copy(), np.zeros(self._shape, np.uint8), frame)
         if self.strokes == 1:
             travel, end = self._alone
             frame, earlier = self._first.frame, np.int32(end - len(travel))
             shifted = np.where(frame < 0, frame, frame + earlier) if earlier else frame
-            return replace(self._first, noise=noise, frame=shifted)
+            return self._first._replace(frame=shifted)
         several, freedom = self._count > 1, np.maximum(self._count, 2) - 1.0
         with np.errstate(divide="ignore", invalid="ignore"):
             mean, width = self._moment / self._weight, self._high - self._low
@@ -307,4 +256,4 @@ class _JoinedOnsets:
         maps = (one.astype(np.float32).reshape(self._shape) for one in (height, sigma))
         height_map, sigma_map = (np.where(found, one, np.float32(np.nan)) for one in maps)
         status = np.where(found, np.uint8(PressStatus.ONSET), self._first.status)
-        return Onset(height_map, sigma_map, status, self._frame.reshape(self._shape), noise)
+        return Found(height_map, sigma_map, status, self._frame.reshape(self._shape))

@@ -1,0 +1,353 @@
+"""Operations: frames in, maps out. The base class of everything that is computed from frames."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from functools import cached_property, wraps
+from typing import Any, ClassVar, ParamSpec, Protocol, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from mirrorskin.engine.options import Configured, Option, documented, option, signature_of
+from mirrorskin.engine.thread_safe import ThreadSafe
+from mirrorskin.engine.tiling import MEMORY_LIMIT
+from mirrorskin.io import InputError, Map, Result
+from mirrorskin.io.arguments import as_array
+from mirrorskin.io.maps import declaration_of
+from mirrorskin.io.result import result_of
+from mirrorskin.io.types import ProcessValue
+from mirrorskin.kernels.device import Device, open_device
+
+P = ParamSpec("P")
+
+_NOT_POSITIONS = ("lent", "frame_weights")  # keywords of push that are not positions of the body
+
+
+class _DeviceOption(Option):
+    """The device: a name or an open device is given, and it is opened on first use."""
+
+    def store(self, holder: object, value: Any) -> None:
+        vars(holder)["_device"] = value
+
+    def stored(self, holder: object) -> Any:
+        return vars(holder).get("device", vars(holder)["_device"])
+
+    def __get__(self, holder: object, owner: type) -> Any:
+        if holder is None:
+            return self
+        vars(holder)["device"] = opened = open_device(vars(holder)["_device"])
+        return opened
+
+
+_device = option(
+    None, help="device to compute on; see `mirrorskin.kernels.device.open_device`", python_only=True
+)
+
+
+class OnDevice(Configured):
+    """What has a device: the attribute is opened on first use."""
+
+    device: Device = cast(Any, _DeviceOption(**{**vars(_device), "name": "device"}))
+
+
+class Operation(ThreadSafe, OnDevice):
+    """Base of operations, which receive frames one block after the other and return maps.
+
+    A subclass declares its options (`mirrorskin.engine.option`) and maps (`mirrorskin.io.Map`) as class
+    attributes, and defines ``push`` and ``result``:
+
+    - ``start(shape, dtype)`` is called before the first frame with a frame's (H, W) and the samples' type.
+    - ``push(frames, *, travel)`` receives the next frames, (n, H, W). Keywords are what it needs of each
+      frame: ``time``, ``travel``, ``phase``, ``displacement``, ``twist``, ``tilt`` or ``pose``; see
+      `mirrorskin.io.Block`. The result must not depend on how the frames are divided, and the memory of the
+      frames is reused.
+    - ``result()`` returns the maps of the frames so far by name, and numbers and texts for ``process``. It
+      has no side effects.
+    - ``passes = 2`` means that the frames are pushed twice; ``start_second_pass()`` is called in between.
+
+    One thread at a time runs the methods of an object; see `mirrorskin.engine.thread_safe.ThreadSafe`.
+
+    Examples
+    --------
+    >>> class Brightest(Operation):
+    ...     least: float = option(0.0, "counts", help="counts below which a pixel is 0")
+    ...     brightest = Map("largest brightness", "counts")
+    ...     def start(self, shape, dtype):
+    ...         self.most = np.zeros(shape)
+    ...     def push(self, frames):
+    ...         np.maximum(self.most, frames.max(axis=0), out=self.most)
+    ...     def result(self):
+    ...         return {"brightest": np.where(self.most < self.least, 0, self.most)}
+    >>> operation = Brightest(least=4)
+    >>> operation.push(np.arange(12.0).reshape(3, 2, 2))
+    >>> operation.result().brightest.tolist()
+    [[8.0, 9.0], [10.0, 11.0]]
+    """
+
+    memory_limit: int = option(
+        MEMORY_LIMIT,
+        help="bytes of host memory for frames that are read ahead",
+        within=(1, None),
+        python_only=True,
+    )
+
+    motions: ClassVar[tuple[str, ...]] = ()
+    """Motions of recordings that it applies to; none for all."""
+    dtypes: ClassVar[tuple[np.dtype[Any], ...] | None] = None
+    """Types of samples that it takes; None for all numbers."""
+    least_frames: ClassVar[int] = 1
+    """Frames that a result needs."""
+    maps: ClassVar[Mapping[str, Map]] = {}
+    """The declared maps by name."""
+    positions: ClassVar[Mapping[str, bool]] = {}
+    """What ``push`` takes of each frame, and whether it needs it."""
+    _takes_lent: ClassVar[bool] = False
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        found: dict[str, Map] = {}
+        for base in reversed(cls.__mro__):
+            found |= {name: one for name, one in vars(base).items() if isinstance(one, Map)}
+        cls.maps = found
+        if "push" in vars(cls):
+            parameters = [*inspect.signature(cls.push).parameters.values()][2:]
+            cls.positions = {
+                one.name: one.default is one.empty for one in parameters if one.name not in _NOT_POSITIONS
+            }
+            cls._takes_lent = any(one.name == "lent" for one in parameters)
+        for name, wrap in _WRAPPERS.items():
+            if name in vars(cls):
+                setattr(cls, name, wrap(vars(cls)[name]))
+        super().__init_subclass__(**kwargs)
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.shape: Any = None
+        self.dtype: Any = None
+        self.count = 0
+        self._pass = 1
+        self._pushing = False
+
+    @property
+    def passes(self) -> int:
+        """How often all frames are pushed: 1, or 2."""
+        return 1
+
+    @property
+    def declarations(self) -> Mapping[str, Map]:
+        """Declarations of the maps of this object, where they depend on options."""
+        return self.maps
+
+    def begin(self, shape: tuple[int, ...], dtype: DTypeLike) -> None:
+        """Prepare for frames of a shape, (H, W), and type, and forget all earlier frames."""
+        wanted = np.dtype(dtype)
+        if self.dtypes is not None and wanted not in self.dtypes:
+            names = ", ".join(str(one) for one in self.dtypes)
+            raise InputError(f"frames of type {wanted}: {names} are needed")
+        if (self.shape, self.dtype) == (shape, wanted):
+            self.reset()
+            return
+        vars(self).pop("room", None)
+        self.shape, self.dtype = (shape[0], shape[1]), wanted
+        self.count, self._pass = 0, 1
+        self.start(self.shape, wanted)
+
+    def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
+        """Prepare for frames of a shape and type; called before the first."""
+
+    def clear(self) -> None:
+        """Forget the frames so far, but keep what `start` prepared; by default, start again."""
+        self.start(self.shape, self.dtype)
+
+    def reset(self) -> None:
+        """Forget the frames so far, and what was estimated from them."""
+        self.count, self._pass = 0, 1
+        if self.dtype is not None:
+            self.clear()
+
+    def push(self, *args: Any, **kwargs: Any) -> None:
+        """Take in the next frames."""
+        raise NotImplementedError(f"{type(self).__name__} has no push(frames)")
+
+    def result(self) -> Any:
+        """Return the maps of the frames so far."""
+        raise NotImplementedError(f"{type(self).__name__} has no result()")
+
+    def finish(self) -> Result:
+        """Return the maps of all frames; only `reset` may follow, so that buffers need not be copied."""
+        return cast(Result, self.result())
+
+    def start_second_pass(self) -> None:
+        """Prepare for the same frames once more."""
+
+    def next_pass(self) -> None:
+        """Begin the second pass, after all frames have been pushed once."""
+        self.start_second_pass()
+        self._pass, self._expected, self.count = 2, self.count, 0
+
+    @cached_property
+    def room(self) -> NDArray[Any]:
+        """Array in which the next frames may be written before they are pushed, (n, H, W)."""
+        rows, columns = self.shape
+        at_once = max(1, self.memory_limit // (2 * rows * columns * self.dtype.itemsize))
+        return np.empty((at_once, rows, columns), self.dtype)
+
+    def _check_frames(self, frames: Any) -> NDArray[Any]:
+        """Return frames as an array that fits to earlier ones."""
+        array = as_array("frames", frames)
+        if self.dtype is None:
+            if array.ndim != 3 or 0 in array.shape or array.dtype.kind not in "uif":
+                raise InputError(f"frames are {array.dtype} {array.shape}: numbers (n, H, W) are needed")
+            self.begin(array.shape[1:], array.dtype)
+        if array.dtype != self.dtype or array.shape[1:] != self.shape or len(array) == 0:
+            expected = f"{self.dtype} (n, {self.shape[0]}, {self.shape[1]})"
+            raise InputError(f"frames are {array.dtype} {array.shape}: {expected} is needed")
+        return array
+
+    def _check_positions(self, count: int, given: Mapping[str, Any]) -> None:
+        """Raise InputError unless there is a position of each frame."""
+        for name, needed in self.positions.items():
+            values = given.get(name)
+            if values is None and needed:
+                raise InputError(f"{name} is missing: {type(self).__name__} needs it of each frame")
+            if values is not None and np.shape(values)[:1] != (count,):
+                frames = "1 frame" if count == 1 else f"{count} frames"
+                raise InputError(f"{name} has shape {np.shape(values)} for {frames}: give one of each frame")
+        if foreign := given.keys() - {*self.positions, *_NOT_POSITIONS}:
+            names = ", ".join(sorted(foreign))
+            taken = ", ".join(self.positions) or "frames only"
+            raise InputError(f"{type(self).__name__} does not take {names}. It takes {taken}")
+
+
+def _checked_push(method: Callable[..., None]) -> Callable[..., None]:
+    """Return a method ``push`` that checks its arguments, and counts frames."""
+
+    @wraps(method)
+    def push(self: Operation, frames: Any, **given: Any) -> None:
+        if self._pushing:  # by the push of a subclass
+            method(self, frames, **given)
+            return
+        array = self._check_frames(frames)
+        self._check_positions(len(array), given)
+        if not self._takes_lent:
+            given.pop("lent", None)
+        self._pushing = True
+        try:
+            method(self, array, **given)
+        finally:
+            self._pushing = False
+        self.count += len(array)
+
+    return push
+
+
+def _checked_result(method: Callable[..., Any]) -> Callable[..., Result]:
+    """Return a method ``result`` whose maps are checked against their declarations."""
+
+    @wraps(method)
+    def result(self: Operation) -> Result:
+        name = type(self).__name__
+        if self.count < self.least_frames:
+            frames = "1 frame" if self.least_frames == 1 else f"{self.least_frames} frames"
+            raise InputError(f"{name} needs at least {frames}; {self.count or 'none'} pushed so far")
+        if self.passes == 2 and (self._pass == 1 or self.count != self._expected):
+            raise InputError(f"{name} needs all frames twice, with next_pass() in between")
+        found = method(self)
+        if isinstance(found, Result):
+            return found
+        if not isinstance(found, Mapping):
+            raise InputError(f"{name}.result() returns a {type(found).__name__}. Return maps by name")
+        declared = self.declarations
+        scalars = {
+            one: value
+            for one, value in found.items()
+            if isinstance(value, str | int | float | np.generic)
+            and declaration_of(one, declared).axes != "none"
+        }
+        maps = {one: value for one, value in found.items() if one not in scalars}
+        process: dict[str, ProcessValue] = {
+            one: value.item() if isinstance(value, np.generic) else value for one, value in scalars.items()
+        }
+        try:
+            return result_of(maps, self.shape, process, declared)
+        except InputError as error:
+            raise InputError(f"{name}.result(): {error}") from error
+
+    return result
+
+
+_WRAPPERS: Mapping[str, Callable[[Any], Any]] = {
+    "push": _checked_push,
+    "result": _checked_result,
+    "finish": _checked_result,
+}
+
+
+def apply(operation: Operation, frames: NDArray[Any], **given: Any) -> Result:
+    """Return the maps of a stack that fits in memory."""
+    for number in range(operation.passes):
+        if number:
+            operation.next_pass()
+        operation.push(frames, lent=True, **given)
+    return operation.finish()
+
+
+class TravelFunction(Protocol[P]):
+    """A function of frames, (T, H, W), their travel, (T,) mm, and options."""
+
+    def __call__(
+        self, frames: ArrayLike, travel: ArrayLike, *args: P.args, **options: P.kwargs
+    ) -> Result:
+        """Return the maps."""
+
+
+class PhaseFunction(Protocol[P]):
+    """A function of frames, (T, H, W), their phase, (T,) radians, and options."""
+
+    def __call__(self, frames: ArrayLike, phase: ArrayLike, *args: P.args, **options: P.kwargs) -> Result:
+        """Return the maps."""
+
+
+def travel_function(
+    operation: Callable[P, Operation], name: str, text: str, about_travel: str
+) -> TravelFunction[P]:
+    """Return the function on arrays of an operation whose ``push`` takes ``travel``."""
+    function = _array_function(cast(Any, operation), name, text, {"travel": about_travel})
+    return cast(TravelFunction[P], function)
+
+
+def phase_function(
+    operation: Callable[P, Operation], name: str, text: str, about_phase: str
+) -> PhaseFunction[P]:
+    """Return the function on arrays of an operation whose ``push`` takes ``phase``."""
+    return cast(PhaseFunction[P], _array_function(cast(Any, operation), name, text, {"phase": about_phase}))
+
+
+def _array_function(
+    operation: type[Operation], name: str, text: str, positions: Mapping[str, str]
+) -> Callable[..., Result]:
+    """Return a function of frames, positions and options, with signature and docstring.
+
+    ``text`` is the docstring without the section "Parameters".
+    """
+    named = ("frames", *positions)
+    hidden = {"memory_limit"}
+    options = {one: declared for one, declared in operation.options.items() if one not in hidden}
+    signature = signature_of(options, named)
+
+    def function(*args: Any, **kwargs: Any) -> Result:
+        given = signature.bind(*args, **kwargs).arguments
+        frames = as_array("frames", given.pop("frames"))
+        where = {one: given.pop(one) for one in positions}
+        made = operation(memory_limit=max(1, min(MEMORY_LIMIT, 2 * frames.nbytes)), **given)
+        return apply(made, frames, **where)
+
+    before = "frames : array_like, (T, H, W)\n    Raw counts.\n" + "".join(
+        f"{one} : array_like, (T,)\n    {about}\n" for one, about in positions.items()
+    )
+    function.__name__ = function.__qualname__ = name
+    function.__module__ = operation.__module__
+    function.__doc__ = documented(text, options, before)
+    function.__signature__ = signature  # type: ignore[attr-defined]
+    return function

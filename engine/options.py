@@ -1,0 +1,299 @@
+"""Options that are declared once: the parameters of operations, steps and methods.
+
+Constructors, checks, signatures, docstrings, the command line, settings of a batch, provenance and the tables
+of the documentation are derived from the declaration.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from numbers import Real
+from typing import Any, ClassVar, Literal, dataclass_transform
+
+import numpy as np
+
+from mirrorskin.io import InputError
+from mirrorskin.io.arguments import as_array
+
+Kind = Literal["number", "integer", "flag", "choice", "numbers", "map", "file", "object"]
+
+_LAST = ("device", "memory_limit")  # options that come last in signatures and help
+_COLUMNS = 100  # of the lines of a docstring
+_INTEGERS = ("frames", "pixels", "turns")  # units of counts
+_EXAMPLES = {"share": "0.5", "mm": "0.1", "rad": "0.05", "counts": "1.5", "frames": "2", "pixels": "8"}
+_NOUNS = {"share": "a share", "frames": "a number of frames", "pixels": "a number of pixels"}
+
+
+@dataclass(frozen=True)
+class Option:
+    """The declaration of an option; see `option`.
+
+    As a class attribute it is the declaration; on an object, the attribute is the value.
+    """
+
+    default: Any
+    unit: str
+    kind: Kind
+    help: str
+    within: tuple[float | None, float | None]
+    above: float | None
+    choices: tuple[str, ...]
+    words: tuple[str, ...]
+    file: str
+    shown_default: str
+    python_only: bool
+    name: str = ""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        object.__setattr__(self, "name", name)
+
+    def store(self, holder: object, value: Any) -> None:
+        """Keep a checked value in an object."""
+        vars(holder)[self.name] = value
+
+    def stored(self, holder: object) -> Any:
+        """Return the value in an object."""
+        return vars(holder)[self.name]
+
+    @property
+    def flag_name(self) -> str:
+        """Name of the option on the command line."""
+        return f"--{self.name.replace('_', '-')}"
+
+    def described(self) -> str:
+        """Return type and unit for a docstring, such as ``float, share, default 0.5``."""
+        kinds = {"number": "float", "integer": "int", "flag": "bool", "numbers": "sequence of float"}
+        kinds |= {"map": "float or ndarray (H, W)", "file": "path, Result or array", "object": "object"}
+        kind = "{" + ", ".join(f'"{one}"' for one in self.choices) + "}" if self.choices else kinds[self.kind]
+        kind = " or ".join([kind, *(f'"{word}"' for word in self.words)])
+        unit = f", {self.unit}" if self.unit else ""
+        end = ", optional" if self.default is None else f", default {self.default!r}"
+        return f"{kind}{unit}{end}"
+
+    def check(self, value: Any) -> Any:
+        """Return a value in the option's type.
+
+        Raises
+        ------
+        InputError
+            The value has another type, or is outside of the limits.
+        """
+        if value is None and self.default is None:
+            return None
+        if isinstance(value, str) and value in self.words:
+            return value
+        if self.kind in ("object", "file"):
+            return value
+        if self.kind == "choice":
+            if value not in self.choices:
+                raise InputError(f"unknown {self.name} {value!r}. Use {' or '.join(self.choices)}")
+            return str(value)
+        if self.kind == "flag":
+            if not isinstance(value, bool | np.bool_):
+                raise InputError(f"{self.name} is {value!r:.40}: use True or False")
+            return bool(value)
+        if self.kind == "numbers":
+            values = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
+            return [self._number(one) for one in values]
+        if self.kind == "map" and not isinstance(value, Real):
+            return as_array(self.name, value)
+        return self._number(value)
+
+    def _number(self, value: Any) -> Any:
+        whole = self.kind == "integer"
+        scalar = isinstance(value, np.ndarray | np.generic) and value.ndim == 0 and value.dtype.kind in "buif"
+        if not scalar and (not isinstance(value, Real) or (whole and not hasattr(value, "__index__"))):
+            what = "a whole number" if whole else "a number"
+            raise InputError(f"{self.name} is {value!r:.40}: {what} is needed")
+        number = int(value) if whole else float(value)
+        low, high = self.within
+        if not (
+            math.isfinite(number)
+            and (low is None or number >= low)
+            and (high is None or number <= high)
+            and (self.above is None or number > self.above)
+        ):
+            raise InputError(f"{self.name} {number:g}: {self._needed()}")
+        return number
+
+    def _needed(self) -> str:
+        noun = _NOUNS.get(self.unit, "a number" + (f" in {self.unit}" if self.unit else ""))
+        low, high = self.within
+        if low is not None and high is not None:
+            limits = f" from {low:g} to {high:g}"
+        elif low is not None:
+            limits = f" of at least {low:g}"
+        elif high is not None:
+            limits = f" of at most {high:g}"
+        else:
+            limits = "" if self.above is None else f" above {self.above:g}"
+        example = f", such as {_EXAMPLES[self.unit]}" if self.unit in _EXAMPLES else ""
+        return f"{noun}{limits} is needed{example}"
+
+
+def option(
+    default: Any,
+    unit: str = "",
+    *,
+    help: str,  # noqa: A002  # the name that argparse and click use
+    within: tuple[float | None, float | None] = (None, None),
+    above: float | None = None,
+    choices: Sequence[str] = (),
+    words: Sequence[str] = (),
+    several: bool = False,
+    map: bool = False,  # noqa: A002
+    file: str = "",
+    shown_default: str = "",
+    python_only: bool = False,
+) -> Any:
+    """Declare an option in the body of a class derived from `Configured`.
+
+    Parameters
+    ----------
+    default : object
+        Value if nothing is given. None means that the operation chooses; ``shown_default`` says how.
+    unit : str
+        Unit of the value in Python: ``"share"``, ``"frames"``, ``"pixels"``, ``"counts"``, ``"mm"``,
+        ``"rad"``, ``"MPa"``, ``"counts/rad"``. On the command line, lengths, angles and pressures are written
+        with a unit.
+    help : str
+        What the option means: one sentence.
+    within : (float or None, float or None)
+        Least and greatest allowed value.
+    above : float, optional
+        The value must be greater than this.
+    choices : sequence of str
+        The allowed texts.
+    words : sequence of str
+        Texts that are allowed in place of a number, such as ``"estimate"``.
+    several : bool
+        Whether the value is a list of numbers.
+    map : bool
+        Whether an array of the frames' size may be given in place of a number.
+    file : str
+        What file the value is read from on the command line, such as ``"RES.h5"``; in Python anything that
+        the operation accepts.
+    shown_default : str
+        What help says the default is.
+    python_only : bool
+        Whether the option is left out on the command line.
+
+    Examples
+    --------
+    >>> class Crossing(Configured):
+    ...     threshold: float = option(0.5, "share", within=(0, 1), help="level that counts as bright")
+    >>> Crossing(threshold=0.25).threshold, Crossing().threshold
+    (0.25, 0.5)
+    >>> Crossing(threshold=2)
+    Traceback (most recent call last):
+    ...
+    mirrorskin.io.types.InputError: threshold 2: a share from 0 to 1 is needed, such as 0.5
+    """
+    kind: Kind = "number"
+    if choices:
+        kind = "choice"
+    elif isinstance(default, bool):
+        kind = "flag"
+    elif file:
+        kind = "file"
+    elif several:
+        kind = "numbers"
+    elif map:
+        kind = "map"
+    elif unit in _INTEGERS or isinstance(default, int):
+        kind = "integer"
+    elif python_only and not unit and not isinstance(default, float):
+        kind = "object"
+    return Option(
+        default=default,
+        unit=unit,
+        kind=kind,
+        help=help,
+        within=within,
+        above=above,
+        choices=tuple(choices),
+        words=tuple(words),
+        file=file,
+        shown_default=shown_default,
+        python_only=python_only,
+    )
+
+
+@dataclass_transform(kw_only_default=True, field_specifiers=(option,))
+class Configured:
+    """Base of classes whose keyword arguments are declared options.
+
+    A class has the options that it declares, those of its bases, and those of the classes that are listed in
+    ``options_of=`` when it is defined.
+
+    Raises
+    ------
+    InputError
+        An option does not exist, has another type, or is outside of its limits.
+    """
+
+    options: ClassVar[Mapping[str, Option]] = {}
+    """All options by name."""
+
+    def __init_subclass__(cls, options_of: Sequence[type[Configured]] = (), **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        found = {name: one for name, one in vars(cls).items() if isinstance(one, Option)}
+        for base in (*options_of, *cls.__mro__[1:]):
+            if issubclass(base, Configured):
+                found |= {name: one for name, one in base.options.items() if name not in found}
+        common = {name: found.pop(name) for name in _LAST if name in found}
+        cls.options = found | common
+        cls.__signature__ = signature_of(cls.options)  # type: ignore[attr-defined]  # for help() and editors
+        cls.__doc__ = documented(cls.__doc__, cls.options)
+
+    def __init__(self, **options: Any) -> None:
+        unknown = options.keys() - self.options
+        if unknown:
+            names = ", ".join(sorted(unknown))
+            raise InputError(
+                f"{type(self).__name__} has no option {names}. It has {', '.join(self.options) or 'none'}"
+            )
+        for name, one in self.options.items():
+            one.store(self, one.check(options[name]) if name in options else one.default)
+
+    def chosen(self) -> dict[str, Any]:
+        """Return the value of each option by name."""
+        return {name: one.stored(self) for name, one in self.options.items()}
+
+    def part(self, kind: type[Configured]) -> dict[str, Any]:
+        """Return the values of the options that another class has as well."""
+        return {name: one.stored(self) for name, one in self.options.items() if name in kind.options}
+
+
+def signature_of(options: Mapping[str, Option], positional: Sequence[str] = ()) -> inspect.Signature:
+    """Return the signature of a callable that takes options as keywords, after positional parameters."""
+    kinds = inspect.Parameter
+    first = [kinds(name, kinds.POSITIONAL_OR_KEYWORD) for name in positional]
+    rest = [kinds(name, kinds.KEYWORD_ONLY, default=one.default) for name, one in options.items()]
+    return inspect.Signature([*first, *rest])
+
+
+def documented(text: str | None, options: Mapping[str, Option], before: str = "") -> str | None:
+    """Return a docstring with its section "Parameters" made of the declarations.
+
+    ``before`` are lines about positional parameters. Sections that the docstring has follow the parameters.
+    """
+    if text is None or (not options and not before) or "\n    Parameters\n" in f"\n{text}":
+        return text
+    head, *rest = inspect.cleandoc(text).split("\n\n")
+    sections = next((k for k, part in enumerate(rest) if "\n---" in part), len(rest))
+    lines = [before.rstrip()] if before else []
+    lines += [f"{name} : {one.described()}\n{_sentence(one)}" for name, one in options.items()]
+    parameters = "\n".join(["Parameters", "----------", *lines])
+    return "\n\n".join([head, *rest[:sections], parameters, *rest[sections:]])
+
+
+def _sentence(one: Option) -> str:
+    text = one.help[:1].upper() + one.help[1:]
+    default = f" By default {one.shown_default}." if one.shown_default else ""
+    sentence = f"{text}{'' if text.endswith('.') else '.'}{default}"
+    return textwrap.fill(sentence, _COLUMNS, initial_indent="    ", subsequent_indent="    ")
