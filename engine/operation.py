@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping
 from functools import cached_property, wraps
-from typing import Any, ClassVar, ParamSpec, Protocol, cast
+from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, Protocol, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -19,6 +19,9 @@ from mirrorskin.io.maps import declaration_of
 from mirrorskin.io.result import result_of
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.device import Device, open_device
+
+if TYPE_CHECKING:
+    from mirrorskin.io import Source
 
 P = ParamSpec("P")
 
@@ -103,6 +106,10 @@ class Operation(ThreadSafe, OnDevice):
     """The declared maps by name."""
     positions: ClassVar[Mapping[str, bool]] = {}
     """What ``push`` takes of each frame, and whether it needs it."""
+    on_device: ClassVar[bool] = False
+    """Whether frames are read for the device: ahead, or where kernels can read them without a copy."""
+    long_blocks: ClassVar[bool] = False
+    """Whether as many frames as possible should be pushed at once."""
     _takes_lent: ClassVar[bool] = False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -125,9 +132,24 @@ class Operation(ThreadSafe, OnDevice):
         super().__init__(**options)
         self.shape: Any = None
         self.dtype: Any = None
-        self.count = 0
-        self._pass = 1
         self._pushing = False
+        self._forget()
+
+    def _forget(self) -> None:
+        self.count, self._pass = 0, 1
+        self._pushed: dict[str, list[NDArray[np.float64]]] = {}
+
+    def configured_for(self, source: Source) -> Self:
+        """Return the operation with options that are not given set from what a source says of its frames."""
+        return self
+
+    def with_options(self, **options: Any) -> Self:
+        """Return an operation of the same class in which some options differ."""
+        return type(self)(**{**self.chosen(), **options})
+
+    def pushed(self, name: str) -> NDArray[np.float64]:
+        """Return the positions of the frames so far, (T,) or (T, components), such as those of ``travel``."""
+        return np.concatenate(self._pushed[name]) if name in self._pushed else np.empty(0)
 
     @property
     def passes(self) -> int:
@@ -150,7 +172,7 @@ class Operation(ThreadSafe, OnDevice):
             return
         vars(self).pop("room", None)
         self.shape, self.dtype = (shape[0], shape[1]), wanted
-        self.count, self._pass = 0, 1
+        self._forget()
         self.start(self.shape, wanted)
 
     def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
@@ -162,7 +184,7 @@ class Operation(ThreadSafe, OnDevice):
 
     def reset(self) -> None:
         """Forget the frames so far, and what was estimated from them."""
-        self.count, self._pass = 0, 1
+        self._forget()
         if self.dtype is not None:
             self.clear()
 
@@ -184,7 +206,9 @@ class Operation(ThreadSafe, OnDevice):
     def next_pass(self) -> None:
         """Begin the second pass, after all frames have been pushed once."""
         self.start_second_pass()
-        self._pass, self._expected, self.count = 2, self.count, 0
+        expected = self.count
+        self._forget()
+        self._pass, self._expected = 2, expected
 
     @cached_property
     def room(self) -> NDArray[Any]:
@@ -238,6 +262,9 @@ def _checked_push(method: Callable[..., None]) -> Callable[..., None]:
         finally:
             self._pushing = False
         self.count += len(array)
+        for name, values in given.items():
+            if name in self.positions and values is not None:
+                self._pushed.setdefault(name, []).append(np.array(values, np.float64))
 
     return push
 
@@ -296,9 +323,7 @@ def apply(operation: Operation, frames: NDArray[Any], **given: Any) -> Result:
 class TravelFunction(Protocol[P]):
     """A function of frames, (T, H, W), their travel, (T,) mm, and options."""
 
-    def __call__(
-        self, frames: ArrayLike, travel: ArrayLike, *args: P.args, **options: P.kwargs
-    ) -> Result:
+    def __call__(self, frames: ArrayLike, travel: ArrayLike, *args: P.args, **options: P.kwargs) -> Result:
         """Return the maps."""
 
 

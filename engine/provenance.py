@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -16,6 +16,7 @@ from mirrorskin import io
 from mirrorskin.engine.errors import NotConverged
 
 if TYPE_CHECKING:
+    from mirrorskin.engine.options import Configured
     from mirrorskin.io import Result, Source
     from mirrorskin.io.types import ProcessValue
     from mirrorskin.kernels.device import Device
@@ -63,6 +64,24 @@ def attach_provenance(
         known |= {"calibration": source.whole.name, "calibration_parts": source.whole.contents}
         result = result.assign(calibration=source.whole)
     return result.assign(x=x, y=y, process=known | process)
+
+
+def describe(configured: Configured, source: Source | None = None) -> dict[str, ProcessValue]:
+    """Return the name of an operation, step or method, and its options as a process lists them."""
+    found: dict[str, ProcessValue] = {"operation": type(configured).__name__}
+    for name, value in configured.chosen().items():
+        if name in ("device", "memory_limit") or value is None:
+            continue
+        if isinstance(value, str | bool | int | float):
+            found[name] = value
+        elif isinstance(value, Sequence):
+            found[name] = str(list(value))
+        elif isinstance(value, np.ndarray):
+            own = source is not None and getattr(source.header, name, None) is value
+            found[name] = "map of the recording" if own else "map given"
+        else:
+            found[name] = "given"
+    return found
 
 
 def level_origin(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -11,7 +12,28 @@ from numpy.typing import ArrayLike
 from mirrorskin import io
 
 if TYPE_CHECKING:
-    from mirrorskin.io import Calibration, Result, Source
+    from mirrorskin.engine.method import Method
+    from mirrorskin.engine.streaming import Progress
+    from mirrorskin.io import Calibration, Motion, Result, Source
+
+_METHODS: Mapping[str, str] = {
+    "vertical": "press.press.Press",
+    "axial": "rotation.rotation.Rotation",
+    "horizontal": "slip.slip.Sliding",
+    "twist": "slip.slip.Sliding",
+}
+
+
+def method_for(motion: Motion) -> type[Method]:
+    """Return the class of methods for a motion.
+
+    Examples
+    --------
+    >>> method_for("vertical").__name__
+    'Press'
+    """
+    module, _, name = _METHODS[motion].rpartition(".")
+    return cast("type[Method]", getattr(import_module(f"mirrorskin.engine.{module}"), name))
 
 
 def reconstruct(
@@ -23,6 +45,7 @@ def reconstruct(
     displacement: ArrayLike | None = None,
     twist: ArrayLike | None = None,
     pixel_size: float | tuple[float, float] | None = None,
+    progress: Progress | None = None,
     **options: Any,
 ) -> Result:
     """Reconstruct what was touched, by the method that fits the source's motion.
@@ -37,15 +60,16 @@ def reconstruct(
         anything.
     travel, phase, twist : array_like, (T,), optional
         Of frames in an array: mm of a press, radians of a rotation or a twist. One position of each frame,
-        which also tells the motion.
+        which also determines the motion.
     displacement : array_like, (T, 2), optional
         Of frames in an array: mm along x and y of a slide.
     pixel_size : float or (float, float), optional
         Of frames in an array: mm along x and y at the sheet.
+    progress : callable, optional
+        Called with the number of frames so far.
     **options
-        Those of `mirrorskin.engine.press.press.reconstruct_press` for a vertical motion, of
-        `mirrorskin.engine.rotation.rotation.reconstruct_rotation` for an axial one, of
-        `mirrorskin.engine.slip.slip.reconstruct_slip` for a horizontal one or a twist.
+        Those of `mirrorskin.engine.Press` for a vertical motion, of `mirrorskin.engine.Rotation` for an axial
+        one, of `mirrorskin.engine.Sliding` for a horizontal one or a twist: ``help(engine.Press)`` lists them.
 
     Raises
     ------
@@ -67,21 +91,8 @@ def reconstruct(
     (40, 40)
     """
     given = {"travel": travel, "phase": phase, "displacement": displacement, "twist": twist}
-    opened = _as_source(source, given, pixel_size)
-    known = calibrated(opened, calibration)
-    if opened.motion == "vertical":
-        from mirrorskin.engine.press.press import reconstruct_press
-
-        result = reconstruct_press(known, **options)
-    elif opened.motion == "axial":
-        from mirrorskin.engine.rotation.rotation import reconstruct_rotation
-
-        result = reconstruct_rotation(known, **options)
-    else:
-        from mirrorskin.engine.slip.slip import reconstruct_slip
-
-        result = reconstruct_slip(known, **options)
-    return undistorted(result, known)
+    opened = calibrated(_as_source(source, given, pixel_size), calibration)
+    return method_for(opened.motion)(**options).run(opened, progress)
 
 
 def _as_source(
@@ -129,12 +140,3 @@ def calibrated(source: Source, calibration: Calibration | str | Path | None = No
     elif not isinstance(calibration, io.Calibration):
         calibration = io.open_calibration(calibration)
     return source if calibration is None else io.Calibrated(source, calibration)
-
-
-def undistorted(result: Result, source: Source) -> Result:
-    """Undistort a result's maps if its source's calibration has a lens: the last step of every method."""
-    if not isinstance(source, io.Calibrated) or source.whole.lens is None:
-        return result
-    from mirrorskin.engine.undistort import undistort
-
-    return undistort(result, source.whole.lens, source.region.origin)

@@ -1,152 +1,127 @@
-"""What an estimator is, and the one loop: frames of a source into an estimator."""
+"""The one loop: frames of a source into an operation."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Protocol
 
-from numpy.typing import NDArray
-
-from mirrorskin.io import Block, Source
-from mirrorskin.kernels.device import Device
+from mirrorskin.engine.operation import Operation
+from mirrorskin.io import Block, InputError, Source
 
 Progress = Callable[[int], None]
 
 
-class Estimator(Protocol):
-    """Takes frames as they come, and returns maps of those so far.
-
-    ``push(frames)`` takes the next frames, (n, H, W), any number of them. What it needs to know of each frame
-    besides, it names as parameters: ``push(frames, *, travel)`` of a press, ``push(frames, *, phase)`` of a
-    rotation; see `mirrorskin.io.Block`. The memory of frames may be written anew when it returns. The same
-    frames give the same result, bit by bit, however they are cut into pushes.
-
-    ``result()`` returns the maps of the frames so far as plain arrays, by name or in a data class. It changes
-    nothing: it may be called again, and more frames may follow. ``reset()`` forgets the frames, and what was
-    estimated from them; parameters, references and device buffers stay.
-
-    Several threads may use an estimator of this package; see `mirrorskin.engine.thread_safe.ThreadSafe`.
-    """
-
-    def push(self, *args: Any, **kwargs: Any) -> None:
-        """Take in the next frames."""
-
-    def result(self) -> Any:
-        """Return the maps of the frames so far."""
-
-    def reset(self) -> None:
-        """Forget the frames so far."""
-
-
-class DeviceEstimator(Estimator, Protocol):
-    """An estimator that says where frames are to be read to, and where it works.
-
-    ``push(frames, travel=..., lent=False)`` or ``push(frames, phase=..., lent=False)``: a device that shares
-    the host's memory reads frames where they lie, and ``push`` waits until it has; ``lent=True`` says that
-    nobody writes to their memory as long as it is referred to, so it need not wait. Only what kernels cannot
-    read in place is copied, such as frames that are not in C order.
-    """
-
-    position: str
-    """The keyword of ``push`` that says where the body was: "travel" or "phase"."""
-
-    @property
-    def device(self) -> Device:
-        """Where it works."""
-
-    @property
-    def room(self) -> NDArray[Any]:
-        """Where the next frames may be written, (n, H, W)."""
-
-
 def feed(
-    source: Source,
-    estimator: DeviceEstimator,
-    frames: range,
-    progress: Progress | None = None,
-    long: bool = False,
+    source: Source, operation: Operation, frames: range | None = None, progress: Progress | None = None
 ) -> None:
-    """Push frames of a source into an estimator.
+    """Push frames of a source into an operation, once or twice.
 
-    A device that shares the host's memory works on frames where they were read or lie. For one with memory of
-    its own, and of frames in Zarr, the next are read and decoded while those before are copied and worked on.
+    A device that shares the host's memory computes on frames where they were read or are mapped. For a device
+    with its own memory, and for compressed frames in Zarr, the next frames are read and decoded while earlier
+    ones are copied and processed.
 
     Parameters
     ----------
     source : Source
         It is rewound first, if it can be.
-    estimator : DeviceEstimator
-    frames : range
-        Which of them, in steps of 1; those before are read and dropped.
+    operation : Operation
+    frames : range, optional
+        Frames to push, in steps of 1, by default all; earlier ones are read and dropped.
     progress : callable, optional
-        Called with the number of frames so far.
-    long : bool
-        Whether to push as many frames at once as a mapped file lends, not as many as there is room for: where
-        kernels are quick beside loading what they keep of each pixel.
+        Called with the number of frames read so far.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        The operation needs all frames twice, and the source can only be read once.
     """
+    if operation.passes == 2 and not source.rewindable:
+        raise InputError(
+            f"{source.name} can be read only once, but {type(operation).__name__} needs all frames twice"
+        )
+    operation.begin(source.shape[1:], source.dtype)
+    chosen = range(source.shape[0]) if frames is None else frames
+    with ThreadPoolExecutor(1, "mirrorskin-fingerprint") as worker:
+        # The result needs it, and it takes about as long as the frames.
+        fingerprint = worker.submit(source.fingerprint) if hasattr(source, "fingerprint") else None
+        for number in range(operation.passes):
+            if number:
+                operation.next_pass()
+            _feed_once(source, operation, chosen, progress)
+    if fingerprint is not None:
+        fingerprint.result()
+
+
+def _feed_once(source: Source, operation: Operation, frames: range, progress: Progress | None) -> None:
     if source.rewindable:
         source.rewind()
-    shared = estimator.device.info.shares_memory
     done = 0
-    for block in _read_in_place(source, estimator, frames.start):
+    for block in _read_in_place(source, operation, frames.start):
         done += len(block.frames)
         if progress:
             progress(done)
-    ahead = not shared or getattr(source, "read_ahead", False)
-    read = _read_ahead if ahead else _lent_or_read if long else _read_in_place
-    with ThreadPoolExecutor(1, "mirrorskin-fingerprint") as beside:
-        # It is needed for the result, and is there by then.
-        known = beside.submit(source.fingerprint) if hasattr(source, "fingerprint") else None
-        for block in read(source, estimator, len(frames)):
-            push_block(estimator, block)
-            done += len(block.frames)
-            if progress:
-                progress(done)
-    if known is not None:
-        known.result()
+    for block in _reader(source, operation)(source, operation, len(frames)):
+        push_block(operation, block)
+        done += len(block.frames)
+        if progress:
+            progress(done)
 
 
-def push_block(estimator: DeviceEstimator, block: Block, part: slice = slice(None)) -> None:
-    """Push what a source yields, or a part of it: frames and their positions."""
-    where = getattr(block, estimator.position)
-    known = {estimator.position: None if where is None else where[part]}
-    estimator.push(block.frames[part], **known, lent=block.lent)
+def push_block(operation: Operation, block: Block, part: slice = slice(None)) -> None:
+    """Push what a source yields, or a part of it: frames and what the operation needs of each."""
+    given = {}
+    for name, needed in operation.positions.items():
+        values = getattr(block, name, None)
+        if values is not None:
+            given[name] = values[part]
+        elif needed:
+            raise InputError(f"{name} is missing: {type(operation).__name__} needs it of each frame")
+    operation.push(block.frames[part], **given, lent=block.lent)
 
 
-def _read_in_place(source: Source, estimator: DeviceEstimator, count: int) -> Iterator[Block]:
-    """Read frames to where the estimator wants them."""
+def _reader(source: Source, operation: Operation) -> Callable[[Source, Operation, int], Iterator[Block]]:
+    """Return how frames are read for an operation."""
+    if not operation.on_device:
+        return _read_in_place
+    if not operation.device.info.shares_memory or getattr(source, "read_ahead", False):
+        return _read_ahead
+    return _lent_or_read if operation.long_blocks else _read_in_place
+
+
+def _read_in_place(source: Source, operation: Operation, count: int) -> Iterator[Block]:
+    """Read frames into the operation's own array."""
     while count > 0:
-        block = source.read(estimator.room[:count])
+        block = source.read(operation.room[:count])
         if block is None:
             return
         yield block
         count -= len(block.frames)
 
 
-def _lent_or_read(source: Source, estimator: DeviceEstimator, count: int) -> Iterator[Block]:
-    """Take frames where they lie, as many at once as is possible, as long as the source lends them."""
+def _lent_or_read(source: Source, operation: Operation, count: int) -> Iterator[Block]:
+    """Use frames where they are mapped, as many at once as possible, as long as the source allows it."""
     lend: Callable[[int], Block | None] = getattr(source, "lend", lambda most: None)
-    most = max(1, estimator.device.max_allocation // (math.prod(source.shape[1:]) * source.dtype.itemsize))
+    frame_size = math.prod(source.shape[1:]) * source.dtype.itemsize
+    most = max(1, operation.device.max_allocation // frame_size)
     while count > 0 and (block := lend(min(count, most))) is not None:
         yield block
         count -= len(block.frames)
-    yield from _read_in_place(source, estimator, count)
+    yield from _read_in_place(source, operation, count)
 
 
-def _read_ahead(source: Source, estimator: DeviceEstimator, count: int) -> Iterator[Block]:
-    """Read frames to two places in turns, one while the other is copied from."""
-    length = max(1, len(estimator.room) // 2)
-    shape = max(1, min(length, count)), *estimator.room.shape[1:]
-    rooms = [estimator.device.pinned(shape, source.dtype) for _ in range(2)]
+def _read_ahead(source: Source, operation: Operation, count: int) -> Iterator[Block]:
+    """Read frames into two arrays in turn, one while the other is copied from."""
+    length = max(1, len(operation.room) // 2)
+    shape = max(1, min(length, count)), *operation.room.shape[1:]
+    buffers = [operation.device.pinned(shape, source.dtype) for _ in range(2)]
     with ThreadPoolExecutor(1, "mirrorskin-read") as reader:
-        coming = reader.submit(source.read, rooms[0][:count])
+        coming = reader.submit(source.read, buffers[0][:count])
         while (block := coming.result()) is not None:
-            rooms.reverse()
+            buffers.reverse()
             count -= len(block.frames)
             if count > 0:
-                coming = reader.submit(source.read, rooms[0][:count])
+                coming = reader.submit(source.read, buffers[0][:count])
             yield block
             if count <= 0:
                 return

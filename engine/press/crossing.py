@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +16,9 @@ from mirrorskin.io.positions import check_travel
 from mirrorskin.io.types import FRAME_DTYPES
 from mirrorskin.kernels.device import C_TYPES, Device
 from mirrorskin.kernels.onset import DARK, complement
+
+if TYPE_CHECKING:
+    from mirrorskin.io import Source
 
 Event = Literal["onset", "release"]
 
@@ -32,6 +35,7 @@ class PressOperation(Operation):
     motions = ("vertical",)
     dtypes = FRAME_DTYPES
     least_frames = 2
+    on_device = long_blocks = True
 
     hold: int = option(
         2,
@@ -60,6 +64,11 @@ class PressOperation(Operation):
         help="standard deviation of a sample",
         shown_default="estimated from the first two frames",
     )
+
+    def configured_for(self, source: Source) -> Self:
+        """Return the operation with the source's own levels of dark and light, where none are given."""
+        levels = {name: getattr(source.header, name) for name in ("dark", "bright")}
+        return self.with_options(**{name: own for name, own in levels.items() if getattr(self, name) is None})
 
 
 class CrossingOperation(PressOperation):

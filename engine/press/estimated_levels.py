@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.frames import estimate_noise, thin_out
-from mirrorskin.engine.press.onset import Onset, OnsetSearch
-from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import Source
-from mirrorskin.kernels.device import Device
 
 _FEWEST = 16  # pixels that must have turned light
 _SURELY = 8.0  # sigmas by which they must have become brighter
@@ -28,11 +23,6 @@ class EstimatedLevels:
     bright: float
     dark_sigma: float
     bright_sigma: float
-
-    def sigma(self, threshold: float) -> float:
-        """Return the standard deviation of the level at a threshold, as a share of the range."""
-        parts = (1 - threshold) * self.dark_sigma, threshold * self.bright_sigma
-        return math.hypot(*parts) / (self.bright - self.dark)
 
 
 def estimate_levels(
@@ -88,56 +78,3 @@ def _middle(counts: NDArray[np.float64], noise: float) -> tuple[float, float]:
 
 def _median(counts: ArrayLike) -> float:
     return float(np.nanmedian(np.asarray(counts, np.float64)))
-
-
-class EstimatedLevelSearch(ThreadSafe):
-    """Find onsets between estimated levels, whose uncertainty is in sigma.
-
-    A second search, at a threshold that is lower by one standard deviation of the level, tells by how much
-    the heights would differ. See `mirrorskin.engine.streaming.Estimator`; options are those of `OnsetSearch`.
-    """
-
-    position = "travel"
-
-    def __init__(
-        self,
-        shape: tuple[int, int],
-        dtype: DTypeLike,
-        levels: EstimatedLevels,
-        *,
-        threshold: float,
-        device: Any = None,
-        **options: Any,
-    ) -> None:
-        self._search = OnsetSearch(shape, dtype, threshold=threshold, device=device, **options)
-        self.device: Device = self._search.device
-        lower = max(0.0, threshold - levels.sigma(threshold))
-        self._lower = OnsetSearch(shape, dtype, threshold=lower, device=self.device, **options)
-
-    @cached_property
-    def room(self) -> NDArray[Any]:
-        """Where a source may write the next frames, (n, H, W), not to be copied."""
-        return self._search.room
-
-    @property
-    def travel(self) -> NDArray[np.float64]:
-        """The travel of the frames so far, (T,), mm."""
-        return self._search.travel
-
-    def push(self, frames: NDArray[Any], *, travel: ArrayLike | None, lent: bool = False) -> None:
-        """Take in the next frames; see `OnsetSearch.push`."""
-        for search in (self._search, self._lower):
-            search.push(frames, travel=travel, lent=lent)
-
-    def result(self) -> Onset:
-        """Return the maps of the frames so far; more may follow."""
-        found, lower = self._search.result(), self._lower.result().height
-        # What is light at the lower threshold all the time turned light no later than in the first frame.
-        end = self.travel[-1 if self._search.falls else 0]
-        shift = found.height - np.where(np.isfinite(lower), lower, np.float32(-end))
-        return replace(found, sigma=np.hypot(found.sigma, shift))
-
-    def reset(self) -> None:
-        """Forget the frames so far."""
-        self._search.reset()
-        self._lower.reset()

@@ -15,6 +15,7 @@ from mirrorskin.engine.press.onset import STATUS, Onset
 from mirrorskin.io import Map, Result
 from mirrorskin.io.maps import TABLE, PressStatus
 from mirrorskin.io.positions import check_strokes, stroke_starts
+from mirrorskin.io.types import ProcessValue
 
 _ALIKE = 1e-3  # relative difference of numbers that are the same but for rounding
 _CONTRADICT = 0.001  # share of pixels without a place in all their intervals from which travel is not exact
@@ -27,7 +28,7 @@ class Strokes(CrossingOperation):
 
     A stroke is a run of frames in which travel does not change its direction; its turning points belong to
     both strokes. The documentation, "Vibration", describes how strokes are joined. An unknown noise is
-    estimated in the first stroke. ``height``, ``status`` and ``frame`` are those of the onsets; ``frame`` is
+    estimated in the first stroke. A press of one stroke has no hysteresis. ``height``, ``status`` and ``frame`` are those of the onsets; ``frame`` is
     that of the last stroke in which there was an onset.
 
     Examples
@@ -103,12 +104,15 @@ class Strokes(CrossingOperation):
             "height_sigma": chosen.sigma,
             "status": chosen.status,
             "frame": chosen.frame,
-            "hysteresis": release.height - onset.height,
-            "hysteresis_sigma": np.hypot(onset.sigma, release.sigma),
-            "strokes": strokes.count,
         }
+        process: dict[str, ProcessValue] = {"noise": noise}
         count = sum(one.strokes for one in joined.values())
-        return Result(maps, process={"noise": noise, "strokes": count}, declarations=self.declarations)
+        if count > 1:
+            maps["hysteresis"] = release.height - onset.height
+            maps["hysteresis_sigma"] = np.hypot(onset.sigma, release.sigma)
+            maps["strokes"] = strokes.count
+            process["strokes"] = count
+        return Result(maps, process=process, declarations=self.declarations)
 
     def onset(self) -> Found:
         """Return only what was found on the strokes down so far."""

@@ -1,0 +1,133 @@
+"""Methods: an operation and the steps that follow it, for recordings of one motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.engine.operation import OnDevice, Operation
+from mirrorskin.engine.options import Configured
+from mirrorskin.engine.provenance import attach_provenance, naming
+from mirrorskin.engine.streaming import Progress, feed
+from mirrorskin.io import Calibrated, InputError, Result
+
+if TYPE_CHECKING:
+    from mirrorskin.io import Source
+    from mirrorskin.io.types import ProcessValue
+
+
+@dataclass(frozen=True)
+class Context:
+    """What a step may use besides maps.
+
+    Attributes
+    ----------
+    source : Source
+        Where the frames come from: its header and calibration.
+    operation : Operation
+        What the maps were computed by: its options, device, and the positions of the frames.
+    """
+
+    source: Source
+    operation: Operation
+
+    def pushed(self, name: str) -> NDArray[np.float64]:
+        """Return the positions of the frames, such as their ``travel``."""
+        return self.operation.pushed(name)
+
+
+class Step(Configured):
+    """Base of steps, which change or add maps after an operation.
+
+    Options are declared as class attributes.
+    """
+
+    def apply(self, result: Result, context: Context) -> Result:
+        """Return the result with the maps of this step, and in ``process`` what was done."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a method does with one source.
+
+    Attributes
+    ----------
+    operation : Operation
+    steps : sequence of Step
+        Applied to the operation's maps, one after the other.
+    process : mapping
+        The options, and where their values come from.
+    frames : range, optional
+        Frames that are used, by default all.
+    omit : sequence of str
+        Maps of the operation that the result leaves out.
+    """
+
+    operation: Operation
+    steps: Sequence[Step] = ()
+    process: Mapping[str, ProcessValue] = field(default_factory=dict)
+    frames: range | None = None
+    omit: Sequence[str] = ()
+
+    def finish(
+        self, result: Result, source: Source, more: Mapping[str, ProcessValue] | None = None
+    ) -> Result:
+        """Return the operation's maps after all steps, with provenance, undistorted if there is a lens."""
+        context = Context(source, self.operation)
+        result = result.assign(dict.fromkeys(self.omit))
+        result = result.assign(process={**self.process, **result.process, **(more or {})})
+        for step in self.steps:
+            result = step.apply(result, context)
+        device = self.operation.device if self.operation.on_device else None
+        return undistorted(attach_provenance(result, source, device, dict(result.process)), source)
+
+
+class Method(OnDevice):
+    """Base of methods. Their options are those of their operations and steps."""
+
+    motions: ClassVar[tuple[str, ...]] = ()
+    """Motions of recordings that the method applies to."""
+
+    def plan(self, source: Source) -> Plan:
+        """Return what is done with a source: its operation, steps and frames."""
+        raise NotImplementedError
+
+    def live_plan(self, source: Source) -> Plan:
+        """Return what is done with a source whose frames come while the body moves."""
+        return self.plan(source)
+
+    def run(self, source: Source, progress: Progress | None = None) -> Result:
+        """Reconstruct a source.
+
+        Raises
+        ------
+        mirrorskin.io.InputError
+            The source has another motion, or it and the options cannot be used.
+        """
+        if source.motion not in self.motions:
+            motions = " or ".join(self.motions)
+            raise InputError(
+                f"{source.name} has {source.motion} motion, but {type(self).__name__} needs {motions} motion"
+            )
+        with naming(source):
+            plan = self.plan(source)
+            feed(source, plan.operation, plan.frames, progress)
+            return plan.finish(plan.operation.finish(), source)
+
+    def make(self, kind: Callable[..., Any], **changes: Any) -> Any:
+        """Return an operation or step with this method's values of its options."""
+        return kind(**{**self.part(kind), **changes})  # type: ignore[arg-type]
+
+
+def undistorted(result: Result, source: Source) -> Result:
+    """Undistort a result's maps if its source's calibration has a lens: the last step of every method."""
+    if not isinstance(source, Calibrated) or source.whole.lens is None:
+        return result
+    from mirrorskin.engine.undistort import undistort
+
+    return undistort(result, source.whole.lens, source.region.origin)

@@ -1,0 +1,147 @@
+"""An operation, run over a recording, an array, or frames that come one by one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.engine.operation import Operation
+from mirrorskin.engine.provenance import attach_provenance, describe, naming, signature
+from mirrorskin.engine.streaming import Progress, feed
+from mirrorskin.io import InputError, Result
+
+if TYPE_CHECKING:
+    from mirrorskin.io import Source
+
+
+def run(
+    source: Source | Iterable[ArrayLike],
+    operation: Operation | type[Operation],
+    *,
+    progress: Progress | None = None,
+    **positions: ArrayLike,
+) -> Result:
+    """Push all frames into an operation, and return its maps.
+
+    Parameters
+    ----------
+    source : Source, array_like (T, H, W), or iterable of array_like (H, W)
+        An open recording, or anything else that frames come from, which is rewound first, if it can be; or
+        the frames themselves: an array is pushed as a whole, frames of an iterable one by one.
+    operation : Operation, or a class of operations
+        It forgets all earlier frames. Options that are not given are taken from a source, where it has them.
+    progress : callable, optional
+        Called with the number of frames so far.
+    **positions : array_like, (T, ...)
+        For an array or an iterable: what the operation needs of each frame, such as ``travel=``, mm.
+
+    Returns
+    -------
+    Result
+        ``process`` contains the operation's name, options and numbers.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        The operation does not apply to the recording's motion, needs something that is unknown, or returns
+        maps that do not fit to its declarations.
+
+    Examples
+    --------
+    >>> from mirrorskin import engine
+    >>> class Brightest(engine.Operation):
+    ...     def start(self, shape, dtype):
+    ...         self.most = np.zeros(shape, dtype)
+    ...     def push(self, frames):
+    ...         np.maximum(self.most, frames.max(axis=0), out=self.most)
+    ...     def result(self):
+    ...         return {"brightest": self.most}
+    >>> run(np.arange(12).reshape(3, 2, 2), Brightest).brightest.tolist()
+    [[8, 9], [10, 11]]
+    """
+    if isinstance(operation, type) and issubclass(operation, Operation):
+        operation = operation()
+    if not isinstance(operation, Operation):
+        name = getattr(operation, "__name__", type(operation).__name__)
+        raise InputError(f"{name} is not an operation: derive the class from mirrorskin.engine.Operation")
+    if hasattr(source, "read") and hasattr(source, "header"):
+        return _run_source(cast("Source", source), operation, positions, progress)
+    if isinstance(source, str | os.PathLike) or not isinstance(source, Iterable):
+        remedy = "open a path with io.open_recording, or give an array"
+        raise InputError(f"frames are a {type(source).__name__}: {remedy}")
+    result = _run_frames(source, operation, positions, progress)
+    return result.assign(process={**signature(), **describe(operation), **result.process})
+
+
+def _run_source(
+    source: Source, operation: Operation, positions: dict[str, ArrayLike], progress: Progress | None
+) -> Result:
+    if positions:
+        raise InputError(f"{source.name} has the positions of its frames. Remove {', '.join(positions)}")
+    check_motion(source, operation)
+    with naming(source):
+        configured = operation.configured_for(source)
+        feed(source, configured, progress=progress)
+        result = configured.finish()
+    device = configured.device if configured.on_device else None
+    return attach_provenance(result, source, device, {**describe(configured, source), **result.process})
+
+
+def check_motion(source: Source, operation: Operation) -> None:
+    """Raise InputError if an operation does not apply to a source's motion."""
+    if operation.motions and source.motion not in operation.motions:
+        motions = " or ".join(operation.motions)
+        raise InputError(
+            f"{source.name} has {source.motion} motion, but {type(operation).__name__} needs {motions} motion"
+        )
+
+
+def _run_frames(
+    frames: Iterable[ArrayLike],
+    operation: Operation,
+    positions: dict[str, ArrayLike],
+    progress: Progress | None,
+) -> Result:
+    """Push an array as a whole, or frames one by one."""
+    if not isinstance(frames, np.ndarray) and operation.passes == 2:
+        frames = np.stack([np.asarray(frame) for frame in frames])
+    started = False
+    for number in range(operation.passes):
+        if number:
+            operation.next_pass()
+        done = 0
+        for piece, where in _cut(frames, positions):
+            if not started:
+                operation.begin(piece.shape[1:], piece.dtype)
+                started = True
+            operation.push(piece, **where)
+            done += len(piece)
+            if progress:
+                progress(done)
+    return operation.finish()
+
+
+def _cut(
+    frames: Iterable[ArrayLike], positions: dict[str, ArrayLike]
+) -> Iterator[tuple[NDArray[Any], dict[str, Any]]]:
+    """Yield an array as a whole, or frames one by one, with their positions."""
+    given = {name: np.asarray(values) for name, values in positions.items()}
+    whole = isinstance(frames, np.ndarray)
+    done = 0
+    for piece in [frames] if whole else (np.asarray(frame)[np.newaxis] for frame in frames):
+        array = np.asarray(piece)
+        if array.ndim != 3 or 0 in array.shape or array.dtype.kind not in "uif":
+            shape = array.shape[not whole :]
+            raise InputError(f"frames are {array.dtype} {shape}: numbers (H, W) of one size are needed")
+        stop = done + len(array)
+        for name, values in given.items():
+            if values.ndim == 0 or len(values) < stop or (whole and len(values) != stop):
+                raise InputError(f"{name} has shape {values.shape}: one is needed for each of {stop} frames")
+        yield array, {name: values[done:stop] for name, values in given.items()}
+        done = stop
+    if done == 0:
+        raise InputError("there are no frames: give at least one")
