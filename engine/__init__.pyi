@@ -1,5 +1,4 @@
 from .errors import NotConverged
-from .estimator import run
 from .focus import Focus, FocusEstimator, find_focus
 from .force.normal import Force, find_force
 from .force.tangential import TangentialForce, find_tangential_force
@@ -17,35 +16,38 @@ from .integration.camera import Camera
 from .integration.integration import Integrator, integrate
 from .integration.laplacian import invert_laplacian
 from .integration.surface import Surface
+from .method import Method, Step
 from .metrology.measures import Measures, measure
+from .operation import Operation
+from .options import option
 from .photometric import Lambertian, PhotometricStereo, photometric_stereo
 from .pose.pose import Pose, estimate_pose
 from .pose.stitching import Stitch, stitch
 from .pose.tracker import PoseTracker
-from .press.changepoint import ChangePointSearch, find_change_point
+from .press.changepoint import ChangePoint, find_change_point
 from .press.growth import Growth, find_growth
 from .press.holes import fill_holes
-from .press.onset import Onset, OnsetSearch, find_onset
-from .press.strokes import Strokes, StrokeSearch
+from .press.onset import Onset, find_onset
+from .press.press import Press
+from .press.strokes import Strokes
 from .reconstruction import reconstruct
 from .rotation.correlation import Correlation, Correlator, correlate
 from .rotation.edges import find_edges
 from .rotation.frequency import Frequency, estimate_frequency
 from .rotation.normals import NormalEstimator, Normals, estimate_normals
 from .rotation.normals_pose import PoseEstimator, PoseNormals
+from .running import run
 from .scoring import Score, score
 from .slip.displacement import Displacement, find_displacement
 from .slip.search import Slip, SlipSearch
-from .streaming import Estimator
 from .tiling import free_memory
 
 __all__ = [
     "Camera",
-    "ChangePointSearch",
+    "ChangePoint",
     "Correlation",
     "Correlator",
     "Displacement",
-    "Estimator",
     "Focus",
     "FocusEstimator",
     "Force",
@@ -56,21 +58,23 @@ __all__ = [
     "Integrator",
     "Lambertian",
     "Measures",
+    "Method",
     "NormalEstimator",
     "Normals",
     "NotConverged",
     "Onset",
-    "OnsetSearch",
+    "Operation",
     "PhotometricStereo",
     "Pose",
     "PoseEstimator",
     "PoseNormals",
     "PoseTracker",
+    "Press",
     "Score",
     "Slip",
     "SlipSearch",
+    "Step",
     "Stitch",
-    "StrokeSearch",
     "Strokes",
     "Surface",
     "TangentialForce",
@@ -95,6 +99,7 @@ __all__ = [
     "integrate",
     "invert_laplacian",
     "measure",
+    "option",
     "photometric_stereo",
     "reconstruct",
     "run",

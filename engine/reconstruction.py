@@ -69,7 +69,8 @@ def reconstruct(
         Called with the number of frames so far.
     **options
         Those of `mirrorskin.engine.Press` for a vertical motion, of `mirrorskin.engine.Rotation` for an axial
-        one, of `mirrorskin.engine.Sliding` for a horizontal one or a twist: ``help(engine.Press)`` lists them.
+        one, of `mirrorskin.engine.Sliding` for a horizontal one or a twist; ``help(engine.Press)`` shows
+        them.
 
     Raises
     ------

@@ -99,8 +99,8 @@ class HoleFilling(Step):
 
     fill: bool = option(
         True,
-        help="fill holes, such as flat tops, which never turn light, if the pixel size is known; filled pixels"
-        " are marked in `filled`, and have no standard deviation",
+        help="fill holes, such as flat tops, which never turn light, if the pixel size is known; they are"
+        " marked in `filled`, and have no standard deviation",
     )
     event: Event = Onset.event
 

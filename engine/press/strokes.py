@@ -28,8 +28,8 @@ class Strokes(CrossingOperation):
 
     A stroke is a run of frames in which travel does not change its direction; its turning points belong to
     both strokes. The documentation, "Vibration", describes how strokes are joined. An unknown noise is
-    estimated in the first stroke. A press of one stroke has no hysteresis. ``height``, ``status`` and ``frame`` are those of the onsets; ``frame`` is
-    that of the last stroke in which there was an onset.
+    estimated in the first stroke. A press of one stroke has no hysteresis. ``frame`` is that of the last
+    stroke in which there was the event.
 
     Examples
     --------
