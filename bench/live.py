@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from mirrorskin.bench.files import shared_memory
 from mirrorskin.bench.harness import Case, Cases, Target
 from mirrorskin.bench.scenes import SCALES, STEPS, TILT, fill_press, fill_turns
-from mirrorskin.engine.live import RAISED, LiveEstimator, LivePress, LiveRotation, Loop, Status, Update
+from mirrorskin.engine import Press
+from mirrorskin.engine.live import RAISED, LiveOperation, Loop, Status, Update
 from mirrorskin.io import Block, Header
 from mirrorskin.io.types import Closing, Floats
 from mirrorskin.kernels.device import Device
@@ -151,7 +152,7 @@ def run_press(case: LiveCase, device: Device, quick: bool) -> Case:
         case.rate,
         case.count,
     )
-    ran = _run(source, LivePress(source, device=device))
+    ran = _run(source, LiveOperation(source, Press(device=device)))
     targets = () if quick else judge_press(ran, case.least)
     title = f"heights of a press while it goes on; {case.size}"
     return Case(case.name, title, [], {}, _notes(ran), targets)
@@ -186,7 +187,7 @@ def run_rotation(case: LiveCase, device: Device, quick: bool) -> Case:
     return Case(case.name, title, [], {}, (*_notes(ran), note), targets)
 
 
-def _run(source: Paced, estimator: LiveEstimator) -> Ran:
+def _run(source: Paced, estimator: LiveOperation) -> Ran:
     last: list[Update] = []
 
     def keep(update: Update, status: Status) -> None:

@@ -80,7 +80,8 @@ class Plan:
         """Return the operation's maps after all steps, with provenance, undistorted if there is a lens."""
         context = Context(source, self.operation)
         result = result.assign(dict.fromkeys(self.omit))
-        result = result.assign(process={**self.process, **result.process, **(more or {})})
+        process = {"frames": self.operation.count, **self.process, **result.process, **(more or {})}
+        result = result.assign(process=process)
         for step in self.steps:
             result = step.apply(result, context)
         device = self.operation.device if self.operation.on_device else None
@@ -101,6 +102,14 @@ class Method(OnDevice):
         """Return what is done with a source whose frames come while the body moves."""
         return self.plan(source)
 
+    def check_motion(self, source: Source) -> None:
+        """Raise InputError unless the method applies to the source's motion."""
+        if source.motion not in self.motions:
+            motions = " or ".join(self.motions)
+            raise InputError(
+                f"{source.name} has {source.motion} motion, but {type(self).__name__} needs {motions} motion"
+            )
+
     def run(self, source: Source, progress: Progress | None = None) -> Result:
         """Reconstruct a source.
 
@@ -109,11 +118,7 @@ class Method(OnDevice):
         mirrorskin.io.InputError
             The source has another motion, or it and the options cannot be used.
         """
-        if source.motion not in self.motions:
-            motions = " or ".join(self.motions)
-            raise InputError(
-                f"{source.name} has {source.motion} motion, but {type(self).__name__} needs {motions} motion"
-            )
+        self.check_motion(source)
         with naming(source):
             plan = self.plan(source)
             feed(source, plan.operation, plan.frames, progress)

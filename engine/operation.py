@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import cached_property, wraps
 from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, Protocol, Self, cast
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 P = ParamSpec("P")
 
+_COMPONENTS = {"displacement": (2,), "pose": (4,)}  # positions that are not single numbers
 _NOT_POSITIONS = ("lent", "frame_weights")  # keywords of push that are not positions of the body
 
 
@@ -110,6 +112,10 @@ class Operation(ThreadSafe, OnDevice):
     """Whether frames are read for the device: ahead, or where kernels can read them without a copy."""
     long_blocks: ClassVar[bool] = False
     """Whether as many frames as possible should be pushed at once."""
+    every: ClassVar[int] = 1
+    """Live, only frames whose number is a multiple of this are used."""
+    updates_per_second: ClassVar[float] = 15.0
+    """Live, as many updates are of use."""
     _takes_lent: ClassVar[bool] = False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -199,6 +205,21 @@ class Operation(ThreadSafe, OnDevice):
     def finish(self) -> Result:
         """Return the maps of all frames; only `reset` may follow, so that buffers need not be copied."""
         return cast(Result, self.result())
+
+    def preview(self, seconds: float) -> Mapping[str, Any]:
+        """Return the maps that a display shows while the body moves, if possible within some seconds."""
+        return self.result()  # type: ignore[no-any-return]
+
+    def spare(self, seconds: float) -> None:
+        """Do what can wait, for some seconds at most: no frame is expected meanwhile."""
+
+    def warm(self) -> None:
+        """Push a frame of zeros and forget it, so that what is compiled on first use is ready."""
+        where = {name: np.zeros((1, *_COMPONENTS.get(name, ()))) for name in self.positions}
+        self.push(np.zeros((1, *self.shape), self.dtype), **where)
+        with suppress(InputError):
+            self.preview(0.0)
+        self.reset()
 
     def start_second_pass(self) -> None:
         """Prepare for the same frames once more."""

@@ -1,9 +1,5 @@
-from .loop import LATENCY, LiveEstimator, Loop
-from .own import LiveOwn
-from .press import LivePress
-from .rocking import LiveRocking
-from .rotation import LiveRotation, choose_window
-from .slip import LiveSlip
+from .loop import LATENCY, Loop
+from .operation import LiveOperation
 from .status import PUSHED, RAISED, SHOWN, STAGES, UPDATED, WAITED, Latency, Maps, Status, Update
 
 __all__ = [
@@ -15,15 +11,9 @@ __all__ = [
     "UPDATED",
     "WAITED",
     "Latency",
-    "LiveEstimator",
-    "LiveOwn",
-    "LivePress",
-    "LiveRocking",
-    "LiveRotation",
-    "LiveSlip",
+    "LiveOperation",
     "Loop",
     "Maps",
     "Status",
     "Update",
-    "choose_window",
 ]

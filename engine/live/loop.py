@@ -1,4 +1,4 @@
-"""The live loop: from a source that does not wait into an estimator, within a bounded time."""
+"""The live loop: from a source that does not wait into an operation, within a bounded time."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.live.operation import LiveOperation
 from mirrorskin.engine.live.status import (
     PUSHED,
     RAISED,
     SHOWN,
     UPDATED,
     WAITED,
-    Maps,
     Monitor,
     Status,
     Update,
 )
-from mirrorskin.engine.streaming import DeviceEstimator, push_block
+from mirrorskin.engine.streaming import push_block
 from mirrorskin.io import Block, InputError, LiveSource
 
 LATENCY = 0.1
@@ -36,54 +36,23 @@ _PATIENCE = 0.01  # seconds that an update waits at least for maps that take lon
 _MARGIN = 0.001  # seconds before that, in which nothing is begun any more
 
 
-class LiveEstimator(DeviceEstimator, Protocol):
-    """An estimator that can return maps at any time, and does what can wait when there is time to spare.
-
-    Its ``result()`` is a `mirrorskin.io.Result`.
-
-    Attributes
-    ----------
-    every : int
-        It takes frames whose number is a multiple of this.
-    most_updates : float
-        Updates a second that are of use.
-    """
-
-    @property
-    def every(self) -> int:
-        """It takes frames whose number is a multiple of this."""
-
-    @property
-    def most_updates(self) -> float:
-        """Updates a second that are of use."""
-
-    def warm(self) -> None:
-        """Compile and try all kernels, so that the first frames need not wait for that; then reset."""
-
-    def maps(self, seconds: float = math.inf, /) -> Maps:
-        """Return what is known by now; what takes longer than that may be of an earlier update."""
-
-    def spare(self, seconds: float) -> None:
-        """Do what can wait, for so long at most."""
-
-
 class Loop:
-    """Push the frames of a live source into an estimator; its status can be read after an exception as well.
+    """Push the frames of a live source into an operation; the status can also be read after an exception.
 
-    *Policy.* All frames that wait are taken at once. Those that are older than ``latency`` then are skipped,
-    but the newest of them never; what the source lost before is counted as dropped. After each push there is
-    an update, at most ``updates`` a second of them; time that is left until the next frame is expected goes
-    into what can wait. So nothing queues up, and each frame is pushed once, skipped or dropped, and counted.
+    *Policy.* All waiting frames are taken at once. Frames that are older than ``latency`` are skipped, except
+    for the newest one; frames that the source has lost are counted as dropped. An update follows each push,
+    at most ``updates`` per second. The time until the next frame is expected is used for what can wait. So
+    nothing queues up, and each frame is pushed once, skipped or dropped, and counted.
 
     Parameters
     ----------
     source : LiveSource
-    estimator : LiveEstimator
-        Best warm; see there.
+    operation : LiveOperation
+        Call its ``warm()`` first.
     latency : float
         Seconds.
     updates : float, optional
-        A second, at most; by default what is of use to the estimator.
+        Updates per second at most; by default as many as the operation states.
     on_update : callable, optional
         Called with each update and the status; the loop waits for it.
     stop : callable, optional
@@ -102,7 +71,7 @@ class Loop:
     def __init__(
         self,
         source: LiveSource,
-        estimator: LiveEstimator,
+        operation: LiveOperation,
         *,
         latency: float = LATENCY,
         updates: float | None = None,
@@ -111,11 +80,11 @@ class Loop:
         mark: Mark | None = None,
         guard: Callable[[], AbstractContextManager[Any]] = nullcontext,
     ) -> None:
-        most = estimator.most_updates if updates is None else updates
+        most = operation.updates_per_second if updates is None else updates
         for name, number in (("latency", latency), ("updates", most)):
             if not number > 0:
                 raise InputError(f"{name} {number}: a number above 0 is needed")
-        self._source, self._estimator = source, estimator
+        self._source, self._operation = source, operation
         self._latency, self._period = latency, 1 / most
         self._on_update, self._stop, self._mark, self._guard = on_update, stop, mark, guard
         self._monitor = Monitor()
@@ -132,13 +101,13 @@ class Loop:
 
     def run(self) -> Status:
         """Push until the source ends, or ``stop`` says so."""
-        while (block := self._source.read(self._estimator.room)) is not None:
+        while (block := self._source.read(self._operation.room)) is not None:
             self._take(block)
             if self._stop is not None and self._stop():
                 break
             if self._source.now() - self._updated >= self._period:
                 self._update()
-            self._estimator.spare(self._idle())
+            self._operation.spare(self._idle())
         if self._pending:
             self._update()
         return self.status
@@ -148,20 +117,19 @@ class Loop:
         now, count = self._source.now(), len(block.frames)
         time = np.full(count, now) if block.time is None else block.time
         used = (now - time <= self._latency) | (np.arange(count) == count - 1)
-        used &= (block.index + np.arange(count)) % self._estimator.every == 0
+        used &= (block.index + np.arange(count)) % self._operation.every == 0
         self._monitor.time(WAITED, *(now - time).tolist())
         self._times.extend(time.tolist())
         with self._guard():
             self._monitor.took(now, count, int(np.count_nonzero(used)), block.dropped)
             for part in _runs(used):
-                push_block(self._estimator, block, part)
+                push_block(self._operation, block, part)
             if self._mark is not None:
                 self._mark(block.index, used)
         if used.any():
             last = int(np.flatnonzero(used)[-1])
             at = math.nan if block.time is None else float(block.time[last])
-            name = self._estimator.position
-            place = getattr(block, "tilt" if name == "pose" else name)[last]
+            place = getattr(block, self._operation.position)[last]
             self._newest = at, float(np.hypot(*place) if np.ndim(place) else place), block.frames[last]
             self._taken, self._pending = float(time[last]), True
             self._monitor.time(PUSHED, self._source.now() - now)
@@ -171,7 +139,7 @@ class Loop:
             return
         begun = self._source.now()
         (at, position, picture), frames = self._newest, self._monitor.used
-        maps = self._estimator.maps(max(_PATIENCE, self._idle()))
+        maps = self._operation.maps(max(_PATIENCE, self._idle()))
         update = Update(frames, at, self._source.motion, position, picture.copy(), **maps)
         done = self._source.now()
         self._updated, self._pending = begun, False

@@ -161,7 +161,7 @@ class Press(Method, options_of=(Onset, Levels, Elastomer, HoleFilling)):
         """Return the search for strokes, which needs to know nothing of the travel beforehand."""
         operation: PressOperation = self.make(Strokes).configured_for(source)
         process = self._process(source, range(0), operation)
-        del process["frames"]
+        del process["frames"]  # they are counted
         return Plan(operation, self._steps(operation), process, omit=_OMIT)
 
     def _kind(self, source: Source, oscillates: bool) -> type[PressOperation]:

@@ -114,9 +114,20 @@ class Strokes(CrossingOperation):
             process["strokes"] = count
         return Result(maps, process=process, declarations=self.declarations)
 
-    def onset(self) -> Found:
-        """Return only what was found on the strokes down so far."""
-        return self._with_open(1).found()
+    def preview(self, seconds: float) -> Mapping[str, Any]:
+        """Return height and contact, without the other maps."""
+        if self.count < self.least_frames:
+            return {}
+        found = self._with_open(1).found()
+        contact = np.isin(found.status, (PressStatus.ONSET, PressStatus.LIGHT_AT_START))
+        return {"height": found.height, "contact": contact.astype(np.uint8)}
+
+    def warm(self) -> None:
+        """Press and lift nothing, twice, so that all kernels are compiled."""
+        for travel in (0.0, 1.0, 2.0, 1.0, 0.0):
+            self.push(np.zeros((1, *self.shape), self.dtype), travel=[travel])
+            self.preview(0.0)
+        self.reset()
 
     @property
     def _known_noise(self) -> float:

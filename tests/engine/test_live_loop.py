@@ -18,18 +18,19 @@ PLACES = 0.1 * np.arange(COUNT)
 
 @dataclass
 class Slow:
-    """An estimator for which each push and update takes a time of its own."""
+    """An operation for which each push and update takes a time of its own."""
 
     clock: Clock
     push_time: float = 0.0
     update_time: float = 0.0
     every: int = 1
-    most_updates: float = math.inf
+    updates_per_second: float = math.inf
     pushed: list[int] = field(default_factory=list)
     updates: list[int] = field(default_factory=list)
     spared: list[float] = field(default_factory=list)
 
     position = "phase"
+    positions = {"phase": True}  # noqa: RUF012
     room = np.empty((64, 2, 3), np.uint8)
 
     def push(self, frames, *, phase, lent):
@@ -51,7 +52,7 @@ def make(slots=64, **how):
     return paced(FRAMES, turn_header(), PLACES, RATE, clock, slots), Slow(clock, **how)
 
 
-def test_a_quick_estimator_gets_each_frame_at_once_and_updates_each_time():
+def test_a_quick_operation_gets_each_frame_at_once_and_updates_each_time():
     source, slow = make(push_time=0.001, update_time=0.002)
     status = Loop(source, slow).run()
     assert slow.pushed == list(range(COUNT))
@@ -112,7 +113,7 @@ def test_updates_are_no_more_often_than_asked_and_the_last_frame_is_in_one():
     assert slow.updates[-1] == COUNT
 
 
-def test_an_estimator_that_asks_for_every_third_frame_gets_these():
+def test_an_operation_that_asks_for_every_third_frame_gets_these():
     source, slow = make(update_time=0.033, every=3)
     status = Loop(source, slow).run()
     assert slow.pushed == list(range(0, COUNT, 3))

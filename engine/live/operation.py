@@ -1,0 +1,134 @@
+"""An operation, or a method, while the body moves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.engine.live.status import Maps
+from mirrorskin.engine.method import Method, Plan
+from mirrorskin.engine.operation import Operation
+from mirrorskin.engine.provenance import describe, naming
+from mirrorskin.engine.running import check_motion
+from mirrorskin.engine.thread_safe import ThreadSafe
+from mirrorskin.io import InputError, LiveSource, Result
+from mirrorskin.io.layout import POSITIONS
+
+_FRAMES = 64  # that may wait to be pushed at once
+_SHOWN = ("height", "normals", "contact", "edges", "displacement", "slope", "height_lag", "offset_unknown")
+
+
+class LiveOperation(ThreadSafe):
+    """What `Loop` pushes frames into: an operation or a method, and the source that its frames come from.
+
+    Parameters
+    ----------
+    source : LiveSource
+        Options that are not given are taken from its header and calibration, where these have them.
+    operation : Operation or Method
+        A method's steps are applied when the result is asked for.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        The operation does not apply to the source's motion, or needs what is unknown while the body moves.
+
+    Attributes
+    ----------
+    operation : Operation
+        Configured for the source, and ready for its frames.
+    """
+
+    def __init__(self, source: LiveSource, operation: Operation | Method) -> None:
+        self._source, shape = source, source.shape[1:]
+        with naming(source):
+            self._plan = _live_plan(source, operation, _FRAMES * math.prod(shape) * source.dtype.itemsize)
+            self.operation: Operation = self._plan.operation
+            self._check_positions()
+            self.operation.begin(shape, source.dtype)
+        self.positions: Mapping[str, bool] = self.operation.positions
+        rocks = source.motion == "axial" and source.header.tilt is None
+        self.position: str = "tilt" if rocks else POSITIONS[source.motion]
+        self.every: int = self.operation.every
+        self.updates_per_second: float = self.operation.updates_per_second
+
+    def _check_positions(self) -> None:
+        operation, source = self.operation, self._source
+        if operation.passes == 2:
+            raise InputError(f"{type(operation).__name__} needs all frames twice, so it cannot run live")
+        available = {POSITIONS[source.motion], "time"}
+        if source.motion == "axial" and source.header.tilt is None:
+            available |= {"tilt", "pose"}
+        needed = {name for name, is_needed in operation.positions.items() if is_needed}
+        if missing := needed - available:
+            names = ", ".join(sorted(missing))
+            raise InputError(
+                f"{type(operation).__name__} needs {names}. While the body moves, {source.name} has"
+                f" {', '.join(sorted(available))} of each frame"
+            )
+
+    @property
+    def room(self) -> NDArray[Any]:
+        """Array in which the next frames may be written before they are pushed, (n, H, W)."""
+        return self.operation.room
+
+    def warm(self) -> None:
+        """Compile and try all kernels, so that the first frames need not wait for that."""
+        self.operation.warm()
+
+    def push(self, frames: NDArray[Any], **positions: Any) -> None:
+        """Take in the next frames."""
+        with naming(self._source):
+            self.operation.push(frames, **positions)
+
+    def maps(self, seconds: float = math.inf, /) -> Maps:
+        """Return the maps of the frames so far that a display shows; none before they are determined."""
+        try:
+            with naming(self._source):
+                found = self.operation.preview(seconds)
+        except InputError:
+            return {}
+        quantity = found.name_of if isinstance(found, Result) else lambda name: name
+        maps = {name: found.get(quantity(name)) for name in _SHOWN}
+        if isinstance(found, Result):  # whose pieces have it
+            maps["offset_unknown"] = found.offset_unknown is not None and bool(found.offset_unknown.any())
+        contact, size = maps["contact"], self._source.header.pixel_size
+        area = None if contact is None or size is None else float(np.count_nonzero(contact)) * math.prod(size)
+        shown = {name: one for name, one in {**maps, "contact_area": area}.items() if one is not None}
+        return cast(Maps, shown)
+
+    def spare(self, seconds: float) -> None:
+        """Do what can wait, for some seconds at most."""
+        self.operation.spare(seconds)
+
+    def reset(self) -> None:
+        """Forget the frames so far."""
+        self.operation.reset()
+
+    def result(self) -> Result:
+        """Return all maps of the frames so far, and how they were computed.
+
+        Raises
+        ------
+        mirrorskin.io.InputError
+            The frames do not determine them.
+        """
+        with naming(self._source):
+            return self._plan.finish(self.operation.result(), self._source, {"live": True})
+
+
+def _live_plan(source: LiveSource, operation: Operation | Method, size: int) -> Plan:
+    """Return what is done with a source; ``size`` are the bytes of frames that may wait."""
+    if isinstance(operation, Method):
+        operation.check_motion(source)
+        plan = operation.live_plan(source)
+    else:
+        check_motion(source, operation)
+        configured = operation.configured_for(source)
+        plan = Plan(configured, process=describe(configured, source))
+    return replace(plan, operation=plan.operation.with_options(memory_limit=2 * size))
