@@ -171,8 +171,8 @@ class Operation(ThreadSafe, OnDevice):
         """Prepare for frames of a shape, (H, W), and type, and forget all earlier frames."""
         wanted = np.dtype(dtype)
         if self.dtypes is not None and wanted not in self.dtypes:
-            names = ", ".join(str(one) for one in self.dtypes)
-            raise InputError(f"frames of type {wanted}: {names} are needed")
+            *others, last = map(str, self.dtypes)
+            raise InputError(f"frames of type {wanted}: {', '.join(others)} or {last} are needed")
         if (self.shape, self.dtype) == (shape, wanted):
             self.reset()
             return
@@ -226,6 +226,7 @@ class Operation(ThreadSafe, OnDevice):
 
     def next_pass(self) -> None:
         """Begin the second pass, after all frames have been pushed once."""
+        self.check_count()
         self.start_second_pass()
         expected = self.count
         self._forget()
@@ -237,6 +238,13 @@ class Operation(ThreadSafe, OnDevice):
         rows, columns = self.shape
         at_once = max(1, self.memory_limit // (2 * rows * columns * self.dtype.itemsize))
         return np.empty((at_once, rows, columns), self.dtype)
+
+    def check_count(self) -> None:
+        """Raise InputError if fewer frames have been pushed than a result needs."""
+        if self.count < self.least_frames:
+            frames = "1 frame" if self.least_frames == 1 else f"{self.least_frames} frames"
+            pushed = f"{self.count} has been" if self.count == 1 else f"{self.count or 'none'} have been"
+            raise InputError(f"{type(self).__name__} needs at least {frames}; {pushed} pushed so far")
 
     def _check_frames(self, frames: Any) -> NDArray[Any]:
         """Return frames as an array that fits to earlier ones."""
@@ -296,9 +304,7 @@ def _checked_result(method: Callable[..., Any]) -> Callable[..., Result]:
     @wraps(method)
     def result(self: Operation) -> Result:
         name = type(self).__name__
-        if self.count < self.least_frames:
-            frames = "1 frame" if self.least_frames == 1 else f"{self.least_frames} frames"
-            raise InputError(f"{name} needs at least {frames}; {self.count or 'none'} pushed so far")
+        self.check_count()
         if self.passes == 2 and (self._pass == 1 or self.count != self._expected):
             raise InputError(f"{name} needs all frames twice, with next_pass() in between")
         found = method(self)

@@ -117,7 +117,7 @@ class Option:
             and (high is None or number <= high)
             and (self.above is None or number > self.above)
         ):
-            raise InputError(f"{self.name} {number:g}: {self._needed()}")
+            raise InputError(f"{self.name} {number}: {self._needed()}")
         return number
 
     def _needed(self) -> str:

@@ -63,7 +63,7 @@ class ChangePoint(PressOperation):
         """Prepare for frames of a shape and type."""
         if not 0 < self.threshold < 1:
             what = "a change-point needs a share between 0 and 1, such as 0.5"
-            raise InputError(f"threshold {self.threshold:g}: {what}")
+            raise InputError(f"threshold {self.threshold}: {what}")
         if self.hold > REACH:
             raise InputError(f"hold {self.hold}: a change-point needs a number of frames from 1 to {REACH}")
         self._release = self.event == "release"

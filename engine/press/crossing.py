@@ -40,7 +40,7 @@ class PressOperation(Operation):
     hold: int = option(
         2,
         "frames",
-        within=(1, None),
+        within=(1, np.iinfo(np.int32).max),
         help="consecutive light frames that confirm an onset, or dark frames that confirm a release",
     )
     dark: ArrayLike | None = option(

@@ -51,9 +51,12 @@ class Levels(ThresholdOperation):
     slope_min = TABLE["slope_min"]
     slope_max = TABLE["slope_max"]
 
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._angles = _check_levels(self.thresholds, self.inclinations)
+
     def shares(self) -> Sequence[float]:
         """Return the thresholds."""
-        self._angles = _check_levels(self.thresholds, self.inclinations)
         return self.thresholds
 
     def result(self) -> Result:

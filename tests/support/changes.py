@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mirrorskin.engine.frames import reference_pair
-from mirrorskin.engine.press.onset import Onset
+from mirrorskin.io import Result
 from mirrorskin.kernels import changepoint as reference
 
 EVIDENCE = 12
@@ -77,7 +77,8 @@ def _onset(maps, start, shape, noise, event):
     frame = np.where((status == 1) | (status == 3), start, -1)
     if event == "release":
         status = np.array([0, 1, 3, 2])[status]
-    return Onset(*(values.reshape(shape) for values in (height, sigma, status, frame)), noise)
+    maps = {"height": height, "height_sigma": sigma, "status": status, "frame": frame}
+    return Result({name: values.reshape(shape) for name, values in maps.items()}, process={"noise": noise})
 
 
 def assert_near(found, expected, travel):
@@ -86,8 +87,8 @@ def assert_near(found, expected, travel):
     np.testing.assert_array_equal(found.frame, expected.frame)
     answered = expected.status == 1
     np.testing.assert_array_equal(np.isnan(found.height), ~answered)
-    np.testing.assert_array_equal(np.isnan(found.sigma), ~answered)
+    np.testing.assert_array_equal(np.isnan(found.height_sigma), ~answered)
     gap = np.abs(found.height - expected.height)[answered]
     # The weights of hypotheses have the rounding of the misfit, in square sigmas, of float32.
-    assert np.all(gap <= 0.01 * expected.sigma[answered] + 1e-6 * np.max(np.abs(travel)))
-    np.testing.assert_allclose(found.sigma[answered], expected.sigma[answered], rtol=0.02, atol=1e-7)
+    assert np.all(gap <= 0.01 * expected.height_sigma[answered] + 1e-6 * np.max(np.abs(travel)))
+    np.testing.assert_allclose(found.height_sigma[answered], expected.height_sigma[answered], rtol=0.02, atol=1e-7)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mirrorskin.engine.frames import reference_maps
-from mirrorskin.engine.press.onset import Onset
+from mirrorskin.io import Result
 from mirrorskin.kernels import onset as reference
 
 SPEC = {"uint8": (20, 220), "uint16": (300, 3500), "float32": (0.1, 0.9)}
@@ -72,8 +72,9 @@ def numpy_onset(
     )
     if release:
         status = np.array([0, 1, 3, 2], np.uint8)[status]
-    maps = (height, sigma, status, np.maximum(onset, reference.DARK))
-    return Onset(*(values.reshape(shape) for values in maps), noise)
+    maps = {"height": height, "height_sigma": sigma, "status": status}
+    maps["frame"] = np.maximum(onset, reference.DARK)
+    return Result({name: values.reshape(shape) for name, values in maps.items()}, process={"noise": noise})
 
 
 def first_run(light, hold):
@@ -87,7 +88,7 @@ def first_run(light, hold):
 
 def assert_equal(left, right):
     """Hold two onsets equal to the last bit."""
-    for name in ("height", "sigma", "status", "frame"):
+    for name in ("height", "height_sigma", "status", "frame"):
         np.testing.assert_array_equal(getattr(left, name), getattr(right, name), err_msg=name)
 
 
@@ -104,4 +105,4 @@ def assert_within_an_ulp(found, expected, travel):
         np.float32(np.max(np.abs(np.diff(travel))))
     )
     assert np.all(np.abs(found.height[answered] - exact) <= 2 * ulp)
-    np.testing.assert_allclose(found.sigma[answered], expected.sigma[answered], rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(found.height_sigma[answered], expected.height_sigma[answered], rtol=1e-5, atol=1e-9)

@@ -68,7 +68,7 @@ def test_levels_that_are_given_are_used_as_they_are():
     _, result = errors(frames, half, dark=12, bright=182)
     onset = engine.find_onset(frames, TRAVEL, dark=12, bright=182)
     np.testing.assert_array_equal(result.height, onset.height)
-    np.testing.assert_array_equal(result.height_sigma, onset.sigma)
+    np.testing.assert_array_equal(result.height_sigma, onset.height_sigma)
 
 
 def test_where_nothing_turns_light_the_range_of_the_type_is_taken_and_told():

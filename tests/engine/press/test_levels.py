@@ -11,7 +11,7 @@ from commands import run
 from stacks import record
 
 from mirrorskin import engine, io
-from mirrorskin.engine.press.levels import LevelSearch
+from mirrorskin.engine.press.levels import Levels
 from mirrorskin.hw.twin import Camera, Sphere, Twin, Vertical
 
 HEIGHT, RADIUS = 40.0, 17.5  # of the twin's wall, mm
@@ -40,7 +40,7 @@ def press(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def found(press):
-    return engine.reconstruct(press, threshold=SHARES, inclinations=STEPS, fill=False)
+    return engine.reconstruct(press, thresholds=SHARES, inclinations=STEPS, fill=False)
 
 
 def test_the_true_inclination_lies_within_its_bounds(press, found):
@@ -68,7 +68,7 @@ def test_heights_are_those_of_the_lowest_threshold(press, found):
 
 
 def test_one_threshold_gives_bounds_too(press, found):
-    one = engine.reconstruct(press, threshold=SHARES[1], inclinations=STEPS[1:2], fill=False)
+    one = engine.reconstruct(press, thresholds=SHARES[1:2], inclinations=STEPS[1:2], fill=False)
     np.testing.assert_array_equal(one.slope_min > 0, found.slope_min >= np.float32(STEPS[1]))
 
 
@@ -76,28 +76,27 @@ def test_blocks_make_no_difference_and_invalid_pixels_have_no_bounds():
     frames = np.zeros((6, 1, 4), np.float32)
     frames[3:, 0] = [0, 0.3, 0.9, np.nan]
     travel = 0.1 * np.arange(6)
-    whole, parts = (LevelSearch((1, 4), "float32", [0.2, 0.8], dark=0, bright=1, noise=0.01) for _ in "ab")
+    options = {"thresholds": [0.2, 0.8], "inclinations": [0.25, 0.5], "dark": 0, "bright": 1, "noise": 0.01}
+    whole, parts = Levels(**options), Levels(**options)
     whole.push(frames, travel=travel)
     for frame, at in zip(frames, travel, strict=True):
         parts.push(frame[np.newaxis], travel=[at])
     for search in (whole, parts):
-        levels = search.result()
-        assert levels.passed.tolist() == [[0, 1, 2, -1]]
-        low, high = levels.bounds([0.25, 0.5])
-        np.testing.assert_array_equal(low, np.array([[0, 0.25, 0.5, np.nan]], np.float32))
-        np.testing.assert_array_equal(high, np.array([[0.25, 0.5, np.nan, np.nan]], np.float32))
+        found = search.result()
+        np.testing.assert_array_equal(found.slope_min, np.array([[0, 0.25, 0.5, np.nan]], np.float32))
+        np.testing.assert_array_equal(found.slope_max, np.array([[0.25, 0.5, np.nan, np.nan]], np.float32))
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"threshold": [0.2, 0.8]}, "2 thresholds and 0 inclinations"),
-        ({"threshold": [0.8, 0.2], "inclinations": [0.2, 0.4]}, "from the lowest to the highest"),
-        ({"threshold": [], "inclinations": []}, "from the lowest to the highest"),
-        ({"threshold": [0.2, 0.8], "inclinations": [0.4, 0.2]}, "must rise with the thresholds"),
-        ({"threshold": [0.2, 0.8], "inclinations": [0.4, 2.0]}, "between 0 and 90"),
-        ({"threshold": [0.2, 1.8], "inclinations": [0.2, 0.4]}, "threshold 1.8"),
-        ({"threshold": 0.5, "inclinations": [0.2], "method": "change-point"}, "method 'threshold'"),
+        ({"thresholds": [0.2, 0.8]}, "2 thresholds and 0 inclinations"),
+        ({"thresholds": [0.8, 0.2], "inclinations": [0.2, 0.4]}, "from the lowest to the highest"),
+        ({"thresholds": [], "inclinations": []}, "from the lowest to the highest"),
+        ({"thresholds": [0.2, 0.8], "inclinations": [0.4, 0.2]}, "must rise with the thresholds"),
+        ({"thresholds": [0.2, 0.8], "inclinations": [0.4, 2.0]}, "between 0 and 90"),
+        ({"thresholds": [0.2, 1.8], "inclinations": [0.2, 0.4]}, "thresholds 1.8"),
+        ({"thresholds": [0.5], "inclinations": [0.2], "method": "change-point"}, "method 'threshold'"),
     ],
 )
 def test_what_cannot_be_is_one_line(press, options, said):
@@ -110,15 +109,15 @@ def test_the_command_takes_them_repeated_or_with_commas(press, found, tmp_path, 
     press.rewind()
     record(press, tmp_path / "press.h5")
     angles = ",".join(f"{step}rad" for step in STEPS)
-    repeated = [word for share in SHARES for word in ("--threshold", share)]
-    commas = ["--threshold", ",".join(map(str, SHARES))]
+    repeated = [word for share in SHARES for word in ("--thresholds", share)]
+    commas = ["--thresholds", ",".join(map(str, SHARES))]
     for words in (repeated, commas):
-        words = [*words, "--inclination", angles, "--no-fill", "-o", "a.h5"]
+        words = [*words, "--inclinations", angles, "--no-fill", "-o", "a.h5"]
         ended = run("reconstruct", "press.h5", *words)
         assert ended.code == 0, ended.said
         np.testing.assert_array_equal(io.open_result("a.h5").slope_max, found.slope_max)
     for words, said in (
-        (["--threshold", "0.2,0.8"], "2 thresholds and 0 inclinations"),
+        (["--thresholds", "0.2,0.8"], "2 thresholds and 0 inclinations"),
         (["--threshold", "half"], "--threshold half: a share from 0 to 1 is needed; write e.g. 0.25"),
     ):
         ended = run("reconstruct", "press.h5", *words, "-o", "b.h5")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from presses import LEVELS, SPEC, assert_equal, assert_within_an_ulp, first_run, numpy_onset, random_press
 
-from mirrorskin.engine import OnsetSearch, find_onset
+from mirrorskin.engine import Onset, find_onset
 from mirrorskin.io import InputError
 from mirrorskin.kernels import onset as reference
 
@@ -45,7 +45,7 @@ def stroke(dtype, count, shape, event="onset", **options):
 
 
 def search_in_blocks(frames, travel, cuts, **options):
-    search = OnsetSearch(frames.shape[1:], frames.dtype, **options)
+    search = Onset(**options)
     for part in np.split(np.arange(len(frames)), cuts):
         if len(part):
             search.push(frames[part], travel=travel[part])
@@ -117,7 +117,7 @@ def test_tiny_stacks_of_all_kinds(device, dtype, hold, subframe, event):
         cuts = np.unique(generator.integers(1, count, generator.integers(0, 6)))
         known = {"dark": dark, "bright": bright, "device": device, **options}
         found = search_in_blocks(frames, travel, list(cuts), **known)
-        options["noise"] = found.noise
+        options["noise"] = found.process["noise"]
         assert_within_an_ulp(found, by_reference(frames, travel, dark, bright, **options), travel)
 
 
@@ -161,7 +161,7 @@ def test_a_sudden_step_lies_in_the_middle_of_its_interval(device, event):
         frames, travel = frames[::-1].copy(), travel[::-1]
     found = find_onset(frames, travel, **LEVELS["uint8"], noise=1.0, event=event, device=device)
     assert found.height[0, 0] == np.float32(-0.25)
-    assert found.sigma[0, 0] == pytest.approx(0.15 / np.sqrt(3))
+    assert found.height_sigma[0, 0] == pytest.approx(0.15 / np.sqrt(3))
 
 
 @pytest.mark.parametrize("event", EVENTS)
@@ -172,7 +172,7 @@ def test_a_ramp_is_interpolated_exactly(device, event):
         frames, travel = frames[::-1].copy(), travel[::-1]
     found = find_onset(frames, travel, **LEVELS["uint8"], noise=1.0, event=event, device=device)
     assert found.height[0, 0] == pytest.approx(-0.625, abs=1e-7)
-    assert found.sigma[0, 0] == pytest.approx(0.1 / 16 * np.hypot(0.25, 0.75), rel=1e-5)
+    assert found.height_sigma[0, 0] == pytest.approx(0.1 / 16 * np.hypot(0.25, 0.75), rel=1e-5)
 
 
 def test_sigma_is_honest_on_ramps(device):
@@ -184,7 +184,7 @@ def test_sigma_is_honest_on_ramps(device):
     found = find_onset(frames, np.arange(24) * 0.1, dark=20, bright=220, noise=1.5, device=device)
     assert np.all(found.status == 1)
     error = found.height + 0.1 * crossing
-    assert np.mean((error / found.sigma) ** 2) == pytest.approx(1, abs=0.05)
+    assert np.mean((error / found.height_sigma) ** 2) == pytest.approx(1, abs=0.05)
 
 
 @pytest.mark.parametrize("event", EVENTS)
@@ -199,7 +199,7 @@ def test_sigma_is_honest_on_steps(device, event):
         frames, travel = frames[::-1].copy(), travel[::-1]
     found = find_onset(frames, travel, **LEVELS["uint8"], event=event, device=device)
     error = found.height + 0.1 * crossing
-    assert np.mean((error / found.sigma) ** 2) == pytest.approx(1, abs=0.05)
+    assert np.mean((error / found.height_sigma) ** 2) == pytest.approx(1, abs=0.05)
     assert abs(np.mean(error)) < 0.001
 
 
@@ -211,7 +211,7 @@ def test_a_pixel_that_hovers_about_its_level_does_not_claim_to_know_when(device)
     found = find_onset(frames, np.arange(40) * 0.1, **LEVELS["uint8"], noise=1.5, device=device)
     late = (found.status == 1) & (found.frame > 10)
     assert late.sum() > 100
-    assert np.max(np.abs(((found.height + 0.25) / found.sigma)[late])) < 4
+    assert np.max(np.abs(((found.height + 0.25) / found.height_sigma)[late])) < 4
 
 
 def test_a_plateau_that_noise_takes_below_its_level_began_in_the_step_that_led_to_it(device):
@@ -226,13 +226,13 @@ def test_a_plateau_that_noise_takes_below_its_level_began_in_the_step_that_led_t
     error = (found.height + depth)[known]
     assert known.mean() > 0.9
     assert np.mean(np.abs(error) > 0.15) < 1e-3  # a step is 0.1 mm
-    assert np.mean((error / found.sigma[known]) ** 2) == pytest.approx(1.0, abs=0.1)
+    assert np.mean((error / found.height_sigma[known]) ** 2) == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_sample_that_is_lit_by_its_neighbours_does_not_tell_when_the_change_began(device):
     frames = np.array([20.0, 20, 38, 190, 200, 200], np.float32).reshape(-1, 1, 1)
     found = find_onset(frames, 0.1 * np.arange(6), dark=20.0, bright=220.0, noise=1.0, device=device)
-    assert found.sigma.item() == pytest.approx(0.1 / math.sqrt(12), rel=0.05)
+    assert found.height_sigma.item() == pytest.approx(0.1 / math.sqrt(12), rel=0.05)
 
 
 def test_noise_is_estimated_from_the_first_two_frames():
@@ -241,7 +241,7 @@ def test_noise_is_estimated_from_the_first_two_frames():
         frames = np.rint(30 + generator.normal(0, noise, (5, 200, 200))).astype(np.uint8)
         frames[1, :, :40] = 200  # what changes in between is left out
         found = find_onset(frames, np.arange(5.0), **LEVELS["uint8"])
-        assert found.noise == pytest.approx(np.hypot(noise, 1 / np.sqrt(12)), rel=0.03)
+        assert found.process["noise"] == pytest.approx(np.hypot(noise, 1 / np.sqrt(12)), rel=0.03)
 
 
 def test_a_spike_is_no_onset_unless_the_stack_ends_on_it_and_moves_no_plateau(device):
@@ -267,7 +267,7 @@ def test_what_never_changes_has_no_height(device, dtype):
         assert np.all(found.status == status)
         assert np.all(found.frame == (0 if status == 3 else -1))
         assert np.isnan(found.height).all()
-        assert np.isnan(found.sigma).all()
+        assert np.isnan(found.height_sigma).all()
 
 
 def test_a_pixel_that_is_dark_at_start_stays_so_though_it_turns_light(device):
@@ -308,7 +308,7 @@ def test_a_saturated_sample_is_light_though_its_level_is_beyond_the_range(device
     assert_within_an_ulp(found, by_reference(frames, travel, 20, 400, **options), travel)
     np.testing.assert_array_equal(found.status[0, [0, 2]], [1, 3])
     assert 1.9 <= -found.height[0, 0] <= 2.0
-    assert 0 < found.sigma[0, 0] < 0.1
+    assert 0 < found.height_sigma[0, 0] < 0.1
 
 
 def test_pixels_without_references_are_invalid(device):
@@ -368,8 +368,9 @@ def test_levels_are_those_of_the_reference_to_the_last_bit(device, dtype, event)
     dark, bright, noise = dark.astype(np.float32), bright.astype(np.float32), 0.01 * top
     for threshold in (0.0, 0.55, 1.0):
         known = {"dark": dark, "bright": bright, "threshold": threshold, "noise": noise, "event": event}
-        search = OnsetSearch(shape, dtype, device=device, **known)
-        (band,) = search._bands
+        search = Onset(device=device, **known)
+        search.begin(shape, dtype)
+        (band,) = search._searches[0]._bands
         levels = band.maps["levels"].download().copy()[:, : band.pixels].reshape(2, *shape)
         search.push(np.zeros((1, *shape), dtype), travel=[0.0])  # looks for what is surely dark
         for name in ("marks", "left"):
@@ -427,7 +428,7 @@ def test_the_whole_range_of_float32(device, broken):
 @pytest.mark.parametrize("event", EVENTS)
 def test_results_on_the_way_change_nothing_and_a_search_can_be_used_again(device, event):
     known = {"dark": None, "bright": 220, "noise": 1.5, "event": event, "device": device}
-    search = OnsetSearch((9, 13), np.uint8, **known)
+    search = Onset(**known)
     for seed in (7, 8):
         frames, travel = stroke("uint8", 30, (9, 13), event, seed=seed)
         for number in range(30):
@@ -435,7 +436,7 @@ def test_results_on_the_way_change_nothing_and_a_search_can_be_used_again(device
             search.push(frames[number : number + 1], travel=travel[number : number + 1])
             if number:
                 assert_equal(search.result(), find_onset(frames[so_far], travel[so_far], **known))
-        np.testing.assert_array_equal(search.travel, travel)
+        np.testing.assert_array_equal(search.pushed("travel"), travel)
         search.reset()
 
 
@@ -446,7 +447,7 @@ def test_nothing_is_left_of_the_press_before(device):
     frames = np.full((12, 1, 1), 117, np.uint8)
     frames[[0, 1]], frames[6:] = 200, 124
     travel = np.arange(40) * 0.1
-    search = OnsetSearch((1, 1), np.uint8, **LEVELS["uint8"], hold=5, noise=1.5, device=device)
+    search = Onset(**LEVELS["uint8"], hold=5, noise=1.5, device=device)
     search.push(before, travel=travel)
     search.reset()
     for part in (slice(0, 2), slice(2, 12)):
@@ -469,7 +470,7 @@ def test_travel_may_pause(device):
     frames[3:] = 200
     found = find_onset(frames, [0.0, 0.1, 0.1, 0.1, 0.2], **LEVELS["uint8"], noise=1.0, device=device)
     assert found.height[0, 0] == np.float32(-0.1)
-    assert found.sigma[0, 0] == 0
+    assert found.height_sigma[0, 0] == 0
 
 
 def test_a_press_played_backwards_has_its_release_where_its_onset_was(device):
@@ -486,7 +487,7 @@ def test_a_press_played_backwards_has_its_release_where_its_onset_was(device):
     steps = lasts < 1
     np.testing.assert_array_equal(release.height[steps], onset.height[steps])
     np.testing.assert_allclose(release.height[~steps], onset.height[~steps], atol=1e-6)
-    np.testing.assert_allclose(release.sigma, onset.sigma, rtol=1e-5)
+    np.testing.assert_allclose(release.height_sigma, onset.height_sigma, rtol=1e-5)
 
 
 def test_a_release_of_the_complement_is_an_onset(device):
@@ -500,21 +501,21 @@ def test_a_release_of_the_complement_is_an_onset(device):
     np.testing.assert_array_equal(release.frame, onset.frame)
     np.testing.assert_array_equal(release.status, np.array([0, 1, 3, 2])[onset.status])
     np.testing.assert_array_equal(release.height, -onset.height)
-    np.testing.assert_array_equal(release.sigma, onset.sigma)
+    np.testing.assert_array_equal(release.height_sigma, onset.height_sigma)
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         ({"frames": np.zeros((1, 3, 3), np.uint8), "travel": [0.0]}, "at least 2 frames"),
-        ({"frames": np.zeros((5, 0, 3), np.uint8)}, "at least 2 frames"),
+        ({"frames": np.zeros((5, 0, 3), np.uint8)}, r"numbers \(n, H, W\)"),
         ({"frames": np.zeros((5, 3, 3), np.int32)}, "uint8, uint16 or float32"),
         ({"frames": np.zeros((5, 3, 3), np.float32), "dark": None}, "dark and bright"),
         ({"travel": [0.0, 1.0]}, "5 frames"),
         ({"travel": [0.0, 1.0, np.nan, 2.0, 3.0]}, "nan at frame 2"),
         ({"travel": [0.0, 1.0, 0.5, 2.0, 3.0]}, "runs back at frame 2: a press only goes down"),
         ({"event": "release"}, "runs back at frame 1: a release only goes up"),
-        ({"event": "slip"}, "unknown event 'slip'; known are onset, release"),
+        ({"event": "slip"}, "unknown event 'slip'. Use onset or release"),
         ({"dark": np.zeros((2, 3))}, "the frames are 3 x 3"),
         ({"dark": 220, "bright": 20}, "bright is not above dark"),
         ({"threshold": 1.5}, "threshold 1.5"),
@@ -531,14 +532,14 @@ def test_bad_input_is_refused(change, words):
 
 
 def test_frames_that_do_not_follow_are_refused():
-    search = OnsetSearch((3, 3), np.uint8)
+    search = Onset()
     search.push(np.zeros((1, 3, 3), np.uint8), travel=[1.0])
-    with pytest.raises(InputError, match="1 frames has no onset"):
+    with pytest.raises(InputError, match="at least 2 frames; 1 has been pushed"):
         search.result()
     with pytest.raises(InputError, match="runs back at frame 0"):
         search.push(np.zeros((2, 3, 3), np.uint8), travel=[0.5, 2.0])
     for shape, dtype in (((2, 9, 5), "u1"), ((2, 1, 1), "u1"), ((2, 3, 3), "u2"), ((0, 3, 3), "u1")):
-        with pytest.raises(InputError, match="expected uint8"):
+        with pytest.raises(InputError, match=r"uint8 \(n, 3, 3\) is needed"):
             search.push(np.zeros(shape, dtype), travel=2 + np.arange(float(shape[0])))
 
 

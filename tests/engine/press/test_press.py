@@ -37,7 +37,7 @@ def used(result):
 
 def assert_found(result, onset):
     np.testing.assert_array_equal(result.height, onset.height)
-    np.testing.assert_array_equal(result.height_sigma, onset.sigma)
+    np.testing.assert_array_equal(result.height_sigma, onset.height_sigma)
     np.testing.assert_array_equal(result.status, onset.status)
 
 
@@ -72,13 +72,13 @@ def test_the_heights_of_a_release_are_as_good_as_those_of_the_press(method):
 
 def test_the_frames_before_a_release_are_read_but_not_looked_at(monkeypatch):
     """Were they, the first one, dark throughout, would be taken for the release."""
-    pushed, done, push = [], [], engine.OnsetSearch.push
+    pushed, done, push = [], [], engine.Onset.push
 
     def note(search, frames, *, travel, **options):
         pushed.append(len(frames))
         push(search, frames, travel=travel, **options)
 
-    monkeypatch.setattr(engine.OnsetSearch, "push", note)
+    monkeypatch.setattr(engine.Onset, "push", note)
     limit = 2 * 8 * SHAPE[0] * SHAPE[1]
     engine.reconstruct(twin(), event="release", memory_limit=limit, progress=done.append)
     assert pushed == [8, 8, 8, 7]
@@ -107,9 +107,9 @@ def test_a_body_that_rests_may_be_asked_for_either():
         (DOWN[::-1], {}, "twin: sphere: travel only falls: that is a release; give event release"),
         (np.array([0.2, 0.2, 0.1]), {}, "travel only falls"),
         (np.array([0.1, 0.2, 0.2]), {"event": "release"}, "travel only rises"),
-        (STROKE, {"event": "slip"}, "unknown event 'slip'; known are onset, release"),
+        (STROKE, {"event": "slip"}, "unknown event 'slip'. Use onset or release"),
         (DOWN, {"method": "change-point", "subframe": False}, "needs method 'threshold'"),
-        (DOWN, {"method": "guess"}, "is a press, which method 'guess' cannot do: take threshold, change-p"),
+        (DOWN, {"method": "guess"}, "unknown method 'guess'. Use threshold or change-point"),
     ],
 )
 def test_what_cannot_be_done_is_refused_before_anything_is_read(travel, options, words):
@@ -197,8 +197,9 @@ def test_a_result_outlives_its_recording(tmp_path):
     path = tmp_path / "press.h5"
     with io.Recorder(MadeUp(frames, io.Header("vertical"), travel=travel), path) as recorder:
         recorder.drain(lambda done: None)
-    search = engine.OnsetSearch((64, 64), "uint8", device=open_device())
+    search = engine.Onset(device=open_device())
     with io.open_recording(path) as recording:
+        search.begin(recording.shape[1:], recording.dtype)
         while (block := recording.read(search.room)) is not None:
             push_block(search, block)
     path.unlink()
