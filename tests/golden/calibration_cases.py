@@ -20,14 +20,14 @@ from engine_cases import (
 from golden import Answer, case
 from scenes import EIGHTHS, TILT, dome, places, turn
 
-from mirrorskin import hw, io
+from mirrorskin import engine, hw, io
 from mirrorskin.engine.calibration.board import Dots
 from mirrorskin.engine.calibration.lens import calibrate_lens
 from mirrorskin.engine.calibration.references import measure_references
 from mirrorskin.engine.calibration.tilt import fit_precession
 from mirrorskin.engine.calibration.tilt_tracks import BallTrack, PlateTrack
 from mirrorskin.engine.calibration.wall import fit_zenith
-from mirrorskin.engine.live import LivePress, LiveRotation
+from mirrorskin.engine.live import LiveOperation
 from mirrorskin.engine.streaming import push_block
 from mirrorskin.engine.undistort import undistort
 
@@ -188,7 +188,7 @@ def undistort_maps() -> Answer:
 @case(FITTED, **RECONSTRUCTED)
 def live_press() -> Answer:
     source = press_source()
-    live = LivePress(source)
+    live = LiveOperation(source, engine.Press())
     for block in blocks(
         source.frames, [1, 1, 3, 2, 7], time=0.01 * np.arange(24), travel=source.series["travel"]
     ):
@@ -226,6 +226,4 @@ def reconstruct_with_a_calibration() -> Answer:
     precession = io.Precession(TILT, 0.4, -1, 0.0, 0.0, (0.0, 0.0), (0.4, -0.3, 5.0))
     camera = io.CameraId("lab", shape, np.dtype("uint16"))
     calibration = io.Calibration(camera, precession=precession)
-    from mirrorskin import engine
-
     return result_maps(engine.reconstruct(Source(frames, known.header, phase=alpha), calibration))

@@ -44,14 +44,14 @@ NORMAL: Tolerance = (1e-5, 2e-6)  # of unit vectors in single precision
 SMALL = (19, 26)
 
 
-def onset_maps(found: engine.Onset) -> Answer:
-    """Return what a search for an onset tells."""
+def onset_maps(found: io.Result) -> Answer:
+    """Return what a search for an onset finds."""
     return {
         "height": found.height,
-        "sigma": found.sigma,
+        "sigma": found.height_sigma,
         "status": found.status,
         "frame": found.frame,
-        "noise": found.noise,
+        "noise": found.process["noise"],
     }
 
 
@@ -222,7 +222,7 @@ def find_onset_of_missing_samples() -> Answer:
 def find_onset_block_by_block() -> Answer:
     frames, travel = press("uint8")
     dark, bright = level_maps("uint8", frames.shape[1:])
-    search = engine.OnsetSearch(frames.shape[1:], frames.dtype, dark=dark, bright=bright)
+    search = engine.Onset(dark=dark, bright=bright)
     for block in blocks(frames, [1, 1, 3, 2, 7], travel=travel):
         push_block(search, block)
     return onset_maps(search.result())
@@ -261,11 +261,11 @@ def find_change_point_of_a_release() -> Answer:
 @case(height=HEIGHT, sigma=HEIGHT)
 def find_change_point_block_by_block() -> Answer:
     frames, travel = press("uint16", seed=8)
-    search = engine.ChangePointSearch(frames.shape[1:], frames.dtype)
+    search = engine.ChangePoint()
     cut = blocks(frames, [2, 1, 6, 1], travel=travel)
     for block in cut:
         push_block(search, block)
-    search.start_second_pass()
+    search.next_pass()
     for block in cut:
         push_block(search, block)
     return onset_maps(search.result())

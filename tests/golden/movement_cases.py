@@ -38,18 +38,21 @@ def stroke_search() -> Answer:
     for dtype in ("uint8", "float32"):
         frames, travel = strokes(dtype)
         dark, bright = LEVELS[dtype]
-        search = engine.StrokeSearch(frames.shape[1:], frames.dtype, dark=dark, bright=bright)
-        for part in np.split(np.arange(len(frames)), [1, 17, 30]):
-            search.push(frames[part], travel=travel[part])
-        found = search.result()
+        found = {}
+        for event in ("onset", "release"):
+            search = engine.Strokes(event=event, dark=dark, bright=bright)
+            for part in np.split(np.arange(len(frames)), [1, 17, 30]):
+                search.push(frames[part], travel=travel[part])
+            found[event] = search.result()
+        onset, release = found["onset"], found["release"]
         answers[dtype] = {
-            "onset": found.onset.height,
-            "onset_sigma": found.onset.sigma,
-            "release": found.release.height,
-            "release_sigma": found.release.sigma,
-            "onsets": found.onsets,
-            "releases": found.releases,
-            "strokes": found.strokes,
+            "onset": onset.height,
+            "onset_sigma": onset.height_sigma,
+            "release": release.height,
+            "release_sigma": release.height_sigma,
+            "onsets": onset.strokes,
+            "releases": release.strokes,
+            "strokes": onset.process["strokes"],
         }
     return {f"{dtype}.{name}": value for dtype, each in answers.items() for name, value in each.items()}
 
