@@ -84,7 +84,7 @@ class Plan:
         result = result.assign(process=process)
         for step in self.steps:
             result = step.apply(result, context)
-        device = self.operation.device if self.operation.on_device else None
+        device = self.operation.opened_device
         return undistorted(attach_provenance(result, source, device, dict(result.process)), source)
 
 

@@ -56,6 +56,11 @@ class OnDevice(Configured):
 
     device: Device = cast(Any, _DeviceOption(**{**vars(_device), "name": "device"}))
 
+    @property
+    def opened_device(self) -> Device | None:
+        """The device, if it has been used."""
+        return vars(self).get("device")
+
 
 class Operation(ThreadSafe, OnDevice):
     """Base of operations, which receive frames one block after the other and return maps.

@@ -1,0 +1,325 @@
+"""Operations of users: the answer is NumPy's, wherever frames come from and however they are divided."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from live_frames import PIXEL, paced, press_header
+from stacks import TRAVEL, MadeUp, random_stack, record, sphere
+
+from mirrorskin import engine, io
+from mirrorskin.engine.live import LiveOperation, Loop
+
+FRAMES = random_stack("uint16", (8, 5, 7))
+HEADER = io.Header("vertical", pixel_size=(0.5, 0.6))
+FRAME = FRAMES[0].nbytes
+
+
+class Moments(engine.Operation):
+    """The sum of the frames, and of each times its travel, in floats in the order of the frames."""
+
+    factor: float = engine.option(1.0, "mm", within=(0, 10), help="what each travel is multiplied by")
+
+    def start(self, shape, dtype):
+        self.total, self.moment = np.zeros(shape, np.uint64), np.zeros(shape, np.float32)
+        self.pushes = []
+
+    def push(self, frames, *, travel):
+        self.total += frames.sum(axis=0, dtype=np.uint64)
+        for frame, at in zip(frames, travel, strict=True):
+            self.moment += np.float32(self.factor) * np.float32(at) * frame
+        self.pushes.append(len(frames))
+
+    def result(self):
+        return {"total": self.total, "moment": self.moment}
+
+
+def stack():
+    return MadeUp(FRAMES, HEADER, travel=TRAVEL)
+
+
+def same(found, expected):
+    assert {name: values.dtype for name, values in found.items()} == {
+        name: values.dtype for name, values in expected.items()
+    }
+    for name, values in expected.items():
+        np.testing.assert_array_equal(found[name], values)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return engine.run(FRAMES, Moments, travel=TRAVEL)
+
+
+def test_the_answer_is_that_of_numpy(whole):
+    np.testing.assert_array_equal(whole["total"], FRAMES.sum(axis=0))
+    moment = np.tensordot(TRAVEL, FRAMES.astype(float), 1)
+    np.testing.assert_allclose(whole["moment"], moment, rtol=1e-6)
+
+
+@pytest.mark.parametrize("compression", ["raw", "gzip"])
+@pytest.mark.parametrize("at_once", [1, 3, 100])
+def test_a_recording_gives_the_same_bits_however_it_is_cut(tmp_path, whole, compression, at_once):
+    record(stack(), tmp_path / "rec.h5", compression)
+    moments = Moments(memory_limit=2 * at_once * FRAME)
+    with io.open_recording(tmp_path / "rec.h5") as recording:
+        found = engine.run(recording, moments)
+    assert max(moments.pushes) == min(at_once, 8)
+    same(found, whole)
+
+
+def test_frames_that_come_one_by_one_give_the_same_bits(whole):
+    same(engine.run((frame for frame in FRAMES), Moments, travel=TRAVEL), whole)
+
+
+def test_a_second_run_begins_anew_and_leaves_the_first_result_alone(whole):
+    moments = Moments()
+    first = engine.run(FRAMES, moments, travel=TRAVEL)
+    engine.run(FRAMES[:3], moments, travel=TRAVEL[:3])
+    same(first, whole)
+    same(engine.run(stack(), moments), whole)
+
+
+def test_maps_numbers_and_provenance_are_kept_in_a_file(tmp_path):
+    class Mixed(Moments):
+        def result(self):
+            count = sum(self.pushes)
+            normals = np.ones((5, 7, 3))
+            return {
+                "height": self.moment,
+                "normals": normals,
+                "light": self.total > 9,
+                "count": np.int64(count),
+            }
+
+    record(stack(), tmp_path / "rec.h5")
+    with io.open_recording(tmp_path / "rec.h5") as recording:
+        made = engine.run(recording, Mixed)
+    io.save_result(made, tmp_path / "res.h5")
+    found = io.open_result(tmp_path / "res.h5")
+    assert found.process == made.process
+    assert (found.process["operation"], found.process["count"]) == ("Mixed", 8)
+    assert found.process["factor"] == 1.0
+    assert {"source_fingerprint", "date", "version"} < set(found.process)
+    assert found.height.dtype == found.normals.dtype == np.float32
+    same(found, made)
+    assert list(found) == ["height", "normals", "light"]
+    np.testing.assert_array_equal(found.x, made.x)
+
+
+def test_maps_that_are_not_built_in_are_exported_and_displayed(tmp_path):
+    made = engine.run(FRAMES, Moments, travel=TRAVEL)
+    io.export_result(made, tmp_path / "maps.npz")
+    with np.load(tmp_path / "maps.npz") as arrays:
+        same({name: arrays[name] for name in made}, made)
+    assert made.to_xarray().total.dims == ("y", "x")
+    assert "total" in repr(made)
+
+
+def test_select_turn_includes_maps_that_are_not_built_in():
+    turns = io.Result(zenith=np.zeros((2, 5, 7), np.float32), total=FRAMES[:2])
+    np.testing.assert_array_equal(io.select_turn(turns, 1)["total"], FRAMES[1])
+
+
+def test_built_in_operations_are_run_as_well(device):
+    press = sphere()
+    frames = press.read(np.empty(press.shape, press.dtype)).frames.copy()
+    onset = engine.find_onset(frames, TRAVEL, device=device)
+    found = engine.run(press, engine.Onset(device=device, memory_limit=1))
+    for name in ("height", "height_sigma", "status", "frame"):
+        np.testing.assert_array_equal(found[name], onset[name])
+    assert found.process["noise"] == onset.process["noise"]
+    assert found.process["device"] == device.info.title
+
+
+def test_levels_that_are_not_given_are_those_of_the_recording(tmp_path):
+    frames = np.full((6, 1, 2), 10, np.uint8)
+    frames[3:] = 30  # light, if the recording's levels are used
+    header = io.Header("vertical", dark=np.float32(10), bright=np.float32(40))
+    found = engine.run(MadeUp(frames, header, travel=0.1 * np.arange(6)), engine.Onset(noise=1.0))
+    assert found.status.tolist() == [[1, 1]]
+    assert found.process["bright"] == 40.0
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+def test_a_kernel_of_the_user_s_gives_the_same_as_numpy(device, tmp_path, dtype):
+    page = (Path(__file__).parents[2] / "docs" / "operations.md").read_text(encoding="utf-8")
+    exec(re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)[-1], known := {})
+    frames = random_stack(dtype)
+    record(MadeUp(frames, HEADER, travel=TRAVEL), tmp_path / "rec.h5")
+    light = (frames > 100).sum(axis=0)
+    for at_once in (1, 3, 100):
+        with io.open_recording(tmp_path / "rec.h5") as recording:
+            limit = 2 * at_once * frames[0].nbytes
+            found = engine.run(recording, known["LightOnDevice"](device=device, memory_limit=limit))
+        np.testing.assert_array_equal(found["light"], light)
+    assert found.process["device"] == device.info.title
+
+
+def test_live_updates_hold_the_heights_so_far_and_the_result_all_of_them():
+    class Heights(Moments):
+        def result(self):
+            return {"height": self.moment, "contact": self.total > 0}
+
+    source, updates = paced(FRAMES, press_header(), TRAVEL), []
+    live = LiveOperation(source, Heights())
+    live.warm()
+    Loop(source, live, updates=1e3, on_update=lambda update, status: updates.append(update)).run()
+    assert [update.frames for update in updates] == [*range(1, 9)]
+    for update in updates:
+        so_far = engine.run(FRAMES[: update.frames], Heights, travel=TRAVEL[: update.frames])
+        np.testing.assert_array_equal(update.height, so_far.height)
+        assert update.contact_area == pytest.approx(np.count_nonzero(so_far.contact) * PIXEL**2)
+    np.testing.assert_array_equal(live.result().height, so_far.height)
+
+
+class Bare(engine.Operation):
+    """Nothing but what an operation must have."""
+
+    def push(self, frames):
+        pass
+
+    def result(self):
+        return {}
+
+
+def returning(value):
+    return type("Odd", (Bare,), {"result": lambda self: value})
+
+
+def pushing(push):
+    return type("Turned", (Bare,), {"push": push})
+
+
+@pytest.mark.parametrize(
+    ("operation", "line"),
+    [
+        (print, "print is not an operation: derive the class from mirrorskin.engine.Operation"),
+        (object(), "object is not an operation"),
+        (pushing(lambda self, frames, *, phase: None), "made up: phase is missing: Turned needs it"),
+        (returning(None), r"Odd.result\(\) returns a NoneType. Return maps by name"),
+        (returning({"a": np.zeros(3)}), r"Odd.result\(\): map a is float64 \(3,\): numbers \(5, 7\)"),
+        (returning({"a": np.full((5, 7), "x")}), r"map a is <U1"),
+        (returning({"a/b": FRAMES[0]}), "a map cannot be called 'a/b'"),
+        (returning({"x": FRAMES[0]}), "a map cannot be called 'x'"),
+        (
+            type("Turning", (Bare,), {"motions": ("axial",)}),
+            "vertical motion, but Turning needs axial motion",
+        ),
+    ],
+)
+def test_what_is_no_operation_is_refused_in_a_line(operation, line):
+    with pytest.raises(io.InputError, match=line) as refusal:
+        engine.run(stack(), operation)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        ({"factr": 2.0}, "Moments has no option factr. It has factor, device, memory_limit"),
+        ({"factor": "2"}, "factor is '2': a number is needed"),
+        ({"factor": 11.0}, "factor 11.0: a number in mm from 0 to 10 is needed"),
+        ({"factor": np.nan}, "factor nan: a number in mm"),
+    ],
+)
+def test_options_that_cannot_be_are_refused_in_a_line(options, line):
+    with pytest.raises(io.InputError, match=line):
+        Moments(**options)
+
+
+@pytest.mark.parametrize(
+    ("frames", "positions", "line"),
+    [
+        ([], {}, "there are no frames"),
+        ("press.h5", {}, "frames are a str: open a path with io.open_recording"),
+        (None, {}, "frames are a NoneType"),
+        (FRAMES, {}, "travel is missing: Moments needs it of each frame"),
+        (FRAMES, {"travel": TRAVEL[:7]}, r"travel has shape \(7,\): one is needed for each of 8"),
+        (iter(FRAMES), {"travel": TRAVEL[:7]}, r"travel has shape \(7,\): one is needed for each of 8"),
+        (FRAMES, {"travel": TRAVEL, "phase": TRAVEL}, "Moments does not take phase. It takes travel"),
+        (FRAMES[0], {"travel": TRAVEL}, r"frames are uint16 \(5, 7\)"),
+        (["text"], {"travel": TRAVEL}, "frames are <U4"),
+        ([FRAMES[0], FRAMES[0, 1:]], {"travel": TRAVEL}, r"frames are uint16 \(1, 4, 7\)"),
+    ],
+)
+def test_frames_that_cannot_be_pushed_are_refused_in_a_line(frames, positions, line):
+    with pytest.raises(io.InputError, match=line):
+        engine.run(frames, Moments, **positions)
+
+
+class Twice(engine.Operation):
+    """How often a pixel is above its mean, which takes two passes."""
+
+    @property
+    def passes(self):
+        return 2
+
+    def start(self, shape, dtype):
+        self.total, self.above, self.mean = np.zeros(shape), np.zeros(shape, np.int32), None
+
+    def start_second_pass(self):
+        self.mean = self.total / self.count
+
+    def push(self, frames):
+        if self.mean is None:
+            self.total += frames.sum(axis=0)
+        else:
+            self.above += (frames > self.mean).sum(axis=0, dtype=np.int32)
+
+    def result(self):
+        return {"above": self.above}
+
+
+@pytest.mark.parametrize("at_once", [1, 3, 100])
+def test_an_operation_of_two_passes_reads_a_recording_twice(tmp_path, at_once):
+    record(stack(), tmp_path / "rec.h5")
+    with io.open_recording(tmp_path / "rec.h5") as recording:
+        found = engine.run(recording, Twice(memory_limit=2 * at_once * FRAME))
+    np.testing.assert_array_equal(found["above"], np.sum(np.mean(FRAMES, axis=0) < FRAMES, axis=0))
+    same(engine.run(FRAMES, Twice), found)
+    same(engine.run(iter(FRAMES), Twice), found)
+
+
+def test_two_passes_are_refused_by_what_is_read_once_and_live():
+    source = stack()
+    source.rewindable = False
+    with pytest.raises(io.InputError, match="can be read only once, but Twice needs all frames twice"):
+        engine.run(source, Twice)
+    with pytest.raises(io.InputError, match="Twice needs all frames twice, so it cannot run live"):
+        LiveOperation(paced(FRAMES, press_header(), TRAVEL), Twice())
+
+
+def test_live_what_an_operation_needs_is_checked_before_anything_moves():
+    class Turned(Moments):
+        def push(self, frames, *, phase):
+            pass
+
+    with pytest.raises(io.InputError, match=r"Turned needs phase. While the body moves, .* has time, travel"):
+        LiveOperation(paced(FRAMES, press_header(), TRAVEL), Turned())
+
+
+def test_a_map_declared_in_the_class_is_written_with_its_unit_and_legend(tmp_path):
+    class Wear(Moments):
+        wear = io.Map("depth of the wear", "mm", quantity="height", displayed="µm")
+        material = io.Map("material", codes={0: "unknown", 1: "steel"}, undefined=0)
+
+        def result(self):
+            return {"wear": self.moment, "wear_sigma": self.moment / 10, "material": self.total > 9}
+
+    found = engine.run(FRAMES, Wear, travel=TRAVEL)
+    io.save_result(found, tmp_path / "wear.h5")
+    read = io.open_result(tmp_path / "wear.h5")
+    np.testing.assert_array_equal(read.height_sigma, found.wear_sigma)
+    assert read.declaration("wear_sigma").unit == "mm"
+    assert read.declaration("material").codes == {0: "unknown", 1: "steel"}
+
+
+def test_what_result_returns_does_not_change_afterwards():
+    moments = Moments()
+    moments.push(FRAMES[:3], travel=TRAVEL[:3])
+    first = moments.result()
+    kept = {name: values.copy() for name, values in first.items()}
+    moments.push(FRAMES[3:], travel=TRAVEL[3:])
+    same(first, kept)
