@@ -1,39 +1,40 @@
-"""An estimator of one's own: a pixel's height is where its brightness rises most from frame to frame.
+"""An operation of one's own: a pixel's height is where its brightness rises most from frame to frame.
 
-mirrorskin run examples/steepest_rise.py:SteepestRise press.h5 -o heights.h5
+mirrorskin run examples/steepest_rise.py:SteepestRise press.h5 --least-rise 5 -o heights.h5
 """
 
 import numpy as np
 
-from mirrorskin import engine, hw
+from mirrorskin import engine, hw, io
 
 
-class SteepestRise:
-    """Keeps, of each pixel, the largest rise so far and the height that it stands for."""
+class SteepestRise(engine.Operation):
+    """Height from the largest rise of a pixel's brightness between two frames."""
 
-    def __init__(self, shape, dtype):
-        self.shape = shape
-        self.reset()
+    least_rise: float = engine.option(0.0, "counts", within=(0, None), help="smaller rises are ignored")
 
-    def reset(self):
-        """Forget all frames."""
+    height = io.Map("height at the steepest rise", "mm", quantity="height")
+    rise = io.Map("largest rise between two frames", "counts", colours="positive")
+
+    def start(self, shape, dtype):
+        """Prepare for frames of a shape, (H, W), and a type."""
         self.last = None
-        self.rise = np.zeros(self.shape, np.float32)
-        self.height = np.full(self.shape, np.nan, np.float32)
+        self.largest = np.full(shape, self.least_rise, np.float32)
+        self.heights = np.full(shape, np.nan, np.float32)
 
     def push(self, frames, *, travel):
         """Take in the next frames, (n, H, W), and the travel of each, mm."""
         for frame, at in zip(frames.astype(np.float32), travel, strict=True):
             if self.last is not None:
                 rise = frame - self.last[0]
-                larger = rise > self.rise
-                self.rise[larger] = rise[larger]
-                self.height[larger] = -(at + self.last[1]) / 2
+                larger = rise > self.largest
+                self.largest[larger] = rise[larger]
+                self.heights[larger] = -(at + self.last[1]) / 2
             self.last = frame, at
 
     def result(self):
-        """Return maps by name: a height is one that results know, the rise one of our own."""
-        return {"height": self.height, "rise": self.rise}
+        """Return the maps by name."""
+        return {"height": self.heights, "rise": self.largest}
 
 
 if __name__ == "__main__":

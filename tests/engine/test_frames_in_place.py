@@ -21,7 +21,7 @@ WORK = {
     ),
     "correlate": lambda frames, device: engine.correlate(frames, PHASE, device=device),
     "estimate_normals": lambda frames, device: engine.estimate_normals(
-        frames, PHASE, tilt=0.05, gain=300, device=device
+        frames, PHASE, tilt=0.05, zenith_gain=300, device=device
     ),
 }
 REFERENCES = {"dark": 20, "bright": 200}
@@ -72,8 +72,7 @@ PLACES = {
 
 
 def maps(result):
-    names = ("height", "sigma", "status", "frame", "mean", "cosine", "sine", "residual", "vectors", "contact")
-    return {name: getattr(result, name) for name in names if hasattr(result, name)}
+    return result.maps()
 
 
 def assert_same(found, expected):
@@ -102,7 +101,7 @@ def test_numbers_in_the_other_order_of_bytes_are_refused(device, work):
 @pytest.mark.parametrize("place", PLACES)
 def test_the_tail_of_a_push_may_be_where_memory_ends(device, place):
     frames = of_type("uint8")
-    search = engine.OnsetSearch(SHAPE[1:], "uint8", device=device, **REFERENCES)
+    search = engine.Onset(device=device, **REFERENCES)
     for part in (slice(0, 9), slice(9, 10), slice(10, 16)):
         search.push(PLACES[place](frames[part]), travel=TRAVEL[part])
     assert_same(search.result(), WORK["find_onset"](frames, device))
@@ -136,17 +135,17 @@ def test_a_result_stays_whatever_comes_after(device, work):
 
 
 @pytest.mark.parametrize(
-    ("estimator", "where", "known"),
+    ("operation", "where", "options"),
     [
-        (engine.OnsetSearch, {"travel": TRAVEL}, REFERENCES),
-        (engine.ChangePointSearch, {"travel": TRAVEL}, REFERENCES),
-        (engine.Correlator, {"phase": PHASE}, {}),
-        (engine.NormalEstimator, {"phase": PHASE}, {"tilt": 0.05, "gain": 300, "noise": 2.0}),
+        (engine.Onset, {"travel": TRAVEL}, REFERENCES),
+        (engine.ChangePoint, {"travel": TRAVEL}, REFERENCES),
+        (engine.Correlate, {"phase": PHASE}, {}),
+        (engine.Normals, {"phase": PHASE}, {"tilt": 0.05, "zenith_gain": 300, "noise": 2.0}),
     ],
 )
-def test_a_result_on_the_way_stays_when_more_frames_follow(device, estimator, where, known):
+def test_a_result_on_the_way_stays_when_more_frames_follow(device, operation, where, options):
     frames = of_type("uint8")
-    (name, positions), found = *where.items(), estimator(SHAPE[1:], "uint8", device=device, **known)
+    (name, positions), found = *where.items(), operation(device=device, **options)
     found.push(frames[:8], **{name: positions[:8]})
     first = found.result()
     kept = {name: values.copy() for name, values in maps(first).items()}

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from mirrorskin.engine import Operation
 from mirrorskin.engine.streaming import feed
 from mirrorskin.io import Block, Header, InputError
 
@@ -30,17 +31,16 @@ class Source:
         return Block(out[: stop - start], start, travel=0.1 * np.arange(start, stop))
 
 
-class Estimator:
-    """Keeps a copy of what it is given."""
+class Keeper(Operation):
+    """Keeps the numbers of the frames that it receives."""
 
-    position = "travel"
+    on_device = True
 
-    def __init__(self, device, room, fails=None):
-        self.device = device
-        self.room = np.zeros((room, 3, 5), np.uint16)
-        self.seen, self.fails = [], fails
+    def __init__(self, device, room, fails=None, long=False):
+        super().__init__(device=device, memory_limit=2 * room * 3 * 5 * 2)
+        self.seen, self.fails, self.long_blocks = [], fails, long
 
-    def push(self, frames, *, travel, lent):
+    def push(self, frames, *, travel, lent=False):
         numbers = frames[:, 0, 0].tolist()
         if self.fails in numbers:
             raise InputError("no")
@@ -52,9 +52,9 @@ class Estimator:
 @pytest.mark.parametrize("wanted", [range(10), range(2, 7), range(9, 10), range(0)])
 def test_each_frame_is_pushed_once_and_in_order(device, room, wanted):
     told = []
-    estimator = Estimator(device, room)
-    feed(Source(10), estimator, wanted, told.append)
-    assert estimator.seen == list(wanted)
+    keeper = Keeper(device, room)
+    feed(Source(10), keeper, wanted, told.append)
+    assert keeper.seen == list(wanted)
     assert told == sorted(told)
     assert told[-1:] == ([wanted.stop] if wanted else [])
 
@@ -72,30 +72,30 @@ def test_frames_that_a_source_lends_are_pushed_where_they_lie(device, longest):
                 Block(frames, start, travel=0.1 * np.arange(start, stop), lent=True) if len(frames) else None
             )
 
-    estimator, told = Estimator(device, 1), []
-    feed(Lender(10), estimator, range(2, 10), told.append, long=True)
-    assert estimator.seen == list(range(2, 10))
+    keeper, told = Keeper(device, 1, long=True), []
+    feed(Lender(10), keeper, range(2, 10), told.append)
+    assert keeper.seen == list(range(2, 10))
     if device.info.shares_memory:
         assert told == ([1, 2, 5, 8, 9, 10] if longest == 3 else [1, 2, 9, 10])
 
 
 def test_a_source_that_ends_early_is_no_error(device):
-    estimator = Estimator(device, 4)
-    feed(Source(6), estimator, range(9))
-    assert estimator.seen == list(range(6))
+    keeper = Keeper(device, 4)
+    feed(Source(6), keeper, range(9))
+    assert keeper.seen == list(range(6))
 
 
 @pytest.mark.parametrize("fails", [0, 5, 9])
 def test_what_fails_in_reading_is_told_and_what_came_before_was_pushed(device, fails):
-    estimator = Estimator(device, 2)
+    keeper = Keeper(device, 2)
     with pytest.raises(InputError, match=f"frame {fails} is damaged"):
-        feed(Source(10, fails), estimator, range(10))
-    assert estimator.seen == list(range(len(estimator.seen)))
-    assert len(estimator.seen) <= fails
+        feed(Source(10, fails), keeper, range(10))
+    assert keeper.seen == list(range(len(keeper.seen)))
+    assert len(keeper.seen) <= fails
 
 
-def test_what_fails_in_the_estimator_ends_the_reading(device):
+def test_what_fails_in_the_keeper_ends_the_reading(device):
     source = Source(100)
     with pytest.raises(InputError, match="no"):
-        feed(source, Estimator(device, 2, fails=3), range(100))
+        feed(source, Keeper(device, 2, fails=3), range(100))
     assert source.next < 10

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from presses import LEVELS, SPEC, assert_equal, random_press
 
-from mirrorskin.engine import OnsetSearch, find_onset
+from mirrorskin.engine import Onset, find_onset
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels.errors import DeviceError
 
@@ -14,42 +14,48 @@ LARGEST = 3 * 768 * 4  # three planes of frame numbers, 23 x 31 pixels in whole 
 SMALLEST = 3 * 64 * 4  # those of one row
 
 
+def ready(operation):
+    """Return an operation that is prepared for the frames."""
+    operation.begin(FRAMES.shape[1:], FRAMES.dtype)
+    return operation
+
+
 @pytest.mark.parametrize("limit", [LARGEST, LARGEST - 1, SMALLEST])
 def test_less_room_gives_the_same_answer(small_device, limit):
     whole = find_onset(FRAMES, TRAVEL, **LEVELS["uint8"], device=small_device)
     small_device.max_allocation = limit
-    search = OnsetSearch((23, 31), FRAMES.dtype, dark=20, bright=220, device=small_device)
+    search = ready(Onset(dark=20, bright=220, device=small_device))
     for start in range(0, 30, 4):
         part = slice(start, start + 4)
         search.push(FRAMES[part], travel=TRAVEL[part])
     assert_equal(search.result(), whole)
     assert_equal(search.result(), whole)
-    assert (len(search._bands) > 1) == (limit < LARGEST)
+    assert (len(search._searches[0]._bands) > 1) == (limit < LARGEST)
 
 
 def test_the_room_shrinks_before_the_picture_is_cut_and_one_row_must_fit(small_device):
     small_device.max_allocation = 14 * 23 * 31
-    search = OnsetSearch((23, 31), FRAMES.dtype, device=small_device)
+    search = ready(Onset(device=small_device))
     assert 1 <= len(search.room) <= 14
     small_device.max_allocation = SMALLEST - 1
     with pytest.raises(DeviceError, match="one row of 31 pixels does not fit"):
-        OnsetSearch((23, 31), FRAMES.dtype, device=small_device)
+        ready(Onset(device=small_device))
 
 
 def test_bands_leave_the_device_to_each_other(small_device):
     small_device.max_allocation = SMALLEST
-    search = OnsetSearch((23, 31), FRAMES.dtype, dark=20, bright=220, device=small_device)
+    search = ready(Onset(dark=20, bright=220, device=small_device))
     search.push(FRAMES, travel=TRAVEL)
     search.result()
-    arrays = [array for band in search._bands for array in (*band.maps.values(), *band._places)]
+    arrays = [array for band in search._searches[0]._bands for array in (*band.maps.values(), *band._places)]
     on_device = [array._buffer is not None for array in arrays]
     assert all(on_device) if small_device.info.shares_memory else not any(on_device)
 
 
 def test_frames_in_the_room_are_not_copied(device):
-    search = OnsetSearch((23, 31), FRAMES.dtype, device=device)
+    search = ready(Onset(device=device))
     search.room[:30] = FRAMES
-    band = search._bands[0]
+    band = search._searches[0]._bands[0]
     (staged,) = band.stage(search.room[:30])
     assert staged.frames == slice(0, 30)
     if device.info.shares_memory:
@@ -60,7 +66,7 @@ def test_frames_in_the_room_are_not_copied(device):
 
 def test_the_room_of_a_picture_in_bands_holds_many_frames(small_device):
     small_device.max_allocation = SMALLEST
-    search = OnsetSearch((23, 31), FRAMES.dtype, dark=20, bright=220, device=small_device)
+    search = ready(Onset(dark=20, bright=220, device=small_device))
     search.room[:30] = FRAMES
     search.push(search.room[:30], travel=TRAVEL)
     small_device.max_allocation = 10**9
@@ -86,7 +92,8 @@ def test_lent_frames_give_the_same_answer_wherever_they_lie(device, dtype, size,
     travel = np.arange(40) * 0.1
     placed = lent(frames, offset)
     dark, bright = SPEC[dtype]
-    search = OnsetSearch(size, dtype, dark=dark, bright=bright, device=device, memory_limit=2 * frames.nbytes)
+    search = Onset(dark=dark, bright=bright, device=device, memory_limit=2 * frames.nbytes)
+    search.begin(size, dtype)
     room = search.room.copy()
     for part in (slice(0, 33), slice(33, 34), slice(34, 40)):
         search.push(placed[part], travel=travel[part], lent=True)
@@ -96,13 +103,13 @@ def test_lent_frames_give_the_same_answer_wherever_they_lie(device, dtype, size,
 
 def test_lent_frames_are_worked_on_where_they_lie(device):
     placed = lent(FRAMES, 128)
-    search = OnsetSearch((23, 31), FRAMES.dtype, device=device)
-    (staged,) = search._bands[0].stage(placed, lent=True)
+    search = ready(Onset(device=device))
+    (staged,) = search._searches[0]._bands[0].stage(placed, lent=True)
     assert np.shares_memory(staged.array.host, placed) == device.info.shares_memory
 
 
 def test_lent_frames_stay_until_their_kernels_are_done(device):
-    search = OnsetSearch((23, 31), FRAMES.dtype, dark=20, bright=220, device=device)
+    search = ready(Onset(dark=20, bright=220, device=device))
     for start in range(0, 30, 3):
         part = slice(start, start + 3)
         search.push(lent(FRAMES[part], 64), travel=TRAVEL[part], lent=True)
@@ -110,7 +117,7 @@ def test_lent_frames_stay_until_their_kernels_are_done(device):
 
 
 def test_a_block_may_be_written_anew_after_it_was_pushed(device):
-    search = OnsetSearch((23, 31), FRAMES.dtype, dark=20, bright=220, device=device)
+    search = ready(Onset(dark=20, bright=220, device=device))
     for start in range(0, 30, 3):
         part = slice(start, start + 3)
         block = FRAMES[part].copy()
@@ -127,6 +134,6 @@ def test_a_device_that_refuses_lent_memory_gets_copies(device, monkeypatch):
 
     borrow = device_layer.BorrowedBuffer
     monkeypatch.setattr(device_layer, "BorrowedBuffer", refuse)
-    search = OnsetSearch((23, 31), FRAMES.dtype, dark=20, bright=220, device=device)
+    search = ready(Onset(dark=20, bright=220, device=device))
     search.push(lent(FRAMES, 64), travel=TRAVEL, lent=True)
     assert_equal(search.result(), find_onset(FRAMES, TRAVEL, dark=20, bright=220, device=device))

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from mirrorskin.engine.press.onset import OnsetSearch
+from mirrorskin.engine.press.onset import Onset
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.ring import MEMORY, Ring, usual_slots
 
@@ -192,10 +192,10 @@ def test_a_device_works_in_the_ring_while_the_camera_goes_on(device) -> None:
     frames = np.random.default_rng(5).integers(0, 60, (count, *shape)).astype(np.uint8)
     frames[17:, 2:7, 3:11] += 150
     travel = np.linspace(0.0, 2.0, count)
-    whole = OnsetSearch(shape, np.uint8, device=device)
+    whole = Onset(device=device)
     whole.push(frames, travel=travel)
     ring = Ring(shape, np.uint8, 6)
-    search = OnsetSearch(shape, np.uint8, device=device)
+    search = Onset(device=device)
     sent = done = 0
     for stop in range(2, count + 1, 2):
         while sent < stop:
