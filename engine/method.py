@@ -77,7 +77,7 @@ class Plan:
     def finish(
         self, result: Result, source: Source, more: Mapping[str, ProcessValue] | None = None
     ) -> Result:
-        """Return the operation's maps after all steps, with provenance, undistorted if there is a lens."""
+        """Return the operation's maps after all steps, with provenance, in the camera's pixels."""
         context = Context(source, self.operation)
         result = result.assign(dict.fromkeys(self.omit))
         process = {"frames": self.operation.count, **self.process, **result.process, **(more or {})}
@@ -85,7 +85,7 @@ class Plan:
         for step in self.steps:
             result = step.apply(result, context)
         device = self.operation.opened_device
-        return undistorted(attach_provenance(result, source, device, dict(result.process)), source)
+        return attach_provenance(result, source, device, dict(result.process))
 
 
 class Method(OnDevice):
@@ -110,8 +110,17 @@ class Method(OnDevice):
                 f"{source.name} has {source.motion} motion, but {type(self).__name__} needs {motions} motion"
             )
 
-    def run(self, source: Source, progress: Progress | None = None) -> Result:
+    def run(self, source: Source, progress: Progress | None = None, *, undistort: bool = True) -> Result:
         """Reconstruct a source.
+
+        Parameters
+        ----------
+        source : Source
+            It is rewound first, if it can be.
+        progress : callable, optional
+            Called with the number of frames so far.
+        undistort : bool
+            Whether maps are undistorted, if the source's calibration has a lens.
 
         Raises
         ------
@@ -122,7 +131,8 @@ class Method(OnDevice):
         with naming(source):
             plan = self.plan(source)
             feed(source, plan.operation, plan.frames, progress)
-            return plan.finish(plan.operation.finish(), source)
+            result = plan.finish(plan.operation.finish(), source)
+        return undistorted(result, source) if undistort else result
 
     def make(self, kind: Callable[..., Any], **changes: Any) -> Any:
         """Return an operation or step with this method's values of its options."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.force.normal import press_within
 from mirrorskin.engine.press.elastic import LEARNED_AT, fit_press
-from mirrorskin.engine.press.press import reconstruct_press
+from mirrorskin.engine.press.press import Press
 from mirrorskin.engine.streaming import Progress
 from mirrorskin.io import Calibrated, Calibration, Gel, InputError, Source, Stiffness
 
@@ -82,7 +82,8 @@ def known_press(
     plain = Calibrated(source, replace(calibration, gel=None, stiffness=None))
     if plain.header.pixel_size is None:
         raise InputError(f"{source.name} has no pixel size: calibrate the scale first, or give --pixel-size")
-    result = reconstruct_press(plain, threshold=LEARNED_AT, fill=False, device=device, progress=progress)
+    press = Press(threshold=LEARNED_AT, fill=False, device=device)
+    result = press.run(plain, progress, undistort=False)
     assert result.height is not None
     assert result.height_sigma is not None
     assert result.status is not None

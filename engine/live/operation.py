@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.live.status import Maps
-from mirrorskin.engine.method import Method, Plan
+from mirrorskin.engine.method import Method, Plan, undistorted
 from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.provenance import describe, naming
 from mirrorskin.engine.running import check_motion
@@ -119,7 +119,8 @@ class LiveOperation(ThreadSafe):
             The frames do not determine them.
         """
         with naming(self._source):
-            return self._plan.finish(self.operation.result(), self._source, {"live": True})
+            result = self._plan.finish(self.operation.result(), self._source, {"live": True})
+        return undistorted(result, self._source)
 
 
 def _live_plan(source: LiveSource, operation: Operation | Method, size: int) -> Plan:

@@ -9,7 +9,7 @@ from contact_theory import sphere
 from mirrorskin import io
 from mirrorskin.engine.calibration.gel import BallOnset, ball_onset, fit_gel, sphere_slope, sphere_travel
 from mirrorskin.engine.press.elastic import correct_onset
-from mirrorskin.engine.press.press import reconstruct_press
+from mirrorskin.engine.press.press import Press
 from mirrorskin.hw.twin import Camera, Sphere, Twin, Vertical, visible_zenith
 from mirrorskin.hw.twin.body import Body
 from mirrorskin.io import InputError, Result
@@ -29,7 +29,7 @@ def pressed(diameter, seed, pixels=56, optics="cylinder"):
         optics=optics,
         camera=Camera(noise=1.5, seed=seed, gain_deviation=0.05),
     )
-    return twin, reconstruct_press(twin, fill=False)
+    return twin, Press(fill=False).run(twin)
 
 
 @pytest.fixture(scope="module")
