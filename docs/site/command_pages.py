@@ -19,7 +19,7 @@ _SEE = {
     "capture": "capture.md",
     "live": "live.md",
     "rig": "rig.md",
-    "run": "estimators.md",
+    "run": "operations.md",
     "simulate": "twin.md",
     "twin": "twin.md",
 }
