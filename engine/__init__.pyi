@@ -1,5 +1,5 @@
 from .errors import NotConverged
-from .focus import Focus, FocusEstimator, find_focus
+from .focus import Focus, find_focus
 from .force.normal import Force, find_force
 from .force.tangential import TangentialForce, find_tangential_force
 from .fringes import (
@@ -49,7 +49,6 @@ __all__ = [
     "Correlator",
     "Displacement",
     "Focus",
-    "FocusEstimator",
     "Force",
     "Frequency",
     "FringeEstimator",
