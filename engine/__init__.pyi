@@ -20,7 +20,7 @@ from .method import Method, Step
 from .metrology.measures import Measures, measure
 from .operation import Operation
 from .options import option
-from .photometric import Lambertian, PhotometricStereo, photometric_stereo
+from .photometric import PhotometricStereo, photometric_stereo
 from .pose.pose import Pose, estimate_pose
 from .pose.stitching import Stitch, stitch
 from .pose.tracker import PoseTracker
@@ -55,7 +55,6 @@ __all__ = [
     "Fringes",
     "Growth",
     "Integrator",
-    "Lambertian",
     "Measures",
     "Method",
     "NormalEstimator",

@@ -377,12 +377,13 @@ def _array_function(
     optional = [one for one in positions if not operation.positions.get(one, True)]
     hidden = {"memory_limit"}
     options = {one: declared for one, declared in operation.options.items() if one not in hidden}
-    signature = signature_of(options, ["frames", *(positions.keys() - {*optional})], optional)
+    named = ["frames", *(one for one in positions if one not in optional)]
+    signature = signature_of(options, named, optional)
 
     def function(*args: Any, **kwargs: Any) -> Result:
         given = signature.bind(*args, **kwargs).arguments
         frames = as_array("frames", given.pop("frames"))
-        where = {one: given.pop(one) for one in positions if one in given}
+        where = {one: values for one in positions if (values := given.pop(one, None)) is not None}
         made = operation(memory_limit=max(1, min(MEMORY_LIMIT, 2 * frames.nbytes)), **given)
         return apply(made, frames, **where)
 

@@ -393,8 +393,8 @@ def photometric_stereo() -> Answer:
     share += np.random.default_rng(4).normal(0, 0.01, share.shape)
     answers = {}
     for dtype, (dark, _) in LEVELS.items():
-        found = engine.photometric_stereo(counted(share, dtype), light, dark=dark)
-        answers[dtype] = {name: getattr(found, name) for name in known}
+        found = engine.photometric_stereo(counted(share, dtype), light=light, dark=dark)
+        answers[dtype] = {name: {**found, **found.process}[name] for name in known}
     return named(**answers)
 
 
