@@ -2,15 +2,7 @@ from .errors import NotConverged
 from .focus import Focus, find_focus
 from .force.normal import Force, find_force
 from .force.tangential import TangentialForce, find_tangential_force
-from .fringes import (
-    FringeEstimator,
-    Fringes,
-    Unwrapped,
-    decode_gray,
-    fit_fringes,
-    unwrap_frequencies,
-    unwrap_gray,
-)
+from .fringes import Fringes, decode_gray, fit_fringes, unwrap_frequencies, unwrap_gray
 from .fusion import fuse
 from .integration.camera import Camera
 from .integration.integration import Integrator, integrate
@@ -51,7 +43,6 @@ __all__ = [
     "Focus",
     "Force",
     "Frequency",
-    "FringeEstimator",
     "Fringes",
     "Growth",
     "Integrator",
@@ -76,7 +67,6 @@ __all__ = [
     "Strokes",
     "Surface",
     "TangentialForce",
-    "Unwrapped",
     "correlate",
     "decode_gray",
     "estimate_frequency",
