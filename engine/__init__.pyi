@@ -1,16 +1,8 @@
 from .errors import NotConverged
-from .focus import Focus, FocusEstimator, find_focus
+from .focus import Focus, find_focus
 from .force.normal import Force, find_force
 from .force.tangential import TangentialForce, find_tangential_force
-from .fringes import (
-    FringeEstimator,
-    Fringes,
-    Unwrapped,
-    decode_gray,
-    fit_fringes,
-    unwrap_frequencies,
-    unwrap_gray,
-)
+from .fringes import Fringes, decode_gray, fit_fringes, unwrap_frequencies, unwrap_gray
 from .fusion import fuse
 from .integration.camera import Camera
 from .integration.integration import Integrator, integrate
@@ -20,7 +12,7 @@ from .method import Method, Step
 from .metrology.measures import Measures, measure
 from .operation import Operation
 from .options import option
-from .photometric import Lambertian, PhotometricStereo, photometric_stereo
+from .photometric import PhotometricStereo, photometric_stereo
 from .pose.pose import Pose, estimate_pose
 from .pose.stitching import Stitch, stitch
 from .pose.tracker import PoseTracker
@@ -49,14 +41,11 @@ __all__ = [
     "Correlator",
     "Displacement",
     "Focus",
-    "FocusEstimator",
     "Force",
     "Frequency",
-    "FringeEstimator",
     "Fringes",
     "Growth",
     "Integrator",
-    "Lambertian",
     "Measures",
     "Method",
     "NormalEstimator",
@@ -78,7 +67,6 @@ __all__ = [
     "Strokes",
     "Surface",
     "TangentialForce",
-    "Unwrapped",
     "correlate",
     "decode_gray",
     "estimate_frequency",

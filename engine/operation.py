@@ -111,8 +111,8 @@ class Operation(ThreadSafe, OnDevice):
     """Frames that a result needs."""
     maps: ClassVar[Mapping[str, Map]] = {}
     """The declared maps by name."""
-    positions: ClassVar[Mapping[str, bool]] = {}
-    """What ``push`` takes of each frame, and whether it needs it."""
+    positions: Mapping[str, bool] = {}
+    """What ``push`` takes of each frame, and whether it needs it; an object's may depend on its options."""
     on_device: ClassVar[bool] = False
     """Whether frames are read for the device: ahead, or where kernels can read them without a copy."""
     long_blocks: ClassVar[bool] = False
@@ -374,6 +374,15 @@ def travel_function(
     return cast(TravelFunction[P], function)
 
 
+class OptionalPhaseFunction(Protocol[P]):
+    """A function of frames, (T, H, W), their phase, (T,) radians, if it is needed, and options."""
+
+    def __call__(
+        self, frames: ArrayLike, phase: ArrayLike | None = None, *args: P.args, **options: P.kwargs
+    ) -> Result:
+        """Return the maps."""
+
+
 def phase_function(
     operation: Callable[P, Operation], name: str, text: str, about_phase: str
 ) -> PhaseFunction[P]:
@@ -381,27 +390,38 @@ def phase_function(
     return cast(PhaseFunction[P], _array_function(cast(Any, operation), name, text, {"phase": about_phase}))
 
 
+def optional_phase_function(
+    operation: Callable[P, Operation], name: str, text: str, about_phase: str
+) -> OptionalPhaseFunction[P]:
+    """Return the function on arrays of an operation whose ``push`` takes ``phase`` if options ask for it."""
+    function = _array_function(cast(Any, operation), name, text, {"phase": about_phase})
+    return cast(OptionalPhaseFunction[P], function)
+
+
 def _array_function(
     operation: type[Operation], name: str, text: str, positions: Mapping[str, str]
 ) -> Callable[..., Result]:
     """Return a function of frames, positions and options, with signature and docstring.
 
-    ``text`` is the docstring without the section "Parameters".
+    ``text`` is the docstring without the section "Parameters". Positions that the operation does not need are
+    None by default.
     """
-    named = ("frames", *positions)
+    optional = [one for one in positions if not operation.positions.get(one, True)]
     hidden = {"memory_limit"}
     options = {one: declared for one, declared in operation.options.items() if one not in hidden}
-    signature = signature_of(options, named)
+    named = ["frames", *(one for one in positions if one not in optional)]
+    signature = signature_of(options, named, optional)
 
     def function(*args: Any, **kwargs: Any) -> Result:
         given = signature.bind(*args, **kwargs).arguments
         frames = as_array("frames", given.pop("frames"))
-        where = {one: given.pop(one) for one in positions}
+        where = {one: values for one in positions if (values := given.pop(one, None)) is not None}
         made = operation(memory_limit=max(1, min(MEMORY_LIMIT, 2 * frames.nbytes)), **given)
         return apply(made, frames, **where)
 
     before = "frames : array_like, (T, H, W)\n    Raw counts.\n" + "".join(
-        f"{one} : array_like, (T,)\n    {about}\n" for one, about in positions.items()
+        f"{one} : array_like, (T,){', optional' * (one in optional)}\n    {about}\n"
+        for one, about in positions.items()
     )
     function.__name__ = function.__qualname__ = name
     function.__module__ = operation.__module__
