@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 
 _NOT_POSITIONS = ("lent", "frame_weights")  # keywords of push that are not positions of the body
+_ABOUT_WEIGHTS = """\
+frame_weights : array_like, (T,), optional
+    Weight of each frame, such as its inverse variance; 0 for a missing frame. By default each has weight 1.
+"""
 
 
 class _DeviceOption(Option):
@@ -111,6 +115,7 @@ class Operation(ThreadSafe, OnDevice):
     long_blocks: ClassVar[bool] = False
     """Whether as many frames as possible should be pushed at once."""
     _takes_lent: ClassVar[bool] = False
+    _takes_weights: ClassVar[bool] = False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         found: dict[str, Map] = {}
@@ -123,6 +128,7 @@ class Operation(ThreadSafe, OnDevice):
                 one.name: one.default is one.empty for one in parameters if one.name not in _NOT_POSITIONS
             }
             cls._takes_lent = any(one.name == "lent" for one in parameters)
+            cls._takes_weights = any(one.name == "frame_weights" for one in parameters)
         for name, wrap in _WRAPPERS.items():
             if name in vars(cls):
                 setattr(cls, name, wrap(vars(cls)[name]))
@@ -328,9 +334,16 @@ class TravelFunction(Protocol[P]):
 
 
 class PhaseFunction(Protocol[P]):
-    """A function of frames, (T, H, W), their phase, (T,) radians, and options."""
+    """A function of frames, (T, H, W), their phase, (T,) radians, their weights, (T,), and options."""
 
-    def __call__(self, frames: ArrayLike, phase: ArrayLike, *args: P.args, **options: P.kwargs) -> Result:
+    def __call__(
+        self,
+        frames: ArrayLike,
+        phase: ArrayLike,
+        frame_weights: ArrayLike | None = None,
+        *args: P.args,
+        **options: P.kwargs,
+    ) -> Result:
         """Return the maps."""
 
 
@@ -345,7 +358,7 @@ def travel_function(
 def phase_function(
     operation: Callable[P, Operation], name: str, text: str, about_phase: str
 ) -> PhaseFunction[P]:
-    """Return the function on arrays of an operation whose ``push`` takes ``phase``."""
+    """Return the function on arrays of an operation whose ``push`` takes ``phase`` and ``frame_weights``."""
     return cast(PhaseFunction[P], _array_function(cast(Any, operation), name, text, {"phase": about_phase}))
 
 
@@ -359,18 +372,20 @@ def _array_function(
     named = ("frames", *positions)
     hidden = {"memory_limit"}
     options = {one: declared for one, declared in operation.options.items() if one not in hidden}
-    signature = signature_of(options, named)
+    weights = ("frame_weights",) if operation._takes_weights else ()
+    signature = signature_of(options, named, weights)
 
     def function(*args: Any, **kwargs: Any) -> Result:
         given = signature.bind(*args, **kwargs).arguments
         frames = as_array("frames", given.pop("frames"))
-        where = {one: given.pop(one) for one in positions}
+        where = {one: given.pop(one, None) for one in (*positions, *weights)}
         made = operation(memory_limit=max(1, min(MEMORY_LIMIT, 2 * frames.nbytes)), **given)
         return apply(made, frames, **where)
 
     before = "frames : array_like, (T, H, W)\n    Raw counts.\n" + "".join(
         f"{one} : array_like, (T,)\n    {about}\n" for one, about in positions.items()
     )
+    before += _ABOUT_WEIGHTS if weights else ""
     function.__name__ = function.__qualname__ = name
     function.__module__ = operation.__module__
     function.__doc__ = documented(text, options, before)
