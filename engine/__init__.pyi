@@ -23,7 +23,7 @@ from .press.onset import Onset, find_onset
 from .press.press import Press
 from .press.strokes import Strokes
 from .reconstruction import reconstruct
-from .rotation.correlation import Correlation, Correlator, correlate
+from .rotation.correlation import Correlate, correlate
 from .rotation.edges import find_edges
 from .rotation.frequency import Frequency, estimate_frequency
 from .rotation.normals import NormalEstimator, Normals, estimate_normals
@@ -37,8 +37,7 @@ from .tiling import free_memory
 __all__ = [
     "Camera",
     "ChangePoint",
-    "Correlation",
-    "Correlator",
+    "Correlate",
     "Displacement",
     "Focus",
     "Force",

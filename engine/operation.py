@@ -28,6 +28,10 @@ P = ParamSpec("P")
 
 _COMPONENTS = {"displacement": (2,), "pose": (4,)}  # positions that are not single numbers
 _NOT_POSITIONS = ("lent", "frame_weights")  # keywords of push that are not positions of the body
+_ABOUT_WEIGHTS = """\
+frame_weights : array_like, (T,), optional
+    Weight of each frame, such as its inverse variance; 0 for a missing frame. By default each has weight 1.
+"""
 
 
 class _DeviceOption(Option):
@@ -122,6 +126,7 @@ class Operation(ThreadSafe, OnDevice):
     updates_per_second: ClassVar[float] = 15.0
     """Live, as many updates are of use."""
     _takes_lent: ClassVar[bool] = False
+    _takes_weights: ClassVar[bool] = False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         found: dict[str, Map] = {}
@@ -134,6 +139,7 @@ class Operation(ThreadSafe, OnDevice):
                 one.name: one.default is one.empty for one in parameters if one.name not in _NOT_POSITIONS
             }
             cls._takes_lent = any(one.name == "lent" for one in parameters)
+            cls._takes_weights = any(one.name == "frame_weights" for one in parameters)
         for name, wrap in _WRAPPERS.items():
             if name in vars(cls):
                 setattr(cls, name, wrap(vars(cls)[name]))
@@ -360,9 +366,16 @@ class TravelFunction(Protocol[P]):
 
 
 class PhaseFunction(Protocol[P]):
-    """A function of frames, (T, H, W), their phase, (T,) radians, and options."""
+    """A function of frames, (T, H, W), their phase, (T,) radians, their weights, (T,), and options."""
 
-    def __call__(self, frames: ArrayLike, phase: ArrayLike, *args: P.args, **options: P.kwargs) -> Result:
+    def __call__(
+        self,
+        frames: ArrayLike,
+        phase: ArrayLike,
+        frame_weights: ArrayLike | None = None,
+        *args: P.args,
+        **options: P.kwargs,
+    ) -> Result:
         """Return the maps."""
 
 
@@ -386,7 +399,7 @@ class OptionalPhaseFunction(Protocol[P]):
 def phase_function(
     operation: Callable[P, Operation], name: str, text: str, about_phase: str
 ) -> PhaseFunction[P]:
-    """Return the function on arrays of an operation whose ``push`` takes ``phase``."""
+    """Return the function on arrays of an operation whose ``push`` takes ``phase`` and ``frame_weights``."""
     return cast(PhaseFunction[P], _array_function(cast(Any, operation), name, text, {"phase": about_phase}))
 
 
@@ -409,13 +422,15 @@ def _array_function(
     optional = [one for one in positions if not operation.positions.get(one, True)]
     hidden = {"memory_limit"}
     options = {one: declared for one, declared in operation.options.items() if one not in hidden}
+    weights = ["frame_weights"] if operation._takes_weights else []
     named = ["frames", *(one for one in positions if one not in optional)]
-    signature = signature_of(options, named, optional)
+    signature = signature_of(options, named, [*optional, *weights])
 
     def function(*args: Any, **kwargs: Any) -> Result:
         given = signature.bind(*args, **kwargs).arguments
         frames = as_array("frames", given.pop("frames"))
-        where = {one: values for one in positions if (values := given.pop(one, None)) is not None}
+        per_frame = {one: given.pop(one, None) for one in (*positions, *weights)}
+        where = {one: values for one, values in per_frame.items() if values is not None}
         made = operation(memory_limit=max(1, min(MEMORY_LIMIT, 2 * frames.nbytes)), **given)
         return apply(made, frames, **where)
 
@@ -423,6 +438,7 @@ def _array_function(
         f"{one} : array_like, (T,){', optional' * (one in optional)}\n    {about}\n"
         for one, about in positions.items()
     )
+    before += _ABOUT_WEIGHTS if weights else ""
     function.__name__ = function.__qualname__ = name
     function.__module__ = operation.__module__
     function.__doc__ = documented(text, options, before)
