@@ -136,7 +136,7 @@ FRAMES = textured().astype(np.float32)
         ({"reach": 51}, "reach 51"),
         ({"travel": TRAVEL[1:]}, "travel"),
         ({"frames": FRAMES[0]}, "frames are float32 (48, 48): numbers (n, H, W) are needed"),
-        ({"frames": FRAMES.astype(float)}, "frames of type float64: uint8, uint16, float32 are needed"),
+        ({"frames": FRAMES.astype(float)}, "frames of type float64: uint8, uint16 or float32 are needed"),
         ({"noise": None}, "noise is missing"),
         ({"radius": 1.5}, "radius is 1.5: a whole number is needed"),
     ],
