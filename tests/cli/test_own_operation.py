@@ -1,0 +1,212 @@
+"""An operation outside of the repository, of at most 40 lines, gets what built-in ones get."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+
+import numpy as np
+import pytest
+import tifffile
+from commands import run
+from stacks import MadeUp, record
+
+from mirrorskin import engine, io
+from mirrorskin.view.result import overview
+
+CODE = '''\
+import numpy as np
+
+from mirrorskin import engine, io
+from mirrorskin.kernels.device import C_TYPES
+
+KERNEL = """
+__kernel void above_mean(__global const FRAME *frames, const int count, const int pixels,
+                         __global const float *level, __global int *above) {
+    const int pixel = get_global_id(0);
+    for (int k = 0; k < count && pixel < pixels; k++)
+        above[pixel] += frames[(long)k * pixels + pixel] > level[pixel];
+}
+"""
+
+
+class Mean(engine.Operation):
+    """Height from the number of frames that are brighter than the mean of all."""
+
+    travel_offset: float = engine.option(0.0, "mm", within=(-1, 1), help="added to all travels")
+    margin: float = engine.option(5.0, "counts", within=(0, None), help="by how much brighter a frame must be")
+    depth = io.Map("depth at which the pixel is brighter than its mean", "mm", quantity="height", displayed="µm")
+    kind = io.Map("kind of pixel", codes={0: "never bright", 1: "bright at the end"}, undefined=0)
+    motions, passes = ("vertical",), 2
+
+    def start(self, shape, dtype):
+        self.total, self.level = np.zeros(shape), None
+        self.above = self.device.given("above", np.zeros(shape), np.int32)
+        self.kernel = self.device.kernel(KERNEL, "above_mean", FRAME=C_TYPES[dtype.name])
+
+    def start_second_pass(self):
+        self.level = self.device.given("level", self.total / self.count + self.margin, np.float32)
+
+    def push(self, frames, *, travel):
+        if self.level is None:
+            self.total += frames.sum(axis=0, dtype=np.float64)
+            return
+        arguments = {"count": len(frames), "pixels": self.total.size, "level": self.level, "above": self.above}
+        self.kernel(self.total.size, frames=self.device.seen("frames", frames), moved=frames.nbytes, **arguments)
+        self.device.finish()
+
+    def result(self):
+        above, travel = self.above.download(), self.pushed("travel") + self.travel_offset
+        step = np.diff(travel).mean()
+        depth = np.where(above > 0, above * step - travel[-1] - step / 2, np.nan)
+        return {"depth": depth, "depth_sigma": np.where(above > 0, step / 12**0.5, np.nan), "kind": above > 0}
+'''
+SHAPE, PIXEL = (24, 32), 0.1
+X, Y = io.pixel_axes(SHAPE, (PIXEL, PIXEL))
+BALL = np.sqrt(25 - X**2 - Y[:, np.newaxis] ** 2) - 5.1
+TRAVEL = 0.02 * np.arange(40)
+FRAMES = np.where(TRAVEL[:, np.newaxis, np.newaxis] >= -BALL, 200, 20).astype(np.uint8)
+OFFSET = 0.1
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with the class, two recordings, and the result of the first."""
+    folder = tmp_path_factory.mktemp("own")
+    (folder / "mine.py").write_text(CODE, encoding="utf-8")
+    for name in ("one.h5", "two.h5"):
+        record(MadeUp(FRAMES, io.Header("vertical", pixel_size=(PIXEL, PIXEL)), travel=TRAVEL), folder / name)
+    ended = run(
+        *words(folder), "--travel-offset", "100um", "--device", "0", "-o", folder / "res.h5", "--json"
+    )
+    assert ended.code == 0, ended.said
+    (folder / "said.json").write_text(ended.out, encoding="utf-8")
+    return folder
+
+
+def words(folder):
+    return "run", f"{folder / 'mine.py'}:Mean", folder / "one.h5"
+
+
+@pytest.fixture(scope="module")
+def result(folder):
+    return io.open_result(folder / "res.h5")
+
+
+def test_it_has_at_most_40_lines():
+    code = CODE[CODE.index("class Mean") :]
+    assert len([line for line in code.splitlines() if line.strip()]) <= 40
+
+
+def test_its_heights_and_their_standard_deviation_are_right(result):
+    error = result.height - (BALL - OFFSET)
+    assert np.nanmax(np.abs(error)) < 0.02
+    assert np.nanmean((error / result.height_sigma) ** 2) == pytest.approx(1, abs=0.3)
+
+
+def test_help_shows_its_options_with_units_and_defaults(folder):
+    ended = run(*words(folder)[:2], "--help")
+    assert ended.code == 0, ended.said
+    text = " ".join(ended.out.split())
+    assert "--travel-offset LENGTH" in text
+    assert "Added to all travels" in text
+    assert "By how much brighter a frame must be" in text
+    assert "Height from the number of frames" in text
+
+
+def test_options_are_in_the_process(result):
+    chosen = {name: result.process[name] for name in ("operation", "travel_offset", "margin")}
+    assert chosen == {"operation": "Mean", "travel_offset": OFFSET, "margin": 5.0}
+
+
+@pytest.mark.parametrize(
+    ("option", "line"),
+    [
+        (["--travel-offst", "1mm"], "--travel-offset, --margin"),
+        (["--travel-offset", "100"], "a unit is needed"),
+        (["--margin", "-1"], "margin -1.0: a number in counts of at least 0"),
+    ],
+)
+def test_an_option_that_cannot_be_is_one_line(folder, option, line):
+    ended = run(*words(folder), *option, "-o", folder / "no.h5")
+    assert (ended.code, ended.said.count("\n")) == (2, 1)
+    assert line in ended.said
+    assert not (folder / "no.h5").exists()
+
+
+def test_json_has_units_and_counts(folder):
+    said = json.loads((folder / "said.json").read_text(encoding="utf-8"))
+    assert said["process"]["travel_offset"] == OFFSET
+    assert said["summary"]["what"] == "depth"
+
+
+@pytest.mark.parametrize("suffix", ["h5", "zarr"])
+def test_files_keep_units_titles_and_legends(folder, result, suffix, tmp_path):
+    io.save_result(result, tmp_path / f"res.{suffix}")
+    read = io.open_result(tmp_path / f"res.{suffix}")
+    assert read.declaration("depth").unit == read.declaration("depth_sigma").unit == "mm"
+    assert read.declaration("kind").codes == {0: "never bright", 1: "bright at the end"}
+    np.testing.assert_array_equal(read.height, result.height)
+
+
+def test_exports_take_its_height(folder, tmp_path):
+    for name in ("res.tif", "res.ply", "res.mcap", "res.npz", "res.csv"):
+        ended = run("export", folder / "res.h5", "-o", tmp_path / name)
+        assert (ended.code, ended.said) == (0, "")
+    with np.load(tmp_path / "res.npz") as arrays:
+        assert json.loads(str(arrays["units"]))["depth"] == "mm"
+    assert tifffile.imread(tmp_path / "res.tif").shape == SHAPE
+    lines = (tmp_path / "res.csv").read_text(encoding="utf-8").splitlines()
+    assert next(csv.reader(line for line in lines if not line.startswith("#")))
+
+
+def test_measure_score_and_fuse_take_its_height(result):
+    sphere = engine.measure(result, form="sphere").quantities["diameter"]
+    assert sphere.value == pytest.approx(10, abs=4 * sphere.sigma)
+    flat = np.zeros(SHAPE, np.float32)
+    truth = io.Truth((BALL - OFFSET).astype(np.float32), flat, flat, np.ones(SHAPE, np.uint8))
+    assert engine.score(result, truth).height.rms < 0.01
+    normals = np.dstack(
+        [X / 5 + 0 * BALL, Y[:, np.newaxis] / 5 + 0 * BALL, np.sqrt(1 - (X**2 + Y[:, np.newaxis] ** 2) / 25)]
+    )
+    faces = io.Result(normals=normals.astype(np.float32), normals_sigma=np.full(SHAPE, 0.01, np.float32))
+    fused = engine.fuse(result, faces, PIXEL)
+    assert np.sqrt(np.nanmean((fused.height - BALL + OFFSET) ** 2)) < 0.004
+
+
+def test_figures_and_the_report_have_its_title_unit_and_legend(folder, result, tmp_path):
+    titles = [axes.get_title() for axes in overview(result, name="res.h5").axes]
+    assert "Depth" in titles
+    assert "Kind" in titles
+    assert run("report", folder / "res.h5", "-o", tmp_path / "res.html").code == 0
+    page = (tmp_path / "res.html").read_text(encoding="utf-8")
+    assert "bright at the end" in page
+    assert "depth at which the pixel is brighter than its mean" in page
+
+
+def test_xarray_has_units_and_legends(result):
+    dataset = result.to_xarray()
+    assert dataset.depth.attrs["units"] == "mm"
+    assert dataset.kind.attrs["flag_meanings"] == "never_bright bright_at_the_end"
+
+
+def test_a_batch_runs_it_and_resumes(folder, tmp_path):
+    (tmp_path / "batch.toml").write_text(
+        f'[operation]\nclass = "{folder / "mine.py"}:Mean"\ntravel-offset = "100um"\n', encoding="utf-8"
+    )
+    command = "batch", folder / "one.h5", folder / "two.h5", "-o", tmp_path / "out", "--settings"
+    first = run(*command, tmp_path / "batch.toml")
+    assert first.code == 0, first.said
+    found = io.open_result(next((tmp_path / "out").glob("one*.h5")))
+    np.testing.assert_array_equal(found.height, io.open_result(folder / "res.h5").height)
+    again = run(*command, tmp_path / "batch.toml", "--json")
+    assert {one["state"] for one in json.loads(again.out)["files"]} == {"kept"}
+
+
+def test_the_documentation_is_enough_to_write_it():
+    page = (__import__("pathlib").Path(__file__).parents[2] / "docs" / "operations.md").read_text(
+        encoding="utf-8"
+    )
+    for name in re.findall(r"(?:engine|io|self|self\.device)\.(\w+)\(", CODE[CODE.index("class Mean") :]):
+        assert name in page, name
