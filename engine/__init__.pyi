@@ -26,8 +26,8 @@ from .reconstruction import reconstruct
 from .rotation.correlation import Correlate, correlate
 from .rotation.edges import find_edges
 from .rotation.frequency import Frequency, estimate_frequency
-from .rotation.normals import NormalEstimator, Normals, estimate_normals
-from .rotation.normals_pose import PoseEstimator, PoseNormals
+from .rotation.moving_normals import MovingNormals, estimate_normals
+from .rotation.normals import Normals
 from .running import run
 from .scoring import Score, score
 from .slip.displacement import Displacement, find_displacement
@@ -47,15 +47,13 @@ __all__ = [
     "Integrator",
     "Measures",
     "Method",
-    "NormalEstimator",
+    "MovingNormals",
     "Normals",
     "NotConverged",
     "Onset",
     "Operation",
     "PhotometricStereo",
     "Pose",
-    "PoseEstimator",
-    "PoseNormals",
     "PoseTracker",
     "Press",
     "Score",

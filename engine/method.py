@@ -30,10 +30,14 @@ class Context:
         Where the frames come from: its header and calibration.
     operation : Operation
         What the maps were computed by: its options, device, and the positions of the frames.
+    stream : Source
+        Where the frames were read: the source, or one that changes its frames, such as
+        `mirrorskin.engine.rotation.registration.Registered`.
     """
 
     source: Source
     operation: Operation
+    stream: Source
 
     def pushed(self, name: str) -> NDArray[np.float64]:
         """Return the positions of the frames, such as their ``travel``."""
@@ -66,6 +70,8 @@ class Plan:
         Frames that are used, by default all.
     omit : sequence of str
         Maps of the operation that the result leaves out.
+    stream : Source, optional
+        Where the frames are read, if not from the source itself.
     """
 
     operation: Operation
@@ -73,12 +79,13 @@ class Plan:
     process: Mapping[str, ProcessValue] = field(default_factory=dict)
     frames: range | None = None
     omit: Sequence[str] = ()
+    stream: Source | None = None
 
     def finish(
         self, result: Result, source: Source, more: Mapping[str, ProcessValue] | None = None
     ) -> Result:
         """Return the operation's maps after all steps, with provenance, in the camera's pixels."""
-        context = Context(source, self.operation)
+        context = Context(source, self.operation, self.stream or source)
         result = result.assign(dict.fromkeys(self.omit))
         process = {"frames": self.operation.count, **self.process, **result.process, **(more or {})}
         result = result.assign(process=process)
@@ -92,7 +99,7 @@ class Method(OnDevice):
     """Base of methods. Their options are those of their operations and steps."""
 
     motions: ClassVar[tuple[str, ...]] = ()
-    """Motions of recordings that the method applies to."""
+    """Motions of recordings that the method applies to; none for all."""
 
     def plan(self, source: Source) -> Plan:
         """Return what is done with a source: its operation, steps and frames."""
@@ -104,7 +111,7 @@ class Method(OnDevice):
 
     def check_motion(self, source: Source) -> None:
         """Raise InputError unless the method applies to the source's motion."""
-        if source.motion not in self.motions:
+        if self.motions and source.motion not in self.motions:
             motions = " or ".join(self.motions)
             raise InputError(
                 f"{source.name} has {source.motion} motion, but {type(self).__name__} needs {motions} motion"
@@ -130,7 +137,7 @@ class Method(OnDevice):
         self.check_motion(source)
         with naming(source):
             plan = self.plan(source)
-            feed(source, plan.operation, plan.frames, progress)
+            feed(plan.stream or source, plan.operation, plan.frames, progress)
             result = plan.finish(plan.operation.finish(), source)
         return undistorted(result, source) if undistort else result
 

@@ -28,10 +28,8 @@ P = ParamSpec("P")
 
 _COMPONENTS = {"displacement": (2,), "pose": (4,)}  # positions that are not single numbers
 _NOT_POSITIONS = ("lent", "frame_weights")  # keywords of push that are not positions of the body
-_ABOUT_WEIGHTS = """\
-frame_weights : array_like, (T,), optional
-    Weight of each frame, such as its inverse variance; 0 for a missing frame. By default each has weight 1.
-"""
+ABOUT_WEIGHTS = "Weight of each frame, such as its inverse variance; 0 for a missing frame. By default 1."
+"""Description of ``frame_weights`` of array functions."""
 
 
 class _DeviceOption(Option):
@@ -126,7 +124,6 @@ class Operation(ThreadSafe, OnDevice):
     updates_per_second: ClassVar[float] = 15.0
     """Live, as many updates are of use."""
     _takes_lent: ClassVar[bool] = False
-    _takes_weights: ClassVar[bool] = False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         found: dict[str, Map] = {}
@@ -139,7 +136,6 @@ class Operation(ThreadSafe, OnDevice):
                 one.name: one.default is one.empty for one in parameters if one.name not in _NOT_POSITIONS
             }
             cls._takes_lent = any(one.name == "lent" for one in parameters)
-            cls._takes_weights = any(one.name == "frame_weights" for one in parameters)
         for name, wrap in _WRAPPERS.items():
             if name in vars(cls):
                 setattr(cls, name, wrap(vars(cls)[name]))
@@ -383,7 +379,7 @@ def travel_function(
     operation: Callable[P, Operation], name: str, text: str, about_travel: str
 ) -> TravelFunction[P]:
     """Return the function on arrays of an operation whose ``push`` takes ``travel``."""
-    function = _array_function(cast(Any, operation), name, text, {"travel": about_travel})
+    function = array_function(cast(Any, operation), name, text, {"travel": about_travel})
     return cast(TravelFunction[P], function)
 
 
@@ -400,45 +396,60 @@ def phase_function(
     operation: Callable[P, Operation], name: str, text: str, about_phase: str
 ) -> PhaseFunction[P]:
     """Return the function on arrays of an operation whose ``push`` takes ``phase`` and ``frame_weights``."""
-    return cast(PhaseFunction[P], _array_function(cast(Any, operation), name, text, {"phase": about_phase}))
+    function = array_function(
+        cast(Any, operation), name, text, {"phase": about_phase}, {"frame_weights": ABOUT_WEIGHTS}
+    )
+    return cast(PhaseFunction[P], function)
 
 
 def optional_phase_function(
     operation: Callable[P, Operation], name: str, text: str, about_phase: str
 ) -> OptionalPhaseFunction[P]:
     """Return the function on arrays of an operation whose ``push`` takes ``phase`` if options ask for it."""
-    function = _array_function(cast(Any, operation), name, text, {"phase": about_phase})
+    function = array_function(cast(Any, operation), name, text, {}, {"phase": about_phase})
     return cast(OptionalPhaseFunction[P], function)
 
 
-def _array_function(
-    operation: type[Operation], name: str, text: str, positions: Mapping[str, str]
+def array_function(
+    operation: type[Operation],
+    name: str,
+    text: str,
+    positions: Mapping[str, str],
+    optional: Mapping[str, str] | None = None,
+    compute: Callable[[NDArray[Any], dict[str, Any], dict[str, Any]], Result] | None = None,
 ) -> Callable[..., Result]:
     """Return a function of frames, positions and options, with signature and docstring.
 
-    ``text`` is the docstring without the section "Parameters". Positions that the operation does not need are
-    None by default.
+    Parameters
+    ----------
+    operation : type
+        Operation that has the options.
+    name : str
+    text : str
+        Docstring without the section "Parameters".
+    positions, optional : mapping of str
+        Names of what is needed of each frame, or may be given, with descriptions.
+    compute : callable, optional
+        Receives frames, positions and options, and returns the result; by default that of the operation.
     """
-    optional = [one for one in positions if not operation.positions.get(one, True)]
-    hidden = {"memory_limit"}
-    options = {one: declared for one, declared in operation.options.items() if one not in hidden}
-    weights = ["frame_weights"] if operation._takes_weights else []
-    named = ["frames", *(one for one in positions if one not in optional)]
-    signature = signature_of(options, named, [*optional, *weights])
+    optional = optional or {}
+    options = {one: declared for one, declared in operation.options.items() if one != "memory_limit"}
+    signature = signature_of(options, ("frames", *positions), tuple(optional))
+
+    def run(frames: NDArray[Any], where: dict[str, Any], given: dict[str, Any]) -> Result:
+        limit = max(1, min(MEMORY_LIMIT, 2 * frames.nbytes))
+        return apply(operation(memory_limit=limit, **given), frames, **where)
 
     def function(*args: Any, **kwargs: Any) -> Result:
         given = signature.bind(*args, **kwargs).arguments
         frames = as_array("frames", given.pop("frames"))
-        per_frame = {one: given.pop(one, None) for one in (*positions, *weights)}
+        per_frame = {one: given.pop(one, None) for one in (*positions, *optional)}
         where = {one: values for one, values in per_frame.items() if values is not None}
-        made = operation(memory_limit=max(1, min(MEMORY_LIMIT, 2 * frames.nbytes)), **given)
-        return apply(made, frames, **where)
+        return (compute or run)(frames, where, given)
 
-    before = "frames : array_like, (T, H, W)\n    Raw counts.\n" + "".join(
-        f"{one} : array_like, (T,){', optional' * (one in optional)}\n    {about}\n"
-        for one, about in positions.items()
-    )
-    before += _ABOUT_WEIGHTS if weights else ""
+    before = "frames : array_like, (T, H, W)\n    Raw counts.\n"
+    for names, end in ((positions, ""), (optional, ", optional")):
+        before += "".join(f"{one} : array_like, (T,){end}\n    {about}\n" for one, about in names.items())
     function.__name__ = function.__qualname__ = name
     function.__module__ = operation.__module__
     function.__doc__ = documented(text, options, before)

@@ -50,8 +50,8 @@ class Correlate(Operation):
     or measured phases mix the three, and least squares separates them.
 
     The residual is sqrt(SS / (N - 3)), the standard deviation of a sample of weight 1; it is undefined if N
-    is 3. The modulation is the amplitude sqrt(cosine^2 + sine^2), and the azimuth is the phase of the maximum,
-    atan2(sine, cosine). ``process`` contains the number N of ``frames`` whose weight is not 0.
+    is 3. The modulation is the amplitude sqrt(cosine^2 + sine^2), and the azimuth is the phase of the
+    maximum, atan2(sine, cosine). ``process`` contains the number N of ``frames`` whose weight is not 0.
 
     Examples
     --------
@@ -77,7 +77,7 @@ class Correlate(Operation):
         None,
         "frames",
         within=(3, WINDOW),
-        help=f"number of the last frames that are fitted, 3 to {WINDOW}, such as those of an endless rotation",
+        help=f"number of the last frames that are fitted, 3 to {WINDOW}: a turn of an endless rotation",
         shown_default="all frames",
     )
 
@@ -149,8 +149,8 @@ correlate = phase_function(
     Returns
     -------
     Result
-        ``mean``, ``cosine``, ``sine``, ``modulation``, ``residual``, counts, and ``azimuth``, radians; NaN where
-        a sample is not a number.
+        ``mean``, ``cosine``, ``sine``, ``modulation`` and ``residual``, counts; ``azimuth``, radians. NaN
+        where a sample is not a number.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Heights that follow normals at a rate of their own, in a thread and on a queue beside theirs."""
+"""Heights that follow normals at their own rate, in a separate thread and on a separate queue."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mirrorskin.engine.rotation.normals_window import NormalWindow
 from mirrorskin.kernels.device import Device
 
 
-class HeightFollower:
+class FollowingHeights:
     """Follow the newest normals for which there was time, one step of a solver each.
 
     Attributes
@@ -59,7 +59,7 @@ class HeightFollower:
         maps = {name: normals.on_device(name) for name in ("vectors", "sigma", "contact")}
         for array in maps.values():  # which the other queue has to wait for
             array.arrived = array.last_use
-        self._slopes.find(normals.tilt, maps, self._integrator.maps)
+        self._slopes.find(normals.model.tilt, maps, self._integrator.maps)
         for array in maps.values():  # and the next estimate for this
             array.arrived = array.last_use
         self._taken = self._seen

@@ -1,0 +1,202 @@
+"""The last turn of an endless rotation: normals, and edges and heights that follow while the body moves."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.engine.options import option
+from mirrorskin.engine.rotation.coarse_height import coarse_heights
+from mirrorskin.engine.rotation.edges import EdgeDrawing
+from mirrorskin.engine.rotation.following_heights import FollowingHeights
+from mirrorskin.engine.rotation.normals import Normals
+from mirrorskin.engine.rotation.normals_window import NormalWindow
+from mirrorskin.io import InputError, Result
+from mirrorskin.kernels.device import Device
+
+if TYPE_CHECKING:
+    from mirrorskin.io import Source
+
+_UPDATES_BETWEEN_PLACINGS = 8  # after which it is estimated anew how high the object stands
+_WARMING = 10  # updates after which every kernel has run
+_PARTS = 24  # of the longest kernel of the edges
+_OVERDUE = 0.1  # seconds after which a part is done even if there is no time
+_FIRST_COST = 0.005  # seconds that a part is assumed to take before one is measured
+_DECAY = 0.7  # of the longest part's time, from part to part
+
+
+class LastTurn(Normals):
+    """Normals of the last turn of an endless rotation; while the body moves, also its edges and heights.
+
+    Heights follow the normals in a thread of their own, by one step of a solver per update for which there is
+    time: their error stays near what changes from one update to the next, and normals do not wait. Edges are
+    drawn in the time that is left. With a calibrated response, the height at which the object stands is
+    estimated from the heights so far, now and then.
+    """
+
+    updates_per_second = math.inf
+
+    pixel_size: tuple[float, float] | None = option(
+        None, help="pixel size along x and y, mm, for heights", python_only=True
+    )
+    press: float | None = option(
+        None, "mm", help="distance by which the body is lowered, for a calibrated response", python_only=True
+    )
+
+    def configured_for(self, source: Source) -> Self:
+        """Return the operation with what the source says of sensor and rotation, where it is not given."""
+        header = source.header
+        return (
+            super()
+            .configured_for(source)
+            .with_options(
+                pixel_size=self.pixel_size or header.pixel_size,
+                press=header.press if self.press is None else self.press,
+            )
+        )
+
+    def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
+        """Prepare for frames of a shape and type."""
+        if self.window_frames is None:
+            raise InputError("window_frames is missing: give the number of frames of a turn")
+        super().start(shape, dtype)
+        self._edges = SpareEdges(self.device, shape)
+        self._heights = None
+        if self.pixel_size is not None:
+            self._heights = FollowingHeights(self.device, shape, self.pixel_size)
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget the frames so far, and what was estimated from them."""
+        super().clear()
+        self._has_estimate, self._updates = False, 0
+        if self.response is not None:
+            self.window.place(self.response.planes[4])
+        self._edges.reset()
+        if self._heights is not None:
+            self._heights.reset()
+
+    def preview(self, seconds: float) -> Mapping[str, Any]:
+        """Return the maps of the last turn; none before the first is complete. Heights may take so long."""
+        window, heights = self.window, self._heights
+        if not window.is_full:
+            return {}
+        window.estimate()
+        started = time.perf_counter()
+        if heights is not None:
+            heights.follow(window)
+        self._has_estimate = True
+        normals, contact = (window.fetch_early(name) for name in ("vectors", "contact"))
+        if heights is not None:
+            heights.wait(seconds - (time.perf_counter() - started))
+        height = None if heights is None else heights.height
+        self._updates += 1
+        if height is not None and self._updates % _UPDATES_BETWEEN_PLACINGS == 1:
+            self._place(height)
+        return {
+            "height": height,
+            "height_lag": 0 if heights is None else heights.lag,
+            "normals": normals,
+            "contact": contact,
+            "edges": self._edges.lines,
+            "offset_unknown": height is not None,
+        }
+
+    def spare(self, seconds: float) -> None:
+        """Continue to draw the edges, for some seconds at most."""
+        if self._has_estimate:
+            self._edges.work(self.window, seconds)
+
+    def warm(self) -> None:
+        """Rotate a slanted plane for a while, and forget it."""
+        with suppress(InputError):  # such as noise or tilt, which a plane does not determine
+            for number in range(self.window.length + _WARMING):
+                phase = 2 * np.pi * number / self.window.length
+                self.push(self._plane(phase), phase=[phase])
+                if number >= self.window.length:
+                    self.preview(math.inf)
+            self._edges.finish(self.window)
+        self.reset()
+
+    def result(self) -> Result:
+        """Return the maps of the last turn, with the object placed by a first estimate of its heights."""
+        result = super().result()
+        response = self.response
+        if response is not None and self.pixel_size is not None and self.press is not None:
+            level = response.too_level(result["mean"])
+            maps = result["normals"], result["contact"], level
+            self.window.place(coarse_heights(*maps, self.pixel_size, self.press, self.device))
+            result = super().result()
+        wave = self.window.correlation()
+        names = ("mean", "cosine", "sine", "modulation", "residual")
+        return result.assign({name: wave[name] for name in names})
+
+    def _place(self, height: NDArray[np.float32]) -> None:
+        """Set where the object is, if that matters: its pieces' tops are as high as the press is deep."""
+        from scipy import ndimage
+
+        response, press = self.response, self.press
+        if response is None or press is None:
+            return
+        piece, count = ndimage.label(np.isfinite(height), np.ones((3, 3)))
+        tops = np.concatenate([[0.0], ndimage.maximum(height, piece, np.arange(1, count + 1))])
+        heights = np.where(piece > 0, np.clip(press + height - tops[piece], 0, press), response.planes[4])
+        self.window.place(heights)
+
+    def _plane(self, phase: float) -> NDArray[Any]:
+        """Return a frame of a plane whose zenith is in the middle of the visible range."""
+        gain, offset, tilt = self.zenith_gain, self.zenith_offset, self.tilt
+        swing = 1.0 if gain is None or tilt is None or isinstance(tilt, str) else gain * np.asarray(tilt)
+        level = 0.0 if offset is None else offset + (0.5 if gain is None else 0.5 * np.asarray(gain))
+        ends = [one for one in (self.dark, self.bright) if one is not None]
+        if len(ends) == 2:
+            level = np.mean(np.stack(np.broadcast_arrays(*ends)), axis=0)
+        most = np.iinfo(self.dtype).max if self.dtype.kind == "u" else np.inf
+        frame = np.clip(level + swing * math.cos(phase), 0, most)
+        return np.broadcast_to(np.nan_to_num(frame), (1, *self.shape)).astype(self.dtype)
+
+
+class SpareEdges:
+    """Edges of the last normals for which there was time: ``lines``, (H, W), None until they are drawn."""
+
+    def __init__(self, device: Device, shape: tuple[int, int]) -> None:
+        self._device = device
+        self._drawing = EdgeDrawing(device, shape)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was drawn."""
+        self.lines: NDArray[np.uint8] | None = None
+        self._steps: Iterator[None] | None = None
+        self._cost, self._last = _FIRST_COST, -math.inf
+
+    def work(self, window: NormalWindow, seconds: float) -> None:
+        """Continue to draw a window's last estimate for some seconds; a little now and then in any case."""
+        started = now = time.perf_counter()
+        while started + seconds - now > self._cost or now - self._last > _OVERDUE:
+            self._part(window)
+            self._last = time.perf_counter()
+            self._cost = max(self._last - now, _DECAY * self._cost)
+            now = self._last
+
+    def finish(self, window: NormalWindow) -> None:
+        """Draw once from the start to the end."""
+        self._steps = None
+        self._part(window)
+        while self._steps is not None:
+            self._part(window)
+
+    def _part(self, window: NormalWindow) -> None:
+        """Start a drawing, do a part of it, or fetch what was drawn."""
+        if self._steps is None:
+            self._drawing.take(*(window.fetch(name) for name in ("vectors", "sigma", "contact")))
+            self._steps = self._drawing.steps(_PARTS)
+        elif next(self._steps, self) is self:
+            self.lines, self._steps = self._drawing.lines(), None
+        self._device.finish()
