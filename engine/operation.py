@@ -438,13 +438,13 @@ def array_function(
 
     def run(frames: NDArray[Any], where: dict[str, Any], given: dict[str, Any]) -> Result:
         limit = max(1, min(MEMORY_LIMIT, 2 * frames.nbytes))
-        return apply(operation(memory_limit=limit, **given), frames, **where)
+        given_positions = {one: values for one, values in where.items() if values is not None}
+        return apply(operation(memory_limit=limit, **given), frames, **given_positions)
 
     def function(*args: Any, **kwargs: Any) -> Result:
         given = signature.bind(*args, **kwargs).arguments
         frames = as_array("frames", given.pop("frames"))
-        per_frame = {one: given.pop(one, None) for one in (*positions, *optional)}
-        where = {one: values for one, values in per_frame.items() if values is not None}
+        where = {one: given.pop(one, None) for one in (*positions, *optional)}
         return (compute or run)(frames, where, given)
 
     before = "frames : array_like, (T, H, W)\n    Raw counts.\n"

@@ -384,7 +384,7 @@ def test_what_cannot_be_used_is_refused_in_one_line(case):
 def test_a_block_that_does_not_fit_is_refused_and_changes_nothing():
     frames, phase = frames_of(turns=2), phases(SETUP, 2)
     estimator = estimator_of(None)
-    with pytest.raises(InputError, match="none pushed so far"):
+    with pytest.raises(InputError, match="none have been pushed"):
         estimator.result()
     push(estimator, frames[:10], phase[:10])
     wrong = [
