@@ -119,8 +119,6 @@ class Operation(ThreadSafe, OnDevice):
     """Whether frames are read for the device: ahead, or where kernels can read them without a copy."""
     long_blocks: ClassVar[bool] = False
     """Whether as many frames as possible should be pushed at once."""
-    every: ClassVar[int] = 1
-    """Live, only frames whose number is a multiple of this are used."""
     updates_per_second: ClassVar[float] = 15.0
     """Live, as many updates are of use."""
     _takes_lent: ClassVar[bool] = False

@@ -32,6 +32,8 @@ class LiveOperation(ThreadSafe):
         Options that are not given are taken from its header and calibration, where these have them.
     operation : Operation or Method
         A method's steps are applied when the result is asked for.
+    every : int
+        Only frames whose number is a multiple of this are used.
 
     Raises
     ------
@@ -44,8 +46,10 @@ class LiveOperation(ThreadSafe):
         Configured for the source, and ready for its frames.
     """
 
-    def __init__(self, source: LiveSource, operation: Operation | Method) -> None:
-        self._source, shape = source, source.shape[1:]
+    def __init__(self, source: LiveSource, operation: Operation | Method, *, every: int = 1) -> None:
+        if every < 1:
+            raise InputError(f"every {every}: a number of frames of at least 1 is needed")
+        self._source, self.every, shape = source, every, source.shape[1:]
         with naming(source):
             self._plan = _live_plan(source, operation, _FRAMES * math.prod(shape) * source.dtype.itemsize)
             self.operation: Operation = self._plan.operation
@@ -54,7 +58,6 @@ class LiveOperation(ThreadSafe):
         self.positions: Mapping[str, bool] = self.operation.positions
         rocks = source.motion == "axial" and source.header.tilt is None
         self.position: str = "tilt" if rocks else POSITIONS[source.motion]
-        self.every: int = self.operation.every
         self.updates_per_second: float = self.operation.updates_per_second
 
     def _check_positions(self) -> None:
@@ -119,7 +122,8 @@ class LiveOperation(ThreadSafe):
             The frames do not determine them.
         """
         with naming(self._source):
-            result = self._plan.finish(self.operation.result(), self._source, {"live": True})
+            process = {"live": True, "every": self.every}
+            result = self._plan.finish(self.operation.result(), self._source, process)
         return undistorted(result, self._source)
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.options import option
 from mirrorskin.engine.rotation.coarse_height import coarse_heights
+from mirrorskin.engine.rotation.design_matrix import LONGEST
 from mirrorskin.engine.rotation.edges import EdgeDrawing
 from mirrorskin.engine.rotation.following_heights import FollowingHeights
 from mirrorskin.engine.rotation.normals import Normals
@@ -24,11 +25,37 @@ if TYPE_CHECKING:
     from mirrorskin.io import Source
 
 _UPDATES_BETWEEN_PLACINGS = 8  # after which it is estimated anew how high the object stands
+_FEWEST = 3  # frames that determine a wave
 _WARMING = 10  # updates after which every kernel has run
 _PARTS = 24  # of the longest kernel of the edges
 _OVERDUE = 0.1  # seconds after which a part is done even if there is no time
 _FIRST_COST = 0.005  # seconds that a part is assumed to take before one is measured
 _DECAY = 0.7  # of the longest part's time, from part to part
+
+
+def choose_window(frames_per_turn: float, window_frames: int | None = None) -> tuple[int, int]:
+    """Return how many frames a window of one turn should have, and n, where every n-th frame is used.
+
+    Parameters
+    ----------
+    frames_per_turn : float
+    window_frames : int, optional
+        Frames of the window; by default as many as there are, up to 64.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        A turn has fewer than three frames, which determine no wave, or fewer than the window.
+    """
+    if not _FEWEST <= frames_per_turn < math.inf:
+        raise InputError(f"{frames_per_turn:g} frames a turn: at least 3 are needed; turn more slowly")
+    if window_frames is None:
+        every = math.ceil(round(frames_per_turn) / LONGEST)
+        return max(_FEWEST, round(frames_per_turn / every)), every
+    if window_frames > round(frames_per_turn):
+        count = round(frames_per_turn)
+        raise InputError(f"window_frames {window_frames}: a turn has only {count} frames. Leave it out")
+    return window_frames, max(1, round(frames_per_turn) // window_frames)  # within one turn
 
 
 class LastTurn(Normals):

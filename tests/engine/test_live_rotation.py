@@ -8,9 +8,10 @@ import pytest
 from live_frames import PIXEL, Clock, paced, phases, press_header, turn_frames, turn_header
 
 from mirrorskin.bench.scenes import SCALES, TILT
-from mirrorskin.engine import Correlator, estimate_normals, find_edges, integrate
+from mirrorskin.engine import Correlate, Rotation, estimate_normals, find_edges, integrate
 from mirrorskin.engine.integration.warm_start import WarmStartIntegrator
-from mirrorskin.engine.live import LiveRotation, Loop, choose_window
+from mirrorskin.engine.live import LiveOperation, Loop
+from mirrorskin.engine.rotation.last_turn import choose_window
 from mirrorskin.engine.rotation.normals_to_height import find_slopes
 from mirrorskin.io import InputError, open_result, save_result
 
@@ -23,8 +24,8 @@ LAST = slice(-WINDOW, None)
 def make(device=None, frames=None, header=None, **options):
     frames = turn_frames(SHAPE) if frames is None else frames
     source = paced(frames, header or turn_header(), PHASE)
-    options = {"window": WINDOW, "noise": NOISE, **options}
-    return frames, LiveRotation(source, device=device, **options)
+    options = {"window_frames": WINDOW, "noise": NOISE, **options}
+    return frames, LiveOperation(source, Rotation(device=device, **options))
 
 
 def feed(live, frames, cuts):
@@ -37,7 +38,7 @@ def feed(live, frames, cuts):
 
 
 def best_heights(normals):
-    slopes = find_slopes(normals.vectors, normals.sigma, normals.contact, normals.tilt)
+    slopes = find_slopes(normals.normals, normals.normals_sigma, normals.contact, normals.process["tilt"])
     weights = slopes.weights
     return integrate(slopes.dz_dx, slopes.dz_dy, PIXEL, mask=slopes.known, slope_weights=weights).height
 
@@ -48,9 +49,9 @@ def test_an_update_is_of_the_last_turn(device):
     updates = feed(live, frames, [1] * SHAPE[0])
     assert not any(updates[: WINDOW - 1])
     last = updates[-1]
-    known = {"tilt": TILT, "gain": GAIN, "offset": OFFSET, "noise": NOISE}
+    known = {"tilt": TILT, "zenith_gain": GAIN, "zenith_offset": OFFSET, "noise": NOISE}
     exact = estimate_normals(frames[LAST], PHASE[LAST], **known, device=device)
-    np.testing.assert_array_equal(last["normals"], exact.vectors)
+    np.testing.assert_array_equal(last["normals"], exact.normals)
     np.testing.assert_array_equal(last["contact"], exact.contact)
     assert last["contact_area"] == pytest.approx(np.count_nonzero(exact.contact) * PIXEL**2)
     assert last["offset_unknown"]
@@ -62,7 +63,7 @@ def test_heights_follow_those_that_fit_best(device):
     for update, stop in [(updates[WINDOW - 1], WINDOW), (updates[-1], SHAPE[0])]:
         turn = slice(stop - WINDOW, stop)
         normals = estimate_normals(
-            frames[turn], PHASE[turn], tilt=TILT, gain=GAIN, offset=OFFSET, noise=NOISE
+            frames[turn], PHASE[turn], tilt=TILT, zenith_gain=GAIN, zenith_offset=OFFSET, noise=NOISE
         )
         best = best_heights(normals)
         np.testing.assert_array_equal(np.isnan(update["height"]), np.isnan(best))
@@ -81,9 +82,9 @@ def test_heights_that_take_long_hold_up_no_normals(monkeypatch):
         update = live.maps(0.0)
         assert update["height"] is before
     assert update["height_lag"] == SHAPE[0] - WINDOW
-    known = {"tilt": TILT, "gain": GAIN, "offset": OFFSET, "noise": NOISE}
+    known = {"tilt": TILT, "zenith_gain": GAIN, "zenith_offset": OFFSET, "noise": NOISE}
     np.testing.assert_array_equal(
-        update["normals"], estimate_normals(frames[LAST], PHASE[LAST], **known).vectors
+        update["normals"], estimate_normals(frames[LAST], PHASE[LAST], **known).normals
     )
     go_on.set()
     live.maps()
@@ -111,29 +112,29 @@ def test_the_result_is_whole_and_says_how_it_came_about(tmp_path):
     feed(live, frames, [SHAPE[0]])
     save_result(live.result(), tmp_path / "live.h5")
     result = open_result(tmp_path / "live.h5")
-    correlator = Correlator(SHAPE[1:], "uint8", window=WINDOW)
-    correlator.push(frames, phase=PHASE)
-    np.testing.assert_array_equal(result.cosine, correlator.result().cosine)
-    normals = estimate_normals(frames[LAST], PHASE[LAST], tilt=TILT, gain=GAIN, offset=OFFSET, noise=NOISE)
-    np.testing.assert_array_equal(result.normals, normals.vectors)
-    np.testing.assert_array_equal(result.edges, find_edges(normals.vectors, normals.sigma, normals.contact))
+    correlate = Correlate(window_frames=WINDOW)
+    correlate.push(frames, phase=PHASE)
+    np.testing.assert_array_equal(result.cosine, correlate.result().cosine)
+    normals = estimate_normals(frames[LAST], PHASE[LAST], tilt=TILT, zenith_gain=GAIN, zenith_offset=OFFSET, noise=NOISE)
+    np.testing.assert_array_equal(result.normals, normals.normals)
+    np.testing.assert_array_equal(result.edges, find_edges(normals.normals, normals.normals_sigma, normals.contact))
     np.testing.assert_allclose(result.height, best_heights(normals), atol=1e-6)
-    assert (result.process["window"], result.process["live"]) == (WINDOW, True)
+    assert (result.process["window_frames"], result.process["live"]) == (WINDOW, True)
     assert result.process["tilt"] == pytest.approx(TILT)
 
 
 def test_edges_are_drawn_in_the_time_that_is_left(device):
-    frames, live = make(device, integrate=False)
+    frames, live = make(device)
     feed(live, frames, [SHAPE[0]])
-    assert live.maps()["edges"] is None
+    assert "edges" not in live.maps()
     for _ in range(400):
         live.spare(0.05)
-        if live.maps()["edges"] is not None:
+        if "edges" in live.maps():
             break
     normals = estimate_normals(
-        frames[LAST], PHASE[LAST], tilt=TILT, gain=GAIN, offset=OFFSET, noise=NOISE, device=device
+        frames[LAST], PHASE[LAST], tilt=TILT, zenith_gain=GAIN, zenith_offset=OFFSET, noise=NOISE, device=device
     )
-    exact = find_edges(normals.vectors, normals.sigma, normals.contact, device=device)
+    exact = find_edges(normals.normals, normals.normals_sigma, normals.contact, device=device)
     np.testing.assert_array_equal(live.maps()["edges"], exact)
     assert exact.any()
 
@@ -143,7 +144,7 @@ def test_a_sudden_change_is_followed_within_some_frames():
     frames[: SHAPE[0] // 2] = frames[: SHAPE[0] // 2, :, ::-1]
     _, live = make(frames=frames)
     update = feed(live, frames, [1] * SHAPE[0])[-1]
-    normals = estimate_normals(frames[LAST], PHASE[LAST], tilt=TILT, gain=GAIN, offset=OFFSET, noise=NOISE)
+    normals = estimate_normals(frames[LAST], PHASE[LAST], tilt=TILT, zenith_gain=GAIN, zenith_offset=OFFSET, noise=NOISE)
     best = best_heights(normals)
     off = (update["height"] - best)[np.isfinite(best)]
     assert np.sqrt(np.mean(off**2)) < 0.02 * np.ptp(best[np.isfinite(best)])
@@ -172,8 +173,8 @@ def test_without_a_gain_there_is_the_wave_alone():
 def test_without_a_pixel_size_there_are_no_heights():
     frames, live = make(header=turn_header(pixel_size=None))
     update = feed(live, frames, [SHAPE[0]])[-1]
-    assert update["height"] is None
-    assert update["contact_area"] is None
+    assert "height" not in update
+    assert "contact_area" not in update
     assert live.result().height is None
 
 
@@ -191,11 +192,11 @@ def test_what_warming_leaves_behind_is_nothing():
 def test_a_whole_run_uses_each_frame():
     frames = turn_frames(SHAPE)
     source = paced(frames, turn_header(), PHASE, 100.0, Clock())
-    live = LiveRotation(source, window=WINDOW, noise=NOISE)
+    live = LiveOperation(source, Rotation(window_frames=WINDOW, noise=NOISE))
     status = Loop(source, live).run()
     assert (status.used, status.updates) == (SHAPE[0], SHAPE[0])
-    exact = estimate_normals(frames[LAST], PHASE[LAST], tilt=TILT, gain=GAIN, offset=OFFSET, noise=NOISE)
-    np.testing.assert_array_equal(live.normals().vectors, exact.vectors)
+    exact = estimate_normals(frames[LAST], PHASE[LAST], tilt=TILT, zenith_gain=GAIN, zenith_offset=OFFSET, noise=NOISE)
+    np.testing.assert_array_equal(live.operation.result().normals, exact.normals)
 
 
 def test_a_window_is_a_turn_of_at_most_64_frames():
@@ -207,12 +208,13 @@ def test_a_window_is_a_turn_of_at_most_64_frames():
     for turn in (2.0, math.nan, math.inf):
         with pytest.raises(InputError, match="frames a turn"):
             choose_window(turn)
-    with pytest.raises(InputError, match="--window 41: a turn has 40 frames only"):
+    with pytest.raises(InputError, match="window_frames 41: a turn has only 40 frames"):
         choose_window(40.2, 41)
 
 
 def test_a_press_and_a_step_of_none_are_refused():
     with pytest.raises(InputError, match="axial"):
-        LiveRotation(paced(turn_frames(SHAPE), press_header(), PHASE), window=8)
-    with pytest.raises(InputError, match="every"):
-        make(every=0)
+        LiveOperation(paced(turn_frames(SHAPE), press_header(), PHASE), Rotation(window_frames=8))
+    source = paced(turn_frames(SHAPE), turn_header(), PHASE)
+    with pytest.raises(InputError, match="every 0"):
+        LiveOperation(source, Rotation(window_frames=8), every=0)
