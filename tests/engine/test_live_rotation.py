@@ -19,6 +19,7 @@ SHAPE, WINDOW = (24, 40, 52), 8
 PHASE = phases(SHAPE[0])
 OFFSET, GAIN, NOISE = SCALES["uint8"]
 LAST = slice(-WINDOW, None)
+KNOWN = {"tilt": TILT, "zenith_gain": GAIN, "zenith_offset": OFFSET, "noise": NOISE}
 
 
 def make(device=None, frames=None, header=None, **options):
@@ -37,6 +38,10 @@ def feed(live, frames, cuts):
     return updates
 
 
+def edges_of(found, device=None):
+    return find_edges(found.normals, found.normals_sigma, found.contact, device=device)
+
+
 def best_heights(normals):
     slopes = find_slopes(normals.normals, normals.normals_sigma, normals.contact, normals.process["tilt"])
     weights = slopes.weights
@@ -49,8 +54,7 @@ def test_an_update_is_of_the_last_turn(device):
     updates = feed(live, frames, [1] * SHAPE[0])
     assert not any(updates[: WINDOW - 1])
     last = updates[-1]
-    known = {"tilt": TILT, "zenith_gain": GAIN, "zenith_offset": OFFSET, "noise": NOISE}
-    exact = estimate_normals(frames[LAST], PHASE[LAST], **known, device=device)
+    exact = estimate_normals(frames[LAST], PHASE[LAST], **KNOWN, device=device)
     np.testing.assert_array_equal(last["normals"], exact.normals)
     np.testing.assert_array_equal(last["contact"], exact.contact)
     assert last["contact_area"] == pytest.approx(np.count_nonzero(exact.contact) * PIXEL**2)
@@ -62,9 +66,7 @@ def test_heights_follow_those_that_fit_best(device):
     updates = feed(live, frames, [1] * SHAPE[0])
     for update, stop in [(updates[WINDOW - 1], WINDOW), (updates[-1], SHAPE[0])]:
         turn = slice(stop - WINDOW, stop)
-        normals = estimate_normals(
-            frames[turn], PHASE[turn], tilt=TILT, zenith_gain=GAIN, zenith_offset=OFFSET, noise=NOISE
-        )
+        normals = estimate_normals(frames[turn], PHASE[turn], **KNOWN)
         best = best_heights(normals)
         np.testing.assert_array_equal(np.isnan(update["height"]), np.isnan(best))
         off = (update["height"] - best)[np.isfinite(best)]
@@ -82,9 +84,8 @@ def test_heights_that_take_long_hold_up_no_normals(monkeypatch):
         update = live.maps(0.0)
         assert update["height"] is before
     assert update["height_lag"] == SHAPE[0] - WINDOW
-    known = {"tilt": TILT, "zenith_gain": GAIN, "zenith_offset": OFFSET, "noise": NOISE}
     np.testing.assert_array_equal(
-        update["normals"], estimate_normals(frames[LAST], PHASE[LAST], **known).normals
+        update["normals"], estimate_normals(frames[LAST], PHASE[LAST], **KNOWN).normals
     )
     go_on.set()
     live.maps()
@@ -115,9 +116,9 @@ def test_the_result_is_whole_and_says_how_it_came_about(tmp_path):
     correlate = Correlate(window_frames=WINDOW)
     correlate.push(frames, phase=PHASE)
     np.testing.assert_array_equal(result.cosine, correlate.result().cosine)
-    normals = estimate_normals(frames[LAST], PHASE[LAST], tilt=TILT, zenith_gain=GAIN, zenith_offset=OFFSET, noise=NOISE)
+    normals = estimate_normals(frames[LAST], PHASE[LAST], **KNOWN)
     np.testing.assert_array_equal(result.normals, normals.normals)
-    np.testing.assert_array_equal(result.edges, find_edges(normals.normals, normals.normals_sigma, normals.contact))
+    np.testing.assert_array_equal(result.edges, edges_of(normals))
     np.testing.assert_allclose(result.height, best_heights(normals), atol=1e-6)
     assert (result.process["window_frames"], result.process["live"]) == (WINDOW, True)
     assert result.process["tilt"] == pytest.approx(TILT)
@@ -131,10 +132,8 @@ def test_edges_are_drawn_in_the_time_that_is_left(device):
         live.spare(0.05)
         if "edges" in live.maps():
             break
-    normals = estimate_normals(
-        frames[LAST], PHASE[LAST], tilt=TILT, zenith_gain=GAIN, zenith_offset=OFFSET, noise=NOISE, device=device
-    )
-    exact = find_edges(normals.normals, normals.normals_sigma, normals.contact, device=device)
+    normals = estimate_normals(frames[LAST], PHASE[LAST], **KNOWN, device=device)
+    exact = edges_of(normals, device)
     np.testing.assert_array_equal(live.maps()["edges"], exact)
     assert exact.any()
 
@@ -144,7 +143,7 @@ def test_a_sudden_change_is_followed_within_some_frames():
     frames[: SHAPE[0] // 2] = frames[: SHAPE[0] // 2, :, ::-1]
     _, live = make(frames=frames)
     update = feed(live, frames, [1] * SHAPE[0])[-1]
-    normals = estimate_normals(frames[LAST], PHASE[LAST], tilt=TILT, zenith_gain=GAIN, zenith_offset=OFFSET, noise=NOISE)
+    normals = estimate_normals(frames[LAST], PHASE[LAST], **KNOWN)
     best = best_heights(normals)
     off = (update["height"] - best)[np.isfinite(best)]
     assert np.sqrt(np.mean(off**2)) < 0.02 * np.ptp(best[np.isfinite(best)])
@@ -195,7 +194,7 @@ def test_a_whole_run_uses_each_frame():
     live = LiveOperation(source, Rotation(window_frames=WINDOW, noise=NOISE))
     status = Loop(source, live).run()
     assert (status.used, status.updates) == (SHAPE[0], SHAPE[0])
-    exact = estimate_normals(frames[LAST], PHASE[LAST], tilt=TILT, zenith_gain=GAIN, zenith_offset=OFFSET, noise=NOISE)
+    exact = estimate_normals(frames[LAST], PHASE[LAST], **KNOWN)
     np.testing.assert_array_equal(live.operation.result().normals, exact.normals)
 
 
