@@ -1,0 +1,211 @@
+"""Options that the engine declares, as options of commands.
+
+``declared.json`` is a copy of the declarations, since help and completion must not wait for the engine. After a
+change of a declaration, ``python -m mirrorskin.cli.declared`` writes it anew; a test compares the two.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from mirrorskin.cli.groups import ExistingPath, MotionOption, for_motions
+
+if TYPE_CHECKING:
+    from mirrorskin.engine.options import Configured, Option
+
+_COPY = Path(__file__).with_suffix(".json")
+_METAVARS = {
+    "mm": "LENGTH",
+    "rad": "ANGLE",
+    "MPa": "PRESSURE",
+    "N": "FORCE",
+    "s": "TIME",
+    "counts/rad": "COUNTS/ANGLE",
+    "Hz": "HZ",
+}
+
+
+@dataclass(frozen=True)
+class Term:
+    """An option as a command shows and reads it."""
+
+    name: str
+    kind: str
+    help: str
+    unit: str = ""
+    shown_default: str = ""
+    choices: Sequence[str] = ()
+    words: Sequence[str] = ()
+    file: str = ""
+    motions: Sequence[str] = ()
+
+    @property
+    def metavar(self) -> str:
+        """What help shows in place of a value."""
+        noun = _METAVARS.get(self.unit) or self.unit.upper() or ("N" if self.kind == "integer" else "NUMBER")
+        several = "[,...]" if self.kind == "numbers" else ""
+        return "|".join([noun + several, *self.words])
+
+    def read(self, text: str, where: str) -> Any:
+        """Return the value that a text stands for, in the option's unit; ``where`` begins messages."""
+        from mirrorskin.cli import quantity
+
+        if text in self.words:
+            return text
+        if self.kind == "numbers":
+            return [replace(self, kind="number").read(part, where) for part in text.split(",")]
+        readers = {
+            "mm": quantity.length,
+            "rad": quantity.angle,
+            "MPa": quantity.pressure,
+            "N": quantity.force,
+            "s": quantity.duration,
+            "counts/rad": quantity.per_angle,
+        }
+        if self.unit in readers:
+            return readers[self.unit](text, where)
+        return (quantity.integer if self.kind == "integer" else quantity.number)(text, where)
+
+    def parameter(self) -> click.Parameter:
+        """Return the option of click."""
+        flag = self.flag
+        settings: dict[str, Any] = {
+            "help": self.help[:1].upper() + self.help[1:].rstrip(".") + ".",
+            "show_default": self.shown_default or False,
+            "default": None,
+            "motions": self.motions,
+        }
+        if self.kind == "flag":
+            return MotionOption([f"{flag}/--no-{flag[2:]}", self.name], **settings)
+        if self.kind == "choice":
+            return MotionOption([flag, self.name], type=click.Choice([*self.choices]), **settings)
+        if self.kind == "file":
+            return MotionOption([flag, self.name], type=ExistingPath(), metavar=self.file, **settings)
+        settings["multiple"] = self.kind == "numbers"
+        return _Quantity([flag, self.name], term=self, metavar=self.metavar, **settings)
+
+    @property
+    def flag(self) -> str:
+        """Name of the option on the command line."""
+        return f"--{self.name.replace('_', '-')}"
+
+
+class _Quantity(MotionOption):
+    """An option whose value is a number, with a unit if it has one, or several."""
+
+    def __init__(self, names: Sequence[str], *, term: Term, **settings: Any) -> None:
+        super().__init__(names, **settings)
+        self._term = term
+
+    def process_value(self, ctx: click.Context, value: Any) -> Any:
+        """Read the text, or the texts of an option that is repeated."""
+        found = super().process_value(ctx, value)
+        if self.multiple:
+            found = ",".join(found or ()) or None
+        return found if found is None else self._term.read(found, self._term.flag)
+
+
+@dataclass(frozen=True)
+class Declared:
+    """Declared options of a command: ``**chosen: Annotated[Any, Declared("reconstruct")]``.
+
+    Attributes
+    ----------
+    command : str
+        The entry of ``declared.json``.
+    only, without : sequence of str
+        Names of the options that the command has, or leaves out.
+    """
+
+    command: str
+    only: Sequence[str] = ()
+    without: Sequence[str] = ()
+
+    def parameters(self) -> list[click.Parameter]:
+        """Return the options of click."""
+        stored = json.loads(_COPY.read_text(encoding="utf-8"))[self.command]
+        return [
+            Term(**fields).parameter()
+            for fields in stored
+            if fields["name"] not in self.without and (not self.only or fields["name"] in self.only)
+        ]
+
+
+def terms_of(kinds: Mapping[str, type[Configured]]) -> list[Term]:
+    """Return the options of classes, by the motion that each is for; those of one name become one.
+
+    A class with the motion ``""`` is for any motion.
+    """
+    found: dict[str, list[Term]] = {}
+    for motion, kind in kinds.items():
+        for one in kind.options.values():
+            if not one.python_only:
+                term = replace(_term(one), motions=(motion,) if motion else ())
+                found.setdefault(one.name, []).append(term)
+    return [_merged(variants) for variants in found.values()]
+
+
+def _term(one: Option) -> Term:
+    shown = one.shown_default
+    if not shown and one.default is not None:
+        shown = f"{one.default:g}" if isinstance(one.default, float) else str(one.default)
+        if one.kind == "flag":
+            shown = one.name.replace("_", "-") if one.default else f"no-{one.name.replace('_', '-')}"
+        elif one.unit == "rad":
+            shown = f"{math.degrees(one.default):g}deg"
+        elif one.unit in ("mm", "MPa", "N", "s"):
+            shown += one.unit
+    kind = "number" if one.kind in ("map", "object") else one.kind
+    return Term(one.name, kind, one.help, one.unit, shown, one.choices, one.words, one.file)
+
+
+def _merged(variants: list[Term]) -> Term:
+    """Join options of one name; where they differ, help and default mention the motions."""
+    first = variants[0]
+    if any((one.kind, one.unit) != (first.kind, first.unit) for one in variants):
+        raise TypeError(f"{first.name} is declared with different kinds or units")
+    motions = tuple(motion for one in variants for motion in one.motions)
+    helps, defaults = (_by_motion(variants, name) for name in ("help", "shown_default"))
+    return replace(
+        first,
+        help=helps if len({one.help for one in variants}) > 1 else for_motions(motions, helps),
+        shown_default=defaults,
+        choices=tuple(dict.fromkeys(choice for one in variants for choice in one.choices)),
+        words=tuple(dict.fromkeys(word for one in variants for word in one.words)),
+        motions=motions,
+    )
+
+
+def _by_motion(variants: list[Term], name: str) -> str:
+    """Return the text of all variants, or each with its motions."""
+    motions: dict[str, list[str]] = {}
+    for one in variants:
+        motions.setdefault(getattr(one, name), []).extend(one.motions)
+    if len(motions) == 1:
+        return next(iter(motions))
+    return "; ".join(for_motions(their, text) for text, their in motions.items() if text)
+
+
+def declarations() -> dict[str, list[dict[str, Any]]]:
+    """Return what ``declared.json`` contains: the options of each command."""
+    from mirrorskin.engine.method import Method
+    from mirrorskin.engine.reconstruction import method_for
+
+    methods = {one: method_for(one) for one in ("vertical",)}  # TODO all
+    methods = {motion: kind for motion, kind in methods.items() if issubclass(kind, Method)}
+    return {"reconstruct": _rows(methods)}
+
+
+def _rows(kinds: Mapping[str, type[Configured]]) -> list[dict[str, Any]]:
+    return [{name: value for name, value in asdict(one).items() if value} for one in terms_of(kinds)]
+
+
+if __name__ == "__main__":
+    _COPY.write_text(json.dumps(declarations(), indent=1) + "\n", encoding="utf-8")
