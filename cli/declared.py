@@ -1,13 +1,14 @@
 """Options that the engine declares, as options of commands.
 
-``declared.json`` is a copy of the declarations, since help and completion must not wait for the engine. After a
-change of a declaration, ``python -m mirrorskin.cli.declared`` writes it anew; a test compares the two.
+``declared.json`` is a copy of the declarations, since help and completion must not wait for the engine. After
+a change of a declaration, ``python -m mirrorskin.cli.declared`` writes it anew; a test compares the two.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -15,11 +16,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mirrorskin.cli.groups import ExistingPath, MotionOption, for_motions
+from mirrorskin.cli.groups import Command, ExistingPath, MotionOption, for_motions
 
 if TYPE_CHECKING:
     from mirrorskin.engine.options import Configured, Option
 
+_CLASS = re.compile(r".+:[A-Za-z_]\w*")
+_LOADED = "mirrorskin.cli.declared"  # key of a context's class and its options
+_OF_RECORDINGS = ("pixel_size",)  # options that operations take from a recording
 _COPY = Path(__file__).with_suffix(".json")
 _METAVARS = {
     "mm": "LENGTH",
@@ -57,7 +61,7 @@ class Term:
         """Return the value that a text stands for, in the option's unit; ``where`` begins messages."""
         from mirrorskin.cli import quantity
 
-        if text in self.words:
+        if text in self.words or self.kind == "choice":
             return text
         if self.kind == "numbers":
             return [replace(self, kind="number").read(part, where) for part in text.split(",")]
@@ -73,7 +77,7 @@ class Term:
             return readers[self.unit](text, where)
         return (quantity.integer if self.kind == "integer" else quantity.number)(text, where)
 
-    def parameter(self) -> click.Parameter:
+    def parameter(self) -> DeclaredOption:
         """Return the option of click."""
         flag = self.flag
         settings: dict[str, Any] = {
@@ -82,14 +86,14 @@ class Term:
             "default": None,
             "motions": self.motions,
         }
-        if self.kind == "flag":
-            return MotionOption([f"{flag}/--no-{flag[2:]}", self.name], **settings)
+        names = [f"{flag}/--no-{flag[2:]}" if self.kind == "flag" else flag, self.name]
         if self.kind == "choice":
-            return MotionOption([flag, self.name], type=click.Choice([*self.choices]), **settings)
-        if self.kind == "file":
-            return MotionOption([flag, self.name], type=ExistingPath(), metavar=self.file, **settings)
-        settings["multiple"] = self.kind == "numbers"
-        return _Quantity([flag, self.name], term=self, metavar=self.metavar, **settings)
+            settings["type"] = click.Choice([*self.choices])
+        elif self.kind == "file":
+            settings |= {"type": ExistingPath(), "metavar": self.file}
+        elif self.kind != "flag":
+            settings |= {"metavar": self.metavar, "multiple": self.kind == "numbers"}
+        return DeclaredOption(names, term=self, **settings)
 
     @property
     def flag(self) -> str:
@@ -97,8 +101,8 @@ class Term:
         return f"--{self.name.replace('_', '-')}"
 
 
-class _Quantity(MotionOption):
-    """An option whose value is a number, with a unit if it has one, or several."""
+class DeclaredOption(MotionOption):
+    """An option that was declared in the engine; the value is in the declaration's unit."""
 
     def __init__(self, names: Sequence[str], *, term: Term, **settings: Any) -> None:
         super().__init__(names, **settings)
@@ -109,7 +113,7 @@ class _Quantity(MotionOption):
         found = super().process_value(ctx, value)
         if self.multiple:
             found = ",".join(found or ()) or None
-        return found if found is None else self._term.read(found, self._term.flag)
+        return self._term.read(found, self._term.flag) if isinstance(found, str) else found
 
 
 @dataclass(frozen=True)
@@ -128,7 +132,7 @@ class Declared:
     only: Sequence[str] = ()
     without: Sequence[str] = ()
 
-    def parameters(self) -> list[click.Parameter]:
+    def parameters(self) -> list[DeclaredOption]:
         """Return the options of click."""
         stored = json.loads(_COPY.read_text(encoding="utf-8"))[self.command]
         return [
@@ -136,6 +140,61 @@ class Declared:
             for fields in stored
             if fields["name"] not in self.without and (not self.only or fields["name"] in self.only)
         ]
+
+
+class ClassCommand(Command):
+    """A command one of whose arguments may be MODULE:CLASS: it has the options of that class.
+
+    They replace other declared options.
+    """
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Load the class, and parse the arguments with its options."""
+        name = next((word for word in args if _CLASS.fullmatch(word)), None)
+        if name is None:
+            return super().parse_args(ctx, args)
+        ctx.meta[_LOADED] = self._load(name)
+        try:
+            return super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            flags = ", ".join(one.opts[0] for one in ctx.meta[_LOADED][1]) or "none"
+            message = f"{name} has no option {error.option_name}. Its options are {flags}"
+            raise click.UsageError(message, ctx) from None
+
+    def _load(self, name: str) -> tuple[type[Configured], list[DeclaredOption]]:
+        """Return the class with this name, and its options."""
+        from mirrorskin.engine.running import load_operation
+        from mirrorskin.io import InputError
+
+        kind = load_operation(name)
+        terms = [one for one in terms_of({"": kind}) if one.name not in _OF_RECORDINGS]
+        taken = {one.name for one in self.params if not isinstance(one, DeclaredOption)}
+        for one in terms:
+            if one.name in taken:
+                raise InputError(
+                    f"{name} has an option {one.name}, and so has 'mirrorskin {self.name}'. Rename that of"
+                    " the class"
+                )
+        return kind, [one.parameter() for one in terms]
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        """Return the command's parameters, with the class's options if there is a class."""
+        parameters = super().get_params(ctx)
+        if _LOADED not in ctx.meta:
+            return parameters
+        rest = [one for one in parameters if not isinstance(one, DeclaredOption)]
+        count = sum(isinstance(one, click.Argument) for one in rest)
+        return [*rest[:count], *ctx.meta[_LOADED][1], *rest[count:]]
+
+    def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write what the command does, and the class."""
+        super().format_help_text(ctx, formatter)
+        if _LOADED in ctx.meta:
+            kind = ctx.meta[_LOADED][0]
+            purpose = (kind.__doc__ or "").strip().split("\n\n")[0]
+            with formatter.indentation():
+                formatter.write_paragraph()
+                formatter.write_text(f"{kind.__name__}: {purpose}")
 
 
 def terms_of(kinds: Mapping[str, type[Configured]]) -> list[Term]:

@@ -61,8 +61,9 @@ def refuse_foreign(context: click.Context, motion: str, name: str = "this") -> N
 
     for one in context.command.get_params(context):
         source = context.get_parameter_source(one.name or "")
-        foreign = isinstance(one, MotionOption) and one.motions and motion not in one.motions
-        if foreign and source is not None and source.name == "COMMANDLINE":
+        if not isinstance(one, MotionOption) or not one.motions or motion in one.motions:
+            continue
+        if source is not None and source.name == "COMMANDLINE":
             nouns = [_NOUNS.get(other, other) for other in one.motions]
             plurals = " and ".join(f"{noun}es" if noun.endswith("s") else f"{noun}s" for noun in nouns)
             noun = _NOUNS.get(motion, motion)
@@ -96,7 +97,7 @@ class Group(click.Group):
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List options and commands."""
-        list_parameters(self, ctx, formatter)
+        _list_parameters(self, ctx, formatter)
         with formatter.section("Commands"):
             formatter.write_dl(list(self.purposes().items()))
 
@@ -130,8 +131,8 @@ def make_command(
     parameters: list[click.Parameter] = []
     for parameter in [*named.values()]:
         if parameter.kind is parameter.VAR_KEYWORD:
-            (declared,) = hints[parameter.name].__metadata__
-            parameters += declared.parameters()
+            for declared in get_args(hints[parameter.name])[1:]:
+                parameters += declared.parameters()
             del named[parameter.name]
         else:
             parameters.append(_parameter(parameter, hints[parameter.name]))
@@ -150,8 +151,11 @@ def make_command(
 
 
 class Command(click.Command):
+    """A command whose help lists arguments as well."""
+
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        list_parameters(self, ctx, formatter)
+        """List arguments and options."""
+        _list_parameters(self, ctx, formatter)
 
 
 class _Argument(click.Argument):
@@ -182,6 +186,7 @@ class ExistingPath(_AnyPath):
     """What a command reads: one that is not there is told before anything heavy is imported."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the path of a file that exists, or an address."""
         from mirrorskin.io.url import Url, path_of
 
         path = path_of(value)
@@ -282,7 +287,7 @@ def _type(kind: Any, bounds: dict[str, Any], written: bool) -> Any:
     return _Words(kind) if issubclass(kind, StrEnum) else kind
 
 
-def list_parameters(command: click.Command, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+def _list_parameters(command: click.Command, ctx: click.Context, formatter: click.HelpFormatter) -> None:
     for title, kind in (("Arguments", click.Argument), ("Options", click.Option)):
         records = [one.get_help_record(ctx) for one in command.get_params(ctx) if isinstance(one, kind)]
         if any(records):

@@ -1,39 +1,43 @@
-"""An estimator of one's own: a pixel's height is where its brightness rises most from frame to frame.
+"""An operation of one's own: a pixel's height is where its brightness rises most from frame to frame.
 
 mirrorskin run examples/steepest_rise.py:SteepestRise press.h5 -o heights.h5
 """
 
 import numpy as np
 
-from mirrorskin import engine, hw
+from mirrorskin import engine, hw, io
+from mirrorskin.io.maps import TABLE
 
 
-class SteepestRise:
-    """Keeps, of each pixel, the largest rise so far and the height that it stands for."""
+class SteepestRise(engine.Operation):
+    """Height from the largest rise of each pixel's brightness."""
 
-    def __init__(self, shape, dtype):
-        self.shape = shape
-        self.reset()
+    motions = ("vertical",)
 
-    def reset(self):
-        """Forget all frames."""
+    least: float = engine.option(0.0, "counts", help="rise above which there is a height")
+
+    height = TABLE["height"]
+    rise = io.Map("largest rise of the brightness", "counts")
+
+    def start(self, shape, dtype):
+        """Prepare for frames of a shape and type."""
         self.last = None
-        self.rise = np.zeros(self.shape, np.float32)
-        self.height = np.full(self.shape, np.nan, np.float32)
+        self.rises = np.full(shape, self.least, np.float32)
+        self.heights = np.full(shape, np.nan, np.float32)
 
     def push(self, frames, *, travel):
         """Take in the next frames, (n, H, W), and the travel of each, mm."""
         for frame, at in zip(frames.astype(np.float32), travel, strict=True):
             if self.last is not None:
                 rise = frame - self.last[0]
-                larger = rise > self.rise
-                self.rise[larger] = rise[larger]
-                self.height[larger] = -(at + self.last[1]) / 2
+                larger = rise > self.rises
+                self.rises[larger] = rise[larger]
+                self.heights[larger] = -(at + self.last[1]) / 2
             self.last = frame, at
 
     def result(self):
-        """Return maps by name: a height is one that results know, the rise one of our own."""
-        return {"height": self.height, "rise": self.rise}
+        """Return maps by name."""
+        return {"height": self.heights, "rise": self.rises}
 
 
 if __name__ == "__main__":
