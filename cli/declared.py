@@ -25,6 +25,18 @@ _CLASS = re.compile(r".+:[A-Za-z_]\w*")
 _LOADED = "mirrorskin.cli.declared"  # key of a context's class and its options
 _OF_RECORDINGS = ("pixel_size",)  # options that operations take from a recording
 _COPY = Path(__file__).with_suffix(".json")
+_UNITS = {  # placeholder in help, function of `mirrorskin.cli.quantity`, example
+    "mm": ("LENGTH", "length", "0.1mm"),
+    "rad": ("ANGLE", "angle", "2.5deg"),
+    "MPa": ("PRESSURE", "pressure", "0.1MPa"),
+    "N": ("FORCE", "force", "1.5N"),
+    "s": ("TIME", "duration", "10ms"),
+    "counts/rad": ("COUNTS/ANGLE", "per_angle", "5.7/deg"),
+}
+_CLASS = re.compile(r".+:[A-Za-z_]\w*")
+_LOADED = "mirrorskin.cli.declared"  # key of a context's class and its options
+_OF_RECORDINGS = ("pixel_size",)  # options that operations take from a recording
+_COPY = Path(__file__).with_suffix(".json")
 _METAVARS = {
     "mm": "LENGTH",
     "rad": "ANGLE",
@@ -51,31 +63,31 @@ class Term:
     motions: Sequence[str] = ()
 
     @property
+    def example(self) -> str:
+        """A value with a unit; empty if values have none."""
+        return _UNITS.get(self.unit, ("", "", ""))[2]
+
+    @property
     def metavar(self) -> str:
         """What help shows in place of a value."""
-        noun = _METAVARS.get(self.unit) or self.unit.upper() or ("N" if self.kind == "integer" else "NUMBER")
+        plain = self.unit.upper() or ("N" if self.kind == "integer" else "NUMBER")
         several = "[,...]" if self.kind == "numbers" else ""
-        return "|".join([noun + several, *self.words])
+        return "|".join([_UNITS.get(self.unit, (plain,))[0] + several, *self.words])
 
     def read(self, text: str, where: str) -> Any:
-        """Return the value that a text stands for, in the option's unit; ``where`` begins messages."""
+        """Return the value that a text on the command line stands for, in the option's unit."""
+        if self.kind == "numbers":
+            return [self.read_one(part, where) for part in text.split(",")]
+        return self.read_one(text, where)
+
+    def read_one(self, text: str, where: str) -> Any:
+        """Return the value that a text stands for; ``where`` begins messages."""
         from mirrorskin.cli import quantity
 
         if text in self.words or self.kind == "choice":
             return text
-        if self.kind == "numbers":
-            return [replace(self, kind="number").read(part, where) for part in text.split(",")]
-        readers = {
-            "mm": quantity.length,
-            "rad": quantity.angle,
-            "MPa": quantity.pressure,
-            "N": quantity.force,
-            "s": quantity.duration,
-            "counts/rad": quantity.per_angle,
-        }
-        if self.unit in readers:
-            return readers[self.unit](text, where)
-        return (quantity.integer if self.kind == "integer" else quantity.number)(text, where)
+        plain = "integer" if self.kind == "integer" else "number"
+        return getattr(quantity, _UNITS.get(self.unit, ("", plain))[1])(text, where)
 
     def parameter(self) -> DeclaredOption:
         """Return the option of click."""
@@ -206,12 +218,13 @@ def terms_of(kinds: Mapping[str, type[Configured]]) -> list[Term]:
     for motion, kind in kinds.items():
         for one in kind.options.values():
             if not one.python_only:
-                term = replace(_term(one), motions=(motion,) if motion else ())
+                term = replace(term_of(one), motions=(motion,) if motion else ())
                 found.setdefault(one.name, []).append(term)
     return [_merged(variants) for variants in found.values()]
 
 
-def _term(one: Option) -> Term:
+def term_of(one: Option) -> Term:
+    """Return what a command needs of a declaration."""
     shown = one.shown_default
     if not shown and one.default is not None:
         shown = f"{one.default:g}" if isinstance(one.default, float) else str(one.default)
