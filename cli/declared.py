@@ -32,6 +32,7 @@ _UNITS = {  # placeholder in help, function of `mirrorskin.cli.quantity`, exampl
     "N": ("FORCE", "force", "1.5N"),
     "s": ("TIME", "duration", "10ms"),
     "counts/rad": ("COUNTS/ANGLE", "per_angle", "5.7/deg"),
+    "mm/N": ("LENGTH/N", "compliance", "0.01mm/N"),
 }
 _CLASS = re.compile(r".+:[A-Za-z_]\w*")
 _LOADED = "mirrorskin.cli.declared"  # key of a context's class and its options
@@ -61,6 +62,8 @@ class Term:
     words: Sequence[str] = ()
     file: str = ""
     motions: Sequence[str] = ()
+    default: str = ""  # as on the command line
+    least: int | None = None
 
     @property
     def example(self) -> str:
@@ -70,7 +73,8 @@ class Term:
     @property
     def metavar(self) -> str:
         """What help shows in place of a value."""
-        plain = self.unit.upper() or ("N" if self.kind == "integer" else "NUMBER")
+        shown = self.unit if self.kind == "text" else self.unit.upper()
+        plain = shown or ("N" if self.kind == "integer" else "NUMBER")
         several = "[,...]" if self.kind == "numbers" else ""
         return "|".join([_UNITS.get(self.unit, (plain,))[0] + several, *self.words])
 
@@ -84,28 +88,15 @@ class Term:
         """Return the value that a text stands for; ``where`` begins messages."""
         from mirrorskin.cli import quantity
 
-        if text in self.words or self.kind == "choice":
+        if text in self.words or self.kind in ("choice", "text"):
             return text
         plain = "integer" if self.kind == "integer" else "number"
-        return getattr(quantity, _UNITS.get(self.unit, ("", plain))[1])(text, where)
+        value = getattr(quantity, _UNITS.get(self.unit, ("", plain))[1])(text, where)
+        if self.least is not None and value < self.least:
+            from mirrorskin.io import InputError
 
-    def parameter(self) -> DeclaredOption:
-        """Return the option of click."""
-        flag = self.flag
-        settings: dict[str, Any] = {
-            "help": self.help[:1].upper() + self.help[1:].rstrip(".") + ".",
-            "show_default": self.shown_default or False,
-            "default": None,
-            "motions": self.motions,
-        }
-        names = [f"{flag}/--no-{flag[2:]}" if self.kind == "flag" else flag, self.name]
-        if self.kind == "choice":
-            settings["type"] = click.Choice([*self.choices])
-        elif self.kind == "file":
-            settings |= {"type": ExistingPath(), "metavar": self.file}
-        elif self.kind != "flag":
-            settings |= {"metavar": self.metavar, "multiple": self.kind == "numbers"}
-        return DeclaredOption(names, term=self, **settings)
+            raise InputError(f"{where} {text}: a number of at least {self.least} is needed")
+        return value
 
     @property
     def flag(self) -> str:
@@ -114,11 +105,28 @@ class Term:
 
 
 class DeclaredOption(MotionOption):
-    """An option that was declared in the engine; the value is in the declaration's unit."""
+    """The option of click for a term; its value is in the term's unit. ``of_engine``: see `ClassCommand`."""
 
-    def __init__(self, names: Sequence[str], *, term: Term, **settings: Any) -> None:
-        super().__init__(names, **settings)
-        self._term = term
+    def __init__(self, one: Term, of_engine: bool = True) -> None:
+        self._term, self.of_engine = one, of_engine
+        names = [f"{one.flag}/--no-{one.flag[2:]}" if one.kind == "flag" else one.flag, one.name]
+        settings: dict[str, Any] = {}
+        if one.kind == "choice":
+            settings = {"type": click.Choice([*one.choices])}
+        elif one.kind == "file":
+            settings = {"type": ExistingPath(), "metavar": one.file}
+        elif one.kind == "switch":
+            settings = {"is_flag": True}
+        elif one.kind != "flag":
+            settings = {"metavar": one.metavar, "multiple": one.kind == "numbers"}
+        super().__init__(
+            names,
+            help=f"{one.help[:1].upper()}{one.help[1:].rstrip('.')}.",
+            default=None,
+            show_default=one.shown_default or one.default or False,
+            motions=one.motions,
+            **settings,
+        )
 
     def process_value(self, ctx: click.Context, value: Any) -> Any:
         """Read the text, or the texts of an option that is repeated."""
@@ -129,35 +137,53 @@ class DeclaredOption(MotionOption):
 
 
 @dataclass(frozen=True)
-class Declared:
-    """Declared options of a command: ``**chosen: Annotated[Any, Declared("reconstruct")]``.
+class Terms:
+    """Options of a command: ``**chosen: Annotated[Any, Terms(...)]`` receives those that are given."""
 
-    Attributes
-    ----------
-    command : str
-        The entry of ``declared.json``.
-    only, without : sequence of str
-        Names of the options that the command has, or leaves out.
-    """
-
-    command: str
-    only: Sequence[str] = ()
-    without: Sequence[str] = ()
+    terms: Sequence[Term]
+    of_engine: bool = False
 
     def parameters(self) -> list[DeclaredOption]:
         """Return the options of click."""
-        stored = json.loads(_COPY.read_text(encoding="utf-8"))[self.command]
-        return [
-            Term(**fields).parameter()
-            for fields in stored
-            if fields["name"] not in self.without and (not self.only or fields["name"] in self.only)
-        ]
+        return [DeclaredOption(one, self.of_engine) for one in self.terms]
+
+    def filled(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the values of all options: given ones, defaults, or None."""
+        return {
+            one.name: given[one.name] if one.name in given else one.read(one.default, one.flag)
+            if one.default else None
+            for one in self.terms
+        }  # fmt: skip
+
+
+def declared(command: str, *, without: Sequence[str] = ()) -> Terms:
+    """Return the engine's options of a command, an entry of ``declared.json``, except some."""
+    stored = json.loads(_COPY.read_text(encoding="utf-8"))[command]
+    return Terms([Term(**fields) for fields in stored if fields["name"] not in without], of_engine=True)
+
+
+def term(
+    name: str,
+    text: str,
+    unit: str = "",
+    default: str = "",
+    *,
+    motions: Sequence[str] = (),
+    kind: str = "number",
+    least: int | None = None,
+) -> Term:
+    """Return an option of a command that the engine does not declare.
+
+    ``kind`` is "number", "integer", "switch" or "text"; of a text, ``unit`` is the placeholder in help.
+    ``default`` is a text as on the command line.
+    """
+    return Term(name, kind, for_motions(motions, text), unit, motions=motions, default=default, least=least)
 
 
 class ClassCommand(Command):
-    """A command one of whose arguments may be MODULE:CLASS: it has the options of that class.
+    """A command one of whose words may be MODULE:CLASS: then it has the options of that class.
 
-    They replace other declared options.
+    They replace other options of the engine.
     """
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -180,21 +206,21 @@ class ClassCommand(Command):
 
         kind = load_operation(name)
         terms = [one for one in terms_of({"": kind}) if one.name not in _OF_RECORDINGS]
-        taken = {one.name for one in self.params if not isinstance(one, DeclaredOption)}
+        taken = {one.name for one in self.params if not getattr(one, "of_engine", False)}
         for one in terms:
             if one.name in taken:
                 raise InputError(
                     f"{name} has an option {one.name}, and so has 'mirrorskin {self.name}'. Rename that of"
                     " the class"
                 )
-        return kind, [one.parameter() for one in terms]
+        return kind, [DeclaredOption(one) for one in terms]
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
         """Return the command's parameters, with the class's options if there is a class."""
         parameters = super().get_params(ctx)
         if _LOADED not in ctx.meta:
             return parameters
-        rest = [one for one in parameters if not isinstance(one, DeclaredOption)]
+        rest = [one for one in parameters if not getattr(one, "of_engine", False)]
         count = sum(isinstance(one, click.Argument) for one in rest)
         return [*rest[:count], *ctx.meta[_LOADED][1], *rest[count:]]
 

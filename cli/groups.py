@@ -65,7 +65,8 @@ def refuse_foreign(context: click.Context, motion: str, name: str = "this") -> N
             continue
         if source is not None and source.name == "COMMANDLINE":
             nouns = [_NOUNS.get(other, other) for other in one.motions]
-            plurals = " and ".join(f"{noun}es" if noun.endswith("s") else f"{noun}s" for noun in nouns)
+            *others, last = [f"{noun}es" if noun.endswith("s") else f"{noun}s" for noun in nouns]
+            plurals = f"{', '.join(others)} and {last}" if others else last
             noun = _NOUNS.get(motion, motion)
             raise InputError(f"{one.opts[0]} applies to {plurals} only; {name} is a {noun}. Remove it")
 
@@ -121,7 +122,7 @@ def make_command(
     """Return a command, or a group of this kind, that calls a function.
 
     A parameter of the type ``click.Context`` gets the context. The docstring is the help. Keywords,
-    ``**chosen: Annotated[Any, Declared(...)]``, are the given ones of declared options.
+    ``**chosen: Annotated[Any, declared(...)]``, are the given ones of other options.
     """
     hints = get_type_hints(function, include_extras=True)
     named = dict(inspect.signature(function).parameters)

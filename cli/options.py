@@ -104,7 +104,8 @@ Contact = Annotated[
     Path | None,
     Option(
         metavar="RES.h5",
-        help="Slide, twist: a press's result, where the skin touches.",
+        help="a press's result, where the skin touches.",
         show_default="estimated, too wide",
+        motions=("horizontal", "twist"),
     ),
 ]

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import click
 
 from mirrorskin.cli import options
-from mirrorskin.cli.declared import Declared
+from mirrorskin.cli.declared import declared
 from mirrorskin.cli.groups import Argument, Option, refuse_foreign
 
 _REMEDIES = {"zenith": "--zenith-gain", "height": "--pixel-size"}  # by maps that are missing
@@ -42,7 +42,7 @@ def command(
     memory: options.Memory = "256MB",
     device: options.Device = None,
     as_json: options.Json = False,
-    **chosen: Annotated[Any, Declared("reconstruct")],
+    **chosen: Annotated[Any, declared("reconstruct")],
 ) -> None:
     """Reconstruct heights from a press, normals and heights from a rotation, or slip."""
     from mirrorskin import engine, io

@@ -52,7 +52,10 @@ def read_settings(path: Path | None, memory_limit: int) -> Plan:
             kinds = {"operation": load_operation(operation)}
         except InputError as error:
             raise InputError(f"{path}: operation.class: {error}") from error
-    tables = {"stack": _Stack, **{name: _table(name, kind) for name, kind in kinds.items()}}
+    tables: dict[str, type[Struct]] = {
+        "stack": _Stack,
+        **{name: _table(name, kind) for name, kind in kinds.items()},
+    }
     fields: Any = [(name, model, field(default_factory=model)) for name, model in tables.items()]
     settings = load_toml(path, defstruct("Settings", fields, frozen=True), _REMEDY)
     given = {name: _given(getattr(settings, name)) for name in tables}

@@ -84,13 +84,13 @@ def _onset(source: Source, known: Calibration | None, radius: float, device: str
     from mirrorskin.cli.output import progress
     from mirrorskin.engine.calibration.gel import ball_onset
     from mirrorskin.engine.press.elastic import LEARNED_AT
-    from mirrorskin.engine.press.press import reconstruct_press
+    from mirrorskin.engine.reconstruction import reconstruct
 
     if source.motion != "vertical":
         raise io.InputError(f"{source.name} is of {source.motion} motion: give presses of a ball")
     plain = source if known is None else io.Calibrated(source, replace(known, gel=None))
     with progress("pressing", source.shape[0]) as show:
-        result = reconstruct_press(plain, threshold=LEARNED_AT, fill=False, device=device, progress=show)
+        result = reconstruct(plain, threshold=LEARNED_AT, fill=False, device=device, progress=show)
     return ball_onset(result, plain, radius)
 
 
