@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
@@ -21,28 +21,10 @@ def command(
     motion: scans.Motion,
     rig_file: scans.RigFile,
     output: options.NewRecording,
-    start: scans.Start = None,
-    stop: scans.Stop = None,
-    strokes: scans.Strokes = None,
-    stroke_depth: scans.StrokeDepth = None,
-    step: scans.Step = None,
-    speed: scans.Speed = None,
-    press: scans.Press = None,
-    distance: scans.Distance = None,
-    direction: scans.Direction = None,
-    angle: scans.Angle = None,
-    wait: scans.Wait = None,
-    tilt: scans.Tilt = None,
-    rock: scans.Rock = False,
-    phase: scans.Phase = None,
-    turns: scans.Turns = None,
-    phase_step: scans.PhaseStep = None,
-    rate: scans.Rate = None,
-    settle: scans.Settle = None,
-    frames: scans.StepFrames = None,
     calibration: options.Calibration = None,
     compression: options.Compression = options.CompressionName.raw,
     overwrite: options.Overwrite = False,
+    **given: Annotated[Any, scans.PLAN],
 ) -> None:
     """Move the stage, and record what the camera sees; what was taken is kept whatever happens."""
     from mirrorskin import io
@@ -51,12 +33,12 @@ def command(
     from mirrorskin.kernels.correlation import WINDOW
 
     settings = load_rig(rig_file)
-    plan = scans.make_plan(context.params, settings)  # from the options above
+    plan = scans.make_plan(context, given, settings)
     io.check_output(output, rig_file, calibration, replaces="anything" if overwrite else "nothing")
     known = scans.open_calibration(calibration, settings)
     with open_rig(settings, plan.in_steps) as rig:
-        # Normals are told from so many frames of a turn; more would be of no use to 'reconstruct'.
-        scan = scans.make_scan(rig, plan, settle, frames, turn_frames=WINDOW)
+        # Normals are computed from this number of frames of a turn; more would be of no use.
+        scan = scans.make_scan(rig, plan, given.get("settle"), given.get("frames"), turn_frames=WINDOW)
         recorder = io.StreamRecorder(scan, output, compression.value, calibration=known, overwrite=overwrite)
         with scans.kept(recorder):
             _drain(recorder)

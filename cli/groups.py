@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import keyword
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import StrEnum
 from importlib import import_module
 from pathlib import Path
@@ -16,12 +16,16 @@ import click
 from click.shell_completion import CompletionItem
 
 _WRITTEN = {"--output", "--record"}  # options that name what a command writes; other paths are read
+_MOTIONS = ("vertical", "axial", "horizontal", "twist")
+_COMMON = ("calibration", "memory", "device", "as_json")  # options that follow the declared ones in help
+_NOUNS = {"vertical": "press", "axial": "rotation", "horizontal": "slide", "rock": "rocking motion"}
 
 
 class Option:
-    """What is said of an option, in click's settings: ``Annotated[float, Option("--rate", help=...)]``.
+    """Settings of click for an option: ``Annotated[float, Option("--rate", help=...)]``.
 
-    With ``or_file``, a text with an ending is a file that must be there.
+    With ``or_file``, a text with an ending is a file that must exist. ``motions`` are the only ones that the
+    option applies to; see `refuse_foreign`.
     """
 
     def __init__(self, *names: str, **settings: Any) -> None:
@@ -30,6 +34,41 @@ class Option:
 
 class Argument(Option):
     """What is said of an argument."""
+
+
+class MotionOption(click.Option):
+    """An option that may apply to some motions only, others of which `refuse_foreign` refuses."""
+
+    def __init__(self, names: Sequence[str], *, motions: Sequence[str] = (), **settings: Any) -> None:
+        self.motions = tuple(motions)
+        super().__init__(names, **{"show_default": True, **settings})
+
+    def get_help_extra(self, ctx: click.Context) -> Any:
+        """Return what help adds to the text, without click's parentheses around a default."""
+        shown = {"default": self.show_default} if isinstance(self.show_default, str) else {}
+        return {**super().get_help_extra(ctx), **shown}
+
+
+def for_motions(motions: Sequence[str], text: str) -> str:
+    """Return a text that begins with the motions that it is about, unless these are all."""
+    nouns = ", ".join(_NOUNS.get(one, one) for one in motions)
+    return text if not motions or {*_MOTIONS} <= {*motions} else f"{nouns}: {text}"
+
+
+def refuse_foreign(context: click.Context, motion: str, name: str = "this") -> None:
+    """Raise InputError if an option on the command line does not apply to a motion, that of ``name``."""
+    from mirrorskin.io import InputError
+
+    for one in context.command.get_params(context):
+        source = context.get_parameter_source(one.name or "")
+        if not isinstance(one, MotionOption) or not one.motions or motion in one.motions:
+            continue
+        if source is not None and source.name == "COMMANDLINE":
+            nouns = [_NOUNS.get(other, other) for other in one.motions]
+            *others, last = [f"{noun}es" if noun.endswith("s") else f"{noun}s" for noun in nouns]
+            plurals = f"{', '.join(others)} and {last}" if others else last
+            noun = _NOUNS.get(motion, motion)
+            raise InputError(f"{one.opts[0]} applies to {plurals} only; {name} is a {noun}. Remove it")
 
 
 class Group(click.Group):
@@ -82,27 +121,41 @@ def make_command(
 ) -> Any:
     """Return a command, or a group of this kind, that calls a function.
 
-    A parameter of the type ``click.Context`` gets the context. The docstring is the help.
+    A parameter of the type ``click.Context`` gets the context. The docstring is the help. Keywords,
+    ``**chosen: Annotated[Any, declared(...)]``, are the given ones of other options.
     """
     hints = get_type_hints(function, include_extras=True)
-    given = {parameter.name: parameter for parameter in inspect.signature(function).parameters.values()}
-    context = next((name for name in given if hints[name] is click.Context), None)
+    named = dict(inspect.signature(function).parameters)
+    context = next((name for name in named if hints[name] is click.Context), None)
     if context is not None:
-        del given[context]
+        del named[context]
+    parameters: list[click.Parameter] = []
+    for parameter in [*named.values()]:
+        if parameter.kind is parameter.VAR_KEYWORD:
+            for declared in get_args(hints[parameter.name])[1:]:
+                parameters += declared.parameters()
+            del named[parameter.name]
+        else:
+            parameters.append(_parameter(parameter, hints[parameter.name]))
+    if len(named) < len(parameters):
+        parameters.sort(key=lambda one: one.name in _COMMON)
 
     def call(**values: Any) -> Any:
-        for name, value in values.items():
-            if isinstance(value, tuple):
-                values[name] = list(value) or given[name].default
-        return function(**values, **({context: click.get_current_context()} if context else {}))
+        for name, parameter in named.items():
+            if isinstance(values[name], tuple):
+                values[name] = list(values[name]) or parameter.default
+        given = {name: value for name, value in values.items() if name in named or value is not None}
+        return function(**given, **({context: click.get_current_context()} if context else {}))
 
-    parameters = [_parameter(parameter, hints[name]) for name, parameter in given.items()]
-    made = _Command if kind is None else kind
+    made = Command if kind is None else kind
     return made(name=name, params=parameters, callback=call, help=inspect.getdoc(function) or "", **settings)
 
 
-class _Command(click.Command):
+class Command(click.Command):
+    """A command whose help lists arguments as well."""
+
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List arguments and options."""
         _list_parameters(self, ctx, formatter)
 
 
@@ -130,10 +183,11 @@ class _AnyPath(click.Path):
         return path_of(os.fsdecode(super().convert(value, param, ctx)))
 
 
-class _ExistingPath(_AnyPath):
+class ExistingPath(_AnyPath):
     """What a command reads: one that is not there is told before anything heavy is imported."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the path of a file that exists, or an address."""
         from mirrorskin.io.url import Url, path_of
 
         path = path_of(value)
@@ -154,7 +208,7 @@ class _NameOrFile(click.ParamType[str]):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if Path(value).suffix:
-            _ExistingPath().convert(value, param, ctx)
+            ExistingPath().convert(value, param, ctx)
         return value
 
     def shell_complete(
@@ -220,14 +274,17 @@ def _parameter(parameter: inspect.Parameter, hint: Any) -> click.Parameter:
     if not names:
         plain = parameter.name.replace("_", "-")
         names = (f"--{plain}/--no-{plain}" if kind is bool else f"--{plain}",)
-    return click.Option([*names, parameter.name], multiple=many, **{"show_default": True, **settings})
+    if "motions" in settings:
+        settings["help"] = for_motions(settings["motions"], settings["help"])
+        settings["help"] = settings["help"][:1].upper() + settings["help"][1:]
+    return MotionOption([*names, parameter.name], multiple=many, **settings)
 
 
 def _type(kind: Any, bounds: dict[str, Any], written: bool) -> Any:
     if bounds:
         return (click.IntRange if kind is int else click.FloatRange)(**bounds)
     if kind is Path:
-        return (_AnyPath if written else _ExistingPath)()
+        return (_AnyPath if written else ExistingPath)()
     return _Words(kind) if issubclass(kind, StrEnum) else kind
 
 

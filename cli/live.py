@@ -14,7 +14,6 @@ import click
 
 from mirrorskin.cli import options, scans
 from mirrorskin.cli.groups import Option
-from mirrorskin.cli.run import Settings, load_estimator
 
 if TYPE_CHECKING:
     from mirrorskin.cli.status import Newest
@@ -58,7 +57,9 @@ def command(
     ] = None,
     window: Annotated[
         int | None,
-        Option(min=3, max=64, help="Axial: frames of a turn to use.", show_default="all, up to 64"),
+        Option(
+            min=3, max=64, motions=("axial",), help="frames of a turn to use.", show_default="all, up to 64"
+        ),
     ] = None,
     latency: Annotated[
         str, Option(metavar="TIME", help="Age from which on a frame is skipped, but the newest.")
@@ -66,57 +67,42 @@ def command(
     threshold: Annotated[
         float | None,
         Option(
-            help="Vertical: share of the way from dark to bright that is light.", show_default=str(_THRESHOLD)
+            motions=("vertical",),
+            help="share of the way from dark to bright that is light.",
+            show_default=str(_THRESHOLD),
         ),
     ] = None,
     hold: Annotated[
         int | None,
-        Option(help="Vertical: light frames in a row that make an onset.", show_default=str(_HOLD)),
+        Option(
+            motions=("vertical",), help="light frames in a row that make an onset.", show_default=str(_HOLD)
+        ),
     ] = None,
     noise: Annotated[
         float | None,
         Option(metavar="COUNTS", help="Standard deviation of a sample; else told from the frames."),
     ] = None,
-    start: scans.Start = None,
-    stop: scans.Stop = None,
-    strokes: scans.Strokes = None,
-    stroke_depth: scans.StrokeDepth = None,
-    step: scans.Step = None,
-    speed: scans.Speed = None,
-    press: scans.Press = None,
-    distance: scans.Distance = None,
-    direction: scans.Direction = None,
-    angle: scans.Angle = None,
-    wait: scans.Wait = None,
-    tilt: scans.Tilt = None,
-    rock: scans.Rock = False,
-    phase: scans.Phase = None,
-    turns: scans.Turns = None,
-    phase_step: scans.PhaseStep = None,
-    rate: scans.Rate = None,
-    settle: scans.Settle = None,
-    frames: scans.StepFrames = None,
     contact: options.Contact = None,
     estimator: Annotated[
         str | None,
         Option(metavar="MODULE:CLASS", help="Your own class; see 'run --help'.", show_default="the motion's"),
     ] = None,
-    settings: Settings = None,
     calibration: options.Calibration = None,
     device: options.Device = None,
+    **given: Annotated[Any, scans.PLAN],
 ) -> None:
     """Reconstruct while the stage moves; Ctrl-C stops it, and what was found and recorded is kept."""
     from mirrorskin import io
     from mirrorskin.cli.quantity import duration
+    from mirrorskin.engine.running import load_operation
     from mirrorskin.hw.rig_file import load_rig
 
     rig = load_rig(rig_file)
-    plan = scans.make_plan(context.params, rig)  # from the options above
-    own = None if estimator is None else load_estimator(estimator, settings)
+    plan = scans.make_plan(context, given, rig)
+    own = None if estimator is None else load_operation(estimator)
     ours = [name for name in _OURS if context.params[name] is not None]
-    if (own and ours) or (settings and not own):
-        told = f"--{ours[0]} says nothing of" if own else "--set is for"
-        raise io.InputError(f"{told} an --estimator of your own: leave it out")
+    if own and ours:
+        raise io.InputError(f"--{ours[0]} does not apply to an --estimator of your own. Remove it")
     if overwrite and record is None:
         raise io.InputError("--overwrite is for --record: leave it out")
     inputs = rig_file, calibration, contact
@@ -125,8 +111,8 @@ def command(
     if output is not None:
         io.check_output(output, *inputs, record, or_zarr=True)
     known = scans.open_calibration(calibration, rig)
-    given = {**context.params, "latency": duration(latency, "--latency"), "own": own}
-    _Live(rig, plan, given, known).run()
+    values = {**context.params, "latency": duration(latency, "--latency"), "own": own}
+    _Live(rig, plan, values, known).run()
 
 
 class _Live:

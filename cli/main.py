@@ -42,7 +42,7 @@ PURPOSES = {
     "live": "Reconstruct while the stage moves.",
     "reconstruct": "Reconstruct heights from a press, normals and heights from a rotation, or slip.",
     "correlate": "Fit mean, cosine and sine of the phase to each pixel's brightness.",
-    "run": "Run an estimator of your own over a recording.",
+    "run": "Run an operation over a recording: built-in, or your own.",
     "fuse": "Make one surface of a press and a rotation.",
     "stitch": "Make one larger surface of several touches.",
     "batch": "Reconstruct many recordings.",

@@ -33,18 +33,25 @@ Device = Annotated[
     str | None, Option(metavar="NAME", help="Number or part of the name, as in 'mirrorskin devices'.")
 ]
 Motion = Annotated[MotionName | None, Option(help="How the body moved, if the file does not say.")]
-TravelStep = Annotated[str | None, Option(metavar="LENGTH", help="Travel from frame to frame: 0.1mm.")]
+_PRESS, _ROTATION = {"motions": ("vertical",)}, {"motions": ("axial",)}
+TravelStep = Annotated[
+    str | None, Option(metavar="LENGTH", help="travel from frame to frame: 0.1mm.", **_PRESS)
+]
 TravelStart = Annotated[
-    str | None, Option(metavar="LENGTH", help="Travel of the first frame; without it 0mm.")
+    str | None, Option(metavar="LENGTH", help="travel of the first frame; without it 0mm.", **_PRESS)
 ]
 Travel = Annotated[
     Path | None,
-    Option(metavar="FILE", help="Travel of all frames, mm, one number a frame: a text, CSV or NPY."),
+    Option(
+        metavar="FILE", help="travel of all frames, mm, one number a frame: a text, CSV or NPY.", **_PRESS
+    ),
 ]
-PhaseStep = Annotated[str | None, Option(metavar="ANGLE", help="Phase from frame to frame: 45deg.")]
+PhaseStep = Annotated[
+    str | None, Option(metavar="ANGLE", help="phase from frame to frame: 45deg.", **_ROTATION)
+]
 Phases = Annotated[
     Path | None,
-    Option(metavar="FILE", help="Phases of all frames, a text of angles: 178.1deg 220.8deg ..."),
+    Option(metavar="FILE", help="phases of all frames, a text of angles: 178.1deg 220.8deg ...", **_ROTATION),
 ]
 Tilt = Annotated[str | None, Option(metavar="ANGLE", help="Half-angle of the precession: 2.5deg.")]
 ZenithGain = Annotated[
@@ -64,6 +71,9 @@ Region = Annotated[
     Option(metavar="X,Y,WxH", help="Only so many pixels, from column X and row Y on: 100,50,640x480."),
 ]
 Frames = Annotated[str | None, Option(metavar="A:B", help="Only frames A to B - 1, of which the first is 0.")]
+LiveFrames = Annotated[
+    bool, Option("--live", help="Only the frames that a live run used, with the positions it had.")
+]
 ResultFile = Annotated[Path, Argument(metavar="RES.h5", help="Result to take.")]
 Turn = Annotated[
     int | None,
@@ -94,7 +104,8 @@ Contact = Annotated[
     Path | None,
     Option(
         metavar="RES.h5",
-        help="Slide, twist: a press's result, where the skin touches.",
+        help="a press's result, where the skin touches.",
         show_default="estimated, too wide",
+        motions=("horizontal", "twist"),
     ),
 ]

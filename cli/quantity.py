@@ -79,12 +79,20 @@ def _above_zero(value: float, text: str, option: str, kind: Kind) -> float:
     return value
 
 
-def share(text: str, option: str = "") -> float:
+def number(text: str, option: str = "") -> float:
     """Return a plain number, as in ``0.25``."""
     try:
         return float(text)
     except ValueError:
-        raise _error(text, option, "a share from 0 to 1 is needed", "0.25") from None
+        raise _error(text, option, "a number is needed", "0.25") from None
+
+
+def integer(text: str, option: str = "") -> int:
+    """Return a whole number, as in ``2``."""
+    try:
+        return int(text)
+    except ValueError:
+        raise _error(text, option, "a whole number is needed", "2") from None
 
 
 def duration(text: str, option: str = "") -> float:

@@ -1,4 +1,4 @@
-"""``mirrorskin run``: a user's own estimator."""
+"""``mirrorskin run``: one operation, built-in or a user's own."""
 
 from __future__ import annotations
 
@@ -6,20 +6,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from mirrorskin.cli import options
-from mirrorskin.cli.groups import Argument, Option
-
-Own = Annotated[
-    str,
-    Argument(metavar="MODULE:CLASS", help="Your class, in a module or file: mine:Sum, or mine.py:Sum."),
-]
-Settings = Annotated[
-    list[str] | None,
-    Option("--set", metavar="NAME=VALUE", help="A parameter of the class, more than once if you like."),
-]
+from mirrorskin.cli.declared import ClassCommand
+from mirrorskin.cli.groups import Argument, Option, make_command
 
 
 def command(
-    estimator: Own,
+    class_name: Annotated[
+        str, Argument(metavar="MODULE:CLASS", help="Class in a module or file: mine:Sum, or mine.py:Sum.")
+    ],
     recording: Annotated[Path, Argument(metavar="REC.h5", help="Frames in HDF5, Zarr, NPY or NPZ.")],
     output: Annotated[
         Path | None,
@@ -31,7 +25,6 @@ def command(
             show_default="REC-CLASS.h5",
         ),
     ] = None,
-    settings: Settings = None,
     dataset: options.Dataset = None,
     motion: options.Motion = None,
     travel_step: options.TravelStep = None,
@@ -42,25 +35,28 @@ def command(
     pixel_size: options.PixelSize = None,
     region: options.Region = None,
     frames: options.Frames = None,
-    live: Annotated[
-        bool, Option("--live", help="Only the frames that a live run used, with the positions it had.")
-    ] = False,
+    live: options.LiveFrames = False,
     memory: options.Memory = "256MB",
+    device: options.Device = None,
     as_json: options.Json = False,
+    **chosen: Any,
 ) -> None:
-    """Run an estimator of your own over a recording.
+    """Run an operation over a recording: built-in, or your own.
 
-    ESTIMATOR is a class with the methods of mirrorskin.engine.Estimator: it is called with a frame's (rows,
-    columns) and sample type, push(frames) gets the next frames (n, rows, columns), result() returns maps by
-    name, and reset() forgets the frames.
+    The class is built-in, such as mirrorskin.engine:Onset, or your own: one derived from
+    mirrorskin.engine.Operation. 'mirrorskin run MODULE:CLASS --help' shows its options.
     """
-    from mirrorskin import engine, io
+    from mirrorskin import io
     from mirrorskin.cli.output import progress, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.cli.stack import stack_options
+    from mirrorskin.engine.running import load_operation, run_class
+    from mirrorskin.kernels.device import open_device
 
-    make = load_estimator(estimator, settings)
-    known = stack_options(
+    kind = load_operation(class_name)
+    if device is not None:
+        open_device(device)  # raises if there is none, even if the operation does not use it
+    stack = stack_options(
         motion=motion,
         travel_step=travel_step,
         travel_start=travel_start,
@@ -72,31 +68,13 @@ def command(
         frames=frames,
     )
     limit = bytes_of(memory, "--memory")
-    with io.open_recording(recording, dataset=dataset, memory_limit=limit, live=live, **known) as source:
-        target = output or recording.with_name(f"{recording.stem}-{estimator.rpartition(':')[2]}.h5")
-        io.check_output(target, recording, phases, travel, or_zarr=True)
+    with io.open_recording(recording, dataset=dataset, memory_limit=limit, live=live, **stack) as source:
+        target = output or recording.with_name(f"{recording.stem}-{kind.__name__}.h5")
+        files = [value for value in chosen.values() if isinstance(value, Path)]
+        io.check_output(target, recording, phases, travel, *files, or_zarr=True)
         with progress("running", source.shape[0]) as show:
-            result = engine.run(source, make, memory_limit=limit, progress=show)
-    device = result.process.get("device")
-    save_and_report(result, target, None if device is None else str(device), as_json)
+            result = run_class(kind, source, show, memory_limit=limit, device=device, **chosen)
+    save_and_report(result, target, device, as_json)
 
 
-def load_estimator(name: str, settings: list[str] | None = None) -> Any:
-    """Return what makes the estimator that is named MODULE:CLASS or FILE.py:CLASS, with parameters set."""
-    import ast
-    import functools
-
-    from mirrorskin.io import InputError
-    from mirrorskin.io.own_class import load_class
-
-    made = load_class(name)
-    values: dict[str, Any] = {}
-    for setting in settings or ():
-        parameter, equals, text = setting.partition("=")
-        if not equals or not parameter.isidentifier():
-            raise InputError(f"--set {setting}: NAME=VALUE is needed, such as threshold=0.5")
-        try:
-            values[parameter] = ast.literal_eval(text)
-        except (ValueError, SyntaxError):
-            values[parameter] = text
-    return functools.partial(made, **values) if values else made
+app = make_command("run", command, ClassCommand)

@@ -1,4 +1,4 @@
-"""What a rig is to do: the options that capture and live share."""
+"""The plan of a rig's motion: the options that capture and live share."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
-from mirrorskin.cli.groups import Argument, Option
+from mirrorskin.cli.declared import Terms, term
+from mirrorskin.cli.groups import Argument, Option, refuse_foreign
 
 if TYPE_CHECKING:
     from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, Plan, RockPlan, TwistPlan, VerticalPlan
@@ -20,14 +21,8 @@ if TYPE_CHECKING:
     from mirrorskin.hw.rig_file import RigSettings
     from mirrorskin.io import Calibration, StreamRecorder
 
-SETTLE = "100ms"
-"""From rest to the first exposure of a step."""
-
-_START = "0mm"
-_TILT = "2.5deg"
-_TURNS = 1.0
-_DIRECTION = _PHASE = "0deg"
-_WAIT = "500ms"
+SETTLE = 0.1
+"""Seconds from rest to the first exposure, of a motion with stops."""
 
 
 class ScanName(StrEnum):
@@ -39,115 +34,102 @@ class ScanName(StrEnum):
     twist = "twist"
 
 
-def _option(metavar: str, text: str, default: str | float | None = None) -> Any:
-    return Option(metavar=metavar, help=text, show_default=False if default is None else str(default))
-
-
 Motion = Annotated[ScanName, Argument(help="How the body moves.")]
 RigFile = Annotated[
     Path, Option("--rig", metavar="RIG.toml", help="Rig file; 'mirrorskin rig new' writes a template.")
 ]
-Start = Annotated[str | None, _option("LENGTH", "Vertical: first travel.", _START)]
-Stop = Annotated[str | None, _option("LENGTH", "Vertical: last travel, deeper than the first.")]
-Strokes = Annotated[
-    int | None, Option(min=2, metavar="N", help="Vertical: go down and up, so many ways together.")
-]
-StrokeDepth = Annotated[
-    str | None, _option("LENGTH", "Vertical, with --strokes: their depth, in place of --start.")
-]
-Step = Annotated[
-    str | None, _option("LENGTH", "But axial, in steps: from place to place; of a twist an angle, 1deg.")
-]
-Speed = Annotated[
-    str | None, _option("LENGTH/s", "But axial, without a halt: 0.5mm/s; of a twist an angle, 2deg/s.")
-]
-Press = Annotated[str | None, _option("LENGTH", "But vertical: how far the body is lowered.")]
-Distance = Annotated[str | None, _option("LENGTH", "Horizontal: how far the body slides.")]
-Direction = Annotated[str | None, _option("ANGLE", "Horizontal: from x towards y, where to.", _DIRECTION)]
-Angle = Annotated[
-    str | None, _option("ANGLE", "Twist: how far the body turns, counter-clockwise, or back if negative.")
-]
-Wait = Annotated[
-    str | None, _option("TIME", "Horizontal and twist: at rest, pressed, before the body moves.", _WAIT)
-]
-Tilt = Annotated[str | None, _option("ANGLE", "Axial: half-angle of the precession.", _TILT)]
-Rock = Annotated[
-    bool, Option("--rock", help="Axial: from one side to the other, with --step or --speed as of a twist.")
-]
-Phase = Annotated[str | None, _option("ANGLE", "Axial, with --rock: where it leans to.", _PHASE)]
-Turns = Annotated[float | None, _option("N", "Axial: how often it goes round.", 1)]
-PhaseStep = Annotated[str | None, _option("ANGLE", "Axial, in steps: from place to place, 45deg.")]
-Rate = Annotated[float | None, _option("HZ", "Axial, without a halt: turns a second.")]
-Settle = Annotated[str | None, _option("TIME", "In steps: from rest to the first exposure.", SETTLE)]
-StepFrames = Annotated[int | None, Option("--frames", min=1, help="In steps: at each place.")]
+_PRESS, _TURN, _ROCK = ("vertical",), ("axial",), ("rock",)
+_SIDEWAYS = ("horizontal", "twist")
+_ALONG = (*_PRESS, *_SIDEWAYS, *_ROCK)
+
+PLAN = Terms(
+    [
+        term("start", "first travel", "mm", "0mm", motions=_PRESS),
+        term("stop", "last travel, deeper than the first", "mm", motions=_PRESS),
+        term("strokes", "this number of strokes down and up", kind="integer", least=2, motions=_PRESS),
+        term("stroke_depth", "depth of the strokes, in place of --start", "mm", motions=_PRESS),
+        term(
+            "step",
+            "distance between the places where it stops; of a twist or rocking an angle, 1deg",
+            "LENGTH",
+            kind="text",
+            motions=_ALONG,
+        ),
+        term(
+            "speed",
+            "speed of a motion without stops, 0.5mm/s; of a twist or rocking an angle, 2deg/s",
+            "LENGTH/s",
+            kind="text",
+            motions=_ALONG,
+        ),
+        term("press", "travel at which the body moves", "mm", motions=(*_TURN, *_ROCK, *_SIDEWAYS)),
+        term("distance", "how far the body slides", "mm", motions=("horizontal",)),
+        term("direction", "direction of the slide, from x towards y", "rad", "0deg", motions=("horizontal",)),
+        term("angle", "counter-clockwise angle of the twist", "rad", motions=("twist",)),
+        term("wait", "time at rest, pressed, before the body moves", "s", "500ms", motions=_SIDEWAYS),
+        term("tilt", "half-angle of the precession", "rad", "2.5deg", motions=(*_TURN, *_ROCK)),
+        term(
+            "rock",
+            "lean from one side to the other, with --step or --speed as of a twist",
+            kind="switch",
+            motions=(*_TURN, *_ROCK),
+        ),
+        term("phase", "with --rock: direction of leaning", "rad", "0deg", motions=_ROCK),
+        term("turns", "number of turns", default="1", motions=_TURN),
+        term("phase_step", "angle between the places where it stops, 45deg", "rad", motions=_TURN),
+        term("rate", "turns a second, of a motion without stops", "Hz", motions=_TURN),
+        term("settle", "with stops: time from rest to the first exposure", "s", f"{SETTLE * 1000:g}ms"),
+        term("frames", "with stops: frames at each place", kind="integer", least=1),
+    ]
+)
+"""The options of a plan."""
 
 
-# The motions of an option that not all have; threshold, hold and window are live's.
-_OF: Mapping[str, str] = {
-    **dict.fromkeys(("start", "stop", "strokes", "stroke_depth", "threshold", "hold"), "vertical"),
-    **dict.fromkeys(("step", "speed"), "vertical horizontal twist rock"),
-    **dict.fromkeys(("turns", "phase_step", "rate", "window"), "axial"),
-    "tilt": "axial rock",
-    "phase": "rock",
-    "press": "axial rock horizontal twist",
-    **dict.fromkeys(("distance", "direction"), "horizontal"),
-    "angle": "twist",
-    **dict.fromkeys(("wait", "contact"), "horizontal twist"),
-}
-
-
-def make_plan(words: Mapping[str, Any], settings: RigSettings) -> Plan:
-    """Turn a command's options into a plan that the rig can do."""
+def make_plan(context: click.Context, given: Mapping[str, Any], settings: RigSettings) -> Plan:
+    """Return the plan that a command's options describe, which the rig can follow."""
     from mirrorskin.hw.rig.plans import check_plan
-    from mirrorskin.io import InputError
 
-    motion, rock = str(words["motion"]), words.get("rock")
-    if rock and motion != "axial":
-        raise InputError(f"--rock says nothing of a motion that is {motion}: leave it out, or choose axial")
-    kind = "rock" if rock else motion
-    foreign = [name for name, of in _OF.items() if words.get(name) is not None and kind not in of.split()]
-    if foreign:
-        raise InputError(
-            f"--{foreign[0].replace('_', '-')} says nothing of a motion that is {kind}:"
-            " leave it out, or choose the other"
-        )
-    makers = {
+    motion = str(context.params["motion"])
+    kind = "rock" if given.get("rock") and motion == "axial" else motion
+    refuse_foreign(context, kind)
+    makers: dict[str, Callable[..., Plan]] = {
         "vertical": _vertical,
         "axial": _axial,
         "rock": _rock,
         "horizontal": _horizontal,
         "twist": _twist,
     }
-    plan: Plan = makers[kind](words)
-    check_steps(plan, words["settle"], words["frames"])
+    plan = makers[kind](PLAN.filled(given), given)
+    check_steps(plan, given)
     check_plan(plan, settings.stage, settings.name)
     return plan
 
 
 def make_scan(
-    rig: Rig, plan: Plan, settle: str | None, frames: int | None, turn_frames: int | None = None
+    rig: Rig,
+    plan: Plan,
+    settle: float | None = None,
+    frames: int | None = None,
+    turn_frames: int | None = None,
 ) -> StepScan | SweepScan:
     """Join a rig and a plan to a source of frames; see ``StepScan`` and ``SweepScan``."""
-    from mirrorskin.cli.quantity import duration
     from mirrorskin.hw.rig.scan import StepScan
     from mirrorskin.hw.rig.sweep import SweepScan
 
-    check_steps(plan, settle, frames)
     if plan.in_steps:
-        return StepScan(rig, plan, duration(settle or SETTLE, "--settle"), frames or 1)
+        return StepScan(rig, plan, SETTLE if settle is None else settle, frames or 1)
     return SweepScan(rig, plan, turn_frames)
 
 
-def check_steps(plan: Plan, settle: str | None, frames: int | None) -> None:
-    """Refuse options of steps where the body does not halt; to be asked before a rig is opened."""
-    from mirrorskin.cli.quantity import duration
+def check_steps(plan: Plan, given: Mapping[str, Any]) -> None:
+    """Refuse options of motions with stops for a motion without."""
     from mirrorskin.io import InputError
 
-    if settle is not None and duration(settle, "--settle") < 0:
-        raise InputError(f"--settle {settle}: a time is 0 or more")
-    for name, value in (("--settle", settle), ("--frames", frames)):
-        if value is not None and not plan.in_steps:
-            raise InputError(f"{name} says nothing of a motion without a halt: leave it out, or give a step")
+    if given.get("settle", 0) < 0:
+        raise InputError(f"--settle {given['settle']:g}s: a time of at least 0 is needed")
+    for name in ("settle", "frames"):
+        if name in given and not plan.in_steps:
+            raise InputError(f"--{name} needs a motion with stops. Remove it, or give a step")
 
 
 def open_calibration(path: Path | None, settings: RigSettings) -> Calibration | None:
@@ -191,90 +173,70 @@ def _remains(recorder: StreamRecorder) -> str:
     return f"{recorder.file} was cut short and holds {recorder.written} frames{older}"
 
 
-def _vertical(words: Mapping[str, Any]) -> VerticalPlan:
-    from mirrorskin.cli.quantity import length
+def _vertical(values: Mapping[str, Any], given: Mapping[str, Any]) -> VerticalPlan:
     from mirrorskin.hw.rig.plans import VerticalPlan
     from mirrorskin.io import InputError
 
-    stop = length(_needed(words["stop"], "--stop", "2mm"), "--stop")
-    strokes, depth = words["strokes"], words["stroke_depth"]
-    if depth is None:
-        start = length(words["start"] or _START, "--start")
-    elif strokes is None or words["start"] is not None:
-        raise InputError("--stroke-depth needs --strokes, and takes the place of --start")
-    else:
-        start = stop - length(depth, "--stroke-depth")
-    return VerticalPlan(start, stop, strokes=strokes or 1, **_pace(words, length, "0.5mm/s"))
+    start, stop = values["start"], _needed(given, "stop", "2mm")
+    if "stroke_depth" in given:
+        if "strokes" not in given or "start" in given:
+            raise InputError("--stroke-depth needs --strokes, and takes the place of --start")
+        start = stop - given["stroke_depth"]
+    return VerticalPlan(start, stop, strokes=given.get("strokes", 1), **_pace(given, "mm", "0.5mm/s"))
 
 
-def _rock(words: Mapping[str, Any]) -> RockPlan:
-    from mirrorskin.cli.quantity import angle, length
+def _rock(values: Mapping[str, Any], given: Mapping[str, Any]) -> RockPlan:
     from mirrorskin.hw.rig.plans import RockPlan
 
-    return RockPlan(
-        length(_needed(words["press"], "--press", "1mm"), "--press"),
-        angle(words["tilt"] or _TILT, "--tilt"),
-        angle(words["phase"] or _PHASE, "--phase"),
-        **_pace(words, angle, "2deg/s"),
-    )
+    pace = _pace(given, "rad", "2deg/s")
+    return RockPlan(_needed(given, "press", "1mm"), values["tilt"], values["phase"], **pace)
 
 
-def _horizontal(words: Mapping[str, Any]) -> HorizontalPlan:
-    from mirrorskin.cli.quantity import angle, duration, length
+def _horizontal(values: Mapping[str, Any], given: Mapping[str, Any]) -> HorizontalPlan:
     from mirrorskin.hw.rig.plans import HorizontalPlan
 
-    return HorizontalPlan(
-        length(_needed(words["press"], "--press", "1mm"), "--press"),
-        length(_needed(words["distance"], "--distance", "0.5mm"), "--distance"),
-        angle(words["direction"] or _DIRECTION, "--direction"),
-        wait=duration(words["wait"] or _WAIT, "--wait"),
-        **_pace(words, length, "0.5mm/s"),
-    )
+    press, distance = _needed(given, "press", "1mm"), _needed(given, "distance", "0.5mm")
+    pace = _pace(given, "mm", "0.5mm/s")
+    return HorizontalPlan(press, distance, values["direction"], wait=values["wait"], **pace)
 
 
-def _twist(words: Mapping[str, Any]) -> TwistPlan:
-    from mirrorskin.cli.quantity import angle, duration, length
+def _twist(values: Mapping[str, Any], given: Mapping[str, Any]) -> TwistPlan:
     from mirrorskin.hw.rig.plans import TwistPlan
 
-    return TwistPlan(
-        length(_needed(words["press"], "--press", "1mm"), "--press"),
-        angle(_needed(words["angle"], "--angle", "10deg"), "--angle"),
-        wait=duration(words["wait"] or _WAIT, "--wait"),
-        **_pace(words, angle, "2deg/s"),
-    )
+    press, angle = _needed(given, "press", "1mm"), _needed(given, "angle", "10deg")
+    return TwistPlan(press, angle, wait=values["wait"], **_pace(given, "rad", "2deg/s"))
 
 
-def _axial(words: Mapping[str, Any]) -> AxialPlan:
-    from mirrorskin.cli.quantity import angle, length
+def _axial(values: Mapping[str, Any], given: Mapping[str, Any]) -> AxialPlan:
     from mirrorskin.hw.rig.plans import AxialPlan
 
-    step, turns = words["phase_step"], words["turns"]
-    return AxialPlan(
-        length(_needed(words["press"], "--press", "1mm"), "--press"),
-        angle(words["tilt"] or _TILT, "--tilt"),
-        _TURNS if turns is None else turns,
-        None if step is None else angle(step, "--phase-step"),
-        words["rate"],
-    )
+    press = _needed(given, "press", "1mm")
+    return AxialPlan(press, values["tilt"], values["turns"], values["phase_step"], values["rate"])
 
 
-def _pace(words: Mapping[str, Any], quantity: Callable[[str, str], float], example: str) -> dict[str, Any]:
+def _pace(given: Mapping[str, Any], unit: str, example: str) -> dict[str, Any]:
     """Read the step and the speed, as in ``0.5mm/s``, of which one is given, in mm or rad."""
+    from mirrorskin.cli import quantity
     from mirrorskin.io import InputError
 
-    step, speed = words["step"], words["speed"]
-    found = {"step": None if step is None else quantity(step, "--step"), "speed": None}
-    if speed is not None:
-        distance, slash, second = speed.strip().rpartition("/")
+    read = quantity.length if unit == "mm" else quantity.angle
+    found: dict[str, Any] = {
+        "step": read(given["step"], "--step") if "step" in given else None,
+        "speed": None,
+    }
+    if "speed" in given:
+        distance, slash, second = given["speed"].strip().rpartition("/")
         if not slash or second.strip() != "s":
-            raise InputError(f"--speed {speed}: so much each second is needed; write e.g. {example}")
-        found["speed"] = quantity(distance, "--speed")
+            raise InputError(
+                f"--speed {given['speed']}: a distance or angle per second is needed; write e.g. {example}"
+            )
+        found["speed"] = read(distance, "--speed")
     return found
 
 
-def _needed(value: str | None, option: str, example: str) -> str:
+def _needed(given: Mapping[str, Any], name: str, example: str) -> float:
     from mirrorskin.io import InputError
 
-    if value is None:
-        raise InputError(f"{option} is missing: say how far the body goes, as in {option} {example}")
-    return value
+    if name not in given:
+        raise InputError(f"--{name} is missing: write e.g. --{name} {example}")
+    return float(given[name])

@@ -1,38 +1,32 @@
-"""The settings of a batch, a file of TOML: what is given of stacks, and how they are reconstructed."""
+"""The settings of a batch, a file of TOML: what the stacks lack, and options of what is computed."""
 
 from __future__ import annotations
 
+import tomllib
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from msgspec import Meta, Struct, field, structs
+from msgspec import Meta, Struct, defstruct, field, structs
 
+from mirrorskin.cli.declared import term_of
 from mirrorskin.cli.options import MotionName
-from mirrorskin.cli.quantity import angle, per_angle, pressure
 from mirrorskin.cli.stack import stack_options
-from mirrorskin.engine.batch.jobs import Plan
-from mirrorskin.engine.press.onset import Event
-from mirrorskin.engine.press.press import PressMethod
-from mirrorskin.engine.rotation.normals_kernel import NormalMethod
+from mirrorskin.engine.batch.jobs import TABLES, Plan
+from mirrorskin.engine.options import Configured, Option
+from mirrorskin.engine.reconstruction import method_for
 from mirrorskin.engine.rotation.tilt import check_tilt
+from mirrorskin.engine.running import load_operation
 from mirrorskin.io import InputError, Motion
+from mirrorskin.io.os_errors import MAX_TEXT_BYTES, read_regular
 from mirrorskin.io.settings_file import load_toml
+
+_REMEDY = "write the tables [stack], [press], [rotation], [slip], or [stack] and [operation] in TOML"
 
 
 def _text(example: str) -> Meta:
     return Meta(min_length=1, description="a text in quotes", examples=[example])
-
-
-_Counts = Annotated[float, Meta(description="a number of counts", examples=[12.5])]
-_Share = Annotated[float, Meta(ge=0, le=1, description="a share from 0 (dark) to 1 (bright)", examples=[0.5])]
-_Frames = Annotated[int, Meta(ge=1, lt=2**31, description="a number of frames from 1 on", examples=[2])]
-_Pixels = Annotated[int, Meta(ge=1, lt=2**16, description="a number of pixels from 1 on", examples=[8])]
-_Sigma = Annotated[
-    float, Meta(ge=0, description="a standard deviation in counts, not below 0,", examples=[1.5])
-]
-_SigmaAboveZero = Annotated[
-    float, Meta(gt=0, description="a standard deviation in counts, above 0,", examples=[1.5])
-]
 
 
 class _Stack(Struct, frozen=True, rename="kebab"):
@@ -48,70 +42,97 @@ class _Stack(Struct, frozen=True, rename="kebab"):
     frames: Annotated[str, _text("10:200")] | None = None
 
 
-class _Press(Struct, frozen=True, rename="kebab"):
-    event: Event | None = None
-    method: PressMethod | None = None
-    threshold: _Share | list[_Share] | None = None
-    inclination: list[Annotated[str, _text("12deg")]] | None = None
-    hold: _Frames | None = None
-    subframe: bool | None = None
-    dark: _Counts | None = None
-    bright: _Counts | None = None
-    noise: _Sigma | None = None
-    fill: bool | None = None
-    modulus: Annotated[str, _text("0.1MPa")] | None = None
-
-    def __post_init__(self) -> None:
-        if self.method == "change-point" and self.subframe is False:
-            raise ValueError("subframe is false: a change-point lies between frames; leave it out")
-        if self.method == "change-point" and self.threshold in (0.0, 1.0):
-            raise ValueError("threshold: a change-point needs a share between 0 and 1; write e.g. 0.5")
-
-
-class _Rotation(Struct, frozen=True, rename="kebab"):
-    method: NormalMethod | None = None
-    tilt: Annotated[str, _text("2.5deg")] | None = None
-    zenith_gain: Annotated[str, _text("5.7/deg")] | None = None
-    zenith_offset: _Counts | None = None
-    noise: _SigmaAboveZero | None = None
-    per_turn: bool | None = None
-    robust: bool | None = None
-
-
-class _Slip(Struct, frozen=True, rename="kebab"):
-    per_frame: bool | None = None
-    window: _Pixels | None = None
-    step: _Pixels | None = None
-    noise: _SigmaAboveZero | None = None
-    modulus: Annotated[str, _text("0.1MPa")] | None = None
-
-
-class _Settings(Struct, frozen=True):
-    stack: _Stack = field(default_factory=_Stack)
-    press: _Press = field(default_factory=_Press)
-    rotation: _Rotation = field(default_factory=_Rotation)
-    slip: _Slip = field(default_factory=_Slip)
-
-
-_REMEDY = f"write the tables {', '.join(f'[{name}]' for name in _Settings.__struct_fields__)} in TOML"
-
-
 def read_settings(path: Path | None, memory_limit: int) -> Plan:
     """Read what a batch does with every recording."""
-    settings = _Settings() if path is None else load_toml(path, _Settings, _REMEDY)
-    where = f"{path}: "
-    opening = _opening(_given(settings.stack), f"{where}stack.")
-    return Plan(
-        opening,
-        _press(_given(settings.press), f"{where}press."),
-        _rotation(_given(settings.rotation), f"{where}rotation."),
-        memory_limit,
-        _slip(_given(settings.slip), f"{where}slip."),
-    )
+    if path is None:
+        return Plan(memory_limit=memory_limit)
+    kinds: dict[str, type[Configured]] = {table: method_for(motion) for motion, table in TABLES.items()}
+    if operation := _operation_of(path):
+        try:
+            kinds = {"operation": load_operation(operation)}
+        except InputError as error:
+            raise InputError(f"{path}: operation.class: {error}") from error
+    tables: dict[str, type[Struct]] = {
+        "stack": _Stack,
+        **{name: _table(name, kind) for name, kind in kinds.items()},
+    }
+    fields: Any = [(name, model, field(default_factory=model)) for name, model in tables.items()]
+    settings = load_toml(path, defstruct("Settings", fields, frozen=True), _REMEDY)
+    given = {name: _given(getattr(settings, name)) for name in tables}
+    opening = _opening(given["stack"], f"{path}: stack.")
+    chosen: dict[str, Any] = {
+        name: _options(given[name], kind, f"{path}: {name}.") for name, kind in kinds.items()
+    }
+    if operation:
+        chosen = {"operation": operation, "operation_options": chosen["operation"]}
+    return Plan(opening, memory_limit=memory_limit, **chosen)
+
+
+def _operation_of(path: Path) -> str:
+    """Return the class of the table [operation], with the whole path of a file; "" without that table.
+
+    `load_toml` reports what else is wrong with the file.
+    """
+    with suppress(ValueError, RecursionError):
+        table = tomllib.loads(read_regular(path, _REMEDY, MAX_TEXT_BYTES).decode()).get("operation")
+        if isinstance(table, dict):
+            place, colon, name = str(table.get("class", "")).rpartition(":")
+            if not colon:
+                needed = 'MODULE:CLASS or FILE.py:CLASS is needed; write e.g. class = "mine.py:Wear"'
+                raise InputError(f"{path}: operation.class: {needed}")
+            return f"{Path(place).resolve() if place.endswith('.py') else place}:{name}"
+    return ""
+
+
+def _table(name: str, kind: type[Configured]) -> type[Struct]:
+    """Return the model of a table with the options of a class."""
+    fields = [(one.name, _type(one) | None, None) for one in kind.options.values() if not one.python_only]
+    if name == "operation":
+        fields = [("class_", Annotated[str, _text("mine.py:Wear")], field(name="class")), *fields]
+    return defstruct(name, fields, frozen=True, rename="kebab", kw_only=True)
+
+
+def _type(one: Option) -> Any:
+    """Return the type of an option's value in TOML."""
+    term = term_of(one)
+    if one.kind == "flag":
+        return bool
+    if one.kind == "choice":
+        return Literal[one.choices]
+    if one.kind == "file" or one.words or term.example:
+        kind: Any = Annotated[str, _text(one.file or term.example)]
+    else:
+        number = int if one.kind == "integer" else float
+        bounds = zip(("ge", "le", "gt"), (*one.within, one.above), strict=True)
+        limits: dict[str, Any] = {name: bound for name, bound in bounds if bound is not None}
+        kind = Annotated[number, Meta(description=one.needed, examples=[number(one.example or 1)], **limits)]
+    return list[kind] if one.kind == "numbers" else kind
 
 
 def _given(table: Struct) -> dict[str, Any]:
     return {name: value for name, value in structs.asdict(table).items() if value is not None}
+
+
+def _options(values: Mapping[str, Any], kind: type[Configured], where: str) -> dict[str, Any]:
+    """Return options in their units, checked."""
+    found = {}
+    for name, value in values.items():
+        if name == "class_":
+            continue
+        one, term = kind.options[name], term_of(kind.options[name])
+        place = f"{where}{name.replace('_', '-')}"
+        if one.kind == "file":
+            found[name] = Path(value)
+            continue
+        if isinstance(value, list):
+            value = [term.read_one(part, place) if isinstance(part, str) else part for part in value]
+        elif isinstance(value, str):
+            value = term.read_one(value, place)
+        try:
+            found[name] = one.check(value)
+        except InputError as error:
+            raise InputError(f"{where}{error}") from error
+    return found
 
 
 def _opening(values: dict[str, Any], where: str) -> dict[str, Any]:
@@ -123,42 +144,10 @@ def _opening(values: dict[str, Any], where: str) -> dict[str, Any]:
         values["travel"] = Path(values["travel"])
     options = stack_options(**values, where=where)
     if "tilt" in options:
-        _check_tilt(options["tilt"], f"{where}tilt")
+        try:
+            check_tilt(options["tilt"])
+        except InputError as error:
+            raise InputError(f"{where}tilt: {error}") from error
     if min(options.get("pixel_size", (1.0,))) <= 0:
         raise InputError(f'{where}pixel-size: a length above 0 is needed; write e.g. "0.03mm"')
     return {**dataset, **options}
-
-
-def _slip(values: dict[str, Any], where: str) -> dict[str, Any]:
-    """Convert [slip] to keywords of ``reconstruct``."""
-    if "modulus" in values:
-        values["modulus"] = pressure(values["modulus"], f"{where}modulus")
-    return values
-
-
-def _press(values: dict[str, Any], where: str) -> dict[str, Any]:
-    """Convert [press] to keywords of ``reconstruct``."""
-    if "inclination" in values:
-        values["inclinations"] = [angle(text, f"{where}inclination") for text in values.pop("inclination")]
-    return _slip(values, where)
-
-
-def _rotation(values: dict[str, Any], where: str) -> dict[str, Any]:
-    """Convert [rotation] to keywords of ``reconstruct``."""
-    if values.get("tilt", "estimate") != "estimate":
-        values["tilt"] = _check_tilt(angle(values["tilt"], f"{where}tilt"), f"{where}tilt")
-    if "zenith_gain" in values:
-        text = values.pop("zenith_gain")
-        values["gain"] = per_angle(text, f"{where}zenith-gain")
-        if values["gain"] == 0:
-            raise InputError(f'{where}zenith-gain {text}: other than 0 is needed; write e.g. "5.7/deg"')
-    if "zenith_offset" in values:
-        values["offset"] = values.pop("zenith_offset")
-    return values
-
-
-def _check_tilt(radians: float, where: str) -> float:
-    try:
-        return check_tilt(radians)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error

@@ -11,23 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 
 from mirrorskin.cli import options, sensor
-from mirrorskin.cli.groups import Argument, Option
+from mirrorskin.cli.declared import Terms, term
+from mirrorskin.cli.groups import Argument, Option, refuse_foreign
 
 if TYPE_CHECKING:
     from mirrorskin.hw.twin import Movement
 
-# The options that each motion has, and what they are if they are not given.
-DEFAULTS: dict[options.MotionName, dict[str, str]] = {
-    options.MotionName.vertical: {"travel-step": "0.1mm", "travel-start": "0.1mm", "compliance": "0mm/N"},
-    options.MotionName.axial: {
-        "press": "1mm",
-        "tilt": "2.5deg",
-        "phase-step": "45deg",
-        "pivot": "0mm,0mm,0mm",
-    },
-    options.MotionName.horizontal: {"press": "1mm", "displacement-step": "0.01mm,0mm"},
-    options.MotionName.twist: {"press": "1mm", "twist-step": "0.2deg"},
-}
 FRAMES_MAX = 10**7
 _FRAMES = 30
 
@@ -47,13 +36,50 @@ class ReferenceName(StrEnum):
     exact = "exact"
 
 
-def _of(motion: options.MotionName, name: str, metavar: str, text: str) -> Any:
-    """Make an option that only one motion, or all but the vertical one, have."""
-    return Option(metavar=metavar, help=text, show_default=DEFAULTS[motion][name])
-
-
-_VERTICAL, _AXIAL = options.MotionName.vertical, options.MotionName.axial
-_HORIZONTAL, _TWIST = options.MotionName.horizontal, options.MotionName.twist
+_PRESS, _TURN, _SIDEWAYS = ("vertical",), ("axial",), ("horizontal", "twist")
+MOVEMENT = Terms(
+    [
+        term("travel_step", "from frame to frame; below zero it is lifted", "mm", "0.1mm", motions=_PRESS),
+        term("travel_start", "travel of the first frame", "mm", "0.1mm", motions=_PRESS),
+        term("release", "then lift it by the same steps, in frames - 1 more", kind="switch", motions=_PRESS),
+        term(
+            "strokes",
+            "N strokes down and up like a cosine, as deep as those steps",
+            kind="integer",
+            least=2,
+            motions=_PRESS,
+        ),
+        term("compliance", "elastic: how far the stage gives way", "mm/N", "0mm/N", motions=_PRESS),
+        term("press", "travel at which the body moves", "mm", "1mm", motions=(*_TURN, *_SIDEWAYS)),
+        term("tilt", "half-angle of the precession", "rad", "2.5deg", motions=_TURN),
+        term("phase_step", "from frame to frame", "rad", "45deg", motions=_TURN),
+        term(
+            "pivot",
+            "centre of the rotation, from the sheet's centre",
+            "X,Y,Z",
+            "0mm,0mm,0mm",
+            kind="text",
+            motions=_TURN,
+        ),
+        term(
+            "rock",
+            "rock towards this phase, up to --tilt, as a sine of the phases of --phase-step",
+            "rad",
+            motions=_TURN,
+        ),
+        term("spiral", "tilt and press grow from nothing, frame by frame", kind="switch", motions=_TURN),
+        term(
+            "displacement_step",
+            "from frame to frame",
+            "X,Y",
+            "0.01mm,0mm",
+            kind="text",
+            motions=("horizontal",),
+        ),
+        term("twist_step", "from frame to frame", "rad", "0.2deg", motions=("twist",)),
+    ]
+)
+"""The options of the body's movement."""
 
 
 def command(
@@ -78,57 +104,6 @@ def command(
     frames: Annotated[
         int | None,
         Option(min=1, max=FRAMES_MAX, help="Frames to take.", show_default="30; of a rotation one turn"),
-    ] = None,
-    travel_step: Annotated[
-        str | None,
-        _of(_VERTICAL, "travel-step", "LENGTH", "Vertical: from frame to frame; below zero it is lifted."),
-    ] = None,
-    travel_start: Annotated[
-        str | None, _of(_VERTICAL, "travel-start", "LENGTH", "Vertical: travel of the first frame.")
-    ] = None,
-    release: Annotated[
-        bool, Option("--release", help="Vertical: then lift it by the same steps, frames - 1 more.")
-    ] = False,
-    strokes: Annotated[
-        int | None,
-        Option(
-            min=2, metavar="N", help="Vertical: N strokes down and up like a cosine, as deep as those steps."
-        ),
-    ] = None,
-    compliance: Annotated[
-        str | None,
-        _of(
-            _VERTICAL,
-            "compliance",
-            "LENGTH/N",
-            "Vertical, elastic: how far the stage gives way.",
-        ),
-    ] = None,
-    press: Annotated[
-        str | None, _of(_AXIAL, "press", "LENGTH", "All but vertical: how far the body is lowered.")
-    ] = None,
-    tilt: Annotated[str | None, _of(_AXIAL, "tilt", "ANGLE", "Axial: half-angle of the precession.")] = None,
-    phase_step: Annotated[
-        str | None, _of(_AXIAL, "phase-step", "ANGLE", "Axial: from frame to frame.")
-    ] = None,
-    pivot: Annotated[
-        str | None, _of(_AXIAL, "pivot", "X,Y,Z", "Axial: what it turns about, from the sheet's centre.")
-    ] = None,
-    rock: Annotated[
-        str | None,
-        Option(
-            metavar="ANGLE",
-            help="Axial: rock towards this phase, --tilt far, as a sine of the phases of --phase-step.",
-        ),
-    ] = None,
-    spiral: Annotated[
-        bool, Option("--spiral", help="Axial: tilt and press grow from nothing, frame by frame.")
-    ] = False,
-    displacement_step: Annotated[
-        str | None, _of(_HORIZONTAL, "displacement-step", "X,Y", "Horizontal: from frame to frame.")
-    ] = None,
-    twist_step: Annotated[
-        str | None, _of(_TWIST, "twist-step", "ANGLE", "Twist: from frame to frame.")
     ] = None,
     contact: sensor.Contact = sensor.ContactName.conform,
     optics: sensor.Optics = sensor.OpticsName.ideal,
@@ -174,6 +149,7 @@ def command(
     compression: options.Compression = options.CompressionName.raw,
     overwrite: options.Overwrite = False,
     device: options.Device = None,
+    **given: Annotated[Any, MOVEMENT],
 ) -> None:
     """Record what the twin sees, with the truth."""
     import numpy as np
@@ -186,7 +162,7 @@ def command(
     # A name without a suffix is that of a shape, and not of a file to keep.
     files = [source for source in map(Path, (thing, pattern)) if source.suffix]
     io.check_output(output, *files, replaces="anything" if overwrite else "nothing")
-    given = {name: context.params[name.replace("-", "_")] for own in DEFAULTS.values() for name in own}
+    refuse_foreign(context, motion)
     columns, rows = frame_size(size, "--size")
     along = vector(object_shift, 2, "--object-shift")
     twin = hw.Twin(
@@ -194,7 +170,7 @@ def command(
         object_shift=(along[0], along[1]),
         shape=(rows, columns),
         pixel_size=lengths(pixel_size, "--pixel-size"),
-        movement=make_movement(motion, frames, release, given, strokes, rock, spiral),
+        movement=make_movement(motion, frames, given),
         contact=contact.value,
         optics=optics.value,
         pattern=pattern,
@@ -235,60 +211,40 @@ def command(
     click.echo(printable(f"{output}: {count} frames of {columns} x {rows}: {twin.header.title}"))
 
 
-def make_movement(
-    motion: options.MotionName,
-    frames: int | None,
-    release: bool,
-    given: Mapping[str, str | None],
-    strokes: int | None = None,
-    rock: str | None = None,
-    spiral: bool = False,
-) -> Movement:
-    """Return the twin's movement that options describe; those not given have the values of ``DEFAULTS``."""
+def make_movement(motion: str, frames: int | None, given: Mapping[str, Any]) -> Movement:
+    """Return the twin's movement that options describe; `MOVEMENT` has the defaults."""
     import numpy as np
 
     from mirrorskin import io
-    from mirrorskin.cli.quantity import angle, compliance, length, vector
+    from mirrorskin.cli.quantity import vector
     from mirrorskin.hw import twin
 
-    own = DEFAULTS[motion]
-    foreign = [f"--{name}" for name, value in given.items() if value is not None and name not in own]
-    own_of = {"--release": _VERTICAL, "--strokes": _VERTICAL, "--rock": _AXIAL, "--spiral": _AXIAL}
-    special = zip(own_of.items(), (release, strokes, rock, spiral), strict=True)
-    foreign += [option for (option, own_motion), value in special if value and own_motion != motion]
-    if foreign:
-        raise io.InputError(
-            f"{foreign[0]} says nothing of a motion that is {motion.value}: leave it out, or choose another"
-        )
-    words = own | {name: value for name, value in given.items() if value is not None}
-    count = frames or _FRAMES
-    if motion == options.MotionName.vertical:
-        step, start = (length(words[name], f"--{name}") for name in ("travel-step", "travel-start"))
-        down = io.Steps(step, start).positions(count)
-        if strokes is not None:
-            if release:
+    values = MOVEMENT.filled(given)
+    count, press = frames or _FRAMES, values["press"]
+    if motion == "vertical":
+        travel = io.Steps(values["travel_step"], values["travel_start"]).positions(count)
+        if values["strokes"] is not None:
+            if values["release"]:
                 raise io.InputError("--strokes go up as well: leave --release out")
-            down = twin.oscillating_travel(down[0], down[-1], strokes, count)
-        travel = np.concatenate([down, down[-2::-1]]) if release else down
-        return twin.Vertical(travel, compliance=compliance(words["compliance"], "--compliance"))
-    press = length(words["press"], "--press")
-    if motion == options.MotionName.axial:
-        step = angle(words["phase-step"], "--phase-step")
-        x, y, z = vector(words["pivot"], 3, "--pivot")
-        tilt = angle(words["tilt"], "--tilt")
+            travel = twin.oscillating_travel(travel[0], travel[-1], values["strokes"], count)
+        if values["release"]:
+            travel = np.concatenate([travel, travel[-2::-1]])
+        return twin.Vertical(travel, compliance=values["compliance"])
+    if motion == "axial":
+        step, tilt = values["phase_step"], values["tilt"]
+        x, y, z = vector(values["pivot"], 3, "--pivot")
         phase = io.Steps(step).positions(frames or _frames_of_a_turn(step))
-        grown = np.arange(1, len(phase) + 1) / len(phase) if spiral else 1.0
-        if rock is not None:
-            towards = np.full(len(phase), angle(rock, "--rock"))
+        grown = np.arange(1, len(phase) + 1) / len(phase) if values["spiral"] else 1.0
+        if values["rock"] is not None:
+            towards = np.full(len(phase), values["rock"])
             return twin.Leaning(towards, grown * tilt * np.sin(phase), grown * press, (x, y, z))
-        if spiral:
+        if values["spiral"]:
             return twin.Leaning(phase, grown * tilt, grown * press, (x, y, z))
         return twin.Axial(phase, tilt, press, (x, y, z))
-    if motion == options.MotionName.horizontal:
-        along = vector(words["displacement-step"], 2, "--displacement-step")
+    if motion == "horizontal":
+        along = vector(values["displacement_step"], 2, "--displacement-step")
         return twin.Horizontal(np.stack([io.Steps(one).positions(count) for one in along], axis=1), press)
-    step = angle(words["twist-step"], "--twist-step")
-    return twin.Twist(io.Steps(step).positions(count), press)
+    return twin.Twist(io.Steps(values["twist_step"]).positions(count), press)
 
 
 def _frames_of_a_turn(step: float) -> int:

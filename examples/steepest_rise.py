@@ -1,25 +1,28 @@
 """An operation of one's own: a pixel's height is where its brightness rises most from frame to frame.
 
-mirrorskin run examples/steepest_rise.py:SteepestRise press.h5 --least-rise 5 -o heights.h5
+mirrorskin run examples/steepest_rise.py:SteepestRise press.h5 -o heights.h5
 """
 
 import numpy as np
 
 from mirrorskin import engine, hw, io
+from mirrorskin.io.maps import TABLE
 
 
 class SteepestRise(engine.Operation):
-    """Height from the largest rise of a pixel's brightness between two frames."""
+    """Height from the largest rise of each pixel's brightness."""
 
-    least_rise: float = engine.option(0.0, "counts", within=(0, None), help="smaller rises are ignored")
+    motions = ("vertical",)
 
-    height = io.Map("height at the steepest rise", "mm", quantity="height")
-    rise = io.Map("largest rise between two frames", "counts", colours="positive")
+    least: float = engine.option(0.0, "counts", help="rise above which there is a height")
+
+    height = TABLE["height"]
+    rise = io.Map("largest rise of the brightness", "counts")
 
     def start(self, shape, dtype):
-        """Prepare for frames of a shape, (H, W), and a type."""
+        """Prepare for frames of a shape and type."""
         self.last = None
-        self.largest = np.full(shape, self.least_rise, np.float32)
+        self.rises = np.full(shape, self.least, np.float32)
         self.heights = np.full(shape, np.nan, np.float32)
 
     def push(self, frames, *, travel):
@@ -27,14 +30,14 @@ class SteepestRise(engine.Operation):
         for frame, at in zip(frames.astype(np.float32), travel, strict=True):
             if self.last is not None:
                 rise = frame - self.last[0]
-                larger = rise > self.largest
-                self.largest[larger] = rise[larger]
+                larger = rise > self.rises
+                self.rises[larger] = rise[larger]
                 self.heights[larger] = -(at + self.last[1]) / 2
             self.last = frame, at
 
     def result(self):
-        """Return the maps by name."""
-        return {"height": self.heights, "rise": self.largest}
+        """Return maps by name."""
+        return {"height": self.heights, "rise": self.rises}
 
 
 if __name__ == "__main__":

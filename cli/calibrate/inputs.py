@@ -32,7 +32,10 @@ OptionalRig = Annotated[
 Overwrite = Annotated[
     bool, Option("--overwrite", help="With --rig: replace existing recordings of these names.")
 ]
-Settle = scans.Settle
+Settle = Annotated[
+    str | None,
+    Option(metavar="TIME", help="With --rig: time from rest to the first exposure.", show_default="100ms"),
+]
 Places = Annotated[int, Option(min=1, help="With --rig: of the ball.")]
 
 
@@ -155,18 +158,22 @@ def take(
     are checked before anything moves.
     """
     from mirrorskin import io
+    from mirrorskin.cli.quantity import duration
     from mirrorskin.hw.rig.plans import check_plan
     from mirrorskin.hw.rig.rig import open_rig
     from mirrorskin.hw.rig_file import load_rig
 
     settings = load_rig(rig_file)
+    seconds = None if settle is None else duration(settle, "--settle")
+    if seconds is not None and seconds < 0:
+        raise io.InputError(f"--settle {settle}: a time of at least 0 is needed")
     paths = [calibration.with_name(f"{calibration.stem}-{place.name}.h5") for place in places]
     for place, path in zip(places, paths, strict=True):
         check_plan(place.plan, settings.stage, settings.name)
         io.check_output(path, rig_file, replaces="anything" if overwrite else "nothing")
     with open_rig(settings) as rig:
         for place, path in zip(places, paths, strict=True):
-            _take_one(rig, place, path, settle, overwrite)
+            _take_one(rig, place, path, seconds, overwrite)
     return paths
 
 
@@ -202,14 +209,13 @@ def still_plan(rig_file: Path, travel: float | None = None) -> VerticalPlan:
     return VerticalPlan(start, start + _STILL, step=_STILL)
 
 
-def _take_one(rig: Rig, place: Place, path: Path, settle: str | None, overwrite: bool) -> None:
+def _take_one(rig: Rig, place: Place, path: Path, settle: float | None, overwrite: bool) -> None:
     import numpy as np
 
     from mirrorskin import io
     from mirrorskin.cli.output import progress
 
-    in_steps = place.plan.in_steps
-    scan = scans.make_scan(rig, place.plan, settle if in_steps else None, place.frames if in_steps else None)
+    scan = scans.make_scan(rig, place.plan, settle, place.frames)
     scan.lift()
     click.echo(f"{place.prompt}, then press Enter", err=True)
     if not sys.stdin.readline():  # nobody is there

@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import hashlib
-import inspect
 import json
 import os
+import sys
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mirrorskin.engine.press.press import reconstruct_press
+from mirrorskin.engine.method import Method
+from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.provenance import program_version
-from mirrorskin.engine.rotation.rotation import reconstruct_rotation
-from mirrorskin.engine.slip.search import MOTIONS as SLIP_MOTIONS
-from mirrorskin.engine.slip.slip import reconstruct_slip
+from mirrorskin.engine.reconstruction import method_for
+from mirrorskin.engine.running import load_operation
 from mirrorskin.engine.tiling import MEMORY_LIMIT
-from mirrorskin.io import InputError, Motion, Result
+from mirrorskin.io import InputError, Motion
 from mirrorskin.io.url import Url
 
 
@@ -93,10 +92,14 @@ def _check(sources: Sequence[Path], targets: Iterable[Path]) -> None:
         taken.add(real)
 
 
-# These change how a result is made, not what is in it.
-_NO_MATTER = {"source", "memory_limit", "device", "progress", "threads"}
+# These change how a result is computed, not what is in it.
+_NO_MATTER = {"source", "memory_limit", "device", "threads"}
 # Parameters of a stack that only one motion uses.
 _OF_MOTION = {"travel": "vertical", "phase": "axial", "tilt": "axial"}
+TABLES: Mapping[Motion, str] = {
+    "vertical": "press", "axial": "rotation", "horizontal": "slip", "twist": "slip"
+}  # fmt: skip
+"""Names of the options of each motion's method."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,44 +107,49 @@ class Plan:
     """What is done with every recording of a batch. It can be pickled."""
 
     opening: Mapping[str, Any] = field(default_factory=dict)  # keywords of `io.open_recording`
-    press: Mapping[str, Any] = field(default_factory=dict)  # of `engine.reconstruct`, for vertical motion
-    rotation: Mapping[str, Any] = field(default_factory=dict)  # and for axial motion
-    memory_limit: int = MEMORY_LIMIT  # bytes of host memory for frames on the move, of each device
-    slip: Mapping[str, Any] = field(default_factory=dict)  # and for slides and twists
+    press: Mapping[str, Any] = field(default_factory=dict)  # options of `engine.Press`
+    rotation: Mapping[str, Any] = field(default_factory=dict)  # of `engine.Rotation`
+    memory_limit: int = MEMORY_LIMIT  # bytes of host memory for frames that are read ahead, of each device
+    slip: Mapping[str, Any] = field(default_factory=dict)  # of `engine.Sliding`
+    operation: str = ""  # MODULE:CLASS of an operation that is run instead of all methods
+    operation_options: Mapping[str, Any] = field(default_factory=dict)
+
+    def kind(self, motion: Motion) -> type[Operation | Method]:
+        """Return the class that is run over recordings of a motion."""
+        return load_operation(self.operation) if self.operation else method_for(motion)
 
     def options(self, motion: Motion) -> Mapping[str, Any]:
-        """Return the keywords of `mirrorskin.engine.reconstruct` for a motion."""
-        chosen = {"vertical": self.press, "axial": self.rotation}.get(motion, self.slip)
+        """Return the options of that class."""
+        chosen = self.operation_options if self.operation else getattr(self, TABLES[motion])
         return {**chosen, "memory_limit": self.memory_limit}
 
     def key(self, motion: Motion) -> str:
-        """Write down, always in the same words, everything of the plan that changes a motion's results.
+        """Return everything of the plan that changes a motion's results, as a text.
 
-        Defaults are included: a parameter that is given with its default's value changes nothing.
+        Defaults are included: an option that is given with its default value changes nothing.
         """
         opening = {
             name: value
             for name, value in self.opening.items()
             if value is not None and name not in _NO_MATTER and _OF_MOTION.get(name, motion) == motion
         }
-        used: dict[str, Any] = {"version": program_version(), "opening": opening}
-        if motion == "vertical":
-            used["press"] = {**_defaults(reconstruct_press), **self.press}
-        if motion == "axial":
-            used["rotation"] = {**_defaults(reconstruct_rotation), **self.rotation}
-        if motion in SLIP_MOTIONS:
-            used["slip"] = {**_defaults(reconstruct_slip), **self.slip}
-        return json.dumps(_as_json(used), sort_keys=True)
+        kind = self.kind(motion)
+        values = {name: one.default for name, one in kind.options.items()} | dict(self.options(motion))
+        used = {name: value for name, value in values.items() if name not in _NO_MATTER}
+        table = {"operation": self.operation, "code": _code(kind)} if self.operation else {}
+        name = "options" if self.operation else TABLES[motion]
+        parts = {"version": program_version(), "opening": opening, name: used, **table}
+        return json.dumps(_as_json(parts), sort_keys=True)
 
     def digest(self, motion: Motion) -> str:
         """Return the SHA-256 of ``key``, in hexadecimal."""
         return hashlib.sha256(self.key(motion).encode()).hexdigest()
 
 
-@functools.cache
-def _defaults(function: Callable[..., Result]) -> Mapping[str, Any]:
-    parameters = inspect.signature(function).parameters.items()
-    return {name: parameter.default for name, parameter in parameters if name not in _NO_MATTER}
+def _code(kind: type) -> str:
+    """Return the SHA-256 of the file with a class: another version of it may return other results."""
+    path = getattr(sys.modules[kind.__module__], "__file__", None)
+    return "" if path is None else hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
 def _as_json(value: Any) -> Any:

@@ -13,7 +13,7 @@ from mirrorskin import io
 from mirrorskin.engine.batch.jobs import Job, Plan
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.provenance import missing_levels, naming
-from mirrorskin.engine.reconstruction import reconstruct
+from mirrorskin.engine.running import run_class
 from mirrorskin.engine.streaming import Progress
 from mirrorskin.engine.summary import summarise
 from mirrorskin.io import InputError, Recording
@@ -100,7 +100,9 @@ def _done(
     io.check_output(target, outcome.job.source)
     opened = open_device(device)
     with naming(source):  # raises if the file was written to meanwhile
-        result = reconstruct(source, device=opened, progress=progress, **plan.options(source.motion))
+        result = run_class(
+            plan.kind(source.motion), source, progress, device=opened, **plan.options(source.motion)
+        )
     signed: dict[str, ProcessValue] = {**result.process, "batch_parameters": digest}
     io.save_result(result.assign(process=signed), target)
     return replace(

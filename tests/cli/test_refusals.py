@@ -97,7 +97,7 @@ CASES = {
     "an oscillation for a change-point": (
         lambda path: ours(path, travel=np.abs(TRAVEL - 0.2)),
         ["--method", "change-point"],
-        "bad.h5: travel oscillates, for which method 'threshold' is needed",
+        "bad.h5: travel oscillates, which needs the method 'threshold'",
     ),
     "a release for a press": (
         lambda path: ours(path, travel=TRAVEL[::-1].copy()),

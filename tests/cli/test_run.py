@@ -1,4 +1,4 @@
-"""An estimator of the user's own, from the command line."""
+"""Operations, built-in and a user's own, from the command line."""
 
 import json
 import re
@@ -9,24 +9,41 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import run
-from stacks import record, sphere
+from stacks import assert_same, record, sphere
 
 from mirrorskin import engine, io
 
 ROOT = Path(__file__).parents[2]
 MINE = """
 import numpy as np
-from mirrorskin.io import Header
+from mirrorskin import engine
+from mirrorskin.io import Map
 
-class Light:
-    def __init__(self, shape, dtype, level=100):
-        self.shape, self.level = shape, level
-    def reset(self):
-        self.count = np.zeros(self.shape, np.int64)
+class Light(engine.Operation):
+    '''Frames in which a pixel is light.'''
+
+    level: float = engine.option(100.0, "counts", help="counts above which a pixel is light")
+    light = Map("frames in which a pixel is light")
+
+    def start(self, shape, dtype):
+        self.number = np.zeros(shape, np.int64)
     def push(self, frames):
-        self.count += (frames > self.level).sum(axis=0)
+        self.number += (frames > self.level).sum(axis=0)
     def result(self):
-        return {"light": self.count}
+        return {"light": self.number}
+
+class Deep(Light):
+    travel_offset: float = engine.option(0.0, "mm", help="added to each travel")
+    tilt: float | None = engine.option(None, "rad", words=["estimate"], help="tilt", shown_default="no")
+    weights: list = engine.option(None, "share", several=True, within=(0, 1), help="some shares")
+    twice: bool = engine.option(False, help="count each frame twice")
+
+    @property
+    def passes(self):
+        return 2 if self.twice else 1
+
+class Frames(Light):
+    frames: int = engine.option(1, help="frames")
 
 class Broken:
     pass
@@ -46,7 +63,7 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("place", ["mine_of_a_test", "mine_of_a_test.py"])
 def test_the_maps_are_written_and_told_in_a_line(place):
-    ended = run("run", f"{place}:Light", "press.h5", "--set", "level=50", "--memory", "100B")
+    ended = run("run", f"{place}:Light", "press.h5", "--level", "50", "--memory", "100B")
     source = sphere()
     frames = source.read(np.empty(source.shape, source.dtype)).frames
     light = (frames > 50).sum(axis=0)
@@ -59,8 +76,8 @@ def test_the_maps_are_written_and_told_in_a_line(place):
 def test_files_of_one_name_are_two_modules():
     for folder, kind in (("a", "One"), ("b", "Two")):
         Path(folder).mkdir()
-        Path(folder, "mine.py").write_text(MINE.replace("class Light", f"class {kind}"))
-        assert run("run", f"{folder}/mine.py:{kind}", "press.h5", "--set", "level=50").code == 0
+        Path(folder, "mine.py").write_text(MINE.replace("Light", kind))
+        assert run("run", f"{folder}/mine.py:{kind}", "press.h5", "--level", "50").code == 0
 
 
 def test_region_frames_and_travel_are_those_of_reconstruct():
@@ -83,9 +100,19 @@ def test_region_frames_and_travel_are_those_of_reconstruct():
         ("nowhere_of_a_test:Light", "there is no nowhere_of_a_test in "),
         ("nowhere_of_a_test.sub:Light", "there is no nowhere_of_a_test.sub in "),
         ("none_of_a_test.py:Light", "there is no none_of_a_test.py in "),
-        ("mine_of_a_test:Dark", "there is no class Dark in mine_of_a_test; it has Light, Broken"),
+        (
+            "mine_of_a_test:Dark",
+            "there is no class Dark in mine_of_a_test; it has Light, Deep, Frames, Broken",
+        ),
         ("mine_of_a_test:some", "there is no class some in mine_of_a_test"),
-        ("mine_of_a_test:Broken", "Broken(shape, dtype) cannot be made"),
+        (
+            "mine_of_a_test:Broken",
+            "Broken is not an operation: derive the class from mirrorskin.engine.Operation",
+        ),
+        (
+            "mine_of_a_test:Frames",
+            "has an option frames, and so has 'mirrorskin run'. Rename that of the class",
+        ),
     ],
 )
 def test_a_class_that_cannot_be_had_is_one_line(name, line):
@@ -96,14 +123,71 @@ def test_a_class_that_cannot_be_had_is_one_line(name, line):
     assert not list(Path().glob("press-*"))
 
 
+DEEP = ("run", "mine_of_a_test:Deep", "press.h5")
+
+
 @pytest.mark.parametrize(
-    ("setting", "line"),
-    [("level", "--set level: NAME=VALUE is needed"), ("depth=1", "unexpected keyword argument 'depth'")],
+    ("words", "line"),
+    [
+        (["--level"], "Option '--level' requires an argument"),
+        (
+            ["--depth", "1"],
+            "mine_of_a_test:Deep has no option --depth. Its options are --travel-offset, --tilt, --weights,"
+            " --twice, --level",
+        ),
+        (["--level", "high"], "--level high: a number is needed; write e.g. 0.25"),
+        (["--level", "nan"], "level nan: a number in counts is needed"),
+        (["--travel-offset", "0.1"], "--travel-offset 0.1: a unit is needed; write e.g. 0.1mm"),
+        (["--travel-offset", "2deg"], "--travel-offset 2deg: degrees are not a length"),
+        (["--tilt", "guess"], "--tilt guess: a number and a unit are needed"),
+        (["--weights", "0.1,2"], "weights 2: a share from 0 to 1 is needed"),
+        (["--device", "abacus"], "abacus"),
+    ],
 )
-def test_a_parameter_that_is_none_is_one_line(setting, line):
-    ended = run("run", "mine_of_a_test:Light", "press.h5", "--set", setting)
+def test_an_option_that_cannot_be_used_is_one_line(words, line):
+    ended = run(*DEEP, *words)
     assert ended.code == 2
     assert line in ended.said
+    assert len(ended.said.splitlines()) == 1
+    assert not list(Path().glob("press-*"))
+
+
+def test_declared_options_arrive_in_their_unit_and_in_the_process():
+    words = ["--travel-offset", "100um", "--tilt", "2.5deg", "--weights", "0.25,0.5", "--weights", "1"]
+    ended = run(*DEEP, *words, "--twice", "--json")
+    assert ended.code == 0, ended.said
+    process = json.loads(ended.out)["process"]
+    assert process["operation"] == "Deep"
+    assert (process["travel_offset"], process["level"]) == (pytest.approx(0.1), 100.0)
+    assert (process["tilt"], process["weights"]) == (pytest.approx(np.radians(2.5)), "[0.25, 0.5, 1.0]")
+    assert process["twice"] is True
+    assert json.loads(run(*DEEP, "--tilt", "estimate", "--json").out)["process"]["tilt"] == "estimate"
+
+
+@pytest.mark.parametrize("words", [["--help"], ["press.h5", "--help"]])
+def test_help_shows_the_options_of_the_class(words):
+    ended = run("run", "mine_of_a_test.py:Deep", *words)
+    assert (ended.code, ended.said) == (0, "")
+    text = " ".join(ended.out.split())
+    assert "--travel-offset LENGTH Added to each travel. [default: 0mm]" in text
+    assert "--tilt ANGLE|estimate Tilt. [default: no]" in text
+    assert "--weights SHARE[,...] Some shares." in text
+    assert "--twice / --no-twice Count each frame twice. [default: no-twice]" in text
+    assert "--level COUNTS Counts above which a pixel is light. [default: 100]" in text
+
+
+def test_a_built_in_operation_and_a_method_run_by_their_names():
+    with io.open_recording("press.h5") as source:
+        onset, press = (
+            engine.run(source, engine.Onset(threshold=0.4)),
+            engine.reconstruct(source, threshold=0.4),
+        )
+    for name, expected in (("Onset", onset), ("Press", press)):
+        ended = run("run", f"mirrorskin.engine:{name}", "press.h5", "--threshold", "0.4")
+        assert ended.code == 0, ended.said
+        found = io.open_result(f"press-{name}.h5")
+        assert found.process["threshold"] == 0.4
+        assert_same(found.assign(process={}), expected.assign(process={}))
 
 
 def test_what_a_module_itself_lacks_is_not_hidden():

@@ -80,7 +80,9 @@ def test_strokes_go_up_and_down_as_far_as_the_steps_would():
         "vertical", "--travel-start", "0.5mm", "--travel-step", "0.2mm", "--strokes", "2", "--frames", "5"
     )
     np.testing.assert_allclose(found.travel, 0.5 + 0.8 * np.array([0, 0.5, 1, 0.5, 0]), atol=1e-12)
-    assert_refused(["axial", "--strokes", "3", "-o", "a.h5"], "--strokes says nothing of a motion")
+    assert_refused(
+        ["axial", "--strokes", "3", "-o", "a.h5"], "--strokes applies to presses only; this is a rotation"
+    )
     assert_refused(["vertical", "--strokes", "3", "--release", "-o", "a.h5"], "leave --release out")
 
 
@@ -96,7 +98,10 @@ def test_a_body_rocks_or_spirals_as_it_is_told():
     np.testing.assert_allclose(wound.phase, phases)
     assert wound.header.press is None
     for motion, option in (("vertical", ["--rock", "0deg"]), ("twist", ["--spiral"])):
-        assert_refused([motion, *option, "-o", "a.h5"], f"{option[0]} says nothing of a motion")
+        assert_refused(
+            [motion, *option, "-o", "a.h5"],
+            f"{option[0]} applies to rotations only; this is a {NOUNS[motion]}",
+        )
 
 
 @pytest.mark.parametrize("contact", ["conform", "elastic"])
@@ -283,6 +288,8 @@ def test_compliance_reaches_the_movement(asked):
     assert asked[0]["movement"].compliance == pytest.approx(0.02)
 
 
+NOUNS = {"vertical": "press", "axial": "rotation", "horizontal": "slide", "twist": "twist"}
+PLURALS = {"vertical": "presses", "axial": "rotations", "horizontal": "slides", "twist": "twists"}
 OWN = {
     "travel-step": ("1mm", ["vertical"]),
     "travel-start": ("1mm", ["vertical"]),
@@ -301,13 +308,16 @@ OWN = {
 )
 def test_an_option_of_another_motion_is_refused(motion, option):
     words = [motion, *SMALL, f"--{option}", OWN[option][0], "-o", "a.h5"]
-    assert_refused(words, f"--{option} says nothing of a motion that is {motion}: leave it out")
+    *others, last = [PLURALS[one] for one in OWN[option][1]]
+    named = f"{', '.join(others)} and {last}" if others else last
+    assert_refused(words, f"--{option} applies to {named} only; this is a {NOUNS[motion]}. Remove it")
 
 
 @pytest.mark.parametrize("motion", ["axial", "horizontal", "twist"])
 def test_only_a_press_is_released(motion):
     assert_refused(
-        [motion, *SMALL, "--release", "-o", "a.h5"], f"--release says nothing of a motion that is {motion}"
+        [motion, *SMALL, "--release", "-o", "a.h5"],
+        f"--release applies to presses only; this is a {NOUNS[motion]}. Remove it",
     )
 
 

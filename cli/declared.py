@@ -1,0 +1,309 @@
+"""Options that the engine declares, as options of commands.
+
+``declared.json`` is a copy of the declarations, since help and completion must not wait for the engine. After
+a change of a declaration, ``python -m mirrorskin.cli.declared`` writes it anew; a test compares the two.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from mirrorskin.cli.groups import Command, ExistingPath, MotionOption, for_motions
+
+if TYPE_CHECKING:
+    from mirrorskin.engine.options import Configured, Option
+
+_CLASS = re.compile(r".+:[A-Za-z_]\w*")
+_LOADED = "mirrorskin.cli.declared"  # key of a context's class and its options
+_OF_RECORDINGS = ("pixel_size",)  # options that operations take from a recording
+_COPY = Path(__file__).with_suffix(".json")
+_UNITS = {  # placeholder in help, function of `mirrorskin.cli.quantity`, example
+    "mm": ("LENGTH", "length", "0.1mm"),
+    "rad": ("ANGLE", "angle", "2.5deg"),
+    "MPa": ("PRESSURE", "pressure", "0.1MPa"),
+    "N": ("FORCE", "force", "1.5N"),
+    "s": ("TIME", "duration", "10ms"),
+    "counts/rad": ("COUNTS/ANGLE", "per_angle", "5.7/deg"),
+    "mm/N": ("LENGTH/N", "compliance", "0.01mm/N"),
+}
+_CLASS = re.compile(r".+:[A-Za-z_]\w*")
+_LOADED = "mirrorskin.cli.declared"  # key of a context's class and its options
+_OF_RECORDINGS = ("pixel_size",)  # options that operations take from a recording
+_COPY = Path(__file__).with_suffix(".json")
+_METAVARS = {
+    "mm": "LENGTH",
+    "rad": "ANGLE",
+    "MPa": "PRESSURE",
+    "N": "FORCE",
+    "s": "TIME",
+    "counts/rad": "COUNTS/ANGLE",
+    "Hz": "HZ",
+}
+
+
+@dataclass(frozen=True)
+class Term:
+    """An option as a command shows and reads it."""
+
+    name: str
+    kind: str
+    help: str
+    unit: str = ""
+    shown_default: str = ""
+    choices: Sequence[str] = ()
+    words: Sequence[str] = ()
+    file: str = ""
+    motions: Sequence[str] = ()
+    default: str = ""  # as on the command line
+    least: int | None = None
+
+    @property
+    def example(self) -> str:
+        """A value with a unit; empty if values have none."""
+        return _UNITS.get(self.unit, ("", "", ""))[2]
+
+    @property
+    def metavar(self) -> str:
+        """What help shows in place of a value."""
+        shown = self.unit if self.kind == "text" else self.unit.upper()
+        plain = shown or ("N" if self.kind == "integer" else "NUMBER")
+        several = "[,...]" if self.kind == "numbers" else ""
+        return "|".join([_UNITS.get(self.unit, (plain,))[0] + several, *self.words])
+
+    def read(self, text: str, where: str) -> Any:
+        """Return the value that a text on the command line stands for, in the option's unit."""
+        if self.kind == "numbers":
+            return [self.read_one(part, where) for part in text.split(",")]
+        return self.read_one(text, where)
+
+    def read_one(self, text: str, where: str) -> Any:
+        """Return the value that a text stands for; ``where`` begins messages."""
+        from mirrorskin.cli import quantity
+
+        if text in self.words or self.kind in ("choice", "text"):
+            return text
+        plain = "integer" if self.kind == "integer" else "number"
+        value = getattr(quantity, _UNITS.get(self.unit, ("", plain))[1])(text, where)
+        if self.least is not None and value < self.least:
+            from mirrorskin.io import InputError
+
+            raise InputError(f"{where} {text}: a number of at least {self.least} is needed")
+        return value
+
+    @property
+    def flag(self) -> str:
+        """Name of the option on the command line."""
+        return f"--{self.name.replace('_', '-')}"
+
+
+class DeclaredOption(MotionOption):
+    """The option of click for a term; its value is in the term's unit. ``of_engine``: see `ClassCommand`."""
+
+    def __init__(self, one: Term, of_engine: bool = True) -> None:
+        self._term, self.of_engine = one, of_engine
+        names = [f"{one.flag}/--no-{one.flag[2:]}" if one.kind == "flag" else one.flag, one.name]
+        settings: dict[str, Any] = {}
+        if one.kind == "choice":
+            settings = {"type": click.Choice([*one.choices])}
+        elif one.kind == "file":
+            settings = {"type": ExistingPath(), "metavar": one.file}
+        elif one.kind == "switch":
+            settings = {"is_flag": True}
+        elif one.kind != "flag":
+            settings = {"metavar": one.metavar, "multiple": one.kind == "numbers"}
+        super().__init__(
+            names,
+            help=f"{one.help[:1].upper()}{one.help[1:].rstrip('.')}.",
+            default=None,
+            show_default=one.shown_default or one.default or False,
+            motions=one.motions,
+            **settings,
+        )
+
+    def process_value(self, ctx: click.Context, value: Any) -> Any:
+        """Read the text, or the texts of an option that is repeated."""
+        found = super().process_value(ctx, value)
+        if self.multiple:
+            found = ",".join(found or ()) or None
+        return self._term.read(found, self._term.flag) if isinstance(found, str) else found
+
+
+@dataclass(frozen=True)
+class Terms:
+    """Options of a command: ``**chosen: Annotated[Any, Terms(...)]`` receives those that are given."""
+
+    terms: Sequence[Term]
+    of_engine: bool = False
+
+    def parameters(self) -> list[DeclaredOption]:
+        """Return the options of click."""
+        return [DeclaredOption(one, self.of_engine) for one in self.terms]
+
+    def filled(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the values of all options: given ones, defaults, or None."""
+        return {
+            one.name: given[one.name] if one.name in given else one.read(one.default, one.flag)
+            if one.default else None
+            for one in self.terms
+        }  # fmt: skip
+
+
+def declared(command: str, *, without: Sequence[str] = ()) -> Terms:
+    """Return the engine's options of a command, an entry of ``declared.json``, except some."""
+    stored = json.loads(_COPY.read_text(encoding="utf-8"))[command]
+    return Terms([Term(**fields) for fields in stored if fields["name"] not in without], of_engine=True)
+
+
+def term(
+    name: str,
+    text: str,
+    unit: str = "",
+    default: str = "",
+    *,
+    motions: Sequence[str] = (),
+    kind: str = "number",
+    least: int | None = None,
+) -> Term:
+    """Return an option of a command that the engine does not declare.
+
+    ``kind`` is "number", "integer", "switch" or "text"; of a text, ``unit`` is the placeholder in help.
+    ``default`` is a text as on the command line.
+    """
+    return Term(name, kind, for_motions(motions, text), unit, motions=motions, default=default, least=least)
+
+
+class ClassCommand(Command):
+    """A command one of whose words may be MODULE:CLASS: then it has the options of that class.
+
+    They replace other options of the engine.
+    """
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Load the class, and parse the arguments with its options."""
+        name = next((word for word in args if _CLASS.fullmatch(word)), None)
+        if name is None:
+            return super().parse_args(ctx, args)
+        ctx.meta[_LOADED] = self._load(name)
+        try:
+            return super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            flags = ", ".join(one.opts[0] for one in ctx.meta[_LOADED][1]) or "none"
+            message = f"{name} has no option {error.option_name}. Its options are {flags}"
+            raise click.UsageError(message, ctx) from None
+
+    def _load(self, name: str) -> tuple[type[Configured], list[DeclaredOption]]:
+        """Return the class with this name, and its options."""
+        from mirrorskin.engine.running import load_operation
+        from mirrorskin.io import InputError
+
+        kind = load_operation(name)
+        terms = [one for one in terms_of({"": kind}) if one.name not in _OF_RECORDINGS]
+        taken = {one.name for one in self.params if not getattr(one, "of_engine", False)}
+        for one in terms:
+            if one.name in taken:
+                raise InputError(
+                    f"{name} has an option {one.name}, and so has 'mirrorskin {self.name}'. Rename that of"
+                    " the class"
+                )
+        return kind, [DeclaredOption(one) for one in terms]
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        """Return the command's parameters, with the class's options if there is a class."""
+        parameters = super().get_params(ctx)
+        if _LOADED not in ctx.meta:
+            return parameters
+        rest = [one for one in parameters if not getattr(one, "of_engine", False)]
+        count = sum(isinstance(one, click.Argument) for one in rest)
+        return [*rest[:count], *ctx.meta[_LOADED][1], *rest[count:]]
+
+    def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write what the command does, and the class."""
+        super().format_help_text(ctx, formatter)
+        if _LOADED in ctx.meta:
+            kind = ctx.meta[_LOADED][0]
+            purpose = (kind.__doc__ or "").strip().split("\n\n")[0]
+            with formatter.indentation():
+                formatter.write_paragraph()
+                formatter.write_text(f"{kind.__name__}: {purpose}")
+
+
+def terms_of(kinds: Mapping[str, type[Configured]]) -> list[Term]:
+    """Return the options of classes, by the motion that each is for; those of one name become one.
+
+    A class with the motion ``""`` is for any motion.
+    """
+    found: dict[str, list[Term]] = {}
+    for motion, kind in kinds.items():
+        for one in kind.options.values():
+            if not one.python_only:
+                term = replace(term_of(one), motions=(motion,) if motion else ())
+                found.setdefault(one.name, []).append(term)
+    return [_merged(variants) for variants in found.values()]
+
+
+def term_of(one: Option) -> Term:
+    """Return what a command needs of a declaration."""
+    shown = one.shown_default
+    if not shown and one.default is not None:
+        shown = f"{one.default:g}" if isinstance(one.default, float) else str(one.default)
+        if one.kind == "flag":
+            shown = one.name.replace("_", "-") if one.default else f"no-{one.name.replace('_', '-')}"
+        elif one.unit == "rad":
+            shown = f"{math.degrees(one.default):g}deg"
+        elif one.unit in ("mm", "MPa", "N", "s"):
+            shown += one.unit
+    kind = "number" if one.kind in ("map", "object") else one.kind
+    return Term(one.name, kind, one.help, one.unit, shown, one.choices, one.words, one.file)
+
+
+def _merged(variants: list[Term]) -> Term:
+    """Join options of one name; where they differ, help and default mention the motions."""
+    first = variants[0]
+    if any((one.kind, one.unit) != (first.kind, first.unit) for one in variants):
+        raise TypeError(f"{first.name} is declared with different kinds or units")
+    motions = tuple(motion for one in variants for motion in one.motions)
+    helps, defaults = (_by_motion(variants, name) for name in ("help", "shown_default"))
+    return replace(
+        first,
+        help=helps if len({one.help for one in variants}) > 1 else for_motions(motions, helps),
+        shown_default=defaults,
+        choices=tuple(dict.fromkeys(choice for one in variants for choice in one.choices)),
+        words=tuple(dict.fromkeys(word for one in variants for word in one.words)),
+        motions=motions,
+    )
+
+
+def _by_motion(variants: list[Term], name: str) -> str:
+    """Return the text of all variants, or each with its motions."""
+    motions: dict[str, list[str]] = {}
+    for one in variants:
+        motions.setdefault(getattr(one, name), []).extend(one.motions)
+    if len(motions) == 1:
+        return next(iter(motions))
+    return "; ".join(for_motions(their, text) for text, their in motions.items() if text)
+
+
+def declarations() -> dict[str, list[dict[str, Any]]]:
+    """Return what ``declared.json`` contains: the options of each command."""
+    from mirrorskin.engine.method import Method
+    from mirrorskin.engine.reconstruction import method_for
+
+    methods = {one: method_for(one) for one in ("vertical",)}  # TODO all
+    methods = {motion: kind for motion, kind in methods.items() if issubclass(kind, Method)}
+    return {"reconstruct": _rows(methods)}
+
+
+def _rows(kinds: Mapping[str, type[Configured]]) -> list[dict[str, Any]]:
+    return [{name: value for name, value in asdict(one).items() if value} for one in terms_of(kinds)]
+
+
+if __name__ == "__main__":
+    _COPY.write_text(json.dumps(declarations(), indent=1) + "\n", encoding="utf-8")
