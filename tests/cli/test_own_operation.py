@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 from commands import run
+from shown import panel
 from stacks import MadeUp, record
 
 from mirrorskin import engine, io
@@ -162,8 +163,8 @@ def test_exports_take_its_height(folder, tmp_path):
 
 
 def test_measure_score_and_fuse_take_its_height(result):
-    sphere = engine.measure(result, form="sphere").quantities["diameter"]
-    assert sphere.value == pytest.approx(10, abs=4 * sphere.sigma)
+    sphere = engine.measure(result, form="sphere").quantities["sphere radius"]
+    assert sphere.value == pytest.approx(5, abs=4 * sphere.sigma)
     flat = np.zeros(SHAPE, np.float32)
     truth = io.Truth((BALL - OFFSET).astype(np.float32), flat, flat, np.ones(SHAPE, np.uint8))
     assert engine.score(result, truth).height.rms < 0.01
@@ -176,9 +177,9 @@ def test_measure_score_and_fuse_take_its_height(result):
 
 
 def test_figures_and_the_report_have_its_title_unit_and_legend(folder, result, tmp_path):
-    titles = [axes.get_title() for axes in overview(result, name="res.h5").axes]
-    assert "Depth" in titles
-    assert "Kind" in titles
+    figure = overview(result, name="res.h5")
+    assert panel(figure, "Depth").child_axes[0].get_ylabel() == "depth (mm)"
+    assert [text.get_text().splitlines()[0] for text in panel(figure, "Kind").get_legend().get_texts()]
     assert run("report", folder / "res.h5", "-o", tmp_path / "res.html").code == 0
     page = (tmp_path / "res.html").read_text(encoding="utf-8")
     assert "bright at the end" in page

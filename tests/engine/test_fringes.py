@@ -197,7 +197,7 @@ STRIPES = {"stripe": np.ones((1, 1)), "risk": np.ones((1, 1))}
     [
         (lambda: engine.fit_fringes(shown(FIELD, EVEN[:3]), EVEN[:3]), "no residual"),
         (lambda: engine.fit_fringes(shown(FIELD, EVEN[:2]), EVEN[:2]), "Fringes needs at least 3 frames"),
-        (lambda: engine.fit_fringes(shown(FIELD, EVEN), EVEN, noise=-1), "noise -1.0: a number in counts"),
+        (lambda: engine.fit_fringes(shown(FIELD, EVEN), EVEN, noise=-1), "noise -1: a number in counts"),
         (lambda: engine.fit_fringes(shown(FIELD, EVEN), EVEN, noise=-FIELD), "noise is below 0"),
         (lambda: engine.fit_fringes(shown(FIELD, EVEN), EVEN, noise=[1, 2]), "noise has shape (2,)"),
         (lambda: engine.unwrap_frequencies([ONE], [1, 2]), "frequency has shape (2,)"),
