@@ -13,19 +13,24 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 
 from mirrorskin.cli import options, scans
-from mirrorskin.cli.groups import Option
+from mirrorskin.cli.declared import ClassCommand, Declared
+from mirrorskin.cli.groups import Option, make_command
 
 if TYPE_CHECKING:
     from mirrorskin.cli.status import Newest
-    from mirrorskin.engine.live import LiveEstimator, Loop
+    from mirrorskin.engine.live import LiveOperation, Loop
+    from mirrorskin.engine.method import Method
+    from mirrorskin.engine.operation import Operation
     from mirrorskin.hw.rig.plans import Plan
     from mirrorskin.hw.rig_file import RigSettings
     from mirrorskin.io import Calibration, LiveSource
 
 _ENDING = "SIGINT", "SIGTERM", "SIGHUP"
 _LATENCY = "100ms"
-_OURS = ("window", "threshold", "hold", "noise", "contact", "device")  # options of our own estimators
-_THRESHOLD, _HOLD = 0.5, 2
+_OPTIONS = (
+    *("threshold", "hold", "subframe", "fill", "modulus", "noise"),
+    *("window_frames", "robust", "contact", "window_size", "window_step"),
+)  # of the methods, which live runs have as well
 # What would bring a map that is missing: keys of the rig file.
 _REMEDIES = {
     "zenith": "zenith_gain in the rig file",
@@ -55,80 +60,62 @@ def command(
         str | None,
         Option(metavar="WHERE", help="Show pictures in a 'window', a 'browser', or write a FILE.rrd."),
     ] = None,
-    window: Annotated[
-        int | None,
-        Option(
-            min=3, max=64, motions=("axial",), help="frames of a turn to use.", show_default="all, up to 64"
-        ),
-    ] = None,
     latency: Annotated[
         str, Option(metavar="TIME", help="Age from which on a frame is skipped, but the newest.")
     ] = _LATENCY,
-    threshold: Annotated[
-        float | None,
-        Option(
-            motions=("vertical",),
-            help="share of the way from dark to bright that is light.",
-            show_default=str(_THRESHOLD),
-        ),
-    ] = None,
-    hold: Annotated[
-        int | None,
-        Option(
-            motions=("vertical",), help="light frames in a row that make an onset.", show_default=str(_HOLD)
-        ),
-    ] = None,
-    noise: Annotated[
-        float | None,
-        Option(metavar="COUNTS", help="Standard deviation of a sample; else told from the frames."),
-    ] = None,
-    contact: options.Contact = None,
-    estimator: Annotated[
+    operation: Annotated[
         str | None,
-        Option(metavar="MODULE:CLASS", help="Your own class; see 'run --help'.", show_default="the motion's"),
+        Option(
+            metavar="MODULE:CLASS",
+            help="Operation in place of the motion's method, such as your own, with its options.",
+        ),
     ] = None,
     calibration: options.Calibration = None,
     device: options.Device = None,
-    **given: Annotated[Any, scans.PLAN],
+    **given: Annotated[Any, scans.PLAN, Declared("reconstruct", only=_OPTIONS)],
 ) -> None:
-    """Reconstruct while the stage moves; Ctrl-C stops it, and what was found and recorded is kept."""
+    """Reconstruct while the stage moves. Ctrl-C stops it, and keeps what was computed and recorded."""
     from mirrorskin import io
     from mirrorskin.cli.quantity import duration
+    from mirrorskin.engine.reconstruction import method_for
     from mirrorskin.engine.running import load_operation
     from mirrorskin.hw.rig_file import load_rig
 
     rig = load_rig(rig_file)
-    plan = scans.make_plan(context, given, rig)
-    own = None if estimator is None else load_operation(estimator)
-    ours = [name for name in _OURS if context.params[name] is not None]
-    if own and ours:
-        raise io.InputError(f"--{ours[0]} does not apply to an --estimator of your own. Remove it")
+    planned = {one.name for one in scans.PLAN.terms}
+    plan = scans.make_plan(context, {name: one for name, one in given.items() if name in planned}, rig)
+    chosen = {name: one for name, one in given.items() if name not in planned}
+    kind = method_for(plan.motion) if operation is None else load_operation(operation)
+    computed = kind(device=device, **chosen)
     if overwrite and record is None:
         raise io.InputError("--overwrite is for --record: leave it out")
-    inputs = rig_file, calibration, contact
+    inputs = rig_file, calibration, *(one for one in chosen.values() if isinstance(one, Path))
     if record is not None:
         io.check_output(record, *inputs, replaces="anything" if overwrite else "nothing")
     if output is not None:
         io.check_output(output, *inputs, record, or_zarr=True)
+    if "contact" in chosen:
+        io.open_result(chosen["contact"])  # refused before anything moves
     known = scans.open_calibration(calibration, rig)
-    values = {**context.params, "latency": duration(latency, "--latency"), "own": own}
-    _Live(rig, plan, values, known).run()
+    values = {**context.params, **given, "latency": duration(latency, "--latency")}
+    _Live(rig, plan, computed, values, known).run()
 
 
 class _Live:
-    """A run, of which what was found is kept whatever ends it; the command's options are `given`."""
+    """A run whose result is kept whatever ends it; the command's options are `given`."""
 
     def __init__(
-        self, settings: RigSettings, plan: Plan, given: Mapping[str, Any], calibration: Calibration | None
+        self,
+        settings: RigSettings,
+        plan: Plan,
+        computed: Operation | Method,
+        given: Mapping[str, Any],
+        calibration: Calibration | None,
     ) -> None:
-        from mirrorskin.io import open_result
-
-        self._settings, self._plan, self._given = settings, plan, given
+        self._settings, self._plan, self._computed, self._given = settings, plan, computed, given
         self._calibration = calibration
-        if given["contact"] is not None:
-            open_result(given["contact"])  # refused before anything moves
         self._loop: Loop | None = None
-        self._estimator: LiveEstimator | None = None
+        self._operation: LiveOperation | None = None
 
     def run(self) -> None:
         """Reconstruct while the stage moves, and save the result."""
@@ -161,7 +148,7 @@ class _Live:
         given, settings, known = self._given, self._settings, self._calibration
         with ExitStack() as stack:
             rig = stack.enter_context(open_rig(settings))
-            scan = scans.make_scan(rig, self._plan, given["settle"], given["frames"])
+            scan = scans.make_scan(rig, self._plan, given.get("settle"), given.get("frames"))
             view = given["view"]
             shown = stack.enter_context(_viewer(view, scan.shape[1:], settings)) if view else None
             tell = stack.enter_context(show_status())
@@ -174,8 +161,8 @@ class _Live:
                 source = Calibrated(source, known)
             stack.enter_context(scans.kept(recorder))
             stack.enter_context(source)
-            self._estimator = estimator = self._make_estimator(source, rig.rate)
-            estimator.warm()
+            self._operation = operation = self._prepare(source, rig.rate)
+            operation.warm()
 
             def on_update(update: Any, status: Any) -> None:
                 tell(status)
@@ -187,7 +174,7 @@ class _Live:
             mark = None if recorder is None else recorder.mark
             guard = _Guard()
             self._loop = Loop(
-                source, estimator, latency=given["latency"], on_update=on_update, mark=mark, guard=guard
+                source, operation, latency=given["latency"], on_update=on_update, mark=mark, guard=guard
             )
             gc.freeze()  # a collector that looks through all that was there before would hold up frames
             try:
@@ -196,32 +183,19 @@ class _Live:
             finally:
                 gc.unfreeze()
 
-    def _make_estimator(self, source: LiveSource, rate: float) -> LiveEstimator:
-        """Make what estimates the maps; the source has its references."""
-        from mirrorskin.engine.live import (
-            LiveOwn,
-            LivePress,
-            LiveRocking,
-            LiveRotation,
-            LiveSlip,
-            choose_window,
-        )
-        from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, RockPlan, TwistPlan
+    def _prepare(self, source: LiveSource, rate: float) -> LiveOperation:
+        """Join the operation and the source, which has references and calibration."""
+        from mirrorskin.engine import Rotation
+        from mirrorskin.engine.live import LiveOperation
+        from mirrorskin.engine.rotation.last_turn import choose_window
+        from mirrorskin.hw.rig.plans import AxialPlan
 
-        given, plan = self._given, self._plan
-        if given["own"] is not None:
-            return LiveOwn(source, given["own"])
-        known: dict[str, Any] = {"noise": given["noise"], "device": given["device"]}
-        if isinstance(plan, AxialPlan):
-            window, every = choose_window(plan.frames_a_turn(rate, given["frames"] or 1), given["window"])
-            return LiveRotation(source, window=window, every=every, **known)
-        if isinstance(plan, RockPlan):
-            return LiveRocking(source, **known)
-        if isinstance(plan, HorizontalPlan | TwistPlan):
-            return LiveSlip(source, contact=self._given["contact"], **known)
-        threshold = _THRESHOLD if given["threshold"] is None else given["threshold"]
-        hold = _HOLD if given["hold"] is None else given["hold"]
-        return LivePress(source, threshold=threshold, hold=hold, **known)
+        computed, plan = self._computed, self._plan
+        if not (isinstance(plan, AxialPlan) and isinstance(computed, Rotation)):
+            return LiveOperation(source, computed)
+        per_turn = plan.frames_a_turn(rate, self._given.get("frames") or 1)
+        window, every = choose_window(per_turn, computed.window_frames)
+        return LiveOperation(source, computed.with_options(window_frames=window), every=every)
 
     def _save(self) -> None:
         """Write the result, if that is asked for, and say what it lacks."""
@@ -230,8 +204,8 @@ class _Live:
             return
         from mirrorskin.cli.output import report_contact, report_levels, report_missing_maps, save_and_report
 
-        assert self._estimator is not None
-        result = self._estimator.result()
+        assert self._operation is not None
+        result = self._operation.result()
         report_missing_maps(self._settings.name, result.process, _REMEDIES)
         report_contact(self._settings.name, result.process)
         save_and_report(result, output, self._given["device"], as_json=False)
@@ -292,3 +266,6 @@ def _viewer(where: str, shape: tuple[int, int], settings: RigSettings) -> Iterat
         viewer.close()
         if viewer.error is not None:
             click.echo(f"the pictures ended early: {viewer.error}", err=True)
+
+
+app = make_command("live", command, ClassCommand)

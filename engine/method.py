@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,6 +140,10 @@ class Method(OnDevice):
             feed(plan.stream or source, plan.operation, plan.frames, progress)
             result = plan.finish(plan.operation.finish(), source)
         return undistorted(result, source) if undistort else result
+
+    def with_options(self, **options: Any) -> Self:
+        """Return a method of the same class in which some options differ."""
+        return type(self)(**{**self.chosen(), **options})
 
     def make(self, kind: Callable[..., Any], **changes: Any) -> Any:
         """Return an operation or step with this method's values of its options."""
