@@ -156,10 +156,11 @@ class Terms:
         }  # fmt: skip
 
 
-def declared(command: str, *, without: Sequence[str] = ()) -> Terms:
-    """Return the engine's options of a command, an entry of ``declared.json``, except some."""
+def declared(command: str, *, only: Sequence[str] = (), without: Sequence[str] = ()) -> Terms:
+    """Return the engine's options of a command, an entry of ``declared.json``: all, or only or without some."""
     stored = json.loads(_COPY.read_text(encoding="utf-8"))[command]
-    return Terms([Term(**fields) for fields in stored if fields["name"] not in without], of_engine=True)
+    chosen = [one for one in stored if one["name"] not in without and (not only or one["name"] in only)]
+    return Terms([Term(**fields) for fields in chosen], of_engine=True)
 
 
 def term(

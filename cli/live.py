@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 
 from mirrorskin.cli import options, scans
-from mirrorskin.cli.declared import ClassCommand, Declared
+from mirrorskin.cli.declared import ClassCommand, declared
 from mirrorskin.cli.groups import Option, make_command
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def command(
     ] = None,
     calibration: options.Calibration = None,
     device: options.Device = None,
-    **given: Annotated[Any, scans.PLAN, Declared("reconstruct", only=_OPTIONS)],
+    **given: Annotated[Any, scans.PLAN, declared("reconstruct", only=_OPTIONS)],
 ) -> None:
     """Reconstruct while the stage moves. Ctrl-C stops it, and keeps what was computed and recorded."""
     from mirrorskin import io
