@@ -101,6 +101,10 @@ class Method(OnDevice):
     motions: ClassVar[tuple[str, ...]] = ()
     """Motions of recordings that the method applies to; none for all."""
 
+    if TYPE_CHECKING:  # the options of `options_of`
+
+        def __getattr__(self, name: str) -> Any: ...
+
     def plan(self, source: Source) -> Plan:
         """Return what is done with a source: its operation, steps and frames."""
         raise NotImplementedError

@@ -41,7 +41,69 @@ _ANSWERS = {
 """Maps of a band, by the arguments of kernels."""
 
 
-class Correlate(Operation):
+class CorrelationOperation(Operation):
+    """Base of operations that fit mean, cosine and sine of a phase to each pixel's brightness."""
+
+    dtypes = FRAME_DTYPES
+    on_device = long_blocks = True
+
+    mean = TABLE["mean"]
+    cosine = TABLE["cosine"]
+    sine = TABLE["sine"]
+    modulation = TABLE["modulation"]
+    azimuth = TABLE["azimuth"]
+    residual = TABLE["residual"]
+
+    def _window(self) -> int | None:
+        """Return the number of the last frames that are fitted; None for all."""
+        return None
+
+    def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
+        """Prepare for frames of a shape and type."""
+        self._length = max(1, self.memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))
+        self._stack: tuple[NDArray[Any], Doubles, Doubles] | None = None
+        vars(self).pop("_sums", None)
+
+    @cached_property
+    def _sums(self) -> TurnSums | WindowSums:
+        window = self._window()
+        if window is None:
+            return TurnSums(self.device, self.shape, self.dtype, self._length)
+        return WindowSums(self.device, self.shape, self.dtype, self._length, window)
+
+    def clear(self) -> None:
+        """Forget the frames so far."""
+        self._stack = None
+        if "_sums" in vars(self):
+            self._sums.reset()
+
+    @property
+    def room(self) -> NDArray[Any]:
+        """Array in which the next frames may be written before they are pushed, (n, H, W)."""
+        return self._sums.room
+
+    def _push(self, frames: NDArray[Any], alpha: Doubles, weights: Doubles, lent: bool) -> None:
+        """Take in frames with the phase and the weight of each."""
+        if lent and self.count == 0 and self._window() is None and StackSums.take(frames, weights):
+            self._stack = frames, alpha, weights  # summed and solved in one run, unless others follow
+            return
+        if self._stack is not None:
+            self._sums.push(*self._stack, lent=True)
+            self._stack = None
+        self._sums.push(frames, alpha, weights, lent)
+
+    def _fit(self) -> Result:
+        """Return the fit of the frames so far, or of those in the window."""
+        if self._stack is None:
+            return self._sums.result()
+        frames, alpha, weights = self._stack
+        check_phases(alpha, weights)
+        sums = StackSums(self.device, self.shape, self.dtype, len(frames))
+        sums.push(frames, alpha, weights)
+        return sums.result()
+
+
+class Correlate(CorrelationOperation):
     """Least-squares fit of mean, cosine and sine of the phase to each pixel's brightness.
 
     It minimises SS = sum_k w_k (E_k - mean - cosine cos alpha_k - sine sin alpha_k)^2. For N evenly spaced
@@ -64,9 +126,6 @@ class Correlate(Operation):
     20.0
     """
 
-    dtypes = FRAME_DTYPES
-    on_device = long_blocks = True
-
     harmonic: int = option(
         1,
         within=(1, None),
@@ -81,35 +140,8 @@ class Correlate(Operation):
         shown_default="all frames",
     )
 
-    mean = TABLE["mean"]
-    cosine = TABLE["cosine"]
-    sine = TABLE["sine"]
-    modulation = TABLE["modulation"]
-    azimuth = TABLE["azimuth"]
-    residual = TABLE["residual"]
-
-    def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
-        """Prepare for frames of a shape and type."""
-        self._length = max(1, self.memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))
-        self._stack: tuple[NDArray[Any], Doubles, Doubles] | None = None
-        vars(self).pop("_sums", None)
-        if self.window_frames is not None:
-            self._sums = WindowSums(self.device, shape, dtype, self._length, self.window_frames)
-
-    @cached_property
-    def _sums(self) -> TurnSums | WindowSums:
-        return TurnSums(self.device, self.shape, self.dtype, self._length)
-
-    def clear(self) -> None:
-        """Forget the frames so far."""
-        self._stack = None
-        if "_sums" in vars(self):
-            self._sums.reset()
-
-    @property
-    def room(self) -> NDArray[Any]:
-        """Array in which the next frames may be written before they are pushed, (n, H, W)."""
-        return self._sums.room
+    def _window(self) -> int | None:
+        return self.window_frames
 
     def push(
         self,
@@ -122,23 +154,11 @@ class Correlate(Operation):
         """Take in the next frames, (n, H, W), the phase of each, (n,) radians, and their weights, (n,)."""
         alpha = self.harmonic * check_phase(phase, len(frames), "phase")
         weights = check_weights(frame_weights, len(frames))
-        if lent and self.count == 0 and self.window_frames is None and StackSums.take(frames, weights):
-            self._stack = frames, alpha, weights
-            return
-        if self._stack is not None:
-            self._sums.push(*self._stack, lent=True)
-            self._stack = None
-        self._sums.push(frames, alpha, weights, lent)
+        self._push(frames, alpha, weights, lent)
 
     def result(self) -> Result:
         """Return the fit of the frames so far, or of those in the window."""
-        if self._stack is None:
-            return self._sums.result()
-        frames, alpha, weights = self._stack
-        check_phases(alpha, weights)
-        sums = StackSums(self.device, self.shape, self.dtype, len(frames))
-        sums.push(frames, alpha, weights)
-        return sums.result()
+        return self._fit()
 
 
 correlate = phase_function(
