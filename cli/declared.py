@@ -157,7 +157,7 @@ class Terms:
 
 
 def declared(command: str, *, only: Sequence[str] = (), without: Sequence[str] = ()) -> Terms:
-    """Return the engine's options of a command, an entry of ``declared.json``: all, or only or without some."""
+    """Return the engine's options of a command, an entry of ``declared.json``: all, or some."""
     stored = json.loads(_COPY.read_text(encoding="utf-8"))[command]
     chosen = [one for one in stored if one["name"] not in without and (not only or one["name"] in only)]
     return Terms([Term(**fields) for fields in chosen], of_engine=True)

@@ -24,6 +24,7 @@ from mirrorskin.engine.rotation.coarse_height import coarse_heights
 from mirrorskin.engine.rotation.correlation import Correlate
 from mirrorskin.engine.rotation.design_matrix import LONGEST, Doubles, cut_into_turns
 from mirrorskin.engine.rotation.edited import EditedSource
+from mirrorskin.engine.rotation.last_turn import LastTurn
 from mirrorskin.engine.rotation.moving_normals import MovingNormals
 from mirrorskin.engine.rotation.normals import Normals, NormalsOperation
 from mirrorskin.engine.rotation.normals_kernel import NormalMethod
@@ -85,15 +86,16 @@ class Rotation(Method, options_of=(NormalsOperation, Integration)):
         return self._calibrated(source, header, wall, heights)
 
     def live_plan(self, source: Source) -> Plan:
-        """Return the normals of the last frames, without registration; or what the source determines."""
+        """Return the normals of the last turn, without registration; or what the source determines."""
         wall = self._wall_of(source)
         if self.zenith_gain is None and source.header.zenith_gain is None and wall is None:
             return self._correlation(source)
         if self.tilt is None and source.header.tilt is None:
             return self._poses(source)
-        operation = self.make(Normals).configured_for(source)
+        operation = self.make(LastTurn).configured_for(source)
         brightness = self._brightness(source) if wall is None else {"zenith": "calibrated"}
-        return Plan(operation, self._steps(), {**self._process(), **brightness}, omit=_OMIT)
+        process = {**self._process(), **brightness, "window_frames": operation.window_frames}
+        return Plan(operation, self._steps(), process)
 
     def _wall_of(self, source: Source) -> WallResponse | None:
         return wall_response_of(source) if self.zenith_gain is None else None
