@@ -98,8 +98,8 @@ class LiveOperation(ThreadSafe):
             return {}
         quantity = found.name_of if isinstance(found, Result) else lambda name: name
         maps = {name: found.get(quantity(name)) for name in _SHOWN}
-        if isinstance(found, Result):  # whose pieces have it
-            maps["offset_unknown"] = found.offset_unknown is not None and bool(found.offset_unknown.any())
+        if maps["offset_unknown"] is not None:  # of each piece, or of all
+            maps["offset_unknown"] = bool(np.any(maps["offset_unknown"]))
         contact, size = maps["contact"], self._source.header.pixel_size
         area = None if contact is None or size is None else float(np.count_nonzero(contact)) * math.prod(size)
         shown = {name: one for name, one in {**maps, "contact_area": area}.items() if one is not None}
