@@ -31,11 +31,11 @@ from .press.onset import Onset, find_onset
 from .press.press import Press
 from .press.strokes import Strokes
 from .reconstruction import reconstruct
-from .rotation.correlation import Correlation, Correlator, correlate
+from .rotation.correlation import Correlate, correlate
 from .rotation.edges import find_edges
 from .rotation.frequency import Frequency, estimate_frequency
-from .rotation.normals import NormalEstimator, Normals, estimate_normals
-from .rotation.normals_pose import PoseEstimator, PoseNormals
+from .rotation.moving_normals import MovingNormals, estimate_normals
+from .rotation.normals import Normals
 from .running import run
 from .scoring import Score, score
 from .slip.displacement import Displacement, find_displacement
@@ -45,8 +45,7 @@ from .tiling import free_memory
 __all__ = [
     "Camera",
     "ChangePoint",
-    "Correlation",
-    "Correlator",
+    "Correlate",
     "Displacement",
     "Focus",
     "FocusEstimator",
@@ -59,15 +58,13 @@ __all__ = [
     "Lambertian",
     "Measures",
     "Method",
-    "NormalEstimator",
+    "MovingNormals",
     "Normals",
     "NotConverged",
     "Onset",
     "Operation",
     "PhotometricStereo",
     "Pose",
-    "PoseEstimator",
-    "PoseNormals",
     "PoseTracker",
     "Press",
     "Score",

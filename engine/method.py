@@ -30,10 +30,14 @@ class Context:
         Where the frames come from: its header and calibration.
     operation : Operation
         What the maps were computed by: its options, device, and the positions of the frames.
+    stream : Source
+        Where the frames were read: the source, or one that changes its frames, such as
+        `mirrorskin.engine.rotation.registration.Registered`.
     """
 
     source: Source
     operation: Operation
+    stream: Source
 
     def pushed(self, name: str) -> NDArray[np.float64]:
         """Return the positions of the frames, such as their ``travel``."""
@@ -66,6 +70,8 @@ class Plan:
         Frames that are used, by default all.
     omit : sequence of str
         Maps of the operation that the result leaves out.
+    stream : Source, optional
+        Where the frames are read, if not from the source itself.
     """
 
     operation: Operation
@@ -73,12 +79,13 @@ class Plan:
     process: Mapping[str, ProcessValue] = field(default_factory=dict)
     frames: range | None = None
     omit: Sequence[str] = ()
+    stream: Source | None = None
 
     def finish(
         self, result: Result, source: Source, more: Mapping[str, ProcessValue] | None = None
     ) -> Result:
         """Return the operation's maps after all steps, with provenance, undistorted if there is a lens."""
-        context = Context(source, self.operation)
+        context = Context(source, self.operation, self.stream or source)
         result = result.assign(dict.fromkeys(self.omit))
         result = result.assign(process={**self.process, **result.process, **(more or {})})
         for step in self.steps:
@@ -91,7 +98,11 @@ class Method(OnDevice):
     """Base of methods. Their options are those of their operations and steps."""
 
     motions: ClassVar[tuple[str, ...]] = ()
-    """Motions of recordings that the method applies to."""
+    """Motions of recordings that the method applies to; none for all."""
+
+    if TYPE_CHECKING:  # the options of `options_of`
+
+        def __getattr__(self, name: str) -> Any: ...
 
     def plan(self, source: Source) -> Plan:
         """Return what is done with a source: its operation, steps and frames."""
@@ -109,14 +120,14 @@ class Method(OnDevice):
         mirrorskin.io.InputError
             The source has another motion, or it and the options cannot be used.
         """
-        if source.motion not in self.motions:
+        if self.motions and source.motion not in self.motions:
             motions = " or ".join(self.motions)
             raise InputError(
                 f"{source.name} has {source.motion} motion, but {type(self).__name__} needs {motions} motion"
             )
         with naming(source):
             plan = self.plan(source)
-            feed(source, plan.operation, plan.frames, progress)
+            feed(plan.stream or source, plan.operation, plan.frames, progress)
             return plan.finish(plan.operation.finish(), source)
 
     def make(self, kind: Callable[..., Any], **changes: Any) -> Any:

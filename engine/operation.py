@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 
 _NOT_POSITIONS = ("lent", "frame_weights")  # keywords of push that are not positions of the body
+ABOUT_WEIGHTS = "Weight of each frame, such as its inverse variance; 0 for a missing frame. By default 1."
+"""Description of ``frame_weights`` of array functions."""
 
 
 class _DeviceOption(Option):
@@ -328,9 +330,16 @@ class TravelFunction(Protocol[P]):
 
 
 class PhaseFunction(Protocol[P]):
-    """A function of frames, (T, H, W), their phase, (T,) radians, and options."""
+    """A function of frames, (T, H, W), their phase, (T,) radians, their weights, (T,), and options."""
 
-    def __call__(self, frames: ArrayLike, phase: ArrayLike, *args: P.args, **options: P.kwargs) -> Result:
+    def __call__(
+        self,
+        frames: ArrayLike,
+        phase: ArrayLike,
+        frame_weights: ArrayLike | None = None,
+        *args: P.args,
+        **options: P.kwargs,
+    ) -> Result:
         """Return the maps."""
 
 
@@ -338,39 +347,59 @@ def travel_function(
     operation: Callable[P, Operation], name: str, text: str, about_travel: str
 ) -> TravelFunction[P]:
     """Return the function on arrays of an operation whose ``push`` takes ``travel``."""
-    function = _array_function(cast(Any, operation), name, text, {"travel": about_travel})
+    function = array_function(cast(Any, operation), name, text, {"travel": about_travel})
     return cast(TravelFunction[P], function)
 
 
 def phase_function(
     operation: Callable[P, Operation], name: str, text: str, about_phase: str
 ) -> PhaseFunction[P]:
-    """Return the function on arrays of an operation whose ``push`` takes ``phase``."""
-    return cast(PhaseFunction[P], _array_function(cast(Any, operation), name, text, {"phase": about_phase}))
+    """Return the function on arrays of an operation whose ``push`` takes ``phase`` and ``frame_weights``."""
+    function = array_function(
+        cast(Any, operation), name, text, {"phase": about_phase}, {"frame_weights": ABOUT_WEIGHTS}
+    )
+    return cast(PhaseFunction[P], function)
 
 
-def _array_function(
-    operation: type[Operation], name: str, text: str, positions: Mapping[str, str]
+def array_function(
+    operation: type[Operation],
+    name: str,
+    text: str,
+    positions: Mapping[str, str],
+    optional: Mapping[str, str] | None = None,
+    compute: Callable[[NDArray[Any], dict[str, Any], dict[str, Any]], Result] | None = None,
 ) -> Callable[..., Result]:
     """Return a function of frames, positions and options, with signature and docstring.
 
-    ``text`` is the docstring without the section "Parameters".
+    Parameters
+    ----------
+    operation : type
+        Operation that has the options.
+    name : str
+    text : str
+        Docstring without the section "Parameters".
+    positions, optional : mapping of str
+        Names of what is needed of each frame, or may be given, with descriptions.
+    compute : callable, optional
+        Receives frames, positions and options, and returns the result; by default that of the operation.
     """
-    named = ("frames", *positions)
-    hidden = {"memory_limit"}
-    options = {one: declared for one, declared in operation.options.items() if one not in hidden}
-    signature = signature_of(options, named)
+    optional = optional or {}
+    options = {one: declared for one, declared in operation.options.items() if one != "memory_limit"}
+    signature = signature_of(options, ("frames", *positions), tuple(optional))
+
+    def run(frames: NDArray[Any], where: dict[str, Any], given: dict[str, Any]) -> Result:
+        limit = max(1, min(MEMORY_LIMIT, 2 * frames.nbytes))
+        return apply(operation(memory_limit=limit, **given), frames, **where)
 
     def function(*args: Any, **kwargs: Any) -> Result:
         given = signature.bind(*args, **kwargs).arguments
         frames = as_array("frames", given.pop("frames"))
-        where = {one: given.pop(one) for one in positions}
-        made = operation(memory_limit=max(1, min(MEMORY_LIMIT, 2 * frames.nbytes)), **given)
-        return apply(made, frames, **where)
+        where = {one: given.pop(one, None) for one in (*positions, *optional)}
+        return (compute or run)(frames, where, given)
 
-    before = "frames : array_like, (T, H, W)\n    Raw counts.\n" + "".join(
-        f"{one} : array_like, (T,)\n    {about}\n" for one, about in positions.items()
-    )
+    before = "frames : array_like, (T, H, W)\n    Raw counts.\n"
+    for names, end in ((positions, ""), (optional, ", optional")):
+        before += "".join(f"{one} : array_like, (T,){end}\n    {about}\n" for one, about in names.items())
     function.__name__ = function.__qualname__ = name
     function.__module__ = operation.__module__
     function.__doc__ = documented(text, options, before)

@@ -276,10 +276,16 @@ class Configured:
         return {name: one.stored(self) for name, one in self.options.items() if name in kind.options}
 
 
-def signature_of(options: Mapping[str, Option], positional: Sequence[str] = ()) -> inspect.Signature:
-    """Return the signature of a callable that takes options as keywords, after positional parameters."""
+def signature_of(
+    options: Mapping[str, Option], positional: Sequence[str] = (), optional: Sequence[str] = ()
+) -> inspect.Signature:
+    """Return the signature of a callable that takes options as keywords, after positional parameters.
+
+    Those in ``optional`` are None by default.
+    """
     kinds = inspect.Parameter
     first = [kinds(name, kinds.POSITIONAL_OR_KEYWORD) for name in positional]
+    first += [kinds(name, kinds.POSITIONAL_OR_KEYWORD, default=None) for name in optional]
     rest = [kinds(name, kinds.KEYWORD_ONLY, default=one.default) for name, one in options.items()]
     return inspect.Signature([*first, *rest])
 

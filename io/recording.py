@@ -21,7 +21,7 @@ from mirrorskin.io.layout import CHECKSUM, MARK, SERIES, STACK, Layout, Recordin
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.positions import Positions, along
 from mirrorskin.io.recorder import checksums
-from mirrorskin.io.result import Result
+from mirrorskin.io.result import absolute_heights
 from mirrorskin.io.result_file import MARK as RESULT_MARK
 from mirrorskin.io.result_file import open_result
 from mirrorskin.io.selection import Region, Selection, source_region
@@ -440,7 +440,7 @@ def open_heights(path: str | Path, source: Recording | None = None) -> NDArray[n
             raise InputError(
                 f"{path} holds undistorted heights, and frames are as the camera saw them: {remedy}"
             )
-        height = _absolute(result)
+        height = absolute_heights(result)
         part = source_region(result.process)
     if height is None:
         raise InputError(f"{path} holds no heights: give a result of a press, or a simulation with truth")
@@ -464,12 +464,3 @@ def _cut_heights(
             "give some of all these pixels"
         )
     return np.ascontiguousarray(height[wanted.within(own)])
-
-
-def _absolute(result: Result) -> NDArray[np.float32] | None:
-    """Return the heights of a result without the pieces whose offset nobody knows."""
-    height: NDArray[np.float32] | None = result.height
-    piece, unknown = result.component, result.offset_unknown
-    if height is None or piece is None or unknown is None or not unknown.any():
-        return height
-    return np.where((piece >= 0) & (unknown[piece] == 0), height, np.float32(np.nan))

@@ -105,7 +105,8 @@ class Result(Shown, Mapping[str, Any]):
     Parameters
     ----------
     maps : mapping of str to ndarray or float, optional
-        Maps, series (T,) and numbers by name; those that are None are left out.
+        Maps, series (T,) and numbers by name; those that are None are left out. A function without arguments
+        that returns a map is called when the map is first used.
     x, y : ndarray, (W,) and (H,), float64, optional
         Millimetres of the pixel centres from the picture's centre; y points up the picture.
     process : mapping, optional
@@ -169,7 +170,10 @@ class Result(Shown, Mapping[str, Any]):
             object.__setattr__(self, name, value)
 
     def __getitem__(self, name: str) -> Any:
-        return self._maps[name]
+        value = self._maps[name]
+        if callable(value):  # a map that is computed when it is needed
+            value = self._maps[name] = value()
+        return value
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._maps)
@@ -182,7 +186,7 @@ class Result(Shown, Mapping[str, Any]):
             raise AttributeError(name)
         own = self.name_of(name)
         if own is not None:
-            return self._maps[own]
+            return self[own]
         if is_builtin(name):
             return None
         has = ", ".join(self._maps) or "no maps"
@@ -192,7 +196,7 @@ class Result(Shown, Mapping[str, Any]):
         raise AttributeError(f"results are read-only: use result.assign({name}=...)")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restore, (self._maps, {name: getattr(self, name) for name in FIELDS})
+        return _restore, (dict(self), {name: getattr(self, name) for name in FIELDS})
 
     __eq__ = object.__eq__
     __hash__ = object.__hash__
@@ -257,7 +261,7 @@ class Result(Shown, Mapping[str, Any]):
         return self._along("frames")
 
     def _along(self, axes: str) -> dict[str, Any]:
-        return {name: one for name, one in self._maps.items() if self.declaration(name).axes == axes}
+        return {name: self[name] for name in self if self.declaration(name).axes == axes}
 
     def to_xarray(self) -> xarray.Dataset:
         """Return the result as an `xarray.Dataset`: coordinates ``x`` and ``y`` in mm, units as attributes.
@@ -354,6 +358,20 @@ def _checked_map(name: str, values: NDArray[Any], declared: Map, shape: tuple[in
                 "Declare another dtype"
             )
     return values.astype(declared.dtype, copy=False) if values.ndim else float(values)
+
+
+def result_from(maps: Mapping[str, Any]) -> Result:
+    """Return a result as it is, and any other mapping from names to maps as a result."""
+    return maps if isinstance(maps, Result) else Result(maps)
+
+
+def absolute_heights(result: Result) -> NDArray[np.float32] | None:
+    """Return the heights of a result without the pieces whose offset is unknown, which are NaN."""
+    height: NDArray[np.float32] | None = result.height
+    piece, unknown = result.component, result.offset_unknown
+    if height is None or piece is None or unknown is None or not unknown.any():
+        return height
+    return np.where((piece >= 0) & (unknown[piece] == 0), height, np.float32(np.nan))
 
 
 def may_name_a_map(name: str) -> bool:

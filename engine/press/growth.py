@@ -4,25 +4,32 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.frames import reference_pair
-from mirrorskin.engine.rotation.correlation import Correlation, correlate
+from mirrorskin.engine.operation import travel_function
+from mirrorskin.engine.options import option
+from mirrorskin.engine.press.crossing import PressOperation
+from mirrorskin.engine.rotation.correlation import CorrelationOperation
 from mirrorskin.engine.rotation.design_matrix import Doubles, basis
 from mirrorskin.engine.rotation.frequency import estimate_frequency
-from mirrorskin.io import InputError
-from mirrorskin.io.arguments import checked
+from mirrorskin.io import InputError, Result
+from mirrorskin.io.maps import TABLE
 from mirrorskin.io.positions import check_strokes
+from mirrorskin.io.types import ProcessValue
+
+if TYPE_CHECKING:
+    from mirrorskin.io import Source
 
 _SINUSOID = 0.9  # share of the travel's variance that its first harmonic has at least
-
 _PERIODS = 2  # of the dither, at least
 
 
-class TravelWave(NamedTuple):
+@dataclass(frozen=True, slots=True, eq=False)
+class TravelWave:
     """The first harmonic of a travel: s = mean + amplitude cos(phase)."""
 
     phase: Doubles  # (T,), radians, from 0 on
@@ -30,73 +37,8 @@ class TravelWave(NamedTuple):
     amplitude: float  # mm
 
 
-@dataclass(frozen=True, slots=True)
-class Growth:
-    """How the share of light grows with travel.
-
-    Attributes
-    ----------
-    growth, sigma : ndarray, (H, W), float32
-        1/mm: share of full light that a pixel gains for each mm of travel, in phase with it, and the standard
-        deviation. NaN where references or samples are missing.
-    lag : ndarray, (H, W), float32
-        Radians by which the light comes after the travel.
-    travel, amplitude : float
-        Millimetres: mean and amplitude of the dither.
-    area, area_sigma : float or None
-        The sum over all pixels: mm^2 of full light for each mm of travel; None without a pixel size.
-    """
-
-    growth: NDArray[np.float32]
-    sigma: NDArray[np.float32]
-    lag: NDArray[np.float32]
-    travel: float
-    amplitude: float
-    area: float | None = None
-    area_sigma: float | None = None
-
-    @classmethod
-    def of(
-        cls,
-        wave: Correlation,
-        travel: TravelWave,
-        dark: ArrayLike | None,
-        bright: ArrayLike | None,
-        dtype: np.dtype[Any],
-        pixel_size: tuple[float, float] | None,
-    ) -> Growth:
-        """Scale the fit of the travel's phases."""
-        low, high = reference_pair(dark, bright, (wave.mean.shape[0], wave.mean.shape[1]), dtype)
-        per_count = 1 / ((high - low) * travel.amplitude)
-        growth = wave.cosine * per_count
-        sigma = wave.residual * math.sqrt(2 / wave.frames) * per_count
-        area = area_sigma = None
-        if pixel_size is not None:
-            pixel = math.prod(pixel_size)
-            area = pixel * float(np.nansum(growth))
-            area_sigma = pixel * math.sqrt(float(np.nansum(sigma**2)))
-        return cls(
-            growth.astype(np.float32),
-            sigma.astype(np.float32),
-            wave.azimuth,
-            travel.mean,
-            travel.amplitude,
-            area,
-            area_sigma,
-        )
-
-
-@checked
-def find_growth(
-    frames: NDArray[Any],
-    travel: ArrayLike,
-    *,
-    dark: ArrayLike | None = None,
-    bright: ArrayLike | None = None,
-    pixel_size: tuple[float, float] | None = None,
-    device: Any = None,
-) -> Growth:
-    """Find how fast contact grows with travel, from a stack of a dithering press.
+class Growth(CorrelationOperation):
+    """Growth of the contact with travel, from a press that dithers about a mean.
 
     At the mean travel s0 the share of full light of a pixel, (E - dark) / (bright - dark), has the derivative
     G by travel. To first order of the dither's amplitude d its part in phase with the travel is G d: this is
@@ -104,23 +46,120 @@ def find_growth(
     derivative; but its sum over the border is (dA/ds) d as well, A being the area of full light, whichever
     shape the border has.
 
-    Parameters
-    ----------
-    frames : ndarray, (T, H, W), uint8, uint16 or float32
-        Raw counts.
-    travel : array_like, (T,)
-        Millimetres; several periods of nearly a sinusoid.
-    dark, bright : array_like, scalar or (H, W), optional
-        As for `mirrorskin.engine.find_onset`.
-    pixel_size : (float, float), optional
-        Millimetres, for the growth of the area.
-    device : str or Device, optional
-        See ``mirrorskin.kernels.device.open_device``.
+    ``azimuth`` is the phase by which the light lags behind the travel. ``process`` contains the mean
+    ``travel`` and the ``travel_amplitude``, mm, and with a pixel size ``area_growth``, the sum over all
+    pixels, mm^2 of full light per mm of travel, and its standard deviation ``area_growth_sigma``.
+
+    The frames are needed twice, unless the travel is known beforehand.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mirrorskin import engine
+    >>> travel = 1 + 0.02 * np.cos(0.7 * np.arange(90))
+    >>> frames = (100 + 300 * (travel - 1)[:, None, None] * np.ones((2, 3))).astype(np.float32)
+    >>> result = engine.run(frames, engine.Growth(dark=0, bright=200), travel=travel)
+    >>> round(result.process["travel_amplitude"], 3)
+    0.02
+    """
+
+    motions = ("vertical",)
+
+    dark: ArrayLike | None = PressOperation.dark
+    bright: ArrayLike | None = PressOperation.bright
+    pixel_size: tuple[float, float] | None = option(
+        None,
+        help="size of a pixel along x and y, mm, for the growth of the area",
+        shown_default="that of the recording",
+        python_only=True,
+    )
+    dither: TravelWave | None = option(
+        None,
+        help="first harmonic of the travel, if it is known beforehand",
+        shown_default="estimated from the travel of all frames in a first pass",
+        python_only=True,
+    )
+
+    growth = TABLE["growth"]
+    growth_sigma = TABLE["growth"].deviation("growth")
+
+    def configured_for(self, source: Source) -> Self:
+        """Return the operation with the source's levels, pixel size and travel, where none are given."""
+        changes: dict[str, Any] = {
+            name: getattr(source.header, name)
+            for name in ("dark", "bright", "pixel_size")
+            if getattr(self, name) is None
+        }
+        travel: Doubles | None = getattr(source, "travel", None)
+        if self.dither is None and travel is not None:
+            changes["dither"] = travel_wave(travel, source.shape[0])
+        return self.with_options(**changes)
+
+    @property
+    def passes(self) -> int:
+        """How often all frames are pushed: twice if the travel is not known beforehand."""
+        return 2 if self.dither is None else 1
+
+    def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
+        """Prepare for frames of a shape and type."""
+        super().start(shape, dtype)
+        self._levels = reference_pair(self.dark, self.bright, shape, dtype)
+        self._wave = self.dither
+
+    def clear(self) -> None:
+        """Forget the frames so far."""
+        super().clear()
+        self._wave = self.dither
+
+    def start_second_pass(self) -> None:
+        """Estimate the first harmonic of the travel of all frames."""
+        self._wave = travel_wave(self.pushed("travel"), self.count)
+
+    def push(self, frames: NDArray[Any], *, travel: ArrayLike, lent: bool = False) -> None:
+        """Take in the next frames, (n, H, W), and the travel of each, (n,) mm."""
+        check_strokes(travel, len(frames), "travel")
+        if self._wave is None:  # in the first pass
+            return
+        phase = self._wave.phase[self.count : self.count + len(frames)]
+        if len(phase) < len(frames):
+            raise InputError(f"there are more than the {len(self._wave.phase)} frames whose travel was known")
+        self._push(frames, phase, np.ones(len(frames)), lent)
+
+    def result(self) -> Result:
+        """Return the growth and the correlation with the travel's first harmonic."""
+        assert self._wave is not None  # after the first pass
+        fit, wave = self._fit(), self._wave
+        dark, bright = self._levels
+        per_count = 1 / ((bright - dark) * wave.amplitude)
+        growth = fit.cosine * per_count
+        sigma = fit.residual * math.sqrt(2 / self.count) * per_count
+        process: dict[str, ProcessValue] = {"travel": wave.mean, "travel_amplitude": wave.amplitude}
+        if self.pixel_size is not None:
+            pixel = math.prod(self.pixel_size)
+            process["area_growth"] = pixel * float(np.nansum(growth))
+            process["area_growth_sigma"] = pixel * math.sqrt(float(np.nansum(sigma**2)))
+        return fit.assign(
+            growth=growth.astype(np.float32),
+            growth_sigma=sigma.astype(np.float32),
+            process={**fit.process, **process},
+        )
+
+
+find_growth = travel_function(
+    Growth,
+    "find_growth",
+    """Find how fast contact grows with travel, from a stack of a dithering press; see `Growth`.
+
+    Returns
+    -------
+    Result
+        ``growth``, 1/mm: share of full light that a pixel gains for each mm of travel, in phase with it; NaN
+        where references or samples are missing. Also the correlation with the travel's phase.
 
     Raises
     ------
     mirrorskin.io.InputError
-        Frames or references that cannot be used, or a travel that is no dither.
+        Frames or references that cannot be used, or a travel that does not dither.
 
     Examples
     --------
@@ -129,16 +168,13 @@ def find_growth(
     >>> frames = (100 + 300 * (travel - 1)[:, None, None] * np.ones((2, 3))).astype(np.float32)
     >>> round(float(find_growth(frames, travel, dark=0, bright=200).growth[0, 0]), 3)
     1.5
-    """
-    if frames.ndim != 3:
-        raise InputError(f"frames of shape {frames.shape}: (T, H, W) is needed")
-    wave = travel_wave(travel, len(frames))
-    fit = correlate(frames, wave.phase, device=device)
-    return Growth.of(fit, wave, dark, bright, frames.dtype, pixel_size)
+    """,
+    "Millimetres; several periods of nearly a sinusoid.",
+)
 
 
 def travel_wave(travel: ArrayLike | None, frames: int) -> TravelWave:
-    """Return the first harmonic of a travel; InputError if it is no dither."""
+    """Return the first harmonic of a travel; InputError if it does not dither."""
     values = check_strokes(travel, frames, "travel")
     frame = np.arange(frames, dtype=np.float64)
     try:

@@ -9,24 +9,23 @@ floats, in the order of the frames. See `mirrorskin.kernels.correlation`.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.frames import check_dtype, check_frames
+from mirrorskin.engine.operation import Operation, phase_function
+from mirrorskin.engine.options import option
 from mirrorskin.engine.rotation.design_matrix import Doubles, basis, check_phases, check_weights
-from mirrorskin.engine.thread_safe import ThreadSafe
-from mirrorskin.engine.tiling import MEMORY_LIMIT, Band, Planes, Staged, cut_into_bands, join_rows, room_of
-from mirrorskin.io import InputError
-from mirrorskin.io.arguments import checked
+from mirrorskin.engine.tiling import Band, Planes, Staged, cut_into_bands, join_rows, room_of
+from mirrorskin.io import InputError, Result
+from mirrorskin.io.maps import TABLE
 from mirrorskin.io.positions import check_phase
-from mirrorskin.io.result import Shown
+from mirrorskin.io.types import FRAME_DTYPES
 from mirrorskin.kernels.array import Array, Operand
 from mirrorskin.kernels.correlation import WINDOW
-from mirrorskin.kernels.device import C_TYPES, Device, open_device
+from mirrorskin.kernels.device import C_TYPES, Device
 
 _STEPS = {1: 2**17, 2: 2**23}  # of a cosine, by bytes of a count: no sum in kernels/correlation.cl overflows
 _BATCH = 256  # frames whose tables a kernel gets at once
@@ -42,72 +41,136 @@ _ANSWERS = {
 """Maps of a band, by the arguments of kernels."""
 
 
-@dataclass(frozen=True, slots=True, repr=False)
-class Correlation(Shown):
-    """The least-squares fit E = mean + cosine cos alpha + sine sin alpha of each pixel.
+class CorrelationOperation(Operation):
+    """Base of operations that fit mean, cosine and sine of a phase to each pixel's brightness."""
 
-    Attributes
-    ----------
-    mean, cosine, sine : ndarray, (H, W), float32
-        Counts; NaN where a sample was no number.
-    residual : ndarray, (H, W), float32
-        Counts: sqrt(SS / (N - 3)), the standard deviation of a sample of weight 1; NaN where N is 3.
-    frames : int
-        Number N of frames that counted: those of a weight above 0.
-    """
+    dtypes = FRAME_DTYPES
+    on_device = long_blocks = True
 
-    mean: NDArray[np.float32]
-    cosine: NDArray[np.float32]
-    sine: NDArray[np.float32]
-    residual: NDArray[np.float32]
-    frames: int
+    mean = TABLE["mean"]
+    cosine = TABLE["cosine"]
+    sine = TABLE["sine"]
+    modulation = TABLE["modulation"]
+    azimuth = TABLE["azimuth"]
+    residual = TABLE["residual"]
+
+    def _window(self) -> int | None:
+        """Return the number of the last frames that are fitted; None for all."""
+        return None
+
+    def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
+        """Prepare for frames of a shape and type."""
+        self._length = max(1, self.memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))
+        self._stack: tuple[NDArray[Any], Doubles, Doubles] | None = None
+        vars(self).pop("_sums", None)
+
+    @cached_property
+    def _sums(self) -> TurnSums | WindowSums:
+        window = self._window()
+        if window is None:
+            return TurnSums(self.device, self.shape, self.dtype, self._length)
+        return WindowSums(self.device, self.shape, self.dtype, self._length, window)
+
+    def clear(self) -> None:
+        """Forget the frames so far."""
+        self._stack = None
+        if "_sums" in vars(self):
+            self._sums.reset()
 
     @property
-    def modulation(self) -> NDArray[np.float32]:
-        """Amplitude sqrt(cosine^2 + sine^2), (H, W) float32, counts."""
-        return np.hypot(self.cosine, self.sine)
+    def room(self) -> NDArray[Any]:
+        """Array in which the next frames may be written before they are pushed, (n, H, W)."""
+        return self._sums.room
 
-    @property
-    def azimuth(self) -> NDArray[np.float32]:
-        """Phase at which the pixel is brightest, atan2(sine, cosine), (H, W) float32, radians, or NaN."""
-        still = (self.cosine == 0) & (self.sine == 0)
-        phase: NDArray[np.float32] = np.where(still, np.float32(np.nan), np.arctan2(self.sine, self.cosine))
-        return phase
+    def _push(self, frames: NDArray[Any], alpha: Doubles, weights: Doubles, lent: bool) -> None:
+        """Take in frames with the phase and the weight of each."""
+        if lent and self.count == 0 and self._window() is None and StackSums.take(frames, weights):
+            self._stack = frames, alpha, weights  # summed and solved in one run, unless others follow
+            return
+        if self._stack is not None:
+            self._sums.push(*self._stack, lent=True)
+            self._stack = None
+        self._sums.push(frames, alpha, weights, lent)
+
+    def _fit(self) -> Result:
+        """Return the fit of the frames so far, or of those in the window."""
+        if self._stack is None:
+            return self._sums.result()
+        frames, alpha, weights = self._stack
+        check_phases(alpha, weights)
+        sums = StackSums(self.device, self.shape, self.dtype, len(frames))
+        sums.push(frames, alpha, weights)
+        return sums.result()
 
 
-@checked
-def correlate(
-    frames: NDArray[Any],
-    phase: ArrayLike,
-    *,
-    harmonic: int = 1,
-    frame_weights: ArrayLike | None = None,
-    device: str | Device | None = None,
-) -> Correlation:
-    """Fit mean, cosine and sine to a stack that fits in memory.
+class Correlate(CorrelationOperation):
+    """Least-squares fit of mean, cosine and sine of the phase to each pixel's brightness.
 
     It minimises SS = sum_k w_k (E_k - mean - cosine cos alpha_k - sine sin alpha_k)^2. For N evenly spaced
     phases, sine and cosine are 2/N times the sums that stand for the paper's integrals S and C (equations 17
     and 20), and so gain times tilt times sine and cosine of the azimuth, as in equations 19 and 22. Uneven
     or measured phases mix the three, and least squares separates them.
 
-    Parameters
-    ----------
-    frames : ndarray, (T, H, W), uint8, uint16 or float32
-        Raw counts.
-    phase : array_like, (T,)
-        Radians, one a frame.
-    harmonic : int
-        Which multiple of the phase is fitted: alpha stands for that. Waves of other multiples are kept out by
-        phases that go evenly over whole turns.
-    frame_weights : array_like, (T,), optional
-        How much each frame counts; 0 for a missing one. By default, all count the same.
-    device : str or Device, optional
-        See ``mirrorskin.kernels.device.open_device``.
+    The residual is sqrt(SS / (N - 3)), the standard deviation of a sample of weight 1; it is undefined if N
+    is 3. The modulation is the amplitude sqrt(cosine^2 + sine^2), and the azimuth is the phase of the
+    maximum, atan2(sine, cosine). ``process`` contains the number N of ``frames`` whose weight is not 0.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mirrorskin import engine
+    >>> operation = engine.Correlate()
+    >>> for phase in np.arange(8) * np.pi / 4:
+    ...     operation.push(np.full((1, 2, 3), 100 + 20 * np.sin(phase), np.uint8), phase=[phase])
+    >>> float(operation.result().sine[0, 0].round())
+    20.0
+    """
+
+    harmonic: int = option(
+        1,
+        within=(1, None),
+        help="multiple of the phase that is fitted: alpha is this multiple. Other multiples do not contribute"
+        " if the phases are evenly spaced over whole turns",
+    )
+    window_frames: int | None = option(
+        None,
+        "frames",
+        within=(3, WINDOW),
+        help=f"number of the last frames that are fitted, 3 to {WINDOW}: a turn of an endless rotation",
+        shown_default="all frames",
+    )
+
+    def _window(self) -> int | None:
+        return self.window_frames
+
+    def push(
+        self,
+        frames: NDArray[Any],
+        *,
+        phase: ArrayLike,
+        frame_weights: ArrayLike | None = None,
+        lent: bool = False,
+    ) -> None:
+        """Take in the next frames, (n, H, W), the phase of each, (n,) radians, and their weights, (n,)."""
+        alpha = self.harmonic * check_phase(phase, len(frames), "phase")
+        weights = check_weights(frame_weights, len(frames))
+        self._push(frames, alpha, weights, lent)
+
+    def result(self) -> Result:
+        """Return the fit of the frames so far, or of those in the window."""
+        return self._fit()
+
+
+correlate = phase_function(
+    Correlate,
+    "correlate",
+    """Fit mean, cosine and sine of the phase to a stack that fits in memory; see `Correlate`.
 
     Returns
     -------
-    Correlation
+    Result
+        ``mean``, ``cosine``, ``sine``, ``modulation`` and ``residual``, counts; ``azimuth``, radians. NaN
+        where a sample is not a number.
 
     Raises
     ------
@@ -124,135 +187,9 @@ def correlate(
     >>> frames = (100 + 10 * np.cos(phase - 1)[:, None, None] * np.ones((2, 3))).astype(np.float32)
     >>> round(float(engine.correlate(frames, phase).azimuth[0, 0]), 4)
     1.0
-    """
-    if frames.ndim != 3 or 0 in frames.shape:
-        raise InputError(f"frames have shape {frames.shape}: (T, H, W) is needed")
-    alpha, weights = check_phase(phase, len(frames), "phase"), check_weights(frame_weights, len(frames))
-    alpha = check_harmonic(harmonic) * alpha
-    check_phases(alpha, weights)
-    if StackSums.take(frames, weights):
-        stack = StackSums(open_device(device), frames.shape[1:], frames.dtype, len(frames))
-        stack.push(frames, alpha, weights)
-        return stack.correlation()
-    limit = min(MEMORY_LIMIT, 2 * frames.nbytes)
-    correlator = Correlator(frames.shape[1:], frames.dtype, device=device, memory_limit=limit)
-    correlator.push(frames, phase=alpha, frame_weights=weights)
-    return correlator.result()
-
-
-def check_harmonic(harmonic: int) -> int:
-    """Return the harmonic if it is a whole number from 1 on, else raise InputError."""
-    if harmonic != int(harmonic) or harmonic < 1:
-        raise InputError(f"harmonic {harmonic}: a whole number from 1 on is needed")
-    return int(harmonic)
-
-
-class Correlator(ThreadSafe):
-    """Fit mean, cosine and sine to frames that come block by block, however they are cut.
-
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns of a frame.
-    dtype : dtype
-        uint8, uint16 or float32.
-    window : int, optional
-        Frames, 3 to 64, that count: the last ones of an endless rotation. By default, all of them.
-    harmonic : int
-        As for `correlate`.
-    device : str or Device, optional
-        See ``mirrorskin.kernels.device.open_device``.
-    memory_limit : int
-        Bytes of host memory for frames on the move; half of it is the room for one block.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        Parameters that cannot be used.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from mirrorskin import engine
-    >>> correlator = engine.Correlator((2, 3), "uint8")
-    >>> for phase in np.arange(8) * np.pi / 4:
-    ...     correlator.push(np.full((1, 2, 3), 100 + 20 * np.sin(phase), np.uint8), phase=[phase])
-    >>> float(correlator.result().sine[0, 0].round())
-    20.0
-    """
-
-    position = "phase"
-
-    def __init__(
-        self,
-        shape: tuple[int, int],
-        dtype: DTypeLike,
-        *,
-        window: int | None = None,
-        harmonic: int = 1,
-        device: str | Device | None = None,
-        memory_limit: int = MEMORY_LIMIT,
-    ) -> None:
-        dtype = np.dtype(dtype)
-        self._harmonic = check_harmonic(harmonic)
-        check_dtype(dtype)
-        self.device: Device = open_device(device)
-        length = max(1, memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))
-        self._shape, self._dtype = shape, dtype
-        self._sums: TurnSums | WindowSums
-        if window is None:
-            self._sums = TurnSums(self.device, shape, dtype, length)
-        else:
-            self._sums = WindowSums(self.device, shape, dtype, length, window)
-
-    @property
-    def room(self) -> NDArray[Any]:
-        """Where a source may write the next frames, (n, H, W), not to be copied where they fit."""
-        return self._sums.room
-
-    def push(
-        self,
-        frames: NDArray[Any],
-        *,
-        phase: ArrayLike,
-        frame_weights: ArrayLike | None = None,
-        lent: bool = False,
-    ) -> None:
-        """Take in the next frames.
-
-        Parameters
-        ----------
-        frames : ndarray, (n, H, W)
-        phase : array_like, (n,)
-            Radians.
-        frame_weights : array_like, (n,), optional
-            How much each frame counts; 0 for a missing one. By default, each has weight 1.
-        lent : bool
-            Whether nobody writes to the frames' memory as long as it is referred to.
-
-        Raises
-        ------
-        mirrorskin.io.InputError
-            Frames of another shape or type, phases or weights that cannot be used, or more frames than
-            the sums hold.
-        """
-        check_frames(frames, self._dtype, self._shape)
-        alpha = self._harmonic * check_phase(phase, len(frames), "phase")
-        self._sums.push(frames, alpha, check_weights(frame_weights, len(frames)), lent)
-
-    def result(self) -> Correlation:
-        """Return the fit of the frames so far, or of those in the window.
-
-        Raises
-        ------
-        mirrorskin.io.InputError
-            Their phases do not determine a fit yet.
-        """
-        return self._sums.correlation()
-
-    def reset(self) -> None:
-        """Forget the frames so far."""
-        self._sums.reset()
+    """,
+    "Radians.",
+)
 
 
 class _Sums:
@@ -291,8 +228,8 @@ class _Sums:
         """Phases and weights of the frames that count; 0 for missing ones."""
         return self._phase, self._weight
 
-    def correlation(self) -> Correlation:
-        """Return the fit that the sums determine; see `Correlator.result`."""
+    def result(self) -> Result:
+        """Return the fit that the sums determine; InputError if their phases do not determine one yet."""
         used = self._weight > 0
         check_phases(self._phase[used], self._weight[used])
         self._solve()
@@ -301,7 +238,15 @@ class _Sums:
             with band.resident():
                 parts.append([band.detach(answer) for answer in _ANSWERS.values()])
         mean, cosine, sine, residual = (join_rows(part) for part in zip(*parts, strict=True))
-        return Correlation(mean, cosine, sine, residual, int(np.count_nonzero(used)))
+        return Result(
+            mean=mean,
+            cosine=cosine,
+            sine=sine,
+            modulation=lambda: np.hypot(cosine, sine),
+            azimuth=lambda: _phase_of_maximum(cosine, sine),
+            residual=residual,
+            process={"frames": int(np.count_nonzero(used))},
+        )
 
     def _solve(self) -> None:
         """Put mean, cosine, sine and residual into the bands' maps."""
@@ -362,7 +307,7 @@ class StackSums(_Sums):
     def take(frames: NDArray[Any], weight: Doubles) -> bool:
         """Whether a stack is short enough, and its weights allow it."""
         few = np.count_nonzero(weight) <= WINDOW and frames.flags.c_contiguous and frames.flags.aligned
-        return bool(few and (check_dtype(frames.dtype).kind == "f" or _are_counts(weight)))
+        return bool(few and (frames.dtype.kind == "f" or _are_counts(weight)))
 
     def push(self, frames: NDArray[Any], phase: Doubles, weight: Doubles) -> None:
         """Sum all frames, which stay as they are until the result is there."""
@@ -464,8 +409,6 @@ class WindowSums(_Sums):
         window: int,
         other_maps: Mapping[str, DTypeLike | Planes] | None = None,
     ) -> None:
-        if not 3 <= window <= WINDOW:
-            raise InputError(f"window {window}: a number of frames from 3 to {WINDOW} is needed")
         self._window = window
         super().__init__(device, shape, dtype, {"ring": Planes(window, dtype), **(other_maps or {})}, length)
         self.reset()
@@ -492,6 +435,11 @@ class WindowSums(_Sums):
             with band.resident():
                 ring = band.maps["ring"]
                 self._run_at_once(band, ring, band.stride, places, self._phase, self._weight)
+
+
+def _phase_of_maximum(cosine: NDArray[np.float32], sine: NDArray[np.float32]) -> NDArray[np.float32]:
+    still = (cosine == 0) & (sine == 0)
+    return np.where(still, np.float32(np.nan), np.arctan2(sine, cosine))
 
 
 def _are_counts(weight: Doubles) -> bool:

@@ -30,8 +30,8 @@ _SHORTER = 4  # by how much other kernels are shorter than the longest one
 
 @checked
 def find_edges(
-    vectors: NDArray[np.float32],
-    sigma: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    normals_sigma: NDArray[np.float32],
     contact: NDArray[np.uint8],
     *,
     device: str | Device | None = None,
@@ -44,9 +44,9 @@ def find_edges(
 
     Parameters
     ----------
-    vectors : ndarray, (H, W, 3), float32
-        Unit normals; NaN where there is none.
-    sigma : ndarray, (H, W), float32
+    normals : ndarray, (H, W, 3), float32
+        Unit vectors; NaN where there is none.
+    normals_sigma : ndarray, (H, W), float32
         Their predicted RMS angular error, radians.
     contact : ndarray, (H, W), uint8
         1 where there is contact in every frame.
@@ -72,17 +72,17 @@ def find_edges(
     >>> import numpy as np
     >>> from mirrorskin import engine
     >>> lean = np.radians(20) * np.sign(np.arange(20) - 9.5) * np.ones((20, 1))
-    >>> vectors = np.stack([np.sin(lean), 0 * lean, np.cos(lean)], axis=-1).astype(np.float32)
+    >>> normals = np.stack([np.sin(lean), 0 * lean, np.cos(lean)], axis=-1).astype(np.float32)
     >>> sigma, contact = np.full((20, 20), 0.01, np.float32), np.ones((20, 20), np.uint8)
-    >>> np.flatnonzero(engine.find_edges(vectors, sigma, contact)[10]).tolist()
+    >>> np.flatnonzero(engine.find_edges(normals, sigma, contact)[10]).tolist()
     [9]
     """
     shape = contact.shape
-    if contact.ndim != 2 or vectors.shape != (*shape, 3) or sigma.shape != shape or 0 in shape:
-        given = f"vectors {vectors.shape}, sigma {sigma.shape} and contact {shape}"
-        raise InputError(f"{given} do not fit: (H, W, 3), (H, W) and (H, W) are needed")
+    if contact.ndim != 2 or normals.shape != (*shape, 3) or normals_sigma.shape != shape or 0 in shape:
+        shapes = f"normals {normals.shape}, normals_sigma {normals_sigma.shape} and contact {shape}"
+        raise InputError(f"{shapes} do not fit: (H, W, 3), (H, W) and (H, W) are needed")
     drawing = EdgeDrawing(open_device(device), shape)
-    drawing.take(vectors, sigma, contact)
+    drawing.take(normals, normals_sigma, contact)
     for _ in drawing.steps():
         pass
     return drawing.lines()

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Required, TypedDict, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.frames import check_dtype, thinning
+from mirrorskin.engine.frames import thinning
+from mirrorskin.engine.options import Configured, option
 from mirrorskin.engine.rotation.design_matrix import LONGEST, TurnFit
 from mirrorskin.engine.rotation.poses import PoseFit
 from mirrorskin.engine.rotation.residual_noise import CountNoise, residual_noise
@@ -18,9 +19,9 @@ from mirrorskin.engine.rotation.response import Response
 from mirrorskin.engine.rotation.scale import make_scale
 from mirrorskin.engine.rotation.tilt import check_tilt, estimate_tilt
 from mirrorskin.engine.tiling import Band, Planes
-from mirrorskin.io import Header, InputError
+from mirrorskin.io import InputError
 from mirrorskin.kernels.array import Operand
-from mirrorskin.kernels.device import C_TYPES, Device, open_device
+from mirrorskin.kernels.device import C_TYPES, Device
 from mirrorskin.kernels.normals import contact_limits
 
 NormalMethod = Literal["exact", "paper"]
@@ -36,39 +37,46 @@ _ENOUGH = 500  # pixels to estimate the noise from
 _MAP_BYTES = 33  # of a pixel, in all of them
 
 
-class NormalOptions(TypedDict, total=False):
-    """Options of `mirrorskin.engine.estimate_normals`, which says what they are; the tilt is needed."""
+class SensorOptions(Configured):
+    """Options of operations that estimate normals: what is known of the sensor."""
 
-    tilt: Required[float | Literal["estimate"]]
-    gain: ArrayLike | None
-    offset: ArrayLike
-    method: NormalMethod
-    noise: float | None
-    dark: ArrayLike | None
-    bright: ArrayLike | None
-    response: Response | None
-    device: str | Device | None
-
-
-def options_from(
-    header: Header,
-    method: NormalMethod,
-    noise: float | None,
-    response: Response | None,
-    device: str | Device | None,
-) -> NormalOptions:
-    """Return what a header says of the sensor, and other options; without a tilt, it is to be estimated."""
-    return {
-        "tilt": "estimate" if header.tilt is None else header.tilt,
-        "gain": header.zenith_gain,
-        "offset": 0.0 if header.zenith_offset is None else header.zenith_offset,
-        "dark": header.dark,
-        "bright": header.bright,
-        "method": method,
-        "noise": noise,
-        "response": response,
-        "device": device,
-    }
+    zenith_gain: ArrayLike | None = option(
+        None,
+        "counts/rad",
+        map=True,
+        help="brightness per zenith angle, a number or a map (H, W); negative if steeper is darker",
+        shown_default="that of the recording or calibration",
+    )
+    zenith_offset: ArrayLike | None = option(
+        None,
+        "counts",
+        map=True,
+        help="brightness at zenith 0, a number or a map (H, W)",
+        shown_default="that of the recording or calibration, otherwise 0",
+    )
+    dark: ArrayLike | None = option(
+        None,
+        "counts",
+        map=True,
+        help="lowest brightness that is linear in the zenith, a number or a map (H, W); samples that are"
+        " expected to be darker are left out",
+        shown_default="that of the recording or calibration, otherwise none",
+    )
+    bright: ArrayLike | None = option(
+        None,
+        "counts",
+        map=True,
+        help="highest brightness that is linear in the zenith, a number or a map (H, W); samples that are"
+        " expected to be brighter are left out",
+        shown_default="that of the recording or calibration, otherwise none",
+    )
+    noise: float | None = option(
+        None,
+        "counts",
+        above=0,
+        help="standard deviation of a sample",
+        shown_default="estimated from the residuals of the first turn, as read noise and shot noise",
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,40 +102,34 @@ class Samples:
 
 
 class NormalKernel:
-    """Fits turns on a device; the parameters are those of `mirrorskin.engine.estimate_normals`.
+    """Fits turns on a device.
 
-    With ``poses``, what it fits are windows of frames at any known poses, each of its own tilt.
+    With ``poses``, it fits windows of frames with an own pose each instead.
     """
 
     def __init__(
         self,
+        options: SensorOptions,
+        device: Device,
         shape: tuple[int, int],
         dtype: np.dtype[Any],
         *,
-        tilt: float | Literal["estimate"],
-        gain: ArrayLike | None = None,
-        offset: ArrayLike = 0.0,
+        tilt: float | Literal["estimate"] = "estimate",
         method: NormalMethod = "exact",
-        noise: float | None = None,
-        dark: ArrayLike | None = None,
-        bright: ArrayLike | None = None,
         response: Response | None = None,
-        device: str | Device | None = None,
         poses: bool = False,
     ) -> None:
-        check_dtype(dtype)
-        if method not in NORMAL_METHODS:
-            raise InputError(f"unknown method {method!r}; known are {', '.join(NORMAL_METHODS)}")
         if response is not None and method != "exact":
             raise InputError(
-                f"method {method!r} takes brightness for linear in the zenith, not as it was calibrated:"
-                " take exact, or leave the calibration out"
+                f"method {method!r} assumes brightness that is linear in the zenith, not the calibrated one:"
+                " use exact, or leave the calibration out"
             )
-        self._tilt = None if tilt == "estimate" else check_tilt(tilt)
-        self._noise = None if noise is None else _even_noise(noise)
+        self._tilt = None if isinstance(tilt, str) else check_tilt(tilt)
+        self._noise = None if options.noise is None else _even_noise(options.noise)
         self._dtype, self._method, self._step = dtype, method, thinning(shape)
-        self._scale = response or make_scale(gain, offset, dark, bright, shape)
-        self.device: Device = open_device(device)
+        levels = options.zenith_gain, options.zenith_offset, options.dark, options.bright
+        self._scale = response or make_scale(*levels, shape)
+        self.device: Device = device
         if not self._scale.per_pixel:
             self._one_scale = self.device.given("scale", self._scale.planes)
         self._wall = None if response is None else self.device.given("wall", response.table)
@@ -274,6 +276,4 @@ def vector_lanes(device: Device) -> int:
 
 def _even_noise(noise: float) -> CountNoise:
     """Return the noise of samples that all have the same standard deviation, counts."""
-    if not 0 < noise < np.inf:
-        raise InputError(f"noise {noise}: a standard deviation in counts is needed, such as 1.5")
     return CountNoise(noise**2, 0.0, noise**2)

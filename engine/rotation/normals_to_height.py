@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +19,6 @@ from mirrorskin.io import Result
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
-
-if TYPE_CHECKING:
-    from mirrorskin.engine.rotation.normals import Normals
 
 Floats = NDArray[np.float32]
 
@@ -56,8 +53,30 @@ class Slopes:
         return np.asarray(self.weights[0] > 0)
 
 
+def slopes_of(
+    result: Result, independent_sigma: Floats | None = None, contact: NDArray[Any] | None = None
+) -> Slopes:
+    """Return the slopes of a result's normals; see `find_slopes`.
+
+    ``contact``, (H, W), replaces that of the result; without either, all normals are used. The half-angle of
+    the precession and the number of turns are ``tilt`` and ``turns`` in the result's process, if there.
+    """
+    normals, process = result.normals, result.process
+    if contact is None:
+        contact = result.contact
+    tilt, turns = process.get("tilt"), process.get("turns", 1)
+    return find_slopes(
+        normals,
+        result.normals_sigma,
+        np.ones(normals.shape[:-1], np.uint8) if contact is None else contact,
+        float(tilt) if isinstance(tilt, int | float) else None,
+        int(turns) if isinstance(turns, int | float) else 1,
+        independent_sigma,
+    )
+
+
 def find_slopes(
-    vectors: Floats,
+    normals: Floats,
     sigma: Floats,
     contact: NDArray[np.uint8],
     tilt: float | None,
@@ -79,14 +98,14 @@ def find_slopes(
     *Bias.* An azimuth that is uncertain by s makes the mean of its vectors shorter by exp(-s^2 / 2), and
     a surface of them flatter. Slopes are made longer by as much.
 
-    Of ``vectors``, (H, W, 3) unit normals, those count with a finite RMS angular error ``sigma``, (H, W)
+    Of ``normals``, (H, W, 3) unit vectors, those count with a finite RMS angular error ``sigma``, (H, W)
     radians, where ``contact`` is not 0. ``tilt`` is the half-angle d of the precession, radians; without it,
     errors are the same in all directions. The normals are the mean of ``turns`` turns. Where errors of
     neighbours are correlated, ``independent_sigma`` replaces sigma in the weights: independent errors that
     leave as much in a mean over many pixels. A surface steeper than 80 degrees is taken to be as steep as
     that.
     """
-    nx, ny, nz = np.moveaxis(vectors, -1, 0)
+    nx, ny, nz = np.moveaxis(normals, -1, 0)
     white = sigma if independent_sigma is None else independent_sigma
     known = (contact != 0) & (nz > 0) & (sigma > 0) & (sigma < np.inf) & (white > 0) & (white < np.inf)
     nx, ny, nz, sigma, white = (np.where(known, one, np.float32(1)) for one in (nx, ny, nz, sigma, white))
@@ -154,7 +173,7 @@ def _variances(
 
 
 def integrate_normals(
-    normals: Normals,
+    result: Result,
     independent_sigma: Floats,
     pixel_size: tuple[float, float],
     *,
@@ -167,14 +186,18 @@ def integrate_normals(
     component is 0; components are numbered through all turns. Edges are where the surface breaks, if
     ``robust``.
     """
-    maps: list[NDArray[Any]] = [normals.vectors, normals.sigma, normals.contact, independent_sigma]
-    per_turn = normals.contact.ndim == 3
-    each = list(zip(*maps, strict=True)) if per_turn else [maps]
-    turns = 1 if per_turn else normals.turns
-    surfaces = []
-    for vectors, sigma, contact, white in each:
-        slopes = find_slopes(vectors, sigma, contact, normals.tilt, turns, white)
-        surfaces.append(_integrate(slopes, pixel_size, robust, device))
+    per_turn = result.contact.ndim == 3
+    each, sigmas = [result], [independent_sigma]
+    if per_turn:
+        once = {**result.process, "turns": 1}
+        names = "normals", "normals_sigma", "contact"
+        maps = zip(*(result[name] for name in names), strict=True)
+        each = [Result(dict(zip(names, turn, strict=True)), process=once) for turn in maps]
+        sigmas = list(independent_sigma)
+    surfaces = [
+        _integrate(slopes_of(turn, sigma), pixel_size, robust, device)
+        for turn, sigma in zip(each, sigmas, strict=True)
+    ]
     before = np.cumsum([0, *(len(one.offset_unknown) for one in surfaces)])
     components: list[NDArray[Any] | None] = [
         np.where(one.component >= 0, one.component + np.int32(shift), np.int32(-1))

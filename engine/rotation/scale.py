@@ -46,7 +46,7 @@ class Scale:
 
 def make_scale(
     gain: ArrayLike | None,
-    offset: ArrayLike,
+    offset: ArrayLike | None,
     dark: ArrayLike | None,
     bright: ArrayLike | None,
     shape: tuple[int, int],
@@ -57,7 +57,12 @@ def make_scale(
     """
     if gain is None:
         raise InputError("a zenith gain is needed: counts per radian, such as 206, or a calibration")
-    given = {"zenith gain": gain, "zenith offset": offset, "dark": dark, "bright": bright}
+    given = {
+        "zenith gain": gain,
+        "zenith offset": 0.0 if offset is None else offset,
+        "dark": dark,
+        "bright": bright,
+    }
     known = {name: _as_map(name, value, shape) for name, value in given.items() if value is not None}
     rate, zero = known["zenith gain"], known["zenith offset"]
     sound = np.isfinite(rate) & (rate != 0)

@@ -5,26 +5,25 @@ import pytest
 from live_frames import blocks, phases, turn_frames
 
 from mirrorskin.bench.scenes import SCALES, TILT
-from mirrorskin.engine import Correlator, correlate, estimate_normals
-from mirrorskin.engine.rotation.normals_window import NormalWindow
+from mirrorskin.engine import Correlate, Normals, correlate, estimate_normals
 from mirrorskin.engine.streaming import push_block
 from mirrorskin.io import InputError
 
 SHAPE, WINDOW = (21, 13, 29), 8
 PHASE = phases(SHAPE[0])
-MAPS = "vectors", "sigma", "contact", "mean", "cosine", "sine", "residual"
+MAPS = "normals", "normals_sigma", "contact", "mean", "cosine", "sine", "residual"
 CUTS = ([21], [1] * 21, [3, 14, 4], [7, 1, 13], [8, 13])
 
 
 def make(dtype="uint8", device=None, **other):
     offset, gain, _ = SCALES[dtype]
-    known = {"window": WINDOW, "tilt": TILT, "gain": gain, "offset": offset, **other}
-    return NormalWindow(SHAPE[1:], dtype, device=device, **known)
+    known = {"window_frames": WINDOW, "tilt": TILT, "zenith_gain": gain, "zenith_offset": offset, **other}
+    return Normals(device=device, **known)
 
 
-def push(window, frames, cuts, phase=PHASE):
+def push(operation, frames, cuts, phase=PHASE):
     for block in blocks(frames, cuts, phase=phase):
-        push_block(window, block)
+        push_block(operation, block)
 
 
 def same(one, other, maps=MAPS):
@@ -35,55 +34,65 @@ def same(one, other, maps=MAPS):
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
 def test_normals_are_bit_by_bit_those_of_the_windows_frames(device, dtype):
     frames, (offset, gain, noise) = turn_frames(SHAPE, dtype), SCALES[dtype]
-    window = make(dtype, device, noise=noise)
-    push(window, frames, [5, 1, 1, 9, 5])
+    operation = make(dtype, device, noise=noise)
+    push(operation, frames, [5, 1, 1, 9, 5])
     last = slice(-WINDOW, None)
     exact = estimate_normals(
-        frames[last], PHASE[last], tilt=TILT, gain=gain, offset=offset, noise=noise, device=device
+        frames[last],
+        PHASE[last],
+        tilt=TILT,
+        zenith_gain=gain,
+        zenith_offset=offset,
+        noise=noise,
+        device=device,
     )
     assert np.mean(exact.contact) > 0.3
-    same(window.result(), exact)
+    same(operation.result(), exact)
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
 def test_cuts_do_not_matter_when_noise_and_tilt_are_told_from_the_frames(dtype):
     frames, found = turn_frames(SHAPE, dtype), []
     for cuts in CUTS:
-        window = make(dtype, tilt="estimate")
-        push(window, frames, cuts)
-        found.append((window.result(), window.correlation()))
+        operation = make(dtype, tilt="estimate")
+        push(operation, frames, cuts)
+        found.append((operation.result(), operation.window.correlation()))
     for normals, wave in found[1:]:
         same(normals, found[0][0])
-        assert (normals.noise, normals.tilt) == (found[0][0].noise, found[0][0].tilt)
+        assert normals.process == found[0][0].process
         same(wave, found[0][1], MAPS[3:])
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
 def test_noise_and_tilt_are_those_of_the_first_full_window(dtype):
     frames, (offset, gain, _) = turn_frames(SHAPE, dtype), SCALES[dtype]
-    window = make(dtype, tilt="estimate")
-    push(window, frames, [21])
+    operation = make(dtype, tilt="estimate")
+    push(operation, frames, [21])
     first = slice(WINDOW)
-    exact = estimate_normals(frames[first], PHASE[first], tilt="estimate", gain=gain, offset=offset)
-    normals = window.result()
-    assert window.tilt == exact.tilt
-    assert normals.shot == exact.shot
-    assert normals.noise == pytest.approx(exact.noise, rel=0.1)  # it is told at the brightness of each
+    exact = estimate_normals(
+        frames[first], PHASE[first], tilt="estimate", zenith_gain=gain, zenith_offset=offset
+    )
+    normals = operation.result()
+    assert normals.process["tilt"] == exact.process["tilt"]
+    assert normals.process["shot_noise"] == exact.process["shot_noise"]
+    assert normals.process["noise"] == pytest.approx(
+        exact.process["noise"], rel=0.1
+    )  # it is told at the brightness of each
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
-def test_the_correlation_is_that_of_a_correlator(device, dtype):
+def test_the_correlation_is_that_of_correlate(device, dtype):
     frames = turn_frames(SHAPE, dtype)
-    window = make(dtype, device, noise=1.0)
-    correlator = Correlator(SHAPE[1:], dtype, window=WINDOW, device=device)
+    operation = make(dtype, device, noise=1.0)
+    correlate_window = Correlate(window_frames=WINDOW, device=device)
     for block in blocks(frames, [4, 12, 5], phase=PHASE):
-        push_block(window, block)
-        push_block(correlator, block)
-    window.result()  # which has maps of its own
-    same(window.correlation(), correlator.result(), MAPS[3:])
+        push_block(operation, block)
+        push_block(correlate_window, block)
+    operation.result()  # which has maps of its own
+    same(operation.window.correlation(), correlate_window.result(), MAPS[3:])
     if dtype != "float32":
         exact = correlate(frames[-WINDOW:], PHASE[-WINDOW:], device=device)
-        np.testing.assert_allclose(window.correlation().cosine, exact.cosine, rtol=1e-4, atol=1e-2)
+        np.testing.assert_allclose(operation.window.correlation().cosine, exact.cosine, rtol=1e-4, atol=1e-2)
 
 
 def test_a_device_without_room_works_in_bands(small_device):
@@ -91,53 +100,55 @@ def test_a_device_without_room_works_in_bands(small_device):
     exact = make(noise=1.3)
     push(exact, frames, [21])
     small_device.max_allocation = 3500
-    window = make(device=small_device, noise=1.3)
-    assert len(window.bands) > 1
-    push(window, frames, [2, 19])
-    found = window.result()
-    assert np.mean(np.isclose(found.vectors, exact.result().vectors, atol=1e-5, equal_nan=True)) > 0.99
-    assert found.vectors.shape == (*SHAPE[1:], 3)
+    operation = make(device=small_device, noise=1.3)
+    push(operation, frames, [2, 19])
+    assert len(operation.window.bands) > 1
+    found = operation.result()
+    assert np.mean(np.isclose(found.normals, exact.result().normals, atol=1e-5, equal_nan=True)) > 0.99
+    assert found.normals.shape == (*SHAPE[1:], 3)
 
 
 def test_normals_with_ends_and_a_scale_of_each_pixel_go_round_the_ring_too():
     frames, (offset, gain, noise) = turn_frames(SHAPE), SCALES["uint8"]
     gains = gain * np.linspace(0.9, 1.1, SHAPE[2]) * np.ones(SHAPE[1:])
     known = {"noise": noise, "dark": offset + 4, "bright": offset + 150}
-    window = make(gain=gains, **known)
-    push(window, frames, [11, 10])
+    operation = make(zenith_gain=gains, **known)
+    push(operation, frames, [11, 10])
     last = slice(-WINDOW, None)
     same(
-        window.result(),
-        estimate_normals(frames[last], PHASE[last], tilt=TILT, gain=gains, offset=offset, **known),
+        operation.result(),
+        estimate_normals(
+            frames[last], PHASE[last], tilt=TILT, zenith_gain=gains, zenith_offset=offset, **known
+        ),
     )
 
 
 def test_a_reset_forgets_all():
     frames = turn_frames(SHAPE)
-    window, fresh = make(), make()
-    push(window, frames[::-1], [21])
-    window.reset()
-    for one in (window, fresh):
+    operation, fresh = make(), make()
+    push(operation, frames[::-1], [21])
+    operation.reset()
+    for one in (operation, fresh):
         push(one, frames, [21])
-    same(window.result(), fresh.result())
+    same(operation.result(), fresh.result())
 
 
 def test_a_window_that_is_not_full_has_no_normals():
-    window = make(noise=1.0)
-    push(window, turn_frames(SHAPE)[:5], [5])
-    assert not window.is_full
+    operation = make(noise=1.0)
+    push(operation, turn_frames(SHAPE)[:5], [5])
+    assert not operation.window.is_full
     with pytest.raises(InputError, match="not full"):
-        window.result()
+        operation.result()
 
 
 def test_phases_that_tell_nothing_are_refused():
-    window = make(noise=1.0)
-    push(window, turn_frames(SHAPE), [21], np.zeros(21))
+    operation = make(noise=1.0)
+    push(operation, turn_frames(SHAPE), [21], np.zeros(21))
     with pytest.raises(InputError, match="phases"):
-        window.result()
+        operation.result()
 
 
 @pytest.mark.parametrize("wrong", [2, 65])
 def test_a_window_of_too_few_or_many_frames_is_refused(wrong):
     with pytest.raises(InputError, match="3 to 64"):
-        make(window=wrong)
+        make(window_frames=wrong)

@@ -56,14 +56,14 @@ def reference(frames, pose, weights, gain):
 def test_kernel_and_reference_agree(device, name, dtype, pressed):
     frames, pose = made_frames(POSES[name], dtype, pressed=pressed)
     weights = np.random.default_rng(1).uniform(0.5, 2, COUNT)
-    estimator = engine.PoseEstimator(
-        (1, frames.shape[1]), dtype, gain=GAINS[dtype], offset=OFFSET, noise=NOISE, device=device
+    operation = engine.MovingNormals(
+        zenith_gain=GAINS[dtype], zenith_offset=OFFSET, noise=NOISE, device=device
     )
-    estimator.push(frames[:, np.newaxis], pose=pose, frame_weights=weights)
-    found, expected = estimator.result(), reference(frames, pose, weights, GAINS[dtype])
+    operation.push(frames[:, np.newaxis], pose=pose, frame_weights=weights)
+    found, expected = operation.result(), reference(frames, pose, weights, GAINS[dtype])
     if name == "spiral":
-        close = np.linalg.norm(found.vectors[0] - expected.vectors, axis=1) < DEVIATIONS * expected.sigma
-        sigma, known = found.sigma[0], expected.sigma
+        close = np.linalg.norm(found.normals[0] - expected.vectors, axis=1) < DEVIATIONS * expected.sigma
+        sigma, known = found.normals_sigma[0], expected.sigma
     else:
         sigma, known = found.slope_sigma[0], expected.sigma
         close = np.abs(found.slope[0] - expected.slope) < DEVIATIONS * expected.sigma

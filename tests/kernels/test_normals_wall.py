@@ -9,7 +9,7 @@ from scipy import optimize
 from walls import PHASE, TILT, facing, light_of
 
 from mirrorskin.engine.rotation.design_matrix import fit_matrix
-from mirrorskin.engine.rotation.normals import estimate_normals
+from mirrorskin.engine import estimate_normals
 from mirrorskin.engine.rotation.response import make_response
 from mirrorskin.kernels.normals import Variance, contact_limits
 from mirrorskin.kernels.normals_wall import _places, _rotations, normals_wall
@@ -144,14 +144,14 @@ def test_kernel_and_reference_agree(device, case):
     stack = frames.reshape(-1, *shape)
     known = {"response": scene.response, "noise": noise, "frame_weights": weights, "device": device}
     found = estimate_normals(stack, scene.phase, tilt=TILT, **known)
-    told = np.isfinite(found.sigma.ravel())
+    told = np.isfinite(found.normals_sigma.ravel())
     # A sample at the very end of the wall may fall on either side.
     assert np.mean(told != np.isfinite(expected.sigma)) <= 0.01
     assert told.any()
     both = told & np.isfinite(expected.sigma)
-    error = off(found.vectors.reshape(-1, 3)[both], expected.vectors[both])
+    error = off(found.normals.reshape(-1, 3)[both], expected.vectors[both])
     assert np.quantile(error / expected.sigma[both], 0.98) < 1e-2
-    close = np.abs(found.sigma.ravel()[both] / expected.sigma[both] - 1) < 1e-3
+    close = np.abs(found.normals_sigma.ravel()[both] / expected.sigma[both] - 1) < 1e-3
     assert close.mean() > 0.98
     assert np.mean(found.contact.ravel()[both] == expected.contact[both]) > 0.98
     for name in ("mean", "cosine", "sine", "residual"):

@@ -82,8 +82,8 @@ def told(request, device):
         scene.frames,
         scene.phase,
         tilt=TILT,
-        gain=header.zenith_gain,
-        offset=header.zenith_offset,
+        zenith_gain=header.zenith_gain,
+        zenith_offset=header.zenith_offset,
         noise=spread,
         device=device,
     )

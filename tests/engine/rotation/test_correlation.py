@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mirrorskin.engine.rotation.correlation import Correlator, correlate
+from mirrorskin.engine import Correlate, correlate
 from mirrorskin.io import InputError
 from mirrorskin.kernels.errors import DeviceError
 
@@ -57,17 +57,17 @@ def stacked(found):
     return np.stack([found.mean, found.cosine, found.sine, found.residual])
 
 
-def push(correlator, frames, phase, weights=None, cuts=(), **options):
+def push(operation, frames, phase, weights=None, cuts=(), **options):
     """Push frames in blocks that are cut as told."""
     for start, stop in pairwise([0, *cuts, len(frames)]):
         part = None if weights is None else weights[start:stop]
-        correlator.push(frames[start:stop], phase=phase[start:stop], frame_weights=part, **options)
-    return correlator
+        operation.push(frames[start:stop], phase=phase[start:stop], frame_weights=part, **options)
+    return operation
 
 
 def same(one, other):
     np.testing.assert_array_equal(stacked(one), stacked(other))
-    assert one.frames == other.frames
+    assert one.process == other.process
 
 
 @pytest.mark.parametrize(
@@ -92,15 +92,15 @@ def test_it_is_least_squares(device, dtype, phases):
     assert np.all(error <= share * sigma + 3e-7 * np.abs(expected[:3]) + 1e-7 * np.ptp(frames))
     np.testing.assert_allclose(found.residual, expected[3], rtol=1e-4, atol=1e-5 * np.ptp(frames))
     assert stacked(found).dtype == np.float32
-    assert found.frames == len(phase)
+    assert found.process["frames"] == len(phase)
 
 
 def in_window(frames, weight, device):
     """The same by a window that other frames have passed through."""
-    correlator = Correlator(frames.shape[1:], frames.dtype, window=8, device=device)
-    push(correlator, frames[::-1].copy(), np.arange(8.0))
-    push(correlator, frames[:3], np.arange(3.0), [0.25, 0, 1])
-    return push(correlator, frames, MEASURED, weight, cuts=[1, 4]).result()
+    operation = Correlate(window_frames=8, device=device)
+    push(operation, frames[::-1].copy(), np.arange(8.0))
+    push(operation, frames[:3], np.arange(3.0), [0.25, 0, 1])
+    return push(operation, frames, MEASURED, weight, cuts=[1, 4]).result()
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_frames_count_by_their_weights(device, dtype, weights):
     expected = least_squares(frames, MEASURED, weight)
     for found in (whole, in_window(frames, weight, device)):
         np.testing.assert_allclose(stacked(found), expected, rtol=1e-5, atol=1e-5 * expected[3].max())
-        assert found.frames == (8 if weight is None else np.count_nonzero(weight))
+        assert found.process["frames"] == (8 if weight is None else np.count_nonzero(weight))
 
 
 @pytest.mark.parametrize(
@@ -127,22 +127,22 @@ def test_blocks_make_no_difference(device, dtype, weights):
     for window in (None, 13):
         found = []
         for cuts in ([], [1, 2, 3, 5, 8, 13, 21, 34], [8, 9, 23, 24]):
-            correlator = Correlator(SHAPE, dtype, window=window, device=device)
-            found.append(push(correlator, frames, phase, weight, cuts).result())
+            operation = Correlate(window_frames=window, device=device)
+            found.append(push(operation, frames, phase, weight, cuts).result())
             same(found[0], found[-1])
-            same(correlator.result(), found[-1])
-            correlator.reset()
-            with pytest.raises(InputError, match="0 frames"):
-                correlator.result()
-            same(push(correlator, lent, phase, weight, cuts, lent=True).result(), found[0])
+            same(operation.result(), found[-1])
+            operation.reset()
+            with pytest.raises(InputError, match="none pushed"):
+                operation.result()
+            same(push(operation, lent, phase, weight, cuts, lent=True).result(), found[0])
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_a_window_forgets_what_has_left_it(device, dtype):
     phase = 0.7 * np.arange(150.0)
     frames, cuts = swing(dtype, phase, noise=0.1), np.unique(np.random.default_rng(3).integers(1, 150, 15))
-    correlator = push(Correlator(SHAPE, dtype, window=9, device=device), frames, phase, cuts=cuts)
-    same(correlator.result(), correlate(frames[-9:], phase[-9:], device=device))
+    operation = push(Correlate(window_frames=9, device=device), frames, phase, cuts=cuts)
+    same(operation.result(), correlate(frames[-9:], phase[-9:], device=device))
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
@@ -153,7 +153,7 @@ def test_counts_without_noise_leave_no_residual(device, dtype):
     cosine, sine = np.rint([np.cos(phase), np.sin(phase)])[:, :, None, None]
     light = (mean + cosine * swings - sine * (swings // 2)).astype(dtype)
     for window in (None, 8):
-        found = push(Correlator(mean.shape, dtype, window=window, device=device), light, phase).result()
+        found = push(Correlate(window_frames=window, device=device), light, phase).result()
         np.testing.assert_allclose(found.mean, mean, rtol=1e-7)
         np.testing.assert_allclose(found.cosine, swings, rtol=3e-7, atol=1e-6)
         np.testing.assert_allclose(found.sine, -(swings // 2), rtol=3e-7, atol=1e-6)
@@ -179,12 +179,12 @@ def test_no_sum_overflows(device, dtype, window):
     phase = np.repeat([0, 2.0, 4.0], [62, 1, 1])
     frames = np.full((64, 1, 2), top, dtype)
     frames[62:, 0, 1] = 0
-    correlator = Correlator((1, 2), dtype, window=window, device=device)
+    operation = Correlate(window_frames=window, device=device)
     for _ in range(10):
-        push(correlator, frames, phase)
+        push(operation, frames, phase)
     turns = 1 if window else 10
     expected = least_squares(np.tile(frames, (turns, 1, 1)), np.tile(phase, turns))
-    np.testing.assert_allclose(stacked(correlator.result())[:3], expected[:3], rtol=2e-7, atol=1e-6 * top)
+    np.testing.assert_allclose(stacked(operation.result())[:3], expected[:3], rtol=2e-7, atol=1e-6 * top)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
@@ -192,11 +192,11 @@ def test_a_sample_that_is_no_number_spoils_its_pixel_while_it_is_in_the_window(d
     phase = PHASES["turns"]
     frames = swing("float32", phase)
     frames[2, 1, 3] = bad
-    clean, correlator = np.isfinite(frames[2]), Correlator(SHAPE, "float32", window=8, device=device)
+    clean, operation = np.isfinite(frames[2]), Correlate(window_frames=8, device=device)
     for start in range(12):
-        push(correlator, frames[start : start + 1], phase[start : start + 1])
+        push(operation, frames[start : start + 1], phase[start : start + 1])
         if start >= 4:
-            found = stacked(correlator.result())
+            found = stacked(operation.result())
             assert np.all(np.isfinite(found[:, clean]))
             assert np.all(np.isnan(found[:, ~clean])) == (start <= 9)
     whole = correlate(frames, phase, device=device)
@@ -215,26 +215,28 @@ def test_what_a_missing_frame_holds_does_not_matter(device, missing):
 
 def test_a_window_answers_as_soon_as_its_phases_determine_a_fit(device):
     frames = swing("uint8", MEASURED)
-    correlator = Correlator(SHAPE, "uint8", window=8, device=device)
+    operation = Correlate(window_frames=8, device=device)
     for count in range(3):
-        with pytest.raises(InputError, match=f"{count} frames at {count} different phases"):
-            correlator.result()
-        push(correlator, frames[count : count + 1], MEASURED[count : count + 1])
-    three = correlator.result()
+        message = f"{count} frames at {count} different phases" if count else "none pushed"
+        with pytest.raises(InputError, match=message):
+            operation.result()
+        push(operation, frames[count : count + 1], MEASURED[count : count + 1])
+    three = operation.result()
     assert np.isnan(three.residual).all()
     np.testing.assert_allclose(stacked(three)[:3], least_squares(frames[:3], MEASURED[:3])[:3], rtol=1e-5)
-    five = push(correlator, frames[3:5], MEASURED[3:5]).result()
-    assert (three.frames, five.frames) == (3, 5)
+    five = push(operation, frames[3:5], MEASURED[3:5]).result()
+    assert (three.process["frames"], five.process["frames"]) == (3, 5)
     np.testing.assert_allclose(five.residual, least_squares(frames[:5], MEASURED[:5])[3], rtol=1e-3)
 
 
 @pytest.mark.parametrize("window", [None, 6])
 def test_frames_may_be_written_into_the_room(device, window):
     frames, weights = swing("uint8", MEASURED), [1, 1, 1, 0.5, 1, 1, 0, 1]
-    correlator, elsewhere = (Correlator(SHAPE, "uint8", window=window, device=device) for _ in range(2))
-    correlator.room[:8] = frames
-    push(correlator, correlator.room[:8], MEASURED, weights)
-    same(correlator.result(), push(elsewhere, frames, MEASURED, weights).result())
+    operation, elsewhere = (Correlate(window_frames=window, device=device) for _ in range(2))
+    operation.begin(SHAPE, frames.dtype)
+    operation.room[:8] = frames
+    push(operation, operation.room[:8], MEASURED, weights)
+    same(operation.result(), push(elsewhere, frames, MEASURED, weights).result())
 
 
 @pytest.mark.parametrize(
@@ -248,23 +250,23 @@ def test_less_room_gives_the_same_answer(small_device, dtype, window, weights):
     found = []
     for limit in (10**9, 3100):
         small_device.max_allocation = limit
-        correlator = Correlator(shape, dtype, window=window, device=small_device)
-        push(correlator, frames[:4], phase[:4], None if weight is None else weight[:4]).result()
-        push(correlator, frames[4:], phase[4:], None if weight is None else weight[4:])
-        found.append(correlator.result())
-    assert len(correlator._sums.bands) > 1
+        operation = Correlate(window_frames=window, device=small_device)
+        push(operation, frames[:4], phase[:4], None if weight is None else weight[:4]).result()
+        push(operation, frames[4:], phase[4:], None if weight is None else weight[4:])
+        found.append(operation.result())
+    assert len(operation._sums.bands) > 1
     same(*found)
     small_device.max_allocation = 400
     with pytest.raises(DeviceError, match="one row of 800 pixels does not fit"):
-        Correlator((4, 800), "uint8", device=small_device)
+        Correlate(device=small_device).push(np.zeros((1, 4, 800), np.uint8), phase=[0])
 
 
 @pytest.mark.parametrize(
     ("frames", "phase", "weights", "message"),
     [
         (np.zeros((8, 2, 2), np.int16), MEASURED, None, "type int16"),
-        (np.zeros((8, 2), np.uint8), MEASURED, None, "shape .8, 2."),
-        (np.zeros((8, 0, 2), np.uint8), MEASURED, None, "shape .8, 0, 2."),
+        (np.zeros((8, 2), np.uint8), MEASURED, None, "uint8 .8, 2.: numbers"),
+        (np.zeros((8, 0, 2), np.uint8), MEASURED, None, "uint8 .8, 0, 2.: numbers"),
         (np.zeros((8, 2, 2), np.uint8), MEASURED[:7], None, "shape .7,. for 8 frames"),
         (np.zeros((4, 2, 2), np.uint8), [0, 1, 0, 1], None, "4 frames at 2 different phases"),
         (np.zeros((3, 2, 2), np.uint8), [0, 1, 2], [1, 1, 0], "2 frames at 2 different phases"),
@@ -279,20 +281,20 @@ def test_what_cannot_be_used_is_refused_in_one_line(frames, phase, weights, mess
 
 @pytest.mark.parametrize("window", [2, 65])
 def test_a_window_has_3_to_64_frames(window):
-    with pytest.raises(InputError, match=f"window {window}: .* from 3 to 64"):
-        Correlator((2, 2), "uint8", window=window)
+    with pytest.raises(InputError, match=f"window_frames {window}: .* from 3 to 64"):
+        Correlate(window_frames=window)
 
 
 @pytest.mark.parametrize("window", [None, 8])
 def test_a_block_that_does_not_fit_is_refused_and_changes_nothing(window, monkeypatch):
     monkeypatch.setattr("mirrorskin.engine.rotation.correlation._MAX_FRAMES", 12)
     frames = swing("uint8", MEASURED)
-    correlator = push(Correlator(SHAPE, "uint8", window=window), frames, MEASURED)
-    before = correlator.result()
+    operation = push(Correlate(window_frames=window), frames, MEASURED)
+    before = operation.result()
     wrong = [
-        (frames.astype(np.uint16), MEASURED, None, "expected uint8"),
-        (frames[:, 1:], MEASURED, None, r"expected uint8 \(n, \*\(3, 5\)\)"),
-        (frames[:0], MEASURED[:0], None, "expected uint8"),
+        (frames.astype(np.uint16), MEASURED, None, "uint8 .* is needed"),
+        (frames[:, 1:], MEASURED, None, r"uint8 \(n, 3, 5\) is needed"),
+        (frames[:0], MEASURED[:0], None, "uint8 .* is needed"),
         (frames, None, None, "phase is missing"),
         (frames, MEASURED[1:], None, "for 8 frames"),
         (frames, MEASURED, -np.ones(8), "weight -1.0 at frame 0"),
@@ -301,5 +303,5 @@ def test_a_block_that_does_not_fit_is_refused_and_changes_nothing(window, monkey
         wrong.append((frames, MEASURED, None, "sums hold 12 frames"))
     for block, phase, weights, message in wrong:
         with pytest.raises(InputError, match=message):
-            correlator.push(block, phase=phase, frame_weights=weights)
-    same(correlator.result(), before)
+            operation.push(block, phase=phase, frame_weights=weights)
+    same(operation.result(), before)

@@ -131,9 +131,9 @@ def test_edges_are_found_in_what_the_twin_sees(device, relief):
     spread = float(np.hypot(1.0, 1 / np.sqrt(12)))
     gain, offset = header.zenith_gain, header.zenith_offset
     found = engine.estimate_normals(
-        frames, EIGHTHS, tilt=TILT, gain=gain, offset=offset, noise=spread, device=device
+        frames, EIGHTHS, tilt=TILT, zenith_gain=gain, zenith_offset=offset, noise=spread, device=device
     )
-    edges = engine.find_edges(found.vectors, found.sigma, found.contact, device=device)
+    edges = engine.find_edges(found.normals, found.normals_sigma, found.contact, device=device)
     assert len(lines.points) > 400
     assert_follows(edges, lines)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mirrorskin import engine, io
-from mirrorskin.engine.rotation.rotation import correlate_source
+from mirrorskin.engine.lock_in import Correlation
 from mirrorskin.io.frames import FrameSequence
 
 RATE, COUNT, HERTZ = 60.0, 150, 7.321
@@ -61,13 +61,13 @@ def test_a_lock_in_finds_the_waves_of_an_estimated_frequency(harmonic, device):
     phase = np.linspace(-1, 1, 12)
     clean = waves(np.full(12, 20.0), phase, harmonic=8.0)
     frames = np.clip(np.rint(clean), 0, 255).astype(np.uint8).reshape(COUNT, 3, 4)
-    result = correlate_source(Stack(frames, TIME), harmonic=harmonic, frequency="estimate", device=device)
+    result = Correlation(harmonic=harmonic, frequency="estimate", device=device).run(Stack(frames, TIME))
     assert result.process["frequency"] == pytest.approx(HERTZ, abs=4 * result.process["frequency_sigma"])
     assert result.process.get("harmonic", 1) == harmonic
     expected = {1: phase, 2: np.full(12, 0.4)}[harmonic].reshape(3, 4)
     np.testing.assert_allclose(result.modulation, {1: 20.0, 2: 8.0}[harmonic], atol=1.2)
     np.testing.assert_allclose(result.azimuth, expected, atol=0.2)
-    given = correlate_source(Stack(frames, None), harmonic=harmonic, frequency=HERTZ, frame_rate=RATE)
+    given = Correlation(harmonic=harmonic, frequency=HERTZ, frame_rate=RATE).run(Stack(frames, None))
     np.testing.assert_allclose(given.modulation, result.modulation, rtol=1e-2)
 
 
@@ -78,7 +78,7 @@ def test_a_harmonic_is_the_fit_of_a_multiple_of_the_phase(harmonic, dtype, devic
     phase = np.arange(16) * np.pi / 8 + 0.1
     found = engine.correlate(frames, phase, harmonic=harmonic, device=device)
     same = engine.correlate(frames, harmonic * phase, device=device)
-    blocks = engine.Correlator((5, 7), dtype, harmonic=harmonic, device=device)
+    blocks = engine.Correlate(harmonic=harmonic, device=device)
     for part in np.split(np.arange(16), [5, 6]):
         blocks.push(frames[part], phase=phase[part])
     for name in ("mean", "cosine", "sine", "residual"):
@@ -98,17 +98,15 @@ def test_a_harmonic_is_the_fit_of_a_multiple_of_the_phase(harmonic, dtype, devic
         (lambda: engine.estimate_frequency(np.full((9, 2), np.nan), np.arange(9)), "a missing sample"),
         (
             lambda: engine.correlate(np.zeros((9, 2, 2), "u1"), np.arange(9), harmonic=0),
-            "harmonic 0: a whole",
+            "harmonic 0: a number of at least 1",
         ),
         (
-            lambda: correlate_source(Stack(np.zeros((9, 2, 2), "u1"), None), frequency=1.0),
+            lambda: Correlation(frequency=1.0).run(Stack(np.zeros((9, 2, 2), "u1"), None)),
             "memory: the time of each frame is unknown: give the frame rate",
         ),
         (
-            lambda: correlate_source(
-                Stack(np.zeros((9, 2, 2), "u1"), None), frequency="estimate", frame_rate=-1.0
-            ),
-            "frame rate -1.0: frames a second",
+            lambda: Correlation(frequency="estimate", frame_rate=-1.0),
+            "frame_rate -1: a number in frames/s above 0",
         ),
     ],
 )

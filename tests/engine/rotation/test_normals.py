@@ -1,6 +1,6 @@
 """Normals of turns that come block by block: the same however they are cut, and what is refused."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -8,13 +8,13 @@ import pytest
 import rotations
 from rotations import EIGHTHS, TILT, UNEVEN, Setup
 
-from mirrorskin.engine.rotation.normals import NormalEstimator, estimate_normals
+from mirrorskin.engine import Normals, estimate_normals
 from mirrorskin.io import InputError
 from mirrorskin.kernels.errors import DeviceError
 
 SETUP = Setup(gain=60.0, noise=20.0, offset=150.0, dtype="uint16")
 SHAPE = (5, 7)
-MAPS = ("vectors", "sigma", "contact", "mean", "cosine", "sine", "residual")
+MAPS = ("normals", "normals_sigma", "contact", "mean", "cosine", "sine", "residual")
 
 
 def facing(shape=SHAPE, zenith=(0, 55)):
@@ -32,11 +32,19 @@ def frames_of(setup=SETUP, turns=1, shape=SHAPE, seed=3):
 
 def known(setup=SETUP, **given):
     """What the lab knows."""
-    return {"tilt": setup.tilt, "gain": setup.slope, "offset": setup.offset, "noise": setup.spread, **given}
+    return {
+        "tilt": setup.tilt,
+        "zenith_gain": setup.slope,
+        "zenith_offset": setup.offset,
+        "noise": setup.spread,
+        **given,
+    }
 
 
 def estimator_of(device, setup=SETUP, shape=SHAPE, **given):
-    return NormalEstimator(shape, setup.dtype, device=device, **known(setup, **given))
+    operation = Normals(device=device, **known(setup, **given))
+    operation.begin(shape, setup.dtype)
+    return operation
 
 
 def push(estimator, frames, phase, cuts=(), weights=None):
@@ -48,17 +56,17 @@ def push(estimator, frames, phase, cuts=(), weights=None):
 
 
 def same(one, other):
-    for field in fields(one):
-        np.testing.assert_array_equal(
-            getattr(one, field.name), getattr(other, field.name), err_msg=field.name
-        )
+    assert one.process == other.process
+    assert [*one] == [*other]
+    for name in one:
+        np.testing.assert_array_equal(one[name], other[name], err_msg=name)
 
 
 def close(one, other, share=0.02):
     """Hold normals against others, but for what rounding makes of them."""
-    away = rotations.between(one.vectors.astype(float), other.vectors.astype(float))
-    assert np.all(away < share * other.sigma), np.max(away / other.sigma)
-    np.testing.assert_allclose(one.sigma, other.sigma, rtol=share)
+    away = rotations.between(one.normals.astype(float), other.normals.astype(float))
+    assert np.all(away < share * other.normals_sigma), np.max(away / other.normals_sigma)
+    np.testing.assert_allclose(one.normals_sigma, other.normals_sigma, rtol=share)
     np.testing.assert_array_equal(one.contact, other.contact)
 
 
@@ -71,8 +79,8 @@ def test_blocks_make_no_difference(device, dtype, per_turn):
     count = 21 if dtype == "uint16" else 24  # an incomplete turn, of one type
     frames, phase = frames_of(setup, 3)[:count], phases(setup, 3)[:count]
     whole = push(estimator_of(setup=setup, **given), frames, phase).result()
-    assert (whole.turns, whole.frames) == (3, count)
-    assert np.isfinite(whole.sigma).all()
+    assert (whole.process["turns"], whole.process["frames"]) == (3, count)
+    assert np.isfinite(whole.normals_sigma).all()
     for cuts in (range(1, count), [15]):
         same(push(estimator_of(setup=setup, **given), frames, phase, cuts).result(), whole)
     little = estimator_of(setup=setup, memory_limit=1, longest=8, **given)
@@ -87,7 +95,7 @@ def test_blocks_make_no_difference_where_the_first_turn_determines_nothing(devic
     weights[:8] = 0
     weights[kept] = 1
     whole = push(estimator_of(device, noise=None), frames, phase, weights=weights).result()
-    assert (whole.turns, whole.frames) == (2, 16)
+    assert (whole.process["turns"], whole.process["frames"]) == (2, 16)
     single = push(estimator_of(device, noise=None), frames, phase, range(1, 24), weights)
     same(single.result(), whole)
 
@@ -131,11 +139,11 @@ def test_turns_are_averaged_by_inverse_variance_or_given_alone(device):
         alone = estimate_normals(frames[part], EIGHTHS, **known(), device=device)
         for name in MAPS:
             np.testing.assert_array_equal(getattr(each, name)[turn], getattr(alone, name))
-    share = np.nan_to_num(each.sigma[..., np.newaxis].astype(float) ** -2)  # 0 without an answer
-    mean = np.sum(share * np.nan_to_num(each.vectors), axis=0)
+    share = np.nan_to_num(each.normals_sigma[..., np.newaxis].astype(float) ** -2)  # 0 without an answer
+    mean = np.sum(share * np.nan_to_num(each.normals), axis=0)
     mean /= np.linalg.norm(mean, axis=-1, keepdims=True)
-    np.testing.assert_allclose(both.vectors, mean, atol=1e-6)
-    np.testing.assert_allclose(both.sigma, np.sum(share[..., 0], axis=0) ** -0.5, rtol=1e-5)
+    np.testing.assert_allclose(both.normals, mean, atol=1e-6)
+    np.testing.assert_allclose(both.normals_sigma, np.sum(share[..., 0], axis=0) ** -0.5, rtol=1e-5)
     np.testing.assert_array_equal(both.contact, each.contact.min(axis=0))
     np.testing.assert_allclose(both.cosine, each.cosine.mean(axis=0), rtol=1e-5, atol=1e-2)
     np.testing.assert_allclose(both.residual, np.sqrt(np.mean(each.residual**2, axis=0)), rtol=1e-5)
@@ -153,9 +161,9 @@ def test_phases_may_be_given_modulo_a_turn_and_go_backwards(device):
 def test_an_incomplete_last_turn_counts_if_it_goes_round(device):
     frames, phase = frames_of(turns=3), phases(SETUP, 3)
     found = estimate_normals(frames[:21], phase[:21], **known(), device=device)
-    assert (found.turns, found.frames) == (3, 21)
+    assert (found.process["turns"], found.process["frames"]) == (3, 21)
     complete = estimate_normals(frames[:16], phase[:16], **known(), device=device)
-    assert np.all(found.sigma < complete.sigma)
+    assert np.all(found.normals_sigma < complete.normals_sigma)
     for count in (18, 20):
         same(estimate_normals(frames[:count], phase[:count], **known(), device=device), complete)
 
@@ -167,15 +175,15 @@ def test_a_frame_of_weight_0_or_of_no_numbers_is_a_missing_one(device):
     frames[2], frames[6] = 65_535, 0
     found = estimate_normals(frames, phase, **known(), frame_weights=weights, device=device)
     same(found, without)
-    assert found.frames == 5
+    assert found.process["frames"] == 5
     shape, setup = (20, 20), replace(SETUP, dtype="float32")
     frames, there = frames_of(setup, shape=shape), np.ones((8, 1, 1))
     frames[3], there[3] = np.nan, 0
     found = estimate_normals(frames, EIGHTHS, **known(setup, noise=None), device=device)
-    assert found.noise == pytest.approx(20, rel=0.1)
+    assert found.process["noise"] == pytest.approx(20, rel=0.1)
     best = np.sqrt(rotations.bound(facing(shape), setup, there))
-    assert np.median(found.sigma / best) == pytest.approx(1, abs=0.1)
-    error = rotations.between(found.vectors.astype(float), facing(shape))
+    assert np.median(found.normals_sigma / best) == pytest.approx(1, abs=0.1)
+    error = rotations.between(found.normals.astype(float), facing(shape))
     assert np.mean((error / best) ** 2) == pytest.approx(1, abs=0.3)
     assert np.mean(found.contact) > 0.98
     assert np.isnan(found.mean).all()
@@ -186,7 +194,7 @@ def test_less_room_gives_the_same_answer(small_device, per_pixel):
     shape, setup = (5, 65), replace(SETUP, phase=tuple(2 * np.pi * np.arange(9) / 9))
     frames, phase, found = frames_of(setup, 3, shape), phases(setup, 3), []
     gain = np.full(shape, setup.slope)
-    given = {"gain": gain, "dark": gain * 0 + 120, "bright": 64_000.0} if per_pixel else {}
+    given = {"zenith_gain": gain, "dark": gain * 0 + 120, "bright": 64_000.0} if per_pixel else {}
     for limit in (10**9, 3000, 1536):
         small_device.max_allocation = limit
         estimator = estimator_of(small_device, setup, shape, noise=None, longest=9, **given)
@@ -204,9 +212,9 @@ def test_a_turn_may_have_64_frames_and_no_more(device):
     setup = replace(setup, phase=tuple(2 * np.pi * np.arange(64) / 64), low=3)
     frames = frames_of(setup, turns=2)
     found = estimate_normals(frames, phases(setup, 2), **known(setup), dark=3, device=device)
-    assert (found.turns, found.frames) == (2, 128)
-    error = rotations.between(found.vectors.astype(float), facing())
-    assert np.mean((error / found.sigma) ** 2) < 2
+    assert (found.process["turns"], found.process["frames"]) == (2, 128)
+    error = rotations.between(found.normals.astype(float), facing())
+    assert np.mean((error / found.normals_sigma) ** 2) < 2
     message = r"a turn of \d+ frames or more: .* take 64 at most; leave some out"
     with pytest.raises(InputError, match=message):
         estimate_normals(frames[:65], 0.01 * np.arange(65), **known(setup), dark=3, device=device)
@@ -219,11 +227,11 @@ def test_three_frames_are_enough_where_the_noise_is_known(device):
     with pytest.raises(InputError, match="3 frames a turn leave no residual"):
         estimate_normals(frames, phase, **known(noise=None), device=device)
     found = estimate_normals(frames, phase, **known(), device=device)
-    answered = np.isfinite(found.sigma)
+    answered = np.isfinite(found.normals_sigma)
     assert answered.mean() > 0.9
     assert np.isnan(found.residual).all()
-    error = rotations.between(found.vectors.astype(float), facing())
-    assert np.median((error / found.sigma)[answered]) < 1.5
+    error = rotations.between(found.normals.astype(float), facing())
+    assert np.median((error / found.normals_sigma)[answered]) < 1.5
     # Of three samples and three unknowns nothing is left that could speak against contact.
     np.testing.assert_array_equal(found.contact, answered)
 
@@ -232,7 +240,7 @@ def test_three_frames_are_enough_where_the_noise_is_known(device):
 def test_steeper_may_be_darker(device, method):
     frames = frames_of()
     bright = estimate_normals(frames, EIGHTHS, **known(), method=method, device=device)
-    turned = known(gain=-SETUP.slope, offset=10_000 - SETUP.offset)
+    turned = known(zenith_gain=-SETUP.slope, zenith_offset=10_000 - SETUP.offset)
     dark = estimate_normals(10_000 - frames, EIGHTHS, **turned, method=method, device=device)
     close(dark, bright, 1e-3)
     np.testing.assert_allclose(dark.mean, 10_000 - bright.mean, rtol=1e-6)
@@ -246,14 +254,14 @@ def test_pictures_of_any_size_are_answered(device, dtype, shape):
     setup = replace(SETUP, dtype=dtype, gain=3.6, noise=1.0, offset=12.0)
     frames = frames_of(setup, shape=shape)
     found = estimate_normals(frames, EIGHTHS, **known(setup, noise=None), device=device)
-    assert found.vectors.shape == (*shape, 3)
+    assert found.normals.shape == (*shape, 3)
     assert {getattr(found, name).shape for name in MAPS[1:]} == {shape}
     kinds = {getattr(found, name).dtype.name for name in (*MAPS, "zenith", "azimuth", "modulation")}
     assert kinds == {"float32", "uint8"}
-    error = rotations.between(found.vectors.astype(float), facing(shape))
-    assert np.median(error / found.sigma) < (2.5 if found.sigma.size > 1 else 20)
+    error = rotations.between(found.normals.astype(float), facing(shape))
+    assert np.median(error / found.normals_sigma) < (2.5 if found.normals_sigma.size > 1 else 20)
     again = rotations.direction(found.zenith, found.azimuth)
-    np.testing.assert_allclose(again, found.vectors.astype(float), atol=1e-6)
+    np.testing.assert_allclose(again, found.normals.astype(float), atol=1e-6)
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "float32"])
@@ -269,7 +277,7 @@ def test_frames_that_are_all_the_same_show_an_upright_sheet_or_none(device, dtyp
     np.testing.assert_allclose(found.mean, levels, rtol=1e-6)
     np.testing.assert_allclose([found.modulation, found.residual], 0, atol=1e-4)
     paper = estimate_normals(frames, EIGHTHS, **known(setup), method="paper", device=device)
-    assert np.isnan([paper.sigma, paper.azimuth]).all()
+    assert np.isnan([paper.normals_sigma, paper.azimuth]).all()
     assert not paper.contact.any()
 
 
@@ -278,10 +286,10 @@ def test_frames_without_light_full_of_it_or_of_no_numbers_have_no_answer(device,
     frames = np.full((8, 2, 3), value, np.uint8 if np.isfinite(value) else np.float32)
     for noise in (None, 1.0):
         found = estimate_normals(frames, EIGHTHS, **known(Setup(), noise=noise), device=device)
-        assert np.isnan(found.vectors).all()
-        assert np.isnan(found.sigma).all()
+        assert np.isnan(found.normals).all()
+        assert np.isnan(found.normals_sigma).all()
         assert not found.contact.any()
-        assert found.noise > 0
+        assert found.process["noise"] > 0
 
 
 def test_the_noise_and_the_tilt_are_estimated_from_the_first_turn(device):
@@ -290,24 +298,31 @@ def test_the_noise_and_the_tilt_are_estimated_from_the_first_turn(device):
     unknown = known(setup, tilt="estimate", noise=None)
     found = estimate_normals(frames, phase, **unknown, device=device)
     first = estimate_normals(frames[:8], phase[:8], **unknown, device=device)
-    assert (found.tilt, found.shot) == (first.tilt, first.shot)
-    assert found.tilt == pytest.approx(setup.tilt, rel=0.02)
-    assert first.noise == pytest.approx(setup.spread, rel=0.1)
+    assert (found.process["tilt"], found.process["shot_noise"]) == (
+        first.process["tilt"],
+        first.process["shot_noise"],
+    )
+    assert found.process["tilt"] == pytest.approx(setup.tilt, rel=0.02)
+    assert first.process["noise"] == pytest.approx(setup.spread, rel=0.1)
     given = estimate_normals(frames, phase, **known(setup), device=device)
-    assert (given.noise, given.shot, given.tilt) == (pytest.approx(setup.spread), 0.0, setup.tilt)
+    assert (given.process["noise"], given.process["shot_noise"], given.process["tilt"]) == (
+        pytest.approx(setup.spread),
+        0.0,
+        setup.tilt,
+    )
 
 
 def test_weights_are_inverse_variances(device):
     shape, weights = (20, 20), np.array([1, 4, 0.25, 1, 1, 9, 1, 0.01])
     clean = rotations.levels(facing(shape), SETUP)
     noise = np.random.default_rng(5).normal(0, 20, clean.shape) / np.sqrt(weights)[:, None, None]
-    given = known(replace(SETUP, dtype="float32"), gain=np.full(shape, SETUP.slope))
+    given = known(replace(SETUP, dtype="float32"), zenith_gain=np.full(shape, SETUP.slope))
     frames = (clean + noise).astype(np.float32)
     found = estimate_normals(frames, EIGHTHS, **given, frame_weights=weights, device=device)
     best = rotations.bound(facing(shape), SETUP, weights[:, None, None])
-    error = rotations.between(found.vectors.astype(float), facing(shape))
+    error = rotations.between(found.normals.astype(float), facing(shape))
     assert np.mean(error**2 / best) == pytest.approx(1, abs=0.3)
-    assert np.median(found.sigma**2 / best) == pytest.approx(1, abs=0.05)
+    assert np.median(found.normals_sigma**2 / best) == pytest.approx(1, abs=0.05)
 
 
 def stack(count=8, dtype=np.uint16):
@@ -315,13 +330,13 @@ def stack(count=8, dtype=np.uint16):
 
 
 REFUSED = {
-    "an empty stack": (stack(0), [], {}, r"frames have shape \(0, 5, 7\): \(T, H, W\) is needed"),
-    "one frame": (stack()[0], EIGHTHS[:5], {}, r"frames have shape \(5, 7\)"),
+    "an empty stack": (stack(0), [], {}, r"frames are uint16 \(0, 5, 7\): numbers \(n, H, W\)"),
+    "one frame": (stack()[0], EIGHTHS[:5], {}, r"frames are uint16 \(5, 7\): numbers"),
     "another type": (
         stack(dtype=np.float64),
         EIGHTHS,
         {},
-        "frames of type float64: uint8, uint16 or float32",
+        "frames of type float64: uint8, uint16, float32 are needed",
     ),
     "phases of others": (stack(), EIGHTHS[:7], {}, r"phase has shape \(7,\) for 8 frames"),
     "two phases": (stack(), [0, 3] * 4, {}, "8 frames at 2 different phases do not determine a fit"),
@@ -331,19 +346,29 @@ REFUSED = {
         stack(),
         EIGHTHS,
         {"method": "best"},
-        "unknown method 'best'; known are exact, paper",
+        "unknown method 'best'. Use exact or paper",
     ),
     "no tilt": (stack(), EIGHTHS, {"tilt": 0.0}, "tilt 0 deg: above 0 and up to 30 deg is needed"),
     "a tilt of 40 degrees": (stack(), EIGHTHS, {"tilt": np.radians(40)}, "tilt 40 deg: above 0"),
     "a tilt that cannot be seen": (stack(), EIGHTHS, {"tilt": "estimate"}, "to estimate the tilt"),
-    "no noise": (stack(), EIGHTHS, {"noise": 0.0}, "noise 0.0: a standard deviation in counts is needed"),
-    "noise of no number": (stack(), EIGHTHS, {"noise": np.nan}, "noise nan: a standard deviation"),
-    "no scale": (stack(), EIGHTHS, {"gain": None}, "a zenith gain is needed"),
-    "no gain": (stack(), EIGHTHS, {"gain": np.zeros(SHAPE)}, "gain of every pixel is 0 or no number"),
-    "a gain of no number": (stack(), EIGHTHS, {"gain": np.nan}, "zenith gain nan: counts per radian other"),
-    "a gain of others": (stack(), EIGHTHS, {"gain": np.ones((7, 5))}, r"zenith gain has shape \(7, 5\)"),
-    "no offset": (stack(), EIGHTHS, {"offset": np.nan}, "zenith offset is no number"),
-    "no end": (stack(), EIGHTHS, {"dark": np.inf}, "dark is no number: give the counts at which"),
+    "no noise": (stack(), EIGHTHS, {"noise": 0.0}, "noise 0: a number in counts above 0 is needed"),
+    "noise of no number": (stack(), EIGHTHS, {"noise": np.nan}, "noise nan: a number in counts above 0"),
+    "no scale": (stack(), EIGHTHS, {"zenith_gain": None}, "a zenith gain is needed"),
+    "no gain": (stack(), EIGHTHS, {"zenith_gain": np.zeros(SHAPE)}, "gain of every pixel is 0 or no number"),
+    "a gain of no number": (
+        stack(),
+        EIGHTHS,
+        {"zenith_gain": np.nan},
+        "zenith_gain nan: a number in counts/rad",
+    ),
+    "a gain of others": (
+        stack(),
+        EIGHTHS,
+        {"zenith_gain": np.ones((7, 5))},
+        r"zenith gain has shape \(7, 5\)",
+    ),
+    "no offset": (stack(), EIGHTHS, {"zenith_offset": np.nan}, "zenith_offset nan: a number in counts"),
+    "no end": (stack(), EIGHTHS, {"dark": np.inf}, "dark inf: a number in counts"),
     "swapped ends": (stack(), EIGHTHS, {"dark": 900, "bright": 10}, "dark is not below bright"),
 }
 
@@ -352,20 +377,20 @@ REFUSED = {
 def test_what_cannot_be_used_is_refused_in_one_line(case):
     frames, phase, given, message = REFUSED[case]
     with pytest.raises(InputError, match=message) as caught:
-        estimate_normals(frames, phase, **{"tilt": TILT, "gain": 200.0, "noise": 1.0, **given})
+        estimate_normals(frames, phase, **{"tilt": TILT, "zenith_gain": 200.0, "noise": 1.0, **given})
     assert "\n" not in str(caught.value)
 
 
 def test_a_block_that_does_not_fit_is_refused_and_changes_nothing():
     frames, phase = frames_of(turns=2), phases(SETUP, 2)
     estimator = estimator_of(None)
-    with pytest.raises(InputError, match="0 frames at 0 different phases"):
+    with pytest.raises(InputError, match="none pushed so far"):
         estimator.result()
     push(estimator, frames[:10], phase[:10])
     wrong = [
-        (frames.astype(np.uint8), phase, None, "expected uint16"),
-        (frames[:, 1:], phase, None, r"expected uint16 \(n, \*\(5, 7\)\)"),
-        (frames[:0], phase[:0], None, "expected uint16"),
+        (frames.astype(np.uint8), phase, None, "uint16 .* is needed"),
+        (frames[:, 1:], phase, None, r"uint16 \(n, 5, 7\) is needed"),
+        (frames[:0], phase[:0], None, "uint16 .* is needed"),
         (frames, None, None, "phase is missing"),
         (frames, phase[1:], None, "for 16 frames"),
         (frames, phase, -np.ones(16), "weight -1.0 at frame 0"),
@@ -387,10 +412,10 @@ def test_a_pixel_without_a_scale_has_no_answer(device):
     setup = replace(SETUP, phase=tuple(2 * np.pi * np.arange(9) / 9))
     frames, gain, offset = frames_of(setup), np.full(SHAPE, setup.slope), np.full(SHAPE, setup.offset)
     ends = {"dark": -1.0, "bright": 70_000.0}
-    others = estimate_normals(frames, setup.phase, **known(setup, gain=gain), **ends, device=device)
+    others = estimate_normals(frames, setup.phase, **known(setup, zenith_gain=gain), **ends, device=device)
     gain[1, 2], gain[4, 6], gain[0, 0], offset[3, 3] = 0, np.nan, np.inf, np.nan
     lost = ~(np.isfinite(gain) & (gain != 0) & np.isfinite(offset))
-    given = known(setup, gain=gain, offset=offset)
+    given = known(setup, zenith_gain=gain, zenith_offset=offset)
     found = estimate_normals(frames, setup.phase, **given, **ends, device=device)
     np.testing.assert_array_equal(found.contact, ~lost)
     for name in MAPS:

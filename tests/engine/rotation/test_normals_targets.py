@@ -25,7 +25,7 @@ def estimate(frames, setup, device, **given):
     """Estimate with what a lab knows: phases, tilt, gain, offset, and the noise of a sample."""
     known = {"noise": setup.spread, "device": device, **given}
     return engine.estimate_normals(
-        frames, setup.phase, tilt=setup.tilt, gain=setup.slope, offset=setup.offset, **known
+        frames, setup.phase, tilt=setup.tilt, zenith_gain=setup.slope, zenith_offset=setup.offset, **known
     )
 
 
@@ -34,7 +34,7 @@ def answered(request, device):
     """What the exact method makes of thousands of draws a bin, and the score of it."""
     stack = drawn(request.param)
     normals = estimate(stack.frames, stack.setup, device)
-    return normals, rotations.scores(normals.vectors, normals.sigma, stack), stack
+    return normals, rotations.scores(normals.normals, normals.normals_sigma, stack), stack
 
 
 def test_the_exact_method_reaches_the_bound_in_every_bin_and_sigma_is_honest(answered):
@@ -52,8 +52,8 @@ def test_frames_without_noise_are_answered_exactly(device, noise):
     normals[0, :8] = rotations.axes(setup.phase, TILT)  # a sample's own axis, where its angle has no slope
     normals[0, 8:16] = rotations.direction(2 * TILT, setup.phase)
     found = estimate(rotations.expose(normals, setup, seed=2), setup, device, noise=noise)
-    assert np.degrees(rotations.between(found.vectors.astype(float), normals)).max() <= 0.01
-    np.testing.assert_allclose(np.linalg.norm(found.vectors, axis=-1), 1, atol=1e-6)
+    assert np.degrees(rotations.between(found.normals.astype(float), normals)).max() <= 0.01
+    np.testing.assert_allclose(np.linalg.norm(found.normals, axis=-1), 1, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_the_paper_method_is_equations_16_to_22(device, name, phase):
 
 def test_the_paper_method_is_where_the_errata_say_it_fails(device):
     stack = drawn("float32")
-    told = rotations.scores(estimate(stack.frames, stack.setup, device, method="paper").vectors, None, stack)
+    told = rotations.scores(estimate(stack.frames, stack.setup, device, method="paper").normals, None, stack)
     assert np.all(told.ratio[1:6] > 3)  # at and below the tilt
     assert np.all(told.ratio[-6:] < 1.05)  # far above
 
@@ -112,8 +112,8 @@ def without_one(stack, how, device):
 def test_uneven_phases_and_missing_frames_cost_what_they_must_and_no_bias(device, case):
     stack = unusual(case)
     normals, best = without_one(stack, UNUSUAL[case][1], device)
-    assert np.all(np.abs(rotations.mean_error(normals.vectors, stack)) < 4)
-    told = rotations.scores(normals.vectors, normals.sigma, stack._replace(bound=best))
+    assert np.all(np.abs(rotations.mean_error(normals.normals, stack)) < 4)
+    told = rotations.scores(normals.normals, normals.normals_sigma, stack._replace(bound=best))
     np.testing.assert_allclose(told.ratio, 1, atol=0.06)
     np.testing.assert_allclose(told.chi_square, 1, atol=0.12)
 
@@ -137,8 +137,8 @@ def test_a_clipped_frame_is_no_bias(device, side):
     assert np.all((lost > 0.9) & (lost < 1.6)), lost
     end = "dark" if side == "low" else "bright"
     normals = estimate(stack.frames, stack.setup, device, **{end: getattr(stack.setup, side)})
-    assert np.all(np.abs(rotations.mean_error(normals.vectors, stack)) < 4)
-    told = rotations.scores(normals.vectors, normals.sigma, stack)
+    assert np.all(np.abs(rotations.mean_error(normals.normals, stack)) < 4)
+    told = rotations.scores(normals.normals, normals.normals_sigma, stack)
     np.testing.assert_allclose(told.ratio, 1, atol=0.08)
     np.testing.assert_allclose(told.chi_square, 1, atol=0.2)
 
@@ -159,13 +159,13 @@ def test_an_unknown_tilt_is_told_within_its_own_error(device, name, tilt):
         stack.frames,
         setup.phase,
         tilt="estimate",
-        gain=setup.slope,
-        offset=setup.offset,
+        zenith_gain=setup.slope,
+        zenith_offset=setup.offset,
         noise=setup.spread,
         device=device,
     )
-    assert found.tilt == pytest.approx(setup.tilt, abs=4 * error)
-    told = rotations.scores(found.vectors.reshape(1, -1, 3), None, flat(stack))
+    assert found.process["tilt"] == pytest.approx(setup.tilt, abs=4 * error)
+    told = rotations.scores(found.normals.reshape(1, -1, 3), None, flat(stack))
     assert told.ratio[0] <= 1.05
 
 

@@ -74,7 +74,12 @@ STEEP = (10, 30, 50)
 @pytest.mark.parametrize(("phase", "azimuth"), [(EIGHTHS, 20), (EIGHTHS, 130), (UNEVEN, 45)])
 def test_slopes_have_honest_errors_and_no_bias(phase, azimuth):
     setup = replace(SETUP, phase=phase)
-    known = {"phase": setup.phase, "tilt": setup.tilt, "gain": setup.slope, "offset": setup.offset}
+    known = {
+        "phase": setup.phase,
+        "tilt": setup.tilt,
+        "zenith_gain": setup.slope,
+        "zenith_offset": setup.offset,
+    }
     # Uneven phases tell azimuths of one direction better than those of another.
     spare = 0.15 if phase is EIGHTHS else 0.4
     toward = np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))
@@ -82,7 +87,7 @@ def test_slopes_have_honest_errors_and_no_bias(phase, azimuth):
         true = np.tile(rotations.direction(np.radians(zenith), np.radians(azimuth)), (100, 100, 1))
         frames = rotations.expose(true, setup, seed=zenith)
         normals = estimate_normals(frames, **known, noise=setup.spread)
-        found = find_slopes(normals.vectors, normals.sigma, np.ones_like(normals.contact), TILT)
+        found = find_slopes(normals.normals, normals.normals_sigma, np.ones_like(normals.contact), TILT)
         steepness = np.tan(np.radians(zenith))
         slopes = found.dz_dx, found.dz_dy
         for slope, weight, way in zip(slopes, found.weights, toward, strict=True):

@@ -9,7 +9,7 @@ from calibrations import a_precession
 from stacks import MadeUp
 from walls import PHASE, TILT
 
-from mirrorskin.engine.rotation.normals import estimate_normals
+from mirrorskin.engine import estimate_normals
 from mirrorskin.engine.rotation.response import make_response, shade, wall_response_of
 from mirrorskin.io import Calibrated, Calibration, CameraId, Header, InputError
 
@@ -68,15 +68,15 @@ def test_a_defect_and_what_lies_beside_the_body_have_no_answer():
     with np.errstate(invalid="ignore"):
         frames = np.random.default_rng(0).integers(90, 110, (8, *SHAPE)).astype(np.uint8)
     normals = estimate_normals(frames, PHASE, tilt=TILT, response=found, noise=1.0)
-    assert np.isnan(normals.sigma[~expected]).all()
-    assert np.isfinite(normals.sigma[expected]).any()
+    assert np.isnan(normals.normals_sigma[~expected]).all()
+    assert np.isfinite(normals.normals_sigma[expected]).any()
 
 
 def test_mirrors_that_face_one_way_are_found_to_do_so_all_over_the_picture(device):
     response = made(pivot=walls.PIVOT)
     frames, normal = frames_of(response, 0.5, 2.0)
     found = estimate_normals(frames, PHASE, tilt=TILT, response=response, noise=1.0, device=device)
-    error = np.linalg.norm(found.vectors - normal, axis=-1) / found.sigma
+    error = np.linalg.norm(found.normals - normal, axis=-1) / found.normals_sigma
     assert np.mean(error**2) == pytest.approx(1, abs=0.25)
     assert found.contact.mean() > 0.98
 

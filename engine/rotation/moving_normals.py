@@ -1,0 +1,200 @@
+"""Normals, or slopes, from frames at any known poses of the body; and from any stack that fits in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, ParamSpec, Protocol, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.engine.operation import ABOUT_WEIGHTS, apply, array_function
+from mirrorskin.engine.rotation.design_matrix import Doubles
+from mirrorskin.engine.rotation.normals import Normals, NormalsOperation, normals_result
+from mirrorskin.engine.rotation.normals_kernel import MAPS, SLOPE_MAPS, NormalKernel, TurnModel
+from mirrorskin.engine.rotation.poses import PoseFit, check_poses, even_windows, pose_fit, rocks
+from mirrorskin.engine.tiling import MEMORY_LIMIT
+from mirrorskin.io import InputError, Result
+from mirrorskin.io.maps import TABLE, PoseStatus, status_of
+
+P = ParamSpec("P")
+
+
+class MovingNormals(NormalsOperation):
+    """Normals from frames at any known poses, or the slope along one direction if the body only rocks.
+
+    The frames are estimated in windows of `longest` frames; a later window that determines less than the
+    first is left out. Where travel differs from frame to frame, only frames in which a pixel is in contact
+    are used, and ``contact`` is 1 where the pixel is in contact in the frames of some window.
+
+    If all axes lie in one plane, ``slope`` is the rise per millimetre along ``slope_direction`` in
+    ``process``, radians from x towards y, and there are no normals.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mirrorskin import engine
+    >>> operation = engine.MovingNormals(zenith_gain=300, noise=1.0)
+    >>> for lean in 0.05 * np.sin(0.8 * np.arange(16)):
+    ...     axis = [[np.sin(lean), 0.0, np.cos(lean)]]
+    ...     operation.push(np.full((1, 2, 3), 150 - 300 * lean, np.float32), pose=axis)
+    >>> rocked = operation.result()
+    >>> int(rocked.status[0, 0]), round(float(rocked.slope[0, 0]), 2)
+    (4, -0.55)
+    """
+
+    status = status_of(PoseStatus)
+    slope = TABLE["slope"]
+    slope_sigma = TABLE["slope"].deviation("slope")
+
+    _kernel_maps = (*MAPS, *SLOPE_MAPS)
+    _width = 4
+
+    def _make_kernel(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> NormalKernel:
+        return NormalKernel(self, self.device, shape, dtype, poses=True)
+
+    def clear(self) -> None:
+        """Forget the frames so far, and what was estimated from them."""
+        super().clear()
+        self._direction: float | None = None
+
+    def push(
+        self,
+        frames: NDArray[Any],
+        *,
+        pose: ArrayLike,
+        frame_weights: ArrayLike | None = None,
+        lent: bool = False,
+    ) -> None:
+        """Take in the next frames, (n, H, W), the axis in each, (n, 3), with travel (n, 4), and weights.
+
+        Axes are unit vectors towards the camera; travel is in mm.
+        """
+        where = np.asarray(pose, np.float64)
+        travel = where[:, 3] if where.shape[1:] == (4,) else None
+        poses = check_poses(len(frames), axis=where[..., :3], travel=travel)
+        self._push(frames, poses, frame_weights, lent)
+
+    def _turns_in(self, where: Doubles) -> list[slice]:
+        starts = range(0, len(where), self._longest)
+        return [slice(start, min(start + self._longest, len(where))) for start in starts]
+
+    def _fit_of(self, where: Doubles, weights: Doubles, first: bool) -> PoseFit | None:
+        try:
+            fit = pose_fit(where, weights)
+        except InputError:
+            return None
+        self._direction = fit.direction if first else self._direction
+        return fit if fit.direction == self._direction else None
+
+    def _explain(self, where: Doubles, weights: Doubles) -> None:
+        pose_fit(where[weights > 0], weights[weights > 0])
+
+    def _as_result(self, maps: list[NDArray[Any]], model: TurnModel) -> Result:
+        slope, sigma, zenith = maps[-3:]
+        result = normals_result(maps[:-3], model, self._turns, self._frames)
+        status = {"status": self.status}
+        if self._direction is None:
+            codes = np.where(np.isfinite(result.normals_sigma), PoseStatus.NORMAL, PoseStatus.NONE)
+            return result.assign(status=codes.astype(np.uint8), declarations=status)
+        codes = np.where(np.isfinite(sigma), PoseStatus.SLOPE_ONLY, PoseStatus.NONE)
+        return result.assign(
+            normals=None,
+            azimuth=None,
+            normals_sigma=None,
+            zenith=zenith,
+            status=codes.astype(np.uint8),
+            slope=slope,
+            slope_sigma=sigma,
+            process={**result.process, "slope_direction": self._direction},
+            declarations=status,
+        )
+
+
+class NormalsFunction(Protocol[P]):
+    """A function of frames, (T, H, W), what says where the body was in each, and options."""
+
+    def __call__(
+        self,
+        frames: ArrayLike,
+        phase: ArrayLike | None = None,
+        frame_weights: ArrayLike | None = None,
+        axis: ArrayLike | None = None,
+        travel: ArrayLike | None = None,
+        *args: P.args,
+        **options: P.kwargs,
+    ) -> Result:
+        """Return the maps."""
+
+
+def _estimate(frames: NDArray[Any], where: dict[str, Any], options: dict[str, Any]) -> Result:
+    """Choose the operation by what is given of the poses."""
+    phase, axis, travel = (where[name] for name in ("phase", "axis", "travel"))
+    tilt, weights = options.pop("tilt", None), where["frame_weights"]
+    options["memory_limit"] = max(1, min(MEMORY_LIMIT, 2 * frames.nbytes))
+    given = None if tilt is None or isinstance(tilt, str) else np.asarray(tilt, np.float64)
+    varies = given is not None and (given.ndim > 0 or rocks(phase))
+    if axis is None and travel is None and not varies:
+        return apply(Normals(tilt=tilt, **options), frames, phase=phase, frame_weights=weights)
+    pose = check_poses(len(frames) if frames.ndim else 0, phase, given, axis, travel)
+    foreign = Normals.options.keys() - MovingNormals.options
+    for name in foreign & options.keys():
+        if options.pop(name) != Normals.options[name].default:
+            raise InputError(f"{name} needs whole turns of one tilt, but frames have poses. Remove {name}")
+    options.setdefault("longest", even_windows(len(frames)) if frames.ndim and len(frames) else None)
+    return apply(MovingNormals(**options), frames, pose=pose, frame_weights=weights)
+
+
+_FUNCTION = array_function(
+    Normals,
+    "estimate_normals",
+    """Estimate the normals from a stack that fits in memory; see `Normals` and `MovingNormals`.
+
+    With a phase and one tilt, the frames are turns of a precession. With a tilt of each frame, two phases
+    half a turn apart, an axis or a travel, they are at known poses.
+
+    Returns
+    -------
+    Result
+        ``normals``, (H, W, 3), unit vectors in the mean pose; ``normals_sigma``, the predicted RMS angle to
+        the true normal; ``contact``, 1 where sheet and object touched in every frame; ``zenith`` and
+        ``azimuth``; ``mean``, ``cosine``, ``sine``, ``modulation`` and ``residual`` of the brightness. Maps
+        are NaN where there is no answer. Of known poses also ``status``; ``slope`` if the body only rocks.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        Frames, phases, tilt, axes, scale or parameters that cannot be used.
+    mirrorskin.kernels.errors.DeviceError
+        No device, or one that cannot hold a single row.
+
+    Examples
+    --------
+    A plane that is inclined by 0.3 rad towards x, seen by a body that leans by 0.05 rad:
+
+    >>> import numpy as np
+    >>> from mirrorskin import engine
+    >>> phase = np.arange(8) * np.pi / 4
+    >>> cosine = np.cos(0.3) * np.cos(0.05) - np.sin(0.3) * np.sin(0.05) * np.cos(phase)
+    >>> frames = (500 * np.arccos(cosine)[:, None, None] * np.ones((2, 3))).astype(np.float32)
+    >>> result = engine.estimate_normals(frames, phase, tilt=0.05, zenith_gain=500, noise=1.0)
+    >>> round(float(result.zenith[0, 0]), 4)
+    0.3
+    """,
+    {},
+    {
+        "phase": "Radians, at least three different phases in each turn. `tilt` may then be an array (T,).",
+        "frame_weights": ABOUT_WEIGHTS,
+        "axis": "The body's axis in each frame, (T, 3), instead of phase and tilt: unit vectors towards the"
+        " camera.",
+        "travel": "Millimetres, if the body presses as well.",
+    },
+    _estimate,
+)
+
+
+def _typed(operation: Callable[P, Normals]) -> NormalsFunction[P]:
+    return cast(NormalsFunction[P], _FUNCTION)
+
+
+estimate_normals = _typed(Normals)

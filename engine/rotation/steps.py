@@ -1,0 +1,114 @@
+"""Steps that follow the normals of a rotation: registration, edges, heights, errors of the calibration."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.engine.method import Context, Step
+from mirrorskin.engine.options import option
+from mirrorskin.engine.rotation.edges import find_edges
+from mirrorskin.engine.rotation.normals import Normals
+from mirrorskin.engine.rotation.normals_to_height import Slopes, integrate_normals, slopes_of
+from mirrorskin.engine.rotation.registration import Registered
+from mirrorskin.io import Result
+
+_NO_PIXEL_SIZE = "none: the recording has no pixel size"
+_REACH = 5  # pixels across, from which a registered sample is interpolated
+
+
+class Edges(Step):
+    """Draw edges where the normal jumps and where contact ends; see `mirrorskin.engine.find_edges`."""
+
+    def apply(self, result: Result, context: Context) -> Result:
+        """Return the result with ``edges``, if it has normals."""
+        if result.normals is None:
+            return result
+        device = context.operation.device
+        maps = result.normals, result.normals_sigma, result.contact
+        if result.contact.ndim == 2:
+            return result.assign(edges=find_edges(*maps, device=device))
+        turns = [find_edges(*turn, device=device) for turn in zip(*maps, strict=True)]
+        return result.assign(edges=np.stack(turns))
+
+
+class RegistrationErrors(Step):
+    """Correct the errors of normals for the interpolation of registered frames.
+
+    If the noise of a sample is given, interpolation changes it; noise that was estimated from the registered
+    frames includes this. A sample is interpolated from 4 x 4 pixels, two of which on either side may have
+    lost contact.
+    """
+
+    def apply(self, result: Result, context: Context) -> Result:
+        """Return the result with other ``normals_sigma`` and ``contact``, if frames were registered."""
+        if not isinstance(context.stream, Registered):
+            return result
+        from scipy import ndimage
+
+        sigma, contact = result.normals_sigma, result.contact
+        reach = np.ones((1,) * (contact.ndim - 2) + (_REACH, _REACH), bool)
+        lost = np.isfinite(sigma) & (contact == 0)
+        inside = contact * ~ndimage.binary_dilation(lost, reach)
+        if _noise_is_given(context):
+            sigma = sigma * context.stream.noise_gain
+        return result.assign(normals_sigma=sigma, contact=inside)
+
+
+class Integration(Step):
+    """Find the heights that fit the normals; the mean height of each connected component is 0.
+
+    Needs the pixel size.
+    """
+
+    robust: bool = option(
+        False,
+        help="let the surface break at discontinuities that are found in it; they are drawn as edges, too",
+    )
+
+    def apply(self, result: Result, context: Context) -> Result:
+        """Return the result with ``height``, ``component`` and ``offset_unknown``, if it has normals."""
+        pixel_size = context.source.header.pixel_size
+        if result.normals is None:
+            return result
+        if pixel_size is None:
+            return result.assign(process={**result.process, "height": _NO_PIXEL_SIZE})
+        surface = integrate_normals(
+            result,
+            _independent_sigma(result, context),
+            pixel_size,
+            robust=self.robust,
+            device=context.operation.device,
+        )
+        if surface.edges is not None and result.edges is not None:
+            surface = surface.assign(edges=result.edges | surface.edges)
+        return result.assign(surface, process={**result.process, **surface.process})
+
+    def slopes(self, result: Result, context: Context) -> Slopes:
+        """Return the slopes that `apply` integrates, of normals that are not of single turns."""
+        return slopes_of(result, _independent_sigma(result, context))
+
+
+class CalibrationErrors(Step):
+    """Add the standard errors of a calibrated response, which neighbours share, to those of the normals."""
+
+    def apply(self, result: Result, context: Context) -> Result:
+        """Return the result with another ``normals_sigma``, if the operation has a response."""
+        operation = context.operation
+        if not isinstance(operation, Normals) or operation.response is None:
+            return result
+        return result.assign(normals_sigma=np.hypot(result.normals_sigma, operation.response.sigma))
+
+
+def _noise_is_given(context: Context) -> bool:
+    return context.operation.chosen()["noise"] is not None
+
+
+def _independent_sigma(result: Result, context: Context) -> NDArray[np.float32]:
+    """Return the errors that normals would have without registration.
+
+    Registration makes errors smaller, but correlates those of neighbours: means over many pixels are no
+    better.
+    """
+    sigma: NDArray[np.float32] = result.normals_sigma
+    return sigma / context.stream.noise_gain if isinstance(context.stream, Registered) else sigma
