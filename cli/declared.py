@@ -33,6 +33,9 @@ _UNITS = {  # placeholder in help, function of `mirrorskin.cli.quantity`, exampl
     "s": ("TIME", "duration", "10ms"),
     "counts/rad": ("COUNTS/ANGLE", "per_angle", "5.7/deg"),
     "mm/N": ("LENGTH/N", "compliance", "0.01mm/N"),
+    "mm,mm": ("LENGTH[,LENGTH]", "lengths", "0.03mm"),
+    "region": ("X,Y,WxH", "region", "100,50,640x480"),
+    "range": ("A:B", "frame_range", "10:200"),
 }
 _CLASS = re.compile(r".+:[A-Za-z_]\w*")
 _LOADED = "mirrorskin.cli.declared"  # key of a context's class and its options
@@ -114,7 +117,7 @@ class DeclaredOption(MotionOption):
         if one.kind == "choice":
             settings = {"type": click.Choice([*one.choices])}
         elif one.kind == "file":
-            settings = {"type": ExistingPath(), "metavar": one.file}
+            settings = {"type": ExistingPath(), "metavar": one.file or one.unit}
         elif one.kind == "switch":
             settings = {"is_flag": True}
         elif one.kind != "flag":
@@ -147,6 +150,14 @@ class Terms:
         """Return the options of click."""
         return [DeclaredOption(one, self.of_engine) for one in self.terms]
 
+    def only(self, *names: str) -> Terms:
+        """Return some of the options."""
+        return replace(self, terms=[one for one in self.terms if one.name in names])
+
+    def without(self, *names: str) -> Terms:
+        """Return all options but some."""
+        return replace(self, terms=[one for one in self.terms if one.name not in names])
+
     def filled(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """Return the values of all options: given ones, defaults, or None."""
         return {
@@ -156,11 +167,18 @@ class Terms:
         }  # fmt: skip
 
 
+<<<<<<< HEAD
 def declared(command: str, *, only: Sequence[str] = (), without: Sequence[str] = ()) -> Terms:
     """Return the engine's options of a command, an entry of ``declared.json``: all, or some."""
     stored = json.loads(_COPY.read_text(encoding="utf-8"))[command]
     chosen = [one for one in stored if one["name"] not in without and (not only or one["name"] in only)]
     return Terms([Term(**fields) for fields in chosen], of_engine=True)
+=======
+def declared(command: str) -> Terms:
+    """Return the engine's options of a command: an entry of ``declared.json``."""
+    stored = json.loads(_COPY.read_text(encoding="utf-8"))[command]
+    return Terms([Term(**fields) for fields in stored], of_engine=True)
+>>>>>>> cli
 
 
 def term(
@@ -175,7 +193,8 @@ def term(
 ) -> Term:
     """Return an option of a command that the engine does not declare.
 
-    ``kind`` is "number", "integer", "switch" or "text"; of a text, ``unit`` is the placeholder in help.
+    ``kind`` is "number", "integer", "switch", "text" or "file"; of a text or a file, ``unit`` is the
+    placeholder in help.
     ``default`` is a text as on the command line.
     """
     return Term(name, kind, for_motions(motions, text), unit, motions=motions, default=default, least=least)

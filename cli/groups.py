@@ -16,7 +16,7 @@ import click
 from click.shell_completion import CompletionItem
 
 _WRITTEN = {"--output", "--record"}  # options that name what a command writes; other paths are read
-_MOTIONS = ("vertical", "axial", "horizontal", "twist")
+MOTIONS = ("vertical", "axial", "horizontal", "twist")
 _COMMON = ("calibration", "memory", "device", "as_json")  # options that follow the declared ones in help
 _NOUNS = {"vertical": "press", "axial": "rotation", "horizontal": "slide", "rock": "rocking motion"}
 
@@ -52,7 +52,7 @@ class MotionOption(click.Option):
 def for_motions(motions: Sequence[str], text: str) -> str:
     """Return a text that begins with the motions that it is about, unless these are all."""
     nouns = ", ".join(_NOUNS.get(one, one) for one in motions)
-    return text if not motions or {*_MOTIONS} <= {*motions} else f"{nouns}: {text}"
+    return text if not motions or {*MOTIONS} <= {*motions} else f"{nouns}: {text}"
 
 
 def refuse_foreign(context: click.Context, motion: str, name: str = "this") -> None:

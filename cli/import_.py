@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.groups import Argument, Option
+from mirrorskin.cli.stack import POSITIONS, stack_options
 
 
 def command(
@@ -20,32 +21,18 @@ def command(
     ],
     output: options.NewRecording,
     motion: Annotated[options.MotionName, Option(help="How the body moved.")],
-    travel_step: options.TravelStep = None,
-    travel_start: options.TravelStart = None,
-    travel: options.Travel = None,
-    phase_step: options.PhaseStep = None,
-    phases: options.Phases = None,
-    tilt: options.Tilt = None,
-    pixel_size: options.PixelSize = None,
     topic: Annotated[str | None, Option(metavar="TOPIC", help="Of an MCAP file: that of the images.")] = None,
     compression: options.Compression = options.CompressionName.raw,
     overwrite: options.Overwrite = False,
+    **given: Annotated[Any, POSITIONS],
 ) -> None:
     """Make a recording of a video or pictures."""
     from mirrorskin import io
     from mirrorskin.cli.output import printable, progress
-    from mirrorskin.cli.stack import stack_options
 
-    io.check_output(output, frames, phases, travel, replaces="anything" if overwrite else "nothing")
-    known = stack_options(
-        travel_step=travel_step,
-        travel_start=travel_start,
-        travel=travel,
-        phase_step=phase_step,
-        phases=phases,
-        tilt=tilt,
-        pixel_size=pixel_size,
-    )
+    files = [value for value in given.values() if isinstance(value, Path)]
+    io.check_output(output, frames, *files, replaces="anything" if overwrite else "nothing")
+    known = stack_options(given)
     header = io.Header(
         motion.value, title=frames.stem, tilt=known.get("tilt"), pixel_size=known.get("pixel_size")
     )

@@ -48,11 +48,10 @@ def command(
     """Measure a height map: heights, areas, volumes, plane or sphere, roughness, steps."""
     from mirrorskin import engine, io
     from mirrorskin.cli import quantity
-    from mirrorskin.cli.stack import region_of
 
     measures = engine.measure(
         io.select_turn(io.open_result(result), turn),
-        region=None if region is None else region_of(region, "--region"),
+        region=None if region is None else quantity.region(region, "--region"),
         form=None if form is None else form.value,
         cutoff=None if cutoff is None else quantity.length(cutoff, "--cutoff"),
         section=None if section is None else quantity.segment(section, "--section"),

@@ -32,28 +32,6 @@ Json = Annotated[bool, Option("--json", help="Print machine-readable output.")]
 Device = Annotated[
     str | None, Option(metavar="NAME", help="Number or part of the name, as in 'mirrorskin devices'.")
 ]
-Motion = Annotated[MotionName | None, Option(help="How the body moved, if the file does not say.")]
-_PRESS, _ROTATION = {"motions": ("vertical",)}, {"motions": ("axial",)}
-TravelStep = Annotated[
-    str | None, Option(metavar="LENGTH", help="travel from frame to frame: 0.1mm.", **_PRESS)
-]
-TravelStart = Annotated[
-    str | None, Option(metavar="LENGTH", help="travel of the first frame; without it 0mm.", **_PRESS)
-]
-Travel = Annotated[
-    Path | None,
-    Option(
-        metavar="FILE", help="travel of all frames, mm, one number a frame: a text, CSV or NPY.", **_PRESS
-    ),
-]
-PhaseStep = Annotated[
-    str | None, Option(metavar="ANGLE", help="phase from frame to frame: 45deg.", **_ROTATION)
-]
-Phases = Annotated[
-    Path | None,
-    Option(metavar="FILE", help="phases of all frames, a text of angles: 178.1deg 220.8deg ...", **_ROTATION),
-]
-Tilt = Annotated[str | None, Option(metavar="ANGLE", help="Half-angle of the precession: 2.5deg.")]
 ZenithGain = Annotated[
     str | None,
     Option(metavar="COUNTS/ANGLE", help="Rotation: of the zenith, 5.7/deg; else the file's."),
@@ -68,9 +46,8 @@ PixelSize = Annotated[
 ]
 Region = Annotated[
     str | None,
-    Option(metavar="X,Y,WxH", help="Only so many pixels, from column X and row Y on: 100,50,640x480."),
+    Option(metavar="X,Y,WxH", help="Only W x H pixels, from column X and row Y on: 100,50,640x480."),
 ]
-Frames = Annotated[str | None, Option(metavar="A:B", help="Only frames A to B - 1, of which the first is 0.")]
 LiveFrames = Annotated[
     bool, Option("--live", help="Only the frames that a live run used, with the positions it had.")
 ]
@@ -87,7 +64,6 @@ Section = Annotated[
         show_default="across the apex",
     ),
 ]
-Dataset = Annotated[str | None, Option(metavar="PATH", help="The stack in another's file.")]
 Calibration = Annotated[
     Path | None,
     Option(metavar="CAL.h5", help="Calibration of the sensor, by 'mirrorskin calibrate'."),

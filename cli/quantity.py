@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 
-from mirrorskin.io import InputError
+from mirrorskin.io import InputError, Region
 from mirrorskin.io.text import shortened
 from mirrorskin.io.units import Kind, in_base
 
@@ -127,6 +127,25 @@ def frame_size(text: str, option: str = "") -> tuple[int, int]:
     if match is None:
         raise _error(text, option, "pixels across and down are needed", "640x480")
     return int(match[1]), int(match[2])
+
+
+def region(text: str, option: str = "") -> Region:
+    """Return a rectangle of the picture, as in ``100,50,640x480``: first column and row, columns and rows."""
+    found = Region.read("".join(text.split()))
+    if found is None:
+        needed = "the first column and row, and how many of each, are needed"
+        raise _error(text, option, needed, "100,50,640x480")
+    return found
+
+
+def frame_range(text: str, option: str = "") -> tuple[int, int | None]:
+    """Return a range of frames, as in ``10:200``: the first and the one after the last, None for the end."""
+    match = re.fullmatch(r"([0-9]{0,9}):([0-9]{0,9})", "".join(text.split()))
+    start, stop = (int(one) if one else None for one in match.groups()) if match else (None, 0)
+    if stop is not None and stop <= (start or 0):
+        needed = "the first frame, from 0, and a later one that is left out are needed"
+        raise _error(text, option, needed, "10:200, or 10: for all from 10 on")
+    return start or 0, stop
 
 
 def _read(text: str, option: str, kind: Kind) -> float:

@@ -10,6 +10,7 @@ import click
 from mirrorskin.cli import options
 from mirrorskin.cli.declared import declared
 from mirrorskin.cli.groups import Argument, Option, refuse_foreign
+from mirrorskin.cli.stack import RECORDING, stack_options
 
 _REMEDIES = {"zenith": "--zenith-gain", "height": "--pixel-size"}  # by maps that are missing
 
@@ -27,52 +28,29 @@ def command(
             show_default="REC-result.h5",
         ),
     ] = None,
-    dataset: options.Dataset = None,
-    motion: options.Motion = None,
-    travel_step: options.TravelStep = None,
-    travel_start: options.TravelStart = None,
-    travel: options.Travel = None,
-    phase_step: options.PhaseStep = None,
-    phases: options.Phases = None,
-    pixel_size: options.PixelSize = None,
-    region: options.Region = None,
-    frames: options.Frames = None,
     live: options.LiveFrames = False,
     calibration: options.Calibration = None,
     memory: options.Memory = "256MB",
     device: options.Device = None,
     as_json: options.Json = False,
-    **chosen: Annotated[Any, declared("reconstruct")],
+    **chosen: Annotated[Any, RECORDING, declared("reconstruct")],
 ) -> None:
     """Reconstruct heights from a press, normals and heights from a rotation, or slip."""
     from mirrorskin import engine, io
     from mirrorskin.cli import output as outputs
     from mirrorskin.cli.quantity import memory as bytes_of
-    from mirrorskin.cli.stack import stack_options
     from mirrorskin.engine.reconstruction import calibrated
 
-    stack = stack_options(
-        motion=motion,
-        travel_step=travel_step,
-        travel_start=travel_start,
-        travel=travel,
-        phase_step=phase_step,
-        phases=phases,
-        pixel_size=pixel_size,
-        region=region,
-        frames=frames,
-    )
-    if isinstance(tilt := chosen.get("tilt"), float):
-        stack["tilt"] = tilt
+    files = [value for value in chosen.values() if isinstance(value, Path)]
+    stack = stack_options(chosen)
     limit = bytes_of(memory, "--memory")
-    with io.open_recording(recording, dataset=dataset, memory_limit=limit, live=live, **stack) as opened:
+    with io.open_recording(recording, memory_limit=limit, live=live, **stack) as opened:
         refuse_foreign(context, opened.motion, str(recording))
         target = output or recording.with_name(f"{recording.stem}-result.h5")
-        files = [value for value in chosen.values() if isinstance(value, Path)]
-        io.check_output(target, recording, phases, travel, calibration, *files, or_zarr=True)
+        io.check_output(target, recording, calibration, *files, or_zarr=True)
         source = calibrated(opened, calibration)
         if isinstance(source, io.Calibrated):
-            if source.whole.lens is not None and pixel_size is not None:
+            if source.whole.lens is not None and "pixel_size" in stack:
                 raise io.InputError(f"{source.whole.name} gives the pixel size. Remove --pixel-size")
         elif "tilt" in stack:  # without a calibration, it is the recording's own
             del chosen["tilt"]

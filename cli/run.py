@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from mirrorskin.cli import options
 from mirrorskin.cli.declared import ClassCommand
 from mirrorskin.cli.groups import Argument, Option, make_command
+from mirrorskin.cli.stack import RECORDING, stack_options
 
 
 def command(
@@ -25,21 +26,11 @@ def command(
             show_default="REC-CLASS.h5",
         ),
     ] = None,
-    dataset: options.Dataset = None,
-    motion: options.Motion = None,
-    travel_step: options.TravelStep = None,
-    travel_start: options.TravelStart = None,
-    travel: options.Travel = None,
-    phase_step: options.PhaseStep = None,
-    phases: options.Phases = None,
-    pixel_size: options.PixelSize = None,
-    region: options.Region = None,
-    frames: options.Frames = None,
     live: options.LiveFrames = False,
     memory: options.Memory = "256MB",
     device: options.Device = None,
     as_json: options.Json = False,
-    **chosen: Any,
+    **chosen: Annotated[Any, RECORDING],
 ) -> None:
     """Run an operation over a recording: built-in, or your own.
 
@@ -49,29 +40,18 @@ def command(
     from mirrorskin import io
     from mirrorskin.cli.output import progress, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
-    from mirrorskin.cli.stack import stack_options
     from mirrorskin.engine.running import load_operation, run_class
     from mirrorskin.kernels.device import open_device
 
     kind = load_operation(class_name)
     if device is not None:
         open_device(device)  # raises if there is none, even if the operation does not use it
-    stack = stack_options(
-        motion=motion,
-        travel_step=travel_step,
-        travel_start=travel_start,
-        travel=travel,
-        phase_step=phase_step,
-        phases=phases,
-        pixel_size=pixel_size,
-        region=region,
-        frames=frames,
-    )
+    files = [value for value in chosen.values() if isinstance(value, Path)]
+    stack = stack_options(chosen)
     limit = bytes_of(memory, "--memory")
-    with io.open_recording(recording, dataset=dataset, memory_limit=limit, live=live, **stack) as source:
+    with io.open_recording(recording, memory_limit=limit, live=live, **stack) as source:
         target = output or recording.with_name(f"{recording.stem}-{kind.__name__}.h5")
-        files = [value for value in chosen.values() if isinstance(value, Path)]
-        io.check_output(target, recording, phases, travel, *files, or_zarr=True)
+        io.check_output(target, recording, *files, or_zarr=True)
         with progress("running", source.shape[0]) as show:
             result = run_class(kind, source, show, memory_limit=limit, device=device, **chosen)
     save_and_report(result, target, device, as_json)

@@ -10,15 +10,14 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct, defstruct, field, structs
 
-from mirrorskin.cli.declared import term_of
-from mirrorskin.cli.options import MotionName
-from mirrorskin.cli.stack import stack_options
+from mirrorskin.cli.declared import Term, term_of
+from mirrorskin.cli.stack import STACK, stack_options
 from mirrorskin.engine.batch.jobs import TABLES, Plan
 from mirrorskin.engine.options import Configured, Option
 from mirrorskin.engine.reconstruction import method_for
 from mirrorskin.engine.rotation.tilt import check_tilt
 from mirrorskin.engine.running import load_operation
-from mirrorskin.io import InputError, Motion
+from mirrorskin.io import InputError
 from mirrorskin.io.os_errors import MAX_TEXT_BYTES, read_regular
 from mirrorskin.io.settings_file import load_toml
 
@@ -27,19 +26,6 @@ _REMEDY = "write the tables [stack], [press], [rotation], [slip], or [stack] and
 
 def _text(example: str) -> Meta:
     return Meta(min_length=1, description="a text in quotes", examples=[example])
-
-
-class _Stack(Struct, frozen=True, rename="kebab"):
-    dataset: Annotated[str, _text("/entry/data")] | None = None
-    motion: Motion | None = None
-    travel_step: Annotated[str, _text("0.1mm")] | None = None
-    travel_start: Annotated[str, _text("0mm")] | None = None
-    travel: Annotated[str, _text("stage.csv")] | None = None
-    phase_step: Annotated[str, _text("45deg")] | None = None
-    tilt: Annotated[str, _text("2.5deg")] | None = None
-    pixel_size: Annotated[str, _text("0.03mm")] | None = None
-    region: Annotated[str, _text("100,50,640x480")] | None = None
-    frames: Annotated[str, _text("10:200")] | None = None
 
 
 def read_settings(path: Path | None, memory_limit: int) -> Plan:
@@ -52,10 +38,9 @@ def read_settings(path: Path | None, memory_limit: int) -> Plan:
             kinds = {"operation": load_operation(operation)}
         except InputError as error:
             raise InputError(f"{path}: operation.class: {error}") from error
-    tables: dict[str, type[Struct]] = {
-        "stack": _Stack,
-        **{name: _table(name, kind) for name, kind in kinds.items()},
-    }
+    stack = [(one.name, _stack_type(one) | None, None) for one in STACK.without("phases").terms]
+    tables: dict[str, type[Struct]] = {"stack": defstruct("stack", stack, frozen=True, rename="kebab")}
+    tables |= {name: _table(name, kind) for name, kind in kinds.items()}
     fields: Any = [(name, model, field(default_factory=model)) for name, model in tables.items()]
     settings = load_toml(path, defstruct("Settings", fields, frozen=True), _REMEDY)
     given = {name: _given(getattr(settings, name)) for name in tables}
@@ -90,6 +75,11 @@ def _table(name: str, kind: type[Configured]) -> type[Struct]:
     if name == "operation":
         fields = [("class_", Annotated[str, _text("mine.py:Wear")], field(name="class")), *fields]
     return defstruct(name, fields, frozen=True, rename="kebab", kw_only=True)
+
+
+def _stack_type(one: Term) -> Any:
+    """Return the type in TOML of an option of a stack."""
+    return Literal[one.choices] if one.choices else Annotated[str, _text(one.example or one.unit)]
 
 
 def _type(one: Option) -> Any:
@@ -137,12 +127,12 @@ def _options(values: Mapping[str, Any], kind: type[Configured], where: str) -> d
 
 def _opening(values: dict[str, Any], where: str) -> dict[str, Any]:
     """Convert [stack] to keywords of ``open_recording``; refuse what no stack can have."""
-    dataset = {name: values.pop(name) for name in ("dataset",) if name in values}
-    if "motion" in values:
-        values["motion"] = MotionName(values["motion"])
-    if "travel" in values:
-        values["travel"] = Path(values["travel"])
-    options = stack_options(**values, where=where)
+    read = {}
+    for one in STACK.terms:
+        if one.name in values:
+            text, place = values[one.name], f"{where}{one.flag[2:]}"
+            read[one.name] = Path(text) if one.kind == "file" else one.read(text, place)
+    options = stack_options(read, where)
     if "tilt" in options:
         try:
             check_tilt(options["tilt"])
@@ -150,4 +140,4 @@ def _opening(values: dict[str, Any], where: str) -> dict[str, Any]:
             raise InputError(f"{where}tilt: {error}") from error
     if min(options.get("pixel_size", (1.0,))) <= 0:
         raise InputError(f'{where}pixel-size: a length above 0 is needed; write e.g. "0.03mm"')
-    return {**dataset, **options}
+    return dict(options)

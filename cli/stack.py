@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict
 
-from mirrorskin.cli.options import MotionName
+from mirrorskin.cli.declared import Term, Terms, term
+from mirrorskin.cli.groups import MOTIONS
 
 if TYPE_CHECKING:
     from mirrorskin.io import Motion, Region
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 class StackOptions(TypedDict, total=False):
     """The keywords of ``io.open_recording`` that describe a stack; those not given are missing."""
 
+    dataset: str
     motion: Motion
     travel: Positions
     phase: Positions
@@ -28,94 +29,81 @@ class StackOptions(TypedDict, total=False):
     frames: tuple[int, int | None]
 
 
-def stack_options(
-    *,
-    motion: MotionName | None = None,
-    travel_step: str | None = None,
-    travel_start: str | None = None,
-    travel: Path | None = None,
-    phase_step: str | None = None,
-    phases: Path | None = None,
-    tilt: str | None = None,
-    pixel_size: str | None = None,
-    region: str | None = None,
-    frames: str | None = None,
-    where: str = "--",
-) -> StackOptions:
-    """Convert options to numbers, mm and radians; messages put ``where`` before an option's name."""
-    from mirrorskin.cli.quantity import angle, lengths
+_PRESS, _TURN = ("vertical",), ("axial",)
 
+STACK = Terms(
+    [
+        term("dataset", "the stack in another program's file", "/entry/data", kind="text"),
+        Term("motion", "choice", "how the body moved, if the file does not say", choices=MOTIONS),
+        term("travel_step", "travel from frame to frame: 0.1mm", "mm", motions=_PRESS),
+        term("travel_start", "travel of the first frame; without it 0mm", "mm", motions=_PRESS),
+        term(
+            "travel",
+            "travel of all frames, mm, one number a frame: a text, CSV or NPY",
+            "FILE.csv",
+            kind="file",
+            motions=_PRESS,
+        ),
+        term("phase_step", "phase from frame to frame: 45deg", "rad", motions=_TURN),
+        term(
+            "phases",
+            "phases of all frames, a text of angles: 178.1deg 220.8deg ...",
+            "FILE.txt",
+            kind="file",
+            motions=_TURN,
+        ),
+        term("tilt", "half-angle of the precession: 2.5deg", "rad", motions=_TURN),
+        term("pixel_size", "size of a pixel at the sheet: 0.03mm", "mm,mm"),
+        term("region", "only W x H pixels, from column X and row Y on: 100,50,640x480", "region"),
+        term("frames", "only frames A to B - 1; the first frame is 0", "range"),
+    ]
+)
+"""What a recording may lack, and the part of it that is used."""
+RECORDING = STACK.without("tilt")
+POSITIONS = STACK.without("dataset", "motion", "region", "frames")
+
+
+def stack_options(given: dict[str, Any], where: str = "--") -> StackOptions:
+    """Return keywords of `io.open_recording`, and remove their options, except the tilt, from those given.
+
+    Messages put ``where`` before an option's name.
+    """
+    names = [one.name for one in STACK.terms if one.name != "tilt"]
+    values = {name: given.pop(name) for name in names if name in given}
     options = StackOptions()
-    if motion is not None:
-        options["motion"] = motion.value
-    options |= _travel(travel_step, travel_start, travel, where) | _phase(phase_step, phases, where)
-    if tilt is not None:
-        options["tilt"] = angle(tilt, f"{where}tilt")
-    if pixel_size is not None:
-        options["pixel_size"] = lengths(pixel_size, f"{where}pixel-size")
-    if region is not None:
-        options["region"] = region_of(region, f"{where}region")
-    if frames is not None:
-        options["frames"] = frame_range(frames, f"{where}frames")
-    return options
+    for name in ("dataset", "motion", "pixel_size", "region", "frames"):
+        if name in values:
+            options[name] = values[name]
+    if isinstance(given.get("tilt"), float):
+        options["tilt"] = given["tilt"]
+    return options | _travel(values, where) | _phase(values)
 
 
-def _travel(step: str | None, start: str | None, listed: Path | None, where: str) -> StackOptions:
-    from mirrorskin.cli.quantity import length
+def _travel(values: Mapping[str, Any], where: str) -> StackOptions:
     from mirrorskin.io import InputError, Steps
 
-    if listed is not None:
-        if step is not None or start is not None:
-            own = where.rpartition(" ")[2]
+    other = where.rpartition(" ")[2]
+    if "travel" in values:
+        if "travel_step" in values or "travel_start" in values:
             raise InputError(
-                f"{where}travel is that of all frames: leave {own}travel-step and {own}travel-start out"
+                f"{where}travel is that of all frames. Remove {other}travel-step and {other}travel-start"
             )
-        return {"travel": read_travel(listed)}
-    if step is not None:
-        first = length(start or "0mm", f"{where}travel-start")
-        return {"travel": Steps(length(step, f"{where}travel-step"), first)}
-    if start is not None:
-        other = f"{where.rpartition(' ')[2]}travel-step"
-        raise InputError(f"{where}travel-start without {other} says nothing: give both")
+        return {"travel": read_travel(values["travel"])}
+    if "travel_step" in values:
+        return {"travel": Steps(values["travel_step"], values.get("travel_start", 0.0))}
+    if "travel_start" in values:
+        raise InputError(f"{where}travel-start needs {other}travel-step: give both")
     return {}
 
 
-def _phase(step: str | None, phases: Path | None, where: str) -> StackOptions:
-    from mirrorskin.cli.quantity import angle
+def _phase(values: Mapping[str, Any]) -> StackOptions:
     from mirrorskin.io import InputError, Steps
 
-    if step is not None and phases is not None:
-        raise InputError("--phase-step and --phases both give the phases: leave one out")
-    if step is not None:
-        return {"phase": Steps(angle(step, f"{where}phase-step"))}
-    return {} if phases is None else {"phase": read_phases(phases)}
-
-
-def region_of(text: str, option: str = "") -> Region:
-    """Return a rectangle of the picture, as in ``100,50,640x480``: first column and row, columns and rows."""
-    from mirrorskin.io import InputError, Region
-
-    found = Region.read("".join(text.split()))
-    if found is None:
-        raise InputError(
-            f"{option} {text}: the first column and row, and how many of each, are needed;"
-            " write e.g. 100,50,640x480"
-        )
-    return found
-
-
-def frame_range(text: str, option: str = "") -> tuple[int, int | None]:
-    """Return a range of frames, as in ``10:200``: the first and the one after the last, None for the end."""
-    from mirrorskin.io import InputError
-
-    match = re.fullmatch(r"([0-9]{0,9}):([0-9]{0,9})", "".join(text.split()))
-    start, stop = (int(one) if one else None for one in match.groups()) if match else (None, 0)
-    if stop is not None and stop <= (start or 0):
-        raise InputError(
-            f"{option} {text}: the first frame, from 0, and a later one that is left out are needed;"
-            " write e.g. 10:200, or 10: for all from 10 on"
-        )
-    return start or 0, stop
+    if "phase_step" in values and "phases" in values:
+        raise InputError("--phase-step and --phases both give the phases. Remove one of them")
+    if "phase_step" in values:
+        return {"phase": Steps(values["phase_step"])}
+    return {"phase": read_phases(values["phases"])} if "phases" in values else {}
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from mirrorskin.cli import options
 from mirrorskin.cli.groups import Argument, Option
+from mirrorskin.cli.stack import STACK
 
 
 def command(
@@ -17,17 +18,17 @@ def command(
     output: Annotated[
         Path, Option("--output", "-o", metavar="RES.h5", help="Result to write: HDF5, or NAME.zarr.")
     ],
-    pixel_size: options.PixelSize = None,
     device: options.Device = None,
     as_json: options.Json = False,
+    **given: Annotated[Any, STACK.only("pixel_size")],
 ) -> None:
     """Make one larger surface of several touches."""
     from mirrorskin import engine, io
     from mirrorskin.cli.output import save_and_report
-    from mirrorskin.cli.stack import stack_options
 
-    size = stack_options(pixel_size=pixel_size).get("pixel_size")
     io.check_output(output, *results, or_zarr=True)
     touches = [io.open_result(path) for path in results]
-    whole = engine.stitch(touches, size, names=[str(path) for path in results], device=device)
+    whole = engine.stitch(
+        touches, given.get("pixel_size"), names=[str(path) for path in results], device=device
+    )
     save_and_report(whole.result, output, device, as_json)

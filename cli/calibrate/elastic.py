@@ -5,19 +5,20 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import inputs
 from mirrorskin.cli.groups import Argument, Option
+from mirrorskin.cli.stack import STACK, stack_options
 
 if TYPE_CHECKING:
     from mirrorskin.engine.calibration.gel import BallOnset, GelFit
     from mirrorskin.io import Calibration, Source
 
-_STEP, _PRESS = "0.03mm", "1.2mm"
+_STEP, _PRESS = 0.03, "1.2mm"  # mm of a step
 
 
 def command(
@@ -30,9 +31,6 @@ def command(
     sheet: Annotated[
         str, Option(metavar="LENGTH", help="Thickness of what lies between mirror and ball.")
     ] = "0.05mm",
-    travel_step: options.TravelStep = None,
-    travel_start: options.TravelStart = None,
-    pixel_size: options.PixelSize = None,
     rig: inputs.OptionalRig = None,
     places: inputs.Places = 1,
     press: Annotated[str | None, inputs.press_option(_PRESS)] = None,
@@ -40,11 +38,11 @@ def command(
     overwrite: inputs.Overwrite = False,
     device: options.Device = None,
     as_json: options.Json = False,
+    **given: Annotated[Any, STACK.only("travel_step", "travel_start", "pixel_size")],
 ) -> None:
     """Learn when the sheet turns light and how far the stage gives way, from presses of a ball."""
     from mirrorskin import io
     from mirrorskin.cli.quantity import length
-    from mirrorskin.cli.stack import stack_options
     from mirrorskin.engine.calibration.gel import fit_gel
 
     paths = list(presses or [])
@@ -56,16 +54,15 @@ def command(
         from mirrorskin.hw.rig.plans import VerticalPlan
 
         plan = VerticalPlan(
-            length(travel_start or "0mm", "--travel-start"),
+            given.pop("travel_start", 0.0),
             length(press or _PRESS, "--press"),
-            step=length(travel_step or _STEP, "--travel-step"),
+            step=given.pop("travel_step", _STEP),
         )
         prompt = "put the ball at place {} of {}, near the middle of the field"
         balls = inputs.at_each("elastic", prompt, places, plan)
         paths = inputs.take(rig, output, balls, settle, overwrite)
-        travel_step = travel_start = None
-    given = stack_options(travel_step=travel_step, travel_start=travel_start, pixel_size=pixel_size)
-    with inputs.open_all(paths, given, known, output) as (sources, camera):
+    stack = stack_options(given)
+    with inputs.open_all(paths, stack, known, output) as (sources, camera):
         fit = fit_gel([_onset(source, known, radius, device) for source in sources], sheet=thickness)
         process = inputs.process_of(
             sources[0],

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import inputs
 from mirrorskin.cli.groups import Argument, Option
+from mirrorskin.cli.stack import STACK, stack_options
 
 if TYPE_CHECKING:
     from mirrorskin.engine.calibration.force import StiffnessFit
@@ -31,17 +32,14 @@ def command(
     force_sigma: Annotated[
         str | None, Option(metavar="FORCE", help="Standard deviation of the scale's readings: 5mN.")
     ] = None,
-    travel_step: options.TravelStep = None,
-    travel_start: options.TravelStart = None,
-    pixel_size: options.PixelSize = None,
     device: options.Device = None,
     as_json: options.Json = False,
+    **given: Annotated[Any, STACK.only("travel_step", "travel_start", "pixel_size")],
 ) -> None:
     """Learn the modulus that turns a press into newtons, from a scale or known weights; after elastic."""
     from mirrorskin import io
     from mirrorskin.cli.output import progress
     from mirrorskin.cli.quantity import force as newtons_of
-    from mirrorskin.cli.stack import stack_options
     from mirrorskin.engine.calibration.force import fit_stiffness, known_press
 
     newtons = _forces(presses, force or [], readings)
@@ -49,8 +47,8 @@ def command(
     known = inputs.check_call(output, presses, None)
     if known is None or known.gel is None:
         raise io.InputError(f"{output} has no gel, by which presses become loads: calibrate elastic first")
-    given = stack_options(travel_step=travel_step, travel_start=travel_start, pixel_size=pixel_size)
-    with inputs.open_all(presses, given, known, output) as (sources, camera):
+    stack = stack_options(given)
+    with inputs.open_all(presses, stack, known, output) as (sources, camera):
         found = []
         for source, one in zip(sources, newtons, strict=True):
             with progress("pressing", source.shape[0]) as show:

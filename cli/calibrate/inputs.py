@@ -183,7 +183,7 @@ def at_each(part: str, prompt: str, count: int, plan: Plan, frames: int = 1) -> 
     return [Place(f"{part}-{n}", prompt.format(n, count), plan, frames) for n in numbers]
 
 
-def turn_plan(press: str | None, tilt: str | None, phase_step: str | None, example: str) -> AxialPlan:
+def turn_plan(press: str | None, tilt: float | None, phase_step: float | None, example: str) -> AxialPlan:
     """Return the plan of a turn on a ball: eight steps and a tilt of 2.5 degrees unless given."""
     from mirrorskin.cli.quantity import angle, length
     from mirrorskin.hw.rig.plans import AxialPlan
@@ -195,8 +195,8 @@ def turn_plan(press: str | None, tilt: str | None, phase_step: str | None, examp
         )
     return AxialPlan(
         length(press, "--press"),
-        angle(tilt or TILT, "--tilt"),
-        phase_step=angle(phase_step or _PHASE_STEP, "--phase-step"),
+        angle(TILT) if tilt is None else tilt,
+        phase_step=angle(_PHASE_STEP) if phase_step is None else phase_step,
     )
 
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import inputs
 from mirrorskin.cli.groups import Argument, Option
+from mirrorskin.cli.stack import STACK, stack_options
 
 if TYPE_CHECKING:
     from mirrorskin.engine.calibration.brightness import Brightness
@@ -38,9 +39,6 @@ def command(
         list[Path] | None,
         Option(metavar="REC.h5", help="Axial recording of an inclined plate; may be given again."),
     ] = None,
-    phase_step: options.PhaseStep = None,
-    phases: options.Phases = None,
-    pixel_size: options.PixelSize = None,
     zenith_gain: options.ZenithGain = None,
     zenith_offset: options.ZenithOffset = None,
     rig: inputs.OptionalRig = None,
@@ -52,12 +50,12 @@ def command(
     settle: inputs.Settle = None,
     overwrite: inputs.Overwrite = False,
     as_json: options.Json = False,
+    **given: Annotated[Any, STACK.only("phase_step", "phases", "pixel_size")],
 ) -> None:
     """Find half-angle, phase offset, direction, ellipticity and pivot of the rotation, with their errors."""
     from mirrorskin import io
     from mirrorskin.cli.output import progress
-    from mirrorskin.cli.quantity import length
-    from mirrorskin.cli.stack import stack_options
+    from mirrorskin.cli.quantity import angle, length
     from mirrorskin.engine.calibration.tilt import fit_precession
     from mirrorskin.engine.calibration.tilt_tracks import track_ball, track_plate
 
@@ -66,13 +64,14 @@ def command(
     known = inputs.check_call(
         output, paths, rig, [*flats, *wedges], press=press, tilt=tilt, settle=settle, overwrite=overwrite
     )
-    given = stack_options(phase_step=phase_step, phases=phases, pixel_size=pixel_size)
     if rig is not None:
-        plan = inputs.turn_plan(press, tilt, phase_step, "0.5mm")
+        half_angle = None if tilt is None else angle(tilt, "--tilt")
+        plan = inputs.turn_plan(press, half_angle, given.get("phase_step"), "0.5mm")
         turns = inputs.at_each("tilt", inputs.BALL, places, plan)
         paths = inputs.take(rig, output, turns, settle, overwrite)
         given = {}
-    with inputs.open_all([*paths, *flats, *wedges], given, known, output) as (sources, camera):
+    stack = stack_options(given)
+    with inputs.open_all([*paths, *flats, *wedges], stack, known, output) as (sources, camera):
         light = _brightness(sources[0], known, zenith_gain, zenith_offset)
         tracks, plates = [], []
         with progress("looking", len(sources)) as show:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import inputs
 from mirrorskin.cli.groups import Argument, Option
+from mirrorskin.cli.stack import STACK, stack_options
 
 if TYPE_CHECKING:
     from mirrorskin.io import Calibration, Precession, Source, WallResponse
@@ -45,21 +46,18 @@ def command(
     body_height: Annotated[
         str, Option(metavar="LENGTH", help="Nominal height of the wall, right within a tenth.")
     ] = "40mm",
-    tilt: options.Tilt = None,
-    phase_step: options.PhaseStep = None,
-    pixel_size: options.PixelSize = None,
     rig: inputs.OptionalRig = None,
     places: Annotated[int, Option(min=5, help="With --rig: of the ball.")] = 9,
     press: Annotated[str | None, inputs.press_option("0.4mm for 4 mm")] = None,
     settle: inputs.Settle = None,
     overwrite: inputs.Overwrite = False,
     as_json: options.Json = False,
+    **given: Annotated[Any, STACK.only("tilt", "phase_step", "pixel_size")],
 ) -> None:
     """Learn what brightness means at each place, from a ball of known size pressed all over the field."""
     from mirrorskin import io
     from mirrorskin.cli.output import progress
     from mirrorskin.cli.quantity import length
-    from mirrorskin.cli.stack import stack_options
     from mirrorskin.engine.calibration.wall import fit_zenith
 
     paths = list(presses or [])
@@ -67,11 +65,12 @@ def command(
     body = length(body_radius, "--body-radius"), length(body_height, "--body-height")
     known = inputs.check_call(output, paths, rig, press=press, settle=settle, overwrite=overwrite)
     if rig is not None:
-        plan = inputs.turn_plan(press, tilt, phase_step, "0.4mm for 4 mm")
+        turn = given.pop("tilt", None), given.pop("phase_step", None)
+        plan = inputs.turn_plan(press, *turn, "0.4mm for 4 mm")
         balls = inputs.at_each("zenith", inputs.BALL, places, plan)
-        paths, tilt, phase_step = inputs.take(rig, output, balls, settle, overwrite), None, None
-    given = stack_options(tilt=tilt, phase_step=phase_step, pixel_size=pixel_size)
-    with inputs.open_all(paths, given, known, output) as (sources, camera):
+        paths = inputs.take(rig, output, balls, settle, overwrite)
+    stack = stack_options(given)
+    with inputs.open_all(paths, stack, known, output) as (sources, camera):
         with progress("fitting", len(sources)) as show:
             response = fit_zenith(
                 sources,

@@ -223,13 +223,16 @@ def refused(*words):
     return ended.said.removeprefix("mirrorskin: ").rstrip("\n")
 
 
+FOR = {"--modulus": "presses, slides and twists"}
+
+
 @pytest.mark.parametrize("option", PRESS)
 def test_options_of_a_press_are_refused_for_a_rotation(option):
     turn()
     told = refused("reconstruct", "turn.h5", option, *PRESS[option])
     # Of a pair of opposites the first is named.
     name = option.replace("--no-", "--")
-    assert told == f"turn.h5 is of axial motion, of which {name} says nothing: leave it out"
+    assert told == f"{name} applies to {FOR.get(name, 'presses')} only; turn.h5 is a rotation. Remove it"
 
 
 @pytest.mark.parametrize("option", ROTATION)
@@ -238,7 +241,7 @@ def test_options_of_a_rotation_are_refused_for_a_press(option):
     Path("phases.txt").write_text("1deg")
     Path("turn.h5").touch()
     told = refused("reconstruct", "press.h5", option, *ROTATION[option])
-    assert told == f"press.h5 is of vertical motion, of which {option} says nothing: leave it out"
+    assert told == f"{option} applies to rotations only; press.h5 is a press. Remove it"
 
 
 @pytest.mark.parametrize("motion", ["horizontal", "twist"])

@@ -28,7 +28,8 @@ frames = "10:200"
 event = "release"
 method = "change-point"
 threshold = 0.25
-inclination = ["12deg"]
+thresholds = [0.25]
+inclinations = ["12deg"]
 hold = 3
 subframe = true
 dark = 12
@@ -45,11 +46,13 @@ zenith-offset = 10
 noise = 2
 per-turn = true
 robust = true
+heights = "ball.h5"
 
 [slip]
+contact = "press.h5"
 per-frame = true
-window = 12
-step = 6
+window-size = 12
+window-step = 6
 noise = 1.5
 modulus = "0.2MPa"
 """
@@ -83,6 +86,7 @@ def test_every_key_arrives_in_the_engine_s_words_and_units(settings):
         "event": "release",
         "method": "change-point",
         "threshold": 0.25,
+        "thresholds": [0.25],
         "inclinations": [pytest.approx(math.radians(12))],
         "hold": 3,
         "subframe": True,
@@ -95,13 +99,21 @@ def test_every_key_arrives_in_the_engine_s_words_and_units(settings):
     assert plan.rotation == {
         "method": "paper",
         "tilt": pytest.approx(math.radians(3)),
-        "gain": pytest.approx(5.7 * 180 / math.pi),
-        "offset": 10.0,
+        "zenith_gain": pytest.approx(5.7 * 180 / math.pi),
+        "zenith_offset": 10.0,
         "noise": 2.0,
         "per_turn": True,
         "robust": True,
+        "heights": Path("ball.h5"),
     }
-    assert plan.slip == {"per_frame": True, "window": 12, "step": 6, "noise": 1.5, "modulus": 0.2}
+    assert plan.slip == {
+        "contact": Path("press.h5"),
+        "per_frame": True,
+        "window_size": 12,
+        "window_step": 6,
+        "noise": 1.5,
+        "modulus": 0.2,
+    }
     assert plan.memory_limit == 1000
 
 
@@ -116,6 +128,33 @@ def test_every_key_is_an_option_of_reconstruct_too(settings):
 def test_what_is_not_said_is_left_to_the_recordings(settings):
     assert settings("") == read_settings(None, 1000) == Plan(memory_limit=1000)
     assert settings("[press]\n[stack]\n") == Plan(memory_limit=1000)
+
+
+def test_an_operation_replaces_the_methods(settings, tmp_path):
+    plan = settings("[operation]\nclass = 'mirrorskin.engine:Onset'\nthreshold = 0.4\n[stack]\nframes = '2:'")
+    options = {"threshold": 0.4}
+    assert plan == Plan(
+        {"frames": (2, None)},
+        memory_limit=1000,
+        operation="mirrorskin.engine:Onset",
+        operation_options=options,
+    )
+    (tmp_path / "mine.py").write_text(WEAR)
+    plan = settings("[operation]\nclass = 'mine.py:Wear'\ntravel-offset = '100um'\nangles = ['1deg', '2deg']")
+    assert plan.operation == f"{tmp_path.resolve()}/mine.py:Wear", "workers may be in another folder"
+    assert plan.operation_options == {
+        "travel_offset": pytest.approx(0.1),
+        "angles": pytest.approx([math.radians(1), math.radians(2)]),
+    }
+
+
+WEAR = """
+from mirrorskin import engine
+
+class Wear(engine.Operation):
+    travel_offset: float = engine.option(0.0, "mm", help="added to each travel")
+    angles: list = engine.option(None, "rad", several=True, help="angles")
+"""
 
 
 def test_a_tilt_may_be_estimated(settings):
@@ -143,17 +182,23 @@ def test_a_tilt_may_be_estimated(settings):
         ("stack", 'region = "5,5,5"', "region 5,5,5: the first column and row"),
         ("stack", 'frames = "5"', "frames 5: the first frame, from 0"),
         ("press", 'method = "exact"', 'method is "exact": one of "threshold", "change-point" is needed'),
-        ("press", "threshold = 1.5", "threshold is 1.5: a share from 0 (dark) to 1 (bright) is needed"),
-        ("press", "hold = 0", "hold is 0: a number of frames from 1 on is needed; write e.g. hold = 2"),
+        (
+            "press",
+            "threshold = 1.5",
+            "threshold is 1.5: a share from 0 to 1 is needed; write e.g. threshold = 0.5",
+        ),
+        ("press", "hold = 0", "hold is 0: a number of frames of at least 1 is needed; write e.g. hold = 2"),
         ("press", "hold = true", "hold is true: a number of frames"),
         ("press", "subframe = 1", "subframe is 1: one of true, false is needed"),
-        ("press", "dark = inf", "dark is inf: a number of counts"),
-        ("press", "noise = -1", "noise is -1: a standard deviation in counts, not below 0, is needed"),
+        ("press", "dark = inf", "dark is inf: a number in counts is needed; write e.g. dark = 1.5"),
+        ("press", "noise = -1", "noise is -1: a number in counts of at least 0 is needed"),
         ("rotation", 'tilt = "0deg"', "tilt: tilt 0 deg: above 0"),
         ("rotation", 'zenith-gain = "5.7"', "zenith-gain 5.7: a number over a unit of angle"),
         ("rotation", 'zenith-gain = "0/deg"', "zenith-gain 0/deg: other than 0"),
-        ("rotation", "noise = 0", "noise is 0: a standard deviation in counts, above 0, is needed"),
-        ("press", "zenith-gain = 1", "zenith-gain is not known: there are event, method"),
+        ("rotation", "noise = 0", "noise is 0: a number in counts above 0 is needed"),
+        ("press", "zenith-gain = 1", "zenith-gain is not known: there are method, threshold"),
+        ("press", 'modulus = "-1MPa"', "modulus -1MPa: a pressure above 0 is needed"),
+        ("press", 'inclinations = ["1mm"]', "inclinations 1mm: millimeters are not an angle"),
         ("stack", "travel_step = '1mm'", "travel_step is not known: did you mean travel-step?"),
     ],
 )
@@ -171,12 +216,17 @@ def test_what_cannot_be_used_is_told_with_file_table_and_key(settings, table, li
         ("press = 2\n", "b.toml: press is 2: write [press] alone in a line"),
         ("[press]\nhold = 1" + 5000 * "0", "b.toml is not TOML: Exceeds the limit"),
         (
-            "[press]\nmethod = 'change-point'\nsubframe = false",
-            "b.toml: [press] subframe is false: a change-",
+            "[operation]\nthreshold = 0.5",
+            "b.toml: operation.class: MODULE:CLASS or FILE.py:CLASS is needed; write",
+        ),
+        ("[operation]\nclass = 'none.py:A'", "b.toml: operation.class: "),
+        (
+            "[operation]\nclass = 'mirrorskin.engine:Onset'\ndepth = 1",
+            "b.toml: operation.depth is not known: there are class, threshold",
         ),
         (
-            "[press]\nmethod = 'change-point'\nthreshold = 0",
-            "b.toml: [press] threshold: a change-point needs",
+            "[operation]\nclass = 'mirrorskin.engine:Onset'\n[press]\nhold = 2",
+            "b.toml: press is not known: there are stack, operation",
         ),
     ],
 )

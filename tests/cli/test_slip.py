@@ -195,9 +195,9 @@ def test_a_batch_takes_slides(slide, tmp_path):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["--hold", 3], "of which --hold says nothing"),
-        (["--method", "paper"], "of which --method says nothing"),
-        (["--window", 200], "window"),
+        (["--hold", 3], "--hold applies to presses only; "),
+        (["--method", "paper"], "--method applies to presses and rotations only; "),
+        (["--window-size", 200], "window_size"),
         (["--frames", "0:2"], "at least 3"),
     ],
 )

@@ -1,6 +1,7 @@
 """A plan's key changes with what changes results, and with nothing else."""
 
 import json
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -64,3 +65,33 @@ def test_a_key_is_json_that_tells_defaults_too():
     assert told["opening"] == {"dataset": "/x", "travel": {"Steps": {"start": 0.0, "step": 0.1}}, "file": "a"}
     assert (told["press"]["dark"], told["press"]["threshold"]) == (2.0, 0.5)
     assert "memory_limit" not in told["press"]
+
+
+WEAR = """
+from mirrorskin import engine
+
+class Wear(engine.Operation):
+    offset: float = engine.option(0.5, "mm", help="offset")
+"""
+
+
+def test_a_plan_with_a_user_s_operation_changes_with_its_options_and_its_code(tmp_path, monkeypatch):
+    paths = [tmp_path / name / "mine.py" for name in "ab"]
+    for path in paths:
+        path.parent.mkdir()
+        path.write_text(WEAR)
+    one, again = (Plan(operation=f"{path}:Wear") for path in paths)
+    assert one.key("vertical") == one.key("axial")
+    told = json.loads(one.key("vertical"))
+    assert (told["operation"], told["options"]) == (f"{paths[0]}:Wear", {"offset": 0.5})
+    assert one.key("vertical") == Plan(operation=one.operation, operation_options={"offset": 0.5}).key(
+        "vertical"
+    )
+    assert one.key("vertical") != Plan(operation=one.operation, operation_options={"offset": 1.0}).key(
+        "vertical"
+    )
+    code = told["code"]
+    assert json.loads(again.key("vertical"))["code"] == code
+    paths[1].write_text(WEAR.replace("0.5", "0.6"))
+    assert json.loads(again.key("vertical"))["code"] != code
+    assert pickle.loads(pickle.dumps(one)) == one
