@@ -167,18 +167,10 @@ class Terms:
         }  # fmt: skip
 
 
-<<<<<<< HEAD
-def declared(command: str, *, only: Sequence[str] = (), without: Sequence[str] = ()) -> Terms:
-    """Return the engine's options of a command, an entry of ``declared.json``: all, or some."""
-    stored = json.loads(_COPY.read_text(encoding="utf-8"))[command]
-    chosen = [one for one in stored if one["name"] not in without and (not only or one["name"] in only)]
-    return Terms([Term(**fields) for fields in chosen], of_engine=True)
-=======
 def declared(command: str) -> Terms:
     """Return the engine's options of a command: an entry of ``declared.json``."""
     stored = json.loads(_COPY.read_text(encoding="utf-8"))[command]
     return Terms([Term(**fields) for fields in stored], of_engine=True)
->>>>>>> cli
 
 
 def term(
@@ -316,7 +308,7 @@ def declarations() -> dict[str, list[dict[str, Any]]]:
     from mirrorskin.engine.method import Method
     from mirrorskin.engine.reconstruction import method_for
 
-    methods = {one: method_for(one) for one in ("vertical",)}  # TODO all
+    methods = {one: method_for(one) for one in ("vertical", "axial", "horizontal", "twist")}
     methods = {motion: kind for motion, kind in methods.items() if issubclass(kind, Method)}
     return {"reconstruct": _rows(methods)}
 
