@@ -1,7 +1,7 @@
 from .errors import NotConverged
 from .focus import Focus, find_focus
-from .force.normal import Force, find_force
-from .force.tangential import TangentialForce, find_tangential_force
+from .force.normal import find_force
+from .force.tangential import find_tangential_force
 from .fringes import Fringes, decode_gray, fit_fringes, unwrap_frequencies, unwrap_gray
 from .fusion import fuse
 from .integration.camera import Camera
@@ -31,17 +31,16 @@ from .rotation.normals import Normals
 from .rotation.rotation import Rotation
 from .running import run
 from .scoring import Score, score
-from .slip.displacement import Displacement, find_displacement
-from .slip.search import Slip, SlipSearch
+from .slip.displacement import find_displacement
+from .slip.search import Slip
+from .slip.slip import Sliding
 from .tiling import free_memory
 
 __all__ = [
     "Camera",
     "ChangePoint",
     "Correlate",
-    "Displacement",
     "Focus",
-    "Force",
     "Frequency",
     "Fringes",
     "Growth",
@@ -59,13 +58,12 @@ __all__ = [
     "Press",
     "Rotation",
     "Score",
+    "Sliding",
     "Slip",
-    "SlipSearch",
     "Step",
     "Stitch",
     "Strokes",
     "Surface",
-    "TangentialForce",
     "correlate",
     "decode_gray",
     "estimate_frequency",

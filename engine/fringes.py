@@ -80,7 +80,7 @@ class Fringes(Operation):
     @property
     def room(self) -> NDArray[Any]:
         """Array in which the next frames may be written before they are pushed, (n, H, W)."""
-        return self._fit.room
+        return np.asarray(self._fit.room)
 
     def clear(self) -> None:
         """Forget the frames so far."""

@@ -55,9 +55,35 @@ def as_result(
     result = maps if isinstance(maps, Result) else _converted(maps, name, quantity)
     if pixel_size is None:
         return result
-    size = map_shape(result)[-2:]
-    x, y = pixel_axes((size[0], size[1]), check_pixel_size(pixel_size))
+    pixels, size = check_pixel_size(pixel_size), map_shape(result)[-2:]
+    if len(size) < 2:  # whoever needs a map refuses this
+        return result
+    x, y = pixel_axes((size[0], size[1]), pixels)
     return result.assign(x=x, y=y)
+
+
+def pixel_size_of(result: Result, name: str, pixel_size: ArrayLike | None = None) -> tuple[float, float]:
+    """Return millimetres along x and y of a pixel, as specified, or as the result has it.
+
+    Raises
+    ------
+    InputError
+        Neither is available.
+    """
+    if pixel_size is not None:
+        return check_pixel_size(pixel_size)
+    if result.x is None or result.y is None:
+        raise InputError(f"{name} has no pixel size: specify pixel_size, in millimetres")
+    return spacing(result.x, result.y)
+
+
+def spacing(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the distances of pixel centres along x and y, mm; of a single row or column, square pixels."""
+    steps = [abs(axis[-1] - axis[0]) / (axis.size - 1) if axis.size > 1 else None for axis in (x, y)]
+    known = [float(step) for step in steps if step is not None]
+    if not known:
+        raise InputError("the result has a single pixel, so its size is unknown: take more")
+    return known[0], known[-1]
 
 
 def _converted(maps: Any, name: str, quantity: str) -> Result:

@@ -111,11 +111,12 @@ def _dimensions(
     """Return the dimensions of a variable, and the coordinate that names the components of a vector."""
     if declared.axes != "pixels":
         return {"frames": ("frame",), "pieces": ("components",), "none": ()}[declared.axes], {}
-    if not declared.components:
-        return (*lead, "y", "x"), {}
+    vector = bool(declared.components)
+    frames = ("frame",) if declared.per_frame and count - len(lead) == 3 + vector else ()
+    if not vector:
+        return (*frames, *lead, "y", "x"), {}
     name = {("x", "y", "z"): "vector", ("x", "y"): "direction"}.get(declared.components)
     name = name or "_".join(declared.components)
-    frames = ("frame",) if count - len(lead) == 4 else ()
     return (*frames, *lead, "y", "x", name), {name: [*declared.components]}
 
 
