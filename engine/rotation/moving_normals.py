@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ParamSpec, Protocol, cast
 
 import numpy as np
@@ -16,8 +16,12 @@ from mirrorskin.engine.rotation.poses import PoseFit, check_poses, even_windows,
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.maps import TABLE, PoseStatus, status_of
+from mirrorskin.io.types import body_axes
 
 P = ParamSpec("P")
+
+_FEWEST = 4  # frames of a preview: 3 determine a slope, and no noise
+_WARMING = 8  # frames
 
 
 class MovingNormals(NormalsOperation):
@@ -74,6 +78,19 @@ class MovingNormals(NormalsOperation):
         travel = where[:, 3] if where.shape[1:] == (4,) else None
         poses = check_poses(len(frames), axis=where[..., :3], travel=travel)
         self._push(frames, poses, frame_weights, lent)
+
+    def preview(self, seconds: float) -> Mapping[str, Any]:
+        """Return the maps of the frames so far; none before they determine a slope and its noise."""
+        return {} if self.count < _FEWEST else self.result()
+
+    def warm(self) -> None:
+        """Rock a plane, and forget it."""
+        tilts = np.linspace(-0.05, 0.05, _WARMING)
+        level = np.random.default_rng(0).normal(100, 1, (_WARMING, *self.shape))
+        frames = (level + 500 * tilts[:, np.newaxis, np.newaxis]).astype(self.dtype)
+        self.push(frames, pose=body_axes(np.zeros(_WARMING), tilts))
+        self.preview(0.0)
+        self.reset()
 
     def _turns_in(self, where: Doubles) -> list[slice]:
         starts = range(0, len(where), self._longest)

@@ -88,10 +88,15 @@ class Rotation(Method, options_of=(NormalsOperation, Integration)):
     def live_plan(self, source: Source) -> Plan:
         """Return the normals of the last turn, without registration; or what the source determines."""
         wall = self._wall_of(source)
-        if self.zenith_gain is None and source.header.zenith_gain is None and wall is None:
-            return self._correlation(source)
+        no_gain = self.zenith_gain is None and source.header.zenith_gain is None
         if self.tilt is None and source.header.tilt is None:
+            if no_gain:
+                raise InputError(
+                    f"{source.name} has no zenith gain, so no slopes. Set zenith_gain in the rig file"
+                )
             return self._poses(source)
+        if no_gain and wall is None:
+            return self._correlation(source)
         operation = self.make(LastTurn).configured_for(source)
         brightness = self._brightness(source) if wall is None else {"zenith": "calibrated"}
         process = {**self._process(), **brightness, "window_frames": operation.window_frames}

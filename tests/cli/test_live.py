@@ -20,10 +20,9 @@ from speckle import Speckle
 
 from mirrorskin import engine, io
 from mirrorskin.cli import live
-from mirrorskin.cli.groups import make_command
-from mirrorskin.cli.run import load_estimator
 from mirrorskin.cli.status import Board, Newest, summary
 from mirrorskin.engine.live import SHOWN, Latency, Status
+from mirrorskin.engine.running import load_operation
 from mirrorskin.engine.streaming import push_block
 from mirrorskin.hw import rig_file as file
 from mirrorskin.hw.errors import HardwareError
@@ -37,7 +36,7 @@ ALL = ["--latency", "60s"]  # no frame is skipped, even on a busy machine
 PRESS = ["vertical", "--stop", "1mm", "--speed", "2mm/s", *ALL]
 TURN = ["axial", "--press", "1mm", "--tilt", "2.5deg", "--rate", "2.5", "--turns", "2", *ALL]
 
-app = make_command(None, live.command)
+app = live.app
 
 
 def slanted(shape=SHAPE):
@@ -130,13 +129,13 @@ def test_strokes_are_joined_and_their_hysteresis_is_told(fake, tmp_path):
 
 
 def test_the_recording_replayed_gives_the_same_onset(fake, tmp_path):
-    from mirrorskin.engine import OnsetSearch
+    from mirrorskin.engine import Onset
 
     record, output = tmp_path / "rec.h5", tmp_path / "res.h5"
     fake.run(*PRESS, "--record", str(record), "-o", str(output))
     with io.open_recording(record, live=True) as recording:
         header = recording.header
-        search = OnsetSearch(SHAPE, "uint8", dark=header.dark, bright=header.bright)
+        search = Onset(dark=header.dark, bright=header.bright)
         while (block := recording.read(np.empty((7, *SHAPE), np.uint8))) is not None:
             push_block(search, block)
     result = io.open_result(output)
@@ -153,7 +152,7 @@ def test_a_rotation_is_told_and_kept(fake, tmp_path):
     done = fake.run(*TURN, "-o", str(output))
     assert done.exit_code == 0, done.output
     result = io.open_result(output)
-    assert result.process["window"] == 24
+    assert result.process["window_frames"] == 24
     assert np.degrees(np.median(result.zenith)) == pytest.approx(math.degrees(0.3), abs=1.0)
     assert result.height is not None
 
@@ -289,7 +288,7 @@ def test_a_turn_that_is_cut_short_says_that_there_is_no_result(fake, tmp_path):
     ("words", "told"),
     [
         ([*PRESS, "--latency", "5mm"], "--latency"),
-        ([*TURN, "--window", "60"], "--window 60"),
+        ([*TURN, "--window-frames", "60"], "window_frames 60"),
         (["vertical", "--stop", "9mm", "--speed", "1mm/s"], "9"),
         ([*PRESS, "-o", "rig.toml"], "rig.toml"),
         (["axial", "--press", "1mm", "--rate", "40"], "frames a turn"),
@@ -402,16 +401,18 @@ def test_a_slide_is_told_recorded_and_kept_and_repeated(fake, tmp_path):
 OWN = str(Path(__file__).parents[2] / "examples" / "steepest_rise.py") + ":SteepestRise"
 
 
-def test_an_estimator_of_the_user_s_gives_the_same_live_as_over_the_recording(fake, tmp_path):
+def test_an_operation_of_the_user_s_gives_the_same_live_as_over_the_recording(fake, tmp_path):
     record, output = tmp_path / "rec.h5", tmp_path / "res.h5"
-    done = fake.run(*PRESS, "--estimator", OWN, "--record", str(record), "-o", str(output))
+    done = fake.run(*PRESS, "--operation", OWN, "--least", "1", "--record", str(record), "-o", str(output))
     assert done.exit_code == 0, done.output
     assert counted(done.output)[4] > 1
     with io.open_recording(record, live=True) as recording:
-        again = engine.run(recording, load_estimator(OWN), memory_limit=2 * 7 * np.prod(SHAPE))
+        operation = load_operation(OWN)(least=1.0, memory_limit=2 * 7 * int(np.prod(SHAPE)))
+        again = engine.run(recording, operation)
     result = io.open_result(output)
     assert np.isfinite(result.height).sum() > 20
     assert result.process["live"]
+    assert result.process["least"] == 1.0
     assert result.maps().keys() == {"height", "rise"} == again.maps().keys()
     for name, values in again.maps().items():
         np.testing.assert_array_equal(result.maps()[name], values)
@@ -420,13 +421,12 @@ def test_an_estimator_of_the_user_s_gives_the_same_live_as_over_the_recording(fa
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        ([*PRESS, "--estimator", OWN, "--hold", "3"], "--hold says nothing of an --estimator of your own"),
-        ([*PRESS, "--set", "a=1"], "--set is for an --estimator of your own"),
-        ([*PRESS, "--estimator", f"{OWN}r"], "there is no class SteepestRiser"),
-        ([*TURN, "--estimator", OWN], "SteepestRise.push needs travel: "),
+        ([*PRESS, "--operation", OWN, "--hold", "3"], "has no option --hold. Its options are --least"),
+        ([*PRESS, "--operation", f"{OWN}r"], "there is no class SteepestRiser"),
+        ([*TURN, "--operation", OWN], "but SteepestRise needs vertical motion"),
     ],
 )
-def test_an_estimator_that_cannot_be_is_one_clear_line(fake, words, told):
+def test_an_operation_that_cannot_be_is_one_clear_line(fake, words, told):
     done = fake.run(*words)
-    assert isinstance(done.exception, io.InputError)
-    assert told in str(done.exception)
+    assert told in f"{done.exception} {done.output}"
+    assert done.exit_code != 0

@@ -5,8 +5,8 @@ import pytest
 from speckle import Speckle
 from stacks import MadeUp
 
-from mirrorskin.engine.live import LiveSlip, Loop
-from mirrorskin.engine.slip.slip import reconstruct_slip
+from mirrorskin.engine import Sliding
+from mirrorskin.engine.live import LiveOperation, Loop
 from mirrorskin.io import Header, InputError
 
 SHAPE, PIXEL, COUNT = (64, 72), 0.05, 8
@@ -28,12 +28,12 @@ class Timed(MadeUp):
 
 
 def test_slip_is_bit_by_bit_that_of_the_same_frames_offline():
-    live = LiveSlip(source(), contact=CONTACT)
+    live = LiveOperation(source(), Sliding(contact=CONTACT))
     live.warm()
     for part in np.split(np.arange(COUNT), [1, 2, 5]):
         live.push(FRAMES[part], displacement=PLACES[part])
         live.maps()
-    found, offline = live.result(), reconstruct_slip(source(), contact=CONTACT)
+    found, offline = live.result(), Sliding(contact=CONTACT).run(source())
     for name in ("displacement", "slip_onset", "status", "stick_ratio", "slide_distance"):
         np.testing.assert_array_equal(getattr(found, name), getattr(offline, name), err_msg=name)
     assert (found.status == 2).mean() > 0.5
@@ -41,7 +41,7 @@ def test_slip_is_bit_by_bit_that_of_the_same_frames_offline():
 
 
 def test_the_displacement_of_the_newest_frame_is_shown_from_the_second_on():
-    live = LiveSlip(source(), contact=CONTACT)
+    live = LiveOperation(source(), Sliding(contact=CONTACT))
     for number in range(COUNT):
         live.push(FRAMES[number : number + 1], displacement=PLACES[number : number + 1])
         maps = live.maps()
@@ -55,7 +55,7 @@ def test_a_whole_run_shows_how_far_the_body_has_come():
     given = source()
     timed = Timed(FRAMES, given.header, displacement=PLACES, time=0.01 * np.arange(COUNT))
     updates = []
-    live = LiveSlip(timed, contact=CONTACT)
+    live = LiveOperation(timed, Sliding(contact=CONTACT))
     status = Loop(timed, live, updates=1e6, on_update=lambda update, _: updates.append(update)).run()
     assert status.used == COUNT
     assert updates[-1].position == pytest.approx(np.hypot(0.14, 0.07))
@@ -63,8 +63,8 @@ def test_a_whole_run_shows_how_far_the_body_has_come():
 
 
 @pytest.mark.parametrize(
-    ("given", "told"), [(source("vertical"), "slip is of"), (source(pixel_size=None), "pixel size")]
+    ("given", "told"), [(source("vertical"), "Sliding needs horizontal or twist motion"), (source(pixel_size=None), "pixel size")]
 )
 def test_what_tells_no_slip_is_refused(given, told):
     with pytest.raises(InputError, match=told):
-        LiveSlip(given)
+        LiveOperation(given, Sliding())
