@@ -164,6 +164,10 @@ class LastTurn(Normals):
         names = ("mean", "cosine", "sine", "modulation", "residual")
         return result.assign({name: wave[name] for name in names})
 
+    def finish(self) -> Result:
+        """Return the maps of the last turn; only `reset` may follow."""
+        return self.result()
+
     def _place(self, height: NDArray[np.float32]) -> None:
         """Set where the object is, if that matters: its pieces' tops are as high as the press is deep."""
         from scipy import ndimage

@@ -1,0 +1,132 @@
+"""Every built-in operation with frames, positions and options that it can work on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from live_frames import phases, press_frames, turn_frames
+from numpy.typing import NDArray
+from speckle import Speckle
+from stacks import MadeUp
+
+from mirrorskin import engine
+from mirrorskin.bench.scenes import SCALES, TILT
+from mirrorskin.engine.press.growth import Growth
+from mirrorskin.engine.press.levels import Levels
+from mirrorskin.engine.rotation.last_turn import LastTurn
+from mirrorskin.io import Header
+from mirrorskin.io.types import body_axes
+
+COUNT, SHAPE, PIXEL = 48, (24, 32), 0.05
+TRAVEL = np.linspace(0, 1.2, COUNT)
+STROKES = 0.6 - 0.6 * np.cos(0.3 * np.arange(COUNT))
+DITHER = 0.6 + 0.03 * np.cos(0.7 * np.arange(COUNT))
+PRESS = press_frames((COUNT, *SHAPE))
+PHASE = phases(COUNT)
+TURNS = turn_frames((COUNT, *SHAPE))
+OFFSET, GAIN, NOISE = SCALES["uint8"]
+SENSOR = {"zenith_gain": GAIN, "zenith_offset": OFFSET}
+LEAN = 0.05 * np.sin(0.8 * np.arange(COUNT))
+ROCKED = np.clip(120 + 400 * LEAN[:, None, None] + np.zeros(SHAPE), 0, 255).astype(np.uint8)
+SLIDE = np.arange(12)[:, None] * [0.006, 0.003]
+SKIN = np.stack([Speckle(3).frame((64, 72), -x / PIXEL, y / PIXEL, 1.0, k) for k, (x, y) in enumerate(SLIDE)])
+LAMPS = np.stack([np.cos(PHASE), np.sin(PHASE), np.ones(len(PHASE))], axis=1)
+
+
+class Readable(MadeUp):
+    """A source that can be read again."""
+
+    rewindable = True
+
+    def rewind(self) -> None:
+        """Go back to the first frame."""
+        self.frames_read = 0
+
+
+@dataclass(frozen=True)
+class Case:
+    """An operation, what it computes on, and the function on arrays that does the same."""
+
+    kind: type[engine.Operation]
+    frames: NDArray[Any]
+    positions: Mapping[str, NDArray[np.float64]]
+    options: Mapping[str, Any] = field(default_factory=dict)
+    function: Callable[..., Any] | None = None
+    motion: str = "vertical"
+    header: Mapping[str, Any] = field(default_factory=dict)
+
+    def make(self, **options: Any) -> engine.Operation:
+        """Return the operation."""
+        return self.kind(**{**self.options, **options})
+
+    def source(self) -> Readable:
+        """Return the frames as a recording."""
+        header = Header(self.motion, pixel_size=(PIXEL, PIXEL), **self.header)
+        named = {"tilt": LEAN, "phase": 0 * LEAN} if "pose" in self.positions else self.positions
+        return Readable(self.frames, header, time=0.01 * np.arange(len(self.frames)), **named)
+
+    def push(self, operation: engine.Operation, part: slice) -> None:
+        """Push some of the frames."""
+        where = {name: values[part] for name, values in self.positions.items()}
+        operation.push(self.frames[part], **where)
+
+
+ON_TRAVEL, ON_PHASE = {"travel": TRAVEL}, {"phase": PHASE}
+LEVELS = {"dark": 20.0, "bright": 230.0}
+ROTATION: dict[str, Any] = {"motion": "axial"}
+CASES = {
+    "Onset": Case(engine.Onset, PRESS, ON_TRAVEL, function=engine.find_onset),
+    "Onset of a release": Case(
+        engine.Onset, PRESS[::-1].copy(), {"travel": TRAVEL[::-1].copy()}, {"event": "release", **LEVELS},
+        engine.find_onset,
+    ),
+    "Onset between estimated levels": Case(
+        engine.Onset, PRESS, ON_TRAVEL, {**LEVELS, "dark_sigma": 1.0, "bright_sigma": 2.0}, engine.find_onset
+    ),
+    "Levels": Case(Levels, PRESS, ON_TRAVEL, {"thresholds": [0.3, 0.7], "inclinations": [0.2, 0.4]}),
+    "Strokes": Case(engine.Strokes, PRESS, {"travel": STROKES}),
+    "ChangePoint": Case(engine.ChangePoint, PRESS, ON_TRAVEL, LEVELS, engine.find_change_point),
+    "ChangePoint between unknown levels": Case(
+        engine.ChangePoint, PRESS, ON_TRAVEL, function=engine.find_change_point
+    ),
+    "Growth": Case(Growth, PRESS, {"travel": DITHER}, LEVELS, engine.find_growth),
+    "Focus": Case(engine.Focus, PRESS, ON_TRAVEL, {"noise": 2.0}, engine.find_focus),
+    "Correlate": Case(engine.Correlate, TURNS, ON_PHASE, {}, engine.correlate, **ROTATION),
+    "Correlate of a window": Case(
+        engine.Correlate, TURNS, ON_PHASE, {"window_frames": 8}, engine.correlate, **ROTATION
+    ),
+    "Normals": Case(
+        engine.Normals, TURNS, ON_PHASE, {"tilt": TILT, "noise": NOISE, **SENSOR}, engine.estimate_normals,
+        **ROTATION,
+    ),
+    "Normals of each turn": Case(
+        engine.Normals, TURNS, ON_PHASE, {"tilt": "estimate", "per_turn": True, **SENSOR}, **ROTATION
+    ),
+    "Normals of a window": Case(
+        engine.Normals, TURNS, ON_PHASE, {"tilt": TILT, "window_frames": 8, **SENSOR}, **ROTATION
+    ),
+    "LastTurn": Case(
+        LastTurn, TURNS, ON_PHASE, {"tilt": TILT, "window_frames": 8, **SENSOR}, **ROTATION
+    ),
+    "MovingNormals": Case(
+        engine.MovingNormals, ROCKED, {"pose": body_axes(0 * LEAN, LEAN)},
+        {"zenith_gain": 400.0, "noise": 1.0}, **ROTATION,
+    ),
+    "Slip": Case(
+        engine.Slip, SKIN, {"displacement": SLIDE},
+        {"pixel_size": PIXEL, "contact": np.ones(SKIN.shape[1:])}, motion="horizontal",
+    ),
+    "Fringes": Case(engine.Fringes, TURNS, ON_PHASE, {}, engine.fit_fringes, **ROTATION),
+    "PhotometricStereo": Case(
+        engine.PhotometricStereo, TURNS, {}, {"light": LAMPS}, engine.photometric_stereo, **ROTATION
+    ),
+}  # fmt: skip
+CUTS = {
+    "one by one": lambda count: [slice(k, k + 1) for k in range(count)],
+    "unevenly": lambda count: [
+        slice(*ends) for ends in ((0, 1), (1, 4), (4, 5), (5, count - 1), (count - 1, count))
+    ],
+}
