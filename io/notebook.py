@@ -1,4 +1,4 @@
-"""How a result shows itself: as text, in a notebook, and as an xarray dataset."""
+"""Display of results: as text, in a notebook, and as an xarray dataset."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ if TYPE_CHECKING:
 
     from mirrorskin.io.recording import Recording
 
-_PICTURE = 480  # pixels that the longer side of a picture has at most
+_PICTURE = 480  # pixels along the longer side of a picture, at most
 
 
 def as_text(result: Shown) -> str:
-    """Return the maps of a result with their shape, unit and range, a line each."""
+    """Return the maps of a result with shape, unit and range, one per line."""
     lines = [f"{name:<14}{shape:<16}{values}" for name, shape, values in _rows(result)]
     return "\n".join([f"{type(result).__name__}{_origin(result)}", *(f"  {line}" for line in lines)])
 
 
 def as_html(result: Shown) -> str:
-    """Return a table of the maps, and a picture of the height, or of what there is instead."""
+    """Return a table of the maps, and a picture of the height, or of the first other map."""
     rows = "".join(
         "<tr>" + "".join(f"<td style='text-align:left'>{escape(cell)}</td>" for cell in row) + "</tr>"
         for row in _rows(result)
@@ -42,7 +42,7 @@ def as_html(result: Shown) -> str:
 
 
 def recording_as_text(recording: Recording) -> str:
-    """Return what a recording holds, in a line."""
+    """Return a description of a recording in one line."""
     count, rows, columns = recording.shape
     size = recording.header.pixel_size
     parts = [f"{count} frames of {columns} x {rows} {recording.dtype}", f"{recording.motion} motion"]
@@ -51,7 +51,7 @@ def recording_as_text(recording: Recording) -> str:
 
 
 def recording_as_html(recording: Recording) -> str:
-    """Return what a recording holds, and its last frame."""
+    """Return a description of a recording, and its last frame."""
     picture = _picture("last frame", recording.frame(recording.shape[0] - 1), "counts")
     return f"<p>{escape(recording_as_text(recording))}</p>{picture}"
 
@@ -79,7 +79,7 @@ def plot(result: Shown, name: str | None, axes: Axes | None) -> Axes:
     return axes
 
 
-_DECLARATION = "declaration"  # attribute of a variable whose declaration is not in the table
+_DECLARATION = "declaration"  # attribute of a variable that is not declared in the table
 
 
 def as_xarray(result: Result) -> xarray.Dataset:
@@ -119,7 +119,7 @@ def _dimensions(
 
 
 def from_xarray(dataset: xarray.Dataset) -> Result:
-    """Return the result that `as_xarray` converted; see `Result.from_xarray`."""
+    """Return the result converted by `as_xarray`; see `Result.from_xarray`."""
     maps: dict[str, Any] = {}
     declarations: dict[str, Map] = {}
     for name, variable in dataset.data_vars.items():
@@ -136,7 +136,7 @@ def from_xarray(dataset: xarray.Dataset) -> Result:
 
 
 def _first(result: Shown) -> str | None:
-    """Return the map that shows most."""
+    """Return the most informative map."""
     pictures = [name for name, values in result.maps().items() if values.ndim == 2 or values.shape[-1] > 3]
     summarised = [name for name in pictures if result.declaration(name).summary]
     return next(iter([*summarised, *pictures]), None)
@@ -167,7 +167,7 @@ def _origin(result: Shown) -> str:
 
 
 def _picture(name: str, values: NDArray[Any], unit: str) -> str:
-    """Return a map, or its last turn, in colours from dark (low) to light (high); unknown is clear."""
+    """Return a map, or its last turn, in colours from dark (low) to light (high); NaN is transparent."""
     import cv2
 
     flat = values.reshape(-1, *values.shape[-2:])[-1].astype(np.float64)
