@@ -26,7 +26,7 @@ from mirrorskin.io.types import FRAME_DTYPES, MOTIONS, Block, Header, InputError
 NUMPY_SUFFIXES = (".npy", ".npz")
 _KNOWN = {*POSITIONS.values(), "dark", "bright"}  # arrays of an archive that are not frames
 _NEEDED = "travel (--travel-step or --travel), phase (--phase-step or --phases)"
-_EVERY, _TAKEN = 4 << 20, 4 << 10  # bytes: of each 4 MiB of frames, the first 4 KiB are hashed
+_HASH_INTERVAL, _HASH_LENGTH = 4 << 20, 4 << 10  # bytes: of each 4 MiB of frames, the first 4 KiB are hashed
 _HEAD_BYTES = 1 << 14  # read to get the header of a member: NumPy accepts at most 10 000 characters
 _PIECE = 1 << 20  # bytes unpacked at a time
 
@@ -135,10 +135,10 @@ class ArrayRecording(Recording):
         if not self._hash:
             frames = self._frames
             digest = hashlib.sha256(f"{self.full_shape} {self.dtype} {self.which} {self.region}".encode())
-            for frame in frames[:: max(1, _EVERY // frames[0].nbytes)]:
+            for frame in frames[:: max(1, _HASH_INTERVAL // frames[0].nbytes)]:
                 flat = np.ascontiguousarray(frame).reshape(-1).view(np.uint8)
-                for start in range(0, len(flat), _EVERY):
-                    digest.update(flat[start : start + _TAKEN].tobytes())
+                for start in range(0, len(flat), _HASH_INTERVAL):
+                    digest.update(flat[start : start + _HASH_LENGTH].tobytes())
             self._hash = digest.hexdigest()
         return self._hash
 

@@ -110,7 +110,7 @@ class Chunks:
         self._index, self._codecs, self._threads = index, codecs, threads
         self._close_file = weakref.finalize(self, os.close, file)
         self._pools: dict[int, ThreadPoolExecutor] = {}  # by process, because threads do not survive a fork
-        self._rooms: list[dict[str, Bytes]] = []  # scratch buffers, reused by one thread at a time
+        self._buffers: list[dict[str, Bytes]] = []  # scratch buffers, reused by one thread at a time
 
     def lend(self, start: int, stop: int) -> None:
         """Return None: chunks have to be read."""
@@ -122,14 +122,14 @@ class Chunks:
         work = deque(itertools.product(*ranges))
 
         def take_chunks() -> None:
-            rooms: dict[str, Bytes] = self._rooms.pop() if self._rooms else {}
+            buffers: dict[str, Bytes] = self._buffers.pop() if self._buffers else {}
             try:
                 with suppress(IndexError):  # no chunk is left
                     while True:
-                        self._fetch_chunk(work.popleft(), spans, out, rooms)
+                        self._fetch_chunk(work.popleft(), spans, out, buffers)
             finally:
                 work.clear()  # after an error, so that the other threads stop, too
-                self._rooms.append(rooms)
+                self._buffers.append(buffers)
 
         helpers: list[Future[None]] = []
         try:
@@ -153,7 +153,7 @@ class Chunks:
         self._close_file()
 
     def _fetch_chunk(
-        self, position: tuple[int, ...], spans: tuple[Span, ...], out: NDArray[Any], rooms: dict[str, Bytes]
+        self, position: tuple[int, ...], spans: tuple[Span, ...], out: NDArray[Any], buffers: dict[str, Bytes]
     ) -> None:
         """Write the part of a chunk that is in these spans."""
         source, target = [], []
@@ -165,26 +165,26 @@ class Chunks:
         first = position[0] * self.length
         with self._place.reading(first, min(first + self.length, self._frames)):
             if wanted.shape == self._shape and wanted.flags.c_contiguous:
-                self._decode(position, wanted.reshape(-1).view(np.uint8), rooms)
+                self._decode(position, wanted.reshape(-1).view(np.uint8), buffers)
             else:
-                unpacked = _room(rooms, "unpacked", self._size)
-                self._decode(position, unpacked, rooms)
+                unpacked = _buffer(buffers, "unpacked", self._size)
+                self._decode(position, unpacked, buffers)
                 wanted[...] = unpacked.view(self._dtype).reshape(self._shape)[*source]
 
-    def _decode(self, position: tuple[int, ...], out: Bytes, rooms: dict[str, Bytes]) -> None:
+    def _decode(self, position: tuple[int, ...], out: Bytes, buffers: dict[str, Bytes]) -> None:
         offset, size = int(self._index.offsets[position]), int(self._index.sizes[position])
         if not self._codecs:
             _read(self._file, offset, out)
             return
-        packed = _room(rooms, "packed", size)
+        packed = _buffer(buffers, "packed", size)
         _read(self._file, offset, packed)
         decode(self._codecs, int(self._index.filter_masks[position]), packed, out)
 
 
-def _room(rooms: dict[str, Bytes], name: str, size: int) -> Bytes:
-    if name not in rooms or rooms[name].size < size:
-        rooms[name] = np.empty(size + size // 8, np.uint8)
-    return rooms[name][:size]
+def _buffer(buffers: dict[str, Bytes], name: str, size: int) -> Bytes:
+    if name not in buffers or buffers[name].size < size:
+        buffers[name] = np.empty(size + size // 8, np.uint8)
+    return buffers[name][:size]
 
 
 def _read(file: int, offset: int, out: Bytes) -> None:

@@ -18,7 +18,7 @@ from mirrorskin.io.types import InputError
 
 Spans = NDArray[np.int64]
 
-_EVERY, _TAKEN = 4 << 20, 4 << 10
+_HASH_INTERVAL, _HASH_LENGTH = 4 << 20, 4 << 10
 _PIECE = 1 << 20
 
 
@@ -91,8 +91,8 @@ def _of_growing(file: Hdf5File, dataset: h5py.Dataset, frames: int) -> str:
     for chunk in sorted(chunks_of(dataset), key=lambda one: one.chunk_offset):
         if chunk.chunk_offset[0] < frames:
             stop = chunk.byte_offset + chunk.size
-            for taken in range(chunk.byte_offset + -before % _EVERY, stop, _EVERY):
-                size = min(_TAKEN, stop - taken)
+            for taken in range(chunk.byte_offset + -before % _HASH_INTERVAL, stop, _HASH_INTERVAL):
+                size = min(_HASH_LENGTH, stop - taken)
                 digest.update(os.pread(file.root.id.get_vfd_handle(), size, taken))
             before += chunk.size
     return digest.hexdigest()
@@ -114,7 +114,7 @@ def _parts(file: Hdf5File, dataset: h5py.Dataset) -> Iterator[tuple[Path, h5py.D
     for source in dataset.virtual_sources() if dataset.is_virtual else ():
         yield from _parts(file, virtual_source(file, dataset, source))
     for name, offset, size in dataset.external or ():
-        raw = file.beside(dataset, name, f"the raw storage of {dataset.name}")
+        raw = file.sibling(dataset, name, f"the raw storage of {dataset.name}")
         yield raw, None, np.array([[offset, min(offset + size, raw.stat().st_size)]], np.int64)
     yield Path(dataset.file.filename), dataset, np.empty((0, 2), np.int64)
 
@@ -144,7 +144,7 @@ def _chosen(frames: Spans, size: int) -> Iterator[tuple[int, int]]:
     place = before = 0
     for start, stop in np.minimum(frames, size).tolist():
         yield place, start
-        for taken in range(start + -before % _EVERY, stop, _EVERY):
-            yield taken, min(taken + _TAKEN, stop)
+        for taken in range(start + -before % _HASH_INTERVAL, stop, _HASH_INTERVAL):
+            yield taken, min(taken + _HASH_LENGTH, stop)
         before, place = before + stop - start, stop
     yield place, size

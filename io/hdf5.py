@@ -221,16 +221,16 @@ class Hdf5File(Closing):
                 node = following
         return node
 
-    def open_beside(self, node: Node, filename: str, what: str) -> h5py.File:
+    def open_sibling(self, node: Node, filename: str, what: str) -> h5py.File:
         """Open a file that an object refers to."""
-        path = self.beside(node, filename, what)
+        path = self.sibling(node, filename, what)
         real = os.path.realpath(path)
         if real not in self._files:
             with as_input_error(str(path)):
                 self._files[real] = _open_file(path, real)
         return self._files[real]
 
-    def beside(self, node: Node, filename: str, what: str) -> Path:
+    def sibling(self, node: Node, filename: str, what: str) -> Path:
         """Return the file that an object refers to, which must be in the recording's own folder."""
         what = f"{self.path}: {what}"
         with as_input_error(what):
@@ -316,7 +316,7 @@ class Hdf5File(Closing):
             link = node.get(part, getlink=True)
         start = node
         if isinstance(link, h5py.ExternalLink):
-            start = self.open_beside(node, link.filename, f"the external link {part} in {node.name}")
+            start = self.open_sibling(node, link.filename, f"the external link {part} in {node.name}")
         elif link.path.startswith("/"):
             start = node.file
         target = self.walk(start, link.path, depth + 1)
@@ -544,7 +544,7 @@ def _bytes_held(file: Hdf5File, dataset: h5py.Dataset, depth: int) -> int:
         return elements * int(dataset.dtype.itemsize)
     if dataset.external:
         what = f"the raw storage of {dataset.name}"
-        parts = [(file.beside(dataset, name, what), offset, size) for name, offset, size in dataset.external]
+        parts = [(file.sibling(dataset, name, what), offset, size) for name, offset, size in dataset.external]
         return sum(min(size, max(0, path.stat().st_size - offset)) for path, offset, size in parts)
     return int(dataset.id.get_storage_size())
 
@@ -558,7 +558,7 @@ def virtual_source(file: Hdf5File, dataset: h5py.Dataset, part: Any) -> h5py.Dat
         raise InputError(
             f"{file.path}: {what} names its sources by a pattern; copy the frames into one dataset"
         )
-    origin = dataset.file if part.file_name == "." else file.open_beside(dataset, part.file_name, what)
+    origin = dataset.file if part.file_name == "." else file.open_sibling(dataset, part.file_name, what)
     source = file.walk(origin, part.dset_name)
     if not isinstance(source, h5py.Dataset):
         raise InputError(f"{file.where(dataset)} needs {part.dset_name} of {part.file_name}: it is not there")

@@ -118,7 +118,7 @@ class Layout:
         own = self._text(f"{STAGE}/motion")
         if motion and own in MOTIONS and own != motion and not override_motion:
             raise InputError(
-                f"{self._file.path} says its motion is {own}, --motion says {motion}: leave --motion out,"
+                f"{self._file.path} states the motion {own}, but --motion is {motion}: leave --motion out,"
                 " or correct the file"
             )
         motion = motion or cast(Motion, own)

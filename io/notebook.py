@@ -64,7 +64,7 @@ def plot(result: Shown, name: str | None, axes: Axes | None) -> Axes:
     chosen = _first(result) if name is None else name
     if chosen not in maps or maps[chosen].ndim != 2:
         pictures = ", ".join(one for one, values in maps.items() if values.ndim == 2)
-        raise InputError(f"there is no picture {chosen!r}: choose from {pictures or 'none'}")
+        raise InputError(f"there is no map {chosen!r} to draw: choose from {pictures or 'none'}")
     x, y = (getattr(result, one, None) for one in "xy")
     extent = None
     if x is not None and y is not None:

@@ -51,7 +51,7 @@ def decode_picture(path: Path, dtypes: Sequence[str] = _DTYPES) -> NDArray[Any]:
     if data[:8] == _PNG_MARK:
         return _decode_png(data, str(path), -1)
     if count_pages(path, dtypes) != 1:
-        raise InputError(f"{path} holds several pages: put it alone, or save each page as a picture")
+        raise InputError(f"{path} holds several pages, and one is needed: save each page as a picture")
     return _decode(data, str(path), -1)
 
 

@@ -156,7 +156,7 @@ def open_result(path: str | Path) -> Result:
                 raise InputError(f"{file.where(node)} has numbers below -1: {_AGAIN}")
         for name, direction in (("x", 1), ("y", -1)):
             if name in maps and not np.all(direction * np.diff(maps[name]) > 0):
-                raise InputError(f"{path}: {_RESULT}/{name} does not run as pixels do: {_AGAIN}")
+                raise InputError(f"{path}: {_RESULT}/{name} is not in the order of the pixels: {_AGAIN}")
         process = read_process(file, _PROCESS)
         if _layout(file) < _LAYOUT and "status" in maps:
             declarations |= _status_of_layout_1(maps, process)

@@ -159,7 +159,7 @@ class StreamRecorder(TeeSource[LiveSource]):
         if self._messages:
             load_writer()  # fails before anything moves if it is missing
             if calibration is not None:
-                raise InputError(f"{path}: MCAP has no place for a calibration; record into a file .h5")
+                raise InputError(f"{path}: an MCAP file cannot contain a calibration; record to a file .h5")
         self._queue: queue.SimpleQueue[Block | _Mark | _Maps | _End] = queue.SimpleQueue()
         self._backlog, self._lock = 0, threading.Lock()
         self._error: BaseException | None = None

@@ -58,7 +58,7 @@ def find_stores(pattern: Url) -> list[Path]:
         system, place = url_to_fs(str(pattern), **options_of(pattern))
         found = [path_of(system.unstrip_protocol(one)) for one in sorted(system.glob(place))]
     if not found:
-        raise InputError(f"{pattern}: nothing answers to that: name recordings")
+        raise InputError(f"{pattern}: no store matches: name recordings")
     return found
 
 

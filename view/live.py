@@ -69,13 +69,13 @@ class LiveView:
             log("slope", rr.Image(self._slopes.colour(update.slope)))
         if update.contact_area is not None:
             log("contact/area", rr.Scalars(update.contact_area))
-        log("status", rr.TextDocument(self._told(update, status), media_type="text/markdown"))
+        log("status", rr.TextDocument(self._status_text(update, status), media_type="text/markdown"))
 
     def close(self) -> None:
         """Wait for the last pictures to arrive, and disconnect from the viewer, which stays open."""
         close_stream(self._stream, _END)
 
-    def _told(self, update: Update, status: Status) -> str:
+    def _status_text(self, update: Update, status: Status) -> str:
         """Return the current state as text."""
         lines = [
             f"**{status.rate:.1f} frames/s**, {status.used} used, {status.skipped} skipped,"

@@ -51,7 +51,7 @@ def show_surface(result: Result, where: str | Path, name: str) -> None:
         vertex_colors=_colours(result, mesh),
     )
     stream.log("surface", surface, static=True)
-    text = "\n\n".join(_told(result, name))
+    text = "\n\n".join(_description(result, name))
     stream.log("about", rr.TextDocument(text, media_type="text/markdown"), static=True)
     close_stream(stream, _END)
 
@@ -77,7 +77,7 @@ def _colours(result: Result, mesh: Mesh) -> Colours:
     return colours
 
 
-def _told(result: Result, name: str) -> Iterator[str]:
+def _description(result: Result, name: str) -> Iterator[str]:
     """Yield a description in paragraphs."""
     assert result.height is not None
     low, high = span(result.height)

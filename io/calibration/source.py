@@ -241,7 +241,7 @@ class Calibrated:
         if own.tilt and not 1 / _SAME_TILT < tilt / own.tilt < _SAME_TILT:
             learned, said = np.degrees([tilt, own.tilt])
             raise InputError(
-                f"{self.whole.name or 'the calibration'} is of a tilt of {learned:.2f} deg, {self.name} of "
-                f"{said:.2f} deg: calibrate the tilt again with this one"
+                f"{self.whole.name or 'the calibration'} is for a tilt of {learned:.2f} deg, but that of "
+                f"{self.name} is {said:.2f} deg: calibrate the tilt again"
             )
         return {"tilt": tilt, "pivot": pivot if np.isfinite(pivot).all() else None}

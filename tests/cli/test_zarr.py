@@ -115,7 +115,7 @@ def test_import_makes_hdf5_of_an_address(bucket):
         (("reconstruct", "press.h5", "-o", "no/x.zarr"), "no/x.zarr: there is no folder no: make it first"),
         (("export", "press.h5", "-o", "x.zarr.zip"), "x.zarr.zip: Zarr is written as NAME.zarr: name it so"),
         (("simulate", "vertical", "-o", "new.zarr"), "new.zarr: this is written as HDF5: name a local file"),
-        (("batch", "memory://bucket/x*", "-o", "r"), "memory://bucket/x*: nothing answers to that"),
+        (("batch", "memory://bucket/x*", "-o", "r"), "memory://bucket/x*: no store matches"),
     ],
 )
 def test_what_cannot_be_is_one_line_with_its_address(bucket, words, said):

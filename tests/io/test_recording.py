@@ -90,7 +90,7 @@ def test_what_is_given_overrides_the_file(press):
 
 @pytest.mark.parametrize("motion", ["axial", "horizontal"])
 def test_a_motion_that_contradicts_the_file_is_refused(press, motion):
-    line = f"press.h5 says its motion is vertical, --motion says {motion}: leave --motion out"
+    line = f"press.h5 states the motion vertical, but --motion is {motion}: leave --motion out"
     with pytest.raises(io.InputError, match=line):
         io.open_recording(press, motion=motion, phase=io.Steps(np.pi / 4))
 

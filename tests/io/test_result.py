@@ -220,7 +220,7 @@ def test_what_is_no_result_is_refused(tmp_path, path):
     [
         ("result", None, "/entry/result holds no maps: reconstruct it again"),
         ("result/status", np.ones((7, 5)), r"status has shape \(7, 5\) where \(5, 7\) is needed: "),
-        ("result/x", np.zeros(7), "/entry/result/x does not run as pixels do: recon"),
+        ("result/x", np.zeros(7), "/entry/result/x is not in the order of the pixels: recon"),
         ("result/height_sigma", np.zeros((5, 7), "S2"), "height_sigma holds no numbers: rec"),
         ("result/height_sigma", h5py.SoftLink("gone"), "the link height_sigma leads to gone, which is"),
         ("result/status", h5py.ExternalLink("../x.h5", "/x"), "leads out of its folder"),

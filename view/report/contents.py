@@ -50,9 +50,9 @@ def contents_of(result: Result, name: str, section: Ends | None, turn: int | Non
     contents = {
         "title": name if turn is None else f"{name}, turn {turn}",
         "summary": sentence(str(summarise(result))),
-        "made": _made(result.process),
+        "made": _origin(result.process),
         "surface": surface,
-        "said": _said_of(result, surface),
+        "texts": _surface_texts(result, surface),
         "pictures": pictures_of(result, name, section),
         "numbers": numbers_of(result, section),
         "parameters": _groups(parameters),
@@ -62,11 +62,11 @@ def contents_of(result: Result, name: str, section: Ends | None, turn: int | Non
         "units": UNITS,
         "citation": _citation(name, result.process),
     }
-    shown = {part: said for part, said in _HEADINGS.items() if part not in _NOT_ALWAYS or contents[part]}
+    shown = {part: heading for part, heading in _HEADINGS.items() if part not in _NOT_ALWAYS or contents[part]}
     return contents | {"headings": shown}
 
 
-def _said_of(result: Result, surface: Mapping[str, Any] | None) -> dict[str, Any]:
+def _surface_texts(result: Result, surface: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the texts of the surface, and notes on what is not shown."""
     if surface is None:
         return {"notes": [_NO_HEIGHTS if result.height is None else _NO_SURFACE]}
@@ -104,7 +104,7 @@ def _calibration_of(result: Result) -> list[tuple[str, ...]]:
     return [row.cells() for row in calibration_table(result.calibration)]
 
 
-def _made(process: Mapping[str, object]) -> str:
+def _origin(process: Mapping[str, object]) -> str:
     """Return the source, program and date of the result, as far as known."""
     words = {"of": process.get("source"), "by": _program(process), "on": _day(process)}
     parts = [f"{word} {value}" for word, value in words.items() if value]

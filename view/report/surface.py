@@ -170,8 +170,8 @@ def _averaged(kinds: NDArray[np.int64], heights: Floats) -> tuple[NDArray[np.int
 
 def _blocks(values: NDArray[Number], block: tuple[int, int], beyond: float) -> NDArray[Number]:
     """Return the pixels of each block, (m, n, pixels); pixels outside the picture are ``beyond``."""
-    beside = [(0, -size % step) for size, step in zip(values.shape, block, strict=True)]
-    whole = np.pad(values, beside, constant_values=beyond)
+    padding = [(0, -size % step) for size, step in zip(values.shape, block, strict=True)]
+    whole = np.pad(values, padding, constant_values=beyond)
     rows, columns = whole.shape[0] // block[0], whole.shape[1] // block[1]
     return whole.reshape(rows, block[0], columns, block[1]).swapaxes(1, 2).reshape(rows, columns, -1)
 
