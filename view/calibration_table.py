@@ -38,7 +38,7 @@ class Row(NamedTuple):
         if isinstance(self.value, str | int):
             return self.part, self.what, str(self.value), "", self.unit
         if not math.isfinite(self.value):
-            return self.part, self.what, "not told", "", self.unit
+            return self.part, self.what, "unknown", "", self.unit
         if not (math.isfinite(self.sigma) and self.sigma > 0):
             return self.part, self.what, f"{self.value:.6g}", "", self.unit
         digits = max(0, 1 - math.floor(math.log10(self.sigma)))
@@ -49,7 +49,7 @@ class Row(NamedTuple):
 def calibration_table(calibration: Calibration) -> list[Row]:
     """Return the numbers of a calibration; for maps, their medians."""
     camera = calibration.camera
-    rows = [Row("camera", "name", camera.name or "not told")]
+    rows = [Row("camera", "name", camera.name or "unknown")]
     rows += (
         Row("camera", f"{what} of a frame", size)
         for what, size in zip(("rows", "columns"), camera.shape, strict=True)

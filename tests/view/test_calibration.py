@@ -147,7 +147,7 @@ def test_numbers_are_in_the_units_people_speak_of():
         (1.23456, 0.012, ("1.235", "0.012")),
         (123.456, 40.0, ("123", "40")),
         (7, math.nan, ("7", "")),
-        (math.nan, math.nan, ("not told", "")),
+        (math.nan, math.nan, ("unknown", "")),
     ],
 )
 def test_no_more_digits_are_written_than_are_known(value, sigma, told):

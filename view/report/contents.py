@@ -62,7 +62,7 @@ def contents_of(result: Result, name: str, section: Ends | None, turn: int | Non
         "units": UNITS,
         "citation": _citation(name, result.process),
     }
-    shown = {part: heading for part, heading in _HEADINGS.items() if part not in _NOT_ALWAYS or contents[part]}
+    shown = {key: text for key, text in _HEADINGS.items() if key not in _NOT_ALWAYS or contents[key]}
     return contents | {"headings": shown}
 
 
