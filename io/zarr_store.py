@@ -135,7 +135,7 @@ class LimitedStore(WrapperStore[Any]):  # type: ignore[misc]  # where it is not 
             byte_range = self._range_of_member(key, byte_range)
         if isinstance(byte_range, RangeByteRequest):
             if not 0 <= byte_range.start <= byte_range.end:
-                raise InputError(f"{self._path}: {key} states an offset beyond its end: copy it again")
+                raise InputError(f"{self._path}: {key} states an invalid range of bytes: copy it again")
             if byte_range.end - byte_range.start > most:
                 raise self._damaged(key, most)
         if byte_range is None and self._remote and not self._http:
