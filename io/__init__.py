@@ -1,6 +1,6 @@
-"""Shared types, and the files: recordings, results, calibrations, other people's frames.
+"""Shared types and files: recordings, results, calibrations, and frames written by other programs.
 
-The public names stand in ``__init__.pyi``; each is imported from its module when it is first used.
+The public names are listed in ``__init__.pyi``; each is imported from its module when it is first used.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""What public functions are given, checked by their annotations before they begin."""
+"""Check and convert the arguments of public functions, according to their annotations."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ R = TypeVar("R")
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
-    """Check a function's arguments by what it says that they are, and convert what is like an array.
+    """Check the arguments of a function against its annotations, and convert array-likes to arrays.
 
-    Of arguments annotated ``ArrayLike`` or ``NDArray``, lists and the like become arrays, and must hold
-    numbers. A mask means "not known": NaN, in frames of integers as well, which become float32; 0 in maps of
-    integers, such as contact. Of ``float``, ``int``, a path, ``Result`` and ``Truth`` the type must fit.
-    Everything else is the function's own business.
+    Arguments annotated ``ArrayLike`` or ``NDArray`` may be lists and the like; they are converted to arrays
+    and must hold numbers. Masked values become NaN (frames of integers then become float32), or 0 in maps of
+    integers, such as contact. For ``float``, ``int``, a path, ``Result`` and ``Truth`` the type must match.
+    Other annotations are not checked.
 
     Raises
     ------
     InputError
-        An argument is of another kind: a line that names it.
+        An argument has another type; the message names it.
 
     Examples
     --------
@@ -68,7 +68,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _check_of(kinds: list[str]) -> Callable[[str, Any], Any] | None:
-    """Return what checks an argument of an annotation, as it is written in the source, cut at "|"."""
+    """Return a function that checks an argument of some annotation, given as source text split at "|"."""
     first = kinds[0].split("[")[0]
     if first in _ARRAYS:
         words = [kind for kind in kinds[1:] if kind not in ("None", "float")]
@@ -87,14 +87,14 @@ def _check_of(kinds: list[str]) -> Callable[[str, Any], Any] | None:
 
 
 def as_array(name: str, value: Any) -> NDArray[Any]:
-    """Return an argument as an array of numbers; see `checked`. Arrays come back as they are."""
+    """Return an argument as an array of numbers; see `checked`. An array is returned unchanged."""
     if type(value) is np.ndarray and value.dtype.kind in "buif":
         return value
     masked = isinstance(value, np.ma.MaskedArray)
     try:
         array = np.asarray(value)
     except (ValueError, TypeError) as error:  # rows of different lengths
-        raise InputError(f"{name} is no array: {_line(error)}") from error
+        raise InputError(f"{name} is not an array: {_line(error)}") from error
     if array.dtype.kind not in "buif":
         raise InputError(f"{name} is {_shown(value)}: numbers are needed")
     mask = np.ma.getmaskarray(value) if masked else None
@@ -108,7 +108,7 @@ def as_array(name: str, value: Any) -> NDArray[Any]:
 
 
 def check_has(name: str, value: Any, *parts: str) -> None:
-    """Raise InputError unless an argument has some attributes."""
+    """Raise InputError unless an argument has the given attributes."""
     if not all(hasattr(value, part) for part in parts):
         raise InputError(f"{name} is {_shown(value)}: something with {' and '.join(parts)} is needed")
 
@@ -147,7 +147,7 @@ def _check_path(name: str, value: Any) -> Any:
 
 
 def _shown(value: Any) -> str:
-    """Return a value in few letters, or its type."""
+    """Return a value as a short text, or its type."""
     if value is None or isinstance(value, str | int | float | complex):
         text = repr(value)
         return text if len(text) <= 40 else f"{text[:36]} ..."

@@ -1,4 +1,4 @@
-"""Frames in an array, in memory or in a file of NumPy's, as a recording."""
+"""Recordings from arrays, in memory or in a file written by NumPy."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from mirrorskin.io.selection import Region
 from mirrorskin.io.types import FRAME_DTYPES, MOTIONS, Block, Header, InputError, Motion, block_memory
 
 NUMPY_SUFFIXES = (".npy", ".npz")
-_KNOWN = {*POSITIONS.values(), "dark", "bright"}  # arrays of an archive that are no frames
+_KNOWN = {*POSITIONS.values(), "dark", "bright"}  # arrays of an archive that are not frames
 _NEEDED = "travel (--travel-step or --travel), phase (--phase-step or --phases)"
-_EVERY, _TAKEN = 4 << 20, 4 << 10  # bytes of frames, of which so many are hashed
-_HEAD_BYTES = 1 << 14  # of a member that hold its header: NumPy reads at most 10 000 characters
-_PIECE = 1 << 20  # bytes that are unpacked at a time
+_HASH_INTERVAL, _HASH_LENGTH = 4 << 20, 4 << 10  # bytes: of each 4 MiB of frames, the first 4 KiB are hashed
+_HEAD_BYTES = 1 << 14  # read to get the header of a member: NumPy accepts at most 10 000 characters
+_PIECE = 1 << 20  # bytes unpacked at a time
 
 
 class ArrayRecording(Recording):
-    """Frames in an array, (T, H, W), as a recording of a motion; see ``Recording``.
+    """A recording of a motion from an array of frames, (T, H, W); see ``Recording``.
 
     Parameters
     ----------
@@ -40,15 +40,15 @@ class ArrayRecording(Recording):
     positions : mapping
         ``travel``, mm, (T,), ``phase`` or ``twist``, radians, (T,), or ``displacement``, mm, (T, 2).
     header : mapping
-        What else is known: ``tilt``, ``pixel_size``, ``dark``, ``bright``; see ``Header``.
+        Other properties: ``tilt``, ``pixel_size``, ``dark``, ``bright``; see ``Header``.
     motion : str, optional
-        By default the one that has the position that is given.
+        By default the motion of the given position.
     region, wanted
-        The part of the picture, and the first frame and the end, that are wanted.
+        The part of the picture; the first frame, and the end of the frames.
     name : str
-        What to call it in messages.
+        Name of the array in messages.
     origins : mapping
-        The file that it comes from, as it was when it was opened.
+        The file of the array, with its state when it was opened.
 
     Raises
     ------
@@ -116,11 +116,11 @@ class ArrayRecording(Recording):
         self.storage, self._next, self._hash = "one piece", 0, ""
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
-        """Return the next frames where they lie, as many as ``out`` holds."""
+        """Return the next frames as a view of the array, at most as many as ``out`` holds."""
         return self.lend(len(block_memory(out, self.shape, self.dtype)))
 
     def lend(self, most: int) -> Block | None:
-        """Return the next frames where they lie, at most so many; None at the end."""
+        """Return the next frames as a view of the array, at most ``most``; None at the end."""
         frames = self._frames[self._next : self._next + most]
         return self._block(frames, lent=False) if len(frames) else None
 
@@ -135,43 +135,43 @@ class ArrayRecording(Recording):
         if not self._hash:
             frames = self._frames
             digest = hashlib.sha256(f"{self.full_shape} {self.dtype} {self.which} {self.region}".encode())
-            for frame in frames[:: max(1, _EVERY // frames[0].nbytes)]:
+            for frame in frames[:: max(1, _HASH_INTERVAL // frames[0].nbytes)]:
                 flat = np.ascontiguousarray(frame).reshape(-1).view(np.uint8)
-                for start in range(0, len(flat), _EVERY):
-                    digest.update(flat[start : start + _TAKEN].tobytes())
+                for start in range(0, len(flat), _HASH_INTERVAL):
+                    digest.update(flat[start : start + _HASH_LENGTH].tobytes())
             self._hash = digest.hexdigest()
         return self._hash
 
     def find_damage(self) -> None:
-        """Return None: there are no checksums."""
+        """Return None: an array has no checksums."""
 
     @property
     def carried(self) -> None:
-        """No calibration: an array carries none."""
+        """None: an array contains no calibration."""
 
     @property
     def how(self) -> str:
-        """How the frames are fetched."""
+        """How the frames are read."""
         return "where they lie"
 
     @property
     def modified(self) -> str:
-        """When the file was written last; empty of an array in memory."""
+        """When the file was last written; empty for an array in memory."""
         return modified(self._files) if self._files else ""
 
     def close(self) -> None:
-        """Let go of the frames."""
+        """Release the frames."""
         self._frames = self._frames[:0]
 
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """Turn what NumPy says of a damaged file into a line that names it."""
+    """Convert what NumPy raises for a damaged file to a one-line error that names the file."""
     try:
         yield
     except (InputError, MemoryError):
         raise
-    except Exception as error:  # a damaged head is parsed as Python: its errors are of many kinds
+    except Exception as error:  # a damaged header is parsed as Python, which raises errors of many types
         said = " ".join(str(error).split())
         raise InputError(
             f"{path} is not a NumPy array of numbers ({said}): write it with numpy.save"
@@ -179,21 +179,21 @@ def _naming(path: Path) -> Iterator[None]:
 
 
 class _Head(NamedTuple):
-    """What the header of an array states."""
+    """Contents of the header of an array."""
 
     shape: tuple[int, ...]
     fortran_order: bool
     dtype: np.dtype[Any]
-    size: int  # bytes of the header, after which the values come
+    size: int  # bytes of the header; the values follow
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the values."""
+        """Size of the values in bytes."""
         return math.prod(self.shape) * self.dtype.itemsize
 
 
 def _read_head(file: IO[bytes]) -> _Head:
-    # NumPy's own functions read as many bytes as a header states that it has.
+    # NumPy's own functions read as many bytes as the header claims to have.
     start = BytesIO(file.read(_HEAD_BYTES))
     version = np.lib.format.read_magic(start)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -204,7 +204,7 @@ def _read_head(file: IO[bytes]) -> _Head:
 
 
 def list_arrays(path: Path) -> dict[str, str]:
-    """Return the names of the arrays of a file, and the shape and type of each."""
+    """Return the names of the arrays in a file, with the shape and type of each."""
     with _naming(path), open_regular(path) as file:
         if path.suffix.lower() == ".npy":
             return {"array": _describe(_read_head(file))}
@@ -229,14 +229,14 @@ def _head_of(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> _Head:
 
 
 def read_array(path: Path) -> NDArray[Any]:
-    """Read an array of numbers that ``numpy.save`` wrote."""
+    """Read an array of numbers written by ``numpy.save``."""
     array = map_array(path)
     check_unpacked(array.nbytes, str(path), "give a smaller array")
     return np.array(array)
 
 
 def map_array(path: Path) -> NDArray[Any]:
-    """Map the array of numbers of a ``.npy`` file into memory; InputError if the file does not hold one."""
+    """Map the array of numbers in a ``.npy`` file into memory; InputError if there is none."""
     with _naming(path), open_regular(path) as file:
         head, size = _read_head(file), os.fstat(file.fileno()).st_size
         if head.dtype.kind not in "buif":
@@ -245,7 +245,7 @@ def map_array(path: Path) -> NDArray[Any]:
             raise ValueError(f"it states {head.nbytes} bytes of values and has {size - head.size}")
         if not head.nbytes:
             return np.empty(head.shape, head.dtype)
-        # Their type is that of files for reading and writing.
+        # np.memmap is annotated for files opened for reading and writing.
         opened: Any = file
         order: Literal["C", "F"] = "F" if head.fortran_order else "C"
         values: NDArray[Any] = np.memmap(opened, head.dtype, "r", head.size, head.shape, order)
@@ -255,7 +255,7 @@ def map_array(path: Path) -> NDArray[Any]:
 def _read_members(
     path: Path, archive: zipfile.ZipFile, members: Mapping[str, zipfile.ZipInfo], limit: int
 ) -> dict[str, NDArray[Any]]:
-    """Read some arrays; those that are compressed may together take ``limit`` bytes."""
+    """Read some arrays; compressed ones may take ``limit`` bytes together."""
     heads = {name: _head_of(archive, member) for name, member in members.items()}
     for name, head in heads.items():
         if head.dtype.kind not in "buif":
@@ -295,11 +295,11 @@ def open_array(
     wanted: tuple[int, int | None] | None,
     memory_limit: int | None = None,
 ) -> ArrayRecording:
-    """Open a stack that ``numpy.save`` or ``numpy.savez`` wrote; see ``open_recording``.
+    """Open a stack written by ``numpy.save`` or ``numpy.savez``; see ``open_recording``.
 
-    An archive may also hold ``travel``, ``phase``, ``displacement`` or ``twist`` of each frame, and ``dark``
-    and ``bright``. Arguments override them. Other arrays are not read. A compressed archive is refused where
-    these arrays take more than ``memory_limit`` and ``MAX_UNPACKED_BYTES``.
+    An archive may also contain ``travel``, ``phase``, ``displacement`` or ``twist`` of each frame, and
+    ``dark`` and ``bright``. Arguments take precedence over them. Other arrays are not read. A compressed
+    archive is refused if these arrays take more than ``memory_limit`` and ``MAX_UNPACKED_BYTES``.
     """
     held: dict[str, NDArray[Any]] = {}
     with _naming(path):
@@ -325,7 +325,7 @@ def open_array(
 
 
 def _stack_of(path: Path, names: Iterable[str]) -> str:
-    """Return the name of the stack of an archive."""
+    """Return the name of the array in an archive that holds the frames."""
     others = [one for one in names if one not in _KNOWN]
     if "frames" in others or len(others) == 1:
         return "frames" if "frames" in others else others[0]
@@ -335,7 +335,7 @@ def _stack_of(path: Path, names: Iterable[str]) -> str:
 def _motion(
     name: str, positions: Mapping[str, ArrayLike | Positions | None], motion: Motion | None
 ) -> tuple[Motion, str]:
-    """Return the motion, and the position that it has."""
+    """Return the motion, and the name of its position."""
     if motion is not None and motion not in MOTIONS:
         raise InputError(f"{name}: unknown motion {motion!r}: give one of {', '.join(MOTIONS)}")
     given = [one for one, values in positions.items() if values is not None]
@@ -344,7 +344,9 @@ def _motion(
         if motion is not None:
             raise InputError(f"{name}: {motion} motion needs the {POSITIONS[motion]} of each frame: give it")
         problem = (
-            "does not say where the body was in each frame" if not given else f"has {' and '.join(given)}"
+            "does not state the position of the body in each frame"
+            if not given
+            else f"has {' and '.join(given)}"
         )
         raise InputError(f"{name} {problem}: give one of {_NEEDED}")
     return fitting[0], POSITIONS[fitting[0]]

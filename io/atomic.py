@@ -1,4 +1,4 @@
-"""Files that exist whole or not at all: of bytes, or HDF5 of some groups and datasets each."""
+"""Files that appear complete or not at all: plain bytes, or HDF5 files of a few groups and datasets."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from mirrorskin.io.types import Closing, InputError, ProcessValue
 from mirrorskin.io.url import ZARR_SUFFIX, is_zarr
 
 MAKE_ROOM = "make room, or choose another place with -o"
-"""What to do where a disk did not take all."""
+"""Remedy for a disk that did not accept all data."""
 
 _PREFIX, _SUFFIX = ".mirrorskin-", ".part"
 
-# Files for HDF5 1.10 and later: the first whose own structures have checksums, and that could read what is
-# being written.
+# Files for HDF5 1.10 and later, the first version whose own structures have checksums and that can read
+# files while they are written.
 VERSIONS = ("v110", "v110")
 
-_NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)  # of a file system
+_NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)  # a file system without hard links
 
-_LARGE = 4096  # bytes of a dataset that is not kept in memory with a file's structure
-_MOST_LAYOUTS = 16  # that are remembered
+_LARGE = 4096  # bytes of a dataset that is not cached with the layout of its file
+_MOST_LAYOUTS = 16  # cached layouts
 
 _TEXT, _ONE = h5py.string_dtype(), h5py.h5s.create(h5py.h5s.SCALAR)
 _STORED_TEXT = h5py.h5t.py_create(_TEXT, logical=True)
@@ -45,31 +45,31 @@ _UNDATED.set_obj_track_times(False)
 _WITH_GROUPS.set_create_intermediate_group(True)
 _WITH_GROUPS.set_char_encoding(h5py.h5t.CSET_UTF8)
 
-# Frames begin with a page, so that they can be worked on where they lie.
+# Frames start at a page boundary, so that the mapped file can be processed without a copy.
 _ALIGNED = {"alignment_threshold": 1 << 20, "alignment_interval": 4096}
 
 
 def check_output(
     path: Path, *keep: Path | None, or_zarr: bool = False, replaces: Replaces = "derived"
 ) -> None:
-    """Refuse an output that could not be written, before any work is done for it.
+    """Refuse an output that could not be written, before any work is done.
 
     Parameters
     ----------
     path : Path
         File to write.
     *keep : Path or None
-        Inputs, files or folders of files, which must not be overwritten.
+        Inputs, files or folders of files, that must not be overwritten.
     or_zarr : bool
-        Whether it may be a Zarr store, too, which must be a new one.
+        Whether the output may also be a Zarr store, which must not exist.
     replaces : {"nothing", "derived", "calibration", "anything"}
         Which existing file may be replaced; see `mirrorskin.io.existing.Replaces`.
 
     Raises
     ------
     InputError
-        Its folder does not exist or cannot be written to, it is a folder itself, it is the input, a file that
-        is being written, or one that may not be replaced.
+        Its folder does not exist or cannot be written to, it is a folder, it is the input, a file that is
+        being written, or a file that may not be replaced.
 
     Examples
     --------
@@ -89,7 +89,7 @@ def check_output(
             raise InputError(f"{path}: there is no folder {path.parent}: make it first")
         if path.exists():
             if not path.is_file():
-                raise InputError(f"{path} is no regular file: choose another place with -o")
+                raise InputError(f"{path} is not a regular file: choose another place with -o")
             inputs = [one for one in keep if one is not None and one.exists()]
             if any(path.samefile(one) or path.parent.samefile(one) for one in inputs):
                 raise InputError(f"{path} is the input, or part of it: name another output with -o")
@@ -106,17 +106,17 @@ def _check_existing(path: Path, replaces: Replaces) -> None:
 
 
 def is_locked(path: Path) -> bool:
-    """Tell whether a program has a file open and keeps others from writing, as all do that write HDF5."""
+    """Return whether a program has a file open with a lock, as every program that writes HDF5 does."""
     with suppress(OSError), path.open("rb") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:  # or the file system does not tell
+        except OSError:  # or the file system does not support locks
             return True
     return False
 
 
 class NewHdf5(Closing):
-    """An HDF5 file in the making, in a file that is open and will be ``path``."""
+    """An HDF5 file that is being written to an open file, which will be renamed to ``path``."""
 
     def __init__(self, path: Path, descriptor: int) -> None:
         self._path = path
@@ -124,13 +124,13 @@ class NewHdf5(Closing):
         self.root: Any = h5py.File(self._disk, "w", libver=VERSIONS, **_ALIGNED)
 
     def check(self) -> None:
-        """Raise InputError if the disk did not take all that was written so far."""
+        """Raise InputError if the disk did not accept everything written so far."""
         if self._disk.error is not None:
             with as_input_error(f"{self._path} could not be written", MAKE_ROOM):
                 raise self._disk.error
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write what remains in buffers."""
         self.root.close()
         self._disk.close()
         self.check()
@@ -138,11 +138,11 @@ class NewHdf5(Closing):
 
 @contextmanager
 def new_file(path: Path, replaces: Replaces = "derived") -> Iterator[int]:
-    """Make a file under a temporary name next to ``path``, and rename it when all went well.
+    """Create a file under a temporary name next to ``path``, and rename it after success.
 
-    It is on the disk before it has its name. Files that killed programs left half-written in that folder are
-    removed, once per process. If ``path`` is a link, its target is replaced. Whether an existing file may be
-    replaced is checked at the start, and again just before that.
+    It is synchronised to the disk before it is renamed. Files that killed programs left half-written in that
+    folder are removed, once per process. If ``path`` is a link, its target is replaced. Whether an existing
+    file may be replaced is checked at the start, and again just before the renaming.
     """
     check_output(path, replaces=replaces)
     with new_part(path) as (part, descriptor):
@@ -154,10 +154,10 @@ def new_file(path: Path, replaces: Replaces = "derived") -> Iterator[int]:
 
 @contextmanager
 def new_part(path: Path) -> Iterator[tuple[Path, int]]:
-    """Make a locked file in the folder of ``path``, under a temporary name that is removed at the end."""
+    """Create a locked file in the folder of ``path``, under a temporary name that is removed at the end."""
     folder = Path(os.path.realpath(path)).parent
     _tidy(folder)
-    # Its name is known before there is a file: whenever the program is ended, it is removed.
+    # The name is chosen before the file exists, so it is removed whenever the program ends.
     part, descriptor = folder / f"{_PREFIX}{secrets.token_hex(8)}{_SUFFIX}", -1
     try:
         with as_input_error(f"{path} could not be written"):
@@ -166,20 +166,20 @@ def new_part(path: Path) -> Iterator[tuple[Path, int]]:
     finally:
         part.unlink(missing_ok=True)
         with suppress(OSError):
-            os.close(descriptor)  # it was locked until it had its name
+            os.close(descriptor)  # locked until it has its final name
 
 
 def complete_part(part: Path, descriptor: int) -> None:
-    """Put a file on the disk, and let others read it as the process's mask says."""
+    """Synchronise a file to the disk, and set the access rights of the process's umask."""
     os.fsync(descriptor)
-    os.close(os.dup(descriptor))  # some disks report only then that they did not take all
+    os.close(os.dup(descriptor))  # some file systems report only on closing that the disk is full
     mask = os.umask(0)
     os.umask(mask)
     part.chmod(0o666 & ~mask)
 
 
 def link_new(part: Path, target: Path) -> None:
-    """Give a file a further name; FileExistsError if that is taken, even by a program that is as quick."""
+    """Give a file an additional name; FileExistsError if it exists, even if created at the same time."""
     try:
         os.link(part, target)
     except FileExistsError:
@@ -193,7 +193,7 @@ def link_new(part: Path, target: Path) -> None:
 
 
 def _rename(part: Path, path: Path, replaces: Replaces) -> None:
-    """Give a file its name; refuse again to replace a file, since it may be new."""
+    """Rename a file; check again whether an existing file may be replaced, since it may be new."""
     target = Path(os.path.realpath(path))
     if replaces == "nothing":
         try:
@@ -209,10 +209,10 @@ def _rename(part: Path, path: Path, replaces: Replaces) -> None:
 
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """Make a folder under a temporary name in that of ``path``, and rename it if all goes well.
+    """Create a folder under a temporary name next to ``path``, and rename it after success.
 
-    What killed programs have left in that folder is removed, as in `new_file`. Whoever gives a folder the
-    name first keeps it: InputError for anyone else.
+    Leftovers of killed programs in that folder are removed, as in `new_file`. If several programs create the
+    same folder, the first one keeps the name; the others raise InputError.
     """
     _tidy(path.parent)
     part, descriptor = path.parent / f"{_PREFIX}{secrets.token_hex(8)}{_SUFFIX}", -1
@@ -231,19 +231,19 @@ def new_folder(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def new_hdf5(path: Path, replaces: Replaces = "derived") -> Iterator[NewHdf5]:
-    """Write an HDF5 file as ``new_file`` does."""
+    """Write an HDF5 file like ``new_file``."""
     with new_file(path, replaces) as descriptor, NewHdf5(path, descriptor) as new:
         yield new
 
 
 def remove_leftovers(folder: Path) -> list[Path]:
-    """Remove the half-written files and folders of writers that are gone, such as those that were killed.
+    """Remove half-written files and folders of programs that no longer run, such as killed ones.
 
-    What is being written is locked, and stays. Where a file system has no locks, all stay.
+    Files that are being written are locked, and kept. On a file system without locks, all are kept.
     """
     removed = []
     for part in folder.glob(f"{_PREFIX}*{_SUFFIX}"):
-        with suppress(OSError):  # locked, no one's to open, or gone by now
+        with suppress(OSError):  # locked, not accessible, or removed meanwhile
             descriptor = os.open(part, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW)
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -261,18 +261,18 @@ _tidy = functools.cache(remove_leftovers)
 
 
 def _make(part: Path) -> int:
-    """Make a file, which is locked as long as it is open, and return its descriptor."""
+    """Create a file that is locked while it is open, and return its descriptor."""
     while True:
         descriptor = os.open(part, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         with suppress(OSError):  # a file system without locks
             fcntl.flock(descriptor, fcntl.LOCK_EX)
-        if os.fstat(descriptor).st_nlink:  # else someone took it for a leftover before it was locked
+        if os.fstat(descriptor).st_nlink:  # otherwise it was removed as a leftover before it was locked
             return descriptor
         os.close(descriptor)
 
 
 def _renamed(part: Path, path: Path) -> bool:
-    """Give a folder its name, unless something of that name is there."""
+    """Rename a folder, unless the name exists."""
     try:
         part.rename(path)
     except OSError as error:
@@ -283,10 +283,10 @@ def _renamed(part: Path, path: Path) -> bool:
 
 
 def _make_folder(part: Path) -> int:
-    """Make a folder, which is locked as long as it is open, and return its descriptor."""
+    """Create a folder that is locked while it is open, and return its descriptor."""
     while True:
         part.mkdir(mode=0o777)
-        with suppress(FileNotFoundError):  # someone took it for a leftover before it was locked
+        with suppress(FileNotFoundError):  # removed as a leftover before it was locked
             descriptor = os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
             with suppress(OSError):  # a file system without locks
                 fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -296,7 +296,7 @@ def _make_folder(part: Path) -> int:
 
 
 def _readable(path: Path) -> bool:
-    """Tell whether HDF5 may read a file, which it may not while the file is being written."""
+    """Return whether HDF5 can open a file, which it cannot while the file is being written."""
     try:
         h5py.File(path, "r").close()
     except OSError:
@@ -305,7 +305,7 @@ def _readable(path: Path) -> bool:
 
 
 class _Disk(FileIO):
-    """A file that keeps its error to itself and takes the rest: HDF5 crashes when it cannot close a file."""
+    """A file that stores its first error and ignores later writes: HDF5 crashes if it cannot close a file."""
 
     error: OSError | None = None
 
@@ -328,7 +328,7 @@ class _Disk(FileIO):
 
 
 def write_new(path: Path, parts: Sequence[bytes], replaces: Replaces = "derived") -> None:
-    """Write the parts of a file, which exists whole or not at all."""
+    """Write the parts of a file, which appears complete or not at all."""
     with (
         new_file(path, replaces) as descriptor,
         as_input_error(f"{path} could not be written", MAKE_ROOM),
@@ -338,9 +338,9 @@ def write_new(path: Path, parts: Sequence[bytes], replaces: Replaces = "derived"
 
 
 class Item(NamedTuple):
-    """Something to write: its full name; the values of a dataset, None of a group; its attributes.
+    """An object to write: its full name, the values of a dataset (None for a group), and its attributes.
 
-    Text instead of values is where a soft link leads.
+    A text instead of values is the target of a soft link.
     """
 
     name: str
@@ -349,9 +349,9 @@ class Item(NamedTuple):
 
 
 def write_item(root: h5py.Group, item: Item) -> int | None:
-    """Write it; return where a dataset's values lie in the file, in one piece as they are in memory.
+    """Write an object; return the offset of a dataset's values in the file if they are contiguous.
 
-    A dataset takes a fifth of the time of h5py's own way where it is small.
+    For small datasets this takes a fifth of the time of h5py's high-level interface.
     """
     if item.values is None:
         root.require_group(item.name).attrs.update(item.attributes)
@@ -376,10 +376,10 @@ def write_item(root: h5py.Group, item: Item) -> int | None:
 
 
 def write_file(path: Path, items: Iterable[Item], replaces: Replaces = "derived") -> None:
-    """Write a file of these items, which exists whole or not at all.
+    """Write a file with these objects, which appears complete or not at all.
 
-    HDF5 says once where things lie in a file of certain names, shapes, types and attributes. The next file
-    that differs in values alone is the same bytes, but for these: it takes a tenth of the time.
+    The layout that HDF5 chooses for given names, shapes, types and attributes is cached. The next file that
+    differs in values only has the same bytes except for these, and is written in a tenth of the time.
     """
     items = list(items)
     arrays = [np.asarray(item.values, order="C") for item in items if isinstance(item.values, np.ndarray)]
@@ -405,9 +405,9 @@ def write_file(path: Path, items: Iterable[Item], replaces: Replaces = "derived"
 
 
 def fixed_text(text: str | Sequence[str]) -> NDArray[Any]:
-    """Return a text, or a list of texts, as UTF-8 of a fixed length: texts of variable length lie in heaps.
+    """Return a text, or a list of texts, as fixed-length UTF-8: HDF5 stores variable lengths in heaps.
 
-    HDF5 reads a heap that is damaged for ever.
+    HDF5 never returns from reading a damaged heap.
     """
     if isinstance(text, str):
         encoded = legible(text).encode() or b"\0"
@@ -417,21 +417,21 @@ def fixed_text(text: str | Sequence[str]) -> NDArray[Any]:
 
 
 def process_items(place: str, process: Mapping[str, ProcessValue]) -> Iterator[Item]:
-    """Yield what says how something came about."""
+    """Yield the objects of a process: the values that describe the provenance of a file."""
     for name, value in process.items():
         values = fixed_text(value) if isinstance(value, str) else np.asarray(value)
         yield Item(f"{place}/{name}", values, {})
 
 
 class _Layout(NamedTuple):
-    """How a file is laid out: its bytes but those of large datasets, and where its datasets begin."""
+    """The layout of a file: its bytes except for large datasets, and the offsets of its datasets."""
 
     pieces: list[tuple[int, bytes]]
     places: list[int | None]
 
     @classmethod
     def of(cls, descriptor: int, places: list[int | None], arrays: Sequence[NDArray[Any]]) -> _Layout:
-        """Read how a file is laid out whose datasets begin at certain bytes."""
+        """Read the layout of a file whose datasets have the given offsets."""
         known = [(at, at + one.nbytes) for at, one in zip(places, arrays, strict=True) if at is not None]
         large = sorted((start, end) for start, end in known if end - start >= _LARGE)
         starts, ends = [0, *(end for _, end in large)], [start for start, _ in large]
@@ -439,7 +439,7 @@ class _Layout(NamedTuple):
         return cls([(start, os.pread(descriptor, end - start, start)) for start, end in gaps], places)
 
     def write(self, descriptor: int, arrays: Sequence[NDArray[Any]]) -> None:
-        """Write a file of other values."""
+        """Write a file with other values."""
         for start, piece in self.pieces:
             _write(descriptor, memoryview(piece), start)
         for at, values in zip(self.places, arrays, strict=True):

@@ -1,6 +1,6 @@
-"""Frames in chunks: where they lie in a file, read past HDF5 and unpacked by several threads, each once.
+"""Frames in chunks: their offsets in a file, reading without HDF5, and decoding by several threads.
 
-Chunks are unpacked outside HDF5's lock, by the C libraries that hdf5plugin and h5py bring, and zlib.
+Chunks are decoded outside HDF5's lock, with the C libraries of hdf5plugin and h5py, and zlib.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ from mirrorskin.io.selection import Place, Region, Span
 
 Bytes = NDArray[np.uint8]
 Codec = Callable[[Bytes, Bytes], None]
-"""Unpack the first bytes into the whole of the second; ValueError if they do not fit."""
+"""Function that unpacks the first bytes into the whole of the second; ValueError if they do not fit."""
 
 _SIZE, _POINTER = ctypes.c_size_t, ctypes.c_void_p
 _WORD, _HEAD = struct.Struct(">I"), struct.Struct(">QI")
 
 
 class ChunkIndex(NamedTuple):
-    """The chunks of a dataset: of what shape, and in arrays with one element a chunk where they are."""
+    """The chunks of a dataset: their shape, and their positions in arrays with one element per chunk."""
 
     shape: tuple[int, int, int]  # samples
     offsets: NDArray[np.int64]  # bytes, in the file
-    sizes: NDArray[np.int64]  # bytes, as they are stored
-    filter_masks: NDArray[np.int64]  # a bit for each filter that a chunk did not go through
+    sizes: NDArray[np.int64]  # bytes, as stored
+    filter_masks: NDArray[np.int64]  # bits of the filters that were not applied to a chunk
 
     def contiguous_offset(self, shape: tuple[int, int, int]) -> int | None:
-        """Return where raw chunks of whole frames begin, if each begins where the one before ends."""
+        """Return the offset of raw chunks of whole frames if they are stored contiguously, else None."""
         offsets, sizes = self.offsets.ravel(), self.sizes.ravel()
         if self.shape[1:] != shape[1:] or np.any(np.diff(offsets) != sizes[:-1]):
             return None
@@ -52,12 +52,12 @@ class ChunkIndex(NamedTuple):
 
 
 def chunk_index(dataset: h5py.Dataset, shape: tuple[int, int, int], size: int) -> ChunkIndex | str:
-    """Return where the chunks of the first frames lie in a file of so many bytes, or why that is unknown.
+    """Return the positions of the chunks of the first frames in a file of ``size`` bytes, or why not.
 
     OSError or ValueError: chunks are missing, or outside the file.
     """
     if dataset.file.userblock_size:
-        return "user block"  # HDF5's versions differ in what they count from
+        return "user block"  # versions of HDF5 disagree about the origin of offsets
     chunks = chunks_of(dataset)
     grid = tuple(-(-n // c) for n, c in zip(shape, dataset.chunks, strict=True))
     places = np.array([chunk.chunk_offset for chunk in chunks], np.int64) // dataset.chunks
@@ -70,8 +70,8 @@ def chunk_index(dataset: h5py.Dataset, shape: tuple[int, int, int], size: int) -
         raise ValueError("(chunks are missing)")
     if np.any(offsets + sizes > size):
         raise OSError("truncated: a chunk lies behind the end")
-    # Chunks that are partly outside the dataset may not have gone through its filters, and HDF5 does not
-    # tell; but then they have the size of raw ones.
+    # Chunks that are partly outside the dataset may have skipped its filters, which HDF5 does not report.
+    # Such chunks have the size of raw ones.
     edge = np.zeros(grid, bool)
     for axis, (n, c) in enumerate(zip(shape, dataset.chunks, strict=True)):
         if n % c:
@@ -83,10 +83,10 @@ def chunk_index(dataset: h5py.Dataset, shape: tuple[int, int, int], size: int) -
 
 
 class Chunks:
-    """A dataset in chunks, of which threads read and unpack one after the other.
+    """A chunked dataset that several threads read and unpack, one chunk after the other.
 
-    A chunk of whole frames that are wanted is unpacked where they are wanted; of others the part that is
-    wanted is copied there. The file's descriptor is closed at the latest with the last reference to this.
+    A chunk of whole frames that are all needed is unpacked directly into the output; of other chunks the
+    needed part is copied. The file descriptor is closed at the latest with the last reference to this object.
     """
 
     length: int
@@ -109,27 +109,27 @@ class Chunks:
         self._frames, self._file, self._place = frames, file, place
         self._index, self._codecs, self._threads = index, codecs, threads
         self._close_file = weakref.finalize(self, os.close, file)
-        self._pools: dict[int, ThreadPoolExecutor] = {}  # of each process: threads stay behind in a fork
-        self._rooms: list[dict[str, Bytes]] = []  # memory that one thread uses again and again
+        self._pools: dict[int, ThreadPoolExecutor] = {}  # by process, because threads do not survive a fork
+        self._buffers: list[dict[str, Bytes]] = []  # scratch buffers, reused by one thread at a time
 
     def lend(self, start: int, stop: int) -> None:
-        """Lend nothing that was not read."""
+        """Return None: chunks have to be read."""
 
     def fetch(self, frames: Span, region: Region, out: NDArray[Any]) -> None:
-        """Write a part into ``out``; every chunk that it touches is decoded once."""
+        """Write a part into ``out``; every chunk of it is decoded once."""
         spans = frames, region.rows, region.columns
         ranges = [range(a // c, -(-b // c)) for (a, b), c in zip(spans, self._shape, strict=True)]
         work = deque(itertools.product(*ranges))
 
         def take_chunks() -> None:
-            rooms: dict[str, Bytes] = self._rooms.pop() if self._rooms else {}
+            buffers: dict[str, Bytes] = self._buffers.pop() if self._buffers else {}
             try:
-                with suppress(IndexError):  # there is none left
+                with suppress(IndexError):  # no chunk is left
                     while True:
-                        self._fetch_chunk(work.popleft(), spans, out, rooms)
+                        self._fetch_chunk(work.popleft(), spans, out, buffers)
             finally:
-                work.clear()  # after an error, so that the others stop, too
-                self._rooms.append(rooms)
+                work.clear()  # after an error, so that the other threads stop, too
+                self._buffers.append(buffers)
 
         helpers: list[Future[None]] = []
         try:
@@ -140,7 +140,7 @@ class Chunks:
             take_chunks()
         finally:
             work.clear()
-            wait(helpers)  # when this returns, nobody writes to out any more
+            wait(helpers)  # afterwards no thread writes to out
         for helper in helpers:
             helper.result()
 
@@ -149,13 +149,13 @@ class Chunks:
         pool = self._pools.pop(os.getpid(), None)
         if pool is not None:
             pool.shutdown()
-        self._file = -1  # the number may be another file's by then
+        self._file = -1  # the number may be reused for another file
         self._close_file()
 
     def _fetch_chunk(
-        self, position: tuple[int, ...], spans: tuple[Span, ...], out: NDArray[Any], rooms: dict[str, Bytes]
+        self, position: tuple[int, ...], spans: tuple[Span, ...], out: NDArray[Any], buffers: dict[str, Bytes]
     ) -> None:
-        """Write what a chunk holds of the part with these spans."""
+        """Write the part of a chunk that is in these spans."""
         source, target = [], []
         for p, c, (start, stop) in zip(position, self._shape, spans, strict=True):
             first, last = max(p * c, start), min((p + 1) * c, stop)
@@ -165,26 +165,26 @@ class Chunks:
         first = position[0] * self.length
         with self._place.reading(first, min(first + self.length, self._frames)):
             if wanted.shape == self._shape and wanted.flags.c_contiguous:
-                self._decode(position, wanted.reshape(-1).view(np.uint8), rooms)
+                self._decode(position, wanted.reshape(-1).view(np.uint8), buffers)
             else:
-                unpacked = _room(rooms, "unpacked", self._size)
-                self._decode(position, unpacked, rooms)
+                unpacked = _buffer(buffers, "unpacked", self._size)
+                self._decode(position, unpacked, buffers)
                 wanted[...] = unpacked.view(self._dtype).reshape(self._shape)[*source]
 
-    def _decode(self, position: tuple[int, ...], out: Bytes, rooms: dict[str, Bytes]) -> None:
+    def _decode(self, position: tuple[int, ...], out: Bytes, buffers: dict[str, Bytes]) -> None:
         offset, size = int(self._index.offsets[position]), int(self._index.sizes[position])
         if not self._codecs:
             _read(self._file, offset, out)
             return
-        packed = _room(rooms, "packed", size)
+        packed = _buffer(buffers, "packed", size)
         _read(self._file, offset, packed)
         decode(self._codecs, int(self._index.filter_masks[position]), packed, out)
 
 
-def _room(rooms: dict[str, Bytes], name: str, size: int) -> Bytes:
-    if name not in rooms or rooms[name].size < size:
-        rooms[name] = np.empty(size + size // 8, np.uint8)
-    return rooms[name][:size]
+def _buffer(buffers: dict[str, Bytes], name: str, size: int) -> Bytes:
+    if name not in buffers or buffers[name].size < size:
+        buffers[name] = np.empty(size + size // 8, np.uint8)
+    return buffers[name][:size]
 
 
 def _read(file: int, offset: int, out: Bytes) -> None:
@@ -197,16 +197,16 @@ def _read(file: int, offset: int, out: Bytes) -> None:
 
 
 def find_codecs(dataset: h5py.Dataset) -> list[Codec] | str:
-    """Return what undoes each filter of a dataset, in the order of writing, or the name of an unknown one."""
+    """Return the functions that undo a dataset's filters, in the order of writing, or an unknown name."""
     plist = dataset.id.get_create_plist()
     codecs, count = [], plist.get_nfilters()
     for index, (code, _, values, name) in enumerate(map(plist.get_filter, range(count))):
         try:
             codecs.append(_MAKERS[code](values))
-        except (OSError, AttributeError, LookupError):  # no library, another one, an unknown filter
+        except (OSError, AttributeError, LookupError):  # a missing or different library, or an unknown filter
             return name.decode(errors="replace").split(";")[0].strip() or str(code)
         if code != h5py.h5z.FILTER_SHUFFLE and index < count - 1:
-            return "packed twice"  # nobody knows how much is in between
+            return "packed twice"  # the size between the two is unknown
     return codecs
 
 
@@ -221,7 +221,7 @@ def decode(codecs: list[Codec], filter_mask: int, packed: Bytes, out: Bytes) -> 
 
 
 def _shuffle(values: tuple[int, ...]) -> Codec:
-    """HDF5's shuffle: the first bytes of all samples come first, and so on."""
+    """HDF5's shuffle: the first bytes of all samples, then the second bytes, and so on."""
 
     def decode(packed: Bytes, out: Bytes) -> None:
         _check(packed.size, out.size)
@@ -257,9 +257,9 @@ def _lzf(_values: tuple[int, ...]) -> Codec:
 
 
 def _bitshuffle(values: tuple[int, ...]) -> Codec:
-    """Bitshuffle: blocks of which the bits are sorted by their place; LZ4 or Zstandard packs them.
+    """Bitshuffle: blocks whose bits are sorted by their position, packed by LZ4 or Zstandard.
 
-    Chunks begin with their unpacked size and that of a block; each block begins with its packed size.
+    Chunks begin with their unpacked size and the size of a block; each block begins with its packed size.
     """
     itemsize, method = values[2], values[4] if len(values) > 4 else 0
     name = {2: "bshuf_decompress_lz4", 3: "bshuf_decompress_zstd"}[method]
@@ -281,8 +281,8 @@ def _bitshuffle(values: tuple[int, ...]) -> Codec:
 
 
 def _check_blocks(packed: Bytes, size: int, block: int, itemsize: int) -> None:
-    """Hold that all blocks of bitshuffle lie in the chunk: the library trusts what they say of themselves."""
-    group = 8 * itemsize  # bits are sorted among eight samples; what is left over is stored as it is
+    """Check that all blocks of bitshuffle are within the chunk: the library does not check their sizes."""
+    group = 8 * itemsize  # bits are sorted among eight samples; the remaining samples are stored unchanged
     if block <= 0 or block % group:
         raise ValueError("(blocks of a wrong size)")
     whole, rest = divmod(size, block)
@@ -332,7 +332,7 @@ def _plugin(name: str) -> str:
 
 @functools.cache
 def _function(library: str, name: str, result: Any, *arguments: Any) -> Any:
-    """Return a function of a C library; calls of it leave the interpreter's lock."""
+    """Return a function of a C library; calls release the interpreter's lock."""
     function = getattr(ctypes.CDLL(library), name)
     function.restype, function.argtypes = result, arguments
     return function

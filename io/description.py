@@ -1,4 +1,4 @@
-"""What a file holds, for people."""
+"""Summaries of the contents of files, for printing."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from mirrorskin.io.zarr import open_file
 
 
 def describe(path: str | Path) -> dict[str, str]:
-    """Tell what a file holds: a recording, a result, a calibration, someone else's stacks, NumPy's arrays.
+    """Describe a file: a recording, a result, a calibration, stacks of another program, or NumPy arrays.
 
     Returns
     -------
@@ -40,7 +40,7 @@ def describe(path: str | Path) -> dict[str, str]:
     """
     path = path_of(path)
     if path.suffix.lower() in NUMPY_SUFFIXES:
-        return {"kind": "array of NumPy's", **list_arrays(path)}
+        return {"kind": "NumPy array", **list_arrays(path)}
     with open_file(path) as file:
         ours, result = file.marked(MARK), file.marked(RESULT_MARK)
         calibration = file.marked(CALIBRATION_MARK)
@@ -100,12 +100,12 @@ def _recording(recording: Recording) -> dict[str, str]:
 
 
 def _counts(values: NDArray[np.floating] | None, unit: str) -> str:
-    """Tell one number, or the middle one of a map."""
+    """Return a number, or the median of a map, as text."""
     if values is None:
         return "none"
     known = values[np.isfinite(values)]
     if not known.size:
-        return "no pixel known"
+        return "no valid pixel"
     return f"{np.median(known):g} {unit}{' (median)' if np.ndim(values) else ''}"
 
 
@@ -133,7 +133,7 @@ def _result(result: Result) -> dict[str, str]:
 
 
 def _carried(calibration: Calibration | None) -> dict[str, str]:
-    """Tell of a copy in a line."""
+    """Return a calibration copied into a file in one line."""
     if calibration is None:
         return {}
     return {"carried calibration": f"{calibration.contents} of camera {calibration.camera}"}
@@ -144,7 +144,7 @@ def _calibration(calibration: Calibration) -> dict[str, str]:
     for name in GROUPS:
         part = calibration.parts().get(name)
         if part is None and name == "stiffness":
-            continue  # few have one
+            continue  # shown only where it exists, which is rare
         if part is None:
             facts[GROUPS[name]] = "none"
         else:

@@ -1,4 +1,4 @@
-"""What an existing file is, where a new file is to take its name."""
+"""Whether a new file may replace an existing one, from the kind of the existing file."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from mirrorskin.io.hdf5 import Hdf5File
 from mirrorskin.io.types import InputError
 
 Replaces = Literal["nothing", "derived", "calibration", "anything"]
-"""Which existing file a new one may replace.
+"""The existing files that a new file may replace.
 
-"nothing": none, the name must be free. "derived": one that can be computed again, such as a result, a picture
-or a table; not a recording, a calibration, an HDF5 or MCAP file of another program, a video, arrays or an
-archive that ``export`` did not write, or settings. "calibration": these, and calibrations. "anything": every
-file, since the user asked for that.
+"nothing": none, the name must be free. "derived": files that can be computed again, such as a result, a
+picture or a table; not a recording, a calibration, an HDF5 or MCAP file of another program, a video, arrays,
+an archive that ``export`` did not write, or settings. "calibration": these, and calibrations. "anything":
+every file, because the user requested it.
 """
 
 _HDF5, _MCAP = b"\x89HDF\r\n\x1a\n", b"\x89MCAP0\r\n"
@@ -29,9 +29,9 @@ _VIDEOS = (
     (0, b"FLV"),
     (0, b"\0\0\1\xba"),
 )
-"""Where videos have which bytes: AVI, MP4 and MOV, Matroska and WebM, Ogg, Flash, MPEG."""
+"""Offsets and bytes that identify videos: AVI, MP4 and MOV, Matroska and WebM, Ogg, FLV, MPEG."""
 
-_USER_BLOCK = 512  # bytes; HDF5's signature is at 0, or at this times a power of two
+_USER_BLOCK = 512  # bytes; HDF5's signature is at 0, or at this value times a power of two
 _KINDS = {"recording": "a recording", "calibration": "a calibration", "result": "a result"}
 _CALIBRATION = _KINDS["calibration"]
 
@@ -51,13 +51,13 @@ def check_replaced(path: Path, replaces: Replaces) -> None:
 
 
 def _was_result(path: Path) -> bool:
-    """Tell whether a damaged HDF5 file was a result: it can be made anew."""
+    """Return whether a damaged HDF5 file was a result, which can be computed again."""
     with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
         return content.find(b"mirrorskin_result") >= 0 and content.find(b"mirrorskin_recording") < 0
 
 
 def _is_exported(path: Path) -> bool:
-    """Tell whether an archive holds the maps of a result, as ``export`` writes them."""
+    """Return whether an archive contains the maps of a result, as written by ``export``."""
     try:
         with zipfile.ZipFile(path) as archive:
             names = set(archive.namelist())
@@ -67,7 +67,7 @@ def _is_exported(path: Path) -> bool:
 
 
 def protected_kind(path: Path) -> str:
-    """Return what a file is, in a few words, if it cannot be computed again; else an empty text."""
+    """Return the kind of a file that cannot be computed again; an empty text for other files."""
     with path.open("rb") as file:
         head = file.read(_HEAD)
         if head.startswith(_MCAP):

@@ -1,4 +1,4 @@
-"""A result as a file that other programs open: the suffix says which kind."""
+"""Export of results to the formats of other programs; the suffix selects the format."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ _SECTION, _ARRAYS = ".csv", ".npz"
 _SOFTWARE, _DATE, _SOURCE = "software", "date", "source"
 _FROM_PROCESS = {_SOURCE: "source", _DATE: "date", "turn": "turn"}
 _NORMAL = "nx", "ny", "nz"
-_POINT_UNITS = dict.fromkeys(("x", "y", "z", "sigma"), "mm")  # of a point's columns; the others have none
+_POINT_UNITS = dict.fromkeys(("x", "y", "z", "sigma"), "mm")  # columns of points; the others have no unit
 _MOST = np.iinfo(np.uint16).max
-_FLAT = 1e-6  # mm a count, where all heights are one
+_FLAT = 1e-6  # mm per count, if all heights are equal
 _PLY_TYPES = {"f4": "float", "u1": "uchar"}
-_STL_HEAD = 80  # bytes of free text, which must not begin with "solid": that would be STL as text
+_STL_HEAD = 80  # bytes of free text, which must not begin with "solid", the mark of a text STL
 _PNG_KEYWORDS = {_SOURCE: "Title", _DATE: "Creation Time", _SOFTWARE: "Software"}
 _CENTIMETRE = 10.0  # mm
-_METRE = 1e-3  # m a mm
-_NO_DATA = 42113  # the tag by which GDAL names the value of holes
+_METRE = 1e-3  # m per mm
+_NO_DATA = 42113  # GDAL's tag for the value of holes
 
 
 @checked
@@ -47,32 +47,32 @@ def export_result(
     section: Mapping[str, NDArray[Any]] | None = None,
     points: bool = False,
 ) -> str:
-    """Write a result for other programs; the file exists whole or not at all.
+    """Write a result for other programs; the file appears complete or not at all.
 
     Parameters
     ----------
     result : Result
-        Of one turn; see ``select_turn``.
+        Maps of one turn; see ``select_turn``.
     path : str or Path
-        Its suffix chooses the format: ``.ply`` and ``.stl``, a surface of triangles; ``.xyz``, points as
-        text; ``.png``, ``.tif`` and ``.tiff``, heights as counts of 16 bits with their scale, and 0 for no
-        answer; ``.npz``, all maps as plain arrays; ``.csv``, a cross-section; ``.mcap``, ROS 2 messages, as
-        ``save_messages`` writes them; ``.zarr``, all that a result's file holds, as ``save_zarr`` does.
+        The suffix selects the format: ``.ply`` and ``.stl``, a surface of triangles; ``.xyz``, points as
+        text; ``.png``, ``.tif`` and ``.tiff``, heights as counts of 16 bits with their scale, 0 for
+        undefined; ``.npz``, all maps as plain arrays; ``.csv``, a cross-section; ``.mcap``, ROS 2 messages,
+        as written by ``save_messages``; ``.zarr``, everything in a result file, as written by ``save_zarr``.
     section : mapping of ndarray, (n,), optional
-        The cross-section, by name; lengths are mm, and ``filled`` is 1 where a height was not measured.
+        Columns of the cross-section; lengths in mm, and ``filled`` is 1 where a height was not measured.
     points : bool, optional
-        A PLY of all points, and no triangles.
+        Write a PLY of all points, without triangles.
 
     Returns
     -------
     str
-        What was written, in a few words.
+        Description of what was written.
 
     Raises
     ------
     InputError
-        See ``check_export``; or no pixels lie together so that they make a surface; or the file cannot be
-        written there.
+        See ``check_export``; or no three adjacent pixels have heights; or the file cannot be
+        written.
 
     Examples
     --------
@@ -114,10 +114,10 @@ def export_result(
 
 
 def check_export(result: Result, path: str | Path) -> None:
-    """Refuse what cannot be exported, before any work is done for it."""
+    """Refuse what cannot be exported, before any work is done."""
     suffix, known = Path(path).suffix.lower(), (*_FORMATS, _SECTION, MCAP_SUFFIX, ZARR_SUFFIX)
     if suffix not in known:
-        wrong = f"{suffix} is no format" if suffix else "its name does not say a format"
+        wrong = f"{suffix} is not a supported format" if suffix else "its name has no suffix"
         raise InputError(f"{path}: {wrong}: name a file that ends with one of {' '.join(known)}")
     if suffix in (_ARRAYS, ZARR_SUFFIX):
         return
@@ -130,7 +130,7 @@ def check_heights(result: Result, path: str | Path) -> None:
     if result.height is None:
         raise InputError(f"{path}: the result has no heights: reconstruct it again with them, {remedy}")
     if not np.isfinite(result.height).any():
-        raise InputError(f"{path}: no height of the result is known: look at its status, {remedy}")
+        raise InputError(f"{path}: no pixel of the result has a height: look at its status, {remedy}")
     if result.x is None or result.y is None:
         again = "reconstruct it again with --pixel-size"
         raise InputError(f"{path} needs millimetres, and the result has no pixel size: {again}, {remedy}")
@@ -142,25 +142,25 @@ def save_table(
     units: Mapping[str, str],
     notes: Mapping[str, str],
 ) -> None:
-    """Write columns as comma-separated values; the file exists whole or not at all.
+    """Write columns as comma-separated values; the file appears complete or not at all.
 
     Notes come first, in lines that begin with ``#``; then names with units, as in ``height [mm]``, then the
-    rows. A cell without an answer is empty.
+    rows. Cells of undefined values are empty.
 
     Parameters
     ----------
     path : str or Path
     columns : mapping of ndarray, (n,)
-        By name.
+        Columns by name.
     units : mapping of str
-        Of the columns that have one.
+        Units of the columns that have one.
     notes : mapping of str
-        By name; one line each.
+        Texts by name, one line each.
 
     Raises
     ------
     InputError
-        It cannot be written there.
+        The file cannot be written.
 
     Examples
     --------
@@ -177,13 +177,13 @@ def save_table(
 
 
 def _cells(values: NDArray[Any]) -> Iterator[str]:
-    """Yield numbers with as many digits as float32 has, and nothing for NaN."""
+    """Yield numbers with the precision of float32, and an empty text for NaN."""
     for value in values.tolist():
         yield "" if math.isnan(value) else f"{value:.9g}"
 
 
 class _Encoded(NamedTuple):
-    """A file's parts, and what they hold, in a few words."""
+    """The parts of a file, and a description of its contents."""
 
     parts: list[bytes]
     holds: str
@@ -198,7 +198,7 @@ def _encode_ply(result: Result, points: bool = False) -> _Encoded:
     mesh = _surface(result)
     columns = points_of(result, mesh.pixels)
     if result.normals is not None:
-        # Programs shade by them, and paint black what has none.
+        # Programs shade by the normals, and draw vertices without one black.
         missing = np.isnan(columns[_NORMAL[0]])
         for name, values in zip(_NORMAL, normals_around(mesh, missing).T, strict=True):
             columns[name] = columns[name].copy()
@@ -208,7 +208,7 @@ def _encode_ply(result: Result, points: bool = False) -> _Encoded:
 
 
 def _encode_stl(result: Result) -> _Encoded:
-    """Encode a surface as binary STL, with its unit in the head: there is no other place for it."""
+    """Encode a surface as binary STL, with its unit in the header, as STL has no field for it."""
     mesh, notes = _surface(result), _notes_of(result)
     title = ", ".join(["unit mm", *(notes[name] for name in (_SOFTWARE, _DATE, _SOURCE) if name in notes)])
     normals = face_vectors(mesh)
@@ -223,7 +223,7 @@ def _encode_stl(result: Result) -> _Encoded:
 
 
 def _encode_xyz(result: Result) -> _Encoded:
-    """Encode points as text, one a line, after comments, of which the last names the columns."""
+    """Encode points as text, one per line, after comments; the last comment names the columns."""
     columns = points_of(result)
     names = [f"{name}[{_POINT_UNITS[name]}]" if name in _POINT_UNITS else name for name in columns]
     head = [*(f"{name}: {note}" for name, note in _notes_of(result).items()), " ".join(names)]
@@ -237,7 +237,7 @@ def _encode_xyz(result: Result) -> _Encoded:
 def _encode_png(result: Result) -> _Encoded:
     """Encode heights as a grey picture of 16 bits.
 
-    Its resolution is pixels a metre, and texts tell the scale of heights: for people, in numbers, and under
+    Its resolution is in pixels per metre. Texts contain the scale of heights, in words and under
     the keys that Gwyddion documents for pictures of 16 bits.
     """
     counts, notes = _counts(result), _notes_of(result)
@@ -249,8 +249,8 @@ def _encode_png(result: Result) -> _Encoded:
 def _encode_tiff(result: Result) -> _Encoded:
     """Encode heights as a grey picture of 16 bits.
 
-    Its resolution is pixels a centimetre, GDAL's tag marks holes, and the scale of heights is in a
-    description that ImageJ reads, so that it shows millimetres.
+    Its resolution is in pixels per centimetre, GDAL's tag marks holes, and the scale of heights is in a
+    description that ImageJ reads to display millimetres.
     """
     import tifffile
 
@@ -272,9 +272,9 @@ def _encode_tiff(result: Result) -> _Encoded:
 
 
 def _encode_npz(result: Result) -> _Encoded:
-    """Encode the maps, the positions of the pixels, and as JSON units, legends and process.
+    """Encode the maps, the positions of the pixels, and JSON texts of units, legends and process.
 
-    Nothing in it needs ``allow_pickle``.
+    It can be loaded without ``allow_pickle``.
     """
     axes = {name: values for name, values in (("x", result.x), ("y", result.y)) if values is not None}
     arrays: dict[str, Any] = {**result, **axes}
@@ -291,7 +291,7 @@ def _encode_npz(result: Result) -> _Encoded:
 
 
 def _notes_of(result: Result) -> dict[str, str]:
-    """Say in lines where heights come from, from where they count, and how many were not measured."""
+    """Return notes on the source and the zero of heights, and the number of filled ones."""
     process = result.process
     maker = " ".join(str(process[name]) for name in ("program", "version") if name in process)
     notes = {name: one_line(process[key]) for name, key in _FROM_PROCESS.items() if key in process}
@@ -306,7 +306,7 @@ def _notes_of(result: Result) -> dict[str, str]:
 
 
 def _height_datum(result: Result) -> str:
-    """Say from where heights count: not from the rest sheet where their offset is unknown."""
+    """Return the zero of the heights: not the sheet at rest if their offset is unknown."""
     unknown = result.offset_unknown
     count, of = (0, 0) if unknown is None else (np.count_nonzero(unknown), unknown.size)
     if not count:
@@ -326,7 +326,7 @@ def _grid(result: Result) -> tuple[NDArray[np.float32], Floats, Floats]:
 
 
 def points_of(result: Result, pixels: NDArray[np.int64] | None = None) -> dict[str, NDArray[Any]]:
-    """Return the columns of points, (n,), by name: of these pixels, or of all with a height."""
+    """Return the columns of points, (n,), by name: of the given pixels, or of all with a height."""
     height, x, y = _grid(result)
     chosen = np.flatnonzero(np.isfinite(height)) if pixels is None else pixels
     row, column = np.unravel_index(chosen, height.shape)
@@ -347,7 +347,7 @@ def points_of(result: Result, pixels: NDArray[np.int64] | None = None) -> dict[s
 def _surface(result: Result) -> Mesh:
     mesh = surface_mesh(*_grid(result), component=result.component)
     if not mesh.faces.size:
-        raise InputError("no three known heights are neighbours, so there is no surface: export points, .xyz")
+        raise InputError("no three adjacent pixels have heights, so there is no surface: export points, .xyz")
     return mesh
 
 
@@ -378,11 +378,11 @@ def _ply(
 
 
 class _Counts(NamedTuple):
-    """A map of heights in 16 bits: its height is ``offset + step * counts``."""
+    """A map of heights in 16 bits: a height is ``offset + step * counts``."""
 
-    values: NDArray[np.uint16]  # 1 at the lowest height, 65535 at the highest, 0 where there is no answer
+    values: NDArray[np.uint16]  # 1 at the lowest height, 65535 at the highest, 0 where undefined
     offset: float  # mm
-    step: float  # mm a count
+    step: float  # mm per count
     pixel_size: tuple[float, float]  # mm
     first: tuple[float, float]  # x and y of the top left pixel's centre, mm
 
@@ -391,17 +391,17 @@ class _Counts(NamedTuple):
 
 
 def _counts(result: Result) -> _Counts:
-    """Spread the known heights of a result over 16 bits."""
+    """Scale the heights of a result to 16 bits."""
     height, x, y = _grid(result)
     known = np.isfinite(height)
     heights = np.where(known, height, np.nan).astype(np.float64)
     lowest, highest = float(np.nanmin(heights)), float(np.nanmax(heights))
     step = (highest - lowest) / (_MOST - 1) or _FLAT
     values = np.rint((np.where(known, heights, lowest) - lowest) / step) + 1
-    # Of a single row or column, a pixel is as long as it is wide.
+    # For a single row or column, pixels are assumed to be square.
     sizes = [abs(float(axis[-1] - axis[0])) / (len(axis) - 1) for axis in (x, y) if len(axis) > 1]
     if not sizes:
-        raise InputError("a result of one pixel does not tell how large that is: export it as .xyz or .npz")
+        raise InputError("the pixel size of a result of one pixel is unknown: export it as .xyz or .npz")
     counts = np.where(known, values, 0).astype(np.uint16)
     return _Counts(counts, lowest - step, step, (sizes[0], sizes[-1]), (float(x[0]), float(y[0])))
 
@@ -427,8 +427,8 @@ def _texts(counts: _Counts, notes: Mapping[str, str]) -> Iterator[tuple[str, str
     for name, length in lengths.items():
         yield f"Gwy::{name}", repr(length * _METRE)
     for name in ("XYUnit", "ZUnit"):
-        yield f"Gwy::{name}", "m"  # as its source has them
-        yield f"Gwy::{name}s", "m"  # as its guide has them
+        yield f"Gwy::{name}", "m"  # as in Gwyddion's source code
+        yield f"Gwy::{name}s", "m"  # as in its user guide
     yield "Gwy::Title", notes.get(_SOURCE, "height")
 
 
@@ -440,7 +440,7 @@ def _description(counts: _Counts, notes: Mapping[str, str]) -> str:
         "xorigin": -x / width,
         "yorigin": y / height,
         "inverty": "true",
-        "cf": 0,  # heights are a straight line of counts: c0 + c1 x count
+        "cf": 0,  # heights are a linear function of counts: c0 + c1 x count
         "c0": counts.offset,
         "c1": counts.step,
         "vunit": "mm",
@@ -448,7 +448,8 @@ def _description(counts: _Counts, notes: Mapping[str, str]) -> str:
         "max": int(counts.values.max()),
         "scale": counts,
     }
-    lines |= {name: note.replace("\\", r"\\") for name, note in notes.items()}  # which begins an escape
+    # A backslash would begin an escape sequence.
+    lines |= {name: note.replace("\\", r"\\") for name, note in notes.items()}
     return "".join(f"{name}={note}\n" for name, note in lines.items())
 
 

@@ -1,4 +1,4 @@
-"""Fingerprints of recordings: a hash of a sample of the bytes, in less time than reading all of them."""
+"""Fingerprints of recordings: a hash of a sample of the bytes, which is faster than reading all of them."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from mirrorskin.io.types import InputError
 
 Spans = NDArray[np.int64]
 
-_EVERY, _TAKEN = 4 << 20, 4 << 10
+_HASH_INTERVAL, _HASH_LENGTH = 4 << 20, 4 << 10
 _PIECE = 1 << 20
 
 
 State = tuple[int, int, int, int]
-"""Of a file: device, number, bytes, and nanoseconds of its last change."""
+"""State of a file: device, number, size, and time of the last change in nanoseconds."""
 
 
 def origins(file: Hdf5File, dataset: h5py.Dataset) -> dict[Path, State]:
-    """Return the files that frames lie in, the recording itself first, each as it was when it was opened."""
+    """Return the files that contain frames, the recording first, with their state when they were opened."""
     with as_input_error(f"{file.path}: {dataset.name}"):
         root = os.fstat(file.root.id.get_vfd_handle())
         found = {Path(file.root.filename): state_of(root)}
@@ -38,14 +38,14 @@ def origins(file: Hdf5File, dataset: h5py.Dataset) -> dict[Path, State]:
 
 
 def fingerprint(file: Hdf5File, dataset: h5py.Dataset, origins: Mapping[Path, State], frames: int) -> str:
-    """Return a SHA-256, in hexadecimal, of a file: its length, all but the frames, and some of the frames.
+    """Return a SHA-256, in hexadecimal, of a file: its size, all data but the frames, and some frames.
 
-    Of the frames, joined in the order in which they are stored, the first 4 KiB of each 4 MiB are taken.
-    Where they lie in other files, as those of virtual and external datasets do, those files follow, in the
-    order in which the dataset names them.
+    Of the frames, joined in the order of storage, the first 4 KiB of each 4 MiB are hashed. If they are
+    stored in other files (virtual and external datasets), these files follow, in the order in which the
+    dataset names them.
 
-    Of a file that is being written, or was when its writer died, only so many frames count, in their order,
-    and the values of all other datasets.
+    For a file that is being written, or whose writer was killed, the hash covers the first ``frames`` frames,
+    in their order, and the values of all other datasets.
     """
     if file.root.swmr_mode:
         with as_input_error(f"{file.path}: {dataset.name}"):
@@ -67,7 +67,7 @@ def fingerprint(file: Hdf5File, dataset: h5py.Dataset, origins: Mapping[Path, St
 
 
 def check_unchanged(origins: Mapping[Path, State]) -> None:
-    """Raise InputError if a file is no longer as it was when it was opened."""
+    """Raise InputError if a file has changed since it was opened."""
     for path, state in origins.items():
         with as_input_error(str(path)):
             _compare(path, path.stat(), state)
@@ -91,47 +91,47 @@ def _of_growing(file: Hdf5File, dataset: h5py.Dataset, frames: int) -> str:
     for chunk in sorted(chunks_of(dataset), key=lambda one: one.chunk_offset):
         if chunk.chunk_offset[0] < frames:
             stop = chunk.byte_offset + chunk.size
-            for taken in range(chunk.byte_offset + -before % _EVERY, stop, _EVERY):
-                size = min(_TAKEN, stop - taken)
+            for taken in range(chunk.byte_offset + -before % _HASH_INTERVAL, stop, _HASH_INTERVAL):
+                size = min(_HASH_LENGTH, stop - taken)
                 digest.update(os.pread(file.root.id.get_vfd_handle(), size, taken))
             before += chunk.size
     return digest.hexdigest()
 
 
 def modified(origins: Mapping[Path, State]) -> str:
-    """Return when the last of some files was written: ISO 8601, UTC, to the nanosecond."""
+    """Return when the most recently changed file was written: ISO 8601, UTC, to the nanosecond."""
     seconds, rest = divmod(max(changed for *_, changed in origins.values()), 10**9)
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest:09d}Z"
 
 
 def state_of(found: os.stat_result) -> State:
-    """Return what tells whether a file was changed."""
+    """Return the state of a file, which differs after a change."""
     return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
 
 
 def _parts(file: Hdf5File, dataset: h5py.Dataset) -> Iterator[tuple[Path, h5py.Dataset | None, Spans]]:
-    """Yield where samples lie: the files, each with a dataset there, or a raw one's begin and end."""
+    """Yield the files that contain samples, with their dataset, or the first byte and the end of raw data."""
     for source in dataset.virtual_sources() if dataset.is_virtual else ():
         yield from _parts(file, virtual_source(file, dataset, source))
     for name, offset, size in dataset.external or ():
-        raw = file.beside(dataset, name, f"the raw storage of {dataset.name}")
+        raw = file.sibling(dataset, name, f"the raw storage of {dataset.name}")
         yield raw, None, np.array([[offset, min(offset + size, raw.stat().st_size)]], np.int64)
     yield Path(dataset.file.filename), dataset, np.empty((0, 2), np.int64)
 
 
 def _stored(dataset: h5py.Dataset) -> Spans:
-    """Return where the samples that a dataset's own file holds begin and end."""
+    """Return the first byte and the end of the samples stored in a dataset's own file."""
     start = dataset.id.get_offset()
     if dataset.chunks and not dataset.is_virtual:
         chunks = [(chunk.byte_offset, chunk.size) for chunk in chunks_of(dataset)]
         return np.cumsum(np.array(chunks, np.int64).reshape(-1, 2), axis=1)
-    if start is None:  # in its header, or elsewhere
+    if start is None:  # in the object header, or in other files
         return np.empty((0, 2), np.int64)
     return np.array([[start, start + dataset.id.get_storage_size()]], np.int64)
 
 
 def _joined(parts: list[Spans]) -> Spans:
-    """Sort spans, and join those that touch or overlap."""
+    """Sort spans, and merge those that touch or overlap."""
     spans = np.concatenate([np.empty((0, 2), np.int64), *parts])
     spans = spans[np.argsort(spans[:, 0], kind="stable")]
     reach = np.maximum.accumulate(spans[:, 1])
@@ -140,11 +140,11 @@ def _joined(parts: list[Spans]) -> Spans:
 
 
 def _chosen(frames: Spans, size: int) -> Iterator[tuple[int, int]]:
-    """Yield which bytes of a file are taken: all between the frames, and some of them."""
+    """Yield the bytes of a file to hash: all between the frames, and some of the frames."""
     place = before = 0
     for start, stop in np.minimum(frames, size).tolist():
         yield place, start
-        for taken in range(start + -before % _EVERY, stop, _EVERY):
-            yield taken, min(taken + _TAKEN, stop)
+        for taken in range(start + -before % _HASH_INTERVAL, stop, _HASH_INTERVAL):
+            yield taken, min(taken + _HASH_LENGTH, stop)
         before, place = before + stop - start, stop
     yield place, size

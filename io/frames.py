@@ -1,4 +1,4 @@
-"""Other people's frames as sources that are read in order: folders of pictures, TIFF, videos."""
+"""Frames of other programs as sources that are read in order: folders of pictures, TIFF, videos."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, bloc
 from mirrorskin.io.url import is_zarr, path_of
 
 MCAP_SUFFIX = ".mcap"
-# OpenCV takes these from the environment only: no messages, and no frame of which the end is missing.
-# Playlists are not opened: they name other files, and addresses.
+# OpenCV reads these from the environment only: no messages, and no incomplete last frame.
+# Playlists are not opened, because they name other files and addresses.
 _CONTAINERS = "avi,mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,mpeg,mpegts,asf,flv,ogg,nut"
 _FFMPEG = {
     "OPENCV_FFMPEG_LOGLEVEL": "-8",
@@ -51,19 +51,19 @@ def open_frames(
     topic: str | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> FrameSequence | Recording:
-    """Open numbered pictures, a TIFF, a video, NumPy's arrays, a stack in Zarr, or ROS 2 messages in MCAP.
+    """Open numbered pictures, a TIFF, a video, NumPy arrays, a Zarr stack, or ROS 2 messages in MCAP.
 
     Parameters
     ----------
     path : str or Path
     header : Header
-        How the body moved, and what else holds for all frames.
+        The motion, and other properties of all frames.
     travel, phase : Positions or array_like, (T,), optional
-        Millimetres and radians, one a frame, or ``Steps``; an MCAP file may have them itself.
+        Millimetres and radians, one per frame, or ``Steps``; an MCAP file may contain them.
     topic : str, optional
-        That of the images, in an MCAP file of more than one.
+        Topic of the images, if an MCAP file has more than one.
     progress : callable, optional
-        Called with the number of frames of a video that were counted so far.
+        Called with the number of frames of a video counted so far.
 
     Returns
     -------
@@ -73,7 +73,7 @@ def open_frames(
     Raises
     ------
     InputError
-        The path holds no such frames, or travel or phase is missing or does not fit them.
+        The path contains no such frames, or travel or phase is missing or does not fit them.
 
     Examples
     --------
@@ -110,7 +110,7 @@ def open_frames(
 
 
 class FrameSequence(Closing, ABC):
-    """A source of other people's frames, read in order and rewindable."""
+    """A source of frames of another program, read in order and rewindable."""
 
     name: str
     header: Header
@@ -168,7 +168,7 @@ class FrameSequence(Closing, ABC):
         """Read the frames from number ``start`` on into the whole of ``out``."""
 
     def _along(self, given: ArrayLike | Positions | None) -> ArrayLike | None:
-        """Write out positions; of steps, a lost frame is one as well."""
+        """Return positions as numbers; with steps, lost frames count, too."""
         if isinstance(given, Steps):
             taken = np.arange(self.shape[0]) + np.cumsum(self._lost)
             return np.asarray(given.start + given.step * taken)
@@ -178,10 +178,10 @@ class FrameSequence(Closing, ABC):
 class Pictures(FrameSequence):
     """A stack of PNG or TIFF pictures, 8 or 16 bits or (TIFF) float32, as a source that can be rewound.
 
-    In a folder, the frames are the pictures whose names are alike but for one number, the last that differs,
-    and they come in its order: ``image2.png`` before ``image10.png``. Numbers may start anywhere; one that is
-    missing is a frame that was lost, so the block after it says ``dropped``. A TIFF's pages are in order.
-    Colour becomes grey as in ``read_picture``.
+    In a folder, the frames are the pictures whose names differ in one number only, the last that varies,
+    in the order of this number: ``image2.png`` before ``image10.png``. Numbers may start anywhere. A missing
+    number is a lost frame, which is counted in ``dropped`` of the next block. A TIFF's pages are in order.
+    Colour is converted to grey as in ``read_picture``.
     """
 
     def __init__(
@@ -228,7 +228,7 @@ class _Folder(NamedTuple):
 
 
 def _find_sequence(folder: Path) -> _Folder:
-    """Find the numbered pictures of a folder, in order, and how many are missing before each."""
+    """Find the numbered pictures of a folder, in order, and the number of missing ones before each."""
     try:
         files = sorted(file for file in folder.iterdir() if file.is_file())
     except OSError as error:
@@ -254,7 +254,7 @@ def _find_sequence(folder: Path) -> _Folder:
 
 
 def _families(files: list[Path]) -> dict[tuple[str, str], list[tuple[int, Path]]]:
-    """Group files by what stands before and after the last number in which some of them differ."""
+    """Group files by the text before and after the last number in which some of them differ."""
     places = {
         file: [
             (file.stem[: match.start()], int(match.group()), file.stem[match.end() :])
@@ -276,7 +276,7 @@ def _count_frames(path: Path) -> int:
     if not path.exists():
         raise InputError(f"{path}: there is no such file or folder")
     if path.suffix.lower() not in TIFF_SUFFIXES:
-        raise InputError(f"{path} is no stack of frames: name the folder that its pictures are in")
+        raise InputError(f"{path} is not a stack of frames: name the folder that contains its pictures")
     return count_pages(path)
 
 
@@ -288,10 +288,10 @@ def _kind(picture: NDArray[Any]) -> str:
 class Video(FrameSequence):
     """The frames of an AVI or MP4 as grey uint8, as a source that can be rewound.
 
-    The file is decoded once to count its frames, because what containers say is often wrong. Grey is the
-    luma of ITU-R BT.601 of what a player shows, in full range (0 to 255); a rotation that the file asks
-    for is applied, so ``shape`` is that of the upright picture. ``time`` is what the file says of each
-    frame, from the first; where that does not increase, the frame's number over the frame rate.
+    The file is decoded once to count its frames, because the number in the container is often wrong. Grey is
+    the luma of ITU-R BT.601 of the displayed picture, in full range (0 to 255); the rotation stored in the
+    file is applied, so ``shape`` is that of the upright picture. ``time`` is the time stamp of each frame
+    relative to the first; if these do not increase, it is computed from the frame rate.
     """
 
     def __init__(
@@ -339,7 +339,7 @@ class Video(FrameSequence):
                 raise InputError(f"{self._path} cannot be opened as a video: it is damaged, cut off, or none")
             size = [int(capture.get(one)) for one in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
             check_unpacked(3 * math.prod(size), f"{self._path}: a frame", "encode it in a smaller size")
-            # FFmpeg's tags of the deeper pixel formats end in the number of bits.
+            # The low-order digits of FFmpeg's tags of high-bit-depth formats are the number of bits.
             bits = int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) >> 24
             if 8 < bits <= 16:
                 raise InputError(
@@ -350,7 +350,7 @@ class Video(FrameSequence):
             return capture
 
     def _survey(self, progress: Callable[[int], None] | None) -> tuple[tuple[int, int, int], Floats | None]:
-        """Decode all frames once: how many, how large, and when."""
+        """Decode all frames once: their number, size, and times."""
         capture = self._open()
         stamps: list[float] = []
         with quiet_opencv() as cv2:

@@ -1,4 +1,4 @@
-"""HDF5 files: of unknown hands, whose links are followed and claims checked; and datasets to write."""
+"""Reading of HDF5 files from any source, with checked links and sizes; and datasets to write."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ Node: TypeAlias = "h5py.Group | h5py.Dataset | h5py.Datatype"
 Shape = tuple[int, ...]
 
 VALUES_LIMIT = MAX_UNPACKED_BYTES
-"""Bytes that everything but the frames of one file may take in memory, unpacked.
+"""Limit of the memory for everything but the frames of one file, unpacked, in bytes.
 
 It applies to HDF5 and Zarr: maps, texts, attributes and process values together. A larger file may take as
-many bytes as it has itself, and ``memory_limit`` raises the limit.
+many bytes as its own size, and ``memory_limit`` raises the limit.
 """
 
 _LINKS_DEEP = 16
-_MOST_STEPS = 100_000  # along links, and to the sources of virtual datasets
+_MOST_STEPS = 100_000  # through links, and to the sources of virtual datasets
 _GROUPS_DEEP = 64
-_MOST_OBJECTS = 20_000  # groups and datasets of a file
-_MOST_NAMES = 10_000  # in a group whose members are all read
+_MOST_OBJECTS = 20_000  # groups and datasets in a file
+_MOST_NAMES = 10_000  # members of a group that is read as a whole
 
 
 class Hdf5File(Closing):
-    """An HDF5 file to read, and the files in its own folder that it refers to."""
+    """An HDF5 file opened for reading, and the files in its folder that it refers to."""
 
     def __init__(self, path: Path, memory_limit: int | None = None, root: h5py.File | None = None) -> None:
         self.path = path
@@ -50,11 +50,11 @@ class Hdf5File(Closing):
         self._files: dict[str, h5py.File] = {real: self.root}
         self._groups: dict[str, Node | None] = {"": self.root}
         self._steps = self._spent = 0
-        # Files whose texts of variable length can be read, and how many bytes their longest text has.
+        # Files whose variable-length texts were checked, with the length of their longest text in bytes.
         self._longest_text: dict[bytes, int] = {}
 
     def close(self) -> None:
-        """Close the file and those it refers to."""
+        """Close the file and the files it refers to."""
         for file in self._files.values():
             file.close()
 
@@ -64,7 +64,7 @@ class Hdf5File(Closing):
         return f"{self.path if filename == self.root.filename else filename}: {node.name}"
 
     def find(self, name: str) -> Node | None:
-        """Return an object, or None where it is simply not there."""
+        """Return an object, or None if it does not exist."""
         if name in self._groups:
             return self._groups[name]
         group, _, last = name.rpartition("/")
@@ -74,14 +74,14 @@ class Hdf5File(Closing):
         return None if parent is None else self.walk(parent, last)
 
     def follow(self, name: str, remedy: str) -> Node:
-        """Return an object; one that is not there raises InputError with the remedy."""
+        """Return an object; raise InputError with the remedy if it does not exist."""
         node = self.find(name)
         if node is None:
             raise InputError(f"{self.path}: there is no {name}: {remedy}")
         return node
 
     def names(self, group: str) -> list[str]:
-        """Return the names in a group; none where there is no such group."""
+        """Return the names in a group; none if the group does not exist."""
         node = self.find(group)
         with as_input_error(f"{self.path}: {group}"):
             if not isinstance(node, h5py.Group):
@@ -94,11 +94,11 @@ class Hdf5File(Closing):
             return list(node)
 
     def marked(self, mark: str, group: str = "/entry") -> bool:
-        """Tell whether a file is one of ours: whether its entry, or that group, has a certain attribute."""
+        """Return whether mirrorskin wrote a file: whether its entry, or the given group, has an attribute."""
         return self.attribute(group, mark) is not None
 
     def check_layout(self, mark: str, known: int = 1) -> None:
-        """Raise InputError if a file of ours is laid out as nobody knew when this was written."""
+        """Raise InputError if the layout of a file is newer than the latest that this version reads."""
         layout = self.attribute("/entry", mark)
         if isinstance(layout, int) and layout > known:
             raise InputError(f"{self.path} is of layout {layout}, where {known} is read: update the program")
@@ -121,15 +121,15 @@ class Hdf5File(Closing):
             return self._values(h5py.h5a.open(node.id, attribute.encode()))
 
     def objects(self) -> Iterator[tuple[str, Node]]:
-        """Yield the groups and datasets of the file itself: the name and the object, in order of names.
+        """Yield the groups and datasets of the file itself, each with its name, in order of names.
 
-        Each object comes once. Soft and external links are not followed.
+        Each object is yielded once. Soft and external links are not followed.
         """
         with as_input_error(str(self.path)):
             yield from walk_objects(self.root, str(self.path))
 
     def stacks(self) -> dict[str, str]:
-        """Return the three-dimensional datasets of the file itself: their names, sizes and types."""
+        """Return the three-dimensional datasets of the file itself, with their sizes and types."""
         with as_input_error(str(self.path)):
             found = {
                 name: f"{' x '.join(map(str, node.shape))} {node.dtype}"
@@ -139,11 +139,11 @@ class Hdf5File(Closing):
         return dict(sorted(found.items()))
 
     def check_frames(self, stack: h5py.Dataset, count: int) -> None:
-        """Refuse frames that HDF5 could not deliver, or would make up."""
+        """Refuse frames that HDF5 cannot read, or would replace by fill values."""
         check_storage(self, stack, frames=count)
 
     def storage(self, stack: h5py.Dataset) -> str:
-        """Tell how a stack is stored, for people."""
+        """Return a description of how a stack is stored."""
         return describe_storage(stack)
 
     def read(
@@ -155,7 +155,7 @@ class Hdf5File(Closing):
         rows: int | None = None,
         mapped: bool = False,
     ) -> NDArray[Any]:
-        """Read numbers, once it is sure that they are there; ``mapped``: when they are used."""
+        """Read numbers after checking that they are stored; ``mapped``: they are read when they are used."""
         remedy = remedy and f": {remedy}"
         with as_input_error(lambda: self.where(node)):
             if not isinstance(node, h5py.Dataset) or node.id.dtype.kind not in "iufb":
@@ -176,16 +176,16 @@ class Hdf5File(Closing):
         return values * conversion_factor(given, unit, self.where(node))
 
     def load(self, node: h5py.Dataset, rows: int | None = None) -> NDArray[Any]:
-        """Read a dataset, or its first rows, if all of it is there and within `VALUES_LIMIT`.
+        """Read a dataset, or its first rows, if it is completely stored and within `VALUES_LIMIT`.
 
-        Every dataset but the frames is read here, also one that holds a single text.
+        Every dataset but the frames is read by this method, including single texts.
         """
         check_storage(self, node, frames=rows)
         with as_input_error(lambda: self.where(node)):
             return self._values(node.id, rows)
 
     def _map(self, node: h5py.Dataset) -> NDArray[Any] | None:
-        """Map a dataset that is stored in one piece; None for any other."""
+        """Map a contiguous dataset into memory; None for any other."""
         check_storage(self, node)
         with as_input_error(lambda: self.where(node)):
             offset = node.id.get_offset()
@@ -194,7 +194,7 @@ class Hdf5File(Closing):
             return np.memmap(node.file.filename, node.dtype, "r", offset, node.shape)
 
     def value(self, node: Node) -> Any:
-        """Read one text or number, alone or in an array of one."""
+        """Read a single text or number, alone or in an array of one."""
         with as_input_error(lambda: self.where(node)):
             if not isinstance(node, h5py.Dataset) or node.id.shape not in ((), (1,)):
                 raise InputError(
@@ -210,9 +210,9 @@ class Hdf5File(Closing):
         return tuple(str(first_value(text)) for text in self.load(node))
 
     def walk(self, node: Node, name: str, depth: int = 0) -> Node | None:
-        """Do what ``find`` does, from any object on and after so many links."""
+        """Do what ``find`` does, starting at any object, after ``depth`` links."""
         if depth > _LINKS_DEEP:
-            raise InputError(f"{self.where(node)}: its links go round in a circle; name a dataset itself")
+            raise InputError(f"{self.where(node)}: its links form a cycle; name the dataset itself")
         for part in name.split("/"):
             if part not in ("", "."):
                 following = self._step(node, part, depth)
@@ -221,22 +221,24 @@ class Hdf5File(Closing):
                 node = following
         return node
 
-    def open_beside(self, node: Node, filename: str, what: str) -> h5py.File:
+    def open_sibling(self, node: Node, filename: str, what: str) -> h5py.File:
         """Open a file that an object refers to."""
-        path = self.beside(node, filename, what)
+        path = self.sibling(node, filename, what)
         real = os.path.realpath(path)
         if real not in self._files:
             with as_input_error(str(path)):
                 self._files[real] = _open_file(path, real)
         return self._files[real]
 
-    def beside(self, node: Node, filename: str, what: str) -> Path:
-        """Return the file that an object refers to if it lies in the recording's own folder, else raise."""
+    def sibling(self, node: Node, filename: str, what: str) -> Path:
+        """Return the file that an object refers to, which must be in the recording's own folder."""
         what = f"{self.path}: {what}"
         with as_input_error(what):
             target = Path(os.path.realpath(Path(node.file.filename).parent / filename))
             if not target.is_relative_to(self._home):
-                raise InputError(f"{what} leads out of its folder, to {filename}: copy that file beside it")
+                raise InputError(
+                    f"{what} leads out of its folder, to {filename}: copy that file into its folder"
+                )
             if not target.is_file():
                 problem = "is not a regular file" if target.exists() else "does not exist"
                 raise InputError(f"{what} leads to {filename}, which {problem}: copy it there")
@@ -245,7 +247,7 @@ class Hdf5File(Closing):
     def _values(self, node: h5py.h5d.DatasetID | h5py.h5a.AttrID, rows: int | None = None) -> NDArray[Any]:
         """Read a dataset or an attribute, or its first rows, in a third of the time that h5py takes.
 
-        ValueError if HDF5 would crash, hang, or need more memory than there is.
+        ValueError if HDF5 would crash, hang, or need too much memory.
         """
         kind, shape = node.dtype, node.shape if rows is None else (rows, *node.shape[1:])
         size = math.prod(shape) * kind.itemsize
@@ -264,9 +266,9 @@ class Hdf5File(Closing):
         return values
 
     def _check_text(self, node: h5py.h5d.DatasetID | h5py.h5a.AttrID, text: Any, size: int) -> int:
-        """Return the most bytes that texts outside of a dataset or an attribute can take.
+        """Return the largest size of the texts stored outside of a dataset or an attribute, in bytes.
 
-        ValueError if this is not text, does not end, or is longer than its file.
+        ValueError if it is not text, does not end, or is longer than its file.
         """
         if text is None:
             raise ValueError("neither numbers nor text")
@@ -276,7 +278,7 @@ class Hdf5File(Closing):
         if text.length is not None:
             return 0
         if isinstance(node, h5py.h5d.DatasetID) and node.get_create_plist().get_layout() == h5py.h5d.VIRTUAL:
-            # HDF5 would read it from the heaps of other files, which are not checked.
+            # HDF5 would read them from the heaps of other files, which are not checked.
             raise ValueError("texts of any length in a virtual dataset")
         if (name := h5py.h5f.get_name(opened)) not in self._longest_text:
             self._longest_text[name] = _check_heaps(h5py.File(opened))
@@ -284,9 +286,9 @@ class Hdf5File(Closing):
         return int(math.prod(node.shape)) * self._longest_text[name]
 
     def spend(self, size: int) -> None:
-        """Count bytes of values that are read; InputError above `VALUES_LIMIT`."""
+        """Count the bytes of values that are read; InputError above `VALUES_LIMIT`."""
         self._spent += size
-        if self._spent <= VALUES_LIMIT:  # nearly always
+        if self._spent <= VALUES_LIMIT:  # the usual case
             return
         most = max(self.memory_limit or 0, self.root.id.get_filesize(), VALUES_LIMIT)
         if self._spent > most:
@@ -296,11 +298,11 @@ class Hdf5File(Closing):
             )
 
     def count_step(self, node: Node) -> None:
-        """Raise InputError if a file leads from place to place without end."""
+        """Raise InputError if links lead from object to object without end."""
         self._steps += 1
         if self._steps > _MOST_STEPS:
             raise InputError(
-                f"{self.where(node)}: its links lead on and on; copy the frames into one dataset"
+                f"{self.where(node)}: it is reached through too many links; copy the frames into one dataset"
             )
 
     def _step(self, node: Node, part: str, depth: int) -> Node | None:
@@ -314,7 +316,7 @@ class Hdf5File(Closing):
             link = node.get(part, getlink=True)
         start = node
         if isinstance(link, h5py.ExternalLink):
-            start = self.open_beside(node, link.filename, f"the external link {part} in {node.name}")
+            start = self.open_sibling(node, link.filename, f"the external link {part} in {node.name}")
         elif link.path.startswith("/"):
             start = node.file
         target = self.walk(start, link.path, depth + 1)
@@ -324,14 +326,14 @@ class Hdf5File(Closing):
 
 
 def _open(group: h5py.Group, name: bytes) -> Node:
-    """Open what a hard link leads to, in a third of the time of h5py's own way."""
+    """Open the target of a hard link, in a third of the time that h5py takes."""
     node = h5py.h5o.open(group.id, name)
     if isinstance(node, h5py.h5g.GroupID):
         return h5py.Group(node)
     if not isinstance(node, h5py.h5d.DatasetID):
         return h5py.Datatype(node)
     if node.get_offset() is None and node.get_create_plist().get_external_count():
-        # HDF5 looks for raw files in the working directory, unless the first opening says otherwise.
+        # HDF5 looks for raw files in the working directory, unless the first opening specifies a folder.
         del node
         access = h5py.h5p.create(h5py.h5p.DATASET_ACCESS)
         access.set_efile_prefix(b"${ORIGIN}")
@@ -340,7 +342,7 @@ def _open(group: h5py.Group, name: bytes) -> Node:
 
 
 def first_value(value: Any) -> Any:
-    """Return a text or a number without its array, bytes or NumPy type."""
+    """Return a text or a number, without array, bytes or NumPy type."""
     if isinstance(value, np.ndarray):
         value = value.reshape(-1)[0]
     if isinstance(value, bytes):
@@ -356,14 +358,14 @@ def _open_file(path: Path, real: str) -> h5py.File:
             f"{path} is a folder: an HDF5 file is needed; 'mirrorskin import' reads picture folders"
         )
     if not path.is_file():
-        raise InputError(f"{path} is no regular file: save what it gives in one first")
+        raise InputError(f"{path} is not a regular file: save what it gives in one first")
     try:
         return h5py.File(real, "r")
     except OSError as error:
         with path.open("rb"):
             pass
         if is_flagged(error):
-            # It may be read while it is written, or its writer died: a lock tells which, so none is taken.
+            # It is being written, or its writer was killed; its lock shows which. Read it without a lock.
             with suppress(OSError):
                 return h5py.File(real, "r", swmr=True, locking=False)
         if h5py.is_hdf5(path):
@@ -374,16 +376,16 @@ def _open_file(path: Path, real: str) -> h5py.File:
 
 
 _HEAP = re.compile(rb"GCOL\x01\0\0\0")  # its signature, version and reserved bytes
-_HEAD = 16  # bytes at the begin of a heap, and of each of its objects
-_BULK = 1 << 16  # bytes of a dataset that is not looked through
-_SMALL = 1 << 20  # bytes of a file that are looked through in less time than its datasets are found
+_HEAD = 16  # bytes at the start of a heap, and of each of its objects
+_BULK = 1 << 16  # bytes; larger datasets are not searched for heaps
+_SMALL = 1 << 20  # bytes; smaller files are searched completely, which is faster than finding their datasets
 
 
 def _check_heaps(file: h5py.File) -> int:
-    """Return the bytes of the longest text of variable length in a file.
+    """Return the length in bytes of the longest variable-length text in a file.
 
-    ValueError if a heap of such texts does not end, which HDF5 would read for ever. See "Global Heap" in
-    HDF5's file format specification.
+    ValueError if a heap of such texts does not end: HDF5 would never return from reading it. See "Global
+    Heap" in the HDF5 file format specification.
     """
     longest = 0
     with Path(file.filename).open("rb") as opened, mmap(opened.fileno(), 0, access=ACCESS_READ) as data:
@@ -397,7 +399,7 @@ def _check_heaps(file: h5py.File) -> int:
 
 
 def _check_heap(data: mmap, start: int) -> int:
-    """Return the bytes of the longest object of a heap."""
+    """Return the size in bytes of the longest object of a heap."""
     longest = 0
     _, size = struct.unpack_from("<8sQ", data, start)
     at, stop = start + _HEAD, min(start + size, len(data))
@@ -412,7 +414,7 @@ def _check_heap(data: mmap, start: int) -> int:
 
 
 def _bulk(file: h5py.File) -> list[tuple[int, int]]:
-    """Return where large datasets are stored in a file, none of which is a heap: first byte and end."""
+    """Return the first byte and the end of large datasets in a file, which contain no heaps."""
     places: list[tuple[int, int]] = []
     for _, node in walk_objects(file, file.filename):
         if not isinstance(node, h5py.Dataset) or node.id.get_storage_size() < _BULK:
@@ -428,7 +430,7 @@ def _bulk(file: h5py.File) -> list[tuple[int, int]]:
 def walk_objects(file: h5py.File, path: str) -> Iterator[tuple[str, Node]]:
     """Yield the groups and datasets of a file in order of names, each once; links are not followed.
 
-    Each object is opened from its group: from the root, as h5py does, deep groups take quadratic time.
+    Each object is opened from its group. Opening it from the root, as h5py does, is quadratic in the depth.
     """
     waiting: list[tuple[str, int, h5py.Group, bytes]] = []
     seen = {_address(file["/"])}
@@ -468,7 +470,7 @@ _VIRTUAL_DEEP = 4
 
 
 def check_storage(file: Hdf5File, dataset: h5py.Dataset, depth: int = 0, frames: int | None = None) -> None:
-    """Refuse a dataset that HDF5 could not deliver, or would make up with fill values."""
+    """Refuse a dataset that HDF5 cannot read, or would replace by fill values."""
     if depth > _VIRTUAL_DEEP:
         where = file.where(dataset)
         raise InputError(f"{where}: virtual datasets are nested too deeply; copy the frames into one dataset")
@@ -493,7 +495,7 @@ def check_storage(file: Hdf5File, dataset: h5py.Dataset, depth: int = 0, frames:
 
 
 def describe_storage(dataset: h5py.Dataset) -> str:
-    """Tell how a dataset is stored, for people."""
+    """Return a description of how a dataset is stored."""
     if dataset.is_virtual:
         return "virtual"
     if dataset.chunks is None:
@@ -503,7 +505,7 @@ def describe_storage(dataset: h5py.Dataset) -> str:
 
 
 def chunks_of(dataset: h5py.Dataset) -> list[h5py.h5d.StoreInfo]:
-    """Return the chunks that a dataset has: where each lies in the stack and in the file."""
+    """Return the stored chunks of a dataset: the position of each in the stack and in the file."""
     found: list[h5py.h5d.StoreInfo] = []
     dataset.id.chunk_iter(found.append)
     return found
@@ -518,14 +520,14 @@ def _filters(dataset: h5py.Dataset) -> list[tuple[int, str]]:
 def _check_filters(dataset: h5py.Dataset, where: str, memory_limit: int | None) -> None:
     filters = _filters(dataset)
     if not all(h5py.h5z.filter_avail(code) for code, _ in filters):
-        import hdf5plugin  # noqa: F401  # which registers bitshuffle, blosc and others with HDF5
+        import hdf5plugin  # noqa: F401  # registers bitshuffle, blosc and others with HDF5
     for code, name in filters:
         if not h5py.h5z.filter_avail(code):
             raise InputError(
                 f"{where} is packed with filter {code} ({name or 'unnamed'}), which is not installed: "
                 "install its HDF5 plugin and name its folder in HDF5_PLUGIN_PATH"
             )
-    # A frame needs room in any case, however it is packed.
+    # A single frame must fit into memory in any case.
     several = filters and dataset.ndim > 2 and dataset.chunks[0] > 1
     size = math.prod(dataset.chunks or ()) * dataset.dtype.itemsize
     if several and memory_limit is not None and size > memory_limit:
@@ -536,27 +538,27 @@ def _check_filters(dataset: h5py.Dataset, where: str, memory_limit: int | None) 
 
 
 def _bytes_held(file: Hdf5File, dataset: h5py.Dataset, depth: int) -> int:
-    """Return what there is of a dataset that lies elsewhere, in its header, or nowhere yet."""
+    """Return the stored size of a dataset in other files, in the object header, or not yet allocated."""
     if dataset.is_virtual:
         elements = sum(_mapped(file, dataset, part, depth) for part in dataset.virtual_sources())
         return elements * int(dataset.dtype.itemsize)
     if dataset.external:
         what = f"the raw storage of {dataset.name}"
-        parts = [(file.beside(dataset, name, what), offset, size) for name, offset, size in dataset.external]
+        parts = [(file.sibling(dataset, name, what), offset, size) for name, offset, size in dataset.external]
         return sum(min(size, max(0, path.stat().st_size - offset)) for path, offset, size in parts)
     return int(dataset.id.get_storage_size())
 
 
 def virtual_source(file: Hdf5File, dataset: h5py.Dataset, part: Any) -> h5py.Dataset:
-    """Return the dataset that a part of a virtual one comes from; InputError if it is not there."""
+    """Return the source of a part of a virtual dataset; InputError if it does not exist."""
     what = f"the virtual dataset {dataset.name}"
     file.count_step(dataset)
     if any(pattern in f"{part.file_name} {part.dset_name}" for pattern in ("%b", "%%")):
-        # HDF5 replaces these and opens files of other names than those checked here.
+        # HDF5 replaces these patterns, and would open other files than those checked here.
         raise InputError(
             f"{file.path}: {what} names its sources by a pattern; copy the frames into one dataset"
         )
-    origin = dataset.file if part.file_name == "." else file.open_beside(dataset, part.file_name, what)
+    origin = dataset.file if part.file_name == "." else file.open_sibling(dataset, part.file_name, what)
     source = file.walk(origin, part.dset_name)
     if not isinstance(source, h5py.Dataset):
         raise InputError(f"{file.where(dataset)} needs {part.dset_name} of {part.file_name}: it is not there")
@@ -564,9 +566,9 @@ def virtual_source(file: Hdf5File, dataset: h5py.Dataset, part: Any) -> h5py.Dat
 
 
 def _mapped(file: Hdf5File, dataset: h5py.Dataset, part: Any, depth: int) -> int:
-    """Return how many elements of a virtual dataset one of its sources holds."""
+    """Return the number of elements of a virtual dataset that one of its sources contains."""
     source = virtual_source(file, dataset, part)
-    if source.external:  # HDF5 would look for the raw files in the working directory
+    if source.external:  # HDF5 would look for them in the working directory
         raise InputError(
             f"{file.where(dataset)} has sources in raw files, {source.name}; copy the frames into one dataset"
         )
@@ -584,7 +586,7 @@ def _mapped(file: Hdf5File, dataset: h5py.Dataset, part: Any, depth: int) -> int
 
 
 def read_process(file: Hdf5File, place: str, names: Iterable[str] | None = None) -> dict[str, ProcessValue]:
-    """Read how something came about, or only some of that; what is not there is missing."""
+    """Read the process values of a file, or only some of them; missing ones are left out."""
     group = file.find(place)
     wanted = file.names(place) if names is None else names
     found = {} if group is None else {name: file.walk(group, name) for name in wanted}

@@ -1,4 +1,4 @@
-"""Our layout of a recording: where its header, positions, state and truth lie, and how they are read."""
+"""Layout of a recording: the names of its header, positions, state and truth, and how they are read."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ MARK = "mirrorskin_recording"
 STACK = "/entry/instrument/detector/data"
 DETECTOR, STAGE, TRUTH = "/entry/instrument/detector", "/entry/instrument/stage", "/entry/truth"
 TRUTH_MAPS = tuple(field.name for field in fields(Truth))
-"""What the truth of a simulation contains."""
+"""Contents of the truth of a simulation."""
 
-# What is known of each frame: where that is written, and in what unit.
+# Values of each frame: name of the dataset, and unit.
 SERIES = {
     "time": (f"{DETECTOR}/frame_time", "s"),
     "travel": (f"{STAGE}/travel", "mm"),
@@ -33,11 +33,11 @@ SERIES = {
     "twist": (f"{STAGE}/twist", "rad"),
     "tilt": (f"{STAGE}/tilt", "rad"),
 }
-# Of recordings that are written while frames come: the positions as they were known then, whether a frame
-# was used, how many were lost before it, and whether all is well.
+# Datasets of recordings that are written live: the positions estimated when the frames arrived, whether a
+# frame was used, the number of frames lost before it, and the state of the recording.
 LIVE = {name: (f"{place}_live", unit) for name, (place, unit) in SERIES.items() if name != "time"}
 USED, DROPPED, STATE = f"{DETECTOR}/used", f"{DETECTOR}/dropped", "/entry/state"
-# The CRC-32 of each frame's bytes, as it was recorded.
+# The CRC-32 of each frame's bytes when it was recorded.
 CHECKSUM = f"{DETECTOR}/frame_checksum"
 UNDER_WAY, COMPLETE, CUT_SHORT = "under way", "complete", "cut short: "
 
@@ -48,32 +48,32 @@ POSITIONS: dict[Motion, str] = {
     "horizontal": "displacement",
     "twist": "twist",
 }
-"""Which series says where the body was, of each motion."""
+"""The series that contains the positions, for each motion."""
 
 _REMEDIES = {"travel": "give --travel-step or --travel", "phase": "give --phase-step or --phases"}
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingState:
-    """How far a recording has come, and what a live run did with its frames.
+    """State of a recording, and the frames used by a live run.
 
-    While it is written, frames and what is known of each grow one after the other: ``count`` frames are known
-    in full. ``state`` is "under way", "complete", or "cut short: " and why.
+    While it is written, the frames and the values of each frame grow one after the other: ``count`` frames
+    are complete. ``state`` is "under way", "complete", or "cut short: " and the reason.
     """
 
     count: int
     state: str = COMPLETE
     used: NDArray[np.bool_] | None = None  # whether a live reconstruction used a frame
-    dropped: NDArray[np.int32] | None = None  # how many frames were lost before a frame
+    dropped: NDArray[np.int32] | None = None  # number of frames lost before a frame
 
     def of(self, frames: slice | NDArray[np.intp]) -> RecordingState:
-        """Return what is known of some frames."""
+        """Return the state of some frames."""
         used = None if self.used is None else self.used[frames]
         return replace(self, used=used, dropped=None if self.dropped is None else self.dropped[frames])
 
 
 def read_state(file: Hdf5File, ours: bool, stack: h5py.Dataset) -> RecordingState:
-    """Read how far a recording has come; stacks of other programs are complete."""
+    """Read the state of a recording; stacks of other programs are complete."""
     node = file.find(STATE) if ours else None
     if node is None:
         return RecordingState(int(stack.shape[0]))
@@ -96,12 +96,12 @@ def _grows(node: Node | None) -> TypeGuard[h5py.Dataset]:
 
 
 def _width(name: str) -> Shape:
-    """Return how many numbers a series has of each frame, as further dimensions."""
+    """Return the shape of one row of a series: () or (2,)."""
     return (2,) if name == "displacement" else ()
 
 
 class Layout:
-    """What a file says of a part of its stack; of a file that is not ours, nothing."""
+    """Reader of the properties of a part of a stack; for a file of another program there are none."""
 
     def __init__(self, file: Hdf5File, ours: bool, shape: tuple[int, int, int], part: Selection) -> None:
         self._file, self._ours, self._part = file, ours, part
@@ -114,18 +114,20 @@ class Layout:
         pixel_size: tuple[float, float] | None,
         override_motion: bool = False,
     ) -> Header:
-        """Read what holds for the whole stack; what is given need not be there."""
+        """Read the properties of the whole stack; those that are given may be missing."""
         own = self._text(f"{STAGE}/motion")
         if motion and own in MOTIONS and own != motion and not override_motion:
             raise InputError(
-                f"{self._file.path} says its motion is {own}, --motion says {motion}: leave --motion out,"
+                f"{self._file.path} states the motion {own}, but --motion is {motion}: leave --motion out,"
                 " or correct the file"
             )
         motion = motion or cast(Motion, own)
         if motion not in MOTIONS:
-            problem = f"says the motion {motion!r}" if motion else "does not say how the sensor moved"
+            problem = (
+                f"states the unknown motion {motion!r}" if motion else "does not state how the sensor moved"
+            )
             raise InputError(f"{self._file.path} {problem}: give --motion, one of {', '.join(MOTIONS)}")
-        # Of a vertical press the travel is no press but the positions.
+        # In a vertical press the dataset "travel" contains the positions, not the press.
         pressed = "vertical" not in (own, motion)
         pixel_size = self._pixel_size() if pixel_size is None else self._above_zero(pixel_size)
         return Header(
@@ -144,7 +146,7 @@ class Layout:
         )
 
     def positions(self, motion: Motion, given: ArrayLike | None) -> dict[str, Floats | None]:
-        """Read when each frame was taken, and where the body was; travel or phase may be given; check it."""
+        """Read and check the times and positions of the frames; travel or phase may be given."""
         name, time = POSITIONS[motion], self._cut(self._series("time"))
         if name not in _REMEDIES:
             return {"time": time, name: self._cut(self._series(name))}
@@ -152,14 +154,16 @@ class Layout:
         given = self._series(name, remedy=_REMEDIES[name]) if given is None else given
         if given is None:
             remedy = _REMEDIES[name]
-            raise InputError(f"{self._file.path} does not say where the body was in each frame: {remedy}")
+            raise InputError(
+                f"{self._file.path} does not state the position of the body in each frame: {remedy}"
+            )
         found = {"time": time, name: check_finite(given, self._count, where, self._part.frames)}
         pressed = self._text(f"{STAGE}/motion") != "vertical"
         also = ("tilt", "travel") if motion == "axial" and pressed else ()
         return found | {one: self._each(one) for one in also}
 
     def live(self, motion: Motion, chosen: NDArray[np.intp]) -> dict[str, Floats | None]:
-        """Read when some frames of the part were taken, and where a live run thought the body to be then."""
+        """Read the times of some frames of the part, and the positions that a live run used."""
         name = POSITIONS[motion]
         known = [name, "tilt"] if motion == "axial" and self._is_of_each("tilt") else [name]
         time = self._cut(self._series("time"))
@@ -173,7 +177,7 @@ class Layout:
         return found
 
     def truth(self) -> Truth | None:
-        """Read what a simulation knew, if it was one."""
+        """Read the truth of a simulation, if there is one."""
         found = {name: self._find(f"{TRUTH}/{name}") for name in TRUTH_MAPS}
         present = {name: node for name, node in found.items() if node is not None}
         if not present:
@@ -184,8 +188,8 @@ class Layout:
         return Truth(**{name: self._known(name, node) for name, node in present.items()})
 
     def _known(self, name: str, node: Node) -> NDArray[Any]:
-        """Read one part of the truth: a series of frames, or a map."""
-        unit = None if name in TWIST else declaration_of(name).unit or None  # that of a twist differs
+        """Read one part of the truth: a series, or a map."""
+        unit = None if name in TWIST else declaration_of(name).unit or None  # the unit differs for a twist
         if name == "force":
             forces = self._file.read(node, (self._count, 3), unit=unit)
             return forces[slice(*self._part.frames)].astype(np.float64, copy=False)
@@ -202,7 +206,7 @@ class Layout:
     def _series(
         self, name: str, places: Mapping[str, tuple[str, str]] = SERIES, remedy: str = ""
     ) -> Floats | None:
-        """Read what there is one of a frame; while a recording is written, there may be more already."""
+        """Read a series; while a recording is written, it may be longer than needed."""
         place, unit = places[name]
         rows = self._count if self._find(STATE) is not None else None
         return self._read(place, (self._count, *_width(name)), unit=unit, remedy=remedy, rows=rows)
@@ -213,7 +217,7 @@ class Layout:
             return None
         if x is None or y is None:
             raise InputError(
-                f"{self._file.path} says the size of its pixels only along one axis: give --pixel-size"
+                f"{self._file.path} states the pixel size along one axis only: give --pixel-size"
             )
         return self._above_zero((x, y))
 
@@ -237,12 +241,12 @@ class Layout:
         return np.ascontiguousarray(values[self._part.region.slices])
 
     def _one(self, name: str, remedy: str) -> float | None:
-        """Read a number of all frames; None if there is one of each."""
+        """Read a number that applies to all frames; None if there is one for each frame."""
         place, unit = SERIES[name]
         return None if self._is_of_each(name) else self._scalar(place, unit, remedy)
 
     def _each(self, name: str) -> Floats | None:
-        """Read a number of each frame of the part, if that is what there is."""
+        """Read a number for each frame of the part, if there is one for each."""
         values = self._series(name) if self._is_of_each(name) else None
         where = f"{self._file.path}: {SERIES[name][0]}"
         return None if values is None else check_finite(values, self._count, where, self._part.frames)
@@ -252,7 +256,7 @@ class Layout:
         return isinstance(node, h5py.Dataset) and (_grows(node) or (node.size or 0) > 1)
 
     def _pivot(self, pixel_size: tuple[float, float] | None) -> tuple[float, float, float] | None:
-        """Read the pivot, and place it from the centre of the region."""
+        """Read the pivot, and convert it to a position relative to the centre of the region."""
         values = self._finite(f"{STAGE}/pivot", (3,), unit="mm")
         if values is None:
             return None
@@ -271,7 +275,7 @@ class Layout:
         return values
 
     def _read(self, name: str, *shapes: Shape, **how: Any) -> Floats | None:
-        """Read numbers as float64, if they are there; see `Hdf5File.read`."""
+        """Read numbers as float64 if they exist; see `Hdf5File.read`."""
         values = self._numbers(name, *shapes, **how)
         return None if values is None else values.astype(np.float64, copy=False)
 

@@ -1,7 +1,7 @@
 """The quantities that a result can contain: each is declared once, here or by a user's own operation.
 
-Files, exports, figures, reports, notebooks, undistortion and the documentation derive what they need to know
-of a map from its declaration.
+Files, exports, figures, reports, notebooks, undistortion and the documentation are derived from these
+declarations.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from mirrorskin.io.types import InputError
 from mirrorskin.io.units import ratio
 
 SIGMA = "_sigma"
-"""What the name of a map's standard deviation ends in."""
+"""Suffix of the name of a map's standard deviation."""
 
 LONGEST_DECLARATION = 60_000
-"""Bytes of a declaration in a file: an attribute in HDF5 has at most 64 kB."""
+"""Limit of the size of a declaration in a file: attributes in HDF5 have at most 64 kB."""
 
 Axes = Literal["pixels", "frames", "pieces", "none"]
 Sampling = Literal["linear", "nearest", "angle", "direction"]
@@ -31,7 +31,7 @@ Colours = Literal["sequential", "positive", "signed", "error"]
 
 _DTYPES = (*("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64"), "float32", "float64")
 _MOST_CODES = 255
-_DISPLAYED = {"rad": "deg"}  # units of figures, unless a declaration names another
+_DISPLAYED = {"rad": "deg"}  # units of figures, unless a declaration specifies another
 
 
 class Map(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
@@ -52,38 +52,38 @@ class Map(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields
     codes : mapping of int to str
         Legend of a categorical map.
     undefined : float or None
-        The value that marks a pixel without an answer; None is NaN.
+        The value that marks an undefined pixel; None is NaN.
     quantity : str
-        Name of the map in the table that this one stands for: a map of quantity ``"height"`` is a result's
-        `height` for everything that consumes heights.
+        Name of the map in the table that this one stands for: a map of quantity ``"height"`` is used as the
+        `height` of a result wherever heights are needed.
     sampling : {"linear", "nearest", "angle", "direction"}
-        How the map is interpolated when the picture is undistorted: between pixels, by the nearest pixel, the
-        short way round the circle, or as unit vectors. Integers are always sampled at the nearest pixel.
+        How the map is interpolated when the picture is undistorted: linearly between pixels, by the nearest
+        pixel, the shorter way around the circle, or as unit vectors. Integers use the nearest pixel.
     within : str
-        The label map across whose borders nothing is interpolated; by default that of the quantity, or
+        The label map across whose borders the map is not interpolated; by default that of the quantity, or
         ``"contact"``.
     per_frame : bool
-        Whether a result may have the map of each frame, with a leading axis (T, H, W).
+        Whether a result may contain the map for each frame, with a leading axis (T, H, W).
     title : str
         Title of the figure; by default the name.
     colours : {"sequential", "positive", "signed", "error"}
-        Colours of the figure: sequential, the same with a logarithmic scale where the values span decades,
+        Colours of the figure: sequential, the same with a logarithmic scale if the values span decades,
         diverging about zero, or those of standard deviations. Angles have cyclic colours.
     displayed : str
         Unit of figures; by default degrees for radians, otherwise `unit`.
     overview : bool
         Whether the figure of a whole result includes the map.
     included_in : str
-        Name of a map whose figure shows this one as well, so that the overview leaves this one out.
+        Name of a map whose figure includes this one, so that the overview omits it.
     summary : str
-        What the one-line summary of a result calls the pixels that have a value, if it reports this map.
+        How the one-line summary of a result names the pixels that have a value, if it includes this map.
     counted : bool
         Whether the summary counts the pixels of each code.
 
     Raises
     ------
     InputError
-        A field has another type, or the fields contradict each other.
+        A field has the wrong type, or the fields contradict each other.
 
     Examples
     --------
@@ -116,7 +116,7 @@ class Map(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields
     def __post_init__(self) -> None:
         for name, kind in _field_types().items():
             value = getattr(self, name)
-            if type(value) is kind:  # texts and flags, most of all fields
+            if type(value) is kind:  # texts and flags, the most common types
                 continue
             try:
                 msgspec.structs.force_setattr(self, name, msgspec.convert(value, kind))
@@ -143,16 +143,16 @@ class Map(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields
 
     @property
     def figure_scale(self) -> float:
-        """Number that values are multiplied by in figures."""
+        """Factor from values to figures."""
         return ratio(self.unit, self.figure_unit)
 
     @property
     def undefined_value(self) -> float:
-        """The value that marks a pixel without an answer."""
+        """The value that marks an undefined pixel."""
         return math.nan if self.undefined is None else self.undefined
 
     def has_answer(self, values: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return which pixels have an answer: none of their components is NaN or the undefined value."""
+        """Return which pixels are defined: none of their components is NaN or the undefined value."""
         known: NDArray[np.bool_] = np.isfinite(values)
         if self.undefined is not None:
             known &= values != self.undefined
@@ -179,7 +179,7 @@ class Map(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields
         )
 
     def attributes(self) -> dict[str, Any]:
-        """Return the attributes of the map in files of other conventions: units, and those of CF."""
+        """Return the attributes of the map in files: units, and those of the CF conventions."""
         attributes: dict[str, Any] = {"units": self.unit} if self.unit else {}
         if self.caption:
             attributes["long_name"] = self.caption
@@ -194,12 +194,12 @@ class Map(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields
 
     @classmethod
     def decode(cls, text: str, where: str) -> Map:
-        """Return the declaration that `encode` wrote.
+        """Return the declaration written by `encode`.
 
         Raises
         ------
         InputError
-            The text is not a declaration; ``where`` begins the message.
+            The text is not a declaration; the message begins with ``where``.
         """
         try:
             if len(text) > LONGEST_DECLARATION:
@@ -270,7 +270,7 @@ _CHECKS = (_text_problems, _type_problems, _shape_problems, _unit_problems)
 
 
 def conflicts(one: Map, other: Map, what: str) -> Iterator[str]:
-    """Yield why a declaration cannot stand for another: consumers rely on its unit, axes and components."""
+    """Yield why a declaration cannot replace another: code relies on its unit, axes and components."""
     for name in ("unit", "axes", "components"):
         wrong, right = getattr(one, name), getattr(other, name)
         if wrong != right:
@@ -333,7 +333,7 @@ class FocusStatus(IntEnum):
 
 
 class StitchStatus(IntEnum):
-    """Codes of ``status`` of a surface that was stitched from several touches."""
+    """Codes of ``status`` of a surface stitched from several touches."""
 
     NO_HEIGHT = 0
     CONSISTENT = 1
@@ -515,7 +515,7 @@ TWIST: Mapping[str, Map] = {
 
 
 def is_deviation(name: str) -> bool:
-    """Return whether a name is that of a standard deviation."""
+    """Return whether a name is the name of a standard deviation."""
     return name.endswith(SIGMA) and name != SIGMA
 
 
@@ -525,7 +525,7 @@ def is_builtin(name: str) -> bool:
 
 
 def place_of(name: str) -> tuple[int, bool]:
-    """Return a key that sorts maps in the order of the table, each before its standard deviation."""
+    """Return a sorting key for the order of the table, with each map before its standard deviation."""
     base = name if name in TABLE else name.removesuffix(SIGMA)
     return _PLACES.get(base, len(_PLACES)), base != name and base in _PLACES
 
@@ -552,14 +552,14 @@ def declaration_of(name: str, declared: Mapping[str, Map] | None = None) -> Map:
 
 
 UNDECLARED = Map()
-"""What is known of a map that nobody declares: nothing."""
+"""Declaration of a map without one."""
 
 
 def check_declarations(declarations: Mapping[str, Map]) -> None:
-    """Raise InputError where declarations give a built-in name another meaning, or two maps one quantity.
+    """Raise InputError if declarations change the meaning of a built-in name, or two maps have one quantity.
 
-    Only the legend and the texts of a built-in map may differ from the table's, and the unit of what a twist
-    has as an angle.
+    Only the legend and the texts of a built-in map may differ from the table, and the unit of maps that are
+    angles for a twist.
     """
     stands_for: dict[str, str] = {}
     for name, one in declarations.items():

@@ -1,4 +1,4 @@
-"""ROS 2 messages in MCAP files: recordings and results as topics, and frames from topics."""
+"""ROS 2 messages in MCAP files: recordings and results as topics, and frames read from topics."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ if TYPE_CHECKING:
 IMAGES = "/camera/image"
 _SURFACE = "/surface"
 _OF_RESULTS = {_SURFACE, "/height", "/force"}
-_METRE = 1e-3  # m a mm
+_METRE = 1e-3  # m per mm
 _SECOND = 1_000_000_000  # nanoseconds
-_FRAME = "sensor"  # to which coordinates belong: x right and y up in the picture, z towards the sensor
+_FRAME = "sensor"  # coordinate frame: x right and y up in the picture, z towards the sensor
 _ENCODINGS = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2", "32FC1": "f4"}
 _COLOURS = {"rgb8": "RGB", "bgr8": "BGR", "rgba8": "RGBA", "bgra8": "BGRA"}
 _NAMES = {np.dtype(np.uint8): "mono8", np.dtype(np.uint16): "mono16", np.dtype(np.float32): "32FC1"}
-_FLOAT32 = 7  # of a PointField
-_SERIES = {"travel": _METRE, "phase": 1.0, "tilt": 1.0, "twist": 1.0}  # topics of numbers, to SI units
+_FLOAT32 = 7  # datatype of a PointField
+_SERIES = {"travel": _METRE, "phase": 1.0, "tilt": 1.0, "twist": 1.0}  # topics, with factors to SI units
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _CLOUD, _NUMBER, _WRENCH = (
     "sensor_msgs/msg/PointCloud2",
@@ -50,14 +50,14 @@ _CLOUD, _NUMBER, _WRENCH = (
 )
 _INSTALL = "MCAP needs packages that are not installed: pip install 'mirrorskin[mcap]'"
 
-_LONGEST = 100  # letters of a package's message
-_MOST_PACKED = 255  # to one that all chunks of a file are compressed at most: the limit of LZ4
+_LONGEST = 100  # characters quoted of an error message of a package
+_MOST_PACKED = 255  # largest compression ratio accepted for all chunks of a file, the limit of LZ4
 
-# Of the file format (https://mcap.dev/spec): opcode and length, then the fields.
+# From the file format (https://mcap.dev/spec): opcode and length, then the fields.
 _RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
 _FOOTER, _FOOTER_CODE = struct.Struct("<BQQQI8s"), 2
 
-# The fields of ROS 2's own messages.
+# The fields of standard ROS 2 messages.
 _PARTS = {
     "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
@@ -86,7 +86,7 @@ _MESSAGES = {
 
 
 def load_writer() -> type[Writer]:
-    """Return what writes messages; InputError if it is not installed."""
+    """Return the class that writes messages; InputError if it is not installed."""
     try:
         from mcap_ros2.writer import Writer
     except ImportError as error:
@@ -95,21 +95,21 @@ def load_writer() -> type[Writer]:
 
 
 def _definition(kind: str) -> str:
-    """Return the definition of a message type and of the types within."""
+    """Return the definition of a message type and of the types it contains."""
     text, parts = _MESSAGES[kind]
     rule = "=" * 80
     return "\n".join([text, *(f"{rule}\nMSG: {part}\n{_PARTS[part]}" for part in parts)])
 
 
 class _File:
-    """Messages on their way into an MCAP file."""
+    """Writer of messages to an MCAP file."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._writer: Writer = load_writer()(stream)
         self._schemas: dict[str, Any] = {}
 
     def put(self, topic: str, kind: str, message: Mapping[str, Any], stamp: int) -> None:
-        """Write a message of a time, nanoseconds; its header is made where it has one."""
+        """Write a message with a time stamp in nanoseconds; the header is added if the type has one."""
         if kind not in self._schemas:
             self._schemas[kind] = self._writer.register_msgdef(kind, _definition(kind))
         seconds, rest = divmod(stamp, _SECOND)
@@ -128,31 +128,31 @@ class _File:
 
 @checked
 def save_messages(given: Result | Recording, path: str | Path) -> str:
-    """Write a result or a recording as ROS 2 messages in an MCAP file, which exists whole or not at all.
+    """Write a result or a recording as ROS 2 messages to an MCAP file, which appears complete or not at all.
 
-    Of a recording, frames are ``sensor_msgs/Image`` on ``/camera/image``, ``dark`` and ``bright`` beside them
-    on ``/camera/dark`` and ``/camera/bright``, and positions ``std_msgs/Float64`` on ``/travel``, in metres,
-    ``/phase``, ``/tilt`` and ``/twist``, in radians, with the stamps of their frames. Of a result, the
-    surface is a ``sensor_msgs/PointCloud2`` on ``/surface`` with ``x``, ``y``, ``z``, ``sigma`` in metres
-    and the normal where it is known, the heights a picture in metres on ``/height``, and a force a
-    ``geometry_msgs/WrenchStamped`` on ``/force``. What else is known is in the metadata ``mirrorskin``.
+    For a recording, the frames are ``sensor_msgs/Image`` on ``/camera/image``, ``dark`` and ``bright`` are on
+    ``/camera/dark`` and ``/camera/bright``, and positions are ``std_msgs/Float64`` on ``/travel``, in metres,
+    ``/phase``, ``/tilt`` and ``/twist``, in radians, with the time stamps of their frames. For a result, the
+    surface is a ``sensor_msgs/PointCloud2`` on ``/surface`` with ``x``, ``y``, ``z``, ``sigma`` in metres and
+    the normal if there is one, the heights are an image in metres on ``/height``, and a force is a
+    ``geometry_msgs/WrenchStamped`` on ``/force``. Other properties are in the metadata ``mirrorskin``.
 
     Parameters
     ----------
     given : Result or Recording
-        Of frames without times, each is a second after the one before.
+        Frames without times are stamped one second apart.
     path : str or Path
 
     Returns
     -------
     str
-        What was written, in a few words.
+        Description of what was written.
 
     Raises
     ------
     InputError
         The packages of the extra ``mcap`` are missing, the result has no heights in millimetres, or the file
-        cannot be written there.
+        cannot be written.
 
     Examples
     --------
@@ -235,30 +235,30 @@ def _put_numbers(file: _File, name: str, values: Floats, stamps: list[int]) -> N
 
 
 def is_surface(path: Path) -> bool:
-    """Return whether an MCAP file holds an exported result and nothing else, so no frames of a camera."""
+    """Return whether an MCAP file contains an exported result only, and thus no frames."""
     try:
         from mcap.reader import make_reader
 
         with path.open("rb") as file:
             summary = make_reader(file).get_summary()
-    except Exception:  # the packages are missing, or damaged bytes lead them to anything
+    except Exception:  # missing packages; damaged bytes raise errors of many types
         return False
     topics = {channel.topic for channel in summary.channels.values()} if summary is not None else set()
     return _SURFACE in topics and topics <= _OF_RESULTS
 
 
 class GrowingMessages(Closing):
-    """An MCAP file to which frames are appended, like a `GrowingRecording`, and maps that were found of them.
+    """An MCAP file to which frames, like to a `GrowingRecording`, and computed maps are appended.
 
-    Topics are those of ``save_messages``; positions come last, as the source has them then. Each update of
-    the heights is a picture on ``/height``, and the area of contact a number on ``/contact_area``, m^2. A
-    file that was cut off has no index; the program ``mcap recover`` makes one.
+    Topics are those of ``save_messages``; the final positions of the source are written at the end. Each
+    update of the heights is an image on ``/height``, and the contact area is a number on ``/contact_area``,
+    m^2. The index of an incomplete file is missing; the program ``mcap recover`` creates it.
     """
 
     def __init__(self, path: Path, descriptor: int, header: Header) -> None:
         self.count: int = 0
         self._path = path
-        self._begun: int | None = None  # when the source's clock began: at the first frames
+        self._begun: int | None = None  # start of the source's clock, set with the first frames
         self._stream = os.fdopen(os.dup(descriptor), "wb")
         self._file = _File(self._stream)
         self._stamps: list[int] = []
@@ -266,8 +266,8 @@ class GrowingMessages(Closing):
         _put_header(self._file, header)
 
     def append(self, block: Block) -> None:
-        """Write frames, and keep their positions."""
-        assert block.time is not None  # frames that come live have one
+        """Write frames, and store their positions."""
+        assert block.time is not None  # live frames have times
         if self._begun is None:
             self._begun = time.time_ns() - round(float(block.time[-1]) * _SECOND)
         stamps = _stamps(self._begun, block.time)
@@ -279,8 +279,8 @@ class GrowingMessages(Closing):
         self.count += len(block.frames)
 
     def add_maps(self, time: float, height: NDArray[np.float32] | None, contact_area: float | None) -> None:
-        """Write what was found of the frames up to a time: mm, mm^2."""
-        assert self._begun is not None  # of frames that have come
+        """Write the maps computed from the frames up to a time: mm, mm^2."""
+        assert self._begun is not None  # frames have been written
         (stamp,) = _stamps(self._begun, np.array([time]))
         if height is not None:
             self._file.put("/height", _IMAGE, _picture(height * np.float32(_METRE)), stamp)
@@ -288,16 +288,16 @@ class GrowingMessages(Closing):
             self._file.put("/contact_area", _NUMBER, {"data": contact_area * _METRE**2}, stamp)
 
     def mark(self, start: int, used: NDArray[np.bool_]) -> None:
-        """Forget it: MCAP files do not tell which frames were used."""
+        """Do nothing: MCAP files do not store which frames were used."""
 
     def flush(self) -> None:
-        """Hand what is written to the system."""
+        """Pass written data to the operating system."""
         self._stream.flush()
 
     publish = flush
 
     def finish(self, positions: Mapping[str, Floats], state: str) -> None:
-        """Write positions, those that came with the frames where there are no better ones, and the index."""
+        """Write the positions, using those of the frames where there are no better ones, and the index."""
         for name, live in self._positions.items():
             better = np.asarray(positions.get(name, live), np.float64)[: self.count]
             values = np.where(np.isfinite(better), better, live[: len(better)])
@@ -307,7 +307,7 @@ class GrowingMessages(Closing):
         self.flush()
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._stream.close()
 
 
@@ -325,12 +325,12 @@ def _picture(values: NDArray[Any]) -> dict[str, Any]:
 
 
 def _stamps(begun: int, time: Floats) -> list[int]:
-    """Return the stamps of times, seconds since it began."""
+    """Return the time stamps of times in seconds since the start."""
     return [begun + round(float(one) * _SECOND) for one in time]
 
 
 def _stamp(text: str) -> int:
-    """Return nanoseconds since 1970 of an ISO 8601 time; 0 if it is none."""
+    """Return an ISO 8601 time in nanoseconds since 1970; 0 if it is invalid."""
     with contextlib.suppress(ValueError):
         when = datetime.fromisoformat(text)
         return round((when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp() * 1e6) * 1000
@@ -338,10 +338,10 @@ def _stamp(text: str) -> int:
 
 
 class Messages(FrameSequence):
-    """The images of one topic of an MCAP file of ROS 2, as a source that can be rewound.
+    """The images of one topic of a ROS 2 MCAP file, as a source that can be rewound.
 
-    Grey images are taken as they are, of colours and of compressed images the luma. Positions that are not
-    given are those of ``/travel`` (m) or ``/phase`` (rad), one message an image.
+    Grey images are used unchanged; colours and compressed images are converted to luma. Positions that are
+    not given are read from ``/travel`` (m) or ``/phase`` (rad), one message per image.
     """
 
     def __init__(
@@ -391,7 +391,7 @@ class Messages(FrameSequence):
             return _frame(next(self._left), f"{self._path}: {self._topic}")
 
     def _choose(self, topic: str | None) -> str:
-        """Return the topic of the images: that which was asked for, or the only one."""
+        """Return the topic of the images: the requested one, or the only one."""
         found = {
             channel.topic
             for channel in self._summary.channels.values()
@@ -418,7 +418,7 @@ class Messages(FrameSequence):
         return np.asarray(values) / _SERIES[name]
 
     def _times_of(self, topic: str) -> NDArray[np.uint64]:
-        """Return when the messages of a topic were logged, in the order in which they are stored."""
+        """Return the log times of the messages of a topic, in the order of storage."""
         if topic not in self._times:
             with self._naming():
                 self._times[topic] = np.fromiter((one.log_time for one in self._stored(topic)), np.uint64)
@@ -434,7 +434,7 @@ class Messages(FrameSequence):
             yield decoders[self._summary.channels[message.channel_id].kind](message.data)
 
     def _hold(self, topic: str) -> Iterator[Message]:
-        """Yield all messages of a topic as long as they fit into memory."""
+        """Yield all messages of a topic, if they fit into memory."""
         size = 0
         for message in self._stored(topic):
             size += len(message.data)
@@ -443,7 +443,7 @@ class Messages(FrameSequence):
             yield message
 
     def _stored(self, topic: str) -> Iterator[Message]:
-        """Yield the messages of a topic in the order in which they are stored."""
+        """Yield the messages of a topic in the order of storage."""
         from mcap.records import Chunk, Message
 
         wanted = {number for number, one in self._summary.channels.items() if one.topic == topic and one.kind}
@@ -460,7 +460,7 @@ class Messages(FrameSequence):
                     yield from _messages_in(data, wanted)
 
     def _records(self, file: BufferedReader, wanted: set[int]) -> Iterator[Any]:
-        """Yield the chunks that hold messages of some channels; without an index, all records."""
+        """Yield the chunks that contain messages of some channels; without an index, all records."""
         from mcap.stream_reader import StreamReader
 
         if not self._summary.chunks:
@@ -471,7 +471,7 @@ class Messages(FrameSequence):
                 yield next(iter(StreamReader(file, skip_magic=True, emit_chunks=True).records))
 
     def _read_summary(self) -> _Summary:
-        """Read which channels and chunks the file's index names."""
+        """Read the channels and chunks from the file's index."""
         try:
             from mcap.records import Channel, ChunkIndex, Schema
             from mcap.stream_reader import StreamReader
@@ -497,12 +497,12 @@ class Messages(FrameSequence):
 
     @contextlib.contextmanager
     def _naming(self) -> Iterator[None]:
-        """Turn what the packages raise on damaged bytes into a line that names the file."""
+        """Convert errors of the packages for damaged bytes to a one-line error that names the file."""
         try:
             yield
         except (InputError, ImportError):
             raise
-        except Exception as error:  # of many kinds
+        except Exception as error:  # of many types
             said = one_line(error) or type(error).__name__
             raise InputError(
                 f"{self._path} is damaged, or not an MCAP file of ROS 2 ({said[:_LONGEST]}): copy it again"
@@ -511,7 +511,7 @@ class Messages(FrameSequence):
 
 class _Channel(NamedTuple):
     topic: str
-    kind: str  # name of its message type, empty of one that is not read
+    kind: str  # name of its message type; empty for one that is not read
 
 
 class _Summary(NamedTuple):
@@ -520,7 +520,7 @@ class _Summary(NamedTuple):
 
 
 def _unpack(chunk: Chunk) -> bytes:
-    """Return the records of a chunk, which must be as long as it states; see ``MAX_UNPACKED_BYTES``."""
+    """Return the records of a chunk, which must have the stated length; see ``MAX_UNPACKED_BYTES``."""
     size = chunk.uncompressed_size
     check_unpacked(size, "a chunk", "repack the file with 'mcap compress'")
     if chunk.compression == "zstd":
@@ -561,7 +561,7 @@ def _messages_in(records: bytes, wanted: set[int]) -> Iterator[Message]:
 
 
 def _decoder(kind: str) -> Callable[[bytes], Any]:
-    """Return what decodes messages of a type of ROS 2: by its own definition, not by one in a file."""
+    """Return the decoder of a ROS 2 message type, from its standard definition, not from one in a file."""
     from mcap.records import Schema
     from mcap_ros2.decoder import DecoderFactory
 

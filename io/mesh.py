@@ -1,4 +1,4 @@
-"""A map of heights as a surface of triangles."""
+"""Triangle meshes of height maps."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from mirrorskin.io.types import Floats
 
 @dataclass(frozen=True, slots=True)
 class Mesh:
-    """A surface of triangles.
+    """A triangle mesh.
 
     Attributes
     ----------
     vertices : ndarray, (N, 3), float64
         x, y and z, mm.
     faces : ndarray, (M, 3), int32
-        Rows of ``vertices``, counter-clockwise where they are seen from +z.
+        Rows of ``vertices``, counter-clockwise as seen from +z.
     pixels : ndarray, (N,), int64
-        The pixel that each vertex is, as an index into the flattened map.
+        The pixel of each vertex, as an index into the flattened map.
     """
 
     vertices: Floats
@@ -33,19 +33,19 @@ class Mesh:
 def surface_mesh(
     height: ArrayLike, x: ArrayLike, y: ArrayLike, *, component: ArrayLike | None = None
 ) -> Mesh:
-    """Span triangles between the pixels whose heights are known.
+    """Return triangles between the pixels that have a height.
 
-    A cell of four known neighbours becomes two triangles, one of three becomes one. Pixels that are in no
-    triangle are left out.
+    A cell with four heights becomes two triangles, one with three becomes one. Pixels without a triangle
+    are left out.
 
     Parameters
     ----------
     height : array_like, (H, W)
-        Millimetres; a hole, NaN, stays one.
+        Millimetres; NaN, a hole, remains a hole.
     x, y : array_like, (W,) and (H,)
         Millimetres of the pixel centres; x increases with the column, y decreases with the row.
     component : array_like, (H, W), int, optional
-        Piece that a height belongs to, -1 for none; no triangle joins two pieces.
+        Piece of each height, -1 for none; no triangle connects two pieces.
 
     Returns
     -------
@@ -69,14 +69,14 @@ def surface_mesh(
 
 
 def face_vectors(mesh: Mesh) -> Floats:
-    """Return the normals of the triangles, (M, 3), as long as twice their areas."""
+    """Return the normals of the triangles, (M, 3), with lengths of twice their areas."""
     first, second, third = (mesh.vertices[corner] for corner in mesh.faces.T)
     vectors: Floats = np.cross(second - first, third - first)
     return vectors
 
 
 def normals_around(mesh: Mesh, vertices: NDArray[np.bool_]) -> Floats:
-    """Return the unit normals of some vertices: of the triangles around, in proportion to their areas."""
+    """Return the unit normals of some vertices: area-weighted means of the adjacent triangles."""
     near = replace(mesh, faces=mesh.faces[vertices[mesh.faces].any(axis=1)])
     vectors = face_vectors(near)
     sums = np.zeros_like(mesh.vertices)

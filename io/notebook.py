@@ -1,4 +1,4 @@
-"""How a result shows itself: as text, in a notebook, and as an xarray dataset."""
+"""Display of results: as text, in a notebook, and as an xarray dataset."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
 
     from mirrorskin.io.recording import Recording
 
-_PICTURE = 480  # pixels that the longer side of a picture has at most
+_PICTURE = 480  # pixels along the longer side of a picture, at most
 
 
 def as_text(result: Shown) -> str:
-    """Return the maps of a result with their shape, unit and range, a line each."""
+    """Return the maps of a result with shape, unit and range, one per line."""
     lines = [f"{name:<14}{shape:<16}{values}" for name, shape, values in _rows(result)]
     return "\n".join([f"{type(result).__name__}{_origin(result)}", *(f"  {line}" for line in lines)])
 
 
 def as_html(result: Shown) -> str:
-    """Return a table of the maps, and a picture of the height, or of what there is instead."""
+    """Return a table of the maps, and a picture of the height, or of the first other map."""
     rows = "".join(
         "<tr>" + "".join(f"<td style='text-align:left'>{escape(cell)}</td>" for cell in row) + "</tr>"
         for row in _rows(result)
@@ -43,7 +43,7 @@ def as_html(result: Shown) -> str:
 
 
 def recording_as_text(recording: Recording) -> str:
-    """Return what a recording holds, in a line."""
+    """Return a description of a recording in one line."""
     count, rows, columns = recording.shape
     size = recording.header.pixel_size
     parts = [f"{count} frames of {columns} x {rows} {recording.dtype}", f"{recording.motion} motion"]
@@ -52,7 +52,7 @@ def recording_as_text(recording: Recording) -> str:
 
 
 def recording_as_html(recording: Recording) -> str:
-    """Return what a recording holds, and its last frame."""
+    """Return a description of a recording, and its last frame."""
     picture = _picture("last frame", recording.frame(recording.shape[0] - 1), "counts")
     return f"<p>{escape(recording_as_text(recording))}</p>{picture}"
 
@@ -65,7 +65,7 @@ def plot(result: Shown, name: str | None, axes: Axes | None) -> Axes:
     chosen = _first(result) if name is None else name
     if chosen not in maps or maps[chosen].ndim != 2:
         pictures = ", ".join(one for one, values in maps.items() if values.ndim == 2)
-        raise InputError(f"there is no picture {chosen!r}: choose from {pictures or 'none'}")
+        raise InputError(f"there is no map {chosen!r} to draw: choose from {pictures or 'none'}")
     x, y = (getattr(result, one, None) for one in "xy")
     extent = None
     if x is not None and y is not None:
@@ -80,7 +80,7 @@ def plot(result: Shown, name: str | None, axes: Axes | None) -> Axes:
     return axes
 
 
-_DECLARATION = "declaration"  # attribute of a variable whose declaration is not in the table
+_DECLARATION = "declaration"  # attribute of a variable that is not declared in the table
 
 
 def as_xarray(result: Result) -> xarray.Dataset:
@@ -173,7 +173,7 @@ def _in_unit(values: Any, variable: xarray.DataArray, unit: str) -> Any:
 
 
 def _first(result: Shown) -> str | None:
-    """Return the map that shows most."""
+    """Return the most informative map."""
     pictures = [name for name, values in result.maps().items() if values.ndim == 2 or values.shape[-1] > 3]
     summarised = [name for name in pictures if result.declaration(name).summary]
     return next(iter([*summarised, *pictures]), None)
@@ -204,7 +204,7 @@ def _origin(result: Shown) -> str:
 
 
 def _picture(name: str, values: NDArray[Any], unit: str) -> str:
-    """Return a map, or its last turn, in colours from dark (low) to light (high); unknown is clear."""
+    """Return a map, or its last turn, in colours from dark (low) to light (high); NaN is transparent."""
     import cv2
 
     flat = values.reshape(-1, *values.shape[-2:])[-1].astype(np.float64)

@@ -1,4 +1,4 @@
-"""Opening files that others made, and what HDF5 and the system report of them, in words that can be read."""
+"""Opening of files, and short messages for errors of HDF5 and the operating system."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from typing import Any
 
 from mirrorskin.io.types import InputError
 
-# A damaged file shows itself in h5py by any of these.
+# h5py raises any of these for damaged files.
 _ERRORS = (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError)
 _LONGEST = 100
 
 MAX_UNPACKED_BYTES = 1 << 30
-"""Bytes of memory that one file may ask for at once by what it states: a picture, a compressed array.
+"""Limit of the memory that one file may require by the sizes it states: a picture, a compressed array.
 
-A file of kilobytes can state sizes of gigabytes: they are compared with this before anything is decoded.
+A file of kilobytes can state sizes of gigabytes. They are compared with this limit before decoding.
 """
 
 MAX_TEXT_BYTES = 64 << 20
-"""Bytes of a text or a table that is read whole: settings, positions, readings."""
+"""Limit of the size of a text or a table that is read as a whole: settings, positions, readings."""
 
 
-class as_input_error(AbstractContextManager[None]):  # noqa: N801  # as contextlib names its own
-    """Turn what goes wrong with a file into an InputError of one line.
+class as_input_error(AbstractContextManager[None]):  # noqa: N801  # named like contextlib's functions
+    """Convert errors of a file to an InputError of one line.
 
-    A class, because files are opened with many of these and a generator takes several times as long.
+    It is a class because many are used when a file is opened, and a generator takes several times as long.
     """
 
     def __init__(self, what: str | Callable[[], str], remedy: str = "", kinds: Any = _ERRORS) -> None:
@@ -44,7 +44,7 @@ class as_input_error(AbstractContextManager[None]):  # noqa: N801  # as contextl
 
 
 def reason(error: Exception) -> str:
-    """Return what went wrong: a few words instead of HDF5's many."""
+    """Return the cause of an error: a few words instead of HDF5's long message."""
     number = getattr(error, "errno", None)
     text = str(error.args[-1]) if error.args else type(error).__name__
     if number == errno.EAGAIN or is_flagged(error):
@@ -58,7 +58,7 @@ def reason(error: Exception) -> str:
 
 
 def is_flagged(error: Exception) -> bool:
-    """Tell whether HDF5 refused a file because a writer left its mark in it, or this process writes it."""
+    """Return whether HDF5 refused a file because it is marked as being written, or this process writes it."""
     return any(said in str(error) for said in ("already open for write", "locking flag values don't match"))
 
 
@@ -70,7 +70,7 @@ def check_regular(path: Path, remedy: str = "") -> None:
     remedy = remedy and f"; {remedy}"
     try:
         mode = path.stat().st_mode
-    except (OSError, ValueError) as error:  # ValueError: a null in its name
+    except (OSError, ValueError) as error:  # ValueError: the name contains a null byte
         raise InputError(f"{path} cannot be read: {getattr(error, 'strerror', error)}{remedy}") from error
     if stat.S_ISDIR(mode):
         raise InputError(f"{path} cannot be read: {os.strerror(errno.EISDIR)}{remedy}")
@@ -79,7 +79,7 @@ def check_regular(path: Path, remedy: str = "") -> None:
 
 
 class _BoundedReader(BufferedReader):
-    """A file that reads at most ``MAX_UNPACKED_BYTES`` at once: lengths that it states may be wrong."""
+    """A file that reads at most ``MAX_UNPACKED_BYTES`` at once, because stated lengths may be wrong."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         if size is not None and size > MAX_UNPACKED_BYTES:
@@ -88,7 +88,7 @@ class _BoundedReader(BufferedReader):
 
 
 def open_regular(path: Path, remedy: str = "") -> BufferedReader:
-    """Open a regular file to read; InputError for anything else."""
+    """Open a regular file for reading; InputError for anything else."""
     check_regular(path, remedy)
     try:
         return _BoundedReader(FileIO(path))
@@ -97,7 +97,7 @@ def open_regular(path: Path, remedy: str = "") -> BufferedReader:
 
 
 def read_regular(path: Path, remedy: str = "", limit: int = MAX_UNPACKED_BYTES) -> bytes:
-    """Read a regular file whole; InputError for anything else, and for one of more bytes than the limit."""
+    """Read a whole regular file; InputError for anything else, and for a file larger than the limit."""
     with open_regular(path, remedy) as file:
         size = os.fstat(file.fileno()).st_size
         if size > limit:
@@ -109,11 +109,11 @@ def read_regular(path: Path, remedy: str = "", limit: int = MAX_UNPACKED_BYTES) 
 
 
 def check_unpacked(size: int, what: str, remedy: str, limit: int = MAX_UNPACKED_BYTES) -> None:
-    """Raise InputError if a file states that it takes more memory than it may."""
+    """Raise InputError if a file states that it needs more memory than the limit."""
     if size > limit:
         raise InputError(f"{what} takes {size} bytes of memory, and at most {limit} are allowed: {remedy}")
 
 
 def legible(text: str) -> str:
-    """Return a text without what is no text: a file's name may be any bytes."""
+    """Return a text without invalid characters: the name of a file may contain any bytes."""
     return text.encode(errors="surrogateescape").decode(errors="replace")

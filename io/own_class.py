@@ -1,4 +1,4 @@
-"""A user's own class, named in a command or a file."""
+"""Loading of a user's own class, specified in a command or a file."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from mirrorskin.io.types import InputError
 
 
 def load_class(name: str) -> Callable[..., Any]:
-    """Return the class that is named MODULE:CLASS or FILE.py:CLASS; modules may lie in the current folder.
+    """Return a class given as MODULE:CLASS or FILE.py:CLASS; modules may be in the current folder.
 
-    An `InputError` says what is not there. What the module itself raises is passed on.
+    Missing modules and classes raise `InputError`. Errors of the module itself are passed on.
 
     Examples
     --------
@@ -36,7 +36,7 @@ def load_class(name: str) -> Callable[..., Any]:
         found = importlib.import_module(module) if file is None else _run(file)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-            raise  # what the module itself imports
+            raise  # an import of the module itself failed
         raise InputError(f"{name}: there is no {place} in {folder.resolve()}, nor installed") from error
     made = getattr(found, kind, None)
     if not callable(made):
@@ -48,11 +48,11 @@ def load_class(name: str) -> Callable[..., Any]:
 
 
 def _run(file: Path) -> ModuleType:
-    """Return the module that a file makes, under a name of its own: others may have files of that name."""
+    """Return the module of a file, under a unique name, since other files may have the same name."""
     name = f"mirrorskin_own_{file.stem}_{zlib.crc32(bytes(file.resolve())):08x}"
     if name not in sys.modules:
         spec = importlib.util.spec_from_file_location(name, file)
-        assert spec is not None and spec.loader is not None  # noqa: PT018  # of a file that ends in .py
+        assert spec is not None and spec.loader is not None  # noqa: PT018  # true for files that end in .py
         sys.modules[name] = importlib.util.module_from_spec(spec)
         try:
             spec.loader.exec_module(sys.modules[name])

@@ -1,4 +1,4 @@
-"""Files of pictures: PNG, TIFF of one page or many; and pictures for printing."""
+"""Picture files: PNG, TIFF with one or several pages; and pictures for printing."""
 
 from __future__ import annotations
 
@@ -24,39 +24,39 @@ PICTURE_SUFFIXES = (".png", *TIFF_SUFFIXES)
 _DTYPES = [dtype.name for dtype in FRAME_DTYPES]
 _PNG_MARK = b"\x89PNG\r\n\x1a\n"
 _TIFF_MARKS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-_PNG_HEAD = 33  # bytes of the mark and the first chunk, after which the pixels' size may be written
-_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # of each colour type
+_PNG_HEAD = 33  # bytes of the signature and the first chunk; the pixel size may follow
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
 _ADAM7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
-_PIECE = 1 << 20  # bytes that are unpacked at once
+_PIECE = 1 << 20  # bytes unpacked at a time
 _INCH = 0.0254  # m
-_FORMATS = {1: "uint", 2: "int", 3: "float"}  # of samples (TIFF 6.0, section 19)
+_FORMATS = {1: "uint", 2: "int", 3: "float"}  # sample formats (TIFF 6.0, section 19)
 _JPEG_MARK = b"\xff\xd8"
-_JPEG_BYTES = 8  # a pixel that a decoder takes: a progressive JPEG has three coefficients of 2 bytes
+_JPEG_BYTES = 8  # bytes per pixel in a decoder: a progressive JPEG has three coefficients of 2 bytes
 _SMALLER = "save it as smaller pictures"
 _UNDECODABLE = "cannot be decoded: it is damaged, or of a kind that OpenCV does not read"
 
 
 def read_picture(path: Path) -> NDArray[Any]:
-    """Read the only picture of a PNG or TIFF, (H, W), uint8, uint16 or float32.
+    """Read the only picture in a PNG or TIFF, (H, W), uint8, uint16 or float32.
 
-    Colour becomes grey: where the channels are equal, their common value; else the luma of ITU-R BT.601,
-    0.299 R + 0.587 G + 0.114 B, as OpenCV computes it. Opacity is ignored.
+    Colour is converted to grey: to the common value of equal channels, otherwise to the luma of ITU-R BT.601,
+    0.299 R + 0.587 G + 0.114 B, as computed by OpenCV. Opacity is ignored.
     """
     return _grey(decode_picture(path))
 
 
 def decode_picture(path: Path, dtypes: Sequence[str] = _DTYPES) -> NDArray[Any]:
-    """Decode the only picture of a PNG or TIFF as it is stored, (H, W) or (H, W, channels)."""
+    """Decode the only picture in a PNG or TIFF as stored, (H, W) or (H, W, channels)."""
     data = read_regular(path)
     if data[:8] == _PNG_MARK:
         return _decode_png(data, str(path), -1)
     if count_pages(path, dtypes) != 1:
-        raise InputError(f"{path} holds several pages: put it alone, or save each page as a picture")
+        raise InputError(f"{path} holds several pages, and one is needed: save each page as a picture")
     return _decode(data, str(path), -1)
 
 
 def decode_grey(data: bytes, name: str) -> NDArray[Any]:
-    """Decode a PNG or JPEG that lies in memory as grey samples, (H, W), of 8 or 16 bits."""
+    """Decode a PNG or JPEG in memory as grey samples, (H, W), of 8 or 16 bits."""
     import cv2
 
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
@@ -92,14 +92,14 @@ def _decode_png(data: bytes, name: str, flags: int) -> NDArray[Any]:
 
 
 def _png_bytes(width: int, height: int, bits: int, interlaced: bool) -> int:
-    """Return the bytes that the pixels of a PNG take before they are packed (PNG, section 7)."""
+    """Return the unpacked size of the pixels of a PNG in bytes (PNG, section 7)."""
     passes = _ADAM7 if interlaced else ((0, 0, 1, 1),)
     sizes = ((-((left - width) // across), -((top - height) // down)) for left, top, across, down in passes)
     return sum(rows * (1 + -(-columns * bits // 8)) for columns, rows in sizes if columns > 0)
 
 
 def _unpack_to(pieces: Iterable[bytes], size: int) -> bool:
-    """Tell whether a PNG's packed pixels have so many bytes or more: libpng prints about fewer."""
+    """Return whether the pixels of a PNG have at least ``size`` bytes; libpng prints messages about fewer."""
     unpacker = zlib.decompressobj()
     try:
         for packed in pieces:
@@ -112,7 +112,7 @@ def _unpack_to(pieces: Iterable[bytes], size: int) -> bool:
 
 
 def _jpeg_size(data: bytes, name: str) -> tuple[int, int]:
-    """Return the rows and columns that a JPEG states (ITU-T T.81, B.2.2)."""
+    """Return the rows and columns stated by a JPEG (ITU-T T.81, B.2.2)."""
     at = 2 if data[:2] == _JPEG_MARK else len(data)
     while at + 9 <= len(data) and data[at] == 0xFF:
         marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
@@ -124,10 +124,10 @@ def _jpeg_size(data: bytes, name: str) -> tuple[int, int]:
 
 
 def count_pages(path: Path, dtypes: Sequence[str] = _DTYPES) -> int:
-    """Count the pages of a TIFF, all of one size and of samples that frames can have."""
+    """Count the pages of a TIFF, which must have one size and one of the supported data types."""
     import tifffile
 
-    remedy = "copy it again, or save it anew"
+    remedy = "copy it again, or save it again"
     check_regular(path, remedy)
     with _quiet_tifffile():
         try:
@@ -138,7 +138,7 @@ def count_pages(path: Path, dtypes: Sequence[str] = _DTYPES) -> int:
                 complete = len(end) == file.tiff.offsetsize and not any(end)
         except OSError as error:
             raise InputError(f"{path} cannot be read: {error.strerror or error}") from error
-        except Exception:  # of many kinds
+        except Exception:  # of many types
             complete = False
     if not complete:
         with open_regular(path) as unread:
@@ -175,7 +175,7 @@ def _page_kind(page: Any) -> _PageKind:
 
 
 def read_pages(path: Path, start: int, stop: int) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Read pages ``start`` to ``stop - 1`` of a TIFF, each with what to call it in messages."""
+    """Read pages ``start`` to ``stop - 1`` of a TIFF, each with its name in messages."""
     with quiet_opencv() as cv2:
         try:
             _, pages = cv2.imreadmulti(str(path), start, stop - start, flags=cv2.IMREAD_UNCHANGED)
@@ -189,7 +189,7 @@ def read_pages(path: Path, start: int, stop: int) -> Iterator[tuple[str, NDArray
 
 
 def save_print(picture: NDArray[np.uint8], path: str | Path, dots_per_inch: float) -> None:
-    """Write a grey picture (H, W) as a PNG that says how large its pixels are, whole or not at all."""
+    """Write a grey picture (H, W) as a PNG with its pixel size; the file appears complete or not at all."""
     size = _INCH / dots_per_inch
     write_new(Path(path), encode_png(picture, (size, size)))
 
@@ -218,7 +218,7 @@ def _png_chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def _essential_chunks(data: bytes, name: str) -> list[bytes]:
-    """Check each chunk of a PNG, and keep those that make the picture: libpng prints about the others."""
+    """Check each chunk of a PNG, and keep those needed for the picture: libpng prints about the others."""
     kept, at, kind = list[bytes](), len(_PNG_MARK), b""
     while kind != b"IEND":
         size = int.from_bytes(data[at : at + 4], "big")
@@ -233,10 +233,10 @@ def _essential_chunks(data: bytes, name: str) -> list[bytes]:
 
 @contextmanager
 def quiet_opencv() -> Iterator[Any]:
-    """Lend OpenCV with its own messages kept off the terminal: the caller raises its own."""
-    import cv2  # takes longer than everything else that mirrorskin.io imports
+    """Yield OpenCV with its messages turned off: callers report errors themselves."""
+    import cv2  # slower to import than the rest of mirrorskin.io together
 
-    # OpenCV 5 moved it.
+    # OpenCV 5 moved this function.
     set_level = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel
     level = set_level(0)
     try:
@@ -247,7 +247,7 @@ def quiet_opencv() -> Iterator[Any]:
 
 @contextmanager
 def _quiet_tifffile() -> Iterator[None]:
-    """Keep what tifffile says of damaged files off the terminal."""
+    """Keep tifffile's messages about damaged files off the terminal."""
     logger = logging.getLogger("tifffile")
     level = logger.level
     logger.setLevel(logging.CRITICAL + 1)

@@ -1,4 +1,4 @@
-"""Where the body was in each frame: the checks that every reader and estimator shares."""
+"""Position of the body in each frame: checks shared by readers and estimators."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io.types import Floats, InputError
 
-_GREATEST = 1e12  # mm, rad or s
+_GREATEST = 1e12  # largest value accepted, in mm, rad or s
 
 
 @runtime_checkable
 class Positions(Protocol):
-    """Where the body was, for whoever knows how many frames there are."""
+    """Positions of the body for a number of frames that is not known yet."""
 
     def positions(self, count: int, /) -> Floats:
-        """Return the positions of so many frames, mm or radians; InputError if they are of another number."""
+        """Return the positions of ``count`` frames, mm or radians; InputError if the number differs."""
 
 
 def along(given: ArrayLike | Positions | None, count: int) -> ArrayLike | None:
-    """Return the positions of so many frames, however they are given."""
+    """Return positions for ``count`` frames, from an array or an object that computes them."""
     return given.positions(count) if isinstance(given, Positions) else given
 
 
@@ -42,7 +42,7 @@ class Steps:
 
     def positions(self, count: int) -> Floats:
         """Return the positions of ``count`` frames."""
-        with np.errstate(invalid="ignore", over="ignore"):  # who takes them refuses what is not finite
+        with np.errstate(invalid="ignore", over="ignore"):  # callers refuse values that are not finite
             return np.asarray(self.start + self.step * np.arange(count), np.float64)
 
 
@@ -51,8 +51,8 @@ def check_travel(
 ) -> NDArray[np.float64]:
     """Return the travel of a press, mm, or of a release if it ``falls``, as float64 (T,).
 
-    InputError, which calls it ``name``: it is missing, of another length, not finite, or runs back; ``after``
-    is the travel of the frame before, if any.
+    InputError, whose message begins with ``name``, if it is missing, has another length, is not finite, or
+    reverses; ``after`` is the travel of the preceding frame, if any.
 
     Examples
     --------
@@ -70,7 +70,7 @@ def check_travel(
 
 
 def check_strokes(travel: ArrayLike | None, count: int, name: str) -> NDArray[np.float64]:
-    """Return the travel of a vertical movement, mm, as float64: strokes down and up, as many as there are.
+    """Return the travel of a vertical movement, mm, as float64: any number of strokes down and up.
 
     Examples
     --------
@@ -83,10 +83,10 @@ def check_strokes(travel: ArrayLike | None, count: int, name: str) -> NDArray[np
 
 
 def stroke_starts(travel: NDArray[np.float64], direction: int = 0) -> NDArray[np.intp]:
-    """Return the frames from which on travel goes the other way than before: those after the turning points.
+    """Return the first frames after the turning points, from which the travel has the opposite direction.
 
-    A stroke is a run of frames in which travel does not change its direction; a rest belongs to the stroke
-    before it. ``direction`` is that of the stroke under way in the first frame: 1 down, -1 up, 0 unknown.
+    A stroke is a run of frames in which the travel does not change direction; a rest belongs to the stroke
+    before it. ``direction`` is the direction at the first frame: 1 down, -1 up, 0 unknown.
 
     Examples
     --------
@@ -119,9 +119,9 @@ def check_finite(
     within: tuple[int, int] | None = None,
     width: tuple[int, ...] = (),
 ) -> NDArray[np.float64]:
-    """Return the positions of so many frames as float64, (T, *width).
+    """Return the positions of ``count`` frames as float64, (T, *width).
 
-    Only those of the frames from the first to the end of ``within`` are checked and returned, if it is given.
+    If ``within`` is given, only those of the frames from its first to its end are checked and returned.
 
     Examples
     --------

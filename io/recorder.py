@@ -1,4 +1,4 @@
-"""Writing recordings: a source that keeps what it reads, and what all recorders have in common."""
+"""Writing of recordings: a source that stores the frames it reads, and functions shared by recorders."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ COMPRESSIONS: tuple[Compression, ...] = get_args(Compression)
 
 
 def check_compression(compression: str) -> None:
-    """Raise InputError for a compression that nobody knows."""
+    """Raise InputError for an unknown compression."""
     if compression not in COMPRESSIONS:
         raise InputError(f"unknown compression {compression!r}; known are {', '.join(COMPRESSIONS)}")
 
 
 def packing(compression: Compression) -> dict[str, Any]:
-    """Return what to create a dataset with so that it is packed."""
+    """Return the arguments with which h5py creates a compressed dataset."""
     if compression == "raw":
         return {}
     if compression == "gzip":
@@ -48,7 +48,7 @@ def packing(compression: Compression) -> dict[str, Any]:
 
 
 def write_header(file: h5py.File, header: Header, calibration: Calibration | None) -> None:
-    """Write what holds for all frames, and the groups for what does not."""
+    """Write the properties of the whole stack, and create the groups."""
     file.attrs.update(NX_class="NXroot", default="entry")
     entry = new_group(file, "entry", "NXentry", default="data", **{MARK: 1})
     put(entry, "title", None, header.title)
@@ -75,7 +75,7 @@ def write_header(file: h5py.File, header: Header, calibration: Calibration | Non
 
 
 def new_stack(file: h5py.File, shape: tuple[int, int, int], dtype: Any, **storage: Any) -> h5py.Dataset:
-    """Make the dataset of the frames."""
+    """Create the dataset of the frames."""
     stack = file.create_dataset(STACK, shape, dtype, **storage)
     stack.attrs.update(interpretation="image", units="counts")
     return stack
@@ -87,10 +87,10 @@ def checksums(frames: NDArray[Any]) -> NDArray[np.uint32]:
 
 
 def write_plot(file: h5py.File, motion: Motion, known: set[str]) -> None:
-    """Say what to plot: the frames, along what is known of each: their positions, else their time."""
+    """Write the default plot: the frames against their positions, or against their time if unknown."""
     data = new_group(file["entry"], "data", "NXdata", signal="frames")
     data["frames"] = h5py.SoftLink(STACK)
-    axes = known - {"displacement"}  # which is two numbers a frame
+    axes = known - {"displacement"}  # it has two numbers per frame
     along = next((name for name in ("tilt", POSITIONS[motion], "time") if name in axes), None)
     if along is not None:
         target = SERIES[along][0]
@@ -100,14 +100,14 @@ def write_plot(file: h5py.File, motion: Motion, known: set[str]) -> None:
 
 
 def new_group(parent: h5py.Group, name: str, nexus: str, **attrs: Any) -> h5py.Group:
-    """Make a group of a NeXus class."""
+    """Create a group of a NeXus class."""
     group = parent.create_group(name)
     group.attrs.update(NX_class=nexus, **attrs)
     return group
 
 
 def put(group: h5py.Group, name: str, unit: str | None, value: Any) -> None:
-    """Write a value and its unit, if there is one."""
+    """Write a value, and its unit if it has one."""
     if value is not None:
         group[name] = fixed_text(value) if isinstance(value, str) else value
         if unit is not None:
@@ -118,7 +118,7 @@ _Source = TypeVar("_Source", bound=Source)
 
 
 class TeeSource(Generic[_Source]):
-    """A source whose frames are written as they go by."""
+    """A source whose frames are also written to a file when they are read."""
 
     name: str
 
@@ -139,7 +139,7 @@ class TeeSource(Generic[_Source]):
         self._compression: Compression = compression
         self._calibration = calibration
         self._replaces: Replaces = "anything" if overwrite else "nothing"
-        self._exit = ExitStack()  # what is to be done when it is left
+        self._exit = ExitStack()  # run when the recorder is closed
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
@@ -147,36 +147,36 @@ class TeeSource(Generic[_Source]):
         self._exit.__exit__(kind, error, trace)
 
     def rewind(self) -> None:
-        """Refuse: what was written stays written."""
+        """Refuse: frames have been written."""
         raise RuntimeError("a recorder cannot be rewound")
 
 
-# Bytes of frames that are drained at a time: much at once, and the system keeps it in large pages.
+# Bytes of frames read at a time: for large blocks the system uses large pages.
 _BLOCK = 64_000_000
 
 
 class Recorder(TeeSource[Source]):
-    """Pass on the frames of a source, and write them to a recording as they go by.
+    """Pass on the frames of a source, and write them to a recording.
 
-    The recording appears under its name when the recorder is left without an error.
+    The recording appears under its name when the recorder is closed without an error.
 
     Parameters
     ----------
     source : Source
     path : str or Path
     compression : {"raw", "bitshuffle", "blosc", "gzip", "lzf"}
-        Raw frames are stored in one piece, which is the fastest to read; the others in one chunk a frame.
+        Raw frames are stored contiguously, which is the fastest to read; others in one chunk per frame.
     truth : Truth or callable, optional
-        What a simulation knows; a callable is called after the last frame.
+        Ground truth of a simulation; a callable is called after the last frame.
     calibration : Calibration, optional
-        What the recording is to carry a copy of; positions and references stay those of the source.
+        Calibration to copy into the recording; positions and references remain those of the source.
     overwrite : bool, optional
         Whether an existing file of that name is replaced; by default it is refused.
 
     Attributes
     ----------
     name, header, shape, dtype, motion, rewindable
-        The source's; what was recorded cannot be read again.
+        Those of the source; recorded frames cannot be read again.
 
     Examples
     --------
@@ -234,7 +234,7 @@ class Recorder(TeeSource[Source]):
         return block
 
     def drain(self, progress: Callable[[int], None]) -> None:
-        """Write all frames, for their recording alone; ``progress`` gets how many there are so far."""
+        """Write all frames without returning them; ``progress`` is called with the number so far."""
         length = max(1, _BLOCK // (self.shape[1] * self.shape[2] * self.dtype.itemsize))
         room = np.empty((min(length, self.shape[0]), *self.shape[1:]), self.dtype)
         while self.read(room) is not None:
@@ -243,7 +243,7 @@ class Recorder(TeeSource[Source]):
     def _finish(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
     ) -> None:
-        """Write what is known only after the last frame."""
+        """Write the values that are only known after the last frame."""
         if kind is None:
             self._check_count(self._count == self.shape[0])
             for name, values in self._series.items():

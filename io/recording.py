@@ -1,4 +1,4 @@
-"""Recordings: frame stacks in HDF5 or Zarr, our own NeXus layout or anyone's; and heights from a file."""
+"""Recordings: frame stacks in HDF5 or Zarr, written by mirrorskin or other programs; heights from a file."""
 
 from __future__ import annotations
 
@@ -57,9 +57,9 @@ class Recording(Closing):
     displacement : ndarray, (T, 2), float64, or None
         Millimetres.
     truth : Truth or None
-        What a simulation knew.
+        Ground truth of a simulation.
     region : Region
-        Which part of the picture it is.
+        The part of the picture.
     origin : (int, int)
         Row and column of the first pixel in the full picture.
     first_frame : int
@@ -67,15 +67,15 @@ class Recording(Closing):
     full_shape : (int, int, int)
         Frames, rows and columns of the whole stack.
     state : str
-        "under way", "complete", or "cut short: " and why.
+        "under way", "complete", or "cut short: " and the reason.
     used, dropped : ndarray, (T,), bool and int, or None
-        Whether a live run used a frame, and how many were lost before it.
+        Whether a live run used a frame, and the number of frames lost before it.
     which : str
-        Which frames of the whole stack these are, for people.
+        The frames of the whole stack that these are, as text.
     storage : str
-        How the frames are stored, for people.
+        How the frames are stored, as text.
     read_ahead : bool
-        Whether reading is worth a thread of its own: of Zarr.
+        Whether reading in a separate thread is faster, as for Zarr.
     """
 
     path: Path
@@ -149,16 +149,16 @@ class Recording(Closing):
         return self._block(frames, lent=not np.may_share_memory(frames, out))
 
     def lend(self, most: int) -> Block | None:
-        """Return the next frames where they lie in the file, at most so many.
+        """Return the next frames without a copy, at most ``most``.
 
-        None at the end, and where frames have to be read. Their pages are the system's, which takes them back
-        when it needs memory.
+        None at the end, and where frames have to be read. The pages of the frames belong to the system's
+        cache, which reclaims them when it needs memory.
         """
         frames = self._stack.lend(self._next, most) if self._next < self.shape[0] else None
         return None if frames is None else self._block(frames, lent=True)
 
     def _block(self, frames: NDArray[Any], lent: bool) -> Block:
-        """Go on behind the next frames, and return them."""
+        """Advance past the next frames, and return them as a block."""
         here = slice(self._next, self._next + len(frames))
         self._next = here.stop
         series = {name: getattr(self, name) for name in SERIES}
@@ -166,7 +166,7 @@ class Recording(Closing):
         return Block(frames, here.start, **known, origin=self.origin, lent=lent)
 
     def frame(self, number: int) -> NDArray[Any]:
-        """Return one frame, (H, W), whichever is the next to be read."""
+        """Return one frame, (H, W); the position of reading does not change."""
         frame: NDArray[Any] = self._stack.read(number, np.empty((1, *self.shape[1:]), self.dtype))[0]
         return frame
 
@@ -175,7 +175,7 @@ class Recording(Closing):
         self._next = 0
 
     def fingerprint(self) -> str:
-        """Return what tells the file from others, if it is as it was; see ``mirrorskin.io.fingerprint``."""
+        """Return a hash that identifies the unchanged file; see ``mirrorskin.io.fingerprint``."""
         if not self._file.root.swmr_mode:
             check_unchanged(self._origins)
         return self._fingerprint
@@ -187,12 +187,14 @@ class Recording(Closing):
         return fingerprint(self._file, self._dataset, self._origins, self.full_shape[0])
 
     def find_damage(self) -> NDArray[np.intp] | None:
-        """Return which frames are not as they were recorded, by their checksums; None where it has none.
+        """Return the frames whose checksums do not match; None if the recording has no checksums.
 
-        Only of a recording that was opened as a whole, which is rewound.
+        The recording must have been opened as a whole, and is rewound.
         """
         if self.shape != self.full_shape:
-            raise InputError(f"{self.name}: frames are verified whole: open it without frames and region")
+            raise InputError(
+                f"{self.name}: only whole recordings can be verified: open it without frames and region"
+            )
         node = self._file.find(CHECKSUM)
         if node is None:
             return None
@@ -205,21 +207,21 @@ class Recording(Closing):
 
     @functools.cached_property
     def carried(self) -> Calibration | None:
-        """The calibration that it carries a copy of, of the whole picture; not applied to anything here."""
+        """The copy of a calibration in the recording, for the whole picture; it is not applied here."""
         return carried_by(self._file)
 
     @property
     def how(self) -> str:
-        """How the frames are fetched."""
+        """How the frames are read."""
         return self._stack.how
 
     @property
     def modified(self) -> str:
-        """When the file, or one that frames lie in, was written last: ISO 8601, UTC; empty of an address."""
+        """When the file, or a file with its frames, was last written: ISO 8601, UTC; empty for an address."""
         return modified(self._origins) if self._origins else ""
 
     def close(self) -> None:
-        """Close the file; frames that were lent live on."""
+        """Close the file; frames that were returned without a copy remain valid."""
         self._stack.close()
         self._file.close()
 
@@ -241,44 +243,44 @@ def open_recording(
     live: bool = False,
     override_motion: bool = False,
 ) -> Recording:
-    """Open a stack of frames in HDF5, Zarr, or an array that ``numpy.save`` or ``numpy.savez`` wrote.
+    """Open a stack of frames in HDF5 or Zarr, or an array written by ``numpy.save`` or ``numpy.savez``.
 
     Parameters
     ----------
     path : str or Path
-        Of Zarr a folder ``NAME.zarr``, that in a ``.zip``, or an address such as ``s3://bucket/NAME.zarr``.
+        For Zarr a folder ``NAME.zarr``, a zipped one, or an address such as ``s3://bucket/NAME.zarr``.
     dataset : str, optional
-        Name of the stack, or of an archive's array; needed where the file is not a recording of ours and
-        holds several.
+        Name of the stack, or of an archive's array; required if the file was not written by mirrorskin and
+        contains several.
     motion : str, optional
-        What the file does not say; one that contradicts the file is refused.
+        Motion, if the file does not contain it; one that contradicts the file is refused.
     travel, phase, tilt, pixel_size
-        What the file does not say, or what to believe instead: positions in mm or radians, one a frame or as
-        ``Steps``; half-angle in radians; mm.
+        Values missing in the file, or replacing those in the file: positions in mm or radians, one per frame
+        or as ``Steps``; half-angle in radians; mm.
     region : Region, optional
-        The part of the picture that is wanted; only that is read. Maps are cut with it, and the pivot is
-        placed from its centre.
+        Part of the picture to read. Maps are cropped, and the pivot becomes relative to the centre of the
+        region.
     frames : (int, int or None), optional
-        The first frame that is wanted, and the end; None for the stack's. Positions are those of the whole
-        stack, and are cut.
+        First frame and end of the frames to read; None for the end of the stack. Positions are given for the
+        whole stack, and are cropped.
     threads : int, optional
-        How many unpack chunks; by default as many as there are cores.
+        Number of threads that unpack chunks; by default the number of cores.
     memory_limit : int, optional
-        Bytes that chunks of frames may take when they are unpacked.
+        Limit of the memory for unpacked chunks of frames, in bytes.
     live : bool, optional
-        Only the frames that a live run used, where it thought the body to be then.
+        Only the frames used by a live run, with the positions it used.
     override_motion : bool, optional
-        Whether the ``motion`` holds even against the file, as for the correlation of any stack with phases.
+        Whether ``motion`` replaces that of the file, to correlate any stack with phases.
 
     Returns
     -------
     Recording
-        Close it, or use it in a ``with``. Of a file that is being written, the frames that are there now.
+        Close it, or use it in a ``with``. For a file that is being written, it contains the present frames.
 
     Raises
     ------
     InputError
-        The file, the stack, or a parameter of it cannot be used.
+        The file, the stack, or one of its parameters cannot be used.
 
     Examples
     --------
@@ -291,7 +293,7 @@ def open_recording(
         from mirrorskin.io.arrays import open_array
 
         if live:
-            raise InputError(f"{path} is no recording of a live run: leave --live out")
+            raise InputError(f"{path} is not a recording of a live run: leave --live out")
         known = {"tilt": tilt, "pixel_size": pixel_size}
         given_positions = {"travel": travel, "phase": phase}
         return open_array(path, dataset, given_positions, known, motion, region, frames, memory_limit)
@@ -315,7 +317,7 @@ def open_recording(
         opened = file.frames(stack) if isinstance(file, ZarrFile) else None
         frames_of = Stack(stack, str(path), shape[0], numbers, cut.region, memory_limit, threads, opened)
         recording = Recording(file, stack, frames_of, cut, header, positions, truth, state, live)
-        opening.pop_all()  # from here on the recording closes its file
+        opening.pop_all()  # the recording closes the file from now on
     return recording
 
 
@@ -327,7 +329,7 @@ def _shape(stack: h5py.Dataset) -> tuple[int, int, int]:
 def cut_out(
     name: str, shape: tuple[int, int, int], frames: tuple[int, int | None] | None, region: Region | None
 ) -> Selection:
-    """Return what is wanted of a stack, if it has that."""
+    """Return the selected part of a stack; InputError if the stack does not contain it."""
     start, end = frames or (0, None)
     stop = shape[0] if end is None else end
     if not 0 <= start <= stop - 2 <= shape[0] - 2:
@@ -346,11 +348,11 @@ def _used(
     travel: ArrayLike | Positions | None,
     phase: ArrayLike | Positions | None,
 ) -> NDArray[np.intp]:
-    """Return the numbers of the frames that a live run used."""
+    """Return the numbers of the frames used by a live run."""
     if travel is not None or phase is not None:
         raise InputError(f"{path}: a live run has its own positions: leave --live out, or those given")
     if state.used is None:
-        raise InputError(f"{path} does not say which frames a live run used: leave --live out")
+        raise InputError(f"{path} does not state which frames a live run used: leave --live out")
     used = np.flatnonzero(state.used)
     if len(used) < 2:
         raise InputError(
@@ -360,13 +362,13 @@ def _used(
 
 
 def _find_stack(file: Hdf5File, dataset: str | None, ours: bool) -> tuple[h5py.Dataset, RecordingState]:
-    """Find the stack that is meant, and how far it has come; refuse what is none or cannot be read."""
+    """Find the stack of frames and its state; refuse one that cannot be read."""
     if dataset is None:
         dataset = STACK if ours else _only_stack(file)
     stack = file.follow(dataset, "name the stack with --dataset")
     where = file.where(stack)
     if not isinstance(stack, h5py.Dataset):
-        raise InputError(f"{where} is no dataset: name one with --dataset")
+        raise InputError(f"{where} is not a dataset: name one with --dataset")
     with as_input_error(where):
         shape, dtype = stack.shape, stack.dtype.newbyteorder("=")
     if shape is None or len(shape) != 3:
@@ -374,7 +376,7 @@ def _find_stack(file: Hdf5File, dataset: str | None, ours: bool) -> tuple[h5py.D
     if dtype not in FRAME_DTYPES:
         raise InputError(f"{where} is of type {dtype}: frames are uint8, uint16 or float32; convert it first")
     if 0 in shape[1:]:
-        raise InputError(f"{where} has shape {shape}: its frames have no pixels; record it anew")
+        raise InputError(f"{where} has shape {shape}: its frames have no pixels; record it again")
     state = read_state(file, ours and dataset == STACK, stack)
     if state.count < 2:
         raise InputError(f"{where} holds {state.count} frames: at least 2 are needed; record more")
@@ -383,7 +385,7 @@ def _find_stack(file: Hdf5File, dataset: str | None, ours: bool) -> tuple[h5py.D
 
 
 def is_recording(path: str | Path) -> bool:
-    """Return whether a file of HDF5 or Zarr is one of our recordings."""
+    """Return whether an HDF5 or Zarr file is a recording written by mirrorskin."""
     with open_file(path) as file:
         return file.marked(MARK)
 
@@ -410,17 +412,17 @@ def open_heights(path: str | Path, source: Recording | None = None) -> NDArray[n
     ----------
     path : str or Path
     source : Recording, optional
-        What they are wanted for: of a larger part of the picture, its part is cut out.
+        Recording whose pixels are needed; heights of a larger part of the picture are cropped.
 
     Returns
     -------
     ndarray, (H, W), float32
-        Millimetres; NaN where none is known.
+        Millimetres; NaN where undefined.
 
     Raises
     ------
     InputError
-        There is no such file, it holds no heights or those of other pixels, or it is damaged.
+        There is no such file, it contains no heights or heights of other pixels, or it is damaged.
 
     Examples
     --------
@@ -436,10 +438,8 @@ def open_heights(path: str | Path, source: Recording | None = None) -> NDArray[n
     else:
         result = open_result(path)
         if result.process.get(UNDISTORTED):
-            remedy = "give one that was made without a scale in its calibration"
-            raise InputError(
-                f"{path} holds undistorted heights, and frames are as the camera saw them: {remedy}"
-            )
+            remedy = "give one that was computed without a scale in its calibration"
+            raise InputError(f"{path} contains undistorted heights, but frames are not undistorted: {remedy}")
         height = absolute_heights(result)
         part = source_region(result.process)
     if height is None:
@@ -456,7 +456,7 @@ def open_heights(path: str | Path, source: Recording | None = None) -> NDArray[n
 def _cut_heights(
     height: NDArray[np.float32], own: Region, source: Recording, name: str
 ) -> NDArray[np.float32]:
-    """Cut out what belongs to the pixels of a recording."""
+    """Crop heights to the pixels of a recording."""
     wanted = source.region
     if not (own.holds(wanted) and Region.whole(source.full_shape[1:]).holds(own)):
         raise InputError(

@@ -1,4 +1,4 @@
-"""The result of a reconstruction: maps by name, with the declarations of what they mean."""
+"""The result of a reconstruction: maps by name, with their declarations."""
 
 from __future__ import annotations
 
@@ -28,26 +28,26 @@ if TYPE_CHECKING:
     from mirrorskin.io.calibration.types import Calibration
 
 FIELDS = ("x", "y", "process", "calibration", "declarations")
-"""What a result has besides maps."""
+"""Contents of a result other than maps."""
 
 RESERVED = frozenset(
     {*FIELDS, "own_maps", "turn", "height_errors", "units", "legends", "file", "allow_pickle"}
 )
-"""Names that no map can have: files use them for other purposes."""
+"""Names that maps cannot have, because files use them for other purposes."""
 
 
 class Shown:
-    """Maps that display themselves: as text, in a notebook, and as figures."""
+    """Base class of maps that are displayed: as text, in a notebook, and as figures."""
 
     __slots__ = ()
 
     def maps(self) -> dict[str, NDArray[Any]]:
-        """Return the maps that there are, by name."""
+        """Return the existing maps, by name."""
         values = {one.name: getattr(self, one.name) for one in fields(self)}  # type: ignore[arg-type]
         return {name: one for name, one in values.items() if isinstance(one, np.ndarray) and one.ndim > 1}
 
     def numbers(self) -> dict[str, float]:
-        """Return the single numbers that there are, by name."""
+        """Return the existing single numbers, by name."""
         return {}
 
     def declaration(self, name: str) -> Map:
@@ -97,10 +97,10 @@ class Result(Shown, Mapping[str, Any]):
 
     The table in `mirrorskin.io.maps` declares the maps of built-in operations: ``result.height`` is an array,
     or None if that map was not computed. A map that a user's own operation declares with the quantity
-    ``"height"`` is ``result.height``, too. The standard deviation of a map ``x`` is ``x_sigma``.
+    ``"height"`` is also available as ``result.height``. The standard deviation of a map ``x`` is ``x_sigma``.
 
     If a rotation is evaluated turn by turn, all maps have a leading axis, (turns, H, W), and components are
-    numbered through all turns.
+    numbered consecutively over all turns.
 
     Parameters
     ----------
@@ -110,20 +110,20 @@ class Result(Shown, Mapping[str, Any]):
     x, y : ndarray, (W,) and (H,), float64, optional
         Millimetres of the pixel centres from the picture's centre; y points up the picture.
     process : mapping, optional
-        Program, version, date, every parameter, device, source and its hash.
+        Program, version, date, all parameters, device, source and its hash.
     calibration : Calibration, optional
-        The calibration that was used, of the camera's whole picture.
+        The calibration used, for the camera's whole picture.
     declarations : mapping of str to Map, optional
-        Declarations of maps that are not in the table, and of those whose legend or texts differ from it.
+        Declarations of maps that are not in the table, or whose legend or texts differ from it.
     **named
-        Maps by name, too. A map whose name is that of a method is only accessible as ``result[name]``.
+        Maps by name. A map with the name of a method is only accessible as ``result[name]``.
 
     Raises
     ------
     InputError
-        A declaration gives a built-in map another unit, or two maps are declared to be the same quantity.
+        A declaration gives a built-in map another unit, or two maps the same quantity.
     AttributeError
-        An attribute is neither a map of this result nor one of the table.
+        An attribute is neither a map of this result nor one in the table.
 
     Examples
     --------
@@ -182,7 +182,7 @@ class Result(Shown, Mapping[str, Any]):
         return len(self._maps)
 
     def __getattr__(self, name: str) -> Any:
-        if name in Result.__slots__:  # of an object whose construction failed
+        if name in Result.__slots__:  # the constructor failed
             raise AttributeError(name)
         own = self.name_of(name)
         if own is not None:
@@ -202,7 +202,7 @@ class Result(Shown, Mapping[str, Any]):
     __hash__ = object.__hash__
 
     def name_of(self, quantity: str) -> str | None:
-        """Return the name of the map of a quantity: of that name, or declared to stand for it.
+        """Return the name of the map of a quantity: the same name, or one declared with this quantity.
 
         Examples
         --------
@@ -215,7 +215,7 @@ class Result(Shown, Mapping[str, Any]):
         return name if name in self._maps else None
 
     def _own_name(self, quantity: str) -> str:
-        """Return the name that a quantity has in this result, if it has the quantity."""
+        """Return the name of a quantity in this result; the quantity itself if there is none."""
         if quantity in self._maps:
             return quantity
         base = quantity.removesuffix(SIGMA) if is_deviation(quantity) else quantity
@@ -227,7 +227,7 @@ class Result(Shown, Mapping[str, Any]):
         return declaration_of(name, self.declarations)
 
     def assign(self, maps: Mapping[str, Any] | None = None, /, **changes: Any) -> Result:
-        """Return a copy of the result in which maps or fields are replaced; a map that is None is removed.
+        """Return a copy of the result in which maps or fields are replaced; a map set to None is removed.
 
         Parameters
         ----------
@@ -257,7 +257,7 @@ class Result(Shown, Mapping[str, Any]):
         return {name: float(value) for name, value in self._along("none").items()}
 
     def series(self) -> dict[str, Floats]:
-        """Return what was computed for each frame, by name."""
+        """Return the values for each frame, by name."""
         return self._along("frames")
 
     def _along(self, axes: str) -> dict[str, Any]:
@@ -281,7 +281,7 @@ class Result(Shown, Mapping[str, Any]):
 
     @classmethod
     def from_xarray(cls, dataset: xarray.Dataset) -> Result:
-        """Return the result that ``to_xarray`` converted, without its calibration.
+        """Return the result converted by ``to_xarray``, without its calibration.
 
         Examples
         --------
@@ -304,12 +304,12 @@ def result_of(
     process: Mapping[str, ProcessValue],
     declarations: Mapping[str, Map] | None = None,
 ) -> Result:
-    """Return a result of copies of maps by name, checked against their declarations.
+    """Return a result with copies of maps, checked against their declarations.
 
     Parameters
     ----------
     maps : mapping of array_like, (H, W), or of vectors, (H, W, components)
-        Built-in and declared maps get the declared type.
+        Built-in and declared maps are converted to the declared type.
     shape : (int, int)
     process : mapping
     declarations : mapping of str to Map, optional
@@ -317,7 +317,7 @@ def result_of(
     Raises
     ------
     InputError
-        A map has another shape or values that its type cannot hold, does not hold numbers, or has a name that
+        A map has the wrong shape, values that its type cannot hold or that are not numbers, or a name that
         is not allowed.
 
     Examples
@@ -341,7 +341,7 @@ def result_of(
 
 
 def _checked_map(name: str, values: NDArray[Any], declared: Map, shape: tuple[int, int]) -> Any:
-    """Return a map in its declared type, or raise InputError if its shape or values do not fit."""
+    """Return a map in its declared type; raise InputError if its shape or values do not fit."""
     size = (*shape, len(declared.components)) if declared.components else shape
     if declared.axes != "pixels":
         size = () if declared.axes == "none" else values.shape[:1] or (1,)
@@ -380,14 +380,14 @@ def may_name_a_map(name: str) -> bool:
 
 
 def map_shape(result: Result) -> tuple[int, ...]:
-    """Return the size of a result's maps: (H, W), or (turns, H, W)."""
+    """Return the shape of a result's maps: (H, W), or (turns, H, W)."""
     for name, values in result.maps().items():
         return size_of_maps(result.declaration(name), values.shape)
     return (0, 0)
 
 
 def size_of_maps(declared: Map, shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the size of the maps of a result, (H, W) or (turns, H, W), that has a map of this shape."""
+    """Return the shape of the maps of a result, (H, W) or (turns, H, W), that has a map of this shape."""
     size = shape[:-1] if declared.components else shape
     return size[-2:] if declared.per_frame else size
 
@@ -399,17 +399,17 @@ def select_turn(result: Result, turn: int | None) -> Result:
     ----------
     result : Result
     turn : int or None
-        Number of the turn, from 0; None for a result whose maps belong to all turns together.
+        Number of the turn, from 0; None for a result with maps of all turns together.
 
     Returns
     -------
     Result
-        With maps (H, W); its components are numbered from 0, and its process contains the turn.
+        Maps (H, W); components are numbered from 0, and the process contains the turn.
 
     Raises
     ------
     InputError
-        The result has turns and none is chosen, or it does not have that one.
+        The result has turns and none is chosen, or it does not have the chosen one.
 
     Examples
     --------
@@ -435,7 +435,7 @@ def select_turn(result: Result, turn: int | None) -> Result:
 def _renumbered(
     component: NDArray[np.int32], offset_unknown: NDArray[np.uint8] | None
 ) -> dict[str, NDArray[Any]]:
-    """Give the components that one turn has numbers from 0 on."""
+    """Renumber the components of one turn from 0."""
     own = np.unique(component[component >= 0])
     numbered = np.where(component >= 0, np.searchsorted(own, component), -1).astype(np.int32)
     if offset_unknown is None:

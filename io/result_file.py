@@ -1,4 +1,4 @@
-"""Result files: the maps of a reconstruction, their declarations, and how they came about."""
+"""Result files: the maps of a reconstruction, their declarations, and their provenance."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ from mirrorskin.io.zarr import open_file
 
 MARK = "mirrorskin_result"
 _RESULT, _PROCESS, _OWN = "/entry/result", "/entry/process", "own_maps"
-_DECLARATION = "declaration"  # attribute of a map whose declaration is not in the table
+_DECLARATION = "declaration"  # attribute of a map that is not declared in the table
 _AGAIN = "reconstruct it again"
 _AXES = dict.fromkeys("xy", Map(unit="mm", dtype="float64"))
-_LAYOUT = 2  # of the files that are written; in layout 1 maps were not declared, and some had other names
+_LAYOUT = 2  # of the files written here; in layout 1 maps were not declared, and some had other names
 
 
 @checked
 def save_result(result: Result, path: str | Path) -> None:
-    """Write a result; the file exists whole or not at all.
+    """Write a result; the file appears complete or not at all.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def save_result(result: Result, path: str | Path) -> None:
     Raises
     ------
     InputError
-        It cannot be written there.
+        The file cannot be written.
 
     Examples
     --------
@@ -85,12 +85,12 @@ def _items(result: Result) -> Iterator[Item]:
     yield from process_items(_PROCESS, result.process)
     if result.calibration is not None:
         yield from calibration_items(result.calibration, CARRIED)
-    if result.height_sigma is not None:  # where viewers look for errors
+    if result.height_sigma is not None:  # viewers use a dataset of this name for error bars
         yield Item(f"{_RESULT}/height_errors", f"{_RESULT}/{result.name_of(f'height{SIGMA}')}", {})
 
 
 def _map_items(result: Result) -> Iterator[Item]:
-    """Yield the maps, and the axes of a plot: the turns, and the places of the pixels."""
+    """Yield the maps, and the axes of a plot: the turns, and the positions of the pixels."""
     for name, values in result.items():
         declared = result.declaration(name)
         attributes = declared.attributes()
@@ -117,7 +117,7 @@ def _axes(result: Result) -> dict[str, NDArray[Any]]:
 
 
 def _plot(result: Result) -> dict[str, Any]:
-    """Return the attributes by which viewers plot the maps; NeXus has no picture of vectors."""
+    """Return the attributes that viewers use to plot the maps; vectors cannot be plotted."""
     plotted = [name for name in result.maps() if not result.declaration(name).components]
     axes = list(_axes(result))
     plot: dict[str, Any] = {"signal": plotted[0], "auxiliary_signals": plotted[1:]} if plotted else {}
@@ -133,7 +133,7 @@ def open_result(path: str | Path) -> Result:
     Raises
     ------
     InputError
-        There is no such file, it is no result, or it is damaged.
+        The file does not exist, is not a result, or is damaged.
 
     Examples
     --------
@@ -156,7 +156,7 @@ def open_result(path: str | Path) -> Result:
                 raise InputError(f"{file.where(node)} has numbers below -1: {_AGAIN}")
         for name, direction in (("x", 1), ("y", -1)):
             if name in maps and not np.all(direction * np.diff(maps[name]) > 0):
-                raise InputError(f"{path}: {_RESULT}/{name} does not run as pixels do: {_AGAIN}")
+                raise InputError(f"{path}: {_RESULT}/{name} is not in the order of the pixels: {_AGAIN}")
         process = read_process(file, _PROCESS)
         if _layout(file) < _LAYOUT and "status" in maps:
             declarations |= _status_of_layout_1(maps, process)
@@ -165,9 +165,9 @@ def open_result(path: str | Path) -> Result:
 
 
 def open_process(path: str | Path, *names: str) -> dict[str, ProcessValue]:
-    """Read how a result came about, or only some of that; its maps are looked for, and not read.
+    """Read the provenance of a result, or some values of it; its maps are checked, but not read.
 
-    What is not there is missing. See ``open_result``.
+    Missing values are left out. See ``open_result``.
     """
     with _opened(path_of(path)) as file:
         for node, shape in _find_maps(file)[0].values():
@@ -180,7 +180,9 @@ def open_process(path: str | Path, *names: str) -> dict[str, ProcessValue]:
 def _opened(path: Path) -> Iterator[Hdf5File]:
     with open_file(path) as file:
         if not file.marked(MARK):
-            raise InputError(f"{path} is no result: 'mirrorskin reconstruct' makes one from a recording")
+            raise InputError(
+                f"{path} is not a result: 'mirrorskin reconstruct' computes one from a recording"
+            )
         file.check_layout(MARK, _LAYOUT)
         yield file
 
@@ -194,7 +196,7 @@ Found = dict[str, tuple[Node, Shape]]
 
 
 def _find_maps(file: Hdf5File) -> tuple[Found, dict[str, Map]]:
-    """Find the maps and axes that a file has, with the shapes that they must have, and their declarations."""
+    """Find the maps and axes in a file, with their required shapes and their declarations."""
     group = file.find(_RESULT)
     listed = file.find(f"{_RESULT}/{_OWN}")
     own = () if listed is None else filter(may_name_a_map, file.texts(listed, _AGAIN))
@@ -222,7 +224,7 @@ def _find_maps(file: Hdf5File) -> tuple[Found, dict[str, Map]]:
 
 
 def _shaped(file: Hdf5File, nodes: Mapping[str, Node], declarations: Mapping[str, Map]) -> Found:
-    """Return the maps with the shapes that they must have, which follow from that of the first."""
+    """Return the maps with their required shapes, which follow from the shape of the first one."""
     shapes: dict[str, Shape] = {name: getattr(node, "shape", None) or () for name, node in nodes.items()}
     declared = {name: declaration_of(name, declarations) for name in nodes if name not in _AXES}
     size = next(
@@ -242,7 +244,7 @@ def _shaped(file: Hdf5File, nodes: Mapping[str, Node], declarations: Mapping[str
 
 
 def _check_frames(path: str | Path, found: Found, declarations: Mapping[str, Map]) -> None:
-    """Refuse what is known of each frame if it is of different numbers of frames."""
+    """Refuse series with different numbers of frames."""
     counts = {}
     for name, (_node, shape) in found.items():
         declared = _AXES.get(name) or declaration_of(name, declarations)
@@ -254,10 +256,10 @@ def _check_frames(path: str | Path, found: Found, declarations: Mapping[str, Map
 
 
 def _status_of_layout_1(maps: Mapping[str, Any], process: Mapping[str, ProcessValue]) -> dict[str, Map]:
-    """Return the declaration of ``status`` in a file of layout 1, which follows from what else is there."""
+    """Return the declaration of ``status`` in a file of layout 1, which follows from the other contents."""
     if "sharpness" in maps:
         return {"status": status_of(FocusStatus)}
-    if "estimator" in process:  # of a user's own
+    if "estimator" in process:  # a user's own estimator
         return {}
     if "slip_onset" in maps:
         return {"status": status_of(SlipStatus)}

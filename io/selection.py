@@ -1,4 +1,4 @@
-"""Which part of a stack is meant: a rectangle of the picture, some of the frames."""
+"""Parts of a stack: a rectangle of the picture, and a range of frames."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _TEXT = re.compile("([0-9]{1,9}),([0-9]{1,9}),([1-9][0-9]{0,8})x([1-9][0-9]{0,8}
 
 @dataclass(frozen=True, slots=True)
 class Region:
-    """A rectangle of the picture, in pixels; as with slices, the end is the first that is left out.
+    """A rectangle of the picture, in pixels; the end is excluded, as for slices.
 
     Attributes
     ----------
@@ -36,12 +36,12 @@ class Region:
 
     @classmethod
     def whole(cls, picture: tuple[int, int]) -> Self:
-        """Return all of a picture of so many rows and columns."""
+        """Return the region of a whole picture with the given rows and columns."""
         return cls((0, picture[0]), (0, picture[1]))
 
     @classmethod
     def read(cls, text: str) -> Self | None:
-        """Return the region that the property ``text`` wrote; None of anything else."""
+        """Return the region written by the property ``text``; None for any other text."""
         found = _TEXT.fullmatch(text)
         if found is None:
             return None
@@ -50,7 +50,7 @@ class Region:
 
     @property
     def text(self) -> str:
-        """Its first column and row, and how many of each, as in ``100,50,640x480``."""
+        """Its first column and row, and the numbers of columns and rows, as in ``100,50,640x480``."""
         (rows, columns), (row, column) = self.shape, self.origin
         return f"{column},{row},{columns}x{rows}"
 
@@ -69,29 +69,29 @@ class Region:
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """What cuts it out of a map."""
+        """The slices that crop a map of the picture to this region."""
         return slice(*self.rows), slice(*self.columns)
 
     def holds(self, other: Region) -> bool:
-        """Tell whether another region lies within this."""
+        """Return whether this region contains another."""
         return all(
             mine[0] <= its[0] and its[1] <= mine[1]
             for mine, its in ((self.rows, other.rows), (self.columns, other.columns))
         )
 
     def within(self, outer: Region) -> tuple[slice, slice]:
-        """Return what cuts this out of a map of another region."""
+        """Return the slices that crop a map of another region to this one."""
         (top, left), (rows, columns) = outer.origin, self.slices
         return slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left)
 
     def centre(self, picture: tuple[int, int], pixel_size: tuple[float, float]) -> tuple[float, float]:
-        """Return where its centre is, mm to the right and up from the centre of a picture of that size."""
+        """Return the position of its centre relative to the centre of a picture, mm to the right and up."""
         down = (sum(self.rows) - picture[0]) / 2
         right = (sum(self.columns) - picture[1]) / 2
         return right * pixel_size[0], -down * pixel_size[1]
 
     def check(self, picture: tuple[int, int], name: str) -> None:
-        """Raise InputError if it does not lie within a picture of so many rows and columns."""
+        """Raise InputError if it is not within a picture of the given rows and columns."""
         for axis, (start, stop), count in (
             ("rows", self.rows, picture[0]),
             ("columns", self.columns, picture[1]),
@@ -104,9 +104,9 @@ class Region:
 
 
 def source_region(process: Mapping[str, object]) -> Region | None:
-    """Return the part of the picture that a result was made of, from its process; None if that is not known.
+    """Return the region of the picture that a result was made from; None if it is unknown.
 
-    A result of 'fuse' names the part of both recordings, which is the same.
+    The process of a result of 'fuse' contains the region of both recordings, which is the same.
 
     Examples
     --------
@@ -118,7 +118,7 @@ def source_region(process: Mapping[str, object]) -> Region | None:
 
 
 class Selection(NamedTuple):
-    """What is wanted of a dataset: the frames, first and end, and the region of the picture."""
+    """A part of a dataset: the frames, first and end, and the region of the picture."""
 
     frames: Span
     region: Region
@@ -126,12 +126,12 @@ class Selection(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where frames come from, for messages: the file, as the user calls it, and the dataset."""
+    """Source of frames, for messages: the file, as the user named it, and the dataset."""
 
     path: str
     dataset: str
 
     def reading(self, start: int, stop: int) -> AbstractContextManager[None]:
-        """Name the frames, ``start`` to ``stop`` of the whole stack, if it fails to read them."""
+        """Return a context that names the frames ``start`` to ``stop`` in errors of reading them."""
         frames = f"frame {start}" if stop == start + 1 else f"frames {start} to {stop - 1}"
         return as_input_error(f"{self.path}: {frames} of {self.dataset} cannot be read")

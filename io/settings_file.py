@@ -1,4 +1,4 @@
-"""TOML files that people write, checked against a model: a `msgspec.Struct` with a field for each key."""
+"""TOML files written by users, checked against a model: a `msgspec.Struct` with a field for each key."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _Model = TypeVar("_Model", bound=msgspec.Struct)
 def load_toml(path: str | Path, model: type[_Model], remedy: str) -> _Model:
     """Read a TOML file as its model; ``remedy`` ends the message about a file that cannot be read.
 
-    A table is a field whose type is a `msgspec.Struct`. What a key may be is its type: a number with bounds,
-    a text, a choice (`Literal`), a list; ``msgspec.Meta`` gives the bounds, says in words what is needed
-    (``description``) and how it may look (``examples``). A ``__post_init__`` that raises ValueError checks
-    what belongs together. Numbers are finite.
+    A table is a field whose type is a `msgspec.Struct`. The type of a key defines its values: a number with
+    bounds, a text, a choice (`Literal`), a list. ``msgspec.Meta`` contains the bounds, a description of valid
+    values (``description``) and examples (``examples``). A ``__post_init__`` that raises ValueError checks
+    the consistency of several keys. Numbers are finite.
 
     Examples
     --------
@@ -51,14 +51,14 @@ def load_toml(path: str | Path, model: type[_Model], remedy: str) -> _Model:
 
 
 def quote(value: Any) -> str:
-    """Write a value as TOML does, near enough to be recognised in a message."""
+    """Return a value in TOML syntax, approximately, for messages."""
     if isinstance(value, dict):
         return "a table"
     if isinstance(value, bool):
         return str(value).lower()
     try:
         text = f'"{value}"' if isinstance(value, str) else str(value)
-    except ValueError:  # a whole number of thousands of digits
+    except ValueError:  # an integer with thousands of digits
         return "too large a number"
     return shortened(printable(text))
 
@@ -100,7 +100,7 @@ def _value(value: Any, kind: Any, where: str, key: str) -> Any:
 
 
 def _convert(value: Any, kind: Any) -> Any:
-    """Convert to the first of a union that fits: msgspec 0.22 crashes if a tuple and a bound are in one."""
+    """Convert to the first matching type of a union: msgspec 0.22 crashes on a tuple and a bound in one."""
     inner = get_args(kind)[0] if get_origin(kind) is Annotated else kind
     if get_origin(inner) not in (Union, UnionType):
         return msgspec.convert(value, kind)
@@ -120,7 +120,7 @@ def _is_finite(value: Any) -> bool:
 
 
 def _within(kind: Any) -> Iterator[Any]:
-    """Yield a type and those that it is a union of, without what annotates them."""
+    """Yield a type, or the members of a union, without their annotations."""
     if get_origin(kind) is Annotated:
         kind = get_args(kind)[0]
     yield kind
@@ -134,7 +134,7 @@ def _is_model(kind: Any) -> bool:
 
 
 def _meta(kind: Any) -> msgspec.Meta | None:
-    """Return the outermost annotation that says something in words."""
+    """Return the outermost annotation with a description."""
     if get_origin(kind) is Annotated:
         for one in kind.__metadata__:
             if isinstance(one, msgspec.Meta) and one.description:

@@ -1,6 +1,6 @@
-"""The frames of a dataset, all or some of them, or a part of each, by the fastest way to fetch them.
+"""Frames of a dataset, all or some of them, or a region of each, read by the fastest method.
 
-Frames in one piece are mapped; chunks are decoded by threads; the rest is read by HDF5.
+Contiguous frames are mapped into memory; chunks are decoded by threads; others are read by HDF5.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from mirrorskin.io.zarr import ZarrFrames
 
 _log = logging.getLogger("mirrorskin.io")
 
-_LIMIT = 256_000_000  # bytes of unpacked frames, where nothing else is given
-_MAPPED = 4  # times as many of a mapped file are lent at once: they are in the system's cache
-_PADDING = 64  # bytes behind the last sample that must be there, too: kernels load their last word whole
+_LIMIT = 256_000_000  # bytes of unpacked frames, by default
+_MAPPED = 4  # factor for mapped frames, which are in the system's cache
+_PADDING = 64  # bytes required after the last sample, because kernels load their last word as a whole
 
 
 class MappedFrames:
-    """Frames in one piece, from some byte of an open file on; whole ones are lent where they lie.
+    """Contiguous frames in an open file, starting at an offset; whole frames are returned without a copy.
 
     OSError: the file is too short, or cannot be mapped. The descriptor may be closed afterwards. At most
-    ``span`` bytes are lent at once, and at most a quarter of the machine's memory: a kernel that comes by
-    them again and again must find them there.
+    ``span`` bytes are returned at once, and at most a quarter of the machine's memory, because a kernel that
+    reads them several times must find them in memory.
     """
 
     length: int
@@ -71,7 +71,7 @@ class MappedFrames:
         self._map: mmap.mmap | None = pages
         self._offset = offset - base
         self._frames = np.ndarray(shape, dtype, self._map, self._offset)
-        # Whole pages are mapped, to the end of the last.
+        # Whole pages are mapped, up to the end of the last one.
         reach = -(-length // mmap.PAGESIZE) * mmap.PAGESIZE
         self._lendable = (reach - _PADDING - self._offset) // self._frame if self._frames.flags.aligned else 0
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
@@ -79,7 +79,7 @@ class MappedFrames:
         self._used = self._dropped = 0
 
     def lend(self, start: int, stop: int) -> NDArray[Any] | None:
-        """Return whole frames where they lie, perhaps fewer; None if the first cannot be lent."""
+        """Return whole frames without a copy, perhaps fewer than requested; None if there are none."""
         stop = min(stop, start + self._longest, self._lendable)
         if stop <= start:
             return None
@@ -92,17 +92,17 @@ class MappedFrames:
         out[...] = self._frames[slice(*frames), *region.slices]
 
     def close(self) -> None:
-        """Let go of the pages; those that were lent live on with the frames."""
-        self._frames = self._frames[:0].copy()  # a view would hold the mapping
+        """Release the pages; frames that were returned keep theirs."""
+        self._frames = self._frames[:0].copy()  # a view would keep the mapping
         self._map = None
 
     def _turn_to(self, start: int, stop: int) -> None:
-        """See that frames are there, and let go of those before the block before."""
+        """Check that frames exist, and release those before the preceding block."""
         with self._place.reading(start, stop):
             if self._map is None:
                 raise ValueError("(it is closed)")
             self._check_length(self._map.size())
-            # Pages that were used count to the memory of this process.
+            # Pages that were read count as memory of this process.
             behind = self._offset + min(self._used, start) * self._frame
             behind -= behind % mmap.PAGESIZE
             if behind > self._dropped:
@@ -115,7 +115,7 @@ class MappedFrames:
 
 
 class Hdf5Frames(Closing):
-    """A dataset that HDF5 itself reads, in one thread; ``why`` says what keeps us from doing so."""
+    """A dataset that HDF5 reads in one thread; ``why`` is the reason that faster methods do not apply."""
 
     scratch_bytes: int
 
@@ -126,20 +126,20 @@ class Hdf5Frames(Closing):
         self._dataset, self._place = dataset, place
 
     def lend(self, start: int, stop: int) -> None:
-        """Lend nothing that was not read."""
+        """Return None: frames have to be read."""
 
     def fetch(self, frames: Span, region: Region, out: NDArray[Any]) -> None:
-        """Write a part into ``out``, which is in C order."""
+        """Write a part into ``out``, a C-contiguous array."""
         with self._place.reading(*frames):
             self._dataset.read_direct(out, (slice(*frames), *region.slices))
 
 
 class Stack:
-    """Some frames (``numbers``, in order) of the first ``count`` of a dataset, and of each the ``region``.
+    """Some frames (``numbers``, in order) of the first ``count`` of a dataset, and the ``region`` of each.
 
-    Nobody writes to frames that are returned where they lie, as long as someone refers to them. A chunk is
-    unpacked once: frames of chunks that hold more of them than are read at a time are kept, in memory of so
-    many bytes or on disk.
+    Frames that are returned without a copy are never overwritten while they are referred to. A chunk is
+    unpacked once: if chunks contain more frames than are read at a time, these are kept in memory, up to
+    ``limit`` bytes, or on disk.
     """
 
     shape: tuple[int, int, int]
@@ -170,15 +170,15 @@ class Stack:
 
     @property
     def how(self) -> str:
-        """How frames are fetched, for people."""
+        """How frames are read, as text."""
         return self._how or self._frames.how
 
     def lend(self, start: int, most: int) -> NDArray[Any] | None:
-        """Return frames where they lie, at most so many, as is wise; None where they have to be read."""
+        """Return frames without a copy, at most ``most`` or fewer; None where they have to be read."""
         return self._frames.lend(*self._run(start, most)) if self._whole else None
 
     def read(self, start: int, out: NDArray[Any]) -> NDArray[Any]:
-        """Return frames in ``out`` or where they lie, at most as many as it holds."""
+        """Return frames in ``out`` or without a copy, at most as many as it holds."""
         lent = self.lend(start, len(out))
         if lent is not None:
             return lent
@@ -194,26 +194,26 @@ class Stack:
         return self._unpacked[first - self._kept[0] : min(stop, self._kept[1]) - self._kept[0]]
 
     def close(self) -> None:
-        """Let go of the file; what was lent lives on."""
+        """Close the file; returned frames remain valid."""
         self._frames.close()
         self._unpacked, self._memory, self._kept = None, None, (0, 0)
 
     def _run(self, start: int, most: int) -> Span:
-        """Return which frames of the dataset follow each other from a wanted one on: first and end."""
+        """Return the consecutive frames of the dataset from a selected one on: first and end."""
         numbers = self._numbers[start : start + most]
         gaps = np.flatnonzero(np.diff(numbers) != 1)
         return int(numbers[0]), int(numbers[gaps[0] if gaps.size else -1]) + 1
 
     def _chunk_span(self, frame: int) -> Span:
-        """Return which frames share their chunks with one."""
+        """Return the frames that share chunks with a frame."""
         start = frame // self._frames.length * self._frames.length
         return max(start, self._first), min(start + self._frames.length, self._end)
 
     def _unpack(self, start: int, stop: int) -> None:
-        """Unpack all chunks of some frames into memory; if there is no room, those of all frames to disk."""
+        """Unpack all chunks of some frames into memory; if they do not fit, those of all frames to disk."""
         frame, count = math.prod(self.shape[1:]) * self.dtype.itemsize, self._end - self._first
         size = min(self._frames.length, count) * frame + _PADDING
-        # While the next are unpacked, someone may still work on those before.
+        # While the next frames are unpacked, the preceding ones may still be in use.
         alive = 1 if stop - start == count else 2
         fits = alive * size + self._frames.scratch_bytes <= self._limit
         before = None if self._unpacked is None else weakref.ref(self._unpacked)
@@ -239,7 +239,7 @@ class Stack:
         self._how = "unpacked into memory" if fits else "unpacked to disk"
 
     def _disk_memory(self, size: int) -> mmap.mmap:
-        """Return the memory of a file without a name."""
+        """Return the memory of a mapped file without a name."""
         what = f"{self._place.path}: {self._place.dataset} is unpacked to disk, {size / 1e9:.3g} GB"
         remedy = "name a folder with more room in TMPDIR, raise --memory, or repack it in chunks of one frame"
         with as_input_error(what, remedy), tempfile.TemporaryFile(buffering=0) as file:
@@ -250,7 +250,7 @@ class Stack:
 def _open(
     dataset: h5py.Dataset, place: Place, count: int, limit: int, threads: int | None
 ) -> MappedFrames | Chunks | Hdf5Frames:
-    """Open the frames: mapped if they lie in one piece, else their chunks; through HDF5 if only that can."""
+    """Open the frames: mapped if they are contiguous, else by chunks, else through HDF5."""
     offset, codecs = None if dataset.chunks else dataset.id.get_offset(), find_codecs(dataset)
     why = _why_only_hdf5(dataset) or (codecs if isinstance(codecs, str) else "")
     if not why and not dataset.chunks and offset is None:
@@ -266,7 +266,7 @@ def _open(
             if not codecs:
                 offset = index.contiguous_offset(shape)
             if offset is None:
-                # So many threads that a quarter of the memory is enough for them.
+                # The number of threads is limited so that a quarter of the memory suffices for them.
                 most = max(1, limit // (4 * math.prod(dataset.chunks) * dtype.itemsize))
                 threads = min(threads or len(os.sched_getaffinity(0)), most)
                 opened, file = file, -1
@@ -278,8 +278,8 @@ def _open(
 
 
 def _open_again(opened: h5py.File) -> int:
-    """Open the file that HDF5 has open, if no other took its name."""
-    # Not a duplicate of HDF5's own descriptor: that would hold its lock as long as frames are lent.
+    """Open again the file that HDF5 has open, unless the name now belongs to another file."""
+    # A duplicate of HDF5's descriptor would hold its lock as long as frames are in use.
     file = os.open(opened.filename, os.O_RDONLY | os.O_CLOEXEC)
     if not os.path.samestat(os.fstat(file), os.fstat(opened.id.get_vfd_handle())):
         os.close(file)
@@ -288,7 +288,7 @@ def _open_again(opened: h5py.File) -> int:
 
 
 def _why_only_hdf5(dataset: h5py.Dataset) -> str:
-    """Return what only HDF5 can read: elsewhere, or in another form than in memory; nothing if we can."""
+    """Return why only HDF5 can read a dataset (storage or data type); an empty text otherwise."""
     if dataset.is_virtual:
         return "virtual"
     if dataset.external:
@@ -298,20 +298,21 @@ def _why_only_hdf5(dataset: h5py.Dataset) -> str:
     return ""
 
 
-# Whoever touches a page that its file has no longer gets SIGBUS, which ends the program: a kernel's thread
-# may do so between the check of a block and its end. Such pages are replaced by empty ones; that the file is
-# not as it was is told by the check of the next block, or by that of the source's fingerprint at the end.
+# Accessing a mapped page beyond the end of a file that became shorter raises SIGBUS, which ends the program.
+# A kernel's thread may do this between the check of a block and its end. Such pages are replaced by empty
+# ones. The check of the next block, or of the source's fingerprint at the end, detects that the file has
+# changed.
 
 _maps: weakref.WeakKeyDictionary[mmap.mmap, tuple[int, int]] = weakref.WeakKeyDictionary()
-"""Pages of files: their address, and where they begin in the file."""
+"""Mapped pages of files: their address, and their offset in the file."""
 
 _FIXED, _WITH_ADDRESS = 0x10, 4  # MAP_FIXED, SA_SIGINFO
-_FAULT = 16  # bytes from the begin of a siginfo_t to the address that was touched
+_FAULT = 16  # offset of the accessed address in a siginfo_t, in bytes
 _HANDLER = ctypes.CFUNCTYPE(None, ctypes.c_int, ctypes.c_size_t, ctypes.c_size_t)
 
 
 class _Action(ctypes.Structure):
-    """A struct sigaction of Linux's C libraries."""
+    """struct sigaction of Linux C libraries."""
 
     _fields_ = (
         ("handler", ctypes.c_void_p),
@@ -323,14 +324,14 @@ class _Action(ctypes.Structure):
 
 @functools.cache
 def _survive_lost_pages() -> Any:
-    """Replace lost pages when one is touched; any other SIGBUS is left to who had it before."""
+    """Replace lost pages when one is accessed; any other SIGBUS is passed to the previous handler."""
     libc, before = ctypes.CDLL(None), _Action()
     libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
     libc.mmap.restype = ctypes.c_void_p
 
     def replace(number: int, info: int, _: int) -> None:
         touched = ctypes.c_size_t.from_address(info + _FAULT).value
-        with suppress(OSError):  # a file that does not even tell its size
+        with suppress(OSError):  # the size of the file cannot be read
             for pages, (address, base) in list(_maps.items()):
                 kept = max(0, -(-(pages.size() - base) // mmap.PAGESIZE)) * mmap.PAGESIZE
                 if address + kept <= touched < address + -(-len(pages) // mmap.PAGESIZE) * mmap.PAGESIZE:
@@ -342,4 +343,4 @@ def _survive_lost_pages() -> Any:
     handler = _HANDLER(replace)
     action = _Action(ctypes.cast(handler, ctypes.c_void_p).value, flags=_WITH_ADDRESS)
     libc.sigaction(signal.SIGBUS, ctypes.byref(action), ctypes.byref(before))
-    return handler  # kept, since the system calls it
+    return handler  # must not be garbage-collected, since the system calls it

@@ -1,4 +1,4 @@
-"""Recordings that are written while frames come, and can be watched meanwhile."""
+"""Recordings that are written live, and can be read meanwhile."""
 
 from __future__ import annotations
 
@@ -57,10 +57,10 @@ from mirrorskin.io.recorder import (
 )
 from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, LiveSource
 
-_POLL = 0.5  # seconds from one look whether the program is still there to the next
-_BACKLOG = 256_000_000  # bytes of frames that may wait for the disk
-_STATE_LENGTH = 240  # bytes; their place is made before the first frame
-_ROWS = 1 << 14  # of each column, for which there is room at once
+_POLL = 0.5  # seconds between checks whether the main program is still running
+_BACKLOG = 256_000_000  # bytes of frames that may wait to be written
+_STATE_LENGTH = 240  # bytes, allocated before the first frame
+_ROWS = 1 << 14  # rows of a column allocated at once
 _PAGE, _STEP, _SPARE, _MOST_META = 4 << 10, 64 << 20, 2 << 20, 4 << 20  # bytes
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _UNABLE = (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS)
@@ -74,7 +74,7 @@ class _Mark(NamedTuple):
 
 
 class _Maps(NamedTuple):
-    """What was found of the frames up to a time."""
+    """Maps computed from the frames up to a time."""
 
     time: float
     height: NDArray[np.float32] | None
@@ -82,54 +82,53 @@ class _Maps(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Bytes."""
+        """Size in bytes."""
         return 0 if self.height is None else self.height.nbytes
 
 
 class _End(NamedTuple):
-    """What is stored after the last frame."""
+    """Values stored after the last frame."""
 
     positions: Mapping[str, Floats]
     state: str
 
 
 class StreamRecorder(TeeSource[LiveSource]):
-    """Pass on the frames of a live source at once, and write them to a recording behind its back.
+    """Pass on the frames of a live source immediately, and write them to a recording in another thread.
 
-    The recording appears with the first frame, as ``file``: that is ``path`` if no file has this name. If an
-    older file has it and ``overwrite`` was given, the recording gets a name of its own next to it
+    The recording appears with the first frame, as ``file``: this is ``path`` if no file has this name. If an
+    older file has it and ``overwrite`` was given, the recording gets its own name next to it
     (``press-partial.h5``), and replaces the older file at the end, if it is complete. From the first frame on
-    other programs can watch (HDF5's SWMR): everything is handed to the system each ``period``, and that is
-    what remains if this process is killed. After an exception the frames so far are kept, and
-    ``/entry/state`` states that the recording was cut short, and why. At the end the source is closed first,
-    so that hardware stops; then the positions are replaced by the source's corrected ones, and those that
-    came with the frames are kept, too.
+    other programs can read it (HDF5's SWMR). Every ``period`` all data is passed to the operating system, and
+    remains if this process is killed. After an exception the frames so far are kept, and ``/entry/state``
+    contains "cut short" and the reason. At the end the source is closed first, so that hardware stops. Then
+    its corrected positions replace those of the frames, which are kept in addition.
 
     Parameters
     ----------
     source : LiveSource
-        Frames that it does not lend are copied.
+        Frames that are not lent are copied.
     path : str or Path
-        HDF5, or for ROS 2 a file ``.mcap`` (`GrowingMessages`), which takes maps, too.
+        HDF5, or for ROS 2 a file ``.mcap`` (`GrowingMessages`), which also stores maps.
     compression : {"raw", "bitshuffle", "blosc", "gzip", "lzf"}
-        Frames are stored in one chunk each; not of MCAP.
+        Frames are stored in one chunk each; not for MCAP.
     period : float, optional
-        Seconds.
+        Interval in seconds.
     calibration : Calibration, optional
-        What the recording is to carry a copy of; positions and references stay those of the source.
+        Calibration to copy into the recording; positions and references remain those of the source.
     overwrite : bool, optional
         Whether an existing file of that name is replaced; by default it is refused.
 
     Attributes
     ----------
     name, header, shape, dtype, motion, rewindable
-        The source's; what was recorded cannot be read again.
+        Those of the source; recorded frames cannot be read again.
     path, file : Path
-        The name that was asked for, and that under which the recording is, once the first frame is written.
+        The requested name, and the actual name of the recording, once the first frame is written.
     state : str
-        "under way", "complete", or "cut short: " and why.
+        "under way", "complete", or "cut short: " and the reason.
     count, written : int
-        Frames that were taken, and those of them that are in the file.
+        Number of frames read, and number of frames in the file.
 
     Examples
     --------
@@ -153,14 +152,14 @@ class StreamRecorder(TeeSource[LiveSource]):
         super().__init__(source, path, compression, calibration, overwrite)
         self.file: Path = self.path
         self.state: str = UNDER_WAY
-        self._older: _Identity | None = None  # which file has the name at the start
+        self._older: _Identity | None = None  # identity of the file that has the name at the start
         self.count = self.written = 0
         self._period = period
         self._messages = self.path.suffix.lower() == MCAP_SUFFIX
         if self._messages:
-            load_writer()  # refused before anything moves
+            load_writer()  # fails before anything moves if it is missing
             if calibration is not None:
-                raise InputError(f"{path}: MCAP has no place for a calibration; record into a file .h5")
+                raise InputError(f"{path}: an MCAP file cannot contain a calibration; record to a file .h5")
         self._queue: queue.SimpleQueue[Block | _Mark | _Maps | _End] = queue.SimpleQueue()
         self._backlog, self._lock = 0, threading.Lock()
         self._error: BaseException | None = None
@@ -168,12 +167,12 @@ class StreamRecorder(TeeSource[LiveSource]):
 
     @property
     def header(self) -> Header:
-        """What holds for all frames; asked of the source when the first frame has come."""
+        """Properties of all frames, read from the source with the first frame."""
         return self.source.header
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Frames that are expected, rows and columns."""
+        """Expected number of frames, rows and columns."""
         return self.source.shape
 
     @property
@@ -192,7 +191,7 @@ class StreamRecorder(TeeSource[LiveSource]):
         return self
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
-        """Read the source's next frames, and hand them to the thread that writes them."""
+        """Read the source's next frames, and pass them to the writing thread."""
         self._check()
         block = self.source.read(out)
         self._check()
@@ -209,11 +208,11 @@ class StreamRecorder(TeeSource[LiveSource]):
         return self.source.positions()
 
     def mark(self, index: int, used: NDArray[np.bool_]) -> None:
-        """Say whether frames, from number ``index`` on, were used; unless marked, they were."""
+        """Mark frames, from number ``index`` on, as used or not; unmarked frames count as used."""
         self._queue.put(_Mark(index, np.array(used, bool)))
 
     def add_maps(self, time: float, height: NDArray[np.float32] | None, contact_area: float | None) -> None:
-        """Write what was found of the frames up to a time, mm and mm^2; HDF5 has no place for it."""
+        """Write maps computed from the frames up to a time, mm and mm^2; HDF5 has no place for them."""
         if self._messages and self.count:
             maps = _Maps(time, height, contact_area)
             self._reserve(maps.size)
@@ -224,7 +223,7 @@ class StreamRecorder(TeeSource[LiveSource]):
             raise self._error
 
     def _hand_over(self, block: Block) -> None:
-        """Queue a block for the thread that writes, if there is room."""
+        """Queue a block for the writing thread, unless the queue is full."""
         frames, size = block.frames, block.frames.nbytes
         if frames.dtype != self.dtype or frames.shape[1:] != self.shape[1:]:
             raise ValueError(f"{self.name} gave {frames.shape} {frames.dtype} and announced {self.shape}")
@@ -235,7 +234,7 @@ class StreamRecorder(TeeSource[LiveSource]):
         self.count += len(frames)
 
     def _reserve(self, size: int) -> None:
-        """Count bytes that are to wait for the disk; InputError if there are too many."""
+        """Count bytes that wait to be written; InputError if there are too many."""
         with self._lock:
             backlog, self._backlog = self._backlog, self._backlog + size
         if backlog and backlog + size > _BACKLOG:
@@ -247,17 +246,17 @@ class StreamRecorder(TeeSource[LiveSource]):
     def _finish(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
     ) -> None:
-        """Have the thread write what is known only now, and wait for it."""
+        """Let the thread write the final values, and wait for it."""
         positions: Mapping[str, Floats] = {}
         failure = error
         try:
             if self.count:
                 positions = self.source.positions()
-        except BaseException as failed:  # Ctrl-C, too: the frames are kept all the same
+        except BaseException as failed:  # Ctrl-C, too: the frames are kept in any case
             failure = failure or failed
         finally:
             self._queue.put(_End(positions, COMPLETE if failure is None else _cut_short(failure)))
-        if self._writer.ident is not None:  # it was started
+        if self._writer.ident is not None:  # the thread was started
             self._writer.join()
         if error is None:
             failure = self._error or failure
@@ -267,7 +266,7 @@ class StreamRecorder(TeeSource[LiveSource]):
                 raise InputError(f"{self.name} gave no frames: nothing was written")
 
     def _write(self) -> None:
-        """Write what is queued; the body of the thread."""
+        """Write the contents of the queue; the body of the thread."""
         try:
             with self._write_errors():
                 file = self._begin()
@@ -278,11 +277,11 @@ class StreamRecorder(TeeSource[LiveSource]):
                     self.state = end.state
                     if self.state == COMPLETE:
                         self._take_name()
-        except BaseException as error:  # it is raised where frames are read
+        except BaseException as error:  # raised again where frames are read
             self._error = self._error or error
 
     def _begin(self) -> GrowingRecording | GrowingMessages | None:
-        """Make the file with the first block in it, and give it its name; None if no block comes."""
+        """Create the file with the first block in it, and name it; None if there is no block."""
         while (block := self._wait(_POLL)) is None:
             pass
         if not isinstance(block, Block):
@@ -294,11 +293,11 @@ class StreamRecorder(TeeSource[LiveSource]):
             file.publish()
             complete_part(part, descriptor)
             self.file = self._name(part)
-            opening.pop_all()  # from here on it is the caller's to close
+            opening.pop_all()  # the caller closes it from now on
         return file
 
     def _name(self, part: Path) -> Path:
-        """Give the recording the first free name: that of ``path``, or one of its own next to it."""
+        """Give the recording the first free name: that of ``path``, or another one next to it."""
         target = Path(os.path.realpath(self.path))
         with suppress(FileExistsError):
             link_new(part, target)
@@ -313,7 +312,7 @@ class StreamRecorder(TeeSource[LiveSource]):
             number += 1
 
     def _take_name(self) -> None:
-        """Replace the older file by the complete recording, if it still is the one that may be replaced."""
+        """Replace the older file by the complete recording, unless the older file has changed."""
         if self.file == self.path:
             return
         target = Path(os.path.realpath(self.path))
@@ -340,7 +339,7 @@ class StreamRecorder(TeeSource[LiveSource]):
         return GrowingRecording(self.path, descriptor, *known, series)
 
     def _follow(self, file: GrowingRecording | GrowingMessages) -> _End:
-        """Append what comes; after an error, wait for the end."""
+        """Append queued items until the end; after an error, wait for the end."""
         try:
             with self._write_errors():
                 return self._append_all(file)
@@ -363,13 +362,13 @@ class StreamRecorder(TeeSource[LiveSource]):
                 self._release(item.size)
             elif item is not None:
                 self._append(file, item)
-            del item  # what a source lends, it has back at once
+            del item  # releases lent frames at once
             if time.monotonic() >= due:
                 file.flush()
                 due = time.monotonic() + self._period
 
     def _wait(self, timeout: float) -> Block | _Mark | _Maps | _End | None:
-        """Return what is queued next, None if nothing comes in time; the end, where the program just left."""
+        """Return the next item in the queue, None after a timeout; the end if the program was left."""
         with suppress(queue.Empty):
             return self._queue.get(timeout=timeout)
         return None if threading.main_thread().is_alive() else _End({}, _cut_short(SystemExit()))
@@ -391,7 +390,7 @@ _Identity = tuple[int, int]
 
 
 def _identity(path: Path) -> _Identity | None:
-    """Return what distinguishes a file from another one of the same name; None if there is no file."""
+    """Return the identity of a file, which differs for another file of the same name; None without a file."""
     try:
         found = path.stat()
     except FileNotFoundError:
@@ -400,7 +399,7 @@ def _identity(path: Path) -> _Identity | None:
 
 
 def _cut_short(error: BaseException) -> str:
-    """Say in one line why a recording ended."""
+    """Return in one line why a recording ended."""
     if isinstance(error, KeyboardInterrupt):
         why = "stopped by the user"
     elif isinstance(error, SystemExit | GeneratorExit):
@@ -411,7 +410,7 @@ def _cut_short(error: BaseException) -> str:
 
 
 class Column:
-    """A dataset with one row a frame; rows are set at any time, and written by ``flush``."""
+    """A dataset with one row per frame; rows can be set at any time, and are written by ``flush``."""
 
     def __init__(
         self,
@@ -425,26 +424,26 @@ class Column:
         chunk = (min(max(expected, 64), _ROWS), *width)
         self._default = default
         self._rows: NDArray[Any] = np.full((chunk[0], *width), default)
-        # With a first row, its place in the file is found before the first frame.
+        # With an initial row, its storage is allocated before the first frame.
         blank = np.zeros_like(self._rows[:1])
         self._dataset = file.create_dataset(name, data=blank, chunks=chunk, maxshape=(None, *width))
         if unit is not None:
             self._dataset.attrs["units"] = unit
-        self._written = 0  # rows in the file that are up to date
+        self._written = 0  # rows of the file that are up to date
 
     def set(self, start: int, rows: NDArray[Any]) -> None:
-        """Set the rows from some frame on; those of other frames are the default."""
+        """Set rows, starting at some frame; frames in between keep the default."""
         self._grow(start + len(rows))
         self._rows[start : start + len(rows)] = rows
         self._written = min(self._written, start)
 
     def correct(self, rows: NDArray[Any]) -> None:
-        """Replace the first rows by better ones, where these are finite."""
+        """Replace the first rows by better values, where these are finite."""
         self._grow(len(rows))
         self.set(0, np.where(np.isfinite(rows), rows, self._rows[: len(rows)]))
 
     def flush(self, count: int) -> None:
-        """Give HDF5 what is new of the first rows."""
+        """Write the changes of the first rows to HDF5."""
         self._grow(count)
         if self._written < count:
             if count > len(self._dataset):
@@ -459,10 +458,10 @@ class Column:
 
 
 class GrowingRecording(Closing):
-    """A recording to which frames are appended; from ``publish`` on others can watch.
+    """A recording to which frames are appended; after ``publish`` other programs can read it.
 
-    Raw frames follow each other without a gap as long as there are no more of them than expected. Unless
-    ``mark`` says otherwise, a frame was used.
+    Raw frames are contiguous as long as there are no more than expected. Unless marked otherwise by ``mark``,
+    a frame counts as used.
     """
 
     def __init__(
@@ -479,7 +478,7 @@ class GrowingRecording(Closing):
         self.count: int = 0
         self._raw = compression == "raw"
         self._frame = math.prod(shape[1:]) * dtype.itemsize
-        # Indices of chunks and the like lie in one piece before the frames, not among them.
+        # Indices of chunks and other metadata are contiguous before the frames, not between them.
         meta = min((1 << 16) + 24 * shape[0], _MOST_META)
         self._spare = _SPARE + 2 * meta
         self._path, self._step = path, min(_STEP, shape[0] * self._frame)
@@ -487,29 +486,29 @@ class GrowingRecording(Closing):
         with ExitStack() as opening:
             self._descriptor = os.dup(descriptor)
             opening.callback(os.close, self._descriptor)
-            room = self._spare + 32 * math.prod(shape[1:])  # for the maps of the header, too
+            room = self._spare + 32 * math.prod(shape[1:])  # includes the maps of the header
             room += 0 if calibration is None else size_of(calibration)
             self._reserve(room)
             file = h5py.File(
                 f"/proc/self/fd/{self._descriptor}",
                 "w",
                 libver=VERSIONS,
-                locking=False,  # HDF5 lets go of its lock when others may read; ours stays
+                locking=False,  # HDF5 releases its lock when others may read; this class keeps its own
                 meta_block_size=meta,
                 alignment_threshold=self._frame,
                 alignment_interval=math.gcd(self._frame, _PAGE),
             )
             self._file = opening.enter_context(file)
-            self._reserve(room)  # once more: HDF5 has emptied the file
+            self._reserve(room)  # again, because HDF5 has truncated the file
             write_header(self._file, header, calibration)
             known = {"time", POSITIONS[header.motion], *series}
             self._make(shape, dtype, compression, known)
             write_plot(self._file, header.motion, known)
-            self._file.flush()  # all but the frames has its place now
+            self._file.flush()  # everything but the frames is allocated now
             self._exit = opening.pop_all()
 
     def append(self, block: Block) -> None:
-        """Write frames, and keep what is known of each until the next ``flush``."""
+        """Write frames, and store the values of each until the next ``flush``."""
         frames, n = block.frames, len(block.frames)
         self._hold(n * (self._frame + self._frame // 8 + _PAGE))
         self._frames.resize(self.count + n, axis=0)
@@ -527,28 +526,28 @@ class GrowingRecording(Closing):
         self.count += n
 
     def mark(self, start: int, used: NDArray[np.bool_]) -> None:
-        """Say whether frames, from some number on, were used."""
+        """Mark frames, from number ``start`` on, as used or not."""
         self._used.set(start, used)
 
     def add_maps(self, *_maps: object) -> None:
-        """Refuse maps, for which there is no place."""
+        """Refuse maps, which this format does not store."""
         raise TypeError("maps go into MCAP files alone")
 
     def flush(self) -> None:
-        """Hand everything to the system, so that it can be read and outlives this process."""
+        """Pass all data to the operating system, so that it can be read and survives this process."""
         self._hold(0)
         self._flush()
 
     def publish(self) -> None:
-        """Let others read from now on; they can still not write."""
+        """Allow other programs to read from now on; they still cannot write."""
         self.flush()
         self._file.swmr_mode = True
         with suppress(OSError):  # a file system without locks
             fcntl.flock(self._descriptor, fcntl.LOCK_SH)
 
     def finish(self, positions: Mapping[str, Floats], state: str) -> None:
-        """Write what is known only now."""
-        if self._frames.shape[0] > self.count:  # it failed to write some
+        """Write the values that are only known at the end."""
+        if self._frames.shape[0] > self.count:  # writing some frames failed
             self._frames.resize(self.count, axis=0)
         for name, values in positions.items():
             if name in self._series:
@@ -558,7 +557,7 @@ class GrowingRecording(Closing):
         self._file.flush()
 
     def close(self) -> None:
-        """Let go of the file, and give back the room that was not needed."""
+        """Close the file, and release the preallocated space that was not needed."""
         if self._file:
             os.ftruncate(self._descriptor, self._file.id.get_filesize())
         self._exit.close()
@@ -566,11 +565,11 @@ class GrowingRecording(Closing):
     def _make(
         self, shape: tuple[int, int, int], dtype: np.dtype[Any], compression: Compression, known: set[str]
     ) -> None:
-        """Make what grows: afterwards nothing new can be made."""
+        """Create the datasets that grow: no others can be created afterwards."""
         file, (expected, rows, columns) = self._file, shape
         chunks, most = (1, rows, columns), (None, rows, columns)
         storage = {"chunks": chunks, "maxshape": most, **packing(compression)}
-        # Without a cache, a chunk is packed when it is written.
+        # Without a cache, a chunk is compressed when it is written.
         self._frames = new_stack(file, (0, rows, columns), dtype, rdcc_nbytes=0, **storage)
         self._state = file.create_dataset(STATE, (), h5py.string_dtype("utf-8", _STATE_LENGTH))
         self._write_state(UNDER_WAY)
@@ -588,8 +587,8 @@ class GrowingRecording(Closing):
         self._used = Column(file, USED, None, np.uint8(1), expected)
 
     def _flush(self) -> None:
-        """Do so; the room that was reserved last is enough for it."""
-        self._frames.flush()  # the frames are there before anything says so
+        """Flush; the preallocated space is sufficient."""
+        self._frames.flush()  # the frames must be stored before any count of them
         for column in (*itertools.chain(*self._series.values()), self._dropped, self._checksums, self._used):
             column.flush(self.count)
         self._file.flush()
@@ -598,12 +597,12 @@ class GrowingRecording(Closing):
         self._state[()] = state.encode()[:_STATE_LENGTH].decode(errors="ignore")
 
     def _hold(self, size: int) -> None:
-        """See that the disk takes so many bytes of frames, and what belongs to them."""
+        """Preallocate space for ``size`` bytes of frames, and for the values that belong to them."""
         self._reserve(self._file.id.get_filesize() + size + self._spare)
 
     def _reserve(self, end: int) -> None:
-        """See that the file can be written up to some byte; a disk that cannot promise that is believed."""
-        start = min(self._reserved, os.fstat(self._descriptor).st_size)  # HDF5 may have cut it off
+        """Preallocate the file up to ``end``, if the file system supports it."""
+        start = min(self._reserved, os.fstat(self._descriptor).st_size)  # HDF5 may have truncated it
         if self._believed or end <= start:
             return
         for reach in (end + self._step, end):

@@ -1,10 +1,10 @@
-"""Texts that come from files, for terminals and for files that are text."""
+"""Texts from files, made safe for terminals and text files."""
 
 from __future__ import annotations
 
 
 def printable(text: str) -> str:
-    r"""Return a text with "?" for each character that does not print, such as control codes.
+    r"""Return a text in which unprintable characters, such as control codes, are replaced by "?".
 
     Examples
     --------
@@ -15,7 +15,7 @@ def printable(text: str) -> str:
 
 
 def one_line(value: object) -> str:
-    r"""Return a value as one line of text that prints.
+    r"""Return a value as one line of printable text.
 
     Examples
     --------
@@ -26,7 +26,7 @@ def one_line(value: object) -> str:
 
 
 def shortened(text: str, most: int = 40) -> str:
-    """Return a text, or its start where it is longer than a message should quote.
+    """Return a text, shortened for quoting in a message.
 
     Examples
     --------

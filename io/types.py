@@ -1,4 +1,4 @@
-"""The types that every layer shares: frames on the move, where they come from, what comes out."""
+"""Types shared by all layers: blocks of frames, their sources, and their properties."""
 
 from __future__ import annotations
 
@@ -19,40 +19,40 @@ ProcessValue = str | int | float | bool
 
 
 class InputError(ValueError):
-    """What the user gave cannot be used; the message is one line that says why and what to do."""
+    """Invalid input by the user; the message is one line with the problem and the remedy."""
 
     exit_code = 2
 
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Some consecutive frames, and where the sensor body was in each of them.
+    """Consecutive frames, and the position of the sensor body in each of them.
 
     Attributes
     ----------
     frames : ndarray, (n, H, W), uint8, uint16 or float32
         Raw counts; may be a view of a buffer that the next read overwrites.
     index : int
-        Number of the first frame in its stack.
+        Number of the first frame in the stack.
     time : ndarray, (n,), float64, or None
-        Seconds since the recording began.
+        Seconds since the start of the recording.
     travel : ndarray, (n,), float64, or None
-        Millimetres that the body has been lowered (vertical motion, and axial where it presses as well).
+        Distance by which the body is lowered, mm (vertical motion, and axial if it also presses).
     phase : ndarray, (n,), float64, or None
-        Radians, counter-clockwise, of the precession (axial motion).
+        Phase of the precession, radians, counter-clockwise (axial motion).
     displacement : ndarray, (n, 2), float64, or None
-        Millimetres that the body has been moved along x and y (horizontal motion).
+        Displacement of the body along x and y, mm (horizontal motion).
     twist : ndarray, (n,), float64, or None
-        Radians that the body has been turned about its axis, counter-clockwise (twist).
+        Angle by which the body is turned about its axis, radians, counter-clockwise (twist).
     tilt : ndarray, (n,), float64, or None
-        Half-angle of the lean, radians, where it differs from frame to frame (axial motion).
+        Half-angle of the lean, radians, if it varies between frames (axial motion).
     origin : (int, int)
         Row and column of the first pixel in the full picture.
     dropped : int
-        Frames lost between the block before and this one.
+        Frames lost between the preceding block and this one.
     lent : bool
-        Whether the frames lie in memory of the source's own that nobody writes to as long as they are
-        referred to, and that can be read 64 bytes beyond them, so that a device may work in it.
+        Whether the frames are in memory of the source that is not overwritten while they are referred to,
+        and that is readable for 64 bytes beyond them, so that a device may use it without a copy.
     """
 
     frames: NDArray[Any]
@@ -69,7 +69,7 @@ class Block:
 
     @property
     def pose(self) -> Floats | None:
-        """The body's axis and travel in each frame, (n, 4): unit vectors, and mm, 0 where it is unknown.
+        """The body's axis and travel in each frame, (n, 4): unit vectors, and mm, 0 if unknown.
 
         None without phases and tilts.
         """
@@ -81,7 +81,7 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What holds for a whole stack: everything a recording says but its frames and their positions.
+    """Properties of a whole stack: everything in a recording but the frames and their positions.
 
     Attributes
     ----------
@@ -91,17 +91,17 @@ class Header:
     pixel_size : (float, float) or None
         Millimetres at the sheet along x and y.
     dark, bright : ndarray, (H, W), float32, or None
-        Counts of each pixel without and with full light.
+        Counts of each pixel without light and with full light.
     press : float or None
-        Millimetres of travel at which the other motions happen.
+        Travel in mm at which the other motions take place.
     tilt : float or None
-        Half-angle of the precession, radians, if it is that of all frames.
+        Half-angle of the precession, radians, if it is the same for all frames.
     pivot : (float, float, float) or None
-        Point that the body turns about, mm, from the rest sheet's centre, with the body pressed and upright.
+        Pivot of the body, mm, from the centre of the sheet at rest, with the body pressed and upright.
     zenith_gain, zenith_offset : ndarray, scalar or (H, W), float64, or None
         Counts per radian of zenith, and counts at zenith zero.
     camera : str
-        What the camera is called; empty where that is not told.
+        Name of the camera; empty if unknown.
     """
 
     motion: Motion
@@ -119,10 +119,10 @@ class Header:
 
 
 class Closing:
-    """A context manager that closes itself when it is left."""
+    """A context manager that closes itself on exit."""
 
     def close(self) -> None:
-        """Close what is open; by default there is nothing."""
+        """Release resources; by default there are none."""
 
     def __enter__(self) -> Self:
         return self
@@ -134,7 +134,7 @@ class Closing:
 
 
 def block_memory(out: NDArray[Any] | None, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return what a source reads into: ``out``, if frames of the stack fit into it, or room for one frame."""
+    """Return the array that a source reads into: ``out``, if it fits the stack, or memory for one frame."""
     if out is None:
         return np.empty((1, *shape[1:]), dtype)
     if out.dtype != dtype or out.shape[1:] != shape[1:] or not len(out):
@@ -143,18 +143,18 @@ def block_memory(out: NDArray[Any] | None, shape: tuple[int, int, int], dtype: n
 
 
 class Source(Protocol):
-    """Anything frames come from: a recording, a rig of camera and stage, the digital twin.
+    """A source of frames: a recording, a rig of camera and stage, the digital twin.
 
-    A source is its own context manager; leaving it stops any hardware and closes any file.
+    A source is its own context manager; leaving it stops hardware and closes files.
     """
 
     @property
     def name(self) -> str:
-        """What to call it in messages and in a result's provenance."""
+        """Name in messages and in the provenance of a result."""
 
     @property
     def header(self) -> Header:
-        """What holds for all of its frames."""
+        """Properties of all frames."""
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -186,32 +186,32 @@ class Source(Protocol):
 
 
 class LiveSource(Source, Protocol):
-    """A source whose frames come while something happens: the first of ``shape`` is how many are expected.
+    """A source whose frames arrive in real time: the first of ``shape`` is the expected number of frames.
 
-    The positions in its blocks are those that were known when the frames came. A block's ``dropped`` counts
-    the frames that were lost between the block before and this one.
+    The positions in its blocks are those known when the frames arrived. A block's ``dropped`` counts the
+    frames lost between the preceding block and this one.
     """
 
     def now(self) -> float:
         """Return the time, in seconds on the scale of ``Block.time``."""
 
     def positions(self) -> Mapping[str, Floats]:
-        """Return the positions of all frames read so far, as well as they are known by now.
+        """Return the best estimate of the positions of all frames read so far.
 
-        It can be asked after the source was left, too; NaN stands where nothing better is known than what
-        the blocks said.
+        It can also be called after the source was left. NaN marks frames for which there is no better
+        estimate than that in the blocks.
 
         Returns
         -------
         mapping
-            ``travel``, mm, ``phase``, ``tilt`` or ``twist``, radians; one value a frame; or ``displacement``,
-            mm, two a frame.
+            ``travel``, mm, ``phase``, ``tilt`` or ``twist``, radians; one value per frame; or
+            ``displacement``, mm, two per frame.
         """
 
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What a simulation knows of its object, in the mean pose: pressed, upright, neither moved nor twisted.
+    """Ground truth of a simulation in the mean pose: pressed, upright, neither displaced nor twisted.
 
     Attributes
     ----------
@@ -220,18 +220,18 @@ class Truth:
     zenith, azimuth : ndarray, (H, W), float32
         Radians, of the surface normal.
     contact : ndarray, (H, W), uint8
-        1 where sheet and object touch: of a vertical motion at some time, of the others in every frame.
+        1 where sheet and object touch: in some frame of a vertical motion, in every frame of the others.
     slip : ndarray, (H, W), uint8, or None
-        1 where the sheet slips on the object at some time; None where no friction was worked out.
+        1 where the sheet slips on the object at some time; None if friction was not simulated.
     force : ndarray, (T, 3), float64, or None
         Newtons in each frame that the object exerts on the sensor: along the body's x and y, by friction, and
-        normal, positive where it presses; None where no contact mechanics was worked out.
+        normal, positive in compression; None if contact mechanics was not simulated.
     displacement : ndarray, (T, H, W, 2), float32, or None
-        Millimetres along the body's x and y by which the skin has moved in each frame since the press: that
-        of the point of the skin that lay at the pixel then.
+        Displacement in mm along the body's x and y, in each frame since the press, of the point of the skin
+        that was at the pixel after the press.
     slip_onset : ndarray, (H, W), float32, or None
-        The way of the body since the press, mm or radians along its path, after which the point of the skin
-        that lay at the pixel broke loose from the object; NaN where it stuck to the end or was not touched.
+        Distance travelled by the body since the press, mm or radians along its path, at which the point of
+        the skin at the pixel starts to slip; NaN where it sticks to the end or was not touched.
     """
 
     height: NDArray[np.float32]
@@ -245,7 +245,7 @@ class Truth:
 
 
 UNDISTORTED = "undistorted"
-"""What the process of a result says once its maps lie on the sheet, and no longer in the camera's pixels."""
+"""Value in the process of a result whose maps are on the sheet, and no longer in the camera's pixels."""
 
 
 def body_axes(phase: ArrayLike, tilt: ArrayLike) -> Floats:
@@ -263,7 +263,7 @@ def body_axes(phase: ArrayLike, tilt: ArrayLike) -> Floats:
 
 
 def pixel_axes(shape: tuple[int, int], pixel_size: tuple[float, float]) -> tuple[Floats, Floats]:
-    """Place the pixel centres in millimetres from the picture's centre.
+    """Return the positions of pixel centres in mm from the picture's centre.
 
     Parameters
     ----------
@@ -277,7 +277,7 @@ def pixel_axes(shape: tuple[int, int], pixel_size: tuple[float, float]) -> tuple
     x : ndarray, (W,), float64
         Increases to the right.
     y : ndarray, (H,), float64
-        Runs up the picture: decreases with the row.
+        Points up the picture: decreases with the row.
 
     Examples
     --------

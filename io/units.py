@@ -1,4 +1,4 @@
-"""Units of measurement, in terms of each other: those in common use from a table, the rest from pint."""
+"""Conversion of units: common ones from a table, others by pint."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ BASE: dict[Kind, str] = {
     "force": "N",
     "pressure": "N/mm^2",
 }
-"""The unit that each kind of quantity is converted to."""
+"""The base unit of each kind of quantity."""
 
-_GRAVITY = 9.80665  # m/s^2, of a weight that is given by its mass
+_GRAVITY = 9.80665  # m/s^2, converts a mass to its weight
 
 _COMMON: dict[Kind, dict[str, float]] = {
     "length": {
@@ -48,12 +48,12 @@ _NOUN: dict[Kind, str] = {
     "pressure": "a pressure",
 }
 _ANGLES = ("radian", "degree", "arcminute", "arcsecond", "grade", "turn")
-_LONGEST = 40  # letters of a unit in a file
-_SYMBOL = re.compile(r"[^\W\d]+|°")  # pint evaluates arithmetic: it is given single names only
+_LONGEST = 40  # characters of a unit that are quoted
+_SYMBOL = re.compile(r"[^\W\d]+|°")  # pint evaluates arithmetic, so only single names are passed to it
 
 
 def in_base(symbol: str, kind: Kind) -> float:
-    """Return how many base units one unit is; ValueError if it is unknown, or measures something else.
+    """Return the number of base units in a unit; ValueError if it is unknown or measures something else.
 
     Examples
     --------
@@ -65,7 +65,7 @@ def in_base(symbol: str, kind: Kind) -> float:
 
 
 def conversion_factor(unit: str, wanted: str, where: str) -> float:
-    """Return the number that converts a value of a file from its unit to a base unit, or one over it."""
+    """Return the factor that converts a value in a file from its unit to a base unit, or to one over it."""
     if unit == wanted:
         return 1.0
     over, _, base = wanted.rpartition("/")
@@ -77,19 +77,19 @@ def conversion_factor(unit: str, wanted: str, where: str) -> float:
         factor = in_base(symbol, kind)
     except ValueError as error:
         raise InputError(
-            f"{where} is in {unit[:_LONGEST]!r}, which cannot be turned into {wanted}: "
+            f"{where} is in {unit[:_LONGEST]!r}, which cannot be converted to {wanted}: "
             "correct its attribute units"
         ) from error
     return 1 / factor if over else factor
 
 
 def ratio(unit: str, other: str) -> float:
-    """Return the number that converts a value from one unit to another.
+    """Return the factor that converts a value from one unit to another.
 
     Raises
     ------
     InputError
-        They do not measure the same quantity, or one is unknown.
+        They do not measure the same quantity, or one of them is unknown.
 
     Examples
     --------
@@ -110,7 +110,7 @@ def ratio(unit: str, other: str) -> float:
 
 
 def _pint_factor(symbol: str, kind: Kind) -> float:
-    import pint  # its table of units takes most of a second to load
+    import pint  # loading its table of units takes most of a second
 
     registry = _registry()
     try:
@@ -120,9 +120,9 @@ def _pint_factor(symbol: str, kind: Kind) -> float:
     except (pint.UndefinedUnitError, ValueError) as error:
         raise ValueError(f"{symbol} is not a known unit") from error
     base = registry.Unit(BASE[kind])
-    # A pixel of a style sheet is a length, but nobody here means that one.
+    # The pixel of style sheets is a length, but is not meant here.
     same = registry.get_root_units(unit)[1] == registry.get_root_units(base)[1]
-    # Angles have no dimension, and neither have decibels, percents and counts.
+    # Angles are dimensionless, but so are decibels, percents and counts.
     other = kind == "angle" and not str(unit).endswith(_ANGLES)
     if not same or other or unit == registry.Unit("css_pixel"):
         raise ValueError(f"{unit}s are not {_NOUN[kind]}")

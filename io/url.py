@@ -1,4 +1,4 @@
-"""Addresses of stacks in object stores, as paths that keep their two slashes."""
+"""Addresses of stacks in object stores, as paths that keep their double slash."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ _SCHEME = re.compile("([a-z][a-z0-9+.-]+):/+")
 
 
 class Url(PosixPath):
-    """An address, such as ``s3://bucket/press.zarr``, wherever a path is taken.
+    """An address, such as ``s3://bucket/press.zarr``, that can be used like a path.
 
-    Names and endings are those of a path. No local file is meant, so ``exists`` is false.
+    Names and suffixes work as for paths. It is not a local file, so ``exists`` is false.
 
     Examples
     --------
@@ -49,6 +49,6 @@ def path_of(text: str | os.PathLike[str]) -> Path:
 
 
 def is_zarr(path: str | Path) -> bool:
-    """Tell whether a path is that of a Zarr store: an address, ``NAME.zarr``, or that in a ``.zip``."""
+    """Return whether a path is a Zarr store: an address, ``NAME.zarr``, or a zipped ``NAME.zarr.zip``."""
     known = path_of(path)
     return isinstance(known, Url) or known.name.lower().endswith((ZARR_SUFFIX, f"{ZARR_SUFFIX}.zip"))

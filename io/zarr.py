@@ -1,7 +1,7 @@
-"""Recordings and results in Zarr: groups and arrays of the names that they have in HDF5.
+"""Recordings and results in Zarr: groups and arrays with the same names as in HDF5.
 
-Groups, attributes and the shapes of arrays are held as HDF5 in memory, so that a store is checked as if it
-were such a file. Values are read from the store when they are needed.
+Groups, attributes and the shapes of arrays are copied to an HDF5 file in memory, so that a store is checked
+like such a file. Values are read from the store when they are needed.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ if TYPE_CHECKING:
 Array: TypeAlias = "zarr.Array[Any]"
 
 _MOST_FRAMES = 1 << 26
-_MOST_PIECES = 1 << 16  # chunks or shards of an array that is read whole, or that hold a frame
-_SMALL, _MOST_EARLY = 1 << 16, 128  # bytes of an array that is read at once, and how many of them are
+_MOST_PIECES = 1 << 16  # chunks or shards of an array that is read as a whole, or that contain a frame
+_SMALL, _MOST_EARLY = 1 << 16, 128  # bytes of an array that is read on opening, and the number of these
 AT_ONCE = 16  # requests
-_SAMPLE = 16  # frames that a fingerprint takes where there are no checksums
+_SAMPLE = 16  # frames hashed for a fingerprint if there are no checksums
 
 
 def open_file(path: str | Path, memory_limit: int | None = None) -> Hdf5File:
-    """Open a file of HDF5, or what is the same in Zarr."""
+    """Open an HDF5 file or a Zarr store."""
     known = path_of(path)
     return (ZarrFile if is_zarr(known) else Hdf5File)(known, memory_limit)
 
 
 def find_stores(pattern: Url) -> list[Path]:
-    """Return the addresses that answer to a pattern such as ``s3://bucket/*.zarr``."""
+    """Return the addresses that match a pattern such as ``s3://bucket/*.zarr``."""
     with naming(str(pattern)):
         from fsspec.core import url_to_fs
 
@@ -58,12 +58,12 @@ def find_stores(pattern: Url) -> list[Path]:
         system, place = url_to_fs(str(pattern), **options_of(pattern))
         found = [path_of(system.unstrip_protocol(one)) for one in sorted(system.glob(place))]
     if not found:
-        raise InputError(f"{pattern}: nothing answers to that: name recordings")
+        raise InputError(f"{pattern}: no store matches: name recordings")
     return found
 
 
 class ZarrFile(Hdf5File):
-    """A Zarr group, or an array alone as ``/data``."""
+    """A Zarr group, or a single array as ``/data``."""
 
     def __init__(self, path: Path, memory_limit: int | None = None) -> None:
         with naming(str(path)), ExitStack() as opening:
@@ -89,11 +89,11 @@ class ZarrFile(Hdf5File):
             self._opened = opening.pop_all()
 
     def close(self) -> None:
-        """Close what is in memory, and all connections."""
+        """Close the file in memory, and all connections."""
         self._opened.close()
 
     def _lay_out(self, groups: Mapping[str, Mapping[str, Any]]) -> None:
-        """Make groups and datasets without values in memory."""
+        """Create groups and datasets without values in memory."""
         grows = "/entry/state" in self.arrays
         for name, attributes in groups.items():
             _set_attributes(self.root.require_group(name), attributes)
@@ -105,7 +105,7 @@ class ZarrFile(Hdf5File):
                 _set_attributes(made, one.attributes)
 
     def _read_early(self) -> None:
-        """Read small arrays, several at once, as each takes a request; an error is kept until it matters."""
+        """Read small arrays concurrently, as each takes a request; an error is stored until it matters."""
         small = [
             name
             for name, one in self.arrays.items()
@@ -115,7 +115,7 @@ class ZarrFile(Hdf5File):
             self._early = {name: pool.submit(self._decode, name) for name in small[:_MOST_EARLY]}
 
     def _array(self, name: str) -> Array:
-        """Return an array of zarr-python, if all its codecs are allowed."""
+        """Return an array of zarr-python; InputError if a codec is not allowed."""
         if name not in self._known:
             from mirrorskin.io.zarr_codecs import open_array
 
@@ -159,11 +159,11 @@ class ZarrFile(Hdf5File):
         rows: int | None = None,
         mapped: bool = False,
     ) -> NDArray[Any]:
-        """Read numbers; none of them is in a file that could be mapped."""
+        """Read numbers; they cannot be mapped."""
         return super().read(node, *shapes, unit=unit, remedy=remedy, rows=rows)
 
     def check_frames(self, stack: h5py.Dataset, count: int) -> None:
-        """Refuse frames that are not there, or in chunks that memory has no room for."""
+        """Refuse frames that are missing, or in chunks too large for memory."""
         one, where = self.arrays[str(stack.name)], self.where(stack)
         with naming(where):
             array = self._array(str(stack.name))
@@ -190,16 +190,16 @@ class ZarrFile(Hdf5File):
                 )
 
     def frames(self, stack: h5py.Dataset) -> ZarrFrames:
-        """Return what fetches the frames."""
+        """Return the object that reads the frames."""
         return ZarrFrames(self._array(str(stack.name)), Place(str(self.path), str(stack.name)))
 
     def storage(self, stack: h5py.Dataset) -> str:
-        """Tell how a stack is stored, for people."""
+        """Return a description of how a stack is stored."""
         name = str(stack.name)
         return f"Zarr, chunks {self._array(name).chunks}, {compressors_of(self.arrays[name])}"
 
     def origins(self) -> dict[Path, State]:
-        """Return what tells of a change: of a folder its metadata, of a zip itself, of an address nothing."""
+        """Return the files that show a change: metadata of a folder, a zip file; none for an address."""
         if isinstance(self.path, Url):
             return {}
         files = [self.path] if self.path.is_file() else [self.path / name for name in METADATA]
@@ -207,7 +207,7 @@ class ZarrFile(Hdf5File):
         return {file: state_of(file.stat()) for file in files}
 
     def fingerprint(self, stack: h5py.Dataset) -> str:
-        """Return a SHA-256 of all but the frames, and of some frames if there are no checksums of them."""
+        """Return a SHA-256 of everything but the frames, and of some frames if they have no checksums."""
         digest = hashlib.sha256()
         for name, one in sorted(self.arrays.items()):
             digest.update(f"{name} {one.shape} {one.dtype} {json.dumps(one.attributes)}".encode())
@@ -226,7 +226,7 @@ def _count_pieces(shape: Shape, chunks: Shape) -> int:
 
 
 def _set_attributes(node: h5py.Group | h5py.Dataset, attributes: Mapping[str, Any]) -> None:
-    """Copy texts and numbers, which HDF5 has, too."""
+    """Copy the texts and numbers, which HDF5 supports, too."""
     for name, value in attributes.items():
         if isinstance(value, str):
             node.attrs.create(name, fixed_text(value))
@@ -237,7 +237,7 @@ def _set_attributes(node: h5py.Group | h5py.Dataset, attributes: Mapping[str, An
 
 
 class ZarrFrames(Closing):
-    """A stack in Zarr, of which several chunks are fetched and unpacked at once."""
+    """A stack in Zarr, whose chunks are fetched and unpacked concurrently."""
 
     how = "chunks of Zarr, several at once"
 
@@ -247,10 +247,10 @@ class ZarrFrames(Closing):
         self._array, self._place = array, place
 
     def lend(self, start: int, stop: int) -> None:
-        """Lend nothing that was not read."""
+        """Return None: frames have to be read."""
 
     def fetch(self, frames: Span, region: Region, out: NDArray[Any]) -> None:
-        """Write a part into ``out``, which is in C order."""
+        """Write a part into ``out``, a C-contiguous array."""
         from zarr.core.buffer.cpu import NDBuffer
 
         what = f"{self._place.path}: frames {frames[0]} to {frames[1] - 1} of {self._place.dataset}"

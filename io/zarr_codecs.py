@@ -1,4 +1,4 @@
-"""Arrays of Zarr whose chunks are unpacked to at most the size that their metadata states.
+"""Zarr arrays whose chunks are unpacked to at most the size stated in their metadata.
 
 The codecs of zarr-python have no limit: a few kilobytes may become gigabytes.
 """
@@ -29,17 +29,17 @@ from mirrorskin.io.zarr_metadata import COMPRESSORS, ArrayMetadata, check_codecs
 Array: TypeAlias = "zarr.Array[Any]"
 
 LONGEST_TEXTS = 1 << 20
-"""Bytes of the texts of one chunk."""
+"""Limit of the texts in one chunk, in bytes."""
 
-_SLACK = 1 << 10  # bytes that a chunk may take more between its codecs: checksums, the index of a shard
-_INDEXED = 16  # bytes of the index of a shard for each of its chunks
-_BLOCK = 128 << 10  # the most bytes that a block of Zstandard gives
+_SLACK = 1 << 10  # additional bytes of a chunk between its codecs: checksums, the index of a shard
+_INDEXED = 16  # bytes of the index of a shard per chunk
+_BLOCK = 128 << 10  # maximum unpacked size of a Zstandard block
 _FRAME = 0xFD2FB528
-_UNPACKED = 8  # times as many bytes as a chunk has may its blocks of Zstandard have: not all are full
+_UNPACKED = 8  # limit of the size of a chunk's Zstandard blocks, relative to the chunk: not all are full
 
 
 def open_array(store: Any, array: ArrayMetadata, where: str) -> Array:
-    """Return an array of zarr-python whose chunks are unpacked within bounds.
+    """Return an array of zarr-python whose chunks are unpacked within limits.
 
     InputError where a codec is not allowed; see ``zarr_metadata.check_codecs``.
     """
@@ -56,14 +56,14 @@ def open_array(store: Any, array: ArrayMetadata, where: str) -> Array:
 
 
 def _bytes_of(array: ArrayMetadata, piece: Sequence[int]) -> int:
-    """Return how many bytes there may be of a piece between any two of its codecs."""
+    """Return the maximum size in bytes of a piece between any two of its codecs."""
     if array.is_text:
         return LONGEST_TEXTS
     return math.prod(piece) * int(array.dtype.itemsize) + _SLACK
 
 
 def _bounded_codecs(codecs: Sequence[Any], array: ArrayMetadata, piece: Sequence[int]) -> tuple[Any, ...]:
-    """Replace the codecs of version 3 that unpack, also inside of shards, by bounded ones."""
+    """Replace the version 3 codecs that unpack, also inside shards, by limited ones."""
     most, count, bounded = _bytes_of(array, piece), math.prod(piece), []
     for one in codecs:
         if isinstance(one, ShardingCodec):
@@ -92,7 +92,7 @@ def _bounded_version_2(metadata: Any, array: ArrayMetadata) -> Any:
 
 @dataclass(frozen=True)
 class _Unpacking(BytesBytesCodec):  # type: ignore[misc]  # where Zarr is not installed
-    """A codec of version 3 that unpacks to at most ``most`` bytes."""
+    """A version 3 codec that unpacks to at most ``most`` bytes."""
 
     unpack: Callable[[bytes, int], bytes]
     most: int
@@ -107,7 +107,7 @@ class _Unpacking(BytesBytesCodec):  # type: ignore[misc]  # where Zarr is not in
 
 
 class _Compressor(Codec):  # type: ignore[misc]
-    """A compressor of version 2 that only unpacks."""
+    """A version 2 compressor that only unpacks."""
 
     codec_id = "mirrorskin"
 
@@ -122,7 +122,7 @@ class _Compressor(Codec):  # type: ignore[misc]
 
 
 def _check_texts(data: bytes, count: int) -> bytes:
-    """Return a chunk of texts if it holds as many as it should: memory is taken for as many as it claims."""
+    """Return a chunk of texts if it contains ``count``: the codec allocates memory for the stated number."""
     _check_size(len(data), LONGEST_TEXTS)
     if len(data) < 4 or int.from_bytes(data[:4], "little") != count:
         raise ValueError(f"a chunk that does not hold {count} texts")
@@ -170,7 +170,7 @@ def _zstd(packed: bytes, most: int) -> bytes:
         unknown = unknown or claim is None
     if unknown:
         _check_size(blocks, _UNPACKED * most + _BLOCK)
-    else:  # no more is unpacked than is claimed
+    else:  # at most the stated size is unpacked
         _check_size(claims, most)
     unpacked = zstd.decompress(packed)
     _check_size(len(unpacked), most)
@@ -178,7 +178,7 @@ def _zstd(packed: bytes, most: int) -> bytes:
 
 
 def _zstd_head(packed: bytes, place: int) -> tuple[int | None, int, int]:
-    """Return a frame's size when unpacked, if stated, the size of its checksum, and where its blocks start.
+    """Return the unpacked size of a frame, if stated, the size of its checksum, and the start of its blocks.
 
     See RFC 8878, 3.1.1.1.
     """
@@ -192,7 +192,7 @@ def _zstd_head(packed: bytes, place: int) -> tuple[int | None, int, int]:
 
 
 def _zstd_blocks(packed: bytes, place: int) -> tuple[int, int]:
-    """Return how many bytes the blocks of a frame give at most, and where the frame ends (3.1.1.2)."""
+    """Return the maximum unpacked size of the blocks of a frame, and the end of the frame (3.1.1.2)."""
     total = last = 0
     while not last:
         header = int.from_bytes(packed[place : place + 3], "little")

@@ -1,4 +1,4 @@
-"""What Zarr and the libraries of stores report, as one line with a remedy."""
+"""Errors of Zarr and of store libraries, converted to one line with a remedy."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _UNREACHABLE = {"ConnectionError", "TimeoutError", "ClientError", "BotoCoreError
 
 
 class MissingChunkError(Exception):
-    """A chunk is missing, which Zarr would replace by its fill value."""
+    """A chunk is missing; Zarr would replace it by its fill value."""
 
 
 @contextmanager
 def naming(what: str) -> Iterator[None]:
-    """Turn errors of Zarr and of the libraries of stores, of many classes, into one line with a remedy."""
+    """Convert errors of Zarr and of store libraries, of many classes, to one line with a remedy."""
     try:
-        # Zarr adds the places that a damaged shard states without a check.
+        # Zarr adds offsets of a damaged shard without a check.
         with np.errstate(over="ignore"):
             yield
     except (InputError, MemoryError):

@@ -1,4 +1,4 @@
-"""Recordings and results of HDF5 written as Zarr; see ``mirrorskin.io.zarr``."""
+"""Recordings and results in HDF5 copied to Zarr; see ``mirrorskin.io.zarr``."""
 
 from __future__ import annotations
 
@@ -25,33 +25,31 @@ from mirrorskin.io.zarr import AT_ONCE, ZarrFile, open_file
 from mirrorskin.io.zarr_errors import naming
 
 _WHOLE: Any = {"write_empty_chunks": True}
-_CLAIM = (
-    ".mirrorskin-writer-"  # how the name of an object begins that a writer puts into a store at an address
-)
-_CHUNK, _BLOCK = 4 << 20, 64 << 20  # bytes of frames, unpacked: of a chunk, and written at a time
+_CLAIM = ".mirrorskin-writer-"  # prefix of the object with which a writer claims a store
+_CHUNK, _BLOCK = 4 << 20, 64 << 20  # unpacked bytes of frames in a chunk, and written at a time
 
 
 def save_zarr(source: str | Path, path: str | Path, progress: Callable[[int], None] | None = None) -> str:
-    """Write a recording or a result of HDF5 as Zarr, version 3; a folder exists whole or not at all.
+    """Copy a recording or a result in HDF5 to Zarr, version 3; a folder appears complete or not at all.
 
     Parameters
     ----------
     source : str or Path
         A recording or a result.
     path : str or Path
-        What to write: ``NAME.zarr``, or an address such as ``s3://bucket/NAME.zarr``.
+        Output: ``NAME.zarr``, or an address such as ``s3://bucket/NAME.zarr``.
     progress : callable, optional
-        Called with the number of frames so far.
+        Called with the number of frames written so far.
 
     Returns
     -------
     str
-        What was written, in a few words.
+        Description of what was written.
 
     Raises
     ------
     InputError
-        It is neither, it is damaged, there is something of that name already, or it cannot be written there.
+        The file is neither, or damaged, the output exists, or it cannot be written.
 
     Examples
     --------
@@ -63,7 +61,7 @@ def save_zarr(source: str | Path, path: str | Path, progress: Callable[[int], No
     with open_file(source) as file:
         if not any(file.marked(f"mirrorskin_{kind}") for kind in ("recording", "result")):
             raise InputError(
-                f"{source} is no recording or result of ours: 'mirrorskin import' makes recordings"
+                f"{source} is not a recording or a result of mirrorskin: 'mirrorskin import' makes recordings"
             )
         with _new_store(target) as store:
             _write_nodes(file, store)
@@ -77,10 +75,10 @@ def save_zarr(source: str | Path, path: str | Path, progress: Callable[[int], No
 
 
 def check_store(target: Path) -> None:
-    """Refuse a store that could not be written, before any work is done for it."""
+    """Refuse a store that could not be written, before any work is done."""
     if target.suffix.lower() != ZARR_SUFFIX:
         raise InputError(f"{target}: Zarr is written as NAME{ZARR_SUFFIX}: name it so with -o")
-    taken = f"{target} is there already: remove it, or name another output with -o"
+    taken = f"{target} exists: remove it, or name another output with -o"
     if isinstance(target, Url):
         with naming(f"{target} cannot be written"):
             from zarr.core.sync import sync
@@ -101,7 +99,7 @@ def check_store(target: Path) -> None:
 
 @contextmanager
 def _new_store(target: Path) -> Iterator[Any]:
-    """Make a store; what was written of it is removed after an error."""
+    """Create a store; after an error, everything written is removed."""
     check_store(target)
     with naming(f"{target} cannot be written"):
         from zarr.core.sync import sync
@@ -123,10 +121,10 @@ def _new_store(target: Path) -> Iterator[Any]:
 
 
 def _claim(store: Any, target: Url) -> str:
-    """Put an object into a store that tells other writers of this one, and return its name.
+    """Write an object that shows other writers that the store is in use, and return its name.
 
-    Stores cannot rename what is finished. Of two writers that start at once both may see the other's object,
-    and give up; they never write both.
+    Objects in stores cannot be renamed. If two writers start at the same time, both may see the other's
+    object and give up, but they never both write.
     """
     from zarr.core.buffer import default_buffer_prototype
     from zarr.core.sync import sync
@@ -142,7 +140,7 @@ def _claim(store: Any, target: Url) -> str:
 
 
 def _write_nodes(file: Hdf5File, store: Any) -> None:
-    """Write all datasets but the frames, several at once; links are left out."""
+    """Write all datasets but the frames, several at once; links are omitted."""
     import zarr
 
     nodes = [node for _, node in file.objects() if isinstance(node, h5py.Dataset) and node.name != STACK]
@@ -171,7 +169,7 @@ def _write_nodes(file: Hdf5File, store: Any) -> None:
 def _attributes(file: Hdf5File, node: Node) -> dict[str, Any]:
     """Return the attributes of an object that are numbers or texts."""
     with as_input_error(f"{file.path}: {node.name}"):
-        # By number: h5py's names open an object again, which fails where its values are in raw files.
+        # By index: h5py opens the object again to find names, which fails where its values are in raw files.
         opened = [h5py.h5a.open(node.id, index=index) for index in range(h5py.h5a.get_num_attrs(node.id))]
     found: dict[str, Any] = {}
     for attribute in opened:
@@ -206,7 +204,7 @@ def _write_frames(recording: Source, store: Any, progress: Callable[[int], None]
 
 
 def _finish(file: Hdf5File, store: Any) -> None:
-    """Write what the groups say, which makes it one of ours, and all metadata in one place."""
+    """Write the attributes of the groups, which mark the store as ours, and the consolidated metadata."""
     import zarr
 
     groups = [node for _, node in file.objects() if isinstance(node, h5py.Group)]
@@ -215,5 +213,5 @@ def _finish(file: Hdf5File, store: Any) -> None:
         root.require_group(str(group.name)).attrs.update(_attributes(file, group))
     root.attrs.update(_attributes(file, file.root))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # other programs of version 3 need not read it, and lose nothing
+        warnings.simplefilter("ignore")  # the specification does not include it yet; other programs ignore it
         zarr.consolidate_metadata(store)

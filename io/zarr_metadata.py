@@ -1,4 +1,4 @@
-"""Metadata of Zarr, versions 2 and 3, checked before zarr-python or a codec sees it."""
+"""Zarr metadata, versions 2 and 3, checked before it is passed to zarr-python or a codec."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ import numpy as np
 from mirrorskin.io.types import InputError
 
 METADATA = "zarr.json", ".zarray", ".zgroup", ".zattrs", ".zmetadata"
-"""The names of metadata documents, of both versions of Zarr."""
+"""The names of metadata documents in both versions of Zarr."""
 
 MOST_NODES = 10_000
-"""Groups and arrays of a store, and names in one of its folders."""
+"""Limit of the groups and arrays in a store, and of the names in one of its folders."""
 
 COMPRESSORS = {"blosc": "Blosc", "gzip": "GZip", "lz4": "LZ4", "zlib": "Zlib", "zstd": "Zstd"}
-"""Codecs that unpack bytes, which `zarr_codecs` bounds, and their names for people."""
+"""Codecs that unpack bytes, which `zarr_codecs` limits, with their names for messages."""
 
 _SHARDS = "sharding_indexed"
 _COMPRESSORS_2, _FILTERS_2 = set(COMPRESSORS), {"shuffle", "vlen-utf8"}
@@ -30,17 +30,17 @@ _CODECS_3 = {"blosc", "bytes", "crc32c", "gzip", "transpose", "vlen-utf8", "zstd
 _INDEX_CODECS = {"bytes", "crc32c"}
 _NUMBERS = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
 _NUMBERS_2 = re.compile(r"[<>|]([iu][1248]|f[248]|b1)")
-_DEEP = 8  # groups in groups
+_DEEP = 8  # nested groups
 _MOST_DIMENSIONS = 32
 _AT_ONCE = 16  # requests
 
 
 @dataclass(frozen=True)
 class ArrayMetadata:
-    """An array as its document describes it.
+    """An array as described by its metadata.
 
-    ``dtype`` is None where the array holds neither numbers nor texts, and is not read; ``path`` is its place
-    in the store, and ``chunks`` the size of its largest pieces in the store: of shards, where there are some.
+    ``dtype`` is None if the array contains neither numbers nor texts, and is not read. ``path`` is its path
+    in the store, and ``chunks`` is the shape of its largest pieces in the store: its shards, if it has any.
     """
 
     path: str
@@ -52,25 +52,25 @@ class ArrayMetadata:
 
     @property
     def is_text(self) -> bool:
-        """Whether it holds texts."""
+        """Whether it contains texts."""
         return isinstance(self.dtype, np.dtypes.StringDType)
 
     @property
     def nbytes(self) -> int:
-        """How many bytes it takes in memory; of texts, how many their places take."""
+        """Size in memory in bytes; for texts, that of their pointers."""
         return math.prod(self.shape) * (0 if self.dtype is None else int(self.dtype.itemsize))
 
 
 @dataclass(frozen=True)
 class Nodes:
-    """The groups of a store, each with its attributes, and its arrays, by their names; "" is the root."""
+    """The groups of a store with their attributes, and its arrays, by name; "" is the root."""
 
     groups: dict[str, dict[str, Any]]
     arrays: dict[str, ArrayMetadata]
 
 
 async def read_nodes(store: Any, path: Path) -> Nodes:
-    """Read what a limited store holds; FileNotFoundError if that is neither a group nor an array."""
+    """Read the structure of a limited store; FileNotFoundError if it is neither a group nor an array."""
     root = await _read_document(store, "", 3) or await _read_document(store, "", 2)
     if root is None:
         raise FileNotFoundError(str(path))
@@ -91,7 +91,7 @@ async def read_nodes(store: Any, path: Path) -> Nodes:
 
 
 async def _walk(store: Any, path: Path, version: int, documents: dict[str, dict[str, Any]]) -> None:
-    """Look for the members of all groups, several at once."""
+    """Find the members of all groups concurrently."""
     gate = asyncio.Semaphore(_AT_ONCE)
 
     async def gated(work: Any) -> Any:
@@ -117,7 +117,7 @@ async def _walk(store: Any, path: Path, version: int, documents: dict[str, dict[
 
 
 async def _all_of(works: Iterable[Coroutine[Any, Any, Any]]) -> list[Any]:
-    """Do all at once; if one fails, end the others and raise its error."""
+    """Run all concurrently; if one fails, cancel the others and raise its error."""
     try:
         async with asyncio.TaskGroup() as group:
             tasks = [group.create_task(work) for work in works]
@@ -127,7 +127,7 @@ async def _all_of(works: Iterable[Coroutine[Any, Any, Any]]) -> list[Any]:
 
 
 async def _read_document(store: Any, place: str, version: int) -> dict[str, Any] | None:
-    """Read the document of a group or an array; of version 2, one with the attributes as in version 3."""
+    """Read the document of a group or an array; attributes of version 2 are added as in version 3."""
     if version == 3:
         return await _read_json(store, place, "zarr.json")
     array, group, attributes = await _all_of(
@@ -146,7 +146,7 @@ async def _read_json(store: Any, place: str, name: str) -> dict[str, Any] | None
 
 
 async def _consolidated(store: Any, root: dict[str, Any], version: int) -> dict[str, dict[str, Any]] | None:
-    """Return the documents of all members if the root has copies of them, else None."""
+    """Return the documents of all members if the root contains copies of them, else None."""
     if version == 3:
         copies = root.get("consolidated_metadata")
         if copies is None:
@@ -224,7 +224,7 @@ def _sizes(value: Any, least: int, what: str) -> tuple[int, ...]:
 
 
 def _configuration(value: Any, names: set[str], what: str) -> dict[str, Any]:
-    """Return the configuration of a named part of a document, if it is one of some."""
+    """Return the configuration of a named part of a document, if its name is in ``names``."""
     value = _mapping(value, what)
     if value.get("name") not in names:
         raise ValueError(f"{what} is {str(value.get('name'))[:40]!r}")
@@ -232,7 +232,7 @@ def _configuration(value: Any, names: set[str], what: str) -> dict[str, Any]:
 
 
 def _dtype(kind: Any, version: int) -> Any:
-    """Return the type of values, StringDType of texts, None of anything else."""
+    """Return the type of values: a NumPy type, StringDType for texts, or None for others."""
     if not isinstance(kind, str):
         return None
     if kind == ("|O" if version == 2 else "string"):
@@ -241,9 +241,9 @@ def _dtype(kind: Any, version: int) -> Any:
 
 
 def check_codecs(array: ArrayMetadata, where: str) -> None:
-    """Refuse an array with a codec that is not in the list: codecs run code, and some of them any code.
+    """Refuse an array with a codec that is not in the list, because some codecs run code from the store.
 
-    It also refuses texts with any codec but that for texts, and numbers with that.
+    Texts with any codec but the one for texts, and numbers with that codec, are refused, too.
     """
     version = _version(array.document)
     if version == 2:
@@ -267,7 +267,7 @@ def check_codecs(array: ArrayMetadata, where: str) -> None:
 
 
 def _codec_names(codecs: Any, allowed: set[str], where: str, depth: int = 0) -> Iterator[str]:
-    """Yield the names of codecs, also of those inside of shards, if all are allowed."""
+    """Yield the names of codecs, including those inside shards, if all are allowed."""
     for one in _sequence(codecs, where):
         name = _identifier(one, "name", allowed, where)
         yield name
@@ -287,7 +287,7 @@ def _sequence(value: Any, where: str) -> list[Any]:
 
 
 def _identifier(codec: Any, key: str, allowed: set[str], where: str) -> str:
-    """Return the name of a codec if it is allowed; version 3 also allows a name in place of an object."""
+    """Return the name of a codec if it is allowed; version 3 also accepts a name instead of an object."""
     name = codec.get(key) if isinstance(codec, dict) else codec
     if not isinstance(name, str) or name not in allowed or not (isinstance(codec, dict) or key == "name"):
         raise InputError(
@@ -298,7 +298,7 @@ def _identifier(codec: Any, key: str, allowed: set[str], where: str) -> str:
 
 
 def compressors_of(array: ArrayMetadata) -> str:
-    """Tell how the chunks of an array are packed, for people."""
+    """Return a description of how the chunks of an array are compressed."""
     if _version(array.document) == 2:
         names = [(array.document.get("compressor") or {}).get("id")]
     else:
@@ -307,10 +307,10 @@ def compressors_of(array: ArrayMetadata) -> str:
 
 
 def too_many(path: Path) -> InputError:
-    """Return what is raised of a store with too many groups and arrays."""
+    """Return the error for a store with too many groups and arrays."""
     return InputError(f"{path} holds more than {MOST_NODES} groups and arrays: copy what is wanted")
 
 
 def is_name(name: str) -> bool:
-    """Tell whether a group or an array can have a name: anything else could lead out of the store."""
+    """Return whether a group or an array can have a name; other names could lead out of the store."""
     return name not in ("", ".", "..") and not any(letter in name for letter in "/\\\0")

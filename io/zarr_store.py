@@ -1,4 +1,4 @@
-"""Stores of Zarr, from which limited bytes are read in limited time, and nothing from outside of them."""
+"""Zarr stores with limits on the size and time of reading, and without access to anything outside."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from mirrorskin.io.zarr_errors import MissingChunkError
 from mirrorskin.io.zarr_metadata import METADATA, MOST_NODES, is_name, too_many
 
 SILENCE = 30.0
-"""Seconds within which a server must accept a connection, send more bytes, or send a metadata document."""
+"""Time in seconds for a server to accept a connection, send more bytes, or send a metadata document."""
 
 TRANSFER = 300.0
-"""Seconds within which one chunk must have arrived."""
+"""Time in seconds for one chunk to arrive."""
 
 LARGEST_DOCUMENT, ALL_DOCUMENTS = 8 << 20, 64 << 20
-"""Bytes of one metadata document or of the listing of a folder, and of all metadata documents of a store."""
+"""Limits in bytes: of a metadata document or the listing of a folder, and of all documents of a store."""
 
 SCHEMES = ("http", "https", "s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "hdfs", "webhdfs", "memory")
-"""What addresses begin with: those of fsspec that are stores, not views of other files."""
+"""Schemes of addresses: those of fsspec that are stores, not views of other files."""
 
-_SLACK = 1 << 20  # bytes that a chunk may take more when it is packed
+_SLACK = 1 << 20  # additional bytes of a compressed chunk
 _most_bytes = contextvars.ContextVar("bytes that an answer may have", default=LARGEST_DOCUMENT)
 
 
 @contextmanager
 def opened_store(path: Path, read_only: bool = True) -> Iterator[Any]:
-    """Open a store of Zarr; at the end its connections are closed, which fsspec does not do itself."""
+    """Open a Zarr store; on exit its connections are closed, which fsspec does not do itself."""
     if isinstance(path, Url):
         if path.parts[0].rstrip(":") not in SCHEMES or "::" in str(path):
             known = ", ".join(SCHEMES)
@@ -64,10 +64,10 @@ def opened_store(path: Path, read_only: bool = True) -> Iterator[Any]:
 
 
 def options_of(address: Url) -> dict[str, Any]:
-    """Return the options with which fsspec opens an address."""
+    """Return the options for opening an address with fsspec."""
     scheme = address.parts[0]
     if scheme in ("s3:", "s3a:"):
-        # An object is fetched in one request, not after another for its size.
+        # An object is fetched in one request, without a preceding request for its size.
         return {"skip_instance_cache": True, "max_concurrency": 1}
     if scheme not in ("http:", "https:"):
         return {"skip_instance_cache": True}
@@ -78,7 +78,7 @@ def options_of(address: Url) -> dict[str, Any]:
     settings = given | {
         "timeout": ClientTimeout(total=TRANSFER, sock_connect=SILENCE, sock_read=SILENCE),
         "response_class": _limited_response(),
-        # Answers are taken as they are: unpacked by aiohttp, a small one could fill the memory.
+        # Answers are not decompressed: by aiohttp, a small one could fill the memory.
         "auto_decompress": False,
         "headers": given.get("headers", {}) | {"Accept-Encoding": "identity"},
     }
@@ -86,7 +86,7 @@ def options_of(address: Url) -> dict[str, Any]:
 
 
 def _limited_response() -> Any:
-    """Return a class of aiohttp's responses that reads at most `_most_bytes`."""
+    """Return a subclass of aiohttp's response class that reads at most `_most_bytes`."""
     from aiohttp import ClientResponse
 
     class LimitedResponse(ClientResponse):
@@ -128,14 +128,14 @@ class LimitedStore(WrapperStore[Any]):  # type: ignore[misc]  # where it is not 
         self._http = self._remote and "http" in store.fs.protocol
 
     async def get(self, key: str, prototype: Any, byte_range: Any = None) -> Any:
-        """Read a document, None if it is missing, or a chunk or a part of one, which must be there."""
+        """Read a document (None if it is missing), or a chunk or a part of one, which must exist."""
         document = key.rpartition("/")[2] in METADATA
         most = LARGEST_DOCUMENT if document else self.largest_chunk + _SLACK
         if isinstance(self._store, ZipStore):
             byte_range = self._range_of_member(key, byte_range)
         if isinstance(byte_range, RangeByteRequest):
             if not 0 <= byte_range.start <= byte_range.end:
-                raise InputError(f"{self._path}: {key} states a place that it does not have: copy it again")
+                raise InputError(f"{self._path}: {key} states an invalid range of bytes: copy it again")
             if byte_range.end - byte_range.start > most:
                 raise self._damaged(key, most)
         if byte_range is None and self._remote and not self._http:
@@ -154,12 +154,12 @@ class LimitedStore(WrapperStore[Any]):  # type: ignore[misc]  # where it is not 
         return found
 
     async def exists(self, key: str) -> bool:
-        """Tell whether there is a chunk."""
+        """Return whether a chunk exists."""
         self._check_place(key, None)
         return bool(await self._in_time(super().exists(key), SILENCE, LARGEST_DOCUMENT))
 
     async def names(self, folder: str) -> list[str]:
-        """Return the names in a folder that groups and arrays can have."""
+        """Return the names in a folder that are valid for groups and arrays."""
         self._check_place(folder, None)
         return await self._in_time(self._listed(folder), SILENCE, LARGEST_DOCUMENT)  # type: ignore[no-any-return]
 
@@ -186,9 +186,9 @@ class LimitedStore(WrapperStore[Any]):  # type: ignore[misc]  # where it is not 
             raise
 
     def _range_of_member(self, key: str, byte_range: Any) -> Any:
-        """Return the bytes of an archive's member that are asked for.
+        """Return the requested bytes of an archive's member.
 
-        Python unpacks all of a member at once, however little it states to hold, unless a number is given.
+        Without a number of bytes, Python unpacks the whole member, regardless of its stated size.
         """
         info = self._store._zf.NameToInfo.get(key)
         if info is None:
@@ -202,7 +202,7 @@ class LimitedStore(WrapperStore[Any]):  # type: ignore[misc]  # where it is not 
         return byte_range or RangeByteRequest(0, info.file_size)
 
     def _check_place(self, key: str, most: int | None) -> None:
-        """Refuse a file outside of a folder, what is not a regular file, and one of too many bytes."""
+        """Refuse a file outside of the folder, one that is not regular, and one that is too large."""
         if not isinstance(self._store, LocalStore):
             return
         place = Path(os.path.realpath(self._store.root / key))

@@ -1,4 +1,4 @@
-"""Pictures for people."""
+"""Figures, reports and interactive views."""
 
 from mirrorskin.view.canvas import check_drawing
 from mirrorskin.view.force import force_figure

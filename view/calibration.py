@@ -1,4 +1,4 @@
-"""Figures of a calibration, and of what is left of its errors on a ball."""
+"""Figures of a calibration, and of its residual errors on a ball."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ if TYPE_CHECKING:
 
     from mirrorskin.engine.calibration.check import Check, Errors
 
-_SHOWN = 1.0, 99.0  # per cent of the values that the colours tell apart
+_SHOWN = 1.0, 99.0  # percentiles at the ends of the colour scale
 
 
 def new_sheet(width: float, height: float) -> Figure:
-    """Return an empty figure, in inches, on which maps keep their colour bars beside them."""
+    """Return an empty figure, in inches, on which colour bars stay next to their maps."""
     figure = new_figure(width, height)
     figure.set_layout_engine("compressed")
     return figure
@@ -45,14 +45,14 @@ def new_sheet(width: float, height: float) -> Figure:
 def draw_pixels(
     axes: Axes, values: ArrayLike, title: str, label: str, colours: str = SEQUENTIAL, even: bool = False
 ) -> None:
-    """Draw a map of all pixels, with its colours explained."""
+    """Draw a map of all pixels, with a colour bar."""
     shown = np.asarray(values, np.float64)
     known = shown[np.isfinite(shown)]
     low, high = (float(v) for v in np.percentile(known, _SHOWN)) if known.size else (0.0, 1.0)
     if even:
         high = max(abs(low), abs(high))
         low = -high
-    if high - low <= 1e-6 * max(abs(low), abs(high)):  # one value is no range
+    if high - low <= 1e-6 * max(abs(low), abs(high)):  # a single value has no range
         low, high = low - 0.5, high + 0.5
     beyond = exceeded(known, low, high)
     draw_image(axes, shown, label=label, extend=beyond, cmap=colours, vmin=low, vmax=high)
@@ -68,11 +68,11 @@ _COLOURS = {
     "saturated": "tab:orange",
     "several": "tab:purple",
 }
-_VISIBLE = 100  # dots in a row that can be distinguished
+_VISIBLE = 100  # number of dots along a side that can be distinguished
 
 
 def draw_references(references: References) -> Figure:
-    """Draw both levels, their difference, both standard errors, and where the defects are."""
+    """Draw both levels, their difference, both standard errors, and the defects."""
     figure = new_sheet(17, 8.2)
     axes = figure.subplots(2, 3)
     light = references.bright - references.dark
@@ -86,7 +86,7 @@ def draw_references(references: References) -> Figure:
 
 
 def _draw_defects(axes: Axes, defects: NDArray[np.uint8]) -> None:
-    """Draw defects by colour, each large enough to be seen."""
+    """Draw defects by colour, each large enough to be visible."""
     names = list(_COLOURS)
     kind = np.full(defects.shape, names.index("several"), np.uint8)
     for name, bits in ({"sound": 0} | BITS).items():
@@ -102,14 +102,14 @@ def _draw_defects(axes: Axes, defects: NDArray[np.uint8]) -> None:
         axes.set_title("defects\n")
 
 
-_LINES = 16  # of the grid, about, along the longer side
+_LINES = 16  # approximate number of grid lines along the longer side
 _GRID = 96  # samples of a map along the longer side
-_FINE = 200  # places along a line
-_BEYOND = 0.75  # of the picture's size from its middle: farther off distortion says nothing
+_FINE = 200  # points along a line
+_BEYOND = 0.75  # of the picture's size from its centre: the distortion model is not valid farther away
 
 
 def draw_lens(lens: Lens) -> Figure:
-    """Draw a grid of millimetres as the camera sees it, the distortion, and how large pixels are."""
+    """Draw a millimetre grid as seen by the camera, the distortion, and the sizes of pixels."""
     figure = new_sheet(17, 5.2)
     axes = figure.subplots(1, 3)
     _draw_grid(axes[0], lens)
@@ -142,7 +142,7 @@ def draw_lens(lens: Lens) -> Figure:
 
 
 def _samples(shape: tuple[int, int]) -> tuple[Floats, Floats]:
-    """Return rows and columns of places spread over the picture, pixels."""
+    """Return rows and columns of points spread over the picture, pixels."""
     step = max(1.0, max(shape) / _GRID)
     along = [np.arange(0.5 * step, size, step) - 0.5 for size in shape]
     rows, columns = np.meshgrid(*along, indexing="ij")
@@ -150,20 +150,20 @@ def _samples(shape: tuple[int, int]) -> tuple[Floats, Floats]:
 
 
 def _distort(ideal: Floats, lens: Lens) -> Floats:
-    """Return where a picture has what lies at (column, row) without distortion, (..., 2)."""
+    """Return the positions in the distorted picture of undistorted (column, row), (..., 2)."""
     x, y = _project(np.asarray(np.linalg.inv(lens.matrix)), ideal)
     bent = distorted(np.stack([x.ravel(), y.ravel(), np.ones(x.size)]), lens.distortion)
     return np.stack(_project(lens.matrix, bent[:2].T.reshape(ideal.shape)), axis=-1)
 
 
 def _project(matrix: Floats, places: Floats) -> tuple[Floats, Floats]:
-    """Apply a homography to places (..., 2)."""
+    """Apply a homography to points (..., 2)."""
     x, y, w = np.moveaxis(places @ matrix[:, :2].T + matrix[:, 2], -1, 0)
     return x / w, y / w
 
 
 def _sizes(ideal: Floats, lens: Lens) -> Floats:
-    """Return the size of a pixel on the sheet, as a share of that of the map."""
+    """Return the size of a pixel on the sheet, relative to that of the map."""
     sides = [
         np.stack(_project(lens.camera, ideal + shift), axis=-1)
         - np.stack(_project(lens.camera, ideal - shift), axis=-1)
@@ -174,7 +174,7 @@ def _sizes(ideal: Floats, lens: Lens) -> Floats:
 
 
 def _draw_grid(axes: Axes, lens: Lens) -> None:
-    """Draw lines of whole millimetres, or tenths of them, as they lie in the picture."""
+    """Draw lines of whole millimetres, or tenths of them, at their positions in the picture."""
     rows, columns = lens.shape
     corners = np.array([[0, 0], [columns - 1, 0], [0, rows - 1], [columns - 1, rows - 1]], np.float64)
     x, y = _project(lens.camera, corners)
@@ -209,7 +209,7 @@ _MARKS = np.arange(8) * math.pi / 4
 
 
 def draw_precession(precession: Precession) -> Figure:
-    """Draw the lean over a turn, its half-angle, and how far its azimuth is from the phase."""
+    """Draw the lean over a turn, its half-angle, and the difference of its azimuth and the phase."""
     figure = new_figure(13.5, 6.4)
     grid = figure.add_gridspec(2, 2, width_ratios=[1.15, 1])
     _draw_path(figure.add_subplot(grid[:, 0]), precession)
@@ -221,8 +221,8 @@ def draw_precession(precession: Precession) -> Figure:
     even = precession.direction * _TURN + precession.phase_offset
     ahead = np.degrees(precession.phase(_TURN) - even)
     azimuth.plot(np.degrees(_TURN), ahead, color="tab:blue")
-    azimuth.axhline(0, color="0.5", ls=":", label="an even turn")
-    azimuth.set(ylabel="azimuth, less even turn (deg)", title="how evenly it goes round")
+    azimuth.axhline(0, color="0.5", ls=":", label="uniform rotation")
+    azimuth.set(ylabel="azimuth - uniform rotation (deg)", title="evenness of the rotation")
     for axes in (angle, azimuth):
         low, high = axes.get_ylim()
         if high - low < 1e-3:
@@ -236,7 +236,7 @@ def draw_precession(precession: Precession) -> Figure:
 
 
 def _draw_path(axes: Axes, precession: Precession) -> None:
-    """Draw where the axis leans, with the phases written beside it, and which way it goes round."""
+    """Draw the lean of the axis, labelled with the phases, and the sense of rotation."""
     centre = np.degrees(precession.centre)
     tilt = math.degrees(precession.tilt)
     path, marks = (np.degrees(precession.lean(phases)) for phases in (_TURN, _MARKS))
@@ -272,7 +272,7 @@ def _draw_path(axes: Axes, precession: Precession) -> None:
         ylim=(min(centre[1] - reach, -reach / 9), max(centre[1] + reach, reach / 9)),
         xlabel="lean along x (deg)",
         ylabel="lean along y (deg)",
-        title="where the body leans; numbers: phase of the recording",
+        title="lean of the body; numbers: phase of the recording",
         aspect="equal",
     )
     axes.grid(alpha=0.3)
@@ -286,11 +286,11 @@ def _draw_path(axes: Axes, precession: Precession) -> None:
     )
 
 
-_WORST = 98  # per cent of the errors that the colours tell apart
+_WORST = 98  # percentile of the errors at the end of the colour scale
 
 
 def check_figure(check: Check, title: str, path: Path) -> None:
-    """Draw the errors before and after a calibration into a PNG: a row for each map, in the same colours."""
+    """Draw the errors before and after a calibration into a PNG: a row for each map, with common colours."""
     columns = [(when, parts) for when, parts in (("before", check.before), ("after", check.after)) if parts]
     figure = new_figure(5.2 * len(columns), 4.4 * len(check.after))
     axes = figure.subplots(len(check.after), len(columns), squeeze=False)
@@ -305,7 +305,7 @@ def check_figure(check: Check, title: str, path: Path) -> None:
 
 def _draw(axes: Axes, name: str, errors: Errors, check: Check, worst: float) -> None:
     place, label = extent(check.x, check.y), f"found - true ({errors.unit})"
-    signed = bool(np.nanmin(errors.error, initial=0.0) < 0)  # the angle between normals is not
+    signed = bool(np.nanmin(errors.error, initial=0.0) < 0)  # the angle between normals has no sign
     colours = DIVERGING if signed else ERROR
     draw_image(axes, errors.error, place, label, cmap=colours, vmin=-worst if signed else 0.0, vmax=worst)
     digits = 3 if errors.unit == "deg" else 4

@@ -1,4 +1,4 @@
-"""The numbers of a calibration, in the units people speak of."""
+"""The numbers of a calibration, in common units."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ _DEGREE = math.degrees(1)
 class Row(NamedTuple):
     """A number of a calibration."""
 
-    part: str  # As the command that finds it out is called
+    part: str  # as its command is called
     what: str
     value: float | int | str
-    sigma: float = math.nan  # Its standard error; NaN where none is known
+    sigma: float = math.nan  # standard error; NaN if unknown
     unit: str = ""
 
     def cells(self) -> tuple[str, str, str, str, str]:
-        """Write it: part, what, value, standard error, unit; no more digits than are known."""
+        """Return part, quantity, value, standard error and unit as text, with the significant digits only."""
         if isinstance(self.value, str | int):
             return self.part, self.what, str(self.value), "", self.unit
         if not math.isfinite(self.value):
-            return self.part, self.what, "not told", "", self.unit
+            return self.part, self.what, "unknown", "", self.unit
         if not (math.isfinite(self.sigma) and self.sigma > 0):
             return self.part, self.what, f"{self.value:.6g}", "", self.unit
         digits = max(0, 1 - math.floor(math.log10(self.sigma)))
@@ -47,9 +47,9 @@ class Row(NamedTuple):
 
 
 def calibration_table(calibration: Calibration) -> list[Row]:
-    """Return the numbers of a calibration: of maps, medians."""
+    """Return the numbers of a calibration; for maps, their medians."""
     camera = calibration.camera
-    rows = [Row("camera", "name", camera.name or "not told")]
+    rows = [Row("camera", "name", camera.name or "unknown")]
     rows += (
         Row("camera", f"{what} of a frame", size)
         for what, size in zip(("rows", "columns"), camera.shape, strict=True)

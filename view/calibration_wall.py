@@ -1,4 +1,4 @@
-"""Figures of a wall's response and of a gel: what they show, from where, and how well they are known."""
+"""Figures of the response of a wall and of a gel, with their uncertainties."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ AZIMUTHS = np.linspace(0, math.tau, 181)  # of the normal, radians
 def _draw_by_azimuth(
     axes: PolarAxes, zenith_at: Callable[[float, float], Floats], axis: Sequence[float], away: float
 ) -> None:
-    """Draw zeniths, radians, over the normal's azimuth: on the wall's axis and so far away from it, mm."""
+    """Draw zeniths, radians, over the azimuth of the normal: on the wall's axis and ``away`` mm from it."""
     x0, y0 = axis
     for name, x, y in (
         ("on the axis", 0.0, 0.0),
@@ -44,17 +44,17 @@ def _draw_by_azimuth(
 
 
 _FINE = 300
-_NAMED = 30  # parameters that have room for their names
-_HALF = 0.5  # of full light
-_OFF_AXIS = 0.3  # of the radius: how far off the axis more places are shown
+_NAMED = 30  # largest number of parameters whose names fit
+_HALF = 0.5  # of full brightness
+_OFF_AXIS = 0.3  # of the radius: distance of the other points from the axis
 
 
 def draw_response(response: WallResponse) -> Figure:
-    """Draw what a wall's response says, and its errors.
+    """Draw the response of a wall, and its errors.
 
-    Above, the curve of a graded wall or the section of a uniform one, the zenith at which half of the light
-    is reached by azimuth, the shading; below, the errors of zenith and azimuth, and how those of the
-    parameters depend on each other.
+    Top: the curve of a graded wall or the section of a uniform one, the zenith of half brightness
+    by azimuth, the shading. Bottom: the errors of zenith and azimuth, and the correlation of the
+    errors of the parameters.
     """
     figure = new_sheet(17, 10)
     grid = figure.add_gridspec(2, 3)
@@ -67,7 +67,7 @@ def draw_response(response: WallResponse) -> Figure:
         response.axis,
         _OFF_AXIS * response.radius,
     )
-    polar.set_title("zenith of half light, by azimuth")
+    polar.set_title("zenith of half brightness, by azimuth")
     _draw_shade(figure.add_subplot(grid[0, 2]), response)
     zenith, azimuth = (figure.add_subplot(grid[1, column]) for column in range(2))
     draw_pixels(zenith, np.degrees(response.zenith_sigma), "standard error of zenith", "deg", ERROR)
@@ -83,7 +83,7 @@ def _central_zenith(q: Floats | float) -> Floats:
 
 
 def _draw_curve(axes: Axes, response: WallResponse) -> None:
-    """Draw light, and what a degree changes of it, against the zenith of a mirror on the axis."""
+    """Draw brightness, and its change per degree, against the zenith of a mirror on the axis."""
     q = np.linspace(*response.reach, _FINE)
     zenith, light = _central_zenith(q), np.polynomial.polynomial.polyval(q, response.curve)
     axes.plot(zenith, light, color="tab:blue", lw=2)
@@ -104,7 +104,7 @@ def _draw_curve(axes: Axes, response: WallResponse) -> None:
 
 
 def _draw_section(axes: Axes, response: WallResponse) -> None:
-    """Draw the body cut through its axis, and the rays to the ends of what is known."""
+    """Draw a cross-section of the body, and the rays to the ends of the calibrated range."""
     radius, rim = response.radius, response.rim
     for side in (-1, 1):
         axes.plot([side * radius] * 2, [0, rim], color="black", lw=4, solid_capstyle="butt")
@@ -128,7 +128,7 @@ def _draw_section(axes: Axes, response: WallResponse) -> None:
 
 
 def _draw_shade(axes: Axes, response: WallResponse) -> None:
-    """Draw by how much the picture is brighter or darker than its references say, and where the lamps are."""
+    """Draw the shading relative to the references, and the direction of the brighter lamps."""
     radius = response.radius
     across = np.linspace(-1, 1, _FINE)
     x, y = np.meshgrid(across, across[::-1])
@@ -159,7 +159,7 @@ def _draw_shade(axes: Axes, response: WallResponse) -> None:
 
 
 def _draw_correlation(axes: Axes, response: WallResponse) -> None:
-    """Draw how the errors of the parameters that were not fixed depend on each other."""
+    """Draw the correlation of the errors of the parameters that were not fixed."""
     free = np.flatnonzero(np.diag(response.covariance) > 0)
     if not free.size:
         axes.set_axis_off()
@@ -180,24 +180,24 @@ def _draw_correlation(axes: Axes, response: WallResponse) -> None:
 _BALL = 2.0  # radius of the ball in the figure, mm
 _RADII = 2.0, 3.0, 5.0  # of the balls pressed into the gel, mm
 _DEEPEST = 1.0  # mm
-_NEAR = 3.0  # the same where the wall is infinitely far, mm
+_NEAR = 3.0  # distance for a wall that is infinitely far away, mm
 
 
 def draw_gel(gel: Gel) -> Figure:
-    """Draw where on a ball light begins, that by place and azimuth, and how far the stage gives way."""
+    """Draw where on a ball pixels turn bright, this zenith by azimuth, and the stage's flexure."""
     figure = new_sheet(17, 5.2)
     grid = figure.add_gridspec(1, 3)
     _draw_threshold(figure.add_subplot(grid[0]), gel)
     polar = cast("PolarAxes", figure.add_subplot(grid[1], projection="polar"))
     away = _OFF_AXIS / gel.curvature if gel.curvature else _NEAR
     _draw_by_azimuth(polar, lambda x, y: threshold_at(gel, x, y, AZIMUTHS), gel.axis, away)
-    polar.set_title("zenith at which light begins, by azimuth")
+    polar.set_title("zenith at which pixels turn bright, by azimuth")
     _draw_give(figure.add_subplot(grid[2]), gel)
     return figure
 
 
 def _draw_threshold(axes: Axes, gel: Gel) -> None:
-    """Draw the upper side of a ball: dark where it is too flat to show light."""
+    """Draw the upper side of a ball: dark where it is too flat to turn bright."""
     angle = np.linspace(-math.radians(60), math.radians(60), _FINE)
     lit = np.abs(angle) >= gel.threshold
     x, z = _BALL * np.sin(angle), _BALL * (np.cos(angle) - 1)
@@ -222,7 +222,7 @@ def _draw_threshold(axes: Axes, gel: Gel) -> None:
 
 
 def _draw_give(axes: Axes, gel: Gel) -> None:
-    """Draw how far the stage gives way under balls (Hertz, of a gel that keeps its volume)."""
+    """Draw the deflection of the stage under balls (Hertz, for an incompressible gel)."""
     depth = np.linspace(0, _DEEPEST, _FINE)
     for radius in _RADII:
         force = 16 / 9 * math.sqrt(radius) * depth**1.5  # over Young's modulus, mm^2
@@ -240,7 +240,7 @@ def _draw_give(axes: Axes, gel: Gel) -> None:
 
 
 def draw_stiffness(stiffness: Stiffness) -> Figure:
-    """Draw by which force balls are pressed into the gel (Hertz), and its standard deviation."""
+    """Draw the force of balls pressed into the gel (Hertz), and its standard deviation."""
     figure = new_sheet(8, 5.2)
     axes = figure.add_subplot()
     depth = np.linspace(0, _DEEPEST, _FINE)
@@ -263,7 +263,7 @@ def draw_stiffness(stiffness: Stiffness) -> Figure:
 
 
 def _with_error(value: float, sigma: float, unit: str) -> str:
-    """Write a value with its standard error, where that is known."""
+    """Return a value with its standard error, if that is known."""
     if not (math.isfinite(sigma) and sigma > 0):
         return f"{value:.4g}{unit}"
     digits = max(0, 1 - math.floor(math.log10(sigma)))

@@ -1,4 +1,4 @@
-"""Canvas: Matplotlib figures, maps and their colour bars on them, and figures as files or windows."""
+"""Matplotlib figures, maps with colour bars, and output of figures to files and windows."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ Extent = tuple[float, float, float, float]
 """Outer edges of a map's pixels: left, right, bottom and top."""
 
 BESIDE: Mapping[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5), "frameon": False}
-"""Place of a legend that hides nothing: to the right of a panel."""
+"""Position of a legend outside of a panel, to the right of it."""
 
 _ROUND = 1, 2, 5, 10
-_DPI = 110  # pixels an inch, of a file
+_DPI = 110  # pixels per inch in files
 
 
 def check_drawing() -> None:
-    """Raise InputError if nothing can be drawn, before any work is done for a figure."""
+    """Raise InputError if figures cannot be drawn, before any work is done."""
     if find_spec("matplotlib") is None:
         raise InputError("figures need Matplotlib: pip install 'mirrorskin[view]'")
-    # It warns where the home cannot be written, and goes on with a temporary folder.
+    # Matplotlib warns if the home directory cannot be written, and uses a temporary folder.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure, size in inches."""
+    """Return an empty figure with a size in inches."""
     check_drawing()
     from matplotlib.figure import Figure
 
@@ -53,13 +53,13 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def save_figure(figure: Figure, title: str, path: Path) -> None:
-    """Write a figure with its title into a PNG, or raise InputError."""
+    """Write a figure with its title as a PNG, or raise InputError."""
     figure.suptitle(title, x=0.02, ha="left", weight="bold")
     write_figure(figure, path)
 
 
 def write_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as it is into a PNG, which exists whole or not at all, or raise InputError."""
+    """Write a figure as a PNG, which appears complete or not at all, or raise InputError."""
     write_new(path, [encode_figure(figure, _DPI)])
 
 
@@ -74,9 +74,9 @@ def encode_figure(figure: Figure, dpi: float) -> bytes:
 
 
 def _print_texts_as_they_are(figure: Figure) -> None:
-    """Take "$" in titles, labels and legends for itself: names of files and maps may not be formulas.
+    """Print "$" in titles, labels and legends literally: names of files and maps are not formulas.
 
-    Labels of ticks are formulas of Matplotlib's own.
+    Tick labels are formulas made by Matplotlib.
     """
     from matplotlib.axes import Axes
     from matplotlib.text import Text
@@ -96,7 +96,7 @@ def _print_texts_as_they_are(figure: Figure) -> None:
 def extent(x: Floats, y: Floats) -> Extent:
     """Return the outer edges of a map's pixels, in the unit of ``x`` and ``y``.
 
-    A picture of one row or one column is as high or wide as its pixels are the other way; one of one pixel
+    A picture of one row or one column gets square pixels; one of a single pixel
     is 1 x 1.
     """
     steps = [abs(float(along[1] - along[0])) if len(along) > 1 else None for along in (x, y)]
@@ -112,7 +112,7 @@ def draw_image(
     extend: str = "neither",
     **colours: Any,
 ) -> AxesImage:
-    """Draw a map, pixel by pixel; what has no answer has a colour of its own."""
+    """Draw a map, pixel by pixel; undefined pixels have their own colour."""
     axes.set_facecolor(MISSING)
     picture = axes.imshow(values, extent=place, **{"interpolation": "nearest", **colours})
     if label:
@@ -121,14 +121,14 @@ def draw_image(
 
 
 def explain_colours(axes: Axes, picture: ScalarMappable, label: str, extend: str = "neither") -> None:
-    """Draw the colours of a map right beside it."""
+    """Draw a colour bar adjacent to a map."""
     bar = axes.inset_axes((1.03, 0, 0.04, 1))
     axes.figure.colorbar(picture, cax=bar, label=label, extend=extend)
     bar.yaxis.label.set_parse_math(False)
 
 
 def exceeded(values: NDArray[Any], low: float, high: float) -> str:
-    """Tell which ends of the colours values exceed, in the words of ``explain_colours``."""
+    """Return which ends of the colour scale are exceeded, as an argument of ``explain_colours``."""
     below, above = bool(np.any(values < low)), bool(np.any(values > high))
     return {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[below, above]
 
@@ -141,7 +141,7 @@ def draw_classes(
     place: Extent | None = None,
     interpolation: str = "nearest",
 ) -> AxesImage:
-    """Draw a map of classes, with those beside it that have a label."""
+    """Draw a map of classes, with a legend of those that have a label."""
     from matplotlib.colors import to_rgb
     from matplotlib.patches import Patch
 
@@ -155,7 +155,7 @@ def draw_classes(
 
 
 def filled_colours() -> Colormap:
-    """Return the colours of heights that were filled, from the lowest to the highest."""
+    """Return the colour map of filled heights."""
     from matplotlib.colors import LinearSegmentedColormap
 
     return LinearSegmentedColormap.from_list("filled", FILLED_SHADES)
@@ -170,11 +170,11 @@ def round_length(length: float, up: bool = False) -> float:
     return float(max(step for step in steps if step <= length * (1 + 1e-9)))
 
 
-_SCREEN = 1600, 900  # pixels that a window may take
+_SCREEN = 1600, 900  # largest size of a window in pixels
 
 
 def has_screen() -> bool:
-    """Tell whether Matplotlib finds a way to open windows here; ``MPLBACKEND`` has its say."""
+    """Return whether Matplotlib can open windows, also considering ``MPLBACKEND``."""
     check_drawing()
     import matplotlib
     from matplotlib import pyplot
@@ -197,6 +197,6 @@ def show_figure(figure: Figure, title: str) -> None:
 
     _print_texts_as_they_are(figure)
     figure.set_dpi(min(figure.get_dpi(), *np.divide(_SCREEN, figure.get_size_inches())))
-    # pyplot makes a window only for what it makes itself.
+    # pyplot creates windows only for figures that it creates itself.
     pyplot.figure(num=title, FigureClass=cast("type[Figure]", ready))
     pyplot.show()

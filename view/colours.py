@@ -9,26 +9,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 MISSING = "lightsteelblue"
-"""Colour of what has no answer."""
+"""Colour of undefined pixels."""
 MISSING_RGB = (176, 196, 222)
 """The same as red, green and blue."""
 FILLED = "tab:orange"
-"""Colour of what was not measured but filled."""
+"""Colour of filled heights."""
 FILLED_RGB = (255, 127, 14)
 """The same as red, green and blue."""
 FILLED_SHADES = "#331a00", "#ffb266"
-"""Its shades, from the lowest to the highest."""
+"""Its shades, from the lowest to the highest height."""
 EDGE_RGB = (0, 0, 0)
 """Colour of edges, as red, green and blue."""
 
 SEQUENTIAL = "viridis"
-"""Matplotlib's name of the colours of heights, lengths and all else that goes from small to large."""
+"""Matplotlib's colour map for heights, lengths and other sequential values."""
 ERROR = "magma"
-"""The same of errors and their standard deviations."""
+"""Colour map for errors and standard deviations."""
 DIVERGING = "coolwarm"
-"""The same of what may be negative: blue below 0, red above."""
+"""Diverging colour map: blue below 0, red above."""
 CYCLIC = "twilight"
-"""The same of angles all the way round."""
+"""Cyclic colour map for angles."""
 
 Colours = NDArray[np.uint8]
 
@@ -36,7 +36,7 @@ _SHOWN = 0.2, 99.8  # percentiles at the ends of the colour scale
 
 
 def span(values: NDArray[Any]) -> tuple[float, float]:
-    """Return the lowest and highest value but for a few pixels at the edge of visibility."""
+    """Return the lowest and highest value, except for a few outliers."""
     known = values[np.isfinite(values)]
     low, high = np.percentile(known, _SHOWN) if known.size else (-1.0, 0.0)
     return float(low), float(high)
@@ -49,7 +49,7 @@ def grey(values: NDArray[Any], low: float, high: float) -> Colours:
 
 
 def height_colours(values: NDArray[Any], low: float, high: float) -> Colours:
-    """Return colours from violet at ``low`` to yellow at ``high``; what has no answer has its own."""
+    """Return colours from violet at ``low`` to yellow at ``high``; undefined values have their own colour."""
     shades = cv2.applyColorMap(grey(values, low, high), cv2.COLORMAP_VIRIDIS)
     colours = np.asarray(cv2.cvtColor(shades, cv2.COLOR_BGR2RGB), np.uint8)
     colours[np.isnan(values)] = MISSING_RGB
@@ -57,7 +57,7 @@ def height_colours(values: NDArray[Any], low: float, high: float) -> Colours:
 
 
 def normal_colours(normals: NDArray[np.float32], edges: NDArray[np.uint8] | None = None) -> Colours:
-    """Return the customary colours: red, green and blue for x, y and z from -1 to 1; edges are black."""
+    """Return the usual colours of normals: red, green and blue for x, y, z from -1 to 1; edges are black."""
     colours: Colours = ((np.nan_to_num(normals) + 1) * 127.5).astype(np.uint8)
     colours[np.isnan(normals[..., 2])] = MISSING_RGB
     if edges is not None:

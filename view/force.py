@@ -1,4 +1,4 @@
-"""Figure of forces: the pressure of a press, and the forces of several against the truth."""
+"""Figure of forces: the pressure of a press, and estimated against true forces."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mirrorskin.io import InputError, Result
 from mirrorskin.view.canvas import draw_image, extent, new_figure, save_figure
 from mirrorskin.view.colours import SEQUENTIAL
 
-_KILO = 1e3  # kPa in a MPa
+_KILO = 1e3  # kPa per MPa
 
 
 def force_figure(
@@ -22,12 +22,12 @@ def force_figure(
     title: str,
     path: Path,
 ) -> None:
-    """Draw the pressure of the last result, cut against the truth, and all forces, into a PNG.
+    """Draw the pressure of the last result, a cut through it with the truth, and all forces into a PNG.
 
     Parameters
     ----------
     results : mapping
-        Names and results with ``force``; the last with ``pressure``, ``x`` and ``y``.
+        Results with ``force`` by name; the last one also with ``pressure``, ``x`` and ``y``.
     truths : mapping
         True forces by the same names, N.
     pressure : ndarray, (H, W), float32
@@ -75,7 +75,7 @@ def force_figure(
     off = (force - truth) / truth
     rms, chi_square = 100 * np.sqrt(np.mean(off**2)), np.mean(((force - truth) / sigma) ** 2)
     axes.set(
-        ylabel="force found (N)",
+        ylabel="estimated force (N)",
         title=f"{len(force)} presses: RMS error {rms:.2g} %, chi2 {chi_square:.2f}",
     )
     axes.tick_params(labelbottom=False)

@@ -1,4 +1,4 @@
-"""Pictures while the body still moves, in rerun."""
+"""Live view of a measurement in rerun."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from mirrorskin.io import pixel_axes
 from mirrorskin.view.colours import Colours, grey, height_colours, normal_colours
 from mirrorskin.view.viewer import close_stream, load_rerun, open_stream
 
-_END = 2.0  # seconds for the last pictures to reach the viewer
+_END = 2.0  # seconds to wait until the last pictures have reached the viewer
 
 
 class LiveView:
-    """The camera's picture, heights, normals, a cross-section and the area of contact, as they come.
+    """The camera's picture, heights, normals, a cross-section and the area of contact, updated live.
 
     Parameters
     ----------
-    where : str or Path
+    "window", "browser", or the name of a file; see ``open_stream``.
         "window", "browser", or a file to write; see ``open_stream``.
     shape : (int, int)
         Rows and columns of the picture.
-    pixel_size : (float, float), optional
+    Millimetres along x and y; without it, the cross-section is in pixels.
         Millimetres along x and y; without it, the cross-section is along pixels.
 
     Raises
@@ -44,12 +44,12 @@ class LiveView:
         self._stream.send_blueprint(_blueprint(pixel_size is not None))
 
     def show(self, update: Update, status: Status) -> None:
-        """Show what is known now.
+        """Show the current state.
 
         Parameters
         ----------
         update : Update
-            Maps that are not known are left as they were.
+            Maps that are None remain as they were.
         status : Status
         """
         rr, log = load_rerun(), self._stream.log
@@ -69,14 +69,14 @@ class LiveView:
             log("slope", rr.Image(self._slopes.colour(update.slope)))
         if update.contact_area is not None:
             log("contact/area", rr.Scalars(update.contact_area))
-        log("status", rr.TextDocument(self._told(update, status), media_type="text/markdown"))
+        log("status", rr.TextDocument(self._status_text(update, status), media_type="text/markdown"))
 
     def close(self) -> None:
-        """Let the last pictures arrive, and let go of the viewer, which stays open."""
+        """Wait for the last pictures to arrive, and disconnect from the viewer, which stays open."""
         close_stream(self._stream, _END)
 
-    def _told(self, update: Update, status: Status) -> str:
-        """Return the state of things as a text."""
+    def _status_text(self, update: Update, status: Status) -> str:
+        """Return the current state as text."""
         lines = [
             f"**{status.rate:.1f} frames/s**, {status.used} used, {status.skipped} skipped,"
             f" {status.dropped} dropped, {status.updates} updates"
@@ -133,7 +133,7 @@ class _Range:
 
 
 def _blueprint(scaled: bool) -> Any:
-    """Return where everything stands."""
+    """Return the layout of the viewer."""
     import rerun.blueprint as rrb
 
     across = "Middle row, mm, true to scale" if scaled else "Middle row"

@@ -1,4 +1,4 @@
-"""Figure of motion: an object at its first touch and its last, its path, and the path's errors."""
+"""Figure of a motion: the object at its first and last touch, its path, and the errors of the path."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from mirrorskin.view.colours import SEQUENTIAL
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_MICRO = 1e3  # um in a mm
+_MICRO = 1e3  # um per mm
 _COLOURS = "tab:blue", "tab:orange", "tab:green"
 
 
 @dataclass(frozen=True, slots=True)
 class Followed:
-    """An object that was followed, and where it truly was.
+    """The estimated and the true motion of an object.
 
     Attributes
     ----------
     first, last : Result
-        Of the first touch and the last, with height, x and y.
+        Results of the first and the last touch, with height, x and y.
     poses : sequence of Pose
         Motion from the first touch to each.
     vectors, shifts : ndarray, (T, 3)
-        True rotation vectors, radians, and translations, mm, since the first touch.
+        True rotation vectors, radians, and translations, mm, relative to the first touch.
     """
 
     first: Result
@@ -45,7 +45,7 @@ class Followed:
 
     @property
     def errors(self) -> Floats:
-        """Small rotations and translations from the truth to what was found, (T, 6), radians and mm."""
+        """Small rotations and translations from the true to the estimated motion, (T, 6), radians and mm."""
         errors = []
         for pose, vector, shift in zip(self.poses, self.vectors, self.shifts, strict=True):
             rest = Rotation.from_rotvec(pose.rotation) * Rotation.from_rotvec(vector).inv()
@@ -59,7 +59,7 @@ class Followed:
 
 
 def pose_figure(found: Followed, title: str, path: Path) -> None:
-    """Draw the object, its path and the path's errors into a PNG.
+    """Draw the object, its path and the errors of the path into a PNG.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def _draw_path(axes: Axes, found: Floats, truth: Floats, label: str, names: Sequ
     for part, name, colour in zip(range(3), names, _COLOURS, strict=True):
         axes.plot(touch, truth[:, part], color=colour, lw=1)
         axes.plot(touch, found[:, part], "o", ms=4, color=colour, label=name)
-    axes.set(xlabel="touch", ylabel=label, title="found (dots) and true (lines)")
+    axes.set(xlabel="touch", ylabel=label, title="estimated (dots) and true (lines)")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
 

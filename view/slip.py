@@ -1,4 +1,4 @@
-"""Figure of slip: how a slide moves the skin, where and when it breaks loose, and the same of a twist."""
+"""Figure of slip: displacement of the skin and onset of slip in a slide, and the same for a twist."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from mirrorskin.view.colours import DIVERGING, ERROR, SEQUENTIAL
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_MICRO = 1e3  # um in a mm
+_MICRO = 1e3  # um per mm
 _ARROWS = 12  # along each side
 
 
 @dataclass(frozen=True, slots=True)
 class Slipped:
-    """What was found of a slide or a twist, and what is true.
+    """Estimated and true slip of a slide or a twist.
 
     Attributes
     ----------
     found : Slip
     truth : Truth
-        With displacement and slip_onset.
+        Truth with displacement and slip_onset.
     contact : ndarray, (H, W), bool
-        Where the skin touched the object before it moved.
+        Where the skin touched the object before the motion.
     closed : ndarray, (T,)
-        Share of the contact that sticks, by a closed form.
+        Share of the contact that sticks, from a closed-form solution.
     x, y : ndarray, (W,) and (H,)
         mm.
     """
@@ -59,25 +59,25 @@ class Slipped:
 
     @property
     def onset_error(self) -> Floats:
-        """Found onset less the true one, (H, W); NaN where either sticks."""
+        """Estimated onset minus the true one, (H, W); NaN where either sticks."""
         return self.found.slip_onset - self.onset
 
     @property
     def displacement_error(self) -> Floats:
-        """Found displacement in the last frame less the true one, (H, W, 2), mm."""
+        """Estimated displacement in the last frame minus the true one, (H, W, 2), mm."""
         assert self.truth.displacement is not None
         error: Floats = self.found.displacement - self.truth.displacement[-1].astype(np.float64)
         return error
 
     @property
     def true_ratio(self) -> Floats:
-        """Share of the contact that truly sticks, (T,)."""
+        """True share of the contact that sticks, (T,)."""
         onset = self.onset[self.contact]
         return np.array([1 - np.mean(onset <= way) for way in self.found.way])
 
 
 def slip_figure(slid: Slipped, twisted: Slipped, title: str, path: Path) -> None:
-    """Draw a slide and a twist, with truth and error, into a PNG.
+    """Draw a slide and a twist, with truth and errors, into a PNG.
 
     Raises
     ------
@@ -87,12 +87,12 @@ def slip_figure(slid: Slipped, twisted: Slipped, title: str, path: Path) -> None
     figure = new_figure(13, 11)
     axes = figure.subplots(3, 3)
     _draw_displacement(axes[0], slid)
-    _draw_stick_ratio(axes[0, 2], slid, 1.0, "way of the body (mm)", "Cattaneo and Mindlin")
-    _draw_onset(axes[1, 0], slid, slid.found.slip_onset, "mm", "slide: onset of slip, found")
-    _draw_onset(axes[1, 1], slid, slid.onset, "mm", "slide: onset of slip, true")
+    _draw_stick_ratio(axes[0, 2], slid, 1.0, "travelled distance (mm)", "Cattaneo and Mindlin")
+    _draw_onset(axes[1, 0], slid, slid.found.slip_onset, "mm", "slide: onset, estimated")
+    _draw_onset(axes[1, 1], slid, slid.onset, "mm", "slide: onset, true")
     _draw_onset_error(axes[1, 2], slid, _MICRO, "µm")
     degrees = float(np.degrees(1.0))
-    _draw_onset(axes[2, 0], twisted, degrees * twisted.found.slip_onset, "°", "twist: onset of slip, found")
+    _draw_onset(axes[2, 0], twisted, degrees * twisted.found.slip_onset, "°", "twist: onset, estimated")
     _draw_onset_error(axes[2, 1], twisted, degrees, "°")
     _draw_stick_ratio(axes[2, 2], twisted, degrees, "twist of the body (°)", "Lubkin")
     for one in axes[:, 0]:
@@ -112,7 +112,7 @@ def _draw_displacement(axes: NDArray[np.object_], slid: Slipped) -> None:
     axes[0].quiver(
         slid.x[some], slid.y[some], across, up, color="w", angles="xy", scale_units="xy", scale=1, width=6e-3
     )
-    axes[0].set(title="slide: displacement of the skin, found")
+    axes[0].set(title="slide: displacement of the skin, estimated")
     draw_image(
         axes[1], error, place, "error (µm)", "max", cmap=ERROR, vmin=0, vmax=np.nanpercentile(error, 99)
     )
@@ -122,7 +122,7 @@ def _draw_displacement(axes: NDArray[np.object_], slid: Slipped) -> None:
 
 
 def _draw_onset(axes: Axes, slid: Slipped, onset: NDArray[np.floating], unit: str, title: str) -> None:
-    draw_image(axes, onset, extent(slid.x, slid.y), f"way ({unit})", cmap=SEQUENTIAL, vmin=0)
+    draw_image(axes, onset, extent(slid.x, slid.y), f"onset of slip ({unit})", cmap=SEQUENTIAL, vmin=0)
     axes.set(title=title)
     _outline(axes, slid)
 
@@ -138,7 +138,7 @@ def _draw_onset_error(axes: Axes, slid: Slipped, scale: float, unit: str) -> Non
 
 
 def _outline(axes: Axes, slid: Slipped) -> None:
-    """Draw the border of the contact, and that of what sticks at the end."""
+    """Draw the border of the contact, and that of the region that sticks at the end."""
     axes.contour(slid.x, slid.y, slid.contact, [0.5], colors="k", linewidths=1)
     stuck = slid.contact & np.isnan(slid.onset)
     axes.contour(slid.x, slid.y, stuck, [0.5], colors="tab:red", linewidths=1)

@@ -1,4 +1,4 @@
-"""A surface in 3D, in rerun's viewer."""
+"""A surface in 3D, shown in rerun's viewer."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from mirrorskin.io.mesh import normals_around
 from mirrorskin.view.colours import FILLED_RGB, Colours, height_colours, span
 from mirrorskin.view.viewer import close_stream, load_rerun, open_stream
 
-_END = 60.0  # seconds for a surface to reach the viewer
+_END = 60.0  # seconds to wait until the surface has reached the viewer
 
 
 def show_surface(result: Result, where: str | Path, name: str) -> None:
-    """Show a result's heights as a surface, in millimetres along all three axes.
+    """Show the heights of a result as a surface, in millimetres along all three axes.
 
-    Colours go from violet to yellow with the height; what was filled is orange, and a hole is a hole.
+    Colours go from violet to yellow with the height; filled heights are orange, and holes are kept.
 
     Parameters
     ----------
     result : Result
-        Of one turn, with heights and pixel size.
+        Maps of one turn, with heights and pixel size.
     where : str or Path
-        "window", "browser", or a file to write; see ``open_stream``.
+        "window", "browser", or the name of a file; see ``open_stream``.
     name : str
-        What the result is called.
+        Name of the result.
 
     Raises
     ------
     mirrorskin.io.InputError
-        The result has no heights of three neighbours, or no pixel size; rerun is not installed or does
+        The result has no three adjacent heights, or no pixel size; rerun is not installed or does
         not start, or the file cannot be written.
     """
     result = select_turn(result, None)
@@ -51,19 +51,17 @@ def show_surface(result: Result, where: str | Path, name: str) -> None:
         vertex_colors=_colours(result, mesh),
     )
     stream.log("surface", surface, static=True)
-    text = "\n\n".join(_told(result, name))
+    text = "\n\n".join(_description(result, name))
     stream.log("about", rr.TextDocument(text, media_type="text/markdown"), static=True)
     close_stream(stream, _END)
 
 
 def _mesh(result: Result, name: str) -> Mesh:
-    """Return the surface, if there is one."""
+    """Return the surface; InputError if there is none."""
     if result.height is None:
         raise InputError(f"{name} has no heights: there is no surface to show")
     if result.x is None or result.y is None:
-        raise InputError(
-            f"{name} does not say how large its pixels are: reconstruct it again with --pixel-size"
-        )
+        raise InputError(f"{name} has no pixel size: reconstruct it again with --pixel-size")
     mesh = surface_mesh(result.height, result.x, result.y, component=result.component)
     if not mesh.faces.size:
         raise InputError(f"{name} has no three neighbours with heights: there is no surface to show")
@@ -79,8 +77,8 @@ def _colours(result: Result, mesh: Mesh) -> Colours:
     return colours
 
 
-def _told(result: Result, name: str) -> Iterator[str]:
-    """Tell in paragraphs what is seen."""
+def _description(result: Result, name: str) -> Iterator[str]:
+    """Yield a description in paragraphs."""
     assert result.height is not None
     low, high = span(result.height)
     yield f"**{name}**"
@@ -94,7 +92,7 @@ def _told(result: Result, name: str) -> Iterator[str]:
 
 
 def _blueprint(name: str) -> Any:
-    """Return where everything stands."""
+    """Return the layout of the viewer."""
     import rerun.blueprint as rrb
 
     return rrb.Blueprint(

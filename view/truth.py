@@ -1,4 +1,4 @@
-"""Figures of results beside the truth of a simulation: heights, normals, surfaces."""
+"""Figures that compare results with the truth of a simulation: heights, normals, surfaces."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Relief:
-    """Heights as figures show them.
+    """Heights to be drawn in figures.
 
     Attributes
     ----------
     height : ndarray, (H, W), float32
-        Millimetres; NaN without an answer.
+        Millimetres; NaN where undefined.
     filled : ndarray, (H, W), bool
-        Where it was not measured.
+        Where it was filled, not measured.
     x, y : ndarray, (W,) and (H,), float64
         Millimetres.
     levelled : bool
-        Whether a component of unknown offset was moved to the truth's mean height.
+        Whether a component of unknown offset was moved to the mean height of the truth.
     """
 
     height: NDArray[np.float32]
@@ -50,14 +50,14 @@ class Relief:
     levelled: bool
 
     def notes(self, missing: str) -> str:
-        """Tell what colours mean, which share of the heights was filled, and what a level is worth."""
+        """Return notes on the colours, the share of filled heights, and the level."""
         share = 100 * float(self.filled.sum()) / max(1.0, float(np.isfinite(self.height).sum()))
         filled = [f"orange: filled, {share:.0f} % of the heights"] if self.filled.any() else []
         return "\n".join([*filled, missing, *(["truth's level"] if self.levelled else [])])
 
     @property
     def measured(self) -> Relief:
-        """The same without what was filled."""
+        """The same without filled heights."""
         height = np.where(self.filled, np.float32(np.nan), self.height)
         return replace(self, height=height, filled=np.zeros_like(self.filled))
 
@@ -69,7 +69,7 @@ class Relief:
 
 
 def relief_of(result: Result, truth: Truth) -> Relief:
-    """Return a result's heights; components of unknown offset are moved to the truth's mean height there."""
+    """Return the heights of a result; components of unknown offset are moved to the truth's mean height."""
     height, x, y = result.height, result.x, result.y
     if height is None or x is None or y is None or height.ndim != 2 or min(height.shape) < 2:
         raise InputError("a figure needs heights and the pixel size, of 2 x 2 pixels at least")
@@ -87,7 +87,7 @@ def _level(result: Result, height: NDArray[np.float32], truth: NDArray[np.float3
     valid = np.isfinite(error) & (result.component >= 0)
     count, label = result.offset_unknown.size, result.component[valid]
     mean = np.bincount(label, error[valid], count) / np.maximum(np.bincount(label, minlength=count), 1)
-    # The last one is for pixels that are in no component.
+    # The last element is for pixels without a component.
     shift = np.append(np.where(result.offset_unknown, mean, 0.0), 0.0)[result.component]
     return np.asarray(height - shift, np.float32)
 
@@ -106,12 +106,12 @@ def draw_map(axes: Axes, name: str, relief: Relief, limits: Range | None = None)
 
 
 def draw_surface(axes: Axes3D, name: str, relief: Relief, limits: Range | None = None) -> None:
-    """Draw heights as a surface in space, within limits along z; filled ones have a colour of their own."""
+    """Draw heights as a 3D surface, within limits along z; filled ones have their own colour."""
     step = max(1, max(relief.height.shape) // _MESH)
     limits = limits or relief.ends
     shown, filled = relief.height[::step, ::step], relief.filled[::step, ::step]
     across, up = np.meshgrid(relief.x[::step], relief.y[::step])
-    # One surface in two colours: Matplotlib does not sort two surfaces by depth.
+    # A single surface with two colour maps, because Matplotlib does not sort two surfaces by depth.
     colours = _colours(shown, filled, limits)
     style = {"rstride": 1, "cstride": 1, "linewidth": 0, "antialiased": True, "shade": False}
     axes.plot_surface(across, up, shown, facecolors=colours, **style)
@@ -121,7 +121,7 @@ def draw_surface(axes: Axes3D, name: str, relief: Relief, limits: Range | None =
 
 
 def _colours(height: NDArray[np.float32], filled: NDArray[np.bool_], limits: Range) -> Floats:
-    """Return the colours of a surface, (H, W, 4): by height, and of what was filled."""
+    """Return the colours of a surface, (H, W, 4): by height, and orange for filled heights."""
     from matplotlib import colormaps
     from matplotlib.colors import Normalize, to_rgba
 
@@ -131,7 +131,7 @@ def _colours(height: NDArray[np.float32], filled: NDArray[np.bool_], limits: Ran
 
 
 def draw_cuts(axes: Axes, reliefs: Mapping[str, Relief], truth: Truth, limits: Range | None = None) -> None:
-    """Draw heights on the middle row against the truth; filled ones are open circles."""
+    """Draw heights on the middle row with the truth; filled ones are open circles."""
     row = len(truth.height) // 2
     any_relief = next(iter(reliefs.values()))
     axes.plot(any_relief.x, truth.height[row], color="0.6", lw=3, label="truth")
@@ -144,7 +144,7 @@ def draw_cuts(axes: Axes, reliefs: Mapping[str, Relief], truth: Truth, limits: R
         limits = 1.04 * lowest - 0.02, -0.04 * lowest + 0.02
     axes.set_ylim(*limits)
     axes.grid(alpha=0.3)
-    # Beside the curves, where it hides none of them.
+    # Outside of the panel, where it hides no curve.
     axes.legend(
         loc="upper center",
         bbox_to_anchor=(0.5, -0.13),
@@ -156,10 +156,10 @@ def draw_cuts(axes: Axes, reliefs: Mapping[str, Relief], truth: Truth, limits: R
 
 
 def dots_on_row(axes: Axes, values: Mapping[str, NDArray[np.float32]], reliefs: Mapping[str, Relief]) -> None:
-    """Draw values along the middle row, (W,), in the colours and with the names of the reliefs."""
+    """Draw values along the middle row, (W,), with the colours and names of the reliefs."""
     for number, (name, relief) in enumerate(reliefs.items()):
         filled = relief.filled[len(relief.filled) // 2]
-        # The first lies on top, small enough to show the others round it.
+        # The first one is on top, and small enough not to hide the others.
         style: dict[str, Any] = {"ms": 3 + number, "zorder": 9 - number, "color": f"C{number}", "ls": ""}
         axes.plot(relief.x, np.where(filled, np.nan, values[name]), marker=".", label=name, **style)
         if filled.any():
@@ -167,7 +167,7 @@ def dots_on_row(axes: Axes, values: Mapping[str, NDArray[np.float32]], reliefs: 
 
 
 def check_same_size(shape: tuple[int, ...], truth: NDArray[np.float32]) -> None:
-    """Raise InputError unless a result and the truth are of one stack."""
+    """Raise InputError if a result and the truth have different sizes."""
     if truth.shape != shape:
         raise InputError(f"the result is {shape} pixels, the truth {truth.shape}: not of one stack")
 
@@ -181,24 +181,24 @@ def height_figure(
     surface: bool = False,
     detail: Range | None = None,
 ) -> None:
-    """Draw heights, and cuts across the middle against the truth, into a PNG.
+    """Draw heights, and cuts across the middle with the truth, into a PNG.
 
     Parameters
     ----------
     results : mapping
-        Names and results with ``height``, ``x`` and ``y``. The first and the last are drawn as a whole, all
+        Results with ``height``, ``x`` and ``y`` by name. The first and the last are drawn as maps, all
         are cut. ``filled`` heights have their own colour; components of unknown
-        offset are moved to the truth's mean.
+        offset are moved to the mean of the truth.
     truth : Truth
-        Of the same size.
+        Truth of the same size.
     title : str
     path : Path
         PNG to write.
     surface : bool
-        Draw surfaces in space, as Fig. 5 (a) of the paper, instead of maps, as its Fig. 6:
-        on one vertical scale, the first also without what was filled.
+        Draw 3D surfaces, as in Fig. 5 (a) of the paper, instead of maps as in its Fig. 6,
+        with one vertical scale; the first also without filled heights.
     detail : (float, float), optional
-        Heights, mm, between which maps and cuts are drawn a second time, on a scale of their own.
+        Heights, mm, between which maps and cuts are drawn again, with their own scale.
 
     Raises
     ------
@@ -227,7 +227,7 @@ def _draw_heights(
 
 
 def _draw_in_space(whole: Mapping[str, Relief], reliefs: Mapping[str, Relief], truth: Truth) -> Figure:
-    """Draw surfaces on one scale, the first also as it was measured, and all cuts."""
+    """Draw surfaces on one scale, the first also without filled heights, and all cuts."""
     first, relief = next(iter(whole.items()))
     if relief.filled.any():
         whole = {f"{first}, measured": relief.measured, **whole}
@@ -251,17 +251,17 @@ _WORST = 98  # percentile of the errors at the end of the colour scale
 def normal_figure(results: Mapping[str, Result], truth: Truth, title: str, path: Path) -> None:
     """Draw normals, a row for each result, into a PNG.
 
-    From left to right: the customary colours, red, green and blue for x, y and z from -1 to 1, with edges
-    black and a key of a half-sphere; the normals projected on the sheet as needles, as Fig. 10 (a) of the
-    paper; the angle to the true normal where the sheet was in contact in every frame. The medians told are
-    those of the pixels that all results answer, so that they can be compared.
+    From left to right: the usual colours, red, green and blue for x, y and z from -1 to 1, with black edges
+    and a half-sphere as a key; the normals projected on the sheet as needles, as in Fig. 10 (a) of the
+    paper; the angle to the true normal where the sheet was in contact in every frame. The medians printed
+    are over the pixels with a normal in all results, so that they can be compared.
 
     Parameters
     ----------
     results : mapping
-        Names and results with ``normals``, ``x`` and ``y``.
+        Results with ``normals``, ``x`` and ``y`` by name.
     truth : Truth
-        Of the same size.
+        Truth of the same size.
     title : str
     path : Path
         PNG to write.
@@ -303,7 +303,7 @@ def _maps(result: Result) -> tuple[NDArray[np.float32], Floats, Floats]:
 
 
 def _errors(result: Result, truth: Truth) -> Floats:
-    """Return the angles to the true normals, degrees, where there was contact in every frame, else NaN."""
+    """Return the angles to the true normals, degrees; NaN where contact was lost in some frame."""
     normals, _, _ = _maps(result)
     angle = np.degrees(angle_between(normals, true_normals(truth)))
     valid = truth.contact.astype(bool)
@@ -326,7 +326,7 @@ def _draw_normals(axes: Axes, name: str, result: Result) -> None:
 
 
 def _draw_key(axes: Axes) -> None:
-    """Draw the colours of a half-sphere seen from above: each is that of the normal of its place."""
+    """Draw the colours of a half-sphere seen from above, as a key."""
     across, up = np.meshgrid(*2 * [np.linspace(-1, 1, 101)])
     height = np.sqrt(np.maximum(0, 1 - across**2 - up**2))
     colours = (np.stack([across, up, height, np.ones_like(up)], axis=-1) + 1) / 2
@@ -378,23 +378,23 @@ def _draw_angles(axes: Axes, result: Result, error: Floats, shared: NDArray[np.b
     axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{note}; blue: no answer")
 
 
-_MICROMETRES = 1e3  # in a millimetre
+_MICROMETRES = 1e3  # per millimetre
 
 
 def surface_figure(results: Mapping[str, Result], truth: Truth, title: str, path: Path) -> None:
-    """Draw a surface, and how it came about, into a PNG.
+    """Draw a surface, and the results that lead to it, into a PNG.
 
-    The last result is drawn in space, as Fig. 10 (b) of the paper, by brightness, and as what is left when
-    the truth is subtracted; all are cut across the middle, with the errors of these cuts below. What
-    was filled is orange or open; pixels without an answer stay empty.
+    The last result is drawn in 3D, as in Fig. 10 (b) of the paper, as shaded heights, and as the difference
+    from the truth; all are cut across the middle, with the errors of these cuts below. Filled
+    heights are orange or open; undefined pixels stay empty.
 
     Parameters
     ----------
     results : mapping
-        Names and results with ``height``, ``x`` and ``y``. A component of unknown offset is moved to the
-        truth's mean height.
+        Results with ``height``, ``x`` and ``y`` by name. A component of unknown offset is moved to the
+        mean height of the truth.
     truth : Truth
-        Of the same size.
+        Truth of the same size.
     title : str
     path : Path
         PNG to write.

@@ -1,4 +1,4 @@
-"""Figure of vibration: an oscillating press, a body that rocks, and a contact that grows."""
+"""Figure of vibration: an oscillating press, a rocking body, and a growing contact."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from mirrorskin.io.types import Floats
 from mirrorskin.view.canvas import draw_image, extent, new_figure, save_figure
 from mirrorskin.view.colours import DIVERGING, SEQUENTIAL
 
-_MICRO = 1e3  # um in a mm
-_WIDE = 4.0  # standard deviations that histograms show
+_MICRO = 1e3  # um per mm
+_WIDE = 4.0  # range of the histograms, standard deviations
 
 
 @dataclass(frozen=True, slots=True)
 class Vibration:
-    """What was found of three vibrations, and what is true.
+    """Estimated and true results of three vibrations.
 
     Attributes
     ----------
     strokes : sequence of (float, float, float)
-        Strokes down, RMS error of the height, and RMS of its predicted standard deviation, mm.
+        Number of strokes down, RMS error of the height, and RMS of its predicted standard deviation, mm.
     press : Result
-        Of all strokes, with height, hysteresis and their sigmas.
+        Result of all strokes, with height, hysteresis and their sigmas.
     height : ndarray, (H, W)
         True height, mm.
     hysteresis : float
         True hysteresis, mm.
     rocked : Result
-        With slope and its sigma, x and y.
+        Result with slope and its sigma, x and y.
     slope : ndarray, (H, W)
         True slope along the direction of rocking.
     dithered : Result
-        With growth, x and y, and the area's growth in its process.
+        Result with growth, x and y, and the area's growth in its process.
     growth : float
         True growth of the area, mm^2/mm.
     """
@@ -53,7 +53,7 @@ class Vibration:
 
     @property
     def deviations(self) -> dict[str, Floats]:
-        """Errors in standard deviations, where there are any, by what was found."""
+        """Errors divided by standard deviations, where defined, by name of the map."""
         press, rocked = self.press, self.rocked
         if press.height is None or press.hysteresis is None or rocked.slope is None:
             raise InputError("a figure of vibration needs heights, a hysteresis and a slope")
@@ -72,7 +72,7 @@ class Vibration:
 
 
 def vibration_figure(found: Vibration, title: str, path: Path) -> None:
-    """Draw what vibrations tell, with truth and error, into a PNG.
+    """Draw the results of vibrations, with truth and errors, into a PNG.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def vibration_figure(found: Vibration, title: str, path: Path) -> None:
     low, high = np.percentile(hysteresis, [0.2, 99.8]).tolist()
     axes.hist(hysteresis, np.linspace(low, high, 60).tolist(), color="tab:blue", alpha=0.7)
     axes.axvline(_MICRO * found.hysteresis, color="tab:red", label="truth")
-    axes.set(xlabel="release less onset (µm)", ylabel="pixels")
+    axes.set(xlabel="release - onset (µm)", ylabel="pixels")
     axes.set(title=f"hysteresis: mean {hysteresis.mean():.2f} µm, truth {_MICRO * found.hysteresis:.0f} µm")
     axes.legend(frameon=False)
 
@@ -129,16 +129,16 @@ def vibration_figure(found: Vibration, title: str, path: Path) -> None:
     place, side = extent(rocked.x, rocked.y), float(np.nanmax(np.abs(found.slope)))
     axes = figure.add_subplot(grid[1, 0])
     draw_image(axes, touched, place, "slope along it", cmap=DIVERGING, vmin=-side, vmax=side)
-    axes.set(xlabel="x (mm)", ylabel="y (mm)", title="a body that rocks: slope along one direction")
+    axes.set(xlabel="x (mm)", ylabel="y (mm)", title="a rocking body: slope along one direction")
     axes = figure.add_subplot(grid[1, 1])
     wrong = touched - found.slope
     side = 4 * float(np.nanstd(wrong))
     draw_image(axes, wrong, place, "error of the slope", "both", cmap=DIVERGING, vmin=-side, vmax=side)
-    axes.set(xlabel="x (mm)", title=f"less the truth: RMS {np.sqrt(np.nanmean(wrong**2)):.3f}")
+    axes.set(xlabel="x (mm)", title=f"minus the truth: RMS {np.sqrt(np.nanmean(wrong**2)):.3f}")
 
     axes = figure.add_subplot(grid[1, 2])
     place, most = extent(dithered.x, dithered.y), float(np.nanpercentile(dithered.growth, 99.5))
     draw_image(axes, dithered.growth, place, "growth (1/mm)", "max", cmap=SEQUENTIAL, vmin=0, vmax=most)
     area = float(dithered.process.get("area_growth", np.nan))
-    axes.set(xlabel="x (mm)", title=f"dither: light grows by {area:.2f} mm²/mm, truth {found.growth:.2f}")
+    axes.set(xlabel="x (mm)", title=f"dither: area grows by {area:.2f} mm²/mm, truth {found.growth:.2f}")
     save_figure(figure, title, path)

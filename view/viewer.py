@@ -1,4 +1,4 @@
-"""rerun's viewer: started on this machine for this machine alone, or a file that it shows later."""
+"""rerun's viewer: started on this machine and accessible from it only, or a file to be viewed later."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from typing import Any
 from mirrorskin.io import InputError, check_output
 
 WINDOW, BROWSER = "window", "browser"
-"""Where pictures can be shown, besides a file."""
+"""Where pictures can be shown, in addition to a file."""
 
 _HERE = "127.0.0.1"
 _SUFFIX = ".rrd"
-_START = 20.0  # seconds for the viewer to listen
+_START = 20.0  # seconds to wait until the viewer listens
 _MEMORY = "1GB"  # of pictures that the viewer keeps, the newest ones
-_VIEWERS: list[subprocess.Popen[bytes]] = []  # they outlive what they show
+_VIEWERS: list[subprocess.Popen[bytes]] = []  # viewers outlive the streams
 
 
 def load_rerun() -> Any:
@@ -35,7 +35,7 @@ def load_rerun() -> Any:
 
 
 def open_stream(where: str | Path, option: str) -> Any:
-    """Open what pictures are logged to."""
+    """Open a stream of pictures to a viewer or a file."""
     check_place(where, option)
     stream = load_rerun().RecordingStream("mirrorskin", send_properties=False)
     if str(where) in (WINDOW, BROWSER):
@@ -46,7 +46,7 @@ def open_stream(where: str | Path, option: str) -> Any:
 
 
 def check_place(where: str | Path, option: str) -> None:
-    """Raise InputError if nothing can be shown there, before any work is done for it; see ``open_stream``."""
+    """Raise InputError if nothing can be shown there, before any work is done; see ``open_stream``."""
     load_rerun()
     if str(where) in (WINDOW, BROWSER):
         return
@@ -66,20 +66,20 @@ def close_stream(stream: Any, patience: float) -> None:
 def _start(where: str, option: str) -> int:
     """Start a viewer, wait until it listens, and return its port."""
     port = _free_port()
-    # Not by way of "rerun", which takes most of a second to import.
+    # Not through the command "rerun", which takes most of a second to import.
     words = [sys.executable, "-m", "rerun_cli", "--bind", _HERE, "--port", str(port)]
     words += ["--server-memory-limit", _MEMORY, "--memory-limit", _MEMORY]
     if where == BROWSER:
         words += ["--web-viewer", "--web-viewer-port", str(_free_port())]
     quiet = subprocess.DEVNULL
-    # In a session of its own, for Ctrl-C ends the run and leaves its pictures there.
+    # In its own session, because Ctrl-C should end the run but keep the viewer.
     viewer = subprocess.Popen(words, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
     _VIEWERS.append(viewer)
     deadline = time.monotonic() + _START
     while not _listens(port):
         if viewer.poll() is not None or time.monotonic() > deadline:
             with suppress(ProcessLookupError):
-                os.killpg(viewer.pid, signal.SIGKILL)  # the module starts a program of its own
+                os.killpg(viewer.pid, signal.SIGKILL)  # the module starts another process
             viewer.wait()
             remedy = f"take {option} {BROWSER}, or {option} FILE.rrd" if where == WINDOW else "see 'rerun'"
             raise InputError(f"rerun's viewer does not start here: {remedy}")

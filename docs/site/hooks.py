@@ -1,7 +1,7 @@
-"""How the site differs from the Markdown that it is made of: what mkdocs calls while it builds (mkdocs.yml).
+"""Hooks that mkdocs calls while it builds the site from the Markdown files (mkdocs.yml).
 
-Pages are added that lie elsewhere in the repository, or that nobody wrote: commands,
-Python, the gallery, the notebook.
+They add pages from other folders of the repository, and generated ones: commands, Python, the gallery, the
+notebook.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ _AS_MEMBER = """\
       show_root_toc_entry: true
 """
 _PACKAGES = {
-    "engine": "The estimators: what turns frames into maps, and maps into numbers.",
+    "engine": "The estimators: from frames to maps, and from maps to numbers.",
     "engine.live": "The same while the body moves.",
-    "io": "Shared types, recordings, results, other people's frames, exports.",
+    "io": "Shared types, recordings, results, frames of other programs, exports.",
     "hw": "Stage, camera, rig.",
     "hw.twin": "The digital twin: objects, body, camera, movements.",
-    "view": "Pictures of results beside the truth.",
-    "view.result": "Pictures of one result.",
+    "view": "Figures of results compared with the truth.",
+    "view.result": "Figures of one result.",
     "view.report": "A result as one page for a browser.",
     "kernels.device": "The OpenCL devices, and what runs on them.",
 }
@@ -84,19 +84,19 @@ def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
 
 @functools.cache
 def _api_pages() -> dict[str, str]:
-    """Return the pages of which mkdocstrings makes the reference of Python."""
-    told = "".join(f"| [`mirrorskin.{name}`]({name}.md) | {what} |\n" for name, what in _PACKAGES.items())
-    index = f"# Python\n\nWhat each package exports.\n\n| package | is |\n|---|---|\n{told}"
+    """Return the pages from which mkdocstrings makes the Python reference."""
+    rows = "".join(f"| [`mirrorskin.{name}`]({name}.md) | {what} |\n" for name, what in _PACKAGES.items())
+    index = f"# Python\n\nThe contents of each package.\n\n| package | contents |\n|---|---|\n{rows}"
     pages = {f"api/{name}.md": _api_page(f"mirrorskin.{name}") for name in _PACKAGES}
     return {"api/index.md": index, **pages}
 
 
 def _api_page(package: str) -> str:
-    """Return the page of a package; what is called as the module it comes from must be asked for there."""
+    """Return the page of a package; members with the name of their module are requested explicitly."""
     found = importlib.import_module(package)
     named = [getattr(found, name) for name in getattr(found, "__all__", []) if _is_module(package, name)]
-    beside = [one for one in named if not isinstance(one, ModuleType)]
-    asked = "".join(f"\n::: {one.__module__}.{one.__name__}\n{_AS_MEMBER}" for one in beside)
+    members = [one for one in named if not isinstance(one, ModuleType)]
+    asked = "".join(f"\n::: {one.__module__}.{one.__name__}\n{_AS_MEMBER}" for one in members)
     return f"# {package}\n\n::: {package}\n{asked}"
 
 

@@ -76,7 +76,7 @@ def _draw_bar(part: Element) -> None:
 
 
 def _lower_prime(part: Element) -> None:
-    """Put a prime beside its letter: it hangs high as it is, and an exponent would lift it once more."""
+    """Place a prime next to its letter: the sign is high already, and an exponent would raise it again."""
     if part.tag == "msup" and part[-1].text in _PRIMES:
         part.tag = "mrow"
 

@@ -24,7 +24,7 @@ def pages() -> dict[str, str | bytes]:
     mkdocs.exceptions.PluginError
         A cell fails.
     """
-    # Commands are those of this environment.
+    # Commands are taken from this environment.
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / _NOTEBOOK.name).write_bytes(_NOTEBOOK.read_bytes())

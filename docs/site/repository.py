@@ -1,7 +1,7 @@
-"""What lies outside the folder of the documentation, and the links that lead there and back.
+"""Files outside of the documentation folder, and the links to and from them.
 
-Links in Markdown are those of the repository, so that it reads well without this site. A file that some page
-links to becomes a page as well: Markdown as it is, code with its colours.
+Links in Markdown are relative to the repository, so that it can be read without this site. A file that a page
+links to becomes a page as well: Markdown unchanged, code with syntax colouring.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ DOCS = ROOT / "docs"
 
 _LINK = re.compile(r"\[((?:[^\[\]]|\[[^\[\]]*\])*)\]\(([^)\s#]+)(#[^)\s]*)?\)")
 _LANGUAGES = {".py": "python", ".cl": "c", ".toml": "toml"}
-_README = ROOT / "README.md", "readme.md"  # which by its own name would be the first page
+_README = ROOT / "README.md", "readme.md"  # under its own name it would be the first page
 
 
 @functools.cache
 def roots() -> list[Path]:
-    """Return what the navigation names of the rest of the repository."""
+    """Return the files of the repository that the navigation contains."""
     return [ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(ROOT.glob("bench/results/*.md"))]
 
 
 def uri_of(path: Path) -> str:
-    """Return what a file of the repository is called in the site."""
+    """Return the address of a file of the repository in the site."""
     if path.is_relative_to(DOCS):
         return path.relative_to(DOCS).as_posix()
     if path == _README[0]:

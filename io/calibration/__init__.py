@@ -1,1 +1,1 @@
-"""Calibration files: what is known of a sensor."""
+"""Calibration files: the parameters of a sensor."""

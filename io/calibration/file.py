@@ -1,6 +1,6 @@
-"""Calibration files, and the copies that recordings and results carry: read, write, replace one part.
+"""Calibration files, and the copies in recordings and results: read, write, replace one part.
 
-The layout is declared by the fields of the parts, see ``types.kept``.
+The layout is declared by the fields of the parts; see ``types.kept``.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ from mirrorskin.io.types import FRAME_DTYPES, InputError, ProcessValue
 from mirrorskin.io.zarr import open_file
 
 MARK, VERSION = "mirrorskin_calibration", 1
-"""The attribute of the group that holds a calibration, and the layout that is written and read here."""
+"""Attribute of the group that contains a calibration, and the version of the layout."""
 
 ENTRY, CARRIED = "/entry", "/entry/calibration"
-"""Where a calibration file has it, and where recordings and results have a copy."""
+"""Group of the calibration in a calibration file, and of the copy in recordings and results."""
 
-_SIGNALS = {"references": "bright", "zenith": "zenith_sigma"}  # maps that a viewer shows by default
+_SIGNALS = {"references": "bright", "zenith": "zenith_sigma"}  # maps that viewers show by default
 _AGAIN = "calibrate again"
-_FEW = 16  # numbers that are written out in words
+_FEW = 16  # numbers that are printed individually
 
 
 def open_calibration(path: str | Path) -> Calibration:
-    """Read a calibration file, or the calibration that a recording or a result carries.
+    """Read a calibration file, or the copy of a calibration in a recording or a result.
 
     Raises
     ------
     InputError
-        There is no such file, it holds no calibration, one of another version, or it is damaged.
+        The file does not exist, contains no calibration or one of another version, or is damaged.
 
     Examples
     --------
@@ -60,22 +60,22 @@ def open_calibration(path: str | Path) -> Calibration:
             return _read(file, ENTRY, str(path))
         carried = carried_by(file)
     if carried is None:
-        raise InputError(f"{path} is no calibration: 'mirrorskin calibrate' makes one")
+        raise InputError(f"{path} is not a calibration: 'mirrorskin calibrate' creates one")
     return carried
 
 
 def carried_by(file: Hdf5File) -> Calibration | None:
-    """Read the calibration that a recording or a result carries, if it does."""
+    """Read the copy of a calibration in a recording or a result; None if it has none."""
     return _read(file, CARRIED, f"the calibration in {file.path}") if file.marked(MARK, CARRIED) else None
 
 
 def save_calibration(calibration: Calibration, path: str | Path) -> None:
-    """Write a calibration, completely or not at all.
+    """Write a calibration; the file appears complete or not at all.
 
     Raises
     ------
     InputError
-        It cannot be written there.
+        The file cannot be written.
 
     Examples
     --------
@@ -90,26 +90,26 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
 def update_calibration(
     path: str | Path, part: Part, camera: CameraId, process: Mapping[str, ProcessValue] | None = None
 ) -> Calibration:
-    """Add a part to a calibration file, or replace that part in it; without such a file, make one.
+    """Add a part to a calibration file, or replace it; the file is created if it does not exist.
 
     Parameters
     ----------
     path : str or Path
     part : References, Lens, WallResponse, Precession, Gel or Stiffness
     camera : CameraId
-        Which camera the part is of.
+        Camera that the part belongs to.
     process : mapping, optional
-        How the part came about: "sources", "date" and so on. The part's name is put before each.
+        Provenance of the part: "sources", "date" and so on. The part's name is added as a prefix.
 
     Returns
     -------
     Calibration
-        What the file holds now.
+        The contents of the file after the update.
 
     Raises
     ------
     InputError
-        The file is no calibration, one of another camera, or cannot be written.
+        The file is not a calibration, is one of another camera, or cannot be written.
 
     Examples
     --------
@@ -123,7 +123,7 @@ def update_calibration(
     if path.exists():
         with Hdf5File(path) as file:
             if not file.marked(MARK):
-                raise InputError(f"{path} is there and no calibration: name another file with -o")
+                raise InputError(f"{path} exists and is not a calibration: name another file with -o")
             before = _read(file, ENTRY, str(path))
         check_camera(before, camera, "this", "name another file with -o")
         before = replace(before, camera=camera) if camera.name else before
@@ -141,13 +141,13 @@ def update_calibration(
 
 
 def write_calibration(file: h5py.File, calibration: Calibration, place: str) -> None:
-    """Write a calibration as the group ``place``, which may exist already."""
+    """Write a calibration to the group ``place``, which may exist."""
     for item in calibration_items(calibration, place):
         write_item(file, item)
 
 
 def calibration_items(calibration: Calibration, place: str) -> Iterator[Item]:
-    """Yield a calibration as the group ``place``."""
+    """Yield the objects of a calibration in the group ``place``."""
     parts = [GROUPS[name] for name in calibration.parts()]
     maps = [name for name in parts if name in _SIGNALS]
     default = {"default": maps[0]} if maps else {}
@@ -161,7 +161,7 @@ def calibration_items(calibration: Calibration, place: str) -> Iterator[Item]:
 
 
 def size_of(calibration: Calibration) -> int:
-    """Return how many bytes its values have."""
+    """Return the size of the values of a calibration in bytes."""
     items = _datasets(calibration, "")
     return sum(item.values.nbytes for item in items if isinstance(item.values, np.ndarray))
 
@@ -177,7 +177,7 @@ def _datasets(calibration: Calibration, place: str) -> Iterator[Item]:
 
 
 def _part_items(part: Part, place: str, camera: CameraId) -> Iterator[Item]:
-    """Yield what a part holds; ValueError if it does not fit the camera or itself."""
+    """Yield the objects of a part; ValueError if it does not fit the camera or is inconsistent."""
     sizes = _sizes_of(camera)
     how = stored(part)
     for name, one in how.items():
@@ -212,7 +212,7 @@ def _sizes_of(camera: CameraId) -> dict[str, int]:
 
 
 def _shape_of(how: Stored, shape: tuple[int, ...], sizes: dict[str, int]) -> tuple[int, ...]:
-    """Return the shape that an array must have; sizes that are met first here are taken from its shape."""
+    """Return the required shape of an array; sizes that occur for the first time are taken from its shape."""
     there = (*shape, *[0] * len(how.shape))
     return tuple(
         size if isinstance(size, int) else sizes.setdefault(size, there[axis])
@@ -224,7 +224,7 @@ def _shape_of(how: Stored, shape: tuple[int, ...], sizes: dict[str, int]) -> tup
 
 
 def _read(file: Hdf5File, place: str, name: str) -> Calibration:
-    """Read the calibration in a group; ``name`` is what messages call it."""
+    """Read the calibration in a group; ``name`` is its name in messages."""
     version = file.attribute(place, MARK)
     if version != VERSION:
         newer = isinstance(version, int) and version > VERSION
@@ -245,14 +245,14 @@ def _read_camera(file: Hdf5File, place: str) -> CameraId:
     rows, columns = file.read(shape, (2,), remedy=_AGAIN).tolist()
     kind = str(file.value(dtype))
     if not (isinstance(rows, int) and isinstance(columns, int) and rows > 0 and columns > 0):
-        raise InputError(f"{file.where(shape)} is ({rows}, {columns}), which no picture has: {_AGAIN}")
+        raise InputError(f"{file.where(shape)} is ({rows}, {columns}), which is not a picture size: {_AGAIN}")
     if kind not in [one.name for one in FRAME_DTYPES]:
-        raise InputError(f"{file.where(dtype)} is {kind!r}, which no camera here gives: {_AGAIN}")
+        raise InputError(f"{file.where(dtype)} is {kind!r}, which is not a supported data type: {_AGAIN}")
     return CameraId(str(file.value(name)), (rows, columns), np.dtype(kind))
 
 
 def _read_part(file: Hdf5File, group: Node, kind: type[Part], camera: CameraId) -> Part:
-    """Read one part; what has a default may be missing."""
+    """Read one part; fields with a default may be missing."""
     sizes, how, values = _sizes_of(camera), stored(kind), dict[str, Any]()
     for one in fields(kind):
         node = file.walk(group, one.name)
@@ -290,7 +290,7 @@ def _read_field(file: Hdf5File, node: Node, how: Stored, sizes: dict[str, int]) 
             number = int if how.kind.startswith("integer") else float
             value = tuple(map(number, value)) if how.kind.endswith("s") else number(value)
     if how.valid is not None and not how.valid(value):
-        raise InputError(f"{file.where(node)} is {value}, which cannot be: {_AGAIN}")
+        raise InputError(f"{file.where(node)} is {value}, which is invalid: {_AGAIN}")
     return value
 
 
@@ -298,7 +298,7 @@ def _read_field(file: Hdf5File, node: Node, how: Stored, sizes: dict[str, int]) 
 
 
 def words_of(part: Part) -> dict[str, str]:
-    """Return what each field of a part says: numbers with units, angles in degrees, maps by their median."""
+    """Return each field of a part as text: numbers with units, angles in degrees, maps by their median."""
     how = stored(part)
     words = {name: _words(getattr(part, name), one, how) for name, one in how.items()}
     return {name: said for name, said in words.items() if said is not None}
@@ -318,7 +318,7 @@ def _words(value: Any, how: Stored, others: dict[str, Stored]) -> str | None:
     if how.kind == "map":
         known = value[np.isfinite(value)]
         lacking = f"; {value.size - known.size} pixels unknown" if known.size < value.size else ""
-        median = _number_words(np.median(known), how.unit) if known.size else "no pixel known"
+        median = _number_words(np.median(known), how.unit) if known.size else "no valid pixel"
         return f"{median} (median{lacking})"
     if np.size(value) > _FEW:
         return f"{' x '.join(map(str, np.shape(value)))} numbers"

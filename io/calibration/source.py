@@ -1,4 +1,4 @@
-"""A source as it is with a calibration: whether that is of this camera and scale, and what is left of it."""
+"""A source with a calibration applied: checks of camera and scale, and the calibration of a region."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from mirrorskin.io.types import Block, Floats, Header, InputError, LiveSource, S
 Size = tuple[float, float]
 
 SIZED = ("zenith", "precession", "gel", "stiffness")
-"""The parts whose lengths come from the size of a pixel."""
+"""The parts whose lengths depend on the pixel size."""
 
 _MEASURED: Mapping[str, tuple[str, ...]] = {
     "axial": ("zenith", "precession"),
     "vertical": ("gel", "stiffness"),
 }
-_SAME_SIZE = 1e-3  # share by which pixel sizes may differ: less than a calibration's lengths are known to
-_SAME_TILT = 1.25  # factor by which a rotation's half-angle may differ from the calibrated one
+_SAME_SIZE = 1e-3  # relative difference allowed between pixel sizes: below the accuracy of calibrated lengths
+_SAME_TILT = 1.25  # allowed ratio of a rotation's half-angle and the calibrated one
 
 
 def size_facts(pixel_size: Size) -> dict[str, float]:
-    """Return what a part's process keeps of the pixel size that it was made with, mm along x and y."""
+    """Return the values in the process of a part that record its pixel size, mm along x and y."""
     return {f"pixel_size_{axis}": float(size) for axis, size in zip("xy", pixel_size, strict=True)}
 
 
 def differ(one: Size, other: Size) -> bool:
-    """Return whether two pixel sizes differ so much that lengths of both cannot be used together."""
+    """Return whether two pixel sizes differ too much for lengths based on both."""
     return not all(abs(left - right) <= _SAME_SIZE * right for left, right in zip(one, other, strict=True))
 
 
 def outdated(
     calibration: Calibration, pixel_size: Size, parts: Iterable[str] = SIZED
 ) -> Iterator[tuple[str, Size]]:
-    """Yield those of the parts that were made with another pixel size, as far as that is known, and it."""
+    """Yield the parts that were made with another pixel size, as far as it is recorded, and that size."""
     there = calibration.parts()
     for part in parts:
         facts = [calibration.process.get(f"{GROUPS[part]}.{fact}") for fact in size_facts(pixel_size)]
@@ -53,7 +53,7 @@ def outdated(
 def check_sizes(
     calibration: Calibration, pixel_size: Size | None, what: str, parts: Iterable[str] = SIZED
 ) -> None:
-    """Refuse parts that were made with another pixel size than the one that is known now, if it is."""
+    """Refuse parts that were made with another pixel size than the current one, if that is known."""
     for part, before in outdated(calibration, pixel_size, parts) if pixel_size else ():
         says = f"{what} says" if calibration.lens is None else "the scale now says"
         sizes = (
@@ -72,9 +72,9 @@ def check_camera(
     what: str,
     remedy: str = "calibrate again, or give that camera's",
 ) -> None:
-    """Refuse a calibration of another camera: by name (empty: any), size of the picture or type of sample.
+    """Refuse a calibration of another camera: other name (empty: any), picture size or data type.
 
-    ``what`` the camera is of, and the ``remedy``, go into the message.
+    The message contains ``what`` the camera belongs to, and the ``remedy``.
     """
     mine, differences = calibration.camera, []
     if mine.name and camera.name and mine.name != camera.name:
@@ -90,7 +90,7 @@ def check_camera(
 
 
 def cropped(calibration: Calibration, region: Region, pixel_size: Size | None) -> Calibration:
-    """Return a calibration for a part of its camera's picture: maps cut, places relative to its centre."""
+    """Return the calibration for a part of the picture: maps cropped, positions relative to its centre."""
     picture = calibration.camera.shape
     if region == Region.whole(picture):
         return calibration
@@ -109,14 +109,14 @@ def cropped(calibration: Calibration, region: Region, pixel_size: Size | None) -
 
 
 class Calibrated:
-    """A source with the header and the phases of a calibration; frames are passed on untouched.
+    """A source with the header and the phases of a calibration; frames are passed on unchanged.
 
-    What else the source has (``travel``, ``region``, ``fingerprint`` ...) this has as well. A live source is
-    not asked for its header before someone asks this, because that moves the stage.
+    Other attributes of the source (``travel``, ``region``, ``fingerprint`` ...) are forwarded. The header of
+    a live source is only read when it is needed, because reading it moves the stage.
 
-    The ``source`` is live, or a recording, also of a part of the picture; the ``calibration``, kept as
-    ``whole``, is of the camera's whole picture. InputError where that is another camera or half-angle, or a
-    part of it was made with another pixel size.
+    The ``source`` is live, or a recording, possibly of a part of the picture. The ``calibration``, stored as
+    ``whole``, is that of the camera's whole picture. InputError if the camera or the half-angle differs, or
+    if a part was made with another pixel size.
     """
 
     source: Source
@@ -134,7 +134,7 @@ class Calibrated:
             _ = self.header
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") or "source" not in self.__dict__:  # one that is being copied
+        if name.startswith("__") or "source" not in self.__dict__:  # while being copied
             raise AttributeError(name)
         return getattr(self.source, name)
 
@@ -150,12 +150,12 @@ class Calibrated:
 
     @property
     def region(self) -> Region:
-        """Which part of the camera's picture it gives."""
+        """The region of the camera's picture."""
         return getattr(self.source, "region", None) or Region.whole(self.source.shape[1:])
 
     @functools.cached_property
     def calibration(self) -> Calibration:
-        """The calibration of the part of the picture that is given: maps cut, places from its centre."""
+        """The calibration of this region: maps cropped, positions relative to its centre."""
         if self.region == Region.whole(self.whole.camera.shape):
             return self.whole
         lens = self.whole.lens
@@ -164,7 +164,7 @@ class Calibrated:
 
     @functools.cached_property
     def header(self) -> Header:
-        """The source's, with references, the lens's pixel size, tilt and pivot of the calibration."""
+        """The header of the source, with references, pixel size, tilt and pivot of the calibration."""
         own = self.source.header
         self._check(own.camera)
         calibration = self.calibration
@@ -181,7 +181,7 @@ class Calibrated:
 
     @property
     def phase(self) -> Floats | None:
-        """The phases of all frames, radians, if they are known beforehand."""
+        """The phases of all frames, radians, if they are known in advance."""
         return self._turned(getattr(self.source, "phase", None))
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
@@ -189,7 +189,7 @@ class Calibrated:
         return self._corrected(self.source.read(out))
 
     def lend(self, most: int) -> Block | None:
-        """Return a recording's next frames where they lie, or None; see ``Recording.lend``."""
+        """Return the next frames of a recording without a copy, or None; see ``Recording.lend``."""
         lend: Callable[[int], Block | None] | None = getattr(self.source, "lend", None)
         return None if lend is None else self._corrected(lend(most))
 
@@ -202,7 +202,7 @@ class Calibrated:
         return cast(LiveSource, self.source).now()
 
     def positions(self) -> Mapping[str, Floats]:
-        """Return the positions of a live source, its phases corrected."""
+        """Return the positions of a live source, with corrected phases."""
         positions = dict(cast(LiveSource, self.source).positions())
         if "phase" in positions:
             positions["phase"] = cast(Floats, self._turned(positions["phase"]))
@@ -233,7 +233,7 @@ class Calibrated:
         check_sizes(self.whole, size, self.name, _MEASURED[self.motion])
 
     def _movement(self, own: Header, precession: Precession) -> dict[str, Any]:
-        """Return tilt and pivot of the precession; what it does not know is the source's own."""
+        """Return tilt and pivot of the precession; undetermined values are those of the source."""
         tilt = precession.tilt
         unknown = own.pivot or (np.nan,) * 3
         places = zip(precession.pivot, unknown, strict=True)
@@ -241,7 +241,7 @@ class Calibrated:
         if own.tilt and not 1 / _SAME_TILT < tilt / own.tilt < _SAME_TILT:
             learned, said = np.degrees([tilt, own.tilt])
             raise InputError(
-                f"{self.whole.name or 'the calibration'} is of a tilt of {learned:.2f} deg, {self.name} of "
-                f"{said:.2f} deg: calibrate the tilt again with this one"
+                f"{self.whole.name or 'the calibration'} is for a tilt of {learned:.2f} deg, but that of "
+                f"{self.name} is {said:.2f} deg: calibrate the tilt again"
             )
         return {"tilt": tilt, "pivot": pivot if np.isfinite(pivot).all() else None}

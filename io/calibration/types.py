@@ -1,8 +1,8 @@
-"""What a calibration holds: the camera it is of, and its parts, each field with how a file keeps it.
+"""The contents of a calibration: the camera, and the parts, with the storage of each field.
 
-Coordinates are those of a result: x to the right and y up, mm from the picture's centre; z up to the camera
+Coordinates are as in a result: x to the right and y up, mm from the picture's centre; z towards the camera
 from the sheet's rest plane, in the frame of the body. To add a field, declare it with `kept`, and give it a
-default if older files are to be read still: a field with a default may be missing from a file.
+default if older files are still to be read: a field with a default may be missing from a file.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ Kind = Literal["map", "array", "number", "integer", "numbers", "integers", "text
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """How one field is kept in a file.
+    """How one field is stored in a file.
 
-    A "map" has one value a pixel of the camera, and is cut with the picture. "numbers", "integers" and
-    "names" are tuples. A "mapping" is of numbers by names, in a group of its own; each has the unit that
-    `unit_of` gives. Letters in ``shape`` are sizes that the fields of one part share. The first two numbers
+    A "map" has one value per pixel of the camera, and is cropped with the picture. "numbers", "integers" and
+    "names" are tuples. A "mapping" contains numbers by name, in a group of its own; `unit_of` returns its
+    unit. Letters in ``shape`` are sizes shared by the fields of one part. The first two numbers
     of a ``place`` are relative to the picture's centre.
     """
 
@@ -53,19 +53,19 @@ def kept(
 
 
 def stored(part: Any) -> dict[str, Stored]:
-    """Return how the fields of a part, or of its class, are kept, by their names."""
+    """Return how the fields of a part, or of its class, are stored, by name."""
     return {one.name: one.metadata["stored"] for one in fields(part)}
 
 
 def unit_of(name: str, how: Mapping[str, Stored]) -> str | None:
-    """Return the unit of a field by its name, or by that with ``_x``, ``_y`` or ``_z``."""
+    """Return the unit of a field by its name, with or without the suffix ``_x``, ``_y`` or ``_z``."""
     one = how.get(name) or how.get(name.rpartition("_")[0])
     return None if one is None else one.unit
 
 
 HOT, DEAD, SATURATED = 1, 2, 4
 BITS = {"hot": HOT, "dead": DEAD, "saturated": SATURATED}
-"""The bits of ``References.defects``, and what they are called."""
+"""The bits of ``References.defects``, and their names."""
 
 PATTERNS = ("graded", "uniform")
 
@@ -76,12 +76,12 @@ def _above_zero(values: float | tuple[float, ...]) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraId:
-    """Which camera a calibration is of.
+    """The camera that a calibration belongs to.
 
     Attributes
     ----------
     name : str
-        As the rig file calls it; empty where unknown.
+        Name in the rig file; empty if unknown.
     shape : (int, int)
         Rows and columns of its full picture.
     dtype : dtype
@@ -100,7 +100,7 @@ class CameraId:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class References:
-    """What each pixel counts without and with full light.
+    """Dark and bright level of each pixel.
 
     Attributes
     ----------
@@ -109,7 +109,7 @@ class References:
     dark_sigma, bright_sigma : ndarray, (H, W), float32
         Counts: the standard errors of the two means.
     defects : ndarray, (H, W), uint8
-        0 of a sound pixel, else a sum of 1 hot, 2 dead, 4 saturated.
+        0 for a sound pixel, otherwise a sum of 1 hot, 2 dead, 4 saturated.
     """
 
     dark: NDArray[np.float32] = field(metadata=kept("map", "counts", dtype=np.float32))
@@ -121,28 +121,28 @@ class References:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lens:
-    """Where on the sheet the pixels look.
+    """Mapping from pixels to positions on the sheet.
 
     The undistorted map has as many pixels as the picture, all of one size; its centre and that of the picture
-    see the same point of the sheet. See ``mirrorskin.engine.undistort``.
+    are the same point of the sheet. See ``mirrorskin.engine.undistort``.
 
     Attributes
     ----------
     pixel_size : (float, float)
-        Millimetres along x and y of a pixel of the undistorted map.
+        Size in mm along x and y of a pixel of the undistorted map.
     camera : ndarray, (3, 3), float64
         Homography from a pixel (column, row, 1) of a picture without distortion to millimetres on the sheet,
-        (x, y, 1); (0, 0) is in the middle of the undistorted map. It holds the perspective.
+        (x, y, 1); (0, 0) is the centre of the undistorted map. It includes the perspective.
     distortion : ndarray, (5,), float64
         Coefficients k1, k2, p1, p2, k3 of OpenCV.
     matrix : ndarray, (3, 3), float64
-        The pinhole camera that goes with them, in pixels of the picture.
+        The corresponding pinhole camera matrix, in pixels of the picture.
     shape : (int, int)
         Rows and columns of the undistorted map, and of the full picture.
     error : float
-        RMS distance of the marks that were found from where the fit has them, pixels.
+        RMS distance between the detected and the fitted marks, pixels.
     scale_sigma : float
-        Standard error of the pixel size, as a share of it.
+        Relative standard error of the pixel size.
     """
 
     pixel_size: tuple[float, float] = field(metadata=kept("numbers", "mm", shape=(2,), valid=_above_zero))
@@ -156,42 +156,42 @@ class Lens:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WallResponse:
-    """How bright a mirror under a cylindrical wall looks, by its normal and its place.
+    """Brightness of a mirror under a cylindrical wall, as a function of its normal and position.
 
-    A pixel looks at (x, y) on the rest plane; X = x - x0, Y = y - y0. Its light is
+    A pixel sees (x, y) on the rest plane; X = x - x0, Y = y - y0. Its relative brightness is
     (E - dark) / ((bright - dark) V) with
-    V = 1 + s0 X/R + s1 Y/R + s2 (X/R)^2 + s3 XY/R^2 + s4 (Y/R)^2. ``kernels/response.py`` gives the light
-    of a normal.
+    V = 1 + s0 X/R + s1 Y/R + s2 (X/R)^2 + s3 XY/R^2 + s4 (Y/R)^2. ``kernels/response.py`` computes the
+    brightness for a normal.
 
     Attributes
     ----------
     radius, rim : float
         Radius R and height H of the wall, mm.
     axis : (float, float)
-        Place (x0, y0) of its axis, mm.
+        Position (x0, y0) of its axis, mm.
     sight : (float, float)
-        k0, 1/mm, and k2, 1/mm^3: the line of sight rises along
+        k0, 1/mm, and k2, 1/mm^3: the line of sight is along
         (-(k0 + k2 r^2) X, -(k0 + k2 r^2) Y, 1), r^2 = X^2 + Y^2.
     lamps : (float, float)
-        By which share the wall is brighter towards x and y.
+        Relative increase of the wall's brightness towards x and y.
     scatter : float
-        Half-angle by which the sheet scatters, radians.
+        Half-angle of the sheet's scatter, radians.
     curve : ndarray, (n,), float64
-        Coefficients of the light as a polynomial in q, the lowest first.
+        Coefficients of the brightness as a polynomial in q, lowest first.
     reach : (float, float)
-        The q from and up to which that holds.
+        Range of q in which the polynomial is valid.
     shade : ndarray, (5,), float64
         s0 to s4, the shading of the picture.
     pattern : {"graded", "uniform"}
-        Whether the wall gives angles, or only a threshold.
+        Whether the wall determines angles, or only a threshold.
     zenith_sigma, azimuth_sigma : ndarray, (H, W), float32
-        Radians: standard deviations of what the response says of zenith, and of azimuth times sin(zenith).
+        Radians: standard deviations of the response in zenith, and in azimuth times sin(zenith).
     parameters : tuple of str
-        What was fitted.
+        Names of the fitted parameters.
     covariance : ndarray, (P, P), float64
-        Of the parameters, in their units.
+        Covariance of the parameters, in their units.
     error : float
-        Upper end, by one standard error, of what is left of the zenith on the balls, radians RMS.
+        Residual of the zenith on the balls plus one standard error, radians RMS.
     """
 
     radius: float = field(metadata=kept("number", "mm", valid=_above_zero))
@@ -211,14 +211,14 @@ class WallResponse:
     error: float = field(metadata=kept("number", "rad"))
 
     def sight_slopes(self, from_axis: Floats) -> Floats:
-        """Return by how much lines of sight at (X, Y), (2, ...), mm, move along x and y for each mm of z."""
+        """Return the displacement of lines of sight at (X, Y), (2, ...), mm, along x and y per mm of z."""
         near, far = self.sight
         return np.asarray(-(near + far * (from_axis**2).sum(axis=0)) * from_axis, np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Precession:
-    """How the body's axis goes round with the phase.
+    """Lean of the body's axis as a function of the phase.
 
     Attributes
     ----------
@@ -227,17 +227,17 @@ class Precession:
     phase_offset : float
         Azimuth of the lean at phase zero, radians.
     direction : {1, -1}
-        Whether it goes round as the phase does, counter-clockwise, or the other way.
+        Sense of rotation: 1 if it is that of the phase, counter-clockwise; otherwise -1.
     ellipticity : float
-        (a - b) / (a + b) of the greatest and the least half-angle.
+        (a - b) / (a + b) of the largest and the smallest half-angle.
     major_axis : float
-        Azimuth of the greatest, radians.
+        Azimuth of the largest half-angle, radians.
     centre : (float, float)
         The mean lean, radians along x and y.
     pivot : (float, float, float)
-        What the body turns about, mm.
+        Centre of the rotation, mm.
     sigma : mapping of str to float
-        Standard errors, by the names of the fields; ``centre_x``, ``pivot_z`` and so on of several numbers.
+        Standard errors, by the names of the fields; for vectors ``centre_x``, ``pivot_z`` and so on.
     """
 
     tilt: float = field(metadata=kept("number", "rad", valid=lambda value: value > 0))
@@ -250,12 +250,12 @@ class Precession:
     sigma: Mapping[str, float] = field(default_factory=dict, metadata=kept("mapping"))
 
     def lean(self, phase: Floats) -> Floats:
-        """Return how the body leans.
+        """Return the lean of the body.
 
         Parameters
         ----------
         phase : ndarray, (n,), float64
-            Radians, as the recording has them.
+            Radians, as in the recording.
 
         Returns
         -------
@@ -276,12 +276,12 @@ class Precession:
         return np.asarray(np.stack(lean, axis=-1), np.float64)
 
     def phase(self, phase: Floats) -> Floats:
-        """Return the azimuth at which the body leans from its mean, radians; it runs on where the phase does.
+        """Return the azimuth of the lean relative to its mean, radians; continuous where the phase is.
 
         Parameters
         ----------
         phase : ndarray, (n,), float64
-            Radians, as the recording has them.
+            Radians, as in the recording.
         """
         even = self._angle(phase)
         along, across = self._ellipse(phase)
@@ -289,11 +289,11 @@ class Precession:
         return np.asarray(even + np.remainder(ahead + math.pi, math.tau) - math.pi, np.float64)
 
     def _angle(self, phase: Floats) -> Floats:
-        """Return the azimuth on the circle of which the ellipse is made."""
+        """Return the azimuth on the circle whose affine image is the ellipse."""
         return self.direction * np.asarray(phase, np.float64) + self.phase_offset
 
     def _ellipse(self, phase: Floats) -> tuple[Floats, Floats]:
-        """Return the lean from the mean, along the major axis and across it."""
+        """Return the lean relative to its mean, along the major axis and across it."""
         angle = self._angle(phase) - self.major_axis
         along = self.tilt * (1 + self.ellipticity) * np.cos(angle)
         return along, self.tilt * (1 - self.ellipticity) * np.sin(angle)
@@ -301,26 +301,26 @@ class Precession:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gel:
-    """The elastomer's compliance, and the slope of the sheet that turns a pixel light.
+    """The elastomer's compliance, and the slope of the sheet at which a pixel turns bright.
 
-    A pixel is taken for light where the sheet's zenith passes the one that shows the rim of a round lit wall
+    A pixel turns bright where the sheet's zenith passes the one that shows the rim of a round lit wall
     (see `threshold_at` of `mirrorskin.engine.press.elastic`).
 
     Attributes
     ----------
     threshold : float
-        Zenith, radians, at which a pixel on the wall's axis turns light.
+        Zenith, radians, at which a pixel on the wall's axis turns bright.
     curvature : float
-        1 / radius of the wall, 1/mm: how much sooner pixels nearer to it turn light; 0 for the same zenith
+        1 / radius of the wall, 1/mm: decrease of the threshold towards the wall; 0 for the same zenith
         everywhere.
     axis : (float, float)
-        Where the wall's axis meets the picture, mm.
+        Position of the wall's axis in the picture, mm.
     compliance : float
-        Of the stage, mm for each N / (N/mm^2): its flexure times the gel's modulus, 1/mm.
+        Deflection of the stage in mm per N / (N/mm^2): its flexure times the gel's modulus, 1/mm.
     travel_zero : float
-        Travel at which the sheet met the ball that it was learned from, mm: a check of the stage, not used.
+        Travel at which the sheet met the calibration ball, mm: a check of the stage, not used.
     error : float
-        RMS height left on what it was learned from, mm.
+        RMS residual of the height on the calibration balls, mm.
     sigma : mapping of str to float
         Standard errors, by the names of the fields.
     """
@@ -345,17 +345,17 @@ class Stiffness:
     modulus : float
         Young's modulus, MPa.
     gel_shift : (float, float, float)
-        By how many standard errors the gel's threshold, compliance and curvature are off, as forces show.
+        Errors of the gel's threshold, compliance and curvature estimated from forces, in standard errors.
     covariance : ndarray, (4, 4), float64
-        Of the modulus and of its products with the shifts, MPa^2.
+        Covariance of the modulus and of its products with the shifts, MPa^2.
     scatter : float
-        Standard deviation of a press's force that neither noise nor these numbers explain, as a share of it.
+        Relative standard deviation of a press's force that neither noise nor these parameters explain.
     gel_threshold : float
-        That of the gel with which it was learned, radians: a gel learned again needs a modulus learned again.
+        Threshold of the gel used, radians: a gel that is calibrated again needs a new modulus.
     error : float
-        RMS error of each force by what the other presses show, as a share of it; NaN of fewer than 2.
+        Relative RMS error of each force predicted from the other presses; NaN for fewer than 2.
     presses : int
-        How many it was learned from.
+        Number of presses used.
     """
 
     modulus: float = field(metadata=kept("number", "MPa", valid=_above_zero))
@@ -377,7 +377,7 @@ Part = References | Lens | WallResponse | Precession | Gel | Stiffness
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """What is known of a sensor; a part that was not found out is None.
+    """The calibration of a sensor; a part that was not calibrated is None.
 
     Attributes
     ----------
@@ -389,7 +389,7 @@ class Calibration:
     gel : Gel or None
     stiffness : Stiffness or None
     process : mapping
-        How each part came about: "references.program", "zenith.sources" and so on, by the names of the
+        Provenance of each part: "references.program", "zenith.sources" and so on, by the names of the
         commands: references, scale, zenith, tilt, elastic, force.
     name : str
         The file that it was read from, for messages.
@@ -406,13 +406,13 @@ class Calibration:
     name: str = ""
 
     def parts(self) -> dict[str, Part]:
-        """Return the parts that there are, by the names of the attributes."""
+        """Return the existing parts, by the names of the attributes."""
         found = {name: getattr(self, name) for name in GROUPS}
         return {name: part for name, part in found.items() if part is not None}
 
     @property
     def contents(self) -> str:
-        """The parts that there are, in a line, by the names of the commands that find them out."""
+        """The existing parts in one line, by the names of the commands that calibrate them."""
         return ", ".join(GROUPS[name] for name in self.parts()) or "nothing"
 
 
@@ -424,7 +424,7 @@ GROUPS = {
     "gel": "elastic",
     "stiffness": "force",
 }
-"""The attributes of a calibration, and what their groups in a file and the commands are called."""
+"""The attributes of a calibration, with the names of their groups in a file and of the commands."""
 
 KINDS: dict[str, type[Part]] = dict(
     zip(GROUPS, (References, Lens, WallResponse, Precession, Gel, Stiffness), strict=True)

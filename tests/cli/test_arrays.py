@@ -99,7 +99,7 @@ def test_the_travel_of_a_real_stage_places_heights():
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["ball.npy"], "ball.npy does not say where the body was in each frame: give one of travel"),
+        (["ball.npy"], "ball.npy does not state the position of the body in each frame: give one of travel"),
         (["ball.npy", "--motion", "axial"], "ball.npy: axial motion needs the phase of each frame"),
         (["ball.npy", *STEPS, "--live"], "leave --live out"),
         (
@@ -168,7 +168,7 @@ def test_frames_with_phases_are_a_rotation():
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({}, "does not say where the body was"),
+        ({}, "does not state the position of the body"),
         ({"travel": TRAVEL, "phase": TRAVEL}, "has travel and phase: give one of"),
         ({"travel": TRAVEL[:3]}, "travel given has shape \\(3,\\) for 12 frames"),
         ({"travel": TRAVEL, "pixel_size": -1.0}, "pixel size -1.0"),

@@ -114,7 +114,7 @@ def test_a_motion_that_contradicts_a_file_fails_it():
     presses("a.h5")
     Path("batch.toml").write_text('[stack]\nmotion = "axial"\n')
     said = run("batch", "a.h5", "-o", "out", "--settings", "batch.toml").out
-    assert "a.h5 says its motion is vertical, motion in [stack] of --settings says axial" in said
+    assert "a.h5 states the motion vertical, but motion in [stack] of --settings is axial" in said
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "ascii"])

@@ -117,7 +117,7 @@ CASES = {
     "no phases": (
         theirs,
         [],
-        "theirs.h5 does not say where the body was in each frame: give --phase-step or --ph",
+        "theirs.h5 does not state the position of the body in each frame: give --phase-step or --ph",
     ),
     "both": (theirs, ["--phase-step", "45deg", "--phases", "phases.txt"], "leave one out"),
     "seven phases": (theirs, ["--phases", "seven.txt"], "seven.txt lists 7 phases for 8 frames"),

@@ -130,7 +130,7 @@ def test_a_filled_height_is_told_apart_in_a_cross_section():
     [
         (
             ["-o", "first.npz", "-o", "a.obj"],
-            "a.obj: .obj is no format: name a file that ends with one of .ply .stl .xyz .png",
+            "a.obj: .obj is not a supported format: name a file that ends with one of .ply .stl .xyz .png",
         ),
         (["-o", "ball-result.h5"], "ball-result.h5 is the input, or part of it: name another output with -o"),
         (["-o", "first.npz", "-o", "no/a.ply"], "no/a.ply: there is no folder no: make it first"),

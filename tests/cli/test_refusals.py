@@ -118,7 +118,7 @@ CASES = {
     "a motion that contradicts the file": (
         ours,
         ["--motion", "twist"],
-        "bad.h5 says its motion is vertical, --motion says twist: leave --motion out, or correct the file",
+        "bad.h5 states the motion vertical, but --motion is twist: leave --motion out, or correct the file",
     ),
     "dark of another shape": (lambda path: ours(path, dark=np.zeros((5, 6))), [], "dark"),
     "bright not above dark": (lambda path: ours(path, bright=np.full((5, 7), 10.0)), [], "not above dark"),

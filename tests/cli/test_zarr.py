@@ -76,7 +76,7 @@ def test_nothing_is_exported_beside_a_store_that_is_there(bucket):
         assert run(*words).code == 0
     ended = run("export", "press-result.h5", "-o", "a.ply", "-o", "taken.zarr")
     assert (ended.code, Path("a.ply").exists()) == (2, False)
-    assert "taken.zarr is there already" in ended.said
+    assert "taken.zarr exists: remove it" in ended.said
 
 
 def test_a_batch_mixes_files_and_addresses(bucket):
@@ -107,15 +107,15 @@ def test_import_makes_hdf5_of_an_address(bucket):
             ("info", "unheard://of"),
             "unheard://of cannot be opened: addresses of stores begin with one of http, https",
         ),
-        (("export", "press.h5", "-o", ADDRESS), f"{ADDRESS} is there already: remove it, or name another"),
+        (("export", "press.h5", "-o", ADDRESS), f"{ADDRESS} exists: remove it, or name another"),
         (
             ("reconstruct", "press.h5", "-o", ADDRESS),
-            f"{ADDRESS} is there already: remove it, or name another",
+            f"{ADDRESS} exists: remove it, or name another",
         ),
         (("reconstruct", "press.h5", "-o", "no/x.zarr"), "no/x.zarr: there is no folder no: make it first"),
         (("export", "press.h5", "-o", "x.zarr.zip"), "x.zarr.zip: Zarr is written as NAME.zarr: name it so"),
         (("simulate", "vertical", "-o", "new.zarr"), "new.zarr: this is written as HDF5: name a local file"),
-        (("batch", "memory://bucket/x*", "-o", "r"), "memory://bucket/x*: nothing answers to that"),
+        (("batch", "memory://bucket/x*", "-o", "r"), "memory://bucket/x*: no store matches"),
     ],
 )
 def test_what_cannot_be_is_one_line_with_its_address(bucket, words, said):

@@ -213,7 +213,9 @@ def test_nothing_outside_the_folder_is_read(tmp_path, way, kind):
     if way == "by another":
         with h5py.File(home / "theirs.h5", "w") as file:
             file["x"] = h5py.ExternalLink("sub/theirs.h5", "/x")
-    refused(home / "theirs.h5", r"leads out of its folder, to .*: copy that file beside it", dataset="x")
+    refused(
+        home / "theirs.h5", r"leads out of its folder, to .*: copy that file into its folder", dataset="x"
+    )
 
 
 def test_links_that_lead_nowhere_are_refused(path, tmp_path):
@@ -247,7 +249,7 @@ def test_links_that_go_round_are_refused(path, tmp_path):
         file["there"] = h5py.ExternalLink("other.h5", "/back")
         file["again"] = h5py.ExternalLink("theirs.h5", "/again")
     for name in ("self", "a", "b/x", "there", "again"):
-        refused(path, "links go round in a circle", dataset=name)
+        refused(path, "links form a cycle", dataset=name)
 
 
 def test_a_name_that_is_no_stack_is_refused(path):
@@ -256,9 +258,9 @@ def test_a_name_that_is_no_stack_is_refused(path):
         file["four"], file["type"] = STACK[None], np.dtype("u1")
     refused(path, r"there is no nothing: name the stack with --dataset", dataset="nothing")
     refused(path, r"there is no flat/x: name", dataset="flat/x")
-    refused(path, r"/group is no dataset: name one with --dataset", dataset="group")
-    refused(path, r"/ is no dataset: name one", dataset="/")
-    refused(path, r"/type is no dataset: name one", dataset="type")
+    refused(path, r"/group is not a dataset: name one with --dataset", dataset="group")
+    refused(path, r"/ is not a dataset: name one", dataset="/")
+    refused(path, r"/type is not a dataset: name one", dataset="type")
     refused(path, r"/flat has shape \(5, 7\): a stack of frames, \(T, H, W\), is needed", dataset="flat")
     refused(path, r"/four has shape \(1, 8, 5, 7\)", dataset="four")
     refused(path, r"/empty has shape None", dataset="empty")
@@ -354,7 +356,7 @@ def test_what_is_no_file_of_frames_is_refused(tmp_path):
     refused(tmp_path / "loop.h5", r"loop\.h5: no such file")
     refused(tmp_path / ("x" * 300), "File name too long")
     refused(tmp_path, "is a folder: an HDF5 file is needed; 'mirrorskin import' reads picture folders")
-    refused("/dev/null", "is no regular file")
+    refused("/dev/null", "is not a regular file")
     refused(
         tmp_path / "text.h5", "is not an HDF5 file; 'mirrorskin import' turns other files into recordings"
     )
@@ -403,14 +405,14 @@ def test_links_that_branch_without_end_are_refused(path, monkeypatch):
         file["x"], file["link0"] = STACK, h5py.SoftLink("/")
         for depth in range(1, 16):
             file[f"link{depth}"] = h5py.SoftLink("/" + "/".join([f"link{depth - 1}"] * 4))
-    refused(path, "its links lead on and on", dataset="link15/x")
+    refused(path, "it is reached through too many links", dataset="link15/x")
 
 
 def test_a_unit_of_many_letters_is_refused_in_a_line(path):
     with h5py.File(path, "w") as file:
         file["x"] = np.ones(3)
         file["x"].attrs["units"] = "m" * 50_000
-    with Hdf5File(path) as file, pytest.raises(io.InputError, match="cannot be turned into mm") as caught:
+    with Hdf5File(path) as file, pytest.raises(io.InputError, match="cannot be converted to mm") as caught:
         file.read(file.find("/x"), (3,), unit="mm")
     assert len(str(caught.value)) < 450
 

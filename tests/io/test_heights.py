@@ -36,9 +36,9 @@ def stack(path):
         (lambda path: record(sphere(), path), "holds no heights: give a result of a press, or a simulation"),
         (
             lambda path: io.save_result(io.Result(height=heights(), process={UNDISTORTED: True}), path),
-            "holds undistorted heights, and frames are as the camera saw them",
+            "contains undistorted heights, but frames are not undistorted",
         ),
-        (stack, "is no result: 'mirrorskin reconstruct' makes one from a recording"),
+        (stack, "is not a result: 'mirrorskin reconstruct' computes one from a recording"),
         (nothing, "no such file"),
         (lambda path: path.write_text("-0.1 -0.2"), "is not an HDF5 file"),
     ],

@@ -186,7 +186,7 @@ def test_frames_that_came_before_a_fault_are_kept(tmp_path):
 
 
 def test_a_calibration_has_no_place_in_it(tmp_path):
-    with pytest.raises(io.InputError, match="no place for a calibration"):
+    with pytest.raises(io.InputError, match="an MCAP file cannot contain a calibration"):
         io.StreamRecorder(
             Feed(),
             tmp_path / "a.mcap",

@@ -78,10 +78,16 @@ def test_the_stage_has_the_layout_of_the_design(tmp_path, motion, shape, unit):
 
 BAD: list[tuple[str, str, Any, str | None, str]] = [
     ("horizontal", "displacement", DISPLACEMENT.T, None, r"has shape \(2, 8\) where \(8, 2\) is needed"),
-    ("horizontal", "displacement", DISPLACEMENT, "deg", "displacement is in 'deg', which cannot be turned"),
+    (
+        "horizontal",
+        "displacement",
+        DISPLACEMENT,
+        "deg",
+        "displacement is in 'deg', which cannot be converted",
+    ),
     ("horizontal", "travel", np.inf, None, "travel is inf, which is not finite: correct it"),
     ("twist", "twist", TWIST[:7], None, r"twist has shape \(7,\) where \(8,\) is needed"),
-    ("twist", "twist", TWIST, "mm", "twist is in 'mm', which cannot be turned into rad"),
+    ("twist", "twist", TWIST, "mm", "twist is in 'mm', which cannot be converted to rad"),
 ]
 
 

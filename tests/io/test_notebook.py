@@ -82,7 +82,7 @@ def test_a_map_is_drawn_where_its_pixels_are(result):
 
 
 def test_what_is_no_picture_is_not_drawn(result):
-    with pytest.raises(io.InputError, match=r"there is no picture 'depth': choose from height"):
+    with pytest.raises(io.InputError, match=r"there is no map 'depth' to draw: choose from height"):
         result.plot("depth")
 
 

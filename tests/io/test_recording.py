@@ -90,7 +90,7 @@ def test_what_is_given_overrides_the_file(press):
 
 @pytest.mark.parametrize("motion", ["axial", "horizontal"])
 def test_a_motion_that_contradicts_the_file_is_refused(press, motion):
-    line = f"press.h5 says its motion is vertical, --motion says {motion}: leave --motion out"
+    line = f"press.h5 states the motion vertical, but --motion is {motion}: leave --motion out"
     with pytest.raises(io.InputError, match=line):
         io.open_recording(press, motion=motion, phase=io.Steps(np.pi / 4))
 
@@ -164,18 +164,28 @@ BAD = [
     (f"{STAGE}/travel", np.where(TRAVEL > 1, np.inf, TRAVEL), None, "travel is inf at frame 4"),
     (f"{STAGE}/travel", TRAVEL[:5], None, r"travel has shape \(5,\) where \(8,\) is needed: give --tr"),
     (f"{STAGE}/travel", ["0"] * 8, None, "travel holds no numbers: give --travel-step"),
-    (f"{STAGE}/travel", None, None, "does not say where the body was in each frame: give --travel-step"),
-    (f"{STAGE}/travel", TRAVEL, "deg", "travel is in 'deg', which cannot be turned into mm"),
-    (f"{STAGE}/travel", TRAVEL, "9**9**9", r"travel is in '9\*\*9\*\*9', which cannot be turned into mm"),
+    (
+        f"{STAGE}/travel",
+        None,
+        None,
+        "does not state the position of the body in each frame: give --travel-step",
+    ),
+    (f"{STAGE}/travel", TRAVEL, "deg", "travel is in 'deg', which cannot be converted to mm"),
+    (f"{STAGE}/travel", TRAVEL, "9**9**9", r"travel is in '9\*\*9\*\*9', which cannot be converted to mm"),
     (f"{STAGE}/travel", h5py.SoftLink("../travel"), None, r"the link travel leads to \.\./travel, which"),
-    (f"{STAGE}/motion", None, None, "does not say how the sensor moved: give"),
-    (f"{STAGE}/motion", "sideways", None, "says the motion 'sideways': give --motion, one of vertical"),
+    (f"{STAGE}/motion", None, None, "does not state how the sensor moved: give"),
+    (
+        f"{STAGE}/motion",
+        "sideways",
+        None,
+        "states the unknown motion 'sideways': give --motion, one of vertical",
+    ),
     (f"{STAGE}/motion", ["vertical"] * 2, None, "stage/motion does not hold one value: write"),
     (f"{STAGE}/tilt", np.nan, None, "tilt is nan, which is not finite: give --tilt"),
     (f"{STAGE}/pivot", [0.0, 1.0], None, r"pivot has shape \(2,\) where \(3,\) is needed"),
     (f"{DETECTOR}/x_pixel_size", -0.1, None, r"pixel size \(-0.1, 0.6\) mm: give --pixel-size, above zero"),
-    (f"{DETECTOR}/y_pixel_size", 0.1, "px", "y_pixel_size is in 'px', which cannot be turned into mm"),
-    (f"{DETECTOR}/y_pixel_size", None, None, "its pixels only along one axis: give --pixel-size"),
+    (f"{DETECTOR}/y_pixel_size", 0.1, "px", "y_pixel_size is in 'px', which cannot be converted to mm"),
+    (f"{DETECTOR}/y_pixel_size", None, None, "states the pixel size along one axis only: give --pixel-size"),
     (f"{DETECTOR}/dark", np.zeros((7, 5)), None, r"dark has shape \(7, 5\) where \(5, 7\) is needed: give"),
     (f"{DETECTOR}/dark", np.zeros((5, 7), "S1"), None, "dark holds no numbers: give --dark, or take"),
     (f"{DETECTOR}/frame_time", np.zeros(3), None, r"frame_time has shape \(3,\) where \(8,\) is needed"),
@@ -200,7 +210,9 @@ def test_what_an_axial_recording_says_wrongly_is_told(turn):
     with pytest.raises(io.InputError, match=r"turn\.h5: /entry/instrument/stage/phase is nan at frame 4"):
         io.open_recording(turn)
     put(turn, f"{STAGE}/phase", None)
-    with pytest.raises(io.InputError, match="does not say where the body was in each frame: give --phase"):
+    with pytest.raises(
+        io.InputError, match="does not state the position of the body in each frame: give --phase"
+    ):
         io.open_recording(turn)
 
 

@@ -1,4 +1,4 @@
-"""What a result looks like in the file, that it comes back as it was, and what is no result."""
+"""What a result looks like in the file, that it comes back as it was, and what is not a result."""
 
 from __future__ import annotations
 
@@ -186,7 +186,7 @@ def test_a_failure_leaves_the_older_result(path, monkeypatch):
     [
         ("missing/r.h5", "there is no folder .*missing: make it first"),
         ("folder", "is a folder: name a file in it"),
-        ("pipe", "is no regular file: choose another place with -o"),
+        ("pipe", "is not a regular file: choose another place with -o"),
         ("x" * 300, "cannot be written: File name too long; choose another place with -o"),
         ("/proc/r.h5", "/proc/r.h5 cannot be written: No such file or directory; choose another"),
     ],
@@ -207,11 +207,11 @@ def test_what_is_no_result_is_refused(tmp_path, path):
     with pytest.raises(io.InputError, match=r"result\.h5: no such file"):
         io.open_result(path)
     record(sphere(), path)
-    with pytest.raises(io.InputError, match=r"result\.h5 is no result: 'mirrorskin reconstruct' makes"):
+    with pytest.raises(io.InputError, match=r"result\.h5 is not a result: 'mirrorskin reconstruct' computes"):
         io.open_result(path)
     with h5py.File(path, "w") as file:
         file["entry"] = 1
-    with pytest.raises(io.InputError, match=r"is no result"):
+    with pytest.raises(io.InputError, match=r"is not a result"):
         io.open_result(path)
 
 
@@ -220,7 +220,7 @@ def test_what_is_no_result_is_refused(tmp_path, path):
     [
         ("result", None, "/entry/result holds no maps: reconstruct it again"),
         ("result/status", np.ones((7, 5)), r"status has shape \(7, 5\) where \(5, 7\) is needed: "),
-        ("result/x", np.zeros(7), "/entry/result/x does not run as pixels do: recon"),
+        ("result/x", np.zeros(7), "/entry/result/x is not in the order of the pixels: recon"),
         ("result/height_sigma", np.zeros((5, 7), "S2"), "height_sigma holds no numbers: rec"),
         ("result/height_sigma", h5py.SoftLink("gone"), "the link height_sigma leads to gone, which is"),
         ("result/status", h5py.ExternalLink("../x.h5", "/x"), "leads out of its folder"),

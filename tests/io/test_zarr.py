@@ -140,7 +140,7 @@ def test_a_zip_is_read(pair, tmp_path):
 def test_stacks_of_others_need_what_they_do_not_say(tmp_path, dtype, chunks):
     frames = random_stack(np.dtype(dtype).newbyteorder("=")).astype(dtype)
     path = bare(tmp_path / "x.zarr", frames, chunks=chunks)
-    assert "does not say how the sensor moved: give --motion" in line(path)
+    assert "does not state how the sensor moved: give --motion" in line(path)
     with io.open_recording(path, **GIVEN) as recording:
         np.testing.assert_array_equal(read_all(recording, 3).frames, frames)
 
@@ -237,7 +237,7 @@ def test_a_store_that_does_not_answer_is_told_with_its_address():
 
 def test_what_is_there_is_not_written_over(pair, memory):
     for target in (pair[1], Url("memory://bucket/press.zarr")):
-        with pytest.raises(io.InputError, match="is there already: remove it"):
+        with pytest.raises(io.InputError, match="exists: remove it"):
             io.save_zarr(pair[0], target)
 
 

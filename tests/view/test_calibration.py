@@ -101,7 +101,7 @@ def test_the_threshold_of_a_uniform_wall_is_drawn_by_azimuth():
     response = io.WallResponse(**values | uniform)
     axes = draw_response(response).axes
     assert titled(axes, "wall: radius 17.50 mm")
-    lines = titled(axes, "zenith of half light").lines
+    lines = titled(axes, "zenith of half brightness").lines
     middle, right = np.degrees(lines[0].get_ydata()), np.degrees(lines[1].get_ydata())
     assert np.all(np.isfinite(lines[0].get_ydata()))
     assert np.ptp(middle) < 0.2 * np.ptp(right)
@@ -109,7 +109,7 @@ def test_the_threshold_of_a_uniform_wall_is_drawn_by_azimuth():
 
 def test_a_precession_is_drawn_through_its_phases():
     known = a_precession()
-    path = titled(draw_precession(known).axes, "where the body leans")
+    path = titled(draw_precession(known).axes, "lean of the body")
     marks = next(line for line in path.lines if line.get_marker() == "o").get_xydata()
     np.testing.assert_allclose(marks, np.degrees(known.lean(np.arange(8) * math.pi / 4)))
     assert {text.get_text() for text in path.texts} >= {f"{45 * k}°" for k in range(8)}
@@ -147,7 +147,7 @@ def test_numbers_are_in_the_units_people_speak_of():
         (1.23456, 0.012, ("1.235", "0.012")),
         (123.456, 40.0, ("123", "40")),
         (7, math.nan, ("7", "")),
-        (math.nan, math.nan, ("not told", "")),
+        (math.nan, math.nan, ("unknown", "")),
     ],
 )
 def test_no_more_digits_are_written_than_are_known(value, sigma, told):

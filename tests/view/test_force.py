@@ -24,7 +24,7 @@ def test_forces_are_drawn_against_the_truth_with_their_errors(tmp_path, monkeypa
     view.force_figure(results, {"light": 0.1, "heavy": 0.2}, 2 * PRESSURE, "title", tmp_path / "a.png")
     pressure, _, cut, forces, errors = (
         next(axes for axes in kept[0].axes if word in (axes.get_title(), axes.get_ylabel()))
-        for word in ("heavy", "heavy", "cut across the middle", "force found (N)", "error (%)")
+        for word in ("heavy", "heavy", "cut across the middle", "estimated force (N)", "error (%)")
     )
     np.testing.assert_allclose(pressure.get_images()[0].get_array(), 1e3 * PRESSURE)
     truth, found = cut.get_lines()

@@ -70,7 +70,7 @@ def test_a_file_keeps_all_that_was_shown(tmp_path):
 def test_what_is_shown_is_told_in_words(tmp_path):
     view = live.LiveView(tmp_path / "run.rrd", SHAPE)
     view.show(known(), STATUS)
-    told = view._told(known(), STATUS)
+    told = view._status_text(known(), STATUS)
     view.close()
     assert "30.0 frames/s" in told
     assert "10.0 ms, 99 % below 20.0 ms" in told

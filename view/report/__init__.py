@@ -1,4 +1,4 @@
-"""A result as one page that any browser shows without a network."""
+"""Report on a result: one HTML page that needs no network."""
 
 from mirrorskin.view.report.page import check_report, write_report
 

@@ -1,4 +1,4 @@
-"""What a report says of a result: pictures, numbers, parameters, provenance."""
+"""Contents of a report on a result: pictures, numbers, parameters, provenance."""
 
 from __future__ import annotations
 
@@ -25,34 +25,34 @@ _HEADINGS = {
     "pictures": "Pictures",
     "numbers": "Numbers",
     "parameters": "Parameters",
-    "provenance": "Where it comes from",
+    "provenance": "Provenance",
     "calibration": "Calibration",
     "maps": "Maps",
     "units": "Units",
 }
 _NOT_ALWAYS = ("parameters", "provenance", "calibration")
 _NO_HEIGHTS = "This result has no heights, so there is no surface to show."
-_NO_SURFACE = "These heights make no surface: that takes two rows and two columns of pixels that touch."
+_NO_SURFACE = "These heights make no surface, which needs two adjacent rows and columns of pixels."
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Names and values that belong together, under a name that may be empty."""
+    """A group of names and values, with a heading that may be empty."""
 
     name: str
     rows: Rows
 
 
 def contents_of(result: Result, name: str, section: Ends | None, turn: int | None) -> dict[str, Any]:
-    """Return the variables of the page's template."""
+    """Return the variables of the page template."""
     surface = surface_data(result)
     parameters, provenance = split_process(result.process)
     contents = {
         "title": name if turn is None else f"{name}, turn {turn}",
         "summary": sentence(str(summarise(result))),
-        "made": _made(result.process),
+        "made": _origin(result.process),
         "surface": surface,
-        "said": _said_of(result, surface),
+        "texts": _surface_texts(result, surface),
         "pictures": pictures_of(result, name, section),
         "numbers": numbers_of(result, section),
         "parameters": _groups(parameters),
@@ -62,12 +62,12 @@ def contents_of(result: Result, name: str, section: Ends | None, turn: int | Non
         "units": UNITS,
         "citation": _citation(name, result.process),
     }
-    shown = {part: said for part, said in _HEADINGS.items() if part not in _NOT_ALWAYS or contents[part]}
+    shown = {key: text for key, text in _HEADINGS.items() if key not in _NOT_ALWAYS or contents[key]}
     return contents | {"headings": shown}
 
 
-def _said_of(result: Result, surface: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Say what is to be seen of the surface, and what is not."""
+def _surface_texts(result: Result, surface: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return the texts of the surface, and notes on what is not shown."""
     if surface is None:
         return {"notes": [_NO_HEIGHTS if result.height is None else _NO_SURFACE]}
     notes = [f"{PIXELS} The surface is not in true proportions."] if surface["unit"] == "px" else []
@@ -77,7 +77,7 @@ def _said_of(result: Result, surface: Mapping[str, Any] | None) -> dict[str, Any
 
 
 def _relative(result: Result) -> list[str]:
-    """Say how many pieces have an unknown offset."""
+    """Return a note on the pieces with an unknown offset."""
     unknown = result.offset_unknown
     if unknown is None or not unknown.any():
         return []
@@ -91,12 +91,12 @@ def _relative(result: Result) -> list[str]:
 
 
 def _groups(rows: Mapping[str, Rows]) -> list[Group]:
-    """Put rows under their names; what is of all comes first, as its name is empty."""
+    """Return the groups in order of names; common rows come first, as their name is empty."""
     return [Group(name, rows[name]) for name in sorted(rows)]
 
 
 def _calibration_of(result: Result) -> list[tuple[str, ...]]:
-    """Return the table of the calibration that a result carries, if there is one."""
+    """Return the table of the calibration in a result, if there is one."""
     if result.calibration is None:
         return []
     from mirrorskin.view.calibration_table import calibration_table
@@ -104,8 +104,8 @@ def _calibration_of(result: Result) -> list[tuple[str, ...]]:
     return [row.cells() for row in calibration_table(result.calibration)]
 
 
-def _made(process: Mapping[str, object]) -> str:
-    """Say when the result was made, by what and from what, as far as known."""
+def _origin(process: Mapping[str, object]) -> str:
+    """Return the source, program and date of the result, as far as known."""
     words = {"of": process.get("source"), "by": _program(process), "on": _day(process)}
     parts = [f"{word} {value}" for word, value in words.items() if value]
     return f"Made {' '.join(parts)}" if parts else ""
@@ -130,7 +130,7 @@ _DIGIT, _POINT = "\N{FIGURE SPACE}", "\N{PUNCTUATION SPACE}"
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A quantity in words; what is not known is empty."""
+    """A quantity as text; unknown parts are empty."""
 
     name: str
     value: str
@@ -140,14 +140,14 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Numbers:
-    """The rows of a table, and what is to be said of them."""
+    """The rows of a table, with notes."""
 
     rows: list[Row]
     notes: list[str]
 
 
 def numbers_of(result: Result, section: Ends | None) -> Numbers:
-    """Measure what makes sense of a result, or say in a note why nothing does."""
+    """Measure a result, or return a note on why that is impossible."""
     from mirrorskin.engine import measure
 
     try:
@@ -162,7 +162,7 @@ def numbers_of(result: Result, section: Ends | None) -> Numbers:
 
 
 def _written(quantity: Quantity) -> tuple[str, str]:
-    """Return a value and its uncertainty as they are written, the latter empty where it is not known."""
+    """Return a value and its uncertainty as text; an unknown uncertainty is empty."""
     number = str(quantity).removesuffix(quantity.unit).strip()
     value, _, sigma = number.replace("-", "\N{MINUS SIGN}").partition(" ± ")
     return value, sigma
@@ -179,39 +179,36 @@ def align(numbers: list[str]) -> list[str]:
 
 
 def sentence(words: str) -> str:
-    """Return words that begin with a capital and end with a stop."""
+    """Return words with an initial capital and a full stop."""
     return f"{words[:1].upper()}{words[1:].rstrip('.')}."
 
 
 Ends = tuple[tuple[float, float], tuple[float, float]]
-"""Of a cross-section: x and y of both, mm."""
+"""Ends of a cross-section: x and y of both, mm."""
 
 FINENESS = 200
-"""Pixels in an inch of a figure."""
+"""Resolution of figures, pixels per inch."""
 MOST_BYTES = 400_000
-"""Of a picture: seven of them and a surface stay below 5 MB, in letters."""
+"""Limit of the size of a picture: seven of them and a surface, encoded as text, stay below 5 MB."""
 
-_QUALITIES = 90, 60  # of WebP, for pictures of noise, which PNG cannot pack
-_TWO = 8.0  # inches from which on a figure is one of two maps
-_BORDER = 20  # pixels that are left above and below
-_WHITE = 250  # and above is paper
+_QUALITIES = 90, 60  # of WebP, for noisy pictures, which PNG cannot compress
+_BORDER = 20  # pixels above and below
+_WHITE = 250  # values from this one on are background
 
 Pixels = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A picture, and what is said of it.
+    """A picture with its texts.
 
     Attributes
     ----------
     caption, alt : str
     source : str
-        The picture itself, as an address.
+        The picture as a data URL.
     width, height : int
         Pixels.
-    wide : bool
-        Whether it needs the room of two.
     """
 
     caption: str
@@ -219,39 +216,37 @@ class Picture:
     source: str
     width: int
     height: int
-    wide: bool
 
 
 def pictures_of(result: Result, name: str, section: Ends | None) -> list[Picture]:
-    """Draw all figures that a result has."""
+    """Draw all figures of a result."""
     from mirrorskin.view.result import figures_of, png_of
 
     figures = figures_of(result, name=name, section=section)
     pictures = []
     for which, figure in figures.items():
-        width = figure.get_figwidth()
-        png = png_of(_untitled(figure), round(FINENESS * width))
-        pictures.append(_picture(*picture_texts(result, which), png, wide=width > _TWO))
+        png = png_of(_untitled(figure), round(FINENESS * figure.get_figwidth()))
+        pictures.append(_picture(*picture_texts(result, which), png))
     return pictures
 
 
 def _untitled(figure: Figure) -> Figure:
-    """Hide a figure's title, which is the page's own."""
+    """Hide a figure's title, since the page has its own."""
     for text in figure.texts:
         text.set_visible(False)
         text.set_in_layout(False)
     return figure
 
 
-def _picture(caption: str, alt: str, png: bytes, wide: bool) -> Picture:
+def _picture(caption: str, alt: str, png: bytes) -> Picture:
     pixels = _trimmed(np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR), np.uint8))
     kind, data = packed(pixels)
     source = f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
-    return Picture(caption, alt, source, pixels.shape[1], pixels.shape[0], wide)
+    return Picture(caption, alt, source, pixels.shape[1], pixels.shape[0])
 
 
 def _trimmed(pixels: Pixels) -> Pixels:
-    """Leave a border of paper above and below, and no more."""
+    """Trim the background above and below to a border."""
     (drawn,) = np.nonzero(np.any(pixels < _WHITE, axis=(1, 2)))
     if not drawn.size:
         return pixels
@@ -259,7 +254,7 @@ def _trimmed(pixels: Pixels) -> Pixels:
 
 
 def packed(pixels: Pixels) -> tuple[str, bytes]:
-    """Pack a picture into at most ``MOST_BYTES``: as it is if it can be, else nearly, else smaller."""
+    """Encode a picture in at most ``MOST_BYTES``: losslessly if possible, else lossily, else smaller."""
     png = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 6])[1].tobytes()
     if len(png) <= MOST_BYTES:
         return "png", png

@@ -1,5 +1,5 @@
-// The grid of heights: what the page says of it, its triangles and slopes, and where a ray meets it.
-// Sample k lies in row floor(k / columns) and column k % columns. Its piece is 0 in a hole.
+// The grid of heights: decoding from the page, triangles and slopes, and intersection with a ray.
+// Sample k is in row floor(k / columns) and column k % columns. Its piece is 0 in a hole.
 
 function decode(text) {
   const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
@@ -18,7 +18,7 @@ function readGrid(data) {
   };
 }
 
-// Two triangles for each cell whose corners are of one piece, one where three of them are.
+// Two triangles for each cell whose corners belong to one piece, one if three of them do.
 function triangles({ x, y, piece }) {
   const corners = [];
   const add = (a, b, c) => {
@@ -39,7 +39,7 @@ function triangles({ x, y, piece }) {
   return new Uint32Array(corners);
 }
 
-// The slope at sample k along a row or column, from those neighbours that are of its piece.
+// The slope at sample k along a row or column, from the neighbours in the same piece.
 function slope({ z, piece }, k, stride, places, index) {
   const before = index > 0 && piece[k - stride] === piece[k] ? 1 : 0;
   const after = index < places.length - 1 && piece[k + stride] === piece[k] ? 1 : 0;
@@ -59,14 +59,14 @@ function vertices(grid) {
   return values;
 }
 
-// The cell that holds a value, and how far into it the value lies; all cells but the last are of one size.
+// The cell that contains a value, and the value's share of the cell; all cells but the last have one size.
 function locate(places, value) {
   const guess = Math.floor((value - places[0]) / (places[1] - places[0]));
   const cell = Math.min(Math.max(guess, 0), places.length - 2);
   return [cell, (value - places[cell]) / (places[cell + 1] - places[cell])];
 }
 
-// The height between the samples; NaN beside the grid, in a hole and between two pieces.
+// The interpolated height; NaN outside the grid, in a hole and between two pieces.
 function heightAt({ x, y, z, piece }, atX, atY) {
   const [column, right] = locate(x, atX);
   const [row, down] = locate(y, atY);
@@ -82,8 +82,8 @@ function isFilledAt({ x, y, filled }, atX, atY) {
   return filled[(row + Math.round(down)) * x.length + column + Math.round(right)] > 0;
 }
 
-// Where a ray first goes below the surface, or null. The ray runs from the highest height, at place 0, to the
-// lowest, at place 1, so that its height needs no stretching.
+// The first intersection of a ray with the surface, or null. The ray runs from the highest height, at 0, to
+// the lowest, at 1, so that the vertical exaggeration is not needed.
 function meet(grid, [fromX, fromY], [toX, toY], lowest, highest) {
   const cell = Math.min(Math.abs(grid.x[1] - grid.x[0]), Math.abs(grid.y[1] - grid.y[0]));
   const steps = Math.max(1, Math.ceil((2 * Math.hypot(toX - fromX, toY - fromY)) / cell));

@@ -21,7 +21,7 @@ _SCRIPTS = ("grid.js", "scene.js", "view.js", "surface.js")
 
 
 def check_report() -> None:
-    """Raise InputError if no page can be made, before any work is done for one."""
+    """Raise InputError if a report cannot be written, before any work is done."""
     check_drawing()
     if find_spec("jinja2") is None:
         raise InputError("a report needs Jinja2: pip install 'mirrorskin[view]'")
@@ -35,27 +35,27 @@ def write_report(
     section: Ends | None = None,
     turn: int | None = None,
 ) -> None:
-    """Write one page that shows a result, and needs nothing but a browser.
+    """Write a report on a result: one page that only needs a browser.
 
-    Pictures, numbers, scripts and styles are in the page itself, and its policy of content forbids all else.
+    The page contains pictures, numbers, scripts and styles; its policy forbids all other content.
 
     Parameters
     ----------
     result : Result
     path : str or Path
-        HTML file to write; it exists whole or not at all.
+        HTML file to write; it appears complete or not at all.
     name : str
-        What to call the result: the name of its file.
+        Name of the result, usually that of its file.
     section : ((float, float), (float, float)), optional
-        Ends of the cross-section, x and y in mm; without them, it goes across the apex.
+        Ends of the cross-section, x and y in mm; by default it passes through the apex.
     turn : int, optional
-        Of a result of each turn: which one, from 0.
+        Number of the turn, from 0, for a result with a map for each turn.
 
     Raises
     ------
     InputError
-        Matplotlib or Jinja2 is not installed, there is no such turn, there is a section and no pixel
-        size to place it by, or the file cannot be written.
+        Matplotlib or Jinja2 is not installed, there is no such turn, a section is given without a pixel
+        size, or the file cannot be written.
     """
     check_report()
     page = _render(contents_of(select_turn(result, turn), name, section, turn))
@@ -86,14 +86,14 @@ def _render(contents: Mapping[str, Any]) -> str:
 
 
 def _unescaped(text: str) -> Any:
-    """Mark a file of this package as what may stand in the page as it is."""
+    """Mark a file of this package as safe to be inserted unescaped."""
     import markupsafe
 
     return markupsafe.Markup(text)
 
 
 def _policy(script: str, style: str) -> str:
-    """Allow the page's own script, style and pictures, and nothing else."""
+    """Return a policy that allows the page's own script, style and pictures, and nothing else."""
     own = {"script-src": script, "style-src": style}
     hashes = [f"{kind} 'sha256-{_hash(text)}'" for kind, text in own.items()]
     return "; ".join(

@@ -1,4 +1,4 @@
-// What WebGL draws: the surface, lit and coloured by height, on the outline of its field.
+// Drawing with WebGL: the shaded surface, coloured by height, and the outline of its field.
 
 const VERTEX = `#version 300 es
   in vec3 place;
@@ -55,7 +55,7 @@ function link(gl) {
   return program;
 }
 
-// Put vertices of six numbers, and which of them make up the shapes, on the graphics card.
+// Upload vertices of six numbers and the indices of the shapes to the graphics card.
 function upload(gl, program, values, indices) {
   const shape = gl.createVertexArray();
   gl.bindVertexArray(shape);
@@ -71,7 +71,7 @@ function upload(gl, program, values, indices) {
   return shape;
 }
 
-// The outline of the field at the lowest height, and an upright at its far left corner.
+// The outline of the field at the lowest height, and a vertical line at its far left corner.
 function outline({ left, right, near, far, lowest, highest }) {
   const corners = [[left, near], [right, near], [right, far], [left, far]];
   const points = [...corners.map((corner) => [...corner, lowest]), [left, far, highest]];
@@ -79,7 +79,7 @@ function outline({ left, right, near, far, lowest, highest }) {
   return { values, indices: new Uint32Array([0, 1, 1, 2, 2, 3, 3, 0, 3, 4]) };
 }
 
-// Return a function that draws the scene from somewhere.
+// Return a function that draws the scene for a view.
 function buildScene(gl, data, grid, box) {
   const program = link(gl);
   const at = (name) => gl.getUniformLocation(program, name);

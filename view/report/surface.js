@@ -1,17 +1,17 @@
-// The surface of the page: what is drawn when, and what pointer, keys and slider do.
+// The surface in the page: when it is drawn, and how pointer, keys and slider control it.
 
-const TURN = 0.008; // radians for a pixel that the pointer moves
-const STEP = Math.PI / 36; // radians for an arrow key
-const ZOOM = 1.25; // for a key
-const SHORT = 30; // CSS pixels below which the upright has no labels
-const WHEEL = 0.0015; // for a unit of the wheel, as a logarithm
+const TURN = 0.008; // radians per pixel of pointer motion
+const STEP = Math.PI / 36; // radians per press of an arrow key
+const ZOOM = 1.25; // factor per key press
+const SHORT = 30; // CSS pixels below which the vertical line has no labels
+const WHEEL = 0.0015; // logarithm of the factor per unit of the wheel
 
 const data = JSON.parse(document.getElementById("surface-data").textContent);
 const part = (name) => document.getElementById(`surface-${name}`);
 const canvas = part("canvas"), slider = part("factor");
 const view = new View(data, readGrid(data), canvas);
-const pointers = new Map(); // where those are that are down, by their number
-let draw = null; // as long as there is a context
+const pointers = new Map(); // positions of pressed pointers, by their id
+let draw = null; // set while there is a context
 let pending = false;
 
 function redraw() {
@@ -30,7 +30,7 @@ function render() {
   placeLabels();
 }
 
-// Axes end in their letters; beside the middle of each stands how long it is.
+// Each axis has its letter at the end and its length next to its middle.
 function labels({ left, right, near, far, lowest, highest, centre }) {
   return [
     ["x", [right, near, lowest], [left, near, lowest]],
@@ -42,7 +42,7 @@ function labels({ left, right, near, far, lowest, highest, centre }) {
   ];
 }
 
-// Put each label just beyond its place, as seen from another; not those that are out of sight, or in the way.
+// Place each label just beyond its point, away from another; hide labels that are invisible or overlap.
 function placeLabels() {
   const [middle, level] = [canvas.clientWidth / 2, canvas.clientHeight / 2];
   const tall = view.box.size[2] * view.stretch * view.scale * Math.cos(view.elevation);
@@ -68,13 +68,13 @@ function setFactor(factor) {
   redraw();
 }
 
-// Where a pointer is on the canvas.
+// The position of a pointer on the canvas.
 function placeOf(event) {
   const seen = canvas.getBoundingClientRect();
   return [event.clientX - seen.left - seen.width / 2, seen.top + seen.height / 2 - event.clientY];
 }
 
-// Say what was found, or nothing.
+// Show the coordinates of a point, or nothing.
 function tell(found) {
   const words = [["x", data.unit], ["y", data.unit], ["z", "mm"]].map(([name, unit]) =>
     found ? `${name} ${found[name].toFixed(3).replace("-", "\u2212")} ${unit}` : "");
@@ -94,7 +94,7 @@ function onMove(event) {
   redraw();
 }
 
-// One finger moves, another stays.
+// One finger moves while another stays.
 function pinch(before, place, other) {
   const apart = (one) => Math.hypot(one[0] - other[0], one[1] - other[1]) || 1;
   view.zoomAt((place[0] + other[0]) / 2, (place[1] + other[1]) / 2, apart(place) / apart(before));
@@ -119,7 +119,7 @@ function onKey(event) {
   redraw();
 }
 
-// At its limits the wheel is left to the page.
+// At the limits of the zoom, the wheel scrolls the page.
 function onWheel(event) {
   if (!view.zoomAt(...placeOf(event), Math.exp(-WHEEL * event.deltaY))) return;
   event.preventDefault();
@@ -144,7 +144,7 @@ function listen() {
   canvas.addEventListener("wheel", onWheel, { passive: false });
   canvas.addEventListener("keydown", onKey);
   canvas.addEventListener("webglcontextlost", (event) => {
-    event.preventDefault(); // else it never comes back
+    event.preventDefault(); // otherwise the context is never restored
     draw = null;
   });
   canvas.addEventListener("webglcontextrestored", start);
@@ -153,7 +153,7 @@ function listen() {
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
 }
 
-// Say what never changes: the legend, and how large the field is.
+// Set the constant texts: the legend, and the size of the field.
 function explain() {
   const rgb = (colour) => `rgb(${colour.map((value) => Math.round(255 * value)).join(" ")})`;
   part("ramp").style.background = `linear-gradient(to right, ${data.colours.map(rgb).join(", ")})`;
@@ -164,7 +164,7 @@ function explain() {
   });
 }
 
-// Begin, and begin again after the context was lost. Without WebGL 2 the page's own sentence stays.
+// Start, also after the context was lost. Without WebGL 2 the note in the page remains.
 function start() {
   const gl = canvas.getContext("webgl2", { antialias: true, preserveDrawingBuffer: true });
   draw = gl && !gl.isContextLost() ? buildScene(gl, data, view.grid, view.box) : null;

@@ -1,4 +1,4 @@
-"""The surface that a report shows in space, of few enough samples for any browser; a hole stays a hole."""
+"""The 3D surface of a report, with few enough samples for any browser; holes are kept."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from mirrorskin.io.types import Floats
 from mirrorskin.view.colours import FILLED_RGB, SEQUENTIAL, span
 
 MOST_EXAGGERATED = 20
-"""Times that heights are drawn larger than they are, at most."""
+"""Largest vertical exaggeration."""
 
-_RELIEF = 0.25  # of the picture's width, that heights should span on the screen
+_RELIEF = 0.25  # height range on the screen, relative to the picture's width
 _STOPS = 16  # samples of the colour map for the script
 _CODES = 65535
-_PIECES = 0x7FFF  # numbers of pieces that a mark has room for
+_PIECES = 0x7FFF  # largest number of a piece that a mark can store
 _FILLED_BIT = 0x8000
 
 
 def surface_data(result: Result) -> dict[str, Any] | None:
-    """Return the surface that a page shows in space, as its script reads it."""
+    """Return the surface of a page as the data that its script reads."""
     if result.height is None or not np.isfinite(result.height).any():
         return None
     grid = sample(result)
@@ -67,14 +67,14 @@ def _text(values: NDArray[Any]) -> str:
 
 
 def _colours() -> list[list[float]]:
-    """Return colours along the map of the pictures, red, green and blue from 0 to 1."""
+    """Return colours along the colour map, red, green and blue from 0 to 1."""
     from matplotlib import colormaps
 
     return [[round(part, 4) for part in colormaps[SEQUENTIAL](k / (_STOPS - 1))[:3]] for k in range(_STOPS)]
 
 
 MOST = 400
-"""Samples along a side, at most."""
+"""Largest number of samples along a side."""
 
 Number = TypeVar("Number", bound=np.generic)
 
@@ -88,7 +88,7 @@ class Grid:
     Attributes
     ----------
     x, y : ndarray, (n,) and (m,), float64
-        Of the samples, mm or pixels from the picture's centre; y runs up.
+        Positions of the samples, mm or pixels from the picture's centre; y points up.
     height : ndarray, (m, n), float64
         Millimetres; NaN in a hole.
     piece : ndarray, (m, n), int64
@@ -105,11 +105,11 @@ class Grid:
 
 
 def sample(result: Result, most: int = MOST) -> Grid:
-    """Take means over blocks of pixels, as many as bring each side to at most ``most`` samples.
+    """Average over blocks of pixels, so that each side has at most ``most`` samples.
 
-    Only the rectangle that holds all heights is taken. A block of which less than half has a height is a
-    hole. Of a block that holds more than one piece, or measured and filled pixels, only those of the middle
-    kind are taken, which is the most common one wherever one has more than half: heights of different kinds
+    Only the rectangle that contains all heights is used. A block with heights at less than half of its pixels
+    is a hole. In a block with several pieces, or with measured and filled pixels, only pixels of the median
+    kind are used, which is the most common one wherever one has more than half: heights of different kinds
     are never mixed.
     """
     assert result.height is not None
@@ -131,7 +131,7 @@ def sample(result: Result, most: int = MOST) -> Grid:
 
 
 def _reach(answered: NDArray[np.bool_]) -> slice:
-    """Return from the first to the last that is answered."""
+    """Return the range from the first to the last true value."""
     (where,) = np.nonzero(answered)
     return slice(int(where[0]), int(where[-1]) + 1)
 
@@ -147,7 +147,7 @@ def _places(result: Result) -> tuple[Floats, Floats]:
 
 
 def _kinds(result: Result) -> NDArray[np.int64]:
-    """Return a number for what may be averaged: twice the piece, and one more where it was filled."""
+    """Return a number of pixels that may be averaged: twice the piece, plus one for filled pixels."""
     assert result.height is not None
     kind = np.zeros(result.height.shape, np.int64)
     if result.component is not None:
@@ -158,7 +158,7 @@ def _kinds(result: Result) -> NDArray[np.int64]:
 
 
 def _averaged(kinds: NDArray[np.int64], heights: Floats) -> tuple[NDArray[np.int64], Floats]:
-    """Return the middle kind of each block, and the mean height of what is of it; of holes only, a hole."""
+    """Return the median kind of each block, and the mean height of its pixels; a block of holes is a hole."""
     ordered = np.sort(kinds, axis=-1)  # holes come first
     size, known = kinds.shape[-1], np.count_nonzero(kinds != _HOLE, axis=-1)
     middle = np.minimum(size - known + known // 2, size - 1)[..., np.newaxis]
@@ -169,20 +169,20 @@ def _averaged(kinds: NDArray[np.int64], heights: Floats) -> tuple[NDArray[np.int
 
 
 def _blocks(values: NDArray[Number], block: tuple[int, int], beyond: float) -> NDArray[Number]:
-    """Return the pixels of each block, (m, n, pixels); pixels beyond the picture are ``beyond``."""
-    beside = [(0, -size % step) for size, step in zip(values.shape, block, strict=True)]
-    whole = np.pad(values, beside, constant_values=beyond)
+    """Return the pixels of each block, (m, n, pixels); pixels outside the picture are ``beyond``."""
+    padding = [(0, -size % step) for size, step in zip(values.shape, block, strict=True)]
+    whole = np.pad(values, padding, constant_values=beyond)
     rows, columns = whole.shape[0] // block[0], whole.shape[1] // block[1]
     return whole.reshape(rows, block[0], columns, block[1]).swapaxes(1, 2).reshape(rows, columns, -1)
 
 
 def _count(where: NDArray[np.bool_], block: tuple[int, int]) -> NDArray[np.int64]:
-    """Count in each block."""
+    """Count the true values in each block."""
     return np.asarray(np.count_nonzero(_blocks(where, block, False), axis=-1))
 
 
 def _means(places: Floats, step: int) -> Floats:
-    """Return where the middles of the blocks are."""
+    """Return the centres of the blocks."""
     starts = np.arange(0, len(places), step)
     lengths = np.minimum(step, len(places) - starts)
     return np.asarray(np.add.reduceat(places, starts) / lengths)

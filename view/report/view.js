@@ -1,14 +1,14 @@
-// Where the surface is seen from: what lies where on the canvas, and what of it one points at.
-// Places on the canvas are in CSS pixels from its middle, y up.
+// The view of the surface: positions on the canvas, and the point under the pointer.
+// Positions on the canvas are in CSS pixels from its centre, y up.
 
 const HOME = { azimuth: -Math.PI / 6, elevation: Math.PI / 5, zoom: 1, shift: [0, 0] };
-const LOWEST = 0.1, UPRIGHT = Math.PI / 2; // how low and how high one can look from
-const CLOSEST = 40; // times
-const MARGIN = 34; // round the surface, for its labels
+const LOWEST = 0.1, UPRIGHT = Math.PI / 2; // limits of the elevation
+const CLOSEST = 40; // largest zoom
+const MARGIN = 34; // around the surface, for its labels
 
 const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 
-// The field that holds the surface.
+// The field that contains the surface.
 function boxOf({ x, y, lowest, highest }) {
   const [left, right, near, far] = [x[0], x.at(-1), y.at(-1), y[0]];
   const size = [right - left, far - near, highest - lowest];
@@ -26,12 +26,12 @@ class View {
     Object.assign(this, HOME);
   }
 
-  // What a millimetre of height is drawn as, in the unit of x and y.
+  // Length of a millimetre of height, in the unit of x and y.
   get stretch() {
     return this.unit * this.factor;
   }
 
-  // CSS pixels for a unit of x and y: at zoom 1 the whole fits, from whichever side.
+  // CSS pixels per unit of x and y: at zoom 1 everything fits, from any side.
   get scale() {
     const flat = Math.hypot(this.box.size[0], this.box.size[1]), tall = this.box.size[2] * this.stretch;
     const upwards = flat * Math.sin(this.elevation) + tall * Math.cos(this.elevation);
@@ -39,14 +39,14 @@ class View {
     return this.zoom * Math.max(Math.min(wide / flat, high / upwards), 1e-6);
   }
 
-  // To the right, upwards and towards the eye, in the surface's x, y and z.
+  // Directions to the right, upwards and towards the eye, in the surface's x, y and z.
   get directions() {
     const [ca, sa] = [Math.cos(this.azimuth), Math.sin(this.azimuth)];
     const [ce, se] = [Math.cos(this.elevation), Math.sin(this.elevation)];
     return [[ca, sa, 0], [-sa * se, ca * se, ce], [sa * ce, -ca * ce, se]];
   }
 
-  // What the scene is told.
+  // The parameters of the scene.
   get told() {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     return {
@@ -58,14 +58,14 @@ class View {
     };
   }
 
-  // Where a point of the surface's x, y and z is on the canvas.
+  // The position on the canvas of a point given in the surface's x, y and z.
   project(point) {
     const seen = point.map((value, k) => (value - this.box.centre[k]) * (k === 2 ? this.stretch : 1));
     const along = (direction) => direction.reduce((sum, value, k) => sum + value * seen[k], 0);
     return this.directions.slice(0, 2).map((one, k) => this.scale * along(one) + this.shift[k]);
   }
 
-  // What of the surface is seen at a place of the canvas, or null.
+  // The point of the surface visible at a position on the canvas, or null.
   pick(x, y) {
     const [right, up, eye] = this.directions, { centre, lowest, highest } = this.box;
     const [a, b] = [(x - this.shift[0]) / this.scale, (y - this.shift[1]) / this.scale];
@@ -82,13 +82,13 @@ class View {
     this.elevation = clamp(this.elevation + elevation, LOWEST, UPRIGHT);
   }
 
-  // Move the picture, but never all of it away.
+  // Move the picture, but keep part of it visible.
   move(x, y) {
     const room = [this.canvas.clientWidth, this.canvas.clientHeight].map((size) => ((this.zoom - 1) * size) / 2);
     this.shift = [x, y].map((by, k) => clamp(this.shift[k] + by, -room[k], room[k]));
   }
 
-  // Zoom, so that a place of the canvas stays where it is; tell whether anything changed.
+  // Zoom about a position on the canvas; return whether anything changed.
   zoomAt(x, y, times) {
     const before = this.zoom;
     this.zoom = clamp(before * times, 1, CLOSEST);

@@ -16,7 +16,7 @@ _GRAPHS: Mapping[str, tuple[str, str]] = {
     ),
     "histogram": ("Number of pixels with each height.", "Histogram of the heights"),
 }
-_ADDITIONS: Mapping[str, str] = {  # what the declarations of maps do not say about the colours of a figure
+_ADDITIONS: Mapping[str, str] = {  # notes on the colours of a figure
     "height": "Blue has no answer, and orange was filled, not measured.",
     "direction": "Red, green and blue are the components along x, y and z; edges are black.",
     "vectors": "Arrows show the direction.",
@@ -55,7 +55,7 @@ UNITS = (
     "A pixel without an answer is NaN in the file and empty in pictures. Every uncertainty is a standard "
     "uncertainty (k = 1).",
 )
-"""What holds for all numbers of a result."""
+"""Conventions for all numbers of a result."""
 
 PIXELS = "The pixel size of this result is unknown, so positions are in pixels from the centre."
 
@@ -74,7 +74,7 @@ _FIRST = (
     "calibration",
     "calibration_parts",
 )
-"""Entries of a process that are provenance; the others are parameters."""
+"""Process values that are provenance; the others are parameters."""
 
 _UNITS = {
     **dict.fromkeys(("tilt", "angle"), "rad"),
@@ -94,7 +94,7 @@ Rows = list[tuple[str, str]]
 
 
 def split_process(process: Mapping[str, object]) -> tuple[dict[str, Rows], dict[str, Rows]]:
-    """Split a result's process into parameters and provenance, as text."""
+    """Split the process of a result into parameters and provenance, as text."""
     parameters: dict[str, Rows] = {}
     provenance: dict[str, Rows] = {}
     for name, value in process.items():

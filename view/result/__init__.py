@@ -1,4 +1,4 @@
-"""Pictures of one result, for people."""
+"""Figures of one result."""
 
 from mirrorskin.view.result.figures import figures_of, overview, png_of
 

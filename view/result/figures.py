@@ -1,4 +1,4 @@
-"""Figures of one result: each of its pictures alone, or all on one page."""
+"""Figures of one result: a figure for each map, or all on one page."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ if TYPE_CHECKING:
     from mirrorskin.engine.metrology import Section
 
 Ends = tuple[tuple[float, float], tuple[float, float]]
-"""Where a section begins and ends, x and y, mm."""
+"""Ends of a section, x and y, mm."""
 
-_GRAPHS = "section", "histogram"  # which are no maps
+_GRAPHS = "section", "histogram"  # panels that are not maps
 _IN_A_ROW = 3  # panels
-# Inches: of a map, at its sides, below and above it, and above all.
+# Inches: width and largest height of a map; margins of a panel; margin and gap of the page.
 _WIDTH, _HIGHEST = 3.5, 5.2
 _LEFT, _RIGHT, _BELOW, _ABOVE = 0.95, 1.75, 0.6, 0.55
 _MARGIN, _GAP = 0.15, 0.2
 _NAME = 13  # points
-_LETTER, _LINE = 0.65 / 72, 1.45 / 72  # inches across and down that a letter takes, of a size of one point
+_LETTER, _LINE = 0.65 / 72, 1.45 / 72  # inches per point of the font size: width of a letter, line spacing
 
 
 @dataclass(frozen=True, slots=True)
 class _Panel:
-    """A picture of a result: its name, the function that draws it, and whether the overview includes it."""
+    """A panel: its name, the function that draws it, and whether the overview includes it."""
 
     name: str
     draw: Callable[[Axes], None]
@@ -49,23 +49,23 @@ class _Panel:
 def figures_of(
     result: Result, *, name: str, section: Ends | None = None, maps: Sequence[str] | None = None
 ) -> dict[str, Figure]:
-    """Draw each picture of a result as a figure of its own.
+    """Draw a figure for each map of a result.
 
     Parameters
     ----------
     result : Result
-        Of one turn. Without pixel size, pictures are drawn along pixels.
+        Maps of one turn. Without a pixel size, axes are in pixels.
     name : str
-        What the result is called in titles.
+        Name of the result in titles.
     section : ((float, float), (float, float)), optional
-        Where the section begins and ends, x and y, mm; without it, the row through the apex.
+        Ends of the section, x and y, mm; by default the row through the apex.
     maps : sequence of str, optional
         Names of maps, ``"section"`` or ``"histogram"``; by default those of the overview.
 
     Returns
     -------
     dict of str to Figure
-        By name: heights, section, histogram, then the other maps in the result's order.
+        By name: heights, section, histogram, then the other maps in the order of the result.
 
     Raises
     ------
@@ -81,18 +81,18 @@ def figures_of(
 def overview(
     result: Result, *, name: str, section: Ends | None = None, maps: Sequence[str] | None = None
 ) -> Figure:
-    """Draw all pictures of a result, or some, on one page; see ``figures_of``."""
+    """Draw all panels of a result, or some, on one page; see ``figures_of``."""
     sheet = sheet_of(result)
     return _figure(sheet, _chosen(sheet, name, section, maps), name)
 
 
 def png_of(figure: Figure, width_px: int) -> bytes:
-    """Return a figure as a PNG, width in pixels."""
+    """Return a figure as a PNG with a width in pixels."""
     return encode_figure(figure, width_px / figure.get_figwidth())
 
 
 def _chosen(sheet: Sheet, name: str, section: Ends | None, maps: Sequence[str] | None) -> list[_Panel]:
-    """Return the requested panels, by default those of the overview; or raise InputError."""
+    """Return the requested panels, by default those of the overview; InputError if one does not exist."""
     panels = list(_panels_of(sheet, section))
     has = list(dict.fromkeys(panel.name for panel in panels))
     lacking = [one for one in maps or () if one not in has]
@@ -106,7 +106,7 @@ def _chosen(sheet: Sheet, name: str, section: Ends | None, maps: Sequence[str] |
 
 
 def _panels_of(sheet: Sheet, section: Ends | None) -> Iterator[_Panel]:
-    """Yield what a result has: heights, their section and histogram, and all other maps."""
+    """Yield the panels of a result: heights, their section and histogram, and all other maps."""
     result = sheet.result
     height, cut = result.name_of("height"), _cut(sheet, section)
     if height is not None:
@@ -123,7 +123,7 @@ def _panels_of(sheet: Sheet, section: Ends | None) -> Iterator[_Panel]:
 
 
 def _cut(sheet: Sheet, ends: Ends | None) -> Section | None:
-    """Cut the heights, if there are any, and more than one along the way."""
+    """Return a section of the heights, if there are any, with more than one sample."""
     from mirrorskin.engine.metrology import section
 
     height = sheet.result.height
@@ -136,7 +136,7 @@ def _cut(sheet: Sheet, ends: Ends | None) -> Section | None:
 
 
 def _figure(sheet: Sheet, panels: Sequence[_Panel], name: str) -> Figure:
-    """Draw panels in rows, as high as the picture needs them, under one title."""
+    """Draw panels in rows, with the height that the maps need, under one title."""
     rows = math.ceil(len(panels) / _IN_A_ROW)
     columns = math.ceil(len(panels) / rows)
     maps = any(panel.name not in _GRAPHS for panel in panels)
@@ -149,7 +149,7 @@ def _figure(sheet: Sheet, panels: Sequence[_Panel], name: str) -> Figure:
     head = _MARGIN + sum(height for _, height in words) + _GAP
     size = wide * columns, tall * rows + head
     figure = new_figure(*size)
-    figure.set_layout_engine("none")  # all panels are alike, so that their places are plain arithmetic
+    figure.set_layout_engine("none")  # all panels have one size, so their positions are computed
     for number, panel in enumerate(panels):
         row, column = divmod(number, columns)
         corner = column * wide + _LEFT, (rows - 1 - row) * tall + _BELOW

@@ -1,4 +1,4 @@
-"""Maps of a result, drawn as their declarations say: heights, normals, vectors, codes and numbers."""
+"""Maps of a result, drawn according to their declarations: heights, normals, vectors, codes, numbers."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 
     from mirrorskin.engine.metrology import Section
 
-_BAR = 0.3  # of the picture's width: the longest scale bar
+_BAR = 0.3  # longest scale bar, relative to the picture's width
 _MARGIN = 0.05
-_EDGE = 0.1  # of the picture's width: room for a letter
+_EDGE = 0.1  # space for a letter, relative to the picture's width
 
 
 def draw_height(axes: Axes, sheet: Sheet, cut: Section | None = None) -> None:
-    """Draw heights by colour, with a scale bar, and where the section runs."""
+    """Draw heights by colour, with a scale bar, and the line of the section."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
@@ -64,7 +64,7 @@ def quantity(sheet: Sheet) -> str:
 
 
 def _notes(sheet: Sheet) -> Iterator[str]:
-    """Yield what the colours mean, and from where heights are measured."""
+    """Yield notes on the colours, and on the zero of the heights."""
     result, filled = sheet.result, sheet.filled
     assert result.height is not None
     if filled.any():
@@ -79,19 +79,19 @@ def _notes(sheet: Sheet) -> Iterator[str]:
 
 
 def _apart(low: float, high: float) -> tuple[float, float]:
-    """Part the ends of a scale that lie together."""
+    """Separate the ends of a scale that coincide."""
     return (low, high) if high > low else (low - 0.5, high + 0.5)
 
 
 def outlined(width: float) -> list[Any]:
-    """Return what keeps black lines and letters readable on any colour."""
+    """Return a path effect that keeps black lines and letters readable on any colour."""
     from matplotlib.patheffects import withStroke
 
     return [withStroke(linewidth=width, foreground="white")]
 
 
 def _draw_scale(axes: Axes, sheet: Sheet) -> None:
-    """Draw a bar of a round length in the lower left corner."""
+    """Draw a scale bar of a round length in the lower left corner."""
     left, right, bottom, top = sheet.place
     length = round_length(_BAR * (right - left))
     margin = _MARGIN * min(right - left, top - bottom)
@@ -111,7 +111,7 @@ def _draw_scale(axes: Axes, sheet: Sheet) -> None:
 
 
 def _draw_line(axes: Axes, sheet: Sheet, cut: Section) -> None:
-    """Draw the line of a section, and its ends A and B beyond it, or within where it ends at the edge."""
+    """Draw the line of a section, with A and B beyond its ends, or inside where an end is near the edge."""
     (line,) = axes.plot(cut.x[[0, -1]], cut.y[[0, -1]], color="black", lw=1, ls=(0, (6, 3)))
     line.set_path_effects(outlined(2.5))
     left, right, _, top = sheet.place
@@ -137,7 +137,7 @@ def _draw_line(axes: Axes, sheet: Sheet, cut: Section) -> None:
 def height_picture(
     height: NDArray[np.float32], filled: NDArray[np.bool_], span: tuple[float, float]
 ) -> Colours:
-    """Return the colours of heights, (H, W, 3): those of the scale, and what was filled in orange."""
+    """Return the colours of heights, (H, W, 3): those of the scale, and orange for filled heights."""
     from matplotlib import colormaps
     from matplotlib.colors import Normalize
 
@@ -155,7 +155,7 @@ _KEY = 129  # pixels of the key along a side
 
 
 def draw_normals(axes: Axes, sheet: Sheet, name: str = "normals") -> None:
-    """Draw unit vectors as colours, edges black, and next to them a half-ball that explains the colours."""
+    """Draw unit vectors as colours, with black edges, and a half-ball next to them as a colour key."""
     result = sheet.result
     normals = result[name]
     colours = normal_colours(normals, result.edges)
@@ -168,7 +168,7 @@ def draw_normals(axes: Axes, sheet: Sheet, name: str = "normals") -> None:
 
 
 def _draw_key(axes: Axes) -> None:
-    """Draw the colours of all normals there are, on a half-ball seen from above."""
+    """Draw the colours of all normals on a half-ball seen from above."""
     across = np.linspace(-1, 1, _KEY, dtype=np.float32)
     right, up = np.meshgrid(across, across[::-1])
     rest = 1 - right**2 - up**2
@@ -186,7 +186,7 @@ def _draw_key(axes: Axes) -> None:
 
 _ARROWS = 12  # along a side
 _SHOWN = 1, 99  # percentiles at the ends of the colour scale
-_DECADES = 30.0  # ratio of these from which colours show the logarithm
+_DECADES = 30.0  # ratio of these above which the scale is logarithmic
 _SIGNED_SHOWN = 99.0  # percentile of the magnitude at the ends of a diverging scale
 _UNDEFINED_NOTE = "blue: no answer"
 _UNKNOWN_CODE = "unknown number"
@@ -195,11 +195,11 @@ _CODE_COLOURS = (
     *("#009e73", "0.25", "#f0e442", "#56b4e9", "#d55e00", "#cc79a7", "#0072b2", "#e69f00"),
     *("#999999", "#661100", "#117733", "#88ccee", "#ddcc77", "#aa4499", "#44aa99", "#332288"),
 )
-"""Colours of codes, but the one that marks an undefined pixel; more codes than these repeat them."""
+"""Colours of codes, except for the one of undefined pixels; they repeat if there are more codes."""
 
 
 def draw_declared(axes: Axes, sheet: Sheet, name: str) -> None:
-    """Draw a map as its declaration says: heights, directions, vectors, codes, or numbers by colour."""
+    """Draw a map according to its declaration: heights, directions, vectors, codes, or numbers."""
     result = sheet.result
     declared = result.declaration(name)
     values = result[name]
@@ -237,7 +237,7 @@ def _draw_vectors(axes: Axes, sheet: Sheet, values: Floats, name: str, declared:
 
 
 def _draw_numbers(axes: Axes, sheet: Sheet, values: Floats, name: str, declared: Map) -> None:
-    """Draw numbers by colour; positive ones that span decades by their logarithm."""
+    """Draw numbers by colour; positive ones that span decades on a logarithmic scale."""
     from matplotlib.colors import LogNorm, Normalize
 
     known = values[np.isfinite(values)]
@@ -253,7 +253,7 @@ def _draw_numbers(axes: Axes, sheet: Sheet, values: Floats, name: str, declared:
 
 
 def _draw_signed(axes: Axes, sheet: Sheet, values: Floats, name: str, declared: Map) -> None:
-    """Draw numbers of either sign, by colours that diverge about zero."""
+    """Draw signed numbers with diverging colours."""
     known = np.abs(values[np.isfinite(values)])
     side = float(np.percentile(known, _SIGNED_SHOWN)) if known.any() else 1.0
     ends = exceeded(values, -side, side)
@@ -263,7 +263,7 @@ def _draw_signed(axes: Axes, sheet: Sheet, values: Floats, name: str, declared: 
 
 
 def _draw_angles(axes: Axes, sheet: Sheet, values: Floats, name: str, declared: Map) -> None:
-    """Draw angles, in degrees, by colours that are the same at both ends of the scale."""
+    """Draw angles, in degrees, with cyclic colours."""
     angle = np.degrees(np.angle(np.exp(1j * values / declared.figure_scale)))
     draw_map(axes, sheet, angle, f"{name.replace('_', ' ')} (deg)", cmap=CYCLIC, vmin=-180, vmax=180)
     axes.child_axes[0].set_yticks(range(-180, 181, 90))
@@ -275,7 +275,7 @@ def _missing_note(values: Floats) -> str:
 
 
 def _draw_codes(axes: Axes, sheet: Sheet, name: str) -> None:
-    """Draw a categorical map, with its legend and the share of pixels that each code has."""
+    """Draw a categorical map, with a legend and the share of pixels with each code."""
     declared, values = sheet.result.declaration(name), sheet.result[name]
     codes = sorted(declared.codes)
     places = np.clip(np.searchsorted(codes, values), 0, len(codes) - 1)
@@ -285,7 +285,7 @@ def _draw_codes(axes: Axes, sheet: Sheet, name: str) -> None:
 
 
 def _colours_of(declared: Map) -> tuple[str, ...]:
-    """Return the colours of codes in their order, and that of numbers which are not in the legend."""
+    """Return the colours of codes in their order, then the colour of numbers missing in the legend."""
     if len(declared.codes) == 2:
         return (*_FLAG_COLOURS, "white")
     others = itertools.cycle(_CODE_COLOURS)
@@ -298,7 +298,7 @@ def _colours_of(declared: Map) -> tuple[str, ...]:
 def _draw_shares(
     axes: Axes, sheet: Sheet, classes: NDArray[np.uint8], colours: tuple[str, ...], names: tuple[str, ...]
 ) -> None:
-    """Draw classes with the share of pixels that each has."""
+    """Draw classes with the share of pixels in each."""
     counts = np.bincount(classes.ravel(), minlength=len(names) + 1)
     labels = {
         number: f"{name}\n{percent(int(counts[number]), classes.size)}"

@@ -1,4 +1,4 @@
-"""Graphs of a result's heights: along a section, and how often each occurs."""
+"""Graphs of the heights of a result: a section, and a histogram."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ if TYPE_CHECKING:
 
     from mirrorskin.engine.metrology import Section
 
-_ROOM = 1.15  # times the heights' range
-_TIMES = 1, 3, 10, 30, 100, 300, 1000  # standard deviations of a band
-_TAIL = 0.1  # of the colours' range, by which that of the histogram is wider
-_SEEN = 0.05  # share of the heights' range that a band can be seen at
-_NEAR = 0.1  # of the width: so near to the side words lean inwards
+_ROOM = 1.15  # range of the axis, relative to the range of the heights
+_TIMES = 1, 3, 10, 30, 100, 300, 1000  # possible widths of the band, in standard deviations
+_TAIL = 0.1  # excess of the histogram's range over the range of the colours
+_SEEN = 0.05  # smallest visible width of a band, relative to the range of the heights
+_NEAR = 0.1  # of the width: labels closer to a side are aligned inwards
 
 
 def draw_section(axes: Axes, sheet: Sheet, cut: Section) -> None:
-    """Draw heights along a section, with a band of as many standard deviations as can be seen.
+    """Draw heights along a section, with a band of enough standard deviations to be visible.
 
-    What was filled is dashed; a hole is a gap; the highest measured point is marked.
+    Filled heights are dashed; a hole is a gap; the highest measured point is marked.
     """
     measured = np.where(cut.filled, np.nan, cut.height)
     if np.isfinite(measured).any():
@@ -63,13 +63,13 @@ def draw_section(axes: Axes, sheet: Sheet, cut: Section) -> None:
 
 
 def _visible(cut: Section) -> int:
-    """Return how many standard deviations make a band that can be seen."""
+    """Return the number of standard deviations that makes the band visible."""
     spread, sigma = float(np.nanmax(cut.height) - np.nanmin(cut.height)), float(np.nanmedian(cut.sigma))
     return next((times for times in _TIMES if times * sigma >= _SEEN * spread), _TIMES[-1])
 
 
 def _joined(cut: Section) -> Floats:
-    """Return the heights that were filled, and the measured ones beside them, so that lines meet."""
+    """Return the filled heights, and the adjacent measured ones, so that the lines connect."""
     near: NDArray[np.bool_] = cut.filled.copy()
     near[1:] |= cut.filled[:-1]
     near[:-1] |= cut.filled[1:]
@@ -94,7 +94,7 @@ def _draw_apex(axes: Axes, distance: Floats, height: Floats) -> None:
 
 
 def _scale(axes: Axes, sheet: Sheet, cut: Section) -> str:
-    """Give the panel its limits, such that heights are a round number of times as large; say how many."""
+    """Set the limits of the panel so that the vertical exaggeration is a round number; return it as text."""
     axes.set_box_aspect(BOX)
     length = float(cut.distance[-1] - cut.distance[0]) or 1.0
     axes.set_xlim(float(cut.distance[0]), float(cut.distance[0]) + length)
@@ -113,7 +113,7 @@ def _scale(axes: Axes, sheet: Sheet, cut: Section) -> str:
 
 
 def _ends(cut: Section, unit: str) -> str:
-    """Tell where the section begins and ends."""
+    """Return the ends of the section as text."""
     a, b = (f"({cut.x[place]:.3g}, {cut.y[place]:.3g})" for place in (0, -1))
     return f"A {a} to B {b} {unit}"
 
@@ -122,7 +122,7 @@ _BINS = 60
 
 
 def draw_histogram(axes: Axes, sheet: Sheet) -> None:
-    """Draw how many pixels have a height, those that were filled on top of those that were measured."""
+    """Draw a histogram of heights, filled ones stacked on measured ones."""
     height = sheet.result.height
     assert height is not None
     parts = [height[np.isfinite(height) & (sheet.filled == filled)] for filled in (False, True)]
@@ -155,7 +155,7 @@ def draw_histogram(axes: Axes, sheet: Sheet) -> None:
 
 
 def _shown(known: Floats) -> tuple[float, float]:
-    """Return the range of heights but for a few pixels far from all others."""
+    """Return the range of heights, except for a few pixels far from all others."""
     low, high = span(known)
     room = _TAIL * (high - low)
     return low - room, high + room

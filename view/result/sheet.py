@@ -1,4 +1,4 @@
-"""Page coordinates of a result's maps, in millimetres or in pixels, and titles and axes of panels."""
+"""Coordinates of the maps of a result, in millimetres or pixels, and titles and axes of panels."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
 SMALL, TEXT, TITLE = 9, 10.5, 12.5
-"""Sizes of letters, points."""
+"""Font sizes, points."""
 BOX = 0.62
-"""Height over width of a panel that is no map."""
+"""Height over width of a panel that is not a map."""
 
-_LONGEST = 8  # times as long as wide, and a picture is no longer drawn true to scale
+_LONGEST = 8  # aspect ratio above which a picture is not drawn to scale
 
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """The maps of a result of one turn, and where its pixels are.
+    """The maps of one turn of a result, and the positions of its pixels.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Sheet:
     x, y : ndarray, (W,) and (H,), float64
         Pixel centres from the picture's centre.
     unit : {"mm", "px"}
-        Of ``x`` and ``y``: pixels where their size is not known. That of heights is always mm.
+        Unit of ``x`` and ``y``: pixels if their size is unknown. Heights are always in mm.
     """
 
     result: Result
@@ -50,25 +50,25 @@ class Sheet:
 
     @property
     def proportion(self) -> float:
-        """How many times as wide as it is high the picture is."""
+        """Width over height of the picture."""
         left, right, bottom, top = self.place
         return (right - left) / (top - bottom)
 
     @property
     def true_to_scale(self) -> bool:
-        """Whether pictures are drawn as wide and high as they are: not a single row."""
+        """Whether the picture is drawn to scale, which a single row is not."""
         return 1 / _LONGEST <= self.proportion <= _LONGEST
 
     @property
     def filled(self) -> NDArray[np.bool_]:
-        """Where the height was not measured but filled, (H, W)."""
+        """Where the height was filled, not measured, (H, W)."""
         assert self.result.height is not None
         known: NDArray[np.bool_] = np.isfinite(self.result.height)
         return np.zeros_like(known) if self.result.filled is None else known & (self.result.filled > 0)
 
 
 def sheet_of(result: Result) -> Sheet:
-    """Lay out a result."""
+    """Return the coordinates of a result."""
     result = select_turn(result, None)
     if result.x is not None and result.y is not None:
         return Sheet(result, result.x, result.y, "mm")
@@ -77,14 +77,14 @@ def sheet_of(result: Result) -> Sheet:
 
 
 def draw_map(axes: Axes, sheet: Sheet, values: NDArray[Any], label: str = "", **colours: Any) -> AxesImage:
-    """Draw a map at its place; see ``draw_image``."""
+    """Draw a map at its coordinates; see ``draw_image``."""
     picture = draw_image(axes, values, sheet.place, label, **colours)
     lay_out(axes, sheet)
     return picture
 
 
 def lay_out(axes: Axes, sheet: Sheet) -> None:
-    """Give a map its axes and proportions."""
+    """Set the axes and proportions of a map."""
     axes.set_aspect("equal" if sheet.true_to_scale else "auto")
     if not sheet.true_to_scale:
         axes.set_box_aspect(0.5 if sheet.proportion > 1 else 2.0)
@@ -99,9 +99,9 @@ def lay_out(axes: Axes, sheet: Sheet) -> None:
 
 
 def entitle(axes: Axes, title: str, note: str = "") -> None:
-    """Write a title above a panel, and a note in smaller letters below it."""
+    """Add a title to a panel, and a note in smaller letters below it."""
     axes.set_title(title, loc="left", fontsize=TITLE, weight="bold", pad=18, parse_math=False)
-    axes.set_anchor("NW")  # the titles of a row in line
+    axes.set_anchor("NW")  # aligns the titles of a row
     axes.annotate(
         note,
         (0, 1),
@@ -115,6 +115,6 @@ def entitle(axes: Axes, title: str, note: str = "") -> None:
 
 
 def percent(part: int, whole: int) -> str:
-    """Write a share, as in "12.3 %"; one that is not nothing never looks like nothing."""
+    """Return a share as text, as in "12.3 %"; a share above 0 is never printed as 0."""
     share = 100 * part / whole
     return "< 0.1 %" if 0 < share < 0.05 else f"{share:.1f} %"

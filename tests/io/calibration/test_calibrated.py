@@ -198,7 +198,9 @@ def test_a_rotation_by_another_tilt_is_refused(tilt, fits):
     if fits:
         assert calibrated(["precession"], source).header.tilt == 0.04
         return
-    with pytest.raises(io.InputError, match=r"of a tilt of 2.29 deg, made up of .* calibrate the tilt again"):
+    with pytest.raises(
+        io.InputError, match=r"for a tilt of 2.29 deg, but that of made up is .* calibrate the tilt again"
+    ):
         calibrated(["precession"], source)
 
 

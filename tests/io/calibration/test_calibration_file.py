@@ -176,19 +176,19 @@ def without(name):
         (a_version(0), "older layout, 0, where 1 is read: calibrate again"),
         (a_version(2), "newer layout, 2, where 1 is read: update the program, or calibrate again"),
         (without("camera"), "there is no /entry/camera/name: calibrate again"),
-        (a_value("camera/shape", [5, 0]), "which no picture has: calibrate again"),
+        (a_value("camera/shape", [5, 0]), "which is not a picture size: calibrate again"),
         (a_value("camera/shape", [5, 8]), r"\(5, 7\) where \(5, 8\) is needed: calibrate again"),
-        (a_value("camera/dtype", "int64"), "'int64', which no camera here gives: calibrate again"),
+        (a_value("camera/dtype", "int64"), "'int64', which is not a supported data type: calibrate again"),
         (without("references/dark"), "references has no dark: calibrate again"),
         (a_value("references/dark", "grey"), "holds no numbers: calibrate again"),
-        (a_value("scale/pixel_size", [0.1, 0.0]), r"\(0.1, 0.0\), which cannot be: calibrate again"),
+        (a_value("scale/pixel_size", [0.1, 0.0]), r"\(0.1, 0.0\), which is invalid: calibrate again"),
         (a_value("scale/shape", [5.0, np.inf]), "whole numbers are needed: calibrate again"),
-        (a_value("zenith/pattern", "striped"), "striped, which cannot be: calibrate again"),
+        (a_value("zenith/pattern", "striped"), "striped, which is invalid: calibrate again"),
         (a_value("zenith/pattern", [1, 2]), "does not hold one value"),
         (a_value("zenith/curve", [0.9, np.nan]), "curve has numbers that are not finite: calibrate again"),
         (a_value("zenith/parameters", [1.0, 2.0]), "no list of texts: calibrate again"),
         (a_value("zenith/parameters", ["radius"]), r"\(2, 2\) where \(1, 1\) is needed: calibrate again"),
-        (a_value("tilt/direction", 2), "is 2, which cannot be: calibrate again"),
+        (a_value("tilt/direction", 2), "is 2, which is invalid: calibrate again"),
         (a_value("tilt/sigma/tilt", "much"), "holds no numbers: calibrate again"),
     ],
 )
@@ -205,7 +205,7 @@ def test_what_is_no_calibration_is_told(path, tmp_path):
     with pytest.raises(io.InputError, match="no such file"):
         io.open_calibration(path)
     record(sphere(), path)
-    with pytest.raises(io.InputError, match="is no calibration: 'mirrorskin calibrate' makes one"):
+    with pytest.raises(io.InputError, match="is not a calibration: 'mirrorskin calibrate' creates one"):
         io.open_calibration(path)
     path.write_text("dark = 12")
     with pytest.raises(io.InputError, match="not an HDF5 file"):

@@ -24,7 +24,7 @@ def refused(result, path, **options):
 
 
 @pytest.mark.parametrize(
-    ("name", "wrong"), [("out.obj", "obj is no format"), ("out", "its name does not say a format")]
+    ("name", "wrong"), [("out.obj", "obj is not a supported format"), ("out", "its name has no suffix")]
 )
 def test_a_suffix_that_is_unknown_names_those_that_are_known(slope, tmp_path, name, wrong):
     line = refused(slope, tmp_path / name)
@@ -40,7 +40,10 @@ def test_a_suffix_that_is_unknown_names_those_that_are_known(slope, tmp_path, na
     [
         ({"x": None, "y": None}, "the result has no pixel size: reconstruct it again with --pixel-size, or"),
         ({"height": None}, ": the result has no heights: reconstruct it again with them, or export"),
-        ({"height": np.full((6, 9), np.nan, np.float32)}, ": no height of the result is known: look at its"),
+        (
+            {"height": np.full((6, 9), np.nan, np.float32)},
+            "no pixel of the result has a height: look at its",
+        ),
     ],
 )
 def test_what_needs_millimetres_is_not_made_without(slope, tmp_path, name, change, line):
@@ -57,7 +60,7 @@ def test_a_single_row_is_no_surface(tmp_path, name, shape):
     x, y = io.pixel_axes(shape, (0.5, 0.5))
     row = io.Result(height=np.zeros(shape, np.float32), x=x, y=y)
     line = refused(row, tmp_path / name)
-    assert line == ": no three known heights are neighbours, so there is no surface: export points, .xyz"
+    assert line == ": no three adjacent pixels have heights, so there is no surface: export points, .xyz"
     assert not list(tmp_path.iterdir())
 
 
