@@ -137,6 +137,8 @@ class Operation(ThreadSafe, OnDevice):
         for name, wrap in _WRAPPERS.items():
             if name in vars(cls):
                 setattr(cls, name, wrap(vars(cls)[name]))
+        if "room" in vars(cls):
+            cls.room = _checked_room(vars(cls)["room"])  # type: ignore[assignment]
         super().__init_subclass__(**kwargs)
 
     def __init__(self, **options: Any) -> None:
@@ -240,6 +242,7 @@ class Operation(ThreadSafe, OnDevice):
     @cached_property
     def room(self) -> NDArray[Any]:
         """Array in which the next frames may be written before they are pushed, (n, H, W)."""
+        _check_started(self)
         rows, columns = self.shape
         at_once = max(1, self.memory_limit // (2 * rows * columns * self.dtype.itemsize))
         return np.empty((at_once, rows, columns), self.dtype)
@@ -334,6 +337,23 @@ def _checked_result(method: Callable[..., Any]) -> Callable[..., Result]:
             raise InputError(f"{name}.result(): {error}") from error
 
     return result
+
+
+def _check_started(operation: Operation) -> None:
+    """Raise InputError if the shape of the frames is unknown."""
+    if operation.shape is None:
+        name = type(operation).__name__
+        raise InputError(f"{name} does not know the shape of the frames yet. Call begin(shape, dtype) first")
+
+
+def _checked_room(member: property | cached_property[Any]) -> property:
+    """Return the property ``room`` of an operation, which needs the shape of the frames."""
+
+    def room(self: Operation) -> NDArray[Any]:
+        _check_started(self)
+        return cast("NDArray[Any]", member.__get__(self, type(self)))
+
+    return property(room, doc=member.__doc__)
 
 
 _WRAPPERS: Mapping[str, Callable[[Any], Any]] = {

@@ -63,7 +63,8 @@ def test_a_whole_run_shows_how_far_the_body_has_come():
 
 
 @pytest.mark.parametrize(
-    ("given", "told"), [(source("vertical"), "Sliding needs horizontal or twist motion"), (source(pixel_size=None), "pixel size")]
+    ("given", "told"),
+    [(source("vertical"), "Sliding needs horizontal or twist"), (source(pixel_size=None), "pixel size")],
 )
 def test_what_tells_no_slip_is_refused(given, told):
     with pytest.raises(InputError, match=told):

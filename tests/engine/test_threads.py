@@ -1,4 +1,4 @@
-"""Estimators in several threads: one pushes, others look on, and every answer is that of a single thread."""
+"""Operations in several threads: one pushes, others look on, and every answer is that of one thread."""
 
 import importlib
 import inspect
@@ -10,158 +10,58 @@ from dataclasses import fields, is_dataclass
 from functools import cached_property, partial
 
 import numpy as np
+import operations
 import pytest
-from live_frames import paced, phases, press_frames, press_header, turn_frames, turn_header
-from speckle import Speckle
-from stacks import MadeUp
 
 from mirrorskin import engine
-from mirrorskin.bench.scenes import SCALES, TILT
 from mirrorskin.engine import live
 from mirrorskin.engine.live.status import STAGES, Monitor
-from mirrorskin.engine.press.estimated_levels import EstimatedLevels, EstimatedLevelSearch
-from mirrorskin.engine.press.levels import LevelSearch
-from mirrorskin.engine.rotation.normals_window import NormalWindow
 from mirrorskin.engine.thread_safe import ThreadSafe
-from mirrorskin.io import Header, InputError
-from mirrorskin.io.types import body_axes
-
-PIECES, SHAPE = 60, (24, 32)
-TRAVEL = np.linspace(0, 1.2, 2 * PIECES)
-STROKES = 0.6 - 0.6 * np.cos(0.15 * np.arange(2 * PIECES))
-PRESS = press_frames((2 * PIECES, *SHAPE))
-PHASE = phases(2 * PIECES)
-TURNS = turn_frames((2 * PIECES, *SHAPE))
-OFFSET, GAIN, NOISE = SCALES["uint8"]
-SCALE = {"gain": GAIN, "offset": OFFSET, "noise": NOISE}
-LEAN = 0.05 * np.sin(0.8 * np.arange(2 * PIECES))
-ROCKED = np.clip(120 + 400 * LEAN[:, None, None] + np.zeros(SHAPE), 0, 255).astype(np.uint8)
-PIXEL = 0.05
-SLIDE = np.arange(PIECES)[:, None] * [0.006, 0.003]
-SKIN = np.stack([Speckle(3).frame((64, 72), -x / PIXEL, y / PIXEL, 1.0, k) for k, (x, y) in enumerate(SLIDE)])
-LIGHTS = np.stack([np.cos(PHASE), np.sin(PHASE), np.ones(len(PHASE))], axis=1)
-
-
-class Brightest:
-    """An estimator of a user's, which returns its own map."""
-
-    def __init__(self, shape, dtype):
-        self.most = np.zeros(shape, dtype)
-
-    def reset(self):
-        self.most[:] = 0
-
-    def push(self, frames):
-        for frame in frames:
-            np.maximum(self.most, frame, out=self.most)
-
-    def result(self):
-        return {"brightest": self.most, "height": self.most.astype(np.float32)}
+from mirrorskin.io import InputError
 
 
 class Pushes:
-    """How an estimator is made, the pushes that it gets, and what other threads call meanwhile."""
+    """How an object is made, the pushes that it gets, and what other threads call meanwhile."""
 
-    def __init__(self, make, frames, reads=("result",), each=2, every=True, looks=10**6, **known):
-        self.make, self.reads, self.every, self.looks = make, reads, every, looks
-        cuts = [slice(start, start + each) for start in range(0, len(frames), each)]
-        self.pieces = [
-            ((frames[cut],), {name: values[cut] for name, values in known.items()}) for cut in cuts
-        ]
+    def __init__(self, make, pieces, reads=("result",), every=True, looks=10**6):
+        self.make, self.pieces, self.reads, self.every, self.looks = make, pieces, reads, every, looks
+
+
+def pushes(name):
+    """Return the pushes of an operation, two frames each; slow results are asked for less often."""
+    case, slow = operations.CASES[name], name in ("Slip", "LastTurn")
+    pieces = [
+        (
+            (case.frames[start : start + 2],),
+            {one: values[start : start + 2] for one, values in case.positions.items()},
+        )
+        for start in range(0, len(case.frames), 2)
+    ]
+    return Pushes(case.make, pieces, ("result", "room"), every=not slow, looks=10 if slow else 10**6)
+
+
+def live_pushes(name):
+    """Return the pushes of an operation that runs live."""
+    case, offline = operations.CASES[name], pushes(name)
+    return Pushes(
+        lambda: live.LiveOperation(case.source(), case.make()),
+        offline.pieces,
+        ("result", "maps"),
+        offline.every,
+        offline.looks,
+    )
 
 
 def slopes(number):
     return (0.01 * number * np.ones(SHAPE), np.linspace(0, 0.02 * number, SHAPE[1]) * np.ones(SHAPE))
 
 
-def integrations():
-    case = Pushes(partial(engine.Integrator, SHAPE, 0.1), [])
-    case.pieces = [(slopes(number), {}) for number in range(PIECES)]
-    return case
-
-
-def rocking():
-    source = MadeUp(ROCKED, Header("axial", pixel_size=(PIXEL, PIXEL), zenith_gain=np.asarray(400.0)))
-    return live.LiveRocking(source, noise=1.0)
-
-
-SEEN = ("result", "travel", "room")
-PICTURE = (SHAPE, "uint8")
-LEVELS = EstimatedLevels(20.0, 230.0, 1.0, 2.0)
+SHAPE = operations.SHAPE
+ONCE = [name for name, case in operations.CASES.items() if case.make().passes == 1]
 CASES = {
-    "OnsetSearch": Pushes(partial(engine.OnsetSearch, *PICTURE), PRESS, (*SEEN, "noise"), travel=TRAVEL),
-    "LevelSearch": Pushes(partial(LevelSearch, *PICTURE, [0.3, 0.7]), PRESS, SEEN, travel=TRAVEL),
-    "EstimatedLevelSearch": Pushes(
-        partial(EstimatedLevelSearch, *PICTURE, LEVELS, threshold=0.5), PRESS, SEEN, travel=TRAVEL
-    ),
-    "StrokeSearch": Pushes(partial(engine.StrokeSearch, *PICTURE), PRESS, (*SEEN, "onset"), travel=STROKES),
-    "ChangePointSearch": Pushes(
-        partial(engine.ChangePointSearch, *PICTURE, dark=20, bright=230), PRESS, SEEN, travel=TRAVEL
-    ),
-    "Correlator": Pushes(partial(engine.Correlator, *PICTURE), TURNS, ("result", "room"), phase=PHASE),
-    "Correlator of a window": Pushes(
-        partial(engine.Correlator, *PICTURE, window=8), TURNS, ("result", "room"), phase=PHASE
-    ),
-    "NormalEstimator": Pushes(
-        partial(engine.NormalEstimator, *PICTURE, tilt=TILT, **SCALE), TURNS, ("result", "room"), phase=PHASE
-    ),
-    "NormalEstimator of each turn": Pushes(
-        partial(engine.NormalEstimator, *PICTURE, tilt="estimate", gain=GAIN, offset=OFFSET, per_turn=True),
-        TURNS,
-        phase=PHASE,
-    ),
-    "PoseEstimator": Pushes(
-        partial(engine.PoseEstimator, *PICTURE, gain=400, noise=1.0), ROCKED, pose=body_axes(0 * LEAN, LEAN)
-    ),
-    "NormalWindow": Pushes(
-        partial(NormalWindow, *PICTURE, window=8, tilt=TILT, **SCALE),
-        TURNS,
-        ("result", "correlation", "is_full", "room"),
-        phase=PHASE,
-    ),
-    "SlipSearch": Pushes(
-        partial(engine.SlipSearch, (64, 72), SKIN.dtype, PIXEL),
-        SKIN,
-        ("result", "newest", "room"),
-        each=1,
-        every=False,
-        looks=10,
-        displacement=SLIDE,
-    ),
-    "FringeEstimator": Pushes(partial(engine.FringeEstimator, *PICTURE), TURNS, phase=PHASE),
-    "FocusEstimator": Pushes(partial(engine.FocusEstimator, *PICTURE, noise=2.0), PRESS, travel=TRAVEL),
-    "PhotometricStereo": Pushes(partial(engine.PhotometricStereo, *PICTURE), TURNS, light=LIGHTS),
-    "Integrator": integrations(),
-    "LivePress": Pushes(
-        lambda: live.LivePress(paced(PRESS, press_header(), STROKES)),
-        PRESS,
-        ("result", "maps"),
-        travel=STROKES,
-    ),
-    "LiveRotation": Pushes(
-        lambda: live.LiveRotation(paced(TURNS, turn_header(), PHASE), window=8, noise=NOISE),
-        TURNS,
-        ("result", "maps", "normals", "correlation", "room"),
-        every=False,
-        looks=10,
-        phase=PHASE,
-    ),
-    "LiveRocking": Pushes(rocking, ROCKED, ("result", "maps"), pose=body_axes(0 * LEAN, LEAN)),
-    "LiveSlip": Pushes(
-        lambda: live.LiveSlip(MadeUp(SKIN, Header("horizontal", pixel_size=(PIXEL, PIXEL)))),
-        SKIN,
-        ("result", "maps"),
-        each=1,
-        every=False,
-        looks=10,
-        displacement=SLIDE,
-    ),
-    "LiveOwn": Pushes(
-        lambda: live.LiveOwn(paced(PRESS, press_header(), TRAVEL), Brightest),
-        PRESS,
-        ("result", "maps"),
-        travel=TRAVEL,
-    ),
+    **{name: pushes(name) for name in ONCE},
+    **{f"live {name}": live_pushes(name) for name in ("Strokes", "LastTurn", "MovingNormals", "Slip")},
+    "Integrator": Pushes(partial(engine.Integrator, SHAPE, 0.1), [(slopes(n), {}) for n in range(60)]),
 }
 
 
@@ -239,29 +139,21 @@ def test_each_answer_beside_pushes_is_that_of_a_single_thread(name):
     assert all(digest(answer) == before for answer, before in kept)  # nothing wrote to them later
 
 
-def classes():
-    """Return the classes of the engine that are pushed to, and answer."""
+def test_every_class_that_is_pushed_to_is_thread_safe():
     modules = [
         importlib.import_module(one.name)
         for one in pkgutil.walk_packages(engine.__path__, "mirrorskin.engine.")
         if not one.name.startswith("mirrorskin.engine.batch")
     ]
-    return {
+    public = {
         one
         for module in modules
-        for one in vars(module).values()
-        if inspect.isclass(one) and one.__module__.startswith("mirrorskin.engine.")
-        if callable(getattr(one, "push", None)) and not getattr(one, "_is_protocol", False)
-        if callable(getattr(one, "result", None)) or one.__name__ in engine.__all__
+        for name, one in vars(module).items()
+        if inspect.isclass(one) and one.__module__ == module.__name__ and not name.startswith("_")
+        if callable(getattr(one, "push", None)) and callable(getattr(one, "result", None))
     }
-
-
-def test_every_estimator_is_thread_safe_and_hammered():
-    found = classes()
-    assert not {one.__name__ for one in found if not issubclass(one, ThreadSafe)}
-    hammered = {name.split()[0] for name in CASES}
-    # The tracker has no method but push; the other is part of LiveRotation.
-    assert {one.__name__ for one in found} - hammered == {"PoseTracker", "WarmStartIntegrator"}
+    inside = {"NormalWindow", "WarmStartIntegrator"}  # used by one operation, under its lock
+    assert {one.__name__ for one in public if not issubclass(one, ThreadSafe)} <= inside
 
 
 class Meeting(ThreadSafe):
@@ -357,14 +249,16 @@ def test_threads_that_integrate_at_once_get_what_each_gets_alone():
     assert found == alone * 3
 
 
-@pytest.mark.parametrize("kind", [engine.OnsetSearch, engine.StrokeSearch])
-def test_an_estimator_that_refuses_frames_goes_on_as_if_they_had_not_come(kind):
-    search, whole = kind(*PICTURE), kind(*PICTURE)
-    whole.push(PRESS, travel=TRAVEL)
-    search.push(PRESS[:50], travel=TRAVEL[:50])
-    back = TRAVEL[40::-1]
-    for frames, travel in ((PRESS[:41, 1:], back), (PRESS[:41].astype(np.uint16), back), (PRESS[:9], [1.0])):
+@pytest.mark.parametrize("kind", [engine.Onset, engine.Strokes])
+def test_an_operation_that_refuses_frames_goes_on_as_if_they_had_not_come(kind):
+    frames, travel = operations.PRESS, operations.TRAVEL
+    search, whole = kind(), kind()
+    whole.push(frames, travel=travel)
+    search.push(frames[:20], travel=travel[:20])
+    back = travel[15::-1]
+    refused = ((frames[:16, 1:], back), (frames[:16].astype(np.uint16), back), (frames[:9], [1.0]))
+    for wrong, where in refused:
         with pytest.raises(InputError), ThreadPoolExecutor(1) as pool:
-            pool.submit(search.push, frames, travel=travel).result()
-    search.push(PRESS[50:], travel=TRAVEL[50:])
+            pool.submit(search.push, wrong, travel=where).result()
+    search.push(frames[20:], travel=travel[20:])
     assert digest(search.result()) == digest(whole.result())

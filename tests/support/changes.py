@@ -91,4 +91,5 @@ def assert_near(found, expected, travel):
     gap = np.abs(found.height - expected.height)[answered]
     # The weights of hypotheses have the rounding of the misfit, in square sigmas, of float32.
     assert np.all(gap <= 0.01 * expected.height_sigma[answered] + 1e-6 * np.max(np.abs(travel)))
-    np.testing.assert_allclose(found.height_sigma[answered], expected.height_sigma[answered], rtol=0.02, atol=1e-7)
+    sigma, exact_sigma = (one.height_sigma[answered] for one in (found, expected))
+    np.testing.assert_allclose(sigma, exact_sigma, rtol=0.02, atol=1e-7)

@@ -105,4 +105,5 @@ def assert_within_an_ulp(found, expected, travel):
         np.float32(np.max(np.abs(np.diff(travel))))
     )
     assert np.all(np.abs(found.height[answered] - exact) <= 2 * ulp)
-    np.testing.assert_allclose(found.height_sigma[answered], expected.height_sigma[answered], rtol=1e-5, atol=1e-9)
+    sigma, exact_sigma = (one.height_sigma[answered] for one in (found, expected))
+    np.testing.assert_allclose(sigma, exact_sigma, rtol=1e-5, atol=1e-9)
