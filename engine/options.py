@@ -117,10 +117,18 @@ class Option:
             and (high is None or number <= high)
             and (self.above is None or number > self.above)
         ):
-            raise InputError(f"{self.name} {number:g}: {self._needed()}")
+            example = f", such as {self.example}" if self.example else ""
+            raise InputError(f"{self.name} {value}: {self.needed} is needed{example}")
         return number
 
-    def _needed(self) -> str:
+    @property
+    def example(self) -> str:
+        """A value in the option's unit."""
+        return _EXAMPLES.get(self.unit, "")
+
+    @property
+    def needed(self) -> str:
+        """What a number must be, such as ``a share from 0 to 1``."""
         noun = _NOUNS.get(self.unit, "a number" + (f" in {self.unit}" if self.unit else ""))
         low, high = self.within
         if low is not None and high is not None:
@@ -131,8 +139,7 @@ class Option:
             limits = f" of at most {high:g}"
         else:
             limits = "" if self.above is None else f" above {self.above:g}"
-        example = f", such as {_EXAMPLES[self.unit]}" if self.unit in _EXAMPLES else ""
-        return f"{noun}{limits} is needed{example}"
+        return f"{noun}{limits}"
 
 
 def option(

@@ -9,10 +9,13 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.method import Method
 from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.provenance import attach_provenance, describe, naming, signature
+from mirrorskin.engine.reconstruction import calibrated
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.io import InputError, Result
+from mirrorskin.io.own_class import load_class
 
 if TYPE_CHECKING:
     from mirrorskin.io import Source
@@ -66,8 +69,7 @@ def run(
     if isinstance(operation, type) and issubclass(operation, Operation):
         operation = operation()
     if not isinstance(operation, Operation):
-        name = getattr(operation, "__name__", type(operation).__name__)
-        raise InputError(f"{name} is not an operation: derive the class from mirrorskin.engine.Operation")
+        raise _no_operation(operation)
     if hasattr(source, "read") and hasattr(source, "header"):
         return _run_source(cast("Source", source), operation, positions, progress)
     if isinstance(source, str | os.PathLike) or not isinstance(source, Iterable):
@@ -75,6 +77,40 @@ def run(
         raise InputError(f"frames are a {type(source).__name__}: {remedy}")
     result = _run_frames(source, operation, positions, progress)
     return result.assign(process={**signature(), **describe(operation), **result.process})
+
+
+def load_operation(name: str) -> type[Operation | Method]:
+    """Return the class of operations or methods that is named MODULE:CLASS or FILE.py:CLASS.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        There is no such class, or it is not derived from `mirrorskin.engine.Operation`.
+
+    Examples
+    --------
+    >>> load_operation("mirrorskin.engine:Onset").__name__
+    'Onset'
+    """
+    kind = load_class(name)
+    if not isinstance(kind, type) or not issubclass(kind, Operation | Method):
+        raise _no_operation(kind)
+    return kind
+
+
+def run_class(
+    kind: type[Operation | Method], source: Source, progress: Progress | None = None, **options: Any
+) -> Result:
+    """Run an operation or a method with these options over a source; see `run`."""
+    configured = kind(**options)
+    if isinstance(configured, Method):
+        return configured.run(calibrated(source), progress)
+    return run(source, configured, progress=progress)
+
+
+def _no_operation(kind: object) -> InputError:
+    name = getattr(kind, "__name__", type(kind).__name__)
+    return InputError(f"{name} is not an operation: derive the class from mirrorskin.engine.Operation")
 
 
 def _run_source(
@@ -87,8 +123,8 @@ def _run_source(
         configured = operation.configured_for(source)
         feed(source, configured, progress=progress)
         result = configured.finish()
-    device = configured.device if configured.on_device else None
-    return attach_provenance(result, source, device, {**describe(configured, source), **result.process})
+    process = {**describe(configured, source), **result.process}
+    return attach_provenance(result, source, configured.opened_device, process)
 
 
 def check_motion(source: Source, operation: Operation) -> None:
