@@ -90,11 +90,13 @@ class Option:
             return value
         if self.kind == "choice":
             if value not in self.choices:
-                raise InputError(f"unknown {self.name} {value!r}. Use {' or '.join(self.choices)}")
+                raise InputError(
+                    f"unknown {self.name} {_in_one_line(value)}. Use {' or '.join(self.choices)}"
+                )
             return str(value)
         if self.kind == "flag":
             if not isinstance(value, bool | np.bool_):
-                raise InputError(f"{self.name} is {value!r:.40}: use True or False")
+                raise InputError(f"{self.name} is {_in_one_line(value)}: use True or False")
             return bool(value)
         if self.kind == "numbers":
             values = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
@@ -108,7 +110,7 @@ class Option:
         scalar = isinstance(value, np.ndarray | np.generic) and value.ndim == 0 and value.dtype.kind in "buif"
         if not scalar and (not isinstance(value, Real) or (whole and not hasattr(value, "__index__"))):
             what = "a whole number" if whole else "a number"
-            raise InputError(f"{self.name} is {value!r:.40}: {what} is needed")
+            raise InputError(f"{self.name} is {_in_one_line(value)}: {what} is needed")
         number = int(value) if whole else float(value)
         low, high = self.within
         if not (
@@ -267,6 +269,10 @@ class Configured:
     def part(self, kind: type[Configured]) -> dict[str, Any]:
         """Return the values of the options that another class has as well."""
         return {name: one.stored(self) for name, one in self.options.items() if name in kind.options}
+
+
+def _in_one_line(value: Any) -> str:
+    return " ".join(repr(value).split())[:40]
 
 
 def signature_of(
