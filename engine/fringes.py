@@ -17,7 +17,7 @@ from mirrorskin.engine.inputs import Maps, as_result
 from mirrorskin.engine.operation import Operation, phase_function
 from mirrorskin.engine.options import option
 from mirrorskin.engine.rotation.correlation import Correlate
-from mirrorskin.engine.rotation.design_matrix import Doubles, fit_matrix
+from mirrorskin.engine.rotation.design_matrix import Doubles, check_weights, fit_matrix
 from mirrorskin.io import InputError, Map, Result
 from mirrorskin.io.arguments import checked
 from mirrorskin.io.maps import TABLE
@@ -76,6 +76,7 @@ class Fringes(Operation):
         self._noise = None if self.noise is None else _map(self.noise, shape, "noise")
         self._fit = Correlate(device=self.device, memory_limit=self.memory_limit)
         self._fit.begin(shape, dtype)
+        self._weights: list[Doubles] = []
 
     @property
     def room(self) -> NDArray[Any]:
@@ -85,14 +86,26 @@ class Fringes(Operation):
     def clear(self) -> None:
         """Forget the frames so far."""
         self._fit.reset()
+        self._weights.clear()
 
-    def push(self, frames: NDArray[Any], *, phase: ArrayLike, lent: bool = False) -> None:
-        """Take in the next frames, (n, H, W), and the shift of the pattern in each, (n,) radians."""
-        self._fit.push(frames, phase=phase, lent=lent)
+    def push(
+        self,
+        frames: NDArray[Any],
+        *,
+        phase: ArrayLike,
+        frame_weights: ArrayLike | None = None,
+        lent: bool = False,
+    ) -> None:
+        """Take in the next frames, (n, H, W), the shift of the pattern in each, (n,) radians, and weights."""
+        weights = check_weights(frame_weights, len(frames))
+        self._fit.push(frames, phase=phase, frame_weights=weights, lent=lent)
+        self._weights.append(weights)
 
     def result(self) -> dict[str, Any]:
         """Return phase, mean and modulation of the frames so far."""
-        fit, freedom = self._fit.result(), self.count - 3
+        fit, weights = self._fit.result(), np.concatenate(self._weights)
+        used = weights > 0
+        freedom = np.count_nonzero(used) - 3
         modulation, phase = fit.modulation, fit.azimuth
         if self._noise is None:
             if freedom < 1:
@@ -103,8 +116,8 @@ class Fringes(Operation):
             noise = np.asarray(noise_of_residual(fit.residual[strong], freedom))
         else:
             noise = self._noise
-        matrix = fit_matrix(self.pushed("phase"))
-        (cc, cs), (_, ss) = (matrix @ matrix.T)[1:, 1:]
+        matrix = fit_matrix(self.pushed("phase")[used], weights[used])
+        (cc, cs), (_, ss) = (matrix @ (matrix / weights[used]).T)[1:, 1:]
         cosine, sine = np.cos(phase, dtype=np.float64), np.sin(phase, dtype=np.float64)
         spread = noise * np.sqrt(cc * sine**2 - 2 * cs * sine * cosine + ss * cosine**2)
         still = modulation == 0

@@ -290,6 +290,8 @@ def _checked_push(method: Callable[..., None]) -> Callable[..., None]:
             method(self, frames, **given)
             return
         array = self._check_frames(frames)
+        for name in given.keys() & {*self.positions, "frame_weights"}:
+            given[name] = None if given[name] is None else as_array(name, given[name])
         self._check_positions(len(array), given)
         if not self._takes_lent:
             given.pop("lent", None)

@@ -276,6 +276,7 @@ class Configured:
         return {name: one.stored(self) for name, one in self.options.items() if name in kind.options}
 
 
+
 def signature_of(
     options: Mapping[str, Option], positional: Sequence[str] = (), optional: Sequence[str] = ()
 ) -> inspect.Signature:

@@ -81,6 +81,20 @@ def test_an_operation_that_was_reset_has_forgotten():
     np.testing.assert_allclose(found.phase_sigma, expected.phase_sigma, rtol=1e-4)
 
 
+def test_a_frame_of_weight_0_is_left_out_and_weights_are_inverse_variances():
+    frames = shown(TURN * FIELD, UNEVEN, 1.5)
+    expected = engine.fit_fringes(np.delete(frames, 2, 0), np.delete(UNEVEN, 2))
+    fringes = engine.Fringes()
+    fringes.push(frames, phase=UNEVEN, frame_weights=[1, 1, 0, 1, 1, 1])
+    found = fringes.result()
+    np.testing.assert_allclose(found.phase, expected.phase, atol=1e-5)
+    np.testing.assert_allclose(found.phase_sigma, expected.phase_sigma, rtol=1e-3)
+    twice = engine.Fringes(noise=2)
+    twice.push(frames, phase=UNEVEN, frame_weights=np.full(6, 4.0))
+    once = engine.fit_fringes(frames, UNEVEN, noise=2)
+    np.testing.assert_allclose(twice.result().phase_sigma, once.phase_sigma / 2, rtol=1e-4)
+
+
 @pytest.mark.parametrize("count", [3, 4, 8])
 def test_the_standard_error_of_even_shifts_is_the_cramer_rao_bound(count):
     shift = np.arange(count) * TURN / count

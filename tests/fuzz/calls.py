@@ -56,6 +56,7 @@ def calls() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
     dither = (100 + 40 * (wave[:, None, None] - 0.5) + 0 * _FAR).astype(np.float32)
     onset, turned = Maps(height=height, sigma=sure), Maps(vectors=normals, sigma=sure, contact=contact)
     disc = _FAR < 5
+    fringes = {"phase": 0.3 * _COLUMN, "phase_sigma": np.full(SHAPE, 0.05)}
     made: dict[str, dict[str, Any]] = {
         "find_onset": {"frames": _press(), "travel": np.linspace(0, 1, 8), "noise": 1.0},
         "find_change_point": {"frames": _press(), "travel": np.linspace(0, 1, 8)},
@@ -73,20 +74,20 @@ def calls() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
             "displacement": np.full((*SHAPE, 2), 0.01), "pixel_size": 0.1, "modulus": 0.1, "contact": disc,
         },
         "find_growth": {"frames": dither, "travel": wave, "dark": 0.0, "bright": 255.0},
-        "fit_fringes": {"frames": _rotation(phases), "shift": phases},
+        "fit_fringes": {"frames": _rotation(phases), "phase": phases},
         "unwrap_frequencies": {
-            "phase": np.stack([0.3 * _COLUMN, 2.4 * _COLUMN % math.tau]), "sigma": np.full((2, *SHAPE), 0.05),
+            "fringes": [fringes, {**fringes, "phase": 2.4 * _COLUMN % math.tau}],
             "frequency": np.array([1.0, 8.0]),
         },
         "decode_gray": {"frames": _press(), "threshold": 100.0, "noise": 2.0},
         "unwrap_gray": {
-            "phase": 0.3 * _COLUMN, "sigma": sure, "stripe": 0.3 * _COLUMN // math.pi, "risk": flat,
+            "fringes": fringes, "stripes": {"stripe": 0.3 * _COLUMN // math.pi, "risk": flat},
         },
         "find_focus": {
             "frames": np.exp(-((np.arange(8) - 3.3) ** 2) / 6)[:, None, None].astype(np.float32) * _texture(),
             "travel": np.arange(8.0), "noise": 0.1,
         },
-        "photometric_stereo": {"frames": _rotation(phases), "light": phases, "zenith": 0.6, "dark": flat},
+        "photometric_stereo": {"frames": _rotation(phases), "phase": phases, "zenith": 0.6, "dark": flat},
         "estimate_frequency": {"samples": wave, "time": 0.01 * np.arange(64)},
         "estimate_pose": {"first": result, "second": result, "pixel_size": 0.1},
         "stitch": {"results": [result, result], "pixel_size": 0.1},
@@ -178,6 +179,11 @@ def _given_arrays(name: str) -> dict[str, np.ndarray]:
 
 
 def _arrays(answer: Any) -> Iterator[tuple[str, np.ndarray]]:
+    if isinstance(answer, io.Result):
+        for name, values in answer.items():
+            if name not in _COUNTS and isinstance(values, np.ndarray) and values.dtype.kind == "f":
+                yield name, values
+        return
     for name in getattr(answer, "__dataclass_fields__", ()):
         if name in _COUNTS:
             continue
