@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mirrorskin.cli.groups import Command, ExistingPath, MotionOption, for_motions
+from mirrorskin.cli.groups import MOTIONS, Command, ExistingPath, MotionOption, for_motions
 
 if TYPE_CHECKING:
     from mirrorskin.engine.options import Configured, Option
@@ -90,14 +90,16 @@ class Term:
     def read_one(self, text: str, where: str) -> Any:
         """Return the value that a text stands for; ``where`` begins messages."""
         from mirrorskin.cli import quantity
+        from mirrorskin.io import InputError
 
         if text in self.words or self.kind in ("choice", "text"):
             return text
         plain = "integer" if self.kind == "integer" else "number"
-        value = getattr(quantity, _UNITS.get(self.unit, ("", plain))[1])(text, where)
+        try:
+            value = getattr(quantity, _UNITS.get(self.unit, ("", plain))[1])(text, where)
+        except InputError as error:
+            raise InputError(", or ".join([str(error), *self.words])) from error
         if self.least is not None and value < self.least:
-            from mirrorskin.io import InputError
-
             raise InputError(f"{where} {text}: a number of at least {self.least} is needed")
         return value
 
@@ -305,16 +307,20 @@ def _by_motion(variants: list[Term], name: str) -> str:
 
 def declarations() -> dict[str, list[dict[str, Any]]]:
     """Return what ``declared.json`` contains: the options of each command."""
-    from mirrorskin.engine.method import Method
+    from mirrorskin.engine.lock_in import Correlation
     from mirrorskin.engine.reconstruction import method_for
 
-    methods = {one: method_for(one) for one in ("vertical",)}  # TODO all
-    methods = {motion: kind for motion, kind in methods.items() if issubclass(kind, Method)}
-    return {"reconstruct": _rows(methods)}
-
-
-def _rows(kinds: Mapping[str, type[Configured]]) -> list[dict[str, Any]]:
-    return [{name: value for name, value in asdict(one).items() if value} for one in terms_of(kinds)]
+    methods = {one: method_for(one) for one in MOTIONS}
+    fused = ("tilt", "zenith_gain", "zenith_offset", "robust")
+    terms = {
+        "reconstruct": terms_of(methods),
+        "correlate": terms_of({"": Correlation}),
+        "fuse": [one for one in terms_of({"": methods["axial"]}) if one.name in fused],
+    }
+    return {
+        command: [{name: value for name, value in asdict(one).items() if value} for one in options]
+        for command, options in terms.items()
+    }
 
 
 if __name__ == "__main__":
