@@ -1,16 +1,8 @@
 from .errors import NotConverged
-from .focus import Focus, FocusEstimator, find_focus
-from .force.normal import Force, find_force
-from .force.tangential import TangentialForce, find_tangential_force
-from .fringes import (
-    FringeEstimator,
-    Fringes,
-    Unwrapped,
-    decode_gray,
-    fit_fringes,
-    unwrap_frequencies,
-    unwrap_gray,
-)
+from .focus import Focus, find_focus
+from .force.normal import find_force
+from .force.tangential import find_tangential_force
+from .fringes import Fringes, decode_gray, fit_fringes, unwrap_frequencies, unwrap_gray
 from .fusion import fuse
 from .integration.camera import Camera
 from .integration.integration import Integrator, integrate
@@ -20,7 +12,7 @@ from .method import Method, Step
 from .metrology.measures import Measures, measure
 from .operation import Operation
 from .options import option
-from .photometric import Lambertian, PhotometricStereo, photometric_stereo
+from .photometric import PhotometricStereo, photometric_stereo
 from .pose.pose import Pose, estimate_pose
 from .pose.stitching import Stitch, stitch
 from .pose.tracker import PoseTracker
@@ -38,24 +30,20 @@ from .rotation.moving_normals import MovingNormals, estimate_normals
 from .rotation.normals import Normals
 from .running import run
 from .scoring import Score, score
-from .slip.displacement import Displacement, find_displacement
-from .slip.search import Slip, SlipSearch
+from .slip.displacement import find_displacement
+from .slip.search import Slip
+from .slip.slip import Sliding
 from .tiling import free_memory
 
 __all__ = [
     "Camera",
     "ChangePoint",
     "Correlate",
-    "Displacement",
     "Focus",
-    "FocusEstimator",
-    "Force",
     "Frequency",
-    "FringeEstimator",
     "Fringes",
     "Growth",
     "Integrator",
-    "Lambertian",
     "Measures",
     "Method",
     "MovingNormals",
@@ -68,14 +56,12 @@ __all__ = [
     "PoseTracker",
     "Press",
     "Score",
+    "Sliding",
     "Slip",
-    "SlipSearch",
     "Step",
     "Stitch",
     "Strokes",
     "Surface",
-    "TangentialForce",
-    "Unwrapped",
     "correlate",
     "decode_gray",
     "estimate_frequency",

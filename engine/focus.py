@@ -2,62 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.frames import check_dtype, check_frames
-from mirrorskin.engine.thread_safe import ThreadSafe
-from mirrorskin.io import InputError
-from mirrorskin.io.arguments import checked
-from mirrorskin.io.maps import FocusStatus, Map, status_of
+from mirrorskin.engine.operation import Operation, travel_function
+from mirrorskin.engine.options import option
+from mirrorskin.io import InputError, Map
+from mirrorskin.io.maps import TABLE, FocusStatus, status_of
 from mirrorskin.io.positions import check_strokes
-from mirrorskin.io.result import Shown
-from mirrorskin.kernels.device import C_TYPES, Device, open_device
+from mirrorskin.io.types import FRAME_DTYPES
+from mirrorskin.kernels.device import C_TYPES
 
 Doubles = NDArray[np.float64]
 
-_SURELY = 5.0  # standard errors by which a contrast is above that of noise
-_BENT = 3.0  # standard errors by which a peak is bent
+_LEAST_CONTRAST = 5.0  # standard errors by which the contrast of a peak exceeds that of noise
+_LEAST_CURVATURE = 3.0  # standard errors by which the curvature of a peak differs from 0
 
 
-@dataclass(frozen=True, slots=True, repr=False)
-class Focus(Shown):
-    """Where each pixel is in focus.
-
-    Attributes
-    ----------
-    height, height_sigma : ndarray, (H, W), float32
-        Millimetres, minus the travel of the sharpest focus, and the standard error; NaN unless status is 1.
-    status : ndarray, (H, W), uint8
-        0 invalid input, 1 in focus, 2 no peak that stands out of the noise, 3 peak at an end of the stack.
-    sharpness : ndarray, (H, W), float32
-        Counts: the standard deviation of the window's samples in the sharpest frame, less the noise.
-    """
-
-    height: NDArray[np.float32]
-    height_sigma: NDArray[np.float32]
-    status: NDArray[np.uint8]
-    sharpness: NDArray[np.float32]
-
-
-class FocusEstimator(ThreadSafe):
-    """An `Estimator` for frames of a focus stack that come block by block; see `find_focus`.
-
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns of a frame.
-    dtype : dtype
-        uint8, uint16 or float32.
-    noise, radius, reach, device
-        As for `find_focus`.
+class Focus(Operation):
+    """Height by the travel at which the surroundings of a pixel are sharpest (shape from focus).
 
     Examples
     --------
-    >>> focus = FocusEstimator((20, 20), "float32", noise=0.1)
+    >>> from mirrorskin import engine
+    >>> focus = engine.Focus(noise=0.1)
     >>> texture = np.random.default_rng(0).normal(size=(20, 20)).astype(np.float32)
     >>> for travel in range(9):
     ...     focus.push((np.exp(-((travel - 3.7) ** 2) / 9) * texture[None]).astype("f4"), travel=[travel])
@@ -65,55 +35,66 @@ class FocusEstimator(ThreadSafe):
     -3.7
     """
 
-    device: Device
-    maps: ClassVar[dict[str, Map]] = {
-        "status": status_of(FocusStatus),
-        "sharpness": Map("standard deviation of the samples around the pixel in the best frame", "counts"),
-    }
+    motions = ("vertical",)
+    dtypes = FRAME_DTYPES
+    on_device = True
 
-    def __init__(
-        self,
-        shape: tuple[int, int],
-        dtype: DTypeLike,
-        *,
-        noise: float,
-        radius: int = 4,
-        reach: int = 2,
-        device: str | Device | None = None,
-    ) -> None:
-        if not 0 <= noise < np.inf:
-            raise InputError(f"noise {noise}: the standard deviation of a sample is needed, counts")
-        if not all(isinstance(one, int | np.integer) and 1 <= one <= 50 for one in (radius, reach)):
-            raise InputError(f"radius {radius} and reach {reach}: whole numbers from 1 to 50 are needed")
-        self._shape, self._dtype, self.device = shape, check_dtype(dtype), open_device(device)
-        self._noise, self._radius, self._reach = noise, radius, reach
-        self._scan = self.device.kernel("focus", "focus_scan", FRAME=C_TYPES[self._dtype.name])
+    noise: float | None = option(
+        None,
+        "counts",
+        within=(0, None),
+        help="standard deviation of a sample; it must be specified",
+    )
+    radius: int = option(
+        4,
+        "pixels",
+        within=(1, 50),
+        help="half of the window's side: sharpness is that of N = (2 radius + 1)^2 pixels, fewer at the"
+        " picture's border",
+    )
+    reach: int = option(
+        2,
+        "frames",
+        within=(1, 50),
+        help="frames on each side of the sharpest one that the peak is fitted to, as far as there are any",
+    )
+
+    height = TABLE["height"]
+    status = status_of(FocusStatus)
+    sharpness = Map("standard deviation of the samples around the pixel in the sharpest frame", "counts")
+
+    def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
+        """Prepare the kernel and its maps."""
+        if self.noise is None:
+            raise InputError("noise is missing: give the standard deviation of a sample in counts, such as 2")
+        self._scan = self.device.kernel("focus", "focus_scan", FRAME=C_TYPES[dtype.name])
         self._best = self.device.array("best", shape, np.int32)
-        self._peak = self.device.array("peak", (2 * reach + 1, *shape), np.float32)
-        self._recent = self.device.array("recent", (reach, *shape), np.float32)
-        self._inside = np.multiply.outer(*(_window(length, radius) for length in shape))
-        self._travel: Doubles = np.empty(0)
+        self._peak = self.device.array("peak", (2 * self.reach + 1, *shape), np.float32)
+        self._recent = self.device.array("recent", (self.reach, *shape), np.float32)
+        self._samples = np.multiply.outer(*(_window(length, self.radius) for length in shape))
+
+    def clear(self) -> None:
+        """Do nothing: the first frame overwrites the maps."""
 
     def push(self, frames: NDArray[Any], *, travel: ArrayLike) -> None:
-        """Take in the next frames, (n, H, W), and the travel of each, mm."""
-        check_frames(frames, self._dtype, self._shape)
-        first, (rows, columns) = len(self._travel), self._shape
-        self._travel = np.concatenate([self._travel, check_strokes(travel, len(frames), "travel")])
+        """Take in the next frames, (n, H, W), and the travel of each, (n,) mm."""
+        check_strokes(travel, len(frames), "travel")
+        rows, columns = self.shape
         self._scan(
             -(-rows * columns // self.device.layout.tile), frames=self.device.seen("frames", frames),
-            count=len(frames), rows=rows, columns=columns, first=first, radius=self._radius,
-            reach=self._reach, best=self._best, peak=self._peak, recent=self._recent, moved=frames.nbytes,
+            count=len(frames), rows=rows, columns=columns, first=self.count, radius=self.radius,
+            reach=self.reach, best=self._best, peak=self._peak, recent=self._recent, moved=frames.nbytes,
         )  # fmt: skip
         self.device.finish()
 
-    def result(self) -> Focus:
-        """Return the focus of the frames so far."""
-        if not len(self._travel):
-            raise InputError("no frame was pushed: at least one is needed")
+    def result(self) -> dict[str, Any]:
+        """Return height, status and sharpness of the frames so far."""
+        assert self.noise is not None
+        travel = self.pushed("travel")
         best, squares = self._best.download(), self._peak.download().astype(np.float64)
-        frame = best + np.arange(-self._reach, self._reach + 1)[:, np.newaxis, np.newaxis]
-        place = self._travel[np.clip(frame, 0, len(self._travel) - 1)] - self._travel[best]
-        variance, freedom = self._noise * self._noise, self._inside - 1
+        frame = best + np.arange(-self.reach, self.reach + 1)[:, np.newaxis, np.newaxis]
+        place = travel[np.clip(frame, 0, len(travel) - 1)] - travel[best]
+        variance, freedom = self.noise * self.noise, self._samples - 1
         signal = squares - freedom * variance
         # One over the variance of the logarithm for noise of variance 1, of a non-central chi-square.
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -121,37 +102,30 @@ class FocusEstimator(ThreadSafe):
             weight = np.where(signal > 0, weight, 0)
             value = np.log(np.where(signal > 0, signal, 1))
             peak = _fit(place, value, weight)
-            points, top = (weight > 0).sum(axis=0), signal[self._reach]
-            found = points > 2  # two have no vertex
-            found &= (top > _SURELY * variance * np.sqrt(2 * freedom)) & (peak.bent > _BENT**2 * variance)
-            misfit = _misfit(peak, points, found, variance)
-            beside = place[self._reach - 1 : self._reach + 2]
-            found &= (beside.min(axis=0) < peak.vertex) & (peak.vertex < beside.max(axis=0))
+            points, top = (weight > 0).sum(axis=0), signal[self.reach]
+            in_focus = points > 2  # two have no vertex
+            in_focus &= top > _LEAST_CONTRAST * variance * np.sqrt(2 * freedom)
+            in_focus &= peak.bent > _LEAST_CURVATURE**2 * variance
+            misfit = _misfit(peak, points, in_focus, variance)
+            neighbours = place[self.reach - 1 : self.reach + 2]
+            in_focus &= (neighbours.min(axis=0) < peak.vertex) & (peak.vertex < neighbours.max(axis=0))
             sharpness = np.sqrt(np.maximum(top, 0) / np.maximum(freedom, 1))
-        status = np.where(found, FocusStatus.IN_FOCUS, FocusStatus.NO_PEAK)
-        status[(best == 0) | (best == len(self._travel) - 1)] = FocusStatus.PEAK_AT_AN_END
-        status[~np.isfinite(squares[self._reach])] = FocusStatus.INVALID_INPUT
-        height = -(self._travel[best] + peak.vertex)
+        status = np.where(in_focus, FocusStatus.IN_FOCUS, FocusStatus.NO_PEAK)
+        status[(best == 0) | (best == len(travel) - 1)] = FocusStatus.PEAK_AT_AN_END
+        status[~np.isfinite(squares[self.reach])] = FocusStatus.INVALID_INPUT
         sigma = np.sqrt(variance * peak.variance + misfit * peak.gain)
         in_focus = status == FocusStatus.IN_FOCUS
-        height, sigma = (np.where(in_focus, one, np.nan).astype(np.float32) for one in (height, sigma))
-        return Focus(height, sigma, status.astype(np.uint8), sharpness.astype(np.float32))
+        return {
+            "height": np.where(in_focus, -(travel[best] + peak.vertex), np.nan),
+            "height_sigma": np.where(in_focus, sigma, np.nan),
+            "status": status,
+            "sharpness": sharpness,
+        }
 
-    def reset(self) -> None:
-        """Forget the frames so far."""
-        self._travel = np.empty(0)
 
-
-@checked
-def find_focus(
-    frames: NDArray[Any],
-    travel: ArrayLike,
-    *,
-    noise: float,
-    radius: int = 4,
-    reach: int = 2,
-    device: str | Device | None = None,
-) -> Focus:
+find_focus = travel_function(
+    Focus,
+    "find_focus",
     """Find the travel at which each pixel's surroundings are sharpest (shape from focus).
 
     Sharpness S is the sum of squares of a window's samples less their mean, N - 1 times their variance, less
@@ -160,24 +134,11 @@ def find_focus(
     noise^2 (2 (N - 1) noise^2 + 4 S) / S^2 (a non-central chi-square). The standard error follows from them
     and, if reach is 2 or more, from the picture's median misfit of such a curve.
 
-    Parameters
-    ----------
-    frames : ndarray, (T, H, W), uint8, uint16 or float32
-        Counts, linear in the light, the camera or its plane of focus being lowered from frame to frame.
-    travel : array_like, (T,)
-        Millimetres by which it was lowered, one a frame, in steps of any size.
-    noise : float
-        Counts: standard deviation of a sample.
-    radius : int
-        Pixels of the window on each side, 1 to 50: N = (2 radius + 1)^2, fewer at the picture's border.
-    reach : int
-        Frames on each side of the sharpest that enter the fit, 1 to 50, as far as there are any.
-    device : str or Device, optional
-        See ``mirrorskin.kernels.device.open_device``.
-
     Returns
     -------
-    Focus
+    Result
+        ``height`` and ``height_sigma`` are undefined where ``status`` is not 1. ``sharpness`` is the standard
+        deviation of the window's samples in the sharpest frame, less the noise.
 
     Raises
     ------
@@ -194,15 +155,9 @@ def find_focus(
     >>> focus = engine.find_focus(frames.astype(np.float32), travel, noise=0.01)
     >>> round(float(focus.height[10, 10]), 2), round(float(focus.height_sigma[10, 10]), 4)
     (-3.7, 0.0023)
-    """
-    if frames.ndim != 3 or 0 in frames.shape:
-        raise InputError(f"frames have shape {frames.shape}: (T, H, W) is needed")
-    rows, columns = frames.shape[1:]
-    focus = FocusEstimator(
-        (rows, columns), frames.dtype, noise=noise, radius=radius, reach=reach, device=device
-    )
-    focus.push(frames, travel=travel)
-    return focus.result()
+    """,
+    "Millimetres by which the camera or its plane of focus was lowered, in steps of any size.",
+)
 
 
 def _window(length: int, radius: int) -> Doubles:
@@ -242,13 +197,13 @@ def _fit(place: Doubles, value: Doubles, weight: Doubles) -> _Peak:
     return _Peak(vertex, variance, gain, bent, residual, total - taken)
 
 
-def _misfit(peak: _Peak, points: NDArray[np.intp], found: NDArray[np.bool_], variance: float) -> float:
+def _misfit(peak: _Peak, points: NDArray[np.intp], in_focus: NDArray[np.bool_], variance: float) -> float:
     """Return the variance by which logarithms of the sharpness differ from a parabola beyond the noise's.
 
-    It is the median of what pixels with four points or more tell, whose residuals are a chi-square; its
-    median is (1 - 2 / 9n)^3 of its mean n (Wilson and Hilferty 1931). 0 if no pixel has as many.
+    It is the median over pixels with four points or more. Their residuals are distributed as chi-square with
+    n degrees of freedom, whose median is (1 - 2 / 9n)^3 n (Wilson and Hilferty 1931). 0 if there is none.
     """
-    some = found & (points > 3) & (peak.free > 0)
+    some = in_focus & (points > 3) & (peak.free > 0)
     if not some.any():
         return 0.0
     freedom = points[some] - 3

@@ -5,128 +5,122 @@ The least-squares fit is that of a rotation: `mirrorskin.engine.rotation.correla
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, ndtr
 
 from mirrorskin.engine.frames import noise_of_residual
-from mirrorskin.engine.rotation.correlation import Correlation, Correlator, correlate
+from mirrorskin.engine.inputs import Maps, as_result
+from mirrorskin.engine.operation import Operation, phase_function
+from mirrorskin.engine.options import option
+from mirrorskin.engine.rotation.correlation import Correlate
 from mirrorskin.engine.rotation.design_matrix import Doubles, fit_matrix
-from mirrorskin.engine.thread_safe import ThreadSafe
-from mirrorskin.io import InputError
+from mirrorskin.io import InputError, Map, Result
 from mirrorskin.io.arguments import checked
-from mirrorskin.io.result import Shown
-from mirrorskin.kernels.device import Device
+from mirrorskin.io.maps import TABLE
+from mirrorskin.io.types import FRAME_DTYPES
 
 _TURN = 2 * np.pi
 
-
-@dataclass(frozen=True, slots=True, repr=False)
-class Fringes(Shown):
-    """The fit E = mean + modulation cos(phase - shift) of each pixel; NaN where a sample was no number.
-
-    Attributes
-    ----------
-    phase, sigma : ndarray, (H, W), float32
-        Radians, -pi to pi, and the standard error; pixels without modulation have NaN and infinity.
-    mean, modulation, residual : ndarray, (H, W), float32
-        Counts, as in `Correlation`.
-    noise : float or ndarray, (H, W)
-        Counts: the standard deviation of a sample that ``sigma`` goes by.
-    """
-
-    phase: NDArray[np.float32]
-    sigma: NDArray[np.float32]
-    mean: NDArray[np.float32]
-    modulation: NDArray[np.float32]
-    residual: NDArray[np.float32]
-    noise: float | NDArray[Any]
+_ORDER = Map("turns that were added to the wrapped phase", dtype="int32", overview=False)
+_RISK = Map("probability that the order is wrong")
+_UNWRAPPED = {"phase": Map("phase of the finest fringes over the whole field", "rad", "float64")}
+_UNWRAPPED |= {"order": _ORDER, "risk": _RISK}
+_STRIPES = {
+    "stripe": Map("number of the stripe, from 0", dtype="int32"),
+    "risk": Map("upper bound of the probability that the number is wrong by more than 1"),
+}
 
 
-@dataclass(frozen=True, slots=True, repr=False)
-class Unwrapped(Shown):
-    """The phase counted on over the whole field.
+class Fringes(Operation):
+    """Phase of fringes, projected or reflected, that are shifted by known steps.
 
-    Attributes
-    ----------
-    phase : ndarray, (H, W), float64
-        Radians, of the finest fringes; NaN where the phase, its standard error or the stripe is not known.
-    sigma : ndarray, (H, W), float32
-        Radians: its standard error if the order is right.
-    order : ndarray, (H, W), int32
-        Turns that were added to the wrapped phase; 0 where that is NaN.
-    risk : ndarray, (H, W), float32
-        Probability that the order is wrong, 0 to 1; 1 where a phase is missing.
-    """
-
-    phase: NDArray[np.float64]
-    sigma: NDArray[np.float32]
-    order: NDArray[np.int32]
-    risk: NDArray[np.float32]
-
-    def safe(self, risk: float = 1e-3) -> NDArray[np.bool_]:
-        """Return where the risk is at most so large, (H, W)."""
-        return self.risk <= risk
-
-
-class FringeEstimator(ThreadSafe):
-    """An `Estimator` for frames of shifted fringes that come block by block; see `fit_fringes`.
-
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns of a frame.
-    dtype : dtype
-        uint8, uint16 or float32.
-    noise, device
-        As for `fit_fringes`.
+    E_k = mean + modulation cos(phase - shift_k) is fitted to each pixel by least squares, for three or more
+    different shifts (Bruning et al. 1974, Greivenkamp 1984). What ``push`` takes as the ``phase`` of a frame
+    is the shift of its pattern towards larger phases.
 
     Examples
     --------
-    >>> fringes = FringeEstimator((1, 2), "float32")
+    >>> from mirrorskin import engine
+    >>> fringes = engine.Fringes()
     >>> for shift in np.arange(4) * np.pi / 2:
     ...     fringes.push(np.full((1, 1, 2), 9 + np.cos(0.5 - shift), np.float32), phase=[shift])
     >>> fringes.result().phase.round(4).tolist()
     [[0.5, 0.5]]
     """
 
-    def __init__(
-        self,
-        shape: tuple[int, int],
-        dtype: DTypeLike,
-        *,
-        noise: ArrayLike | None = None,
-        device: str | Device | None = None,
-    ) -> None:
-        self._correlator, self._noise = Correlator(shape, dtype, device=device), noise
-        self._shift: Doubles = np.empty(0)
+    dtypes = FRAME_DTYPES
+    least_frames = 3
+    on_device = long_blocks = True
 
-    def push(self, frames: NDArray[Any], *, phase: ArrayLike) -> None:
-        """Take in the next frames, (n, H, W), and the shift of each, radians."""
-        self._correlator.push(frames, phase=phase)
-        self._shift = np.concatenate([self._shift, np.asarray(phase, np.float64)])
+    noise: ArrayLike | None = option(
+        None,
+        "counts",
+        map=True,
+        within=(0, None),
+        help="standard deviation of a sample, a number or a map (H, W)",
+        shown_default="estimated from the median residual of the half of the pixels that has more modulation,"
+        " which needs four frames or more",
+    )
 
-    def result(self) -> Fringes:
-        """Return the phase of the frames so far."""
-        return _fringes_of(self._correlator.result(), self._shift, self._noise)
+    phase = Map("phase of the fringes, from -pi to pi", "rad", sampling="angle")
+    mean = TABLE["mean"]
+    modulation = TABLE["modulation"]
+    residual = TABLE["residual"]
 
-    def reset(self) -> None:
+    def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
+        """Prepare the fit."""
+        self._noise = None if self.noise is None else _map(self.noise, shape, "noise")
+        self._fit = Correlate(device=self.device, memory_limit=self.memory_limit)
+        self._fit.begin(shape, dtype)
+
+    @property
+    def room(self) -> NDArray[Any]:
+        """Array in which the next frames may be written before they are pushed, (n, H, W)."""
+        return np.asarray(self._fit.room)
+
+    def clear(self) -> None:
         """Forget the frames so far."""
-        self._correlator.reset()
-        self._shift = np.empty(0)
+        self._fit.reset()
+
+    def push(self, frames: NDArray[Any], *, phase: ArrayLike, lent: bool = False) -> None:
+        """Take in the next frames, (n, H, W), and the shift of the pattern in each, (n,) radians."""
+        self._fit.push(frames, phase=phase, lent=lent)
+
+    def result(self) -> dict[str, Any]:
+        """Return phase, mean and modulation of the frames so far."""
+        fit, freedom = self._fit.result(), self.count - 3
+        modulation, phase = fit.modulation, fit.azimuth
+        if self._noise is None:
+            if freedom < 1:
+                raise InputError(
+                    "3 frames leave no residual to estimate the noise from: specify noise, counts"
+                )
+            strong = modulation >= np.nanmedian(modulation)
+            noise = np.asarray(noise_of_residual(fit.residual[strong], freedom))
+        else:
+            noise = self._noise
+        matrix = fit_matrix(self.pushed("phase"))
+        (cc, cs), (_, ss) = (matrix @ matrix.T)[1:, 1:]
+        cosine, sine = np.cos(phase, dtype=np.float64), np.sin(phase, dtype=np.float64)
+        spread = noise * np.sqrt(cc * sine**2 - 2 * cs * sine * cosine + ss * cosine**2)
+        still = modulation == 0
+        maps = {
+            "phase": phase,
+            "phase_sigma": np.where(still, np.inf, spread / np.where(still, 1, modulation)),
+            "mean": fit.mean,
+            "modulation": modulation,
+            "residual": fit.residual,
+        }
+        return maps if noise.ndim else maps | {"noise": float(noise)}
 
 
-@checked
-def fit_fringes(
-    frames: NDArray[Any],
-    shift: ArrayLike,
-    *,
-    noise: ArrayLike | None = None,
-    device: str | Device | None = None,
-) -> Fringes:
+fit_fringes = phase_function(
+    Fringes,
+    "fit_fringes",
     """Fit phase, modulation and mean to frames of fringes that were shifted by known steps.
 
     Least squares of E_k = mean + modulation cos(phase - shift_k), for three or more different shifts (Bruning
@@ -134,21 +128,12 @@ def fit_fringes(
     the phase, sigma = noise sqrt(C_cc sin^2 p - 2 C_cs sin p cos p + C_ss cos^2 p) / modulation. For N evenly
     spaced shifts that is noise sqrt(2 / N) / modulation.
 
-    Parameters
-    ----------
-    frames : ndarray, (N, H, W), uint8, uint16 or float32
-        Counts, linear in the light.
-    shift : array_like, (N,)
-        Radians by which the pattern was moved towards larger phases; the negative of steps that are added.
-    noise : float or array_like, (H, W), optional
-        Counts: standard deviation of a sample. By default from the median residual of the half of the pixels
-        that has more modulation, which needs four frames or more.
-    device : str or Device, optional
-        See ``mirrorskin.kernels.device.open_device``.
-
     Returns
     -------
-    Fringes
+    Result
+        ``phase`` and ``phase_sigma``, radians; ``mean``, ``modulation`` and ``residual``, counts. Pixels
+        without modulation have the phase NaN with an infinite standard deviation. ``process`` contains the
+        ``noise``, counts, if it is one number.
 
     Raises
     ------
@@ -162,16 +147,15 @@ def fit_fringes(
     >>> shift = np.arange(4) * np.pi / 2
     >>> frames = (100 + 50 * np.cos(0.5 - shift)[:, None, None] * np.ones((2, 3))).astype(np.float32)
     >>> fringes = engine.fit_fringes(frames, shift, noise=2)
-    >>> round(float(fringes.phase[0, 0]), 4), round(float(fringes.sigma[0, 0]), 4)
+    >>> round(float(fringes.phase[0, 0]), 4), round(float(fringes.phase_sigma[0, 0]), 4)
     (0.5, 0.0283)
-    """
-    return _fringes_of(correlate(frames, shift, device=device), np.asarray(shift, np.float64), noise)
+    """,
+    "Shift of the pattern towards larger phases, radians; the negative of steps that are added.",
+)
 
 
 @checked
-def unwrap_frequencies(
-    phase: ArrayLike, sigma: ArrayLike, frequency: ArrayLike, *, start: float = 0.0
-) -> Unwrapped:
+def unwrap_frequencies(fringes: Sequence[Maps], frequency: ArrayLike, *, start: float = 0.0) -> Result:
     """Unwrap fringes of several frequencies, each with the help of the one before.
 
     The phase before, times the ratio of the frequencies, predicts the next, and the order is that which comes
@@ -180,8 +164,9 @@ def unwrap_frequencies(
 
     Parameters
     ----------
-    phase, sigma : array_like, (F, H, W)
-        Radians, wrapped in any way, and their standard errors: `Fringes` from coarse to fine.
+    fringes : sequence of Result, mapping, xarray.Dataset or path
+        Maps ``phase`` and ``phase_sigma``, (H, W), radians, from coarse to fine fringes, such as those of
+        `fit_fringes`. The phase may be wrapped in any way.
     frequency : array_like, (F,)
         Fringes over the field, ascending; all phases are 0 at the same place. The coarsest has one turn at
         most.
@@ -190,7 +175,11 @@ def unwrap_frequencies(
 
     Returns
     -------
-    Unwrapped
+    Result
+        ``phase``, radians, float64, of the finest fringes; NaN where a phase, its standard deviation or the
+        order is unknown. ``phase_sigma`` is its standard deviation if the order is right; ``order`` the turns
+        that were added to the wrapped phase; ``risk`` the probability that the order is wrong, and 1 where a
+        phase is missing.
 
     Raises
     ------
@@ -201,14 +190,25 @@ def unwrap_frequencies(
     --------
     >>> import numpy as np
     >>> from mirrorskin import engine
-    >>> phase = np.array([1.0, 8.0, 64.0])[:, None, None] % (2 * np.pi)
-    >>> engine.unwrap_frequencies(phase, np.full((3, 1, 1), 0.05), [1, 8, 64]).phase.round(4).tolist()
+    >>> wrapped = np.array([1.0, 8.0, 64.0])[:, None, None] % (2 * np.pi)
+    >>> fringes = [{"phase": phase, "phase_sigma": [[0.05]]} for phase in wrapped]
+    >>> engine.unwrap_frequencies(fringes, [1, 8, 64]).phase.round(4).tolist()
     [[64.0]]
     """
-    phases, sigmas, rate = (np.asarray(one, np.float64) for one in (phase, sigma, frequency))
-    if phases.ndim != 3 or sigmas.shape != phases.shape or rate.shape != phases.shape[:1] or not len(rate):
-        shapes = f"phase {phases.shape}, sigma {sigmas.shape}, frequency {rate.shape}"
-        raise InputError(f"{shapes}: (F, H, W), (F, H, W) and (F,) are needed")
+    if not isinstance(fringes, Sequence) or isinstance(fringes, str):
+        raise InputError(
+            f"fringes are a {type(fringes).__name__}: a list of results, coarse to fine, is needed"
+        )
+    rate = np.asarray(frequency, np.float64)
+    if rate.shape != (len(fringes),) or not len(rate):
+        raise InputError(
+            f"frequency has shape {rate.shape}: one is needed for each of {len(fringes)} fringes"
+        )
+    pairs = [_phase_of(one, f"fringes[{number}]") for number, one in enumerate(fringes)]
+    phases, sigmas = zip(*pairs, strict=True)
+    if len({phase.shape for phase in phases}) > 1:
+        shapes = " and ".join(str(phase.shape) for phase in phases)
+        raise InputError(f"fringes have phases of shapes {shapes}: give maps of one size")
     if not (np.all(np.isfinite(rate)) and rate[0] > 0 and np.all(np.diff(rate) > 0)):
         raise InputError(f"frequencies {rate.tolist()}: positive ones from coarse to fine are needed")
     whole = start + np.mod(phases[0] - start, _TURN)
@@ -222,9 +222,7 @@ def unwrap_frequencies(
 
 
 @checked
-def decode_gray(
-    frames: NDArray[Any], threshold: ArrayLike, *, noise: ArrayLike
-) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+def decode_gray(frames: NDArray[Any], threshold: ArrayLike, *, noise: ArrayLike) -> Result:
     """Read the number of a pixel's stripe from pictures of a reflected binary (Gray) code.
 
     With c the RMS distance from the threshold over the pictures, less the noise, a bit at the distance d is
@@ -241,12 +239,10 @@ def decode_gray(
 
     Returns
     -------
-    stripe : ndarray, (H, W), int32
-        From 0 on.
-    risk : ndarray, (H, W), float32
-        Probability that the number is off by more than one, at most; 1 where a sample is no number.
-        On the border of two stripes one bit is uncertain, and takes one for the other: no harm to
-        `unwrap_gray`.
+    Result
+        ``stripe``, int32, from 0. ``risk`` is an upper bound of the probability that the number is wrong by
+        more than 1, and 1 where a sample is not a number. On the border of two stripes one bit is uncertain,
+        and the number may be that of the other stripe; `unwrap_gray` tolerates that.
 
     Raises
     ------
@@ -259,7 +255,7 @@ def decode_gray(
     >>> from mirrorskin import engine
     >>> stripe = np.arange(8)[None]
     >>> frames = np.stack([(stripe ^ stripe >> 1) >> bit & 1 for bit in (2, 1, 0)]) * 100
-    >>> engine.decode_gray(frames, 50, noise=2)[0].tolist()
+    >>> engine.decode_gray(frames, 50, noise=2).stripe.tolist()
     [[0, 1, 2, 3, 4, 5, 6, 7]]
     """
     if frames.ndim != 3 or not 0 < len(frames) <= 30:
@@ -276,19 +272,11 @@ def decode_gray(
     for left, distance in zip(range(len(frames), 0, -1), np.abs(above), strict=True):
         other = stripe ^ (1 << left) - 1  # if this bit is wrong, so are all after it
         risk += expit(-2 * contrast * distance / variance) * (np.abs(other - stripe) > 1)
-    return stripe, _probability(risk)
+    return Result(stripe=stripe, risk=_probability(risk), declarations=_STRIPES)
 
 
 @checked
-def unwrap_gray(
-    phase: ArrayLike,
-    sigma: ArrayLike,
-    stripe: ArrayLike,
-    risk: ArrayLike,
-    *,
-    width: float = np.pi,
-    start: float = 0.0,
-) -> Unwrapped:
+def unwrap_gray(fringes: Maps, stripes: Maps, *, width: float = np.pi, start: float = 0.0) -> Result:
     """Unwrap fringes by the numbers of stripes that are narrower than a fringe.
 
     The order is that by which the phase comes nearest to the middle of the stripe. With stripes of half a
@@ -296,10 +284,10 @@ def unwrap_gray(
 
     Parameters
     ----------
-    phase, sigma : array_like, (H, W)
-        Radians: those of `Fringes`.
-    stripe, risk : array_like, (H, W)
-        Those of `decode_gray`.
+    fringes : Result, mapping, xarray.Dataset or path
+        Maps ``phase`` and ``phase_sigma``, (H, W), radians, such as those of `fit_fringes`.
+    stripes : Result, mapping, xarray.Dataset or path
+        Maps ``stripe`` and ``risk``, (H, W), such as those of `decode_gray`.
     width : float
         Radians of phase that a stripe is wide, above 0 and at most pi.
     start : float
@@ -307,8 +295,9 @@ def unwrap_gray(
 
     Returns
     -------
-    Unwrapped
-        Its risk is that of the stripe and that of a phase whose error leads to the next order.
+    Result
+        Maps as those of `unwrap_frequencies`. The risk is the sum of that of the stripe and that of a phase
+        whose error leads to the adjacent order.
 
     Raises
     ------
@@ -320,14 +309,14 @@ def unwrap_gray(
     >>> import numpy as np
     >>> from mirrorskin import engine
     >>> true = np.linspace(0.1, 25, 6)[None]
-    >>> stripe, sigma = true // np.pi, np.full(true.shape, 0.05)
-    >>> engine.unwrap_gray(true % (2 * np.pi), sigma, stripe, 0 * true).phase.round(2).tolist()
+    >>> fringes = {"phase": true % (2 * np.pi), "phase_sigma": np.full(true.shape, 0.05)}
+    >>> engine.unwrap_gray(fringes, {"stripe": true // np.pi, "risk": 0 * true}).phase.round(2).tolist()
     [[0.1, 5.08, 10.06, 15.04, 20.02, 25.0]]
     """
-    wrapped, errors, number, wrong = (np.asarray(one, np.float64) for one in (phase, sigma, stripe, risk))
-    if wrapped.ndim != 2 or {errors.shape, number.shape, wrong.shape} != {wrapped.shape}:
-        shapes = ", ".join(str(one.shape) for one in (wrapped, errors, number, wrong))
-        raise InputError(f"phase, sigma, stripe and risk have shapes {shapes}: (H, W) of each is needed")
+    wrapped, errors = _phase_of(fringes, "fringes")
+    number, wrong = _maps_of(stripes, "stripes", "stripe", "risk")
+    if number.shape != wrapped.shape:
+        raise InputError(f"stripes have shape {number.shape}, fringes {wrapped.shape}: give maps of one size")
     if not 0 < width <= np.pi:
         raise InputError(f"width {width}: stripes of at most half a fringe, pi, are needed")
     middle = start + (number + 0.5) * width
@@ -336,23 +325,24 @@ def unwrap_gray(
     return _unwrapped(wrapped, whole, errors, wrong + ndtr(-error))
 
 
-def _fringes_of(fit: Correlation, shift: Doubles, noise: ArrayLike | None) -> Fringes:
-    """Return phases and their standard errors of a fit."""
-    if noise is None:
-        if fit.frames < 4:
-            raise InputError("3 frames leave no residual to tell the noise from: give noise, in counts")
-        strong = fit.modulation >= np.nanmedian(fit.modulation)
-        counts = np.asarray(noise_of_residual(fit.residual[strong], fit.frames - 3))
-    else:
-        counts = _map(noise, fit.mean.shape, "noise")
-    matrix, phase = fit_matrix(shift), fit.azimuth
-    (cc, cs), (_, ss) = (matrix @ matrix.T)[1:, 1:]
-    cosine, sine = np.cos(phase, dtype=np.float64), np.sin(phase, dtype=np.float64)
-    spread = counts * np.sqrt(cc * sine**2 - 2 * cs * sine * cosine + ss * cosine**2)
-    still = fit.modulation == 0
-    sigma = np.where(still, np.inf, spread / np.where(still, 1, fit.modulation)).astype(np.float32)
-    kept = counts if counts.ndim else float(counts)
-    return Fringes(phase, sigma, fit.mean, fit.modulation, fit.residual, kept)
+def _phase_of(fringes: Maps, name: str) -> tuple[Doubles, Doubles]:
+    """Return a phase and its standard deviation, (H, W)."""
+    return _maps_of(fringes, name, "phase", "phase_sigma")
+
+
+def _maps_of(maps: Maps, name: str, *quantities: str) -> tuple[Doubles, Doubles]:
+    """Return two maps of one size, (H, W), float64."""
+    result = as_result(maps, name, quantity=quantities[0])
+    missing = [one for one in quantities if one not in result]
+    if missing:
+        raise InputError(
+            f"{name} has no {' and no '.join(missing)}: maps {' and '.join(quantities)} are needed"
+        )
+    first, second = (np.asarray(result[one], np.float64) for one in quantities)
+    if first.ndim != 2 or second.shape != first.shape:
+        shapes = f"{quantities[0]} {first.shape} and {quantities[1]} {second.shape}"
+        raise InputError(f"{name} has {shapes}: (H, W) of both is needed")
+    return first, second
 
 
 def _nearest(phase: Doubles, guess: Doubles) -> Doubles:
@@ -360,13 +350,15 @@ def _nearest(phase: Doubles, guess: Doubles) -> Doubles:
     return np.asarray(phase + _TURN * np.rint((guess - phase) / _TURN))
 
 
-def _unwrapped(wrapped: Doubles, whole: Doubles, sigma: Doubles, risk: Doubles) -> Unwrapped:
+def _unwrapped(wrapped: Doubles, whole: Doubles, sigma: Doubles, risk: Doubles) -> Result:
+    """Return an unwrapped phase with its order and risk."""
     order = np.nan_to_num(np.rint((whole - wrapped) / _TURN)).astype(np.int32)
     with np.errstate(over="ignore"):
         error = sigma.astype(np.float32)
     known = np.isfinite(whole) & np.isfinite(error)
     phase, error, wrong = (np.where(known, one, np.nan) for one in (whole, error, risk))
-    return Unwrapped(phase, error.astype(np.float32), order, _probability(wrong))
+    maps = {"phase": phase, "phase_sigma": error.astype(np.float32), "order": order}
+    return Result(maps, risk=_probability(wrong), declarations=_UNWRAPPED)
 
 
 def _probability(sum_of_risks: Doubles) -> NDArray[np.float32]:

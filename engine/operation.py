@@ -106,8 +106,8 @@ class Operation(ThreadSafe, OnDevice):
     """Frames that a result needs."""
     maps: ClassVar[Mapping[str, Map]] = {}
     """The declared maps by name."""
-    positions: ClassVar[Mapping[str, bool]] = {}
-    """What ``push`` takes of each frame, and whether it needs it."""
+    positions: Mapping[str, bool] = {}
+    """What ``push`` takes of each frame, and whether it needs it; an object's may depend on its options."""
     on_device: ClassVar[bool] = False
     """Whether frames are read for the device: ahead, or where kernels can read them without a copy."""
     long_blocks: ClassVar[bool] = False
@@ -351,6 +351,15 @@ def travel_function(
     return cast(TravelFunction[P], function)
 
 
+class OptionalPhaseFunction(Protocol[P]):
+    """A function of frames, (T, H, W), their phase, (T,) radians, if it is needed, and options."""
+
+    def __call__(
+        self, frames: ArrayLike, phase: ArrayLike | None = None, *args: P.args, **options: P.kwargs
+    ) -> Result:
+        """Return the maps."""
+
+
 def phase_function(
     operation: Callable[P, Operation], name: str, text: str, about_phase: str
 ) -> PhaseFunction[P]:
@@ -359,6 +368,14 @@ def phase_function(
         cast(Any, operation), name, text, {"phase": about_phase}, {"frame_weights": ABOUT_WEIGHTS}
     )
     return cast(PhaseFunction[P], function)
+
+
+def optional_phase_function(
+    operation: Callable[P, Operation], name: str, text: str, about_phase: str
+) -> OptionalPhaseFunction[P]:
+    """Return the function on arrays of an operation whose ``push`` takes ``phase`` if options ask for it."""
+    function = array_function(cast(Any, operation), name, text, {}, {"phase": about_phase})
+    return cast(OptionalPhaseFunction[P], function)
 
 
 def array_function(
@@ -389,7 +406,8 @@ def array_function(
 
     def run(frames: NDArray[Any], where: dict[str, Any], given: dict[str, Any]) -> Result:
         limit = max(1, min(MEMORY_LIMIT, 2 * frames.nbytes))
-        return apply(operation(memory_limit=limit, **given), frames, **where)
+        positions = {one: values for one, values in where.items() if values is not None}
+        return apply(operation(memory_limit=limit, **given), frames, **positions)
 
     def function(*args: Any, **kwargs: Any) -> Result:
         given = signature.bind(*args, **kwargs).arguments

@@ -314,6 +314,15 @@ class SlipStatus(IntEnum):
     NO_TEXTURE = 4
 
 
+class DisplacementStatus(IntEnum):
+    """Codes of ``status`` of a displacement."""
+
+    INVALID_INPUT = 0
+    FOUND = 1
+    NOT_FOUND = 2
+    NO_TEXTURE = 3
+
+
 class FocusStatus(IntEnum):
     """Codes of ``status`` of a focus stack."""
 

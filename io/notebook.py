@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.maps import Map
+from mirrorskin.io.maps import Map, declaration_of
 from mirrorskin.io.result import Result, Shown, map_shape, may_name_a_map
 from mirrorskin.io.types import InputError
+from mirrorskin.io.units import ratio
 
 if TYPE_CHECKING:
     import xarray
@@ -110,29 +111,65 @@ def _dimensions(
     """Return the dimensions of a variable, and the coordinate that names the components of a vector."""
     if declared.axes != "pixels":
         return {"frames": ("frame",), "pieces": ("components",), "none": ()}[declared.axes], {}
-    if not declared.components:
-        return (*lead, "y", "x"), {}
+    vector = bool(declared.components)
+    frames = ("frame",) if declared.per_frame and count - len(lead) == 3 + vector else ()
+    if not vector:
+        return (*frames, *lead, "y", "x"), {}
     name = {("x", "y", "z"): "vector", ("x", "y"): "direction"}.get(declared.components)
     name = name or "_".join(declared.components)
-    frames = ("frame",) if count - len(lead) == 4 else ()
     return (*frames, *lead, "y", "x", name), {name: [*declared.components]}
 
 
 def from_xarray(dataset: xarray.Dataset) -> Result:
-    """Return the result that `as_xarray` converted; see `Result.from_xarray`."""
+    """Return the result that `as_xarray` converted, or that others describe by coordinates and units.
+
+    The rows are those of a picture: y decreases. Units are converted to the declared ones.
+    """
+    dataset = _as_picture(dataset)
     maps: dict[str, Any] = {}
     declarations: dict[str, Map] = {}
     for name, variable in dataset.data_vars.items():
         if not may_name_a_map(str(name)):
             raise InputError(f"the dataset's variable {name!r} cannot name a map. Rename it")
-        values = variable.to_numpy()
-        maps[str(name)] = values if values.ndim else values.item()
         if _DECLARATION in variable.attrs:
             text = str(variable.attrs[_DECLARATION])
             declarations[str(name)] = Map.decode(text, f"variable {name} of the dataset")
-    x, y = (dataset[name].to_numpy() if name in dataset.variables else None for name in "xy")
+        values = variable.to_numpy()
+        maps[str(name)] = values if values.ndim else values.item()
+    for name, values in maps.items():
+        maps[name] = _in_unit(values, dataset[name], declaration_of(name, declarations).unit)
+    x, y = (
+        _in_unit(dataset[name].to_numpy(), dataset[name], "mm") if name in dataset.variables else None
+        for name in "xy"
+    )
     process = {str(name): one for name, one in dataset.attrs.items()}
     return Result(maps, x=x, y=y, process=process, declarations=declarations)
+
+
+def _as_picture(dataset: xarray.Dataset) -> xarray.Dataset:
+    """Return a dataset whose rows are along y, from the top, and columns along x, from the left."""
+    for name, sign in (("x", 1), ("y", -1)):
+        places = dataset[name].to_numpy() if name in dataset.coords else np.empty(0)
+        if places.ndim == 1 and len(places) > 1 and np.all(sign * np.diff(places) < 0):
+            dataset = dataset.isel({name: slice(None, None, -1)})
+    swapped = {"x": "y", "y": "x"}
+    for name, variable in dataset.data_vars.items():
+        names = [str(one) for one in variable.dims]
+        if {"x", "y"} <= {*names} and names.index("x") < names.index("y"):
+            dataset = dataset.assign({name: variable.transpose(*(swapped.get(one, one) for one in names))})
+    return dataset
+
+
+def _in_unit(values: Any, variable: xarray.DataArray, unit: str) -> Any:
+    """Return values in a declared unit, converted if the variable's attribute names another."""
+    own = str(variable.attrs.get("units", unit))
+    if not unit or own == unit:
+        return values
+    try:
+        factor = ratio(own, unit)
+    except InputError as error:
+        raise InputError(f"variable {variable.name} of the dataset: {error}") from error
+    return np.asarray(values, np.float64) * factor if np.ndim(values) else values * factor
 
 
 def _first(result: Shown) -> str | None:

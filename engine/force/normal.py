@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.errors import NotConverged
-from mirrorskin.engine.integration.validation import check_pixel_size
+from mirrorskin.engine.inputs import Maps, as_result, pixel_size_of
+from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.press.halfspace import HalfSpace, Pressed, load_gradient, press
-from mirrorskin.io import InputError
+from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import checked
 
 if TYPE_CHECKING:
@@ -22,38 +22,18 @@ if TYPE_CHECKING:
 _BEYOND = 0.01  # of the load that may lie beyond the picture
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Force:
-    """The normal force of a press.
-
-    Attributes
-    ----------
-    pressure : ndarray, (H, W), float32
-        MPa; 0 where nothing touches.
-    contact : ndarray, (H, W), bool
-        Where sensor and object touch.
-    force, sigma : float
-        Newtons, and the standard deviation that is expected.
-    """
-
-    pressure: NDArray[np.float32]
-    contact: NDArray[np.bool_]
-    force: float
-    sigma: float
-
-
 @checked
 def find_force(
-    height: ArrayLike,
-    travel: float,
-    pixel_size: ArrayLike,
-    modulus: float,
+    height: Maps,
+    travel: float | None = None,
+    pixel_size: ArrayLike | None = None,
+    modulus: float | None = None,
     *,
-    sigma: ArrayLike = 0.0,
+    sigma: ArrayLike | None = None,
     travel_sigma: float = 0.0,
     modulus_sigma: float = 0.0,
     compliance: float = 0.0,
-) -> Force:
+) -> Result:
     """Find the pressure on a rigid object of known shape, pressed into the elastomer without friction.
 
     The elastomer is an incompressible half-space, E* = E / (1 - 1/4) = 4/3 E; the contact is found by
@@ -62,26 +42,30 @@ def find_force(
 
     Parameters
     ----------
-    height : array_like, (H, W)
-        Of the object, mm: 0 where it meets the sheet at travel 0; NaN where there is none.
-    travel : float
-        By how much the body is lowered, mm.
-    pixel_size : float or (float, float)
-        Millimetres, along x and y.
-    modulus : float
-        Young's, MPa.
-    sigma : array_like, scalar or (H, W)
-        Standard deviation of each height, mm, independent of the others'.
+    height : Result, mapping, xarray.Dataset, path or array_like, (H, W)
+        Height of the object, mm, and its standard deviation, if available; an array is the height. It is 0
+        where the object meets the sheet at travel 0, and NaN where there is no object.
+    travel : float, optional
+        Distance by which the body is lowered, mm; by default ``travel`` of the result's process.
+    pixel_size : float or (float, float), optional
+        Millimetres along x and y; by default that of the result.
+    modulus : float, optional
+        Young's modulus, MPa; by default that of the result's calibration.
+    sigma : array_like, scalar or (H, W), optional
+        Standard deviation of each height, mm, independent of the others'; where it is NaN, that of the
+        nearest pixel. By default ``height_sigma`` of the result, or 0.
     travel_sigma : float
-        That of the travel, or of an error that all heights have in common, mm.
+        Standard deviation of the travel, or of an error that all heights have in common, mm.
     modulus_sigma : float
-        That of the modulus, MPa.
+        Standard deviation of the modulus, MPa; by default that of the calibration if the modulus is.
     compliance : float
-        Of the stage, times the modulus: mm for each mm^2 of force over modulus, 1/mm, as `io.Gel` has it.
+        Compliance of the stage times the modulus: mm for each mm^2 of force over modulus, 1/mm, as in
+        `io.Gel`.
 
     Returns
     -------
-    Force
+    Result
+        ``pressure``, MPa, 0 where nothing touches; ``contact``; ``force`` and ``force_sigma``, N.
 
     Raises
     ------
@@ -98,25 +82,53 @@ def find_force(
     >>> x = np.linspace(-2, 2, 41)
     >>> ball = np.sqrt(9 - x**2 - x[:, np.newaxis] ** 2) - 3
     >>> found = find_force(ball, 0.5, 0.1, modulus=0.1, modulus_sigma=0.002)
-    >>> round(found.force, 3), round(found.sigma, 3)
+    >>> round(found.force, 3), round(found.force_sigma, 3)
     (0.107, 0.002)
     """
-    surface, size = np.asarray(height, np.float64), check_pixel_size(pixel_size)
+    result = as_result(height, "height")
+    if result.height is None:
+        raise InputError("height has no map of that name: give the result of a press, or an array (H, W)")
+    surface, size = np.asarray(result.height, np.float64), pixel_size_of(result, "height", pixel_size)
     if surface.ndim != 2 or 0 in surface.shape:
         raise InputError(f"heights have shape {surface.shape}: one map (H, W) is needed")
+    if travel is None:
+        stored = result.process.get("travel")
+        if not isinstance(stored, float):
+            raise InputError("travel is missing: specify by how many millimetres the body is lowered")
+        travel = stored
+    young, young_sigma = modulus_of(result, modulus, modulus_sigma)
     _check(travel=(travel, -math.inf), travel_sigma=(travel_sigma, 0.0), modulus_sigma=(modulus_sigma, 0.0))
     _check(compliance=(compliance, 0.0))
-    check_modulus(modulus)
-    errors = np.asarray(sigma, np.float64)
+    own = 0.0 if result.height_sigma is None else result.height_sigma
+    errors = np.asarray(own if sigma is None else sigma, np.float64)
     if errors.shape not in ((), surface.shape):
         raise InputError(f"sigma has shape {errors.shape}: give one number, or one a pixel {surface.shape}")
+    if errors.ndim and np.isfinite(errors).any():
+        errors = fill_with_nearest(errors)
     space = HalfSpace((surface.shape[0], surface.shape[1]), size)
-    found = press(space, surface + travel, compliance)
-    gradient = load_gradient(space, found.contact, compliance)
+    pressed = press(space, surface + travel, compliance)
+    gradient = load_gradient(space, pressed.contact, compliance)
     common = travel_sigma * float(gradient.sum())
-    independent = float(np.sqrt(np.sum(np.where(found.contact, errors * gradient, 0.0) ** 2)))
-    spread = math.hypot(modulus * common, modulus * independent, modulus_sigma * found.load)
-    return Force((modulus * found.strain).astype(np.float32), found.contact, modulus * found.load, spread)
+    independent = float(np.sqrt(np.sum(np.where(pressed.contact, errors * gradient, 0.0) ** 2)))
+    spread = math.hypot(young * common, young * independent, young_sigma * pressed.load)
+    pressure = (young * pressed.strain).astype(np.float32)
+    found = _force(pressure, pressed.contact, young * pressed.load, spread)
+    x, y = pixel_axes((surface.shape[0], surface.shape[1]), size)
+    return found.assign(x=x, y=y, process={"travel": float(travel), "modulus": float(young)})
+
+
+def _force(pressure: NDArray[np.float32], contact: NDArray[np.bool_], force: float, sigma: float) -> Result:
+    return Result(pressure=pressure, contact=contact.astype(np.uint8), force=force, force_sigma=sigma)
+
+
+def modulus_of(result: Result, modulus: float | None, modulus_sigma: float) -> tuple[float, float]:
+    """Return Young's modulus and its standard deviation, as specified, or those of a result's calibration."""
+    if modulus is not None:
+        return check_modulus(modulus), modulus_sigma
+    stiffness = None if result.calibration is None else result.calibration.stiffness
+    if stiffness is None:
+        raise InputError("modulus is missing: specify Young's modulus, MPa, or calibrate force")
+    return stiffness.modulus, modulus_sigma or math.sqrt(stiffness.covariance[0, 0])
 
 
 def check_modulus(modulus: float) -> float:
@@ -135,7 +147,7 @@ def _check(**values: tuple[float, float]) -> None:
             raise InputError(f"{name} {value:g} cannot be: give {bound}")
 
 
-def force_of_press(fit: PressFit, known: Stiffness | float) -> Force:
+def force_of_press(fit: PressFit, known: Stiffness | float) -> Result:
     """Return the force of a press whose surface was fitted to the onsets, at the greatest travel.
 
     Presses of known force correct for the gel's errors, and tell what is left; with a modulus that is merely
@@ -155,7 +167,7 @@ def force_of_press(fit: PressFit, known: Stiffness | float) -> Force:
         spread = math.hypot(modulus * own, learned, known.scatter * force)
     pressure = (force / pressed.load * fit.on_pixels(pressed.strain)).astype(np.float32)
     contact = fit.on_pixels(pressed.contact.astype(np.float64)) >= 0.5
-    return Force(np.where(contact, pressure, np.float32(0)), contact, force, spread)
+    return _force(np.where(contact, pressure, np.float32(0)), contact, force, spread)
 
 
 def press_within(fit: PressFit) -> Pressed:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,11 +10,11 @@ from scipy import fft, ndimage, special
 from scipy.optimize import brentq
 
 from mirrorskin.engine.errors import NotConverged
-from mirrorskin.engine.force.normal import check_modulus
-from mirrorskin.engine.integration.validation import check_pixel_size
+from mirrorskin.engine.force.normal import modulus_of
+from mirrorskin.engine.inputs import Maps, as_result, pixel_size_of
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.press.halfspace import spectrum_of
-from mirrorskin.io import InputError
+from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import checked
 
 Doubles = NDArray[np.float64]
@@ -30,35 +29,18 @@ _LEAST_KNOWN = 0.8  # of the contact that must have a displacement
 _DAMPING = 1e-4, 1e4  # of what a contact as a whole gives way by
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TangentialForce:
-    """The force along the sheet.
-
-    Attributes
-    ----------
-    traction : ndarray, (H, W, 2), float32
-        MPa along x and y that the object exerts on the sensor; 0 outside the contact.
-    force, sigma : ndarray, (2,), float64
-        Newtons along x and y, and the standard deviations that are expected.
-    """
-
-    traction: NDArray[np.float32]
-    force: Doubles
-    sigma: Doubles
-
-
 @checked
 def find_tangential_force(
-    displacement: ArrayLike,
-    pixel_size: ArrayLike,
-    modulus: float,
+    displacement: Maps,
+    pixel_size: ArrayLike | None = None,
+    modulus: float | None = None,
     *,
     contact: ArrayLike | None = None,
     normal_pressure: ArrayLike | None = None,
-    sigma: ArrayLike = 0.0,
-    window: int = 1,
+    sigma: ArrayLike | None = None,
+    window_size: int = 1,
     modulus_sigma: float = 0.0,
-) -> TangentialForce:
+) -> Result:
     """Find the traction that displaces the skin along the sheet, and the force.
 
     The elastomer is an incompressible half-space, in which pressure displaces nothing along the surface. A
@@ -73,27 +55,31 @@ def find_tangential_force(
 
     Parameters
     ----------
-    displacement : array_like, (H, W, 2)
-        Of the skin against the body, mm, x right and y up.
-    pixel_size : float or (float, float)
-        Millimetres, along x and y.
-    modulus : float
-        Young's, MPa.
+    displacement : Result, mapping, xarray.Dataset, path or array_like, (H, W, 2)
+        Displacement of the skin against the body, mm, x to the right and y up, and its standard deviation, if
+        available; of several frames, (T, H, W, 2), the last is used. An array is the displacement.
+    pixel_size : float or (float, float), optional
+        Millimetres along x and y; by default that of the result.
+    modulus : float, optional
+        Young's modulus, MPa; by default that of the result's calibration.
     contact : array_like, (H, W), optional
-        Where the object touches; by default where the pressure is above 0. One that is too large costs
-        accuracy only by noise, one that is too small loses force.
+        Where the object touches; by default where the pressure is above 0, or the contact or pressure of the
+        result. A contact that is too large adds noise, one that is too small loses force.
     normal_pressure : array_like, (H, W), optional
         As a result's ``pressure``; needed without a contact.
-    sigma : array_like, scalar, (H, W) or (H, W, 2)
-        Standard deviation of each component of the displacement, mm; where it is NaN, that of the nearest.
-    window : int
-        Pixels along a side of the windows in which displacements were found: neighbours share their errors.
+    sigma : array_like, scalar, (H, W) or (H, W, 2), optional
+        Standard deviation of each component of the displacement, mm; where it is NaN, that of the nearest
+        pixel. By default ``displacement_sigma`` of the result, or 0.
+    window_size : int
+        Side of the windows in which displacements were found, pixels: their errors are correlated.
     modulus_sigma : float
-        Standard deviation of the modulus, MPa.
+        Standard deviation of the modulus, MPa; by default that of the calibration if the modulus is.
 
     Returns
     -------
-    TangentialForce
+    Result
+        ``traction``, (H, W, 2), MPa along x and y that the object exerts on the sensor, 0 outside the
+        contact; ``force_x`` and ``force_y``, N, with their standard deviations.
 
     Raises
     ------
@@ -110,12 +96,14 @@ def find_tangential_force(
     >>> x = np.linspace(-1.5, 1.5, 61)
     >>> disc = np.hypot(x, x[:, np.newaxis]) <= 1
     >>> moved = np.broadcast_to([0.1, 0.0], (61, 61, 2))
-    >>> find_tangential_force(moved, 0.05, modulus=0.1, contact=disc).force.round(3)[0].tolist()
+    >>> round(find_tangential_force(moved, 0.05, modulus=0.1, contact=disc).force_x, 3)
     0.018
     """
-    moved, spread, touches = _checked(displacement, sigma, contact, normal_pressure, window)
-    size = check_pixel_size(pixel_size)
-    check_modulus(modulus)
+    result = as_result(displacement, "displacement", quantity="displacement")
+    moved, spread, touches = _checked(result, sigma, contact, normal_pressure, window_size)
+    size = pixel_size_of(result, "displacement", pixel_size)
+    young, young_sigma = modulus_of(result, modulus, modulus_sigma)
+    x, y = pixel_axes((touches.shape[0], touches.shape[1]), size)
     rows, columns = (slice(int(part.min()), int(part.max()) + 1) for part in np.nonzero(touches))
     traction = np.zeros((*touches.shape, 2), np.float32)
     touches, spread = touches[rows, columns], spread[:, rows, columns]
@@ -123,38 +111,50 @@ def find_tangential_force(
     system = _System(touches, size)
     units = [touches * unit for unit in np.eye(2)[:, :, np.newaxis, np.newaxis]]
     weights = np.stack([system.solve(unit, _TOLERANCE) for unit in units]) * size[0] * size[1]
-    force = modulus * np.sum(weights * target, axis=(1, 2, 3)) * _UP.ravel()
-    shared = ndimage.uniform_filter(weights * spread, (0, 0, window, window), mode="constant") * window
-    own = modulus * np.sqrt(np.sum(shared**2, axis=(1, 2, 3)))
+    force = young * np.sum(weights * target, axis=(1, 2, 3)) * _UP.ravel()
+    window = (0, 0, window_size, window_size)
+    shared = ndimage.uniform_filter(weights * spread, window, mode="constant") * window_size
+    own = young * np.sqrt(np.sum(shared**2, axis=(1, 2, 3)))
     strain = system.damped(target, spread)
-    traction[rows, columns] = np.moveaxis(modulus * strain * _UP, 0, -1)
-    return TangentialForce(traction, force, np.hypot(own, modulus_sigma / modulus * force))
+    traction[rows, columns] = np.moveaxis(young * strain * _UP, 0, -1)
+    force_sigma = np.hypot(own, young_sigma / young * force)
+    return Result(
+        traction=traction,
+        force_x=float(force[0]),
+        force_x_sigma=float(force_sigma[0]),
+        force_y=float(force[1]),
+        force_y_sigma=float(force_sigma[1]),
+        x=x,
+        y=y,
+        process={"modulus": float(young)},
+    )
 
 
 def _checked(
-    displacement: ArrayLike,
-    sigma: ArrayLike,
+    result: Result,
+    sigma: ArrayLike | None,
     contact: ArrayLike | None,
     pressure: ArrayLike | None,
-    window: int,
+    window_size: int,
 ) -> tuple[Doubles, Doubles, Mask]:
     """Return displacements without gaps, their standard deviations, and the contact."""
-    moved = np.asarray(displacement, np.float64)
+    if result.displacement is None:
+        raise InputError("displacement has no map of that name: give the result of a slide, or an array")
+    moved = np.asarray(result.displacement, np.float64)
+    moved = moved[-1] if moved.ndim == 4 and len(moved) else moved
     if moved.ndim != 3 or moved.shape[2] != 2 or 0 in moved.shape:
         raise InputError(f"displacements have shape {moved.shape}: one map (H, W, 2) is needed")
     if contact is None and pressure is None:
-        raise InputError("where the object touches is not said: give contact, or normal_pressure")
-    touches = np.asarray(contact if contact is not None else np.asarray(pressure, np.float64) > 0) > 0
-    if touches.shape != moved.shape[:2]:
-        raise InputError(f"contact has shape {touches.shape}: it must be that of the map, {moved.shape[:2]}")
-    spread = np.asarray(sigma, np.float64)
+        contact, pressure = result.contact, result.pressure
+    touches = _touches(contact, pressure, moved.shape[:2])
+    own = 0.0 if result.displacement_sigma is None else result.displacement_sigma
+    spread = np.asarray(own if sigma is None else sigma, np.float64)
+    spread = spread[-1] if sigma is None and spread.ndim == 4 else spread
     if spread.shape not in ((), moved.shape[:2], moved.shape):
         raise InputError(f"sigma has shape {spread.shape}: it must be that of the map, {moved.shape[:2]}")
     spread = np.broadcast_to(spread[..., np.newaxis] if spread.ndim == 2 else spread, moved.shape)
-    if window < 1:
-        raise InputError(f"window {window} cannot be: give pixels, 1 or more")
-    if not touches.any():
-        raise InputError("nothing touches: there is no traction to find")
+    if window_size < 1:
+        raise InputError(f"window_size {window_size} cannot be: give pixels, 1 or more")
     known = np.isfinite(moved).all(axis=-1)
     if known.any() and not (farthest := np.abs(moved[known]).max()) < _FARTHEST:
         raise InputError(f"a displacement is {farthest:.3g} mm: less than {_FARTHEST:g} are needed")
@@ -168,6 +168,18 @@ def _checked(
         for values in (moved, spread)
     )
     return next(filled), next(filled), touches
+
+
+def _touches(contact: ArrayLike | None, pressure: ArrayLike | None, shape: tuple[int, ...]) -> Mask:
+    """Return where the object touches."""
+    if contact is None and pressure is None:
+        raise InputError("it is unknown where the object touches: give contact, or normal_pressure")
+    touches = np.asarray(contact if contact is not None else np.asarray(pressure, np.float64) > 0) > 0
+    if touches.shape != shape:
+        raise InputError(f"contact has shape {touches.shape}: it must be that of the map, {shape}")
+    if not touches.any():
+        raise InputError("nothing touches: there is no traction to find")
+    return touches
 
 
 class _System:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.inputs import spacing
 from mirrorskin.io import InputError, Region, Result
 from mirrorskin.io.result import select_turn
 
@@ -73,7 +74,7 @@ def patch_of(result: Result, region: Region | None = None) -> tuple[Patch, Resul
         result = result.assign(height_sigma=None)
     if result.x is None or result.y is None:
         raise InputError("the result has no pixel size: reconstruct it again with --pixel-size")
-    pixel_size = pixel_size_of(result.x, result.y)
+    pixel_size = spacing(result.x, result.y)
     if region is None:
         region = Region.whole((height.shape[0], height.shape[1]))
     region.check((height.shape[0], height.shape[1]), "--region")
@@ -139,12 +140,3 @@ def _secant(normals: NDArray[np.float32]) -> Doubles:
     """Return one over their z; NaN of normals that do not face the camera."""
     z = normals[..., 2].astype(np.float64)
     return 1 / np.where(z > 0, z, np.nan)
-
-
-def pixel_size_of(x: Doubles, y: Doubles) -> tuple[float, float]:
-    """Return the distances of pixel centres along x and y, mm; of a single row or column, square pixels."""
-    steps = [abs(axis[-1] - axis[0]) / (axis.size - 1) if axis.size > 1 else None for axis in (x, y)]
-    known = [float(step) for step in steps if step is not None]
-    if not known:
-        raise InputError("the result has a single pixel, so its size is unknown: take more")
-    return known[0], known[-1]

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.inputs import spacing
 from mirrorskin.engine.metrology.fitting import covariance
-from mirrorskin.engine.metrology.patch import heights_of, pixel_size_of
+from mirrorskin.engine.metrology.patch import heights_of
 from mirrorskin.engine.metrology.quantity import Quantity
 from mirrorskin.engine.resample import SamplePoints
 from mirrorskin.io import InputError, Result, pixel_axes
@@ -93,7 +94,7 @@ def section(result: Result, start: Point | None = None, end: Point | None = None
                 "the result has no pixel size to place a section by: reconstruct it again with --pixel-size"
             )
         (x, y), unit = pixel_axes((height.shape[0], height.shape[1]), (1.0, 1.0)), "px"
-    size = pixel_size_of(x, y) if height.size > 1 else (1.0, 1.0)
+    size = spacing(x, y) if height.size > 1 else (1.0, 1.0)
     if start is None or end is None:
         row = _top_row(height)
         start, end = (float(x[0]), float(y[row])), (float(x[-1]), float(y[row]))

@@ -89,7 +89,7 @@ class Elastomer(Step):
         return result.assign(
             pressure=force.pressure,
             force=force.force,
-            force_sigma=force.sigma,
+            force_sigma=force.force_sigma,
             process={**result.process, "modulus": said},
         )
 

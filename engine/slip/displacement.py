@@ -7,22 +7,28 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.frames import check_dtype, check_frames
 from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.slip.tracking import GRADIENT_NOISE, NodeField, Tracker
-from mirrorskin.io import InputError
+from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import checked
-from mirrorskin.io.result import Shown
+from mirrorskin.io.maps import TABLE, DisplacementStatus, status_of
 from mirrorskin.kernels.device import Device, open_device
 
 Doubles = NDArray[np.float64]
 
-WINDOW, STEP = 12, 4
-INVALID, FOUND, NOT_FOUND, NO_TEXTURE = range(4)
-"""What the status says of a pixel's displacement."""
+MAPS = {
+    "displacement": TABLE["displacement"],
+    "displacement_sigma": replace(
+        TABLE["displacement"].deviation("displacement"), components=("x", "y"), per_frame=True
+    ),
+    "status": replace(status_of(DisplacementStatus), per_frame=True),
+}
+"""Declarations of the maps of `find_displacement`: each component has a standard deviation of its own."""
 
 _RANK = np.array([1, 0, 2, 3], np.uint8)  # of a status among those of the nodes around a pixel
 _CODES = np.argsort(_RANK).astype(np.uint8)
@@ -32,38 +38,17 @@ _LAPLACIAN_NOISE = 4 * 20 / 24**2  # of a variance: two standard deviations
 _LEAST_TEXTURED = 0.1  # of the windows; there are as many on a clear sheet where light and dark meet
 
 
-@dataclass(frozen=True, slots=True, repr=False)
-class Displacement(Shown):
-    """How far each point of a reference has moved in each frame.
-
-    Attributes
-    ----------
-    displacement, sigma : ndarray, (T, H, W, 2), float32
-        Millimetres along x and along y (up), and their standard deviations; NaN unless status is 1.
-    status : ndarray, (T, H, W), uint8
-        0 the window leaves the picture or holds no usable sample, 1 displacement, 2 the texture was not
-        found again, 3 no texture beyond the noise.
-    noise : float
-        Standard deviation of a sample, counts, given or estimated.
-    """
-
-    displacement: NDArray[np.float32]
-    sigma: NDArray[np.float32]
-    status: NDArray[np.uint8]
-    noise: float
-
-
 @checked
 def find_displacement(
     reference: NDArray[Any],
     frames: NDArray[Any],
     pixel_size: ArrayLike,
     *,
-    window: int = WINDOW,
-    step: int = STEP,
+    window_size: int = 12,
+    window_step: int = 4,
     noise: float | None = None,
     device: str | Device | None = None,
-) -> Displacement:
+) -> Result:
     """Find how far the texture of a reference has moved in frames.
 
     Least squares in square windows, of which each may move, strain and turn (an affine field), and whose
@@ -79,14 +64,22 @@ def find_displacement(
         In the order in which they were taken.
     pixel_size : float or (float, float)
         Millimetres, along x and y.
-    window, step : int
-        Pixels of a window's side, and from one window's centre to the next. Twice the window halves the
-        standard deviation, and smooths over twice as far.
+    window_size : int
+        Side of a window, pixels. A window twice as large halves the standard deviation, and smooths twice as
+        far.
+    window_step : int
+        Distance between the centres of adjacent windows, pixels.
     noise : float, optional
-        Standard deviation of a sample in counts; by default estimated from what the fit leaves, window by
-        window.
+        Standard deviation of a sample, counts; by default estimated from the residuals, window by window.
     device : str or Device, optional
         See ``mirrorskin.kernels.device.open_device``.
+
+    Returns
+    -------
+    Result
+        ``displacement`` and ``displacement_sigma``, (T, H, W, 2), mm along x and y (up), are undefined unless
+        ``status``, (T, H, W), is 1: 0 the window leaves the picture or has no usable sample, 2 the texture
+        was not found again, 3 no texture beyond the noise. ``process`` contains the ``noise``, counts.
 
     Raises
     ------
@@ -114,16 +107,18 @@ def find_displacement(
     if not np.isfinite(reference).all():
         raise InputError("the reference has samples that are no numbers: leave out a part that has none")
     size = check_pixel_size(pixel_size)
-    check_windows(np.shape(reference), window, step)
-    check_noise(noise)
-    tracker = Tracker(reference, window, step, open_device(device))
+    check_windows(np.shape(reference), window_size, window_step)
+    if noise is not None and not 0 < noise < 1e9:
+        raise InputError(f"noise {noise}: a standard deviation in counts above 0 is needed, such as 1.5")
+    tracker = Tracker(reference, window_size, window_step, open_device(device))
     fields = [tracker.follow(frame) for frame in frames]
     texture = Texture.of(tracker, np.mean([field.variance for field in fields], axis=0), noise)
     texture.refuse_clear("the frames")
     sigma = np.sqrt(np.einsum("yxii->yxi", texture.covariance)) * size
-    maps = [_maps(tracker, field, texture, window, sigma, size) for field in fields]
-    displacement, sigmas, status = (np.stack(part) for part in zip(*maps, strict=True))
-    return Displacement(displacement, sigmas, status, texture.noise)
+    parts = [_maps(tracker, field, texture, window_size, sigma, size) for field in fields]
+    maps = dict(zip(MAPS, (np.stack(part) for part in zip(*parts, strict=True)), strict=True))
+    x, y = pixel_axes(frames.shape[1:], size)
+    return Result(maps, x=x, y=y, process={"noise": texture.noise}, declarations=MAPS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +185,7 @@ def _maps(
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Return a frame's displacement, sigma, mm, and status, of all pixels."""
     status = node_status(field, texture)
-    known = (status == FOUND)[..., None]
+    known = (status == DisplacementStatus.FOUND)[..., None]
     displacement = np.where(known, field.moved.transpose(1, 2, 0) * [size[0], -size[1]], np.nan)
     noisy = (sigma * misfit(field, texture, window)) ** 2
     sigma = np.sqrt(noisy + bending_variance(displacement, sigma**2, tracker.finest.step, window))
@@ -235,24 +230,16 @@ def bending_variance(displacement: Doubles, variance: Doubles, step: int, window
 
 def node_status(field: NodeField, texture: Texture) -> NDArray[np.uint8]:
     """Return the status of a frame's nodes, (rows, columns)."""
-    status = np.where(field.found, FOUND, NOT_FOUND)
-    status = np.where(np.isfinite(field.moved[0]), status, INVALID)
-    status = np.where(texture.there, status, NO_TEXTURE)
-    return np.where(texture.usable, status, INVALID).astype(np.uint8)
+    status = np.where(field.found, DisplacementStatus.FOUND, DisplacementStatus.NOT_FOUND)
+    status = np.where(np.isfinite(field.moved[0]), status, DisplacementStatus.INVALID_INPUT)
+    status = np.where(texture.there, status, DisplacementStatus.NO_TEXTURE)
+    return np.where(texture.usable, status, DisplacementStatus.INVALID_INPUT).astype(np.uint8)
 
 
-def check_windows(shape: tuple[int, ...], window: int, step: int) -> None:
+def check_windows(shape: tuple[int, ...], window_size: int, window_step: int) -> None:
     """Raise InputError unless windows fit into a picture, and nodes are close enough."""
     most = min(shape)
-    if not 6 <= window <= most:
-        raise InputError(f"window {window}: 6 to {most} pixels are possible, the frames being {shape}")
-    if not 1 <= step <= min(_MOST_STEP, most):
-        raise InputError(
-            f"step {step}: 1 to {min(_MOST_STEP, most)} pixels from window to window are possible"
-        )
-
-
-def check_noise(noise: float | None) -> None:
-    """Raise InputError unless noise is a standard deviation, or not given."""
-    if noise is not None and not 0 < noise < 1e9:
-        raise InputError(f"noise {noise}: a standard deviation in counts above 0 is needed, such as 1.5")
+    if not 6 <= window_size <= most:
+        raise InputError(f"window_size {window_size}: 6 to {most} pixels are possible in frames of {shape}")
+    if not 1 <= window_step <= min(_MOST_STEP, most):
+        raise InputError(f"window_step {window_step}: 1 to {min(_MOST_STEP, most)} pixels are possible")

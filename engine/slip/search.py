@@ -3,258 +3,234 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+import os
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.frames import check_dtype, check_frames
+from mirrorskin.engine.inputs import Maps, as_result
 from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.nearest_fill import fill_with_nearest
+from mirrorskin.engine.operation import Operation
+from mirrorskin.engine.options import option
 from mirrorskin.engine.slip.displacement import (
-    FOUND,
-    NO_TEXTURE,
-    STEP,
     Texture,
     bending_variance,
-    check_noise,
     check_windows,
     misfit,
     node_status,
 )
 from mirrorskin.engine.slip.onset_map import Expected, OnsetMap, fit_onsets
 from mirrorskin.engine.slip.tracking import NodeField, Tracker
-from mirrorskin.engine.thread_safe import ThreadSafe
-from mirrorskin.engine.tiling import MEMORY_LIMIT
-from mirrorskin.io import InputError, pixel_axes
-from mirrorskin.io.maps import SlipStatus
-from mirrorskin.io.result import Shown
-from mirrorskin.kernels.device import Device, open_device
+from mirrorskin.io import Calibrated, InputError, Map, Recording, Result, pixel_axes
+from mirrorskin.io.maps import TABLE, TWIST, DisplacementStatus, SlipStatus, status_of
+from mirrorskin.io.positions import check_finite
+from mirrorskin.io.types import FRAME_DTYPES, UNDISTORTED
+
+if TYPE_CHECKING:
+    from mirrorskin.io import Source
+    from mirrorskin.io.types import ProcessValue
 
 Doubles = NDArray[np.float64]
-SlipMotion = Literal["horizontal", "twist"]
-MOTIONS: tuple[SlipMotion, ...] = get_args(SlipMotion)
-
-WINDOW = 8
-"""Pixels: smaller than for displacement alone, as all frames together tell an onset."""
 
 _EXPECTED = {  # see docs/method/slip.md
-    "displacement": Expected(power=1.6, onset_bend=12.0, growth_bend=32.0),
+    "horizontal": Expected(power=1.6, onset_bend=12.0, growth_bend=32.0),
     "twist": Expected(power=1.4, onset_bend=24.0, growth_bend=4.0),
 }
-# A contact that is estimated is too wide: what windows see at its rim in a slide is free skin.
-_BEND_ESTIMATED = {"displacement": 64.0, "twist": 24.0}
-_FOLLOWS = 0.5  # of the object's movement, from which on skin is taken to have touched it
-_LEAST_STUCK = 4  # nodes that a twist's centre and angle are made of
-_STILL = 1e-9  # of the way, by which nobody moves
+# An estimated contact is too wide: at its rim in a slide, windows contain free skin.
+_BEND_ESTIMATED = {"horizontal": 64.0, "twist": 24.0}
+_FOLLOWS = 0.5  # of the object's movement, above which skin is assumed to have been in contact with it
+_LEAST_STUCK = 4  # nodes from which the centre and the angle of a twist are computed
+_STILL = 1e-9  # of the body's path, below which it is at rest
+_BLOCK = 16  # frames that are read at once
 
 
-@dataclass(frozen=True, slots=True, repr=False)
-class Slip(Shown):
-    """How the skin went along with an object that the body slid or turned over.
-
-    Attributes
-    ----------
-    displacement : ndarray, (H, W, 2) or (T, H, W, 2), float32
-        Millimetres along x and y that the skin has moved in the picture since the first frame, in the last
-        frame or in each: of the point that was seen at the pixel first.
-    displacement_sigma : ndarray, (H, W), float32
-        Millimetres: standard deviation along either axis, the root of their mean square.
-    slip_onset, slip_onset_sigma : ndarray, (H, W), float32
-        The way of the body since the first frame, mm or radians, after which the skin broke loose; NaN where
-        it did not.
-    status : ndarray, (H, W), uint8
-        0 unknown, 1 slipped, 2 sticks, 3 no contact, 4 no texture.
-    contact : ndarray, (H, W), uint8
-        1 where the skin touches the object: given, or estimated.
-    way : ndarray, (T,), float64
-        How far the body has come along its path in each frame, mm or radians.
-    stick_ratio : ndarray, (T,), float64
-        Share of the contact that sticks, frame by frame; NaN from where the body first turns back.
-    centre : (float, float) or None
-        Of a twist: what the skin that sticks turned about, mm from the picture's centre; NaN where too
-        little of it is left.
-    angle : float or None
-        Of a twist: by how much it turned, radians, counter-clockwise; the body's own is the opposite.
-    noise : float
-        Standard deviation of a sample, counts, given or estimated.
-    """
-
-    displacement: NDArray[np.float32]
-    displacement_sigma: NDArray[np.float32]
-    slip_onset: NDArray[np.float32]
-    slip_onset_sigma: NDArray[np.float32]
-    status: NDArray[np.uint8]
-    contact: NDArray[np.uint8]
-    way: Doubles
-    stick_ratio: Doubles
-    centre: tuple[float, float] | None
-    angle: float | None
-    noise: float
-
-
-class SlipSearch(ThreadSafe):
-    """Find displacement and slip in frames that come block by block; see `engine.streaming.Estimator`.
+class Slip(Operation):
+    """Displacement of the skin, and where and when it slips while the body slides or twists.
 
     The first frame is the reference. In the body's frame, skin that sticks to an object at rest moves as the
-    object does, against the body; by what it lags behind it has slipped. When that began is fitted to all
+    object does, against the body; skin that lags behind it has slipped. The onset of slip is fitted to all
     frames (`mirrorskin.engine.slip.onset_map.fit_onsets`); see the documentation, "Slip".
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns of a frame.
-    dtype : dtype
-        uint8, uint16 or float32.
-    pixel_size : float or (float, float)
-        Millimetres, along x and y.
-    motion : {"horizontal", "twist"}
-    contact : array_like, (H, W), optional
-        Not 0 where the skin touches the object in the first frame, as a press tells. Without it, contact is
-        where the skin went along by half of the way or more: free skin round the contact does so, too, so
-        that the contact comes out 2 to 9 % too wide.
-    centre : (float, float)
-        Of a twist: where the body's axis is, mm from the picture's centre.
-    window, step, noise, device
-        As for `mirrorskin.engine.find_displacement`.
-    per_frame : bool
-        Whether the displacement is that of each frame.
-    memory_limit : int
-        Bytes of host memory for frames on the move; half of it is the room for one block.
+    ``process`` contains the ``noise``, counts, and where the ``contact`` is from. For a twist it contains the
+    ``angle``, radians counter-clockwise, by which the skin that sticks turned, and ``centre_x`` and
+    ``centre_y``, mm from the body's axis, of that rotation; they are NaN if too little skin sticks.
 
     Examples
     --------
     >>> import cv2
+    >>> from mirrorskin import engine
     >>> texture = np.random.default_rng(1).normal(100, 20, (60, 80))
     >>> texture = cv2.GaussianBlur(texture, (0, 0), 1.5).astype(np.float32)
-    >>> search = SlipSearch((60, 80), np.float32, 0.1, contact=np.ones((60, 80)), noise=0.1)
-    >>> for k in range(4):  # the body goes to the right, the skin sticks and stays behind
-    ...     search.push(np.roll(texture, -k, axis=1)[None], displacement=[[0.1 * k, 0.0]])
-    >>> found = search.result()
+    >>> slip = engine.Slip(pixel_size=0.1, contact=np.ones((60, 80)), noise=0.1)
+    >>> for k in range(4):  # the body moves to the right, the skin sticks to the object
+    ...     slip.push(np.roll(texture, -k, axis=1)[None], displacement=[[0.1 * k, 0.0]])
+    >>> found = slip.result()
     >>> [round(float(part), 3) for part in found.displacement[30, 40]], int(found.status[30, 40])
     ([-0.3, 0.0], 2)
     """
 
-    window: int
-    step: int
+    motions = ("horizontal", "twist")
+    dtypes = FRAME_DTYPES
+    least_frames = 3
+    on_device = True
 
-    def __init__(
-        self,
-        shape: tuple[int, int],
-        dtype: DTypeLike,
-        pixel_size: ArrayLike,
-        *,
-        motion: SlipMotion = "horizontal",
-        contact: ArrayLike | None = None,
-        centre: tuple[float, float] = (0.0, 0.0),
-        window: int = WINDOW,
-        step: int = STEP,
-        noise: float | None = None,
-        per_frame: bool = False,
-        device: str | Device | None = None,
-        memory_limit: int = MEMORY_LIMIT,
-    ) -> None:
-        if motion not in MOTIONS:
-            raise InputError(f"motion {motion!r} does not slip: {' and '.join(MOTIONS)} do")
-        check_windows(shape, window, step)
-        check_noise(noise)
-        self.position = "displacement" if motion == "horizontal" else "twist"
-        self.device: Device = open_device(device)
-        self._shape, self._dtype, self._size = shape, check_dtype(dtype), check_pixel_size(pixel_size)
-        self._contact = None if contact is None else check_contact(contact, shape)
-        self._centre, self.window, self.step = centre, window, step
-        self._noise, self._per_frame = noise, per_frame
-        self._length = max(1, memory_limit // (2 * math.prod(shape) * self._dtype.itemsize))
-        self.reset()
+    contact: Maps | None = option(
+        None,
+        file="RES.h5",
+        help="where the skin touches the object in the first frame: the result of a press, or a map that is"
+        " not 0 there. A pressure determines contact; heights alone are those of light, which runs ahead of"
+        " an elastic contact",
+        shown_default="where the skin followed the object by half of its movement, 2 to 9 % too wide",
+    )
+    per_frame: bool = option(False, help="return the displacement in each frame, not only in the last")
+    window_size: int = option(
+        8, "pixels", within=(6, None), help="side of the windows in which the texture is followed"
+    )
+    window_step: int = option(
+        4, "pixels", within=(1, None), help="distance between the centres of adjacent windows"
+    )
+    noise: float | None = option(
+        None,
+        "counts",
+        above=0,
+        within=(None, 1e9),
+        help="standard deviation of a sample",
+        shown_default="estimated from the residuals, window by window",
+    )
+    motion: Literal["horizontal", "twist"] = option(
+        "horizontal",
+        choices=("horizontal", "twist"),
+        help="motion of the body: a slide along the sheet, or a rotation about its axis; that of a source",
+        python_only=True,
+    )
+    pixel_size: ArrayLike | None = option(
+        None,
+        help="millimetres along x and y, one number or both; that of a source",
+        python_only=True,
+    )
+    centre: tuple[float, float] = option(
+        (0.0, 0.0),
+        help="where the body's axis is, mm from the centre of the frames along x and y; that of a source",
+        python_only=True,
+    )
 
-    @cached_property
-    def room(self) -> NDArray[Any]:
-        """Where a source may write the next frames, (n, H, W)."""
-        return np.empty((min(self._length, 16), *self._shape), self._dtype)
+    displacement = TABLE["displacement"]
+    slip_onset = TABLE["slip_onset"]
+    status = status_of(SlipStatus)
+    slide_distance = TABLE["slide_distance"]
+    twist_angle = TABLE["twist_angle"]
+    stick_ratio = TABLE["stick_ratio"]
 
-    def reset(self) -> None:
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._position = "displacement" if self.motion == "horizontal" else "twist"
+        self.positions = {self._position: True}
+
+    @property
+    def declarations(self) -> Mapping[str, Map]:
+        """Declarations of the maps; the onset in a twist is an angle."""
+        return {**self.maps, "contact": TABLE["contact"], **(TWIST if self.motion == "twist" else {})}
+
+    def configured_for(self, source: Source) -> Self:
+        """Return the operation with motion, pixel size and axis of a source."""
+        changes: dict[str, Any] = {"motion": source.motion}
+        if self.pixel_size is None:
+            changes["pixel_size"] = source.header.pixel_size
+        own = source.source if isinstance(source, Calibrated) else source
+        if isinstance(own, Recording) and source.header.pixel_size is not None:
+            _, rows, columns = own.full_shape
+            right, up = own.region.centre((rows, columns), source.header.pixel_size)
+            changes["centre"] = -right, -up
+        return self.with_options(**changes)
+
+    def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
+        """Check windows and contact, and forget all frames."""
+        if self.pixel_size is None:
+            raise InputError("the pixel size is missing, which slip needs: give --pixel-size (pixel_size=)")
+        self._size = check_pixel_size(self.pixel_size)
+        check_windows(shape, self.window_size, self.window_step)
+        self._contact, self._contact_origin = _read_contact(self.contact, shape)
+        self.clear()
+
+    def clear(self) -> None:
         """Forget the frames so far."""
         self._tracker: Tracker | None = None
         self._places: list[Doubles] = []
         self._fields: list[NodeField] = []
 
-    def push(
-        self,
-        frames: NDArray[Any],
-        *,
-        displacement: ArrayLike | None = None,
-        twist: ArrayLike | None = None,
-        lent: bool = False,
-    ) -> None:
-        """Take in the next frames, (n, H, W), and where the body was: (n, 2) mm, or (n,) radians.
+    @cached_property
+    def room(self) -> NDArray[Any]:
+        """Array in which the next frames may be written before they are pushed, (n, H, W)."""
+        frame_size = math.prod(self.shape) * self.dtype.itemsize
+        return np.empty((max(1, min(_BLOCK, self.memory_limit // (2 * frame_size))), *self.shape), self.dtype)
 
-        Raises
-        ------
-        mirrorskin.io.InputError
-            Frames of another shape or type, or positions that are missing or not finite.
-        """
-        check_frames(frames, self._dtype, self._shape)
-        places = self._check_places(displacement if self.position == "displacement" else twist, len(frames))
+    def push(
+        self, frames: NDArray[Any], *, displacement: ArrayLike | None = None, twist: ArrayLike | None = None
+    ) -> None:
+        """Take in the next frames, (n, H, W), and the body's displacement, (n, 2) mm, or twist, (n,) rad."""
+        width, values = ((2,), displacement) if twist is None else ((), twist)
+        assert values is not None
+        places = check_finite(values, len(frames), self._position, width=width).reshape(len(frames), -1)
         for frame, place in zip(frames, places, strict=True):
             if self._tracker is None:
-                self._tracker = Tracker(frame.copy(), self.window, self.step, self.device)
+                self._tracker = Tracker(frame.copy(), self.window_size, self.window_step, self.device)
             else:
                 self._fields.append(self._tracker.follow(frame, self._stride(place)))
             self._places.append(place)
 
-    def _check_places(self, given: ArrayLike | None, count: int) -> Doubles:
-        if given is None:
-            raise InputError(f"frames without {self.position}: say where the body was in each")
-        places = np.asarray(given, np.float64)
-        wanted = (count, 2) if self.position == "displacement" else (count,)
-        if places.shape != wanted or not np.isfinite(places).all():
-            raise InputError(
-                f"{self.position} of shape {places.shape}: finite numbers of shape {wanted} are needed"
-            )
-        return places.reshape(count, -1)
-
     def _stride(self, place: Doubles) -> float:
-        """Return how long the step to a place is, as a multiple of the step before; 0 where that was none."""
+        """Return the step to a place as a multiple of the step before; 0 if the body was at rest."""
         if len(self._places) < 2:
             return 0.0
         before = self._places[-1] - self._places[-2]
         square = float(before @ before)
         return float(np.clip((place - self._places[-1]) @ before / square, -4, 4)) if square > 0 else 0.0
 
-    def newest(self) -> NDArray[np.float32] | None:
-        """Return the displacement in the newest frame, (H, W, 2), mm; None before the second."""
+    def warm(self) -> None:
+        """Push a few frames of a texture and forget them, so that all kernels are compiled."""
+        texture = np.random.default_rng(0).uniform(0, 200, self.shape).astype(self.dtype)
+        place = np.zeros((1, 2) if self.motion == "horizontal" else 1)
+        for _ in range(3):
+            self.push(texture[np.newaxis], **{self._position: place})
+            self.preview(0.0)
+        self.reset()
+
+    def preview(self, seconds: float) -> Mapping[str, Any]:  # it takes a moment
+        """Return the displacement in the newest frame, (H, W, 2); none before the second."""
         if self._tracker is None or not self._fields:
-            return None
+            return {}
         field = self._fields[-1]
         moved = np.where(field.found, field.moved, np.nan)
-        return self._tracker.to_pixels(np.moveaxis(moved, 0, -1) * self._scale)
+        return {"displacement": self._tracker.to_pixels(np.moveaxis(moved, 0, -1) * self._scale)}
 
     @property
     def _scale(self) -> Doubles:
-        """Millimetres along x and y that pixels to the right and down are."""
+        """Millimetres along x and y that correspond to a pixel to the right and down."""
         return np.array([self._size[0], -self._size[1]])
 
-    def result(self) -> Slip:
-        """Return the maps of the frames so far; more may follow.
+    def result(self) -> Result:
+        """Return displacement and slip in the frames so far.
 
         Raises
         ------
         mirrorskin.io.InputError
             Too few frames, a body that does not move, or a sheet without texture.
         """
-        if self._tracker is None or len(self._fields) < 2:
-            raise InputError(f"{len(self._places)} frames tell no slip: at least 3 are needed")
+        assert self._tracker is not None
         tracker, fields = self._tracker, self._fields
         variance = np.mean([field.variance for field in fields], axis=0)
-        texture = Texture.of(tracker, variance, self._noise)
+        texture = Texture.of(tracker, variance, self.noise)
         texture.refuse_clear("the frames")
         codes = node_status(fields[-1], texture)
         moved = self._in_mm(tracker, fields, texture)
-        course = _Course(np.array(self._places), *self._node_places(tracker), self._centre)
+        course = _Course(np.array(self._places), *self._node_places(tracker), self.centre)
         departure, sigma = course.departures(moved, self._covariance(texture))
-        if course.way[course.forward - 1] <= 0:
+        if course.distance[course.forward - 1] <= 0:
             raise InputError("the body does not move in these frames: take some along a slide or a twist")
         touched = self._touched(tracker, course, departure)
         drawn = np.sin(2 * np.pi * moved / self._scale) * self._scale  # to halves of a pixel, amplitude 1
@@ -267,34 +243,39 @@ class SlipSearch(ThreadSafe):
         status, onset = self._pixels(tracker, codes, onsets, contact, course.end)
         slipped = status == SlipStatus.SLIPPED
         noisy = np.einsum("yxii->yxi", self._covariance(texture))
-        bent = bending_variance(moved[-1], noisy, self.step, self.window)
-        noisy = noisy * misfit(fields[-1], texture, self.window) ** 2
+        bent = bending_variance(moved[-1], noisy, self.window_step, self.window_size)
+        noisy = noisy * misfit(fields[-1], texture, self.window_size) ** 2
         spread = tracker.positive_to_pixels(np.sqrt(np.mean(noisy + bent, axis=-1)))
-        centre, angle = (
-            (None, None)
-            if self.position == "displacement"
-            else self._turn(tracker, moved[-1], codes == FOUND, onsets.onset, course, touched)
-        )
         last = tracker.to_pixels(moved[-1])
-        return Slip(
-            displacement=self._each(tracker, moved) if self._per_frame else last,
-            displacement_sigma=np.where(np.isfinite(last[..., 0]), spread, np.float32(np.nan)),
-            slip_onset=np.where(slipped, np.maximum(onset, 0), np.float32(np.nan)),
-            slip_onset_sigma=np.where(slipped, tracker.positive_to_pixels(onsets.sigma), np.float32(np.nan)),
-            status=status,
-            contact=contact.astype(np.uint8),
-            way=np.append(0.0, course.way),
-            stick_ratio=course.stick_ratio(
+        process: dict[str, ProcessValue] = {
+            "motion": self.motion,
+            "frames": self.count,
+            "noise": texture.noise,
+            "contact": self._contact_origin,
+        }
+        if self.motion == "twist":
+            found = codes == DisplacementStatus.FOUND
+            (x, y), angle = self._turn(tracker, moved[-1], found, onsets.onset, course, touched)
+            process |= {"angle": angle, "centre_x": x - self.centre[0], "centre_y": y - self.centre[1]}
+        maps = {
+            "displacement": self._each(tracker, moved) if self.per_frame else last,
+            "displacement_sigma": np.where(np.isfinite(last[..., 0]), spread, np.float32(np.nan)),
+            "slip_onset": np.where(slipped, np.maximum(onset, 0), np.float32(np.nan)),
+            "slip_onset_sigma": np.where(
+                slipped, tracker.positive_to_pixels(onsets.sigma), np.float32(np.nan)
+            ),
+            "status": status,
+            "contact": contact.astype(np.uint8),
+            "twist_angle" if self.motion == "twist" else "slide_distance": np.append(0.0, course.distance),
+            "stick_ratio": course.stick_ratio(
                 onset[(status == SlipStatus.SLIPPED) | (status == SlipStatus.STICKS)]
             ),
-            centre=centre,
-            angle=angle,
-            noise=texture.noise,
-        )
+        }
+        return Result(maps, process=process, declarations=self.declarations)
 
     def _in_mm(self, tracker: Tracker, fields: list[NodeField], texture: Texture) -> Doubles:
         """Return the displacement of the nodes, (T - 1, rows, columns, 2), mm; NaN where it was not found."""
-        found = [(node_status(field, texture) == FOUND)[..., None] for field in fields]
+        found = [(node_status(field, texture) == DisplacementStatus.FOUND)[..., None] for field in fields]
         moved = [np.moveaxis(field.moved, 0, -1) * self._scale for field in fields]
         return np.where(np.stack(found), np.stack(moved), np.nan)
 
@@ -309,18 +290,18 @@ class SlipSearch(ThreadSafe):
     def _node_places(self, tracker: Tracker) -> tuple[Doubles, Doubles]:
         """Return x and y of the nodes, mm from the picture's centre, (rows, columns)."""
         level = tracker.finest
-        x, y = pixel_axes(self._shape, self._size)
+        x, y = pixel_axes(self.shape, self._size)
         rows, columns = (level.start + level.step * np.arange(n) for n in level.grid)
         across, up = x[0] + columns * self._size[0], y[0] - rows * self._size[1]
         return np.broadcast_to(across, level.grid), np.broadcast_to(up[:, None], level.grid)
 
     def _touched(self, tracker: Tracker, course: _Course, departure: Doubles) -> NDArray[np.bool_]:
-        """Return the nodes in contact: as given, or those that have gone along in the middle of the way."""
+        """Return the nodes in contact: as specified, or those that followed the object by half."""
         if self._contact is not None:
             return np.asarray(tracker.at_nearest_pixels(self._contact))
-        way = course.way[: course.forward, None, None] * course.reach
+        distance = course.distance[: course.forward, None, None] * course.reach
         with np.errstate(invalid="ignore", divide="ignore"):
-            share = departure[: course.forward] / way
+            share = departure[: course.forward] / distance
         known = np.isfinite(share).any(axis=0)
         lag = np.full(share.shape[1:], np.nan)
         lag[known] = np.nanmedian(share[:, known], axis=0)
@@ -336,25 +317,25 @@ class SlipSearch(ThreadSafe):
         touched: NDArray[np.bool_],
         drawn: Doubles,
     ) -> OnsetMap:
-        """Fit the onsets of the nodes in contact, in a box round them; elsewhere they are NaN."""
+        """Fit the onsets of the nodes in contact, in a box around them; elsewhere they are NaN."""
         onset, spread = np.full(touched.shape, np.nan), np.full(touched.shape, np.nan)
         if touched.any():
             rows, columns = np.nonzero(touched)
             box = np.s_[
                 max(rows.min() - 2, 0) : rows.max() + 3, max(columns.min() - 2, 0) : columns.max() + 3
             ]
-            # Windows overlap: what they say together is worth less.
-            overlap = max(1.0, self.window / self.step)
-            expected, radius = _EXPECTED[self.position], math.sqrt(touched.sum() / math.pi)
+            # Windows overlap, so that the errors of adjacent nodes are correlated.
+            overlap = max(1.0, self.window_size / self.window_step)
+            expected, radius = _EXPECTED[self.motion], math.sqrt(touched.sum() / math.pi)
             if self._contact is None:
-                expected = replace(expected, onset_bend=_BEND_ESTIMATED[self.position])
+                expected = replace(expected, onset_bend=_BEND_ESTIMATED[self.motion])
             known = np.where(touched, overlap * sigma, np.nan)
             locking = -np.nan_to_num(course.along(drawn * np.identity(2)[:, None, None, None]))
             found = fit_onsets(
                 departure[: course.forward, *box],
                 known[box],
-                course.way[: course.forward],
-                self.window / self.step,
+                course.distance[: course.forward],
+                self.window_size / self.window_step,
                 radius,
                 expected,
                 locking[:, : course.forward, *box],
@@ -370,14 +351,13 @@ class SlipSearch(ThreadSafe):
         contact: NDArray[np.bool_],
         end: float,
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Return the status, and the onset that it is of."""
+        """Return the status and the onset of all pixels."""
         onset = tracker.to_pixels(onsets.onset)
         near = tracker.nearest(codes)
         status = np.where(onset < end, SlipStatus.SLIPPED, SlipStatus.STICKS)
         status = np.where(np.isfinite(onset), status, SlipStatus.UNKNOWN)
-        status = np.where(
-            near == FOUND, status, np.where(near == NO_TEXTURE, SlipStatus.NO_TEXTURE, SlipStatus.UNKNOWN)
-        )
+        missing = np.where(near == DisplacementStatus.NO_TEXTURE, SlipStatus.NO_TEXTURE, SlipStatus.UNKNOWN)
+        status = np.where(near == DisplacementStatus.FOUND, status, missing)
         return np.where(contact, status, SlipStatus.NO_CONTACT).astype(np.uint8), onset
 
     def _turn(
@@ -389,7 +369,7 @@ class SlipSearch(ThreadSafe):
         course: _Course,
         touched: NDArray[np.bool_],
     ) -> tuple[tuple[float, float], float]:
-        """Return what the skin that sticks turned about, and by how much (least squares: Kabsch, 1976)."""
+        """Return centre and angle of the rotation of the skin that sticks (least squares: Kabsch, 1976)."""
         stuck = touched & found & ~(onset < course.end)
         if np.count_nonzero(stuck) < _LEAST_STUCK:
             return (math.nan, math.nan), math.nan
@@ -405,22 +385,22 @@ class SlipSearch(ThreadSafe):
 
 
 class _Course:
-    """Where the body went, and with it the object in the body's frame.
+    """Trajectory of the body, and of the object in the body's frame.
 
-    ``way``, (T - 1,), is its path since the first frame, to the last frame ``end``; ``forward`` says how many
-    frames there are before it turns back, ``reach`` by how many millimetres a node goes along for each unit
-    of the way.
+    ``distance``, (T - 1,), mm or radians, is the length of the path since the first frame, and ``end`` that
+    before the body turns back, after ``forward`` frames. ``reach`` is the distance in millimetres that a node
+    moves for each unit of it.
     """
 
     def __init__(self, places: Doubles, x: Doubles, y: Doubles, centre: tuple[float, float]) -> None:
         self.x, self.y = x, y
         steps = np.diff(places, axis=0)
         lengths = np.sqrt(np.sum(steps**2, axis=1))
-        self.way: Doubles = np.cumsum(lengths)
+        self.distance: Doubles = np.cumsum(lengths)
         from_start = np.sqrt(np.sum((places[1:] - places[0]) ** 2, axis=1))
-        back = np.flatnonzero(np.diff(from_start, prepend=0.0) < -_STILL * self.way[-1])
-        self.forward = int(back[0]) if back.size else len(self.way)
-        self.end = float(self.way[self.forward - 1])
+        back = np.flatnonzero(np.diff(from_start, prepend=0.0) < -_STILL * self.distance[-1])
+        self.forward = int(back[0]) if back.size else len(self.distance)
+        self.end = float(self.distance[self.forward - 1])
         self._moved = -(places[1:] - places[0])
         self._arms = x - centre[0], y - centre[1]
         twist = places.shape[1] == 1
@@ -437,39 +417,67 @@ class _Course:
 
     @cached_property
     def _unit(self) -> Doubles:
-        """The object's way in the last frame, of length 1, or 0 where it does not move."""
+        """Unit vector of the object's displacement in the last frame, or 0 where it does not move."""
         last = self._object(self.forward - 1)
         length = np.sqrt(np.sum(last**2, axis=-1, keepdims=True))
         unit: Doubles = np.divide(last, length, out=np.zeros(last.shape), where=length > 0)
         return unit
 
     def along(self, moved: Doubles) -> Doubles:
-        """Return what of displacements, (..., rows, columns, 2), is along the object's way."""
+        """Return the components of displacements, (..., rows, columns, 2), along that of the object."""
         return np.asarray(np.sum(moved * self._unit, axis=-1))
 
     def departures(self, moved: Doubles, covariance: Doubles) -> tuple[Doubles, Doubles]:
-        """Return how far nodes lag behind the object, along its way in the last frame, and the sigma."""
+        """Return by how much nodes lag behind the object, along its displacement, and the sigma."""
         lags = [self.along(self._object(k) - part) for k, part in enumerate(moved)]
         variance = np.einsum("yxi,yxij,yxj->yx", self._unit, covariance, self._unit)
         return np.stack(lags), np.where(variance > 0, np.sqrt(np.maximum(variance, 0)), np.nan)
 
     def stick_ratio(self, onsets: NDArray[np.float32]) -> Doubles:
         """Return the share of onsets that are still to come, frame by frame."""
-        ratio = np.full(len(self.way) + 1, np.nan)
+        ratio = np.full(len(self.distance) + 1, np.nan)
         if onsets.size:
-            behind = np.searchsorted(np.sort(onsets), self.way[: self.forward], side="left") / onsets.size
+            behind = (
+                np.searchsorted(np.sort(onsets), self.distance[: self.forward], side="left") / onsets.size
+            )
             ratio[0], ratio[1 : self.forward + 1] = 1.0, 1 - behind
         return ratio
 
 
-def check_contact(contact: ArrayLike, shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return where a map is not 0; raise InputError unless it is so somewhere in a picture of this shape."""
-    given = np.asarray(contact)
-    if given.shape != shape:
+def _read_contact(contact: Maps | None, shape: tuple[int, int]) -> tuple[NDArray[np.bool_] | None, str]:
+    """Return where the skin touches, if that is specified, and what the process says of it."""
+    if contact is None:
+        return None, "estimated"
+    if isinstance(contact, str | os.PathLike):
+        try:
+            return _contact_of(as_result(contact), shape)
+        except InputError as error:
+            path = os.fspath(contact)
+            raise (error if path in str(error) else InputError(f"{path}: {error}")) from error
+    return _contact_of(as_result(contact, "contact", quantity="contact"), shape)
+
+
+def _contact_of(result: Result, shape: tuple[int, int]) -> tuple[NDArray[np.bool_], str]:
+    if result.process.get(UNDISTORTED):
+        raise InputError("the contact is undistorted, and the frames are not: make it without a lens")
+    if result.pressure is not None:
+        return _check_contact(result.pressure > 0, shape), "given"
+    if result.contact is not None:
+        return _check_contact(result.contact, shape), "given"
+    if result.height is None:
+        raise InputError("the contact's result has neither contact nor heights: give that of a press")
+    return _check_contact(np.isfinite(result.height), shape), "given, by light"
+
+
+def _check_contact(contact: NDArray[Any], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return where a map is not 0; raise InputError unless it is so somewhere in frames of this shape."""
+    if contact.shape != shape:
         size = f"{shape[0]} x {shape[1]}"
         raise InputError(
-            f"contact has shape {given.shape}, the frames are {size}: give that of the same camera and region"
+            f"contact has shape {contact.shape}, the frames are {size}:"
+            " give that of the same camera and region"
         )
-    if not np.nan_to_num(given).any():
+    touched = np.asarray(np.nan_to_num(contact) != 0)
+    if not touched.any():
         raise InputError("contact is nowhere: give a map that is not 0 where the skin touches the object")
-    return np.asarray(np.nan_to_num(given) != 0)
+    return touched

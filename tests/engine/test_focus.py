@@ -115,12 +115,14 @@ def test_a_missing_sample_is_left_out_and_a_missing_pixel_invalid():
 def test_frames_that_come_one_by_one_give_the_same():
     frames = noisy(textured(), 2.0, 0).clip(0, 255).astype(np.uint8)
     whole = engine.find_focus(frames, TRAVEL, noise=2.0)
-    focus = engine.FocusEstimator(SHAPE, "uint8", noise=2.0)
+    focus = engine.Focus(noise=2.0)
     focus.push(frames[3:9], travel=TRAVEL[3:9])
     result = engine.run(list(frames), focus, travel=TRAVEL)  # which resets it
     np.testing.assert_array_equal(result.height, whole.height)
     np.testing.assert_array_equal(result.height_sigma, whole.height_sigma)
     np.testing.assert_array_equal(result.status, whole.status)
+    np.testing.assert_array_equal(result.sharpness, whole.sharpness)
+    assert result.declaration("status").codes[3] == "peak at an end"
 
 
 FRAMES = textured().astype(np.float32)
@@ -133,14 +135,12 @@ FRAMES = textured().astype(np.float32)
         ({"radius": 0}, "radius 0"),
         ({"reach": 51}, "reach 51"),
         ({"travel": TRAVEL[1:]}, "travel"),
-        ({"frames": FRAMES[0]}, "frames have shape (48, 48)"),
+        ({"frames": FRAMES[0]}, "frames are float32 (48, 48): numbers (n, H, W) are needed"),
+        ({"frames": FRAMES.astype(float)}, "frames of type float64: uint8, uint16, float32 are needed"),
+        ({"noise": None}, "noise is missing"),
+        ({"radius": 1.5}, "radius is 1.5: a whole number is needed"),
     ],
 )
 def test_bad_input_is_one_line(arguments, line):
     with pytest.raises(io.InputError, match=re.escape(line)):
         engine.find_focus(**{"frames": FRAMES, "travel": TRAVEL, "noise": 1, **arguments})
-
-
-def test_half_a_pixel_is_refused():
-    with pytest.raises(io.InputError, match=re.escape("radius 1.5")):
-        engine.FocusEstimator(SHAPE, "uint8", noise=1, radius=1.5)

@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from stacks import MadeUp
 
 from mirrorskin import engine, io
 
@@ -44,14 +45,14 @@ def bound(lamps):
 
 @pytest.mark.parametrize("lamps", [round_lamps(0.3), LAMPS], ids=["round", "anywhere"])
 def test_a_ball_is_exact_without_noise(lamps):
-    found = engine.photometric_stereo(lit(lamps), lamps)
+    found = engine.photometric_stereo(lit(lamps), light=lamps)
     np.testing.assert_allclose(found.normals[INSIDE], BALL[INSIDE], atol=2e-6)
     np.testing.assert_allclose(found.albedo[INSIDE], ALBEDO[INSIDE], rtol=2e-6)
 
 
 def test_shadows_and_highlights_are_left_out():
     frames = lit(round_lamps(1.0), "uint8", dark=160.0)  # to 300 counts
-    found = engine.photometric_stereo(frames, round_lamps(1.0), dark=160)
+    found = engine.photometric_stereo(frames, light=round_lamps(1.0), dark=160)
     known = INSIDE & (found.samples > 4)
     assert known.mean() > 0.5
     assert (found.samples[known] < 12).mean() > 0.6
@@ -59,8 +60,8 @@ def test_shadows_and_highlights_are_left_out():
 
 
 def test_too_few_lamps_are_no_answer():
-    found = engine.photometric_stereo(lit(LAMPS[:2]), LAMPS[:2], noise=1)
-    flat = engine.photometric_stereo(lit(LAMPS[[0, 1, 0, 1]]), LAMPS[[0, 1, 0, 1]])
+    found = engine.photometric_stereo(lit(LAMPS[:2]), light=LAMPS[:2], noise=1)
+    flat = engine.photometric_stereo(lit(LAMPS[[0, 1, 0, 1]]), light=LAMPS[[0, 1, 0, 1]])
     assert np.isnan([found.normals, flat.normals]).all()
 
 
@@ -68,7 +69,7 @@ def test_the_standard_error_is_the_cramer_rao_bound():
     lamps = round_lamps(0.3)
     lamps = lamps * np.linspace(0.5, 1.5, 12)[:, None]
     lit_by_all = np.all(np.einsum("hwk,tk->thw", BALL, lamps) > 0, axis=0)[INSIDE]
-    found = engine.photometric_stereo(lit(lamps), lamps, noise=2)
+    found = engine.photometric_stereo(lit(lamps), light=lamps, noise=2)
     np.testing.assert_allclose(
         found.normals_sigma[INSIDE][lit_by_all], 2 * bound(lamps)[lit_by_all], rtol=1e-4
     )
@@ -76,8 +77,8 @@ def test_the_standard_error_is_the_cramer_rao_bound():
 
 def test_the_standard_errors_are_the_scatter():
     lamps = round_lamps(0.5)
-    found = engine.photometric_stereo(lit(lamps, noise=0.5), lamps, shadow=2)
-    assert found.noise == pytest.approx(0.5, rel=0.03)
+    found = engine.photometric_stereo(lit(lamps, noise=0.5), light=lamps, shadow=2)
+    assert found.process["noise"] == pytest.approx(0.5, rel=0.03)
     assert np.mean((angle(found.normals) / found.normals_sigma[INSIDE]) ** 2) == pytest.approx(1, abs=0.07)
     error = (found.albedo - ALBEDO)[INSIDE] / found.albedo_sigma[INSIDE]
     assert np.mean(error**2) == pytest.approx(1, abs=0.07)
@@ -94,13 +95,33 @@ def test_a_lamp_that_goes_round_is_the_correlation_of_a_rotation():
 
 def test_frames_that_come_one_by_one_give_the_same():
     frames, lamps = lit(round_lamps(0.4), "uint8", 2), round_lamps(0.4)
-    whole = engine.photometric_stereo(frames, lamps, shadow=8)
-    stereo = engine.PhotometricStereo(frames.shape[1:], "uint8", shadow=8)
-    stereo.push(frames[:5], light=lamps[:5])
-    result = engine.run(list(frames), stereo, light=lamps)  # which resets it
+    whole = engine.photometric_stereo(frames, light=lamps, shadow=8)
+    stereo = engine.PhotometricStereo(light=lamps, shadow=8)
+    stereo.push(frames[:5])
+    result = engine.run(list(frames), stereo)  # which resets it
     np.testing.assert_array_equal(result.normals, whole.normals)
     np.testing.assert_array_equal(result.normals_sigma, whole.normals_sigma)
-    np.testing.assert_array_equal(result["albedo"], whole.albedo)
+    np.testing.assert_array_equal(result.albedo, whole.albedo)
+    assert result.process["light"] == "map given"
+
+
+def test_a_lamp_is_needed_for_each_frame_and_no_more():
+    stereo = engine.PhotometricStereo(light=LAMPS)
+    stereo.push(FRAMES[:6])
+    assert np.isfinite(stereo.result().normals[INSIDE]).any()
+    with pytest.raises(io.InputError, match="light has 8 vectors: one is needed for each of 6 frames"):
+        stereo.finish()
+    with pytest.raises(io.InputError, match="light has 8 vectors: one is needed for each of 9 frames"):
+        stereo.push(FRAMES[:3])
+
+
+def test_the_dark_level_is_that_of_the_recording():
+    frames = lit(round_lamps(0.3), dark=20.0)
+    header = io.Header("axial", dark=np.full(ROW.shape, 20, np.float32))
+    source = MadeUp(frames, header, phase=AZIMUTH)
+    found = engine.run(source, engine.PhotometricStereo(zenith=0.3))
+    expected = engine.photometric_stereo(frames, AZIMUTH, zenith=0.3, dark=20.0)
+    np.testing.assert_array_equal(found.normals, expected.normals)
 
 
 FRAMES = lit(LAMPS)
@@ -109,13 +130,17 @@ FRAMES = lit(LAMPS)
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        ({"light": AZIMUTH[:8]}, "give their zenith"),
-        ({"light": AZIMUTH[:8], "zenith": 2.0}, "zenith 2.0"),
-        ({"light": LAMPS[:3]}, "light has shape (3, 3)"),
+        ({}, "phase is missing: PhotometricStereo needs it of each frame"),
+        ({"phase": AZIMUTH[:8]}, "specify the zenith"),
+        ({"phase": AZIMUTH[:8], "zenith": 2.0}, "zenith 2: a number in rad of at most 1.5708 is needed"),
+        ({"phase": AZIMUTH[:3], "zenith": 0.5}, "phase has shape (3,) for 8 frames"),
+        ({"phase": AZIMUTH[:8], "light": LAMPS}, "PhotometricStereo does not take phase"),
+        ({"light": AZIMUTH[:8]}, "light has shape (8,): (T, 3) is needed"),
+        ({"light": LAMPS[:3]}, "light has 3 vectors: one is needed for each of 8 frames"),
         ({"light": 0 * LAMPS}, "light has lengths 0 to 0"),
         ({"light": LAMPS, "dark": [1, 2]}, "dark has shape (2,)"),
         ({"light": LAMPS, "noise": -1}, "noise"),
-        ({"light": LAMPS, "shadow": -1.0}, "shadow -1.0"),
+        ({"light": LAMPS, "shadow": -1.0}, "shadow -1"),
     ],
 )
 def test_bad_input_is_one_line(arguments, line):

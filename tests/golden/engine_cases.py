@@ -365,9 +365,15 @@ def correlate_a_sliding_window() -> Answer:
 
 @case(phase=NORMAL, sigma=(1e-4, 1e-7))
 def fit_fringes() -> Answer:
-    known = ("phase", "sigma", "mean", "modulation", "residual", "noise")
-    found = {d: engine.fit_fringes(turn(d, SMALL, UNEVEN)[0], UNEVEN) for d in LEVELS}
-    return named(**{d: {name: getattr(fit, name) for name in known} for d, fit in found.items()})
+    answers = {}
+    for dtype in LEVELS:
+        found = engine.fit_fringes(turn(dtype, SMALL, UNEVEN)[0], UNEVEN)
+        answers[dtype] = {
+            **{name: found[name] for name in ("phase", "mean", "modulation", "residual")},
+            "sigma": found.phase_sigma,
+            "noise": found.process["noise"],
+        }
+    return named(**answers)
 
 
 @case(height=HEIGHT, height_sigma=SIGMA, sharpness=FITTED)
@@ -393,8 +399,8 @@ def photometric_stereo() -> Answer:
     share += np.random.default_rng(4).normal(0, 0.01, share.shape)
     answers = {}
     for dtype, (dark, _) in LEVELS.items():
-        found = engine.photometric_stereo(counted(share, dtype), light, dark=dark)
-        answers[dtype] = {name: getattr(found, name) for name in known}
+        found = engine.photometric_stereo(counted(share, dtype), light=light, dark=dark)
+        answers[dtype] = {name: {**found, **found.process}[name] for name in known}
     return named(**answers)
 
 

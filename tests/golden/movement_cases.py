@@ -61,8 +61,8 @@ def find_force() -> Answer:
     soft = engine.find_force(height, 0.2, PIXEL, 0.1, compliance=0.02)
     return {
         "pressure": found.pressure,
-        "contact": found.contact,
-        "numbers": np.array([found.force, found.sigma, soft.force]),
+        "contact": found.contact != 0,
+        "numbers": np.array([found.force, found.force_sigma, soft.force]),
     }
 
 
@@ -73,9 +73,13 @@ def find_tangential_force() -> Answer:
     shift = np.stack([0.05 - 0.02 * np.hypot(x, y) ** 2, 0.01 * x * y], axis=-1)
     shift += np.random.default_rng(3).normal(0, 5e-4, shift.shape)
     found = engine.find_tangential_force(
-        shift, PIXEL, 0.1, contact=contact, sigma=5e-4, window=4, modulus_sigma=0.001
+        shift, PIXEL, 0.1, contact=contact, sigma=5e-4, window_size=4, modulus_sigma=0.001
     )
-    return {"traction": found.traction, "force": found.force, "sigma": found.sigma}
+    return {
+        "traction": found.traction,
+        "force": np.array([found.force_x, found.force_y]),
+        "sigma": np.array([found.force_x_sigma, found.force_y_sigma]),
+    }
 
 
 def leaning(direction: Any, tilt: Any, dtype: str = "uint16") -> tuple[Any, Any, float, float]:
@@ -142,12 +146,12 @@ def find_displacement() -> Answer:
     for dtype in ("uint8", "float32"):
         frames = np.stack([drift(k) for k in range(4)])
         frames = frames if dtype == "float32" else np.clip(frames.round(), 0, 255).astype(dtype)
-        found = engine.find_displacement(frames[0], frames[1:], PIXEL, window=12, step=4)
+        found = engine.find_displacement(frames[0], frames[1:], PIXEL, window_size=12, window_step=4)
         answers |= {
             f"{dtype}.displacement": found.displacement[:, ::3, ::3],
-            f"{dtype}.sigma": found.sigma[0, ::3, ::3],
+            f"{dtype}.sigma": found.displacement_sigma[0, ::3, ::3],
             f"{dtype}.status": found.status,
-            f"{dtype}.noise": found.noise,
+            f"{dtype}.noise": found.process["noise"],
         }
     return answers
 
@@ -158,7 +162,7 @@ def slip_search() -> Answer:
     x, y = np.meshgrid(np.arange(72) - 36, np.arange(64) - 32)
     contact = np.hypot(x, y) < 26
     for motion, position in (("horizontal", "displacement"), ("twist", "twist")):
-        search = engine.SlipSearch(SHAPE, np.float32, PIXEL, motion=motion, contact=contact)
+        search = engine.Slip(pixel_size=PIXEL, motion=motion, contact=contact)
         for k in range(12):
             search.push(slipping(motion, k)[None], **{position: places_of(motion, k)})
         found = search.result()

@@ -52,14 +52,14 @@ def test_errors_of_travel_and_modulus_are_propagated():
     ball = -(distances() ** 2) / 6
     whole = [find_force(ball, 0.5 + step, PIXEL, MODULUS).force for step in (-0.002, 0.002)]
     found = find_force(ball, 0.5, PIXEL, MODULUS, travel_sigma=0.002)
-    assert found.sigma == pytest.approx((whole[1] - whole[0]) / 2, rel=0.02)
+    assert found.force_sigma == pytest.approx((whole[1] - whole[0]) / 2, rel=0.02)
     found = find_force(ball, 0.5, PIXEL, MODULUS, modulus_sigma=0.1 * MODULUS)
-    assert found.sigma == pytest.approx(0.1 * found.force)
+    assert found.force_sigma == pytest.approx(0.1 * found.force)
 
 
 def test_independent_errors_of_heights_give_the_scatter_that_is_expected():
     generator, ball = np.random.default_rng(4), -(distances(48) ** 2) / 6
-    expected = find_force(ball, 0.4, PIXEL, MODULUS, sigma=0.002).sigma
+    expected = find_force(ball, 0.4, PIXEL, MODULUS, sigma=0.002).force_sigma
     drawn = [
         find_force(ball + generator.normal(0, 0.002, ball.shape), 0.4, PIXEL, MODULUS).force
         for _ in range(60)
@@ -67,14 +67,71 @@ def test_independent_errors_of_heights_give_the_scatter_that_is_expected():
     assert np.std(drawn) == pytest.approx(expected, rel=0.3)  # 9 % is the error of 60 draws
 
 
+@pytest.mark.parametrize("kind", ["declared", "mapping", "dataset", "metres", "upwards", "file"])
+def test_heights_come_from_wherever_they_are(kind, tmp_path):
+    ball, x = -(distances(40) ** 2) / 6, PIXEL * (np.arange(40) - 19.5)
+    ball[:, 30:] = ball[2, 2] - 0.1  # so that left and right differ
+    ball[:9] -= 0.05
+    sigma = np.full(ball.shape, 0.002)
+    process = {"travel": 0.3}
+    sigma[18:22, 18:22] = np.nan  # filled: their standard deviation is that of the nearest pixel
+    expected = find_force(ball, 0.3, PIXEL, MODULUS, sigma=0.002)
+    declared = io.Result(
+        {"depth": ball, "depth_sigma": sigma},
+        x=x,
+        y=-x,
+        process=process,
+        declarations={"depth": io.Map("depth", "mm", "float64", quantity="height")},
+    )
+    io.save_result(declared, tmp_path / "worn.h5")
+    dataset = io.Result(height=ball, height_sigma=sigma, x=x, y=-x, process=process).to_xarray()
+    metres = dataset / 1000
+    metres.attrs = dataset.attrs
+    for name in ("height", "height_sigma"):
+        metres[name].attrs["units"] = "m"
+    maps = {
+        "declared": declared,
+        "mapping": {
+            "height": ball.tolist(),
+            "height_sigma": sigma,
+            "x": x,
+            "y": -x,
+            "process": {"travel": 0.3},
+        },
+        "dataset": dataset,
+        "metres": metres,
+        "upwards": dataset.isel(y=slice(None, None, -1)).transpose("x", "y"),
+        "file": tmp_path / "worn.h5",
+    }[kind]
+    found = find_force(maps, modulus=MODULUS)
+    assert found.force == pytest.approx(expected.force, rel=1e-9)
+    assert found.force_sigma == pytest.approx(expected.force_sigma, rel=1e-9)
+    np.testing.assert_allclose(found.pressure, expected.pressure, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(found.x, x)
+    assert found.process == {"travel": 0.3, "modulus": MODULUS}
+
+
+def test_a_result_brings_the_modulus_of_its_calibration():
+    ball, x = -(distances(40) ** 2) / 6, PIXEL * (np.arange(40) - 19.5)
+    stiffness = io.Stiffness(MODULUS, (0.0, 0.0, 0.0), np.diag([0.01**2, 0, 0, 0]), 0.0, GEL.threshold)
+    result = io.Result(height=ball, x=x, y=-x, calibration=calibration(stiffness=stiffness))
+    found, expected = find_force(result, 0.3), find_force(ball, 0.3, PIXEL, MODULUS, modulus_sigma=0.01)
+    assert found.force == pytest.approx(expected.force)
+    assert found.force_sigma == pytest.approx(expected.force_sigma)
+
+
 def test_what_is_lifted_presses_with_nothing():
     found = find_force(-(distances() ** 2) / 6, -0.1, PIXEL, MODULUS, travel_sigma=0.01)
-    assert (found.force, found.sigma, bool(found.contact.any())) == (0.0, 0.0, False)
+    assert (found.force, found.force_sigma, bool(found.contact.any())) == (0.0, 0.0, False)
 
 
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
+        ({"modulus": None}, "modulus is missing"),
+        ({"travel": None}, "travel is missing"),
+        ({"pixel_size": None}, "height has no pixel size"),
+        ({"height": {"status": np.zeros((4, 4))}}, "height has no map of that name"),
         ({"modulus": 0.0}, "modulus of 0 MPa"),
         ({"modulus": float("nan")}, "modulus of nan MPa"),
         ({"height": np.zeros(4)}, "one map"),
@@ -142,7 +199,7 @@ def test_without_a_gel_or_a_modulus_there_is_no_force(ball):
     twin, _ = ball
     with pytest.raises(io.InputError, match="calibrate elastic first"):
         engine.reconstruct(twin, modulus=MODULUS)
-    with pytest.raises(io.InputError, match="modulus of -1 MPa"):
+    with pytest.raises(io.InputError, match="modulus -1: a number in MPa above 0 is needed"):
         engine.reconstruct(twin, calibration(), modulus=-1.0)
     result = engine.reconstruct(twin, calibration(), fill=False)
     assert (result.force, result.pressure) == (None, None)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from speckle import Speckle
 
+from mirrorskin import io
 from mirrorskin.engine import find_displacement
 from mirrorskin.hw.twin import SheetTexture
 from mirrorskin.io import InputError
@@ -41,10 +42,12 @@ def test_errors_are_at_the_bound_and_sigma_is_honest(device, window):
     for seed, (right, down) in enumerate(shifts):
         reference = SPECKLE.frame(SHAPE, 0, 0, NOISE, 50 + seed)
         frames = SPECKLE.frame(SHAPE, right, down, NOISE, seed)[None]
-        found = find_displacement(reference, frames, PIXEL, window=window, step=1, noise=NOISE, device=device)
+        found = find_displacement(
+            reference, frames, PIXEL, window_size=window, window_step=1, noise=NOISE, device=device
+        )
         error = (found.displacement - in_mm(np.float64(right), np.float64(down)))[INSIDE]
         squares.append(error**2)
-        bound.append(found.sigma[INSIDE].astype(float) ** 2)
+        bound.append(found.displacement_sigma[INSIDE].astype(float) ** 2)
     assert np.sqrt(np.mean(squares) / np.mean(bound)) == pytest.approx(1, abs=0.07)
     assert np.mean(np.array(squares) / np.array(bound)) == pytest.approx(1, abs=0.12)
 
@@ -61,16 +64,16 @@ def test_errors_on_a_sheet_s_own_texture_are_at_the_bound(kind, size):
              + random.normal(0, NOISE, SHAPE)).astype(np.float32)
             for x, y in ((0, 0), (right, down))
         )  # fmt: skip
-        found = find_displacement(reference, frame[None], PIXEL, step=1)
+        found = find_displacement(reference, frame[None], PIXEL, window_step=1)
         assert (found.status[INSIDE[:-1]] == 1).mean() > 0.99
         squares.append((found.displacement - in_mm(np.float64(right), np.float64(down)))[INSIDE] ** 2)
-        bound.append((found.sigma[INSIDE] * NOISE / found.noise) ** 2)
+        bound.append((found.displacement_sigma[INSIDE] * NOISE / found.process["noise"]) ** 2)
     assert np.sqrt(np.nanmean(squares) / np.nanmean(bound)) == pytest.approx(1, abs=0.1)
 
 
 def test_the_noise_is_estimated_from_what_the_fit_leaves():
     found = find_displacement(REFERENCE, SPECKLE.frame(SHAPE, 0.4, 0.7, NOISE, 1)[None], PIXEL)
-    assert found.noise == pytest.approx(NOISE, rel=0.03)
+    assert found.process["noise"] == pytest.approx(NOISE, rel=0.03)
 
 
 @pytest.mark.parametrize("angle", [0.05, 0.2])
@@ -81,7 +84,7 @@ def test_a_turn_is_followed_frame_by_frame(angle):
     part = np.s_[24:-24, 24:-24]
     error = (found.displacement[-1] - grid(*steps[-1]))[part]
     assert (found.status[-1][part] == 1).all()
-    assert np.mean((error / found.sigma[-1][part]) ** 2) == pytest.approx(1, abs=0.15)
+    assert np.mean((error / found.displacement_sigma[-1][part]) ** 2) == pytest.approx(1, abs=0.15)
 
 
 def test_sigma_counts_that_the_movement_bends_inside_windows():
@@ -89,16 +92,16 @@ def test_sigma_counts_that_the_movement_bends_inside_windows():
         return 0.003 * (x - 64) ** 2 + 0 * y
 
     frames = np.stack([SPECKLE.frame(SHAPE, right, 0, NOISE, k) for k in range(4)])
-    found = find_displacement(REFERENCE, frames, PIXEL, window=16)
+    found = find_displacement(REFERENCE, frames, PIXEL, window_size=16)
     part = np.s_[:, 24:-24, 40:88, 0]
     error = (found.displacement - grid(right, lambda x, y: 0 * x))[part]
-    assert np.mean((error / found.sigma[part]) ** 2) == pytest.approx(1, abs=0.4)
+    assert np.mean((error / found.displacement_sigma[part]) ** 2) == pytest.approx(1, abs=0.4)
 
 
 @pytest.mark.parametrize("far", [6.0, 40.0])
 def test_a_long_way_in_one_step_is_found(far):
     frame = SPECKLE.frame(SHAPE, far, 0, NOISE, 1)[None]
-    found = find_displacement(REFERENCE, frame, PIXEL, window=16)
+    found = find_displacement(REFERENCE, frame, PIXEL, window_size=16)
     there = found.displacement[0, 16:-16, 16 : -16 - int(far), 0]
     assert np.nanmedian(there) == pytest.approx(far * PIXEL[0], abs=1e-3)
     assert np.mean(np.abs(there - far * PIXEL[0]) < 0.01) > 0.95
@@ -113,7 +116,7 @@ def test_another_gain_and_offset_of_brightness_change_nothing():
         find_displacement(REFERENCE, counts.astype(np.float32)[None], PIXEL, noise=NOISE)
         for counts in (frame, 1.3 * frame - 40 + 0.5 * row)
     )
-    error = (other.displacement - plain.displacement)[INSIDE] / plain.sigma[INSIDE]
+    error = (other.displacement - plain.displacement)[INSIDE] / plain.displacement_sigma[INSIDE]
     assert np.sqrt(np.mean(error**2)) < 0.4
 
 
@@ -158,9 +161,9 @@ def test_a_texture_that_is_not_found_again_has_no_answer():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"window": 5}, "window 5: 6 to 96 pixels"),
-        ({"window": 97}, "window 97: 6 to 96 pixels"),
-        ({"step": 0}, "step 0: 1 to 64 pixels"),
+        ({"window_size": 5}, "window_size 5: 6 to 96 pixels"),
+        ({"window_size": 97}, "window_size 97: 6 to 96 pixels"),
+        ({"window_step": 0}, "window_step 0: 1 to 64 pixels"),
         ({"noise": 0.0}, "noise 0.0: a standard deviation"),
         ({"pixel_size": -1}, "pixel size -1: a length"),
         ({"frames": REFERENCE}, r"frames \(96, 128\): \(H, W\) and \(T, H, W\) are needed"),
@@ -172,3 +175,15 @@ def test_bad_input_is_one_line(change, message):
     given = {"reference": REFERENCE, "frames": REFERENCE[None], "pixel_size": PIXEL} | change
     with pytest.raises(InputError, match=message):
         find_displacement(**given)
+
+
+def test_a_displacement_is_a_result_that_files_and_datasets_keep(tmp_path):
+    frames = SPECKLE.frame(SHAPE, 0.4, 0.7, NOISE, 1)[None]
+    found = find_displacement(REFERENCE, frames, PIXEL)
+    io.save_result(found, tmp_path / "moved.h5")
+    for other in (io.open_result(tmp_path / "moved.h5"), io.Result.from_xarray(found.to_xarray())):
+        for name in ("displacement", "displacement_sigma", "status"):
+            np.testing.assert_array_equal(other[name], found[name], err_msg=name)
+        assert other.declaration("status").codes[3] == "no texture"
+        np.testing.assert_allclose(np.diff(other.x), PIXEL[0])
+    assert found.to_xarray().displacement_sigma.dims == ("frame", "y", "x", "direction")

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation, binary_erosion
 from speckle import Speckle
+from stacks import MadeUp
 
-from mirrorskin.engine import SlipSearch
+from mirrorskin import engine, io
+from mirrorskin.engine import Slip
 from mirrorskin.io import InputError
 
 SHAPE, PIXEL, NOISE = (128, 140), 0.05, 1.5
@@ -69,15 +71,15 @@ INSIDE = radius(COLUMN, ROW) < CONTACT
 
 
 def search(**options):
-    return SlipSearch(SHAPE, np.float32, PIXEL, **({"contact": INSIDE} | options))
+    return Slip(**({"contact": INSIDE, "pixel_size": PIXEL} | options))
 
 
 @pytest.fixture(scope="module")
 def slid():
     frames, places = slide()
-    estimator = search()
-    estimator.push(frames, displacement=places)
-    return estimator.result(), float(places[-1, 0])
+    operation = search()
+    operation.push(frames, displacement=places)
+    return operation.result(), float(places[-1, 0])
 
 
 def test_slip_is_told_from_stick_within_a_pixel(slid):
@@ -94,9 +96,9 @@ def test_slip_is_told_from_stick_within_a_pixel(slid):
 
 def test_texture_that_seems_drawn_to_halves_of_a_pixel_does_not_pass_for_slip():
     frames, places = slide(count=18, drawn=0.06)
-    estimator = search()
-    estimator.push(frames, displacement=places)
-    found, true = estimator.result(), onset(COLUMN, ROW) * PIXEL
+    operation = search()
+    operation.push(frames, displacement=places)
+    found, true = operation.result(), onset(COLUMN, ROW) * PIXEL
     assert np.sqrt(np.nanmean((found.slip_onset - true)[INSIDE] ** 2)) < 0.3 * STEP * PIXEL
     assert (found.status[INSIDE] == 1).sum() == pytest.approx((true[INSIDE] < places[-1, 0]).sum(), rel=0.02)
 
@@ -129,16 +131,16 @@ def test_the_displacement_is_that_of_the_skin(slid):
 
 def test_the_direction_of_a_slide_does_not_matter(slid):
     frames, places = slide((-0.6, 0.8))
-    estimator = search()
-    estimator.push(frames, displacement=places)
-    assert estimator.result().stick_ratio[-1] == pytest.approx(slid[0].stick_ratio[-1], rel=0.05)
+    operation = search()
+    operation.push(frames, displacement=places)
+    assert operation.result().stick_ratio[-1] == pytest.approx(slid[0].stick_ratio[-1], rel=0.05)
 
 
 def test_contact_is_estimated_if_it_is_not_given(slid):
     frames, places = slide()
-    estimator = search(contact=None)
-    estimator.push(frames, displacement=places)
-    found = estimator.result()
+    operation = search(contact=None)
+    operation.push(frames, displacement=places)
+    found = operation.result()
     assert found.contact[INSIDE].mean() > 0.97
     assert found.contact.sum() < 1.1 * INSIDE.sum()
     stuck = [np.count_nonzero(one.status == 2) for one in (found, slid[0])]
@@ -147,26 +149,26 @@ def test_contact_is_estimated_if_it_is_not_given(slid):
 
 def test_blocks_make_no_difference_and_a_result_changes_nothing(slid):
     frames, places = slide()
-    estimator = search(per_frame=True)
+    operation = search(per_frame=True)
     for part in np.split(np.arange(20), [1, 4, 11]):
-        estimator.push(frames[part], displacement=places[part])
+        operation.push(frames[part], displacement=places[part])
         if part[-1] == 10:
-            estimator.result()
-    found = estimator.result()
+            operation.result()
+    found = operation.result()
     np.testing.assert_array_equal(found.slip_onset, slid[0].slip_onset)
     np.testing.assert_array_equal(found.displacement[-1], slid[0].displacement)
     assert found.displacement.shape == (20, *SHAPE, 2)
     assert np.nanmax(np.abs(found.displacement[0])) == 0
-    estimator.reset()
-    estimator.push(frames, displacement=places)
-    np.testing.assert_array_equal(estimator.result().slip_onset, slid[0].slip_onset)
+    operation.reset()
+    operation.push(frames, displacement=places)
+    np.testing.assert_array_equal(operation.result().slip_onset, slid[0].slip_onset)
 
 
 def test_skin_that_sticks_does_so_to_the_end():
     frames = np.stack([SPECKLE.frame(SHAPE, -0.4 * k, 0, NOISE, k) for k in range(8)])
-    estimator = search()
-    estimator.push(frames, displacement=0.4 * PIXEL * np.arange(8)[:, None] * [1, 0])
-    found = estimator.result()
+    operation = search()
+    operation.push(frames, displacement=0.4 * PIXEL * np.arange(8)[:, None] * [1, 0])
+    found = operation.result()
     assert (found.status[INSIDE] == 1).mean() < 0.01
     assert (found.stick_ratio > 0.99).all()
 
@@ -174,9 +176,9 @@ def test_skin_that_sticks_does_so_to_the_end():
 def test_a_body_that_turns_back_is_followed_until_then():
     frames, places = slide()
     way = np.r_[np.arange(20), np.arange(18, 14, -1)]
-    estimator = search()
-    estimator.push(frames[way], displacement=places[way])
-    found = estimator.result()
+    operation = search()
+    operation.push(frames[way], displacement=places[way])
+    found = operation.result()
     assert np.isfinite(found.stick_ratio[:20]).all()
     assert np.isnan(found.stick_ratio[20:]).all()
 
@@ -191,39 +193,98 @@ def test_centre_and_angle_of_a_twist_are_those_of_the_skin_that_sticks():
 
     frames = np.stack([SPECKLE.frame(SHAPE, *turned(angle), NOISE, k) for k, angle in enumerate(steps)])
     centre = (about[0] * PIXEL, about[1] * PIXEL)
-    estimator = search(motion="twist", centre=centre)
-    estimator.push(frames, twist=steps)
-    found = estimator.result()
-    assert found.angle == pytest.approx(-0.12, abs=2e-4)
-    assert found.centre == pytest.approx(centre, abs=0.1 * PIXEL)
+    operation = search(motion="twist", centre=centre)
+    operation.push(frames, twist=steps)
+    found = operation.result()
+    assert found.process["angle"] == pytest.approx(-0.12, abs=2e-4)
+    assert (found.process["centre_x"], found.process["centre_y"]) == pytest.approx((0, 0), abs=0.1 * PIXEL)
+    assert found.twist_angle.tolist() == pytest.approx(steps)
+    assert found.declaration("slip_onset").unit == found.declaration("slip_onset_sigma").unit == "rad"
     assert (found.status[INSIDE] == 1).mean() < 0.01
 
 
 def test_a_clear_sheet_is_refused():
     frames = np.random.default_rng(1).normal(100, NOISE, (4, *SHAPE)).astype(np.float32)
-    estimator = search()
-    estimator.push(frames, displacement=0.01 * np.arange(4)[:, None] * [1, 0])
+    operation = search()
+    operation.push(frames, displacement=0.01 * np.arange(4)[:, None] * [1, 0])
     with pytest.raises(InputError, match="no texture beyond the noise"):
-        estimator.result()
+        operation.result()
 
 
 def test_bad_input_is_one_line():
     frames, places = slide()
     for options, message in [
-        ({"motion": "axial"}, "motion 'axial' does not slip: horizontal and twist do"),
+        ({"motion": "axial"}, "unknown motion 'axial'. Use horizontal or twist"),
         ({"contact": INSIDE[:-1]}, "contact has shape"),
         ({"contact": 0 * INSIDE}, "contact is nowhere"),
-        ({"window": 4}, "window 4"),
+        ({"window_size": 4}, "window_size 4"),
+        ({"window_size": 200}, "window_size 200: 6 to 128 pixels"),
+        ({"window_step": 65}, "window_step 65: 1 to 64 pixels"),
+        ({"noise": 0.0}, "noise 0: a number in counts"),
+        ({"pixel_size": None}, "the pixel size is missing"),
     ]:
         with pytest.raises(InputError, match=message):
-            search(**options)
-    estimator = search()
-    with pytest.raises(InputError, match="frames without displacement"):
-        estimator.push(frames, twist=np.arange(20.0))
-    with pytest.raises(InputError, match=r"displacement of shape \(20,\): finite numbers of shape"):
-        estimator.push(frames, displacement=places[:, 0])
-    with pytest.raises(InputError, match="0 frames tell no slip"):
-        estimator.result()
-    estimator.push(frames[:4], displacement=0 * places[:4])
+            search(**options).push(frames, displacement=places)
+    operation = search()
+    with pytest.raises(InputError, match="displacement is missing: Slip needs it of each frame"):
+        operation.push(frames)
+    with pytest.raises(InputError, match=r"Slip does not take twist\. It takes displacement"):
+        operation.push(frames, displacement=places, twist=np.arange(20.0))
+    with pytest.raises(InputError, match=r"displacement has shape \(20,\) for 20 frames: two numbers"):
+        operation.push(frames, displacement=places[:, 0])
+    with pytest.raises(InputError, match="Slip needs at least 3 frames; none pushed so far"):
+        operation.result()
+    operation.push(frames[:4], displacement=0 * places[:4])
     with pytest.raises(InputError, match="the body does not move"):
-        estimator.result()
+        operation.result()
+
+
+def test_a_source_is_reconstructed_as_the_operation_does(slid):
+    frames, places = slide()
+    source = MadeUp(frames, io.Header("horizontal", pixel_size=(PIXEL, PIXEL)), displacement=places)
+    found = engine.reconstruct(source, contact=INSIDE)
+    for name in ("displacement", "displacement_sigma", "slip_onset", "slip_onset_sigma", "status", "contact"):
+        np.testing.assert_array_equal(found[name], slid[0][name], err_msg=name)
+    np.testing.assert_array_equal(found.slide_distance, slid[0].slide_distance)
+    expected = {"motion": "horizontal", "frames": 20, "window_size": 8, "window_step": 4, "contact": "given"}
+    assert expected.items() <= found.process.items()
+    assert found.process["noise"] == slid[0].process["noise"]
+    assert found.x[0] == pytest.approx(-PIXEL * (SHAPE[1] - 1) / 2)
+    assert found.traction is None
+
+
+@pytest.mark.parametrize("kind", ["result", "mapping", "dataset", "file", "pressure", "heights"])
+def test_the_contact_comes_from_wherever_there_is_one(kind, slid, tmp_path):
+    result = io.Result(contact=INSIDE.astype(np.uint8))
+    heights = io.Result(
+        {"depth": np.where(INSIDE, -0.1, np.nan)},
+        declarations={"depth": io.Map(unit="mm", quantity="height")},
+    )
+    io.save_result(result, tmp_path / "press.h5")
+    contact = {
+        "result": result,
+        "mapping": {"contact": INSIDE},
+        "dataset": result.to_xarray(),
+        "file": tmp_path / "press.h5",
+        "pressure": io.Result(pressure=INSIDE * np.float32(0.1)),
+        "heights": heights,
+    }[kind]
+    frames, places = slide()
+    operation = search(contact=contact)
+    operation.push(frames, displacement=places)
+    found = operation.result()
+    np.testing.assert_array_equal(found.contact, INSIDE)
+    np.testing.assert_array_equal(found.slip_onset, slid[0].slip_onset)
+    assert found.process["contact"] == ("given, by light" if kind == "heights" else "given")
+
+
+def test_a_modulus_gives_traction_and_force(slid):
+    frames, places = slide()
+    source = MadeUp(frames, io.Header("horizontal", pixel_size=(PIXEL, PIXEL)), displacement=places)
+    found = engine.reconstruct(source, contact=INSIDE, modulus=0.1)
+    assert found.process["modulus"] == "0.1 MPa, given"
+    assert found.force_x < -3 * found.force_x_sigma
+    expected = engine.find_tangential_force(slid[0], PIXEL, 0.1, window_size=8)
+    np.testing.assert_array_equal(found.traction, expected.traction)
+    assert (found.force_x, found.force_y_sigma) == (expected.force_x, expected.force_y_sigma)
+    assert found.traction[..., 0].sum() * PIXEL**2 == pytest.approx(found.force_x, rel=0.1)

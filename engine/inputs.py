@@ -1,0 +1,129 @@
+"""Maps as arguments: a result, a mapping, a dataset of xarray, a file, or an array."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, TypeAlias, Union
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.engine.integration.validation import check_pixel_size
+from mirrorskin.io import InputError, Result, open_result, pixel_axes
+from mirrorskin.io.arguments import as_array
+from mirrorskin.io.result import FIELDS, map_shape, size_of_maps
+
+if TYPE_CHECKING:
+    import xarray
+
+Maps: TypeAlias = Union[
+    Result, Mapping[str, Any], "xarray.Dataset", "xarray.DataArray", str, os.PathLike[str], ArrayLike
+]
+"""What functions of maps accept; see `as_result`."""
+
+
+def as_result(
+    maps: Maps, name: str = "maps", *, quantity: str = "height", pixel_size: ArrayLike | None = None
+) -> Result:
+    """Return maps as a result, wherever they come from.
+
+    Parameters
+    ----------
+    maps : Result, mapping, xarray.Dataset, path or array_like
+        A mapping has arrays by name, and may have the fields of a result, such as ``x`` and ``y``. A dataset
+        has maps with the dimensions y and x; units that differ from the declared ones are converted. A path
+        is that of a result file. An array is the map of ``quantity``.
+    name : str
+        The argument, for messages.
+    quantity : str
+    pixel_size : float or (float, float), optional
+        Millimetres along x and y; by default ``x`` and ``y`` of the maps, if they have them.
+
+    Raises
+    ------
+    InputError
+        The argument has no maps, maps of different sizes, or values that are not numbers.
+
+    Examples
+    --------
+    >>> as_result({"height": [[0.0, 1.0]], "height_sigma": [[0.1, 0.1]]}, pixel_size=0.5).x
+    array([-0.25,  0.25])
+    >>> as_result(np.zeros((2, 3))).height.shape
+    (2, 3)
+    """
+    result = maps if isinstance(maps, Result) else _converted(maps, name, quantity)
+    if pixel_size is None:
+        return result
+    pixels, size = check_pixel_size(pixel_size), map_shape(result)[-2:]
+    if len(size) < 2:  # whoever needs a map refuses this
+        return result
+    x, y = pixel_axes((size[0], size[1]), pixels)
+    return result.assign(x=x, y=y)
+
+
+def pixel_size_of(result: Result, name: str, pixel_size: ArrayLike | None = None) -> tuple[float, float]:
+    """Return millimetres along x and y of a pixel, as specified, or as the result has it.
+
+    Raises
+    ------
+    InputError
+        Neither is available.
+    """
+    if pixel_size is not None:
+        return check_pixel_size(pixel_size)
+    if result.x is None or result.y is None:
+        raise InputError(f"{name} has no pixel size: specify pixel_size, in millimetres")
+    return spacing(result.x, result.y)
+
+
+def spacing(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the distances of pixel centres along x and y, mm; of a single row or column, square pixels."""
+    steps = [abs(axis[-1] - axis[0]) / (axis.size - 1) if axis.size > 1 else None for axis in (x, y)]
+    known = [float(step) for step in steps if step is not None]
+    if not known:
+        raise InputError("the result has a single pixel, so its size is unknown: take more")
+    return known[0], known[-1]
+
+
+def _converted(maps: Any, name: str, quantity: str) -> Result:
+    """Return what is not a result as one."""
+    if isinstance(maps, str | os.PathLike):
+        return open_result(os.fspath(maps))
+    if type(maps).__module__.partition(".")[0] == "xarray":
+        dataset = maps if hasattr(maps, "data_vars") else maps.to_dataset(name=maps.name or quantity)
+        return _of_one_size(Result.from_xarray(dataset), name)
+    if isinstance(maps, Mapping):
+        fields = {one: value for one, value in maps.items() if one in FIELDS}
+        arrays = {
+            str(one): _number_or_array(f"{name}[{one!r}]", value)
+            for one, value in maps.items()
+            if one not in fields and value is not None
+        }
+        for axis in fields.keys() & {"x", "y"}:
+            fields[axis] = np.asarray(as_array(f"{name}[{axis!r}]", fields[axis]), np.float64)
+        return _of_one_size(Result(arrays, **fields), name)
+    if maps is None or type(maps) is object:
+        raise InputError(
+            f"{name} is {maps!r:.40}: a Result, a mapping, a dataset, a path or an array is needed"
+        )
+    return Result({quantity: as_array(name, maps)})
+
+
+def _number_or_array(name: str, value: Any) -> NDArray[Any] | float:
+    array = as_array(name, value)
+    return array if array.ndim else float(array)
+
+
+def _of_one_size(result: Result, name: str) -> Result:
+    """Return a result if its maps are of one size."""
+    size = map_shape(result)[-2:]
+    for one, values in result.maps().items():
+        own = size_of_maps(result.declaration(one), np.shape(values))[-2:]
+        if own != size:
+            raise InputError(f"map {one} of {name} has size {own}, others have {size}: give maps of one size")
+    for axis, length in zip("yx", size, strict=True):
+        places = getattr(result, axis)
+        if places is not None and np.shape(places) != (length,):
+            raise InputError(f"{axis} of {name} has shape {np.shape(places)}: ({length},) is needed")
+    return result
