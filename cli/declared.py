@@ -310,7 +310,7 @@ def declarations() -> dict[str, list[dict[str, Any]]]:
     from mirrorskin.engine.lock_in import Correlation
     from mirrorskin.engine.reconstruction import method_for
 
-    methods = {one: method_for(one) for one in MOTIONS}
+    methods: dict[str, type[Configured]] = {one: method_for(one) for one in MOTIONS}
     fused = ("tilt", "zenith_gain", "zenith_offset", "robust")
     terms = {
         "reconstruct": terms_of(methods),
