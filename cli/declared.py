@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 _CLASS = re.compile(r".+:[A-Za-z_]\w*")
 _LOADED = "mirrorskin.cli.declared"  # key of a context's class and its options
-_OF_RECORDINGS = ("pixel_size",)  # options that operations take from a recording
 _COPY = Path(__file__).with_suffix(".json")
 _UNITS = {  # placeholder in help, function of `mirrorskin.cli.quantity`, example
     "mm": ("LENGTH", "length", "0.1mm"),
@@ -39,7 +38,6 @@ _UNITS = {  # placeholder in help, function of `mirrorskin.cli.quantity`, exampl
 }
 _CLASS = re.compile(r".+:[A-Za-z_]\w*")
 _LOADED = "mirrorskin.cli.declared"  # key of a context's class and its options
-_OF_RECORDINGS = ("pixel_size",)  # options that operations take from a recording
 _COPY = Path(__file__).with_suffix(".json")
 _METAVARS = {
     "mm": "LENGTH",
@@ -219,7 +217,7 @@ class ClassCommand(Command):
         from mirrorskin.io import InputError
 
         kind = load_operation(name)
-        terms = [one for one in terms_of({"": kind}) if one.name not in _OF_RECORDINGS]
+        terms = terms_of({"": kind})
         taken = {one.name for one in self.params if not getattr(one, "of_engine", False)}
         for one in terms:
             if one.name in taken:
