@@ -1,4 +1,4 @@
-"""One surface of both movements: absolute heights of a press, and the normals of a rotation."""
+"""One surface from absolute heights and normals, such as those of a press and of a rotation."""
 
 from __future__ import annotations
 
@@ -8,21 +8,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.fusion_solver import FusionSolver, PressHeights
+from mirrorskin.engine.fusion_solver import AbsoluteHeights, FusionSolver
 from mirrorskin.engine.integration.surface import Surface
+from mirrorskin.engine.integration.validation import check_pixel_size
+from mirrorskin.engine.method import Context, Method, undistorted
 from mirrorskin.engine.nearest_fill import fill_with_nearest
-from mirrorskin.engine.press.onset import Onset
-from mirrorskin.engine.press.press import reconstruct_press
-from mirrorskin.engine.provenance import attach_provenance
-from mirrorskin.engine.reconstruction import calibrated, undistorted
-from mirrorskin.engine.rotation.normals import Normals
-from mirrorskin.engine.rotation.normals_to_height import Slopes, describe_integration, find_slopes
+from mirrorskin.engine.press.press import Press
+from mirrorskin.engine.provenance import attach_provenance, naming
+from mirrorskin.engine.reconstruction import calibrated
+from mirrorskin.engine.rotation.normals_to_height import Slopes, describe_integration, slopes_of
 from mirrorskin.engine.rotation.response import wall_response_of
-from mirrorskin.engine.rotation.rotation import Rotation, at_poses, estimate_rotation, rotation_maps
-from mirrorskin.engine.streaming import Progress
+from mirrorskin.engine.rotation.rotation import Rotation, at_poses
+from mirrorskin.engine.rotation.steps import Integration
+from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.engine.tiling import MEMORY_LIMIT
-from mirrorskin.io import InputError, Motion, Result, Source
-from mirrorskin.io.arguments import check_has, checked
+from mirrorskin.io import InputError, Motion, Result, Source, pixel_axes
+from mirrorskin.io.arguments import checked
+from mirrorskin.io.result import absolute_heights, result_from
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.device import Device, open_device
 
@@ -35,33 +37,38 @@ _STILL = 0.02  # of a pixel, by which points may move between passes
 
 @checked
 def fuse(
-    onset: Onset,
-    normals: Normals,
+    heights: Mapping[str, Any],
+    normals: Mapping[str, Any],
     pixel_size: ArrayLike,
     *,
     mask: ArrayLike | None = None,
     robust: bool = False,
     device: str | Device | None = None,
-) -> Surface:
-    """Join the heights of a press and the normals of a rotation to one surface in absolute millimetres.
+) -> Result:
+    """Join heights and normals of the same pixels to one surface in absolute millimetres.
 
-    The surface is the one that fits the slopes of the normals and the known heights best, weighted by inverse
-    variance; see ``mirrorskin.engine.integrate``. A height lies in the interval between two frames, which is
-    more than its standard deviation says: once a first surface is there, heights inside their intervals pull
-    no more, and those at the ends do; see `mirrorskin.engine.press.intervals`.
+    Heights are those of a press, a focus stack, or of any operation; normals are those of a rotation, of
+    photometric stereo, or of any operation. The surface is the one that fits the slopes of the normals and
+    the heights best, weighted by inverse variance; see `mirrorskin.engine.integrate`. A height of a press is
+    in the interval between two frames, which is more than its standard deviation says: once a first surface
+    is there, heights inside their intervals have no more weight, and those at the ends do; see
+    `mirrorskin.engine.press.intervals`.
 
-    Where there is a height but no normal, the height is the press's own; near normals it gets the slope of
-    the smooth surface that fits the heights around, if one does. Where there is a normal but no height,
-    slopes lead there. Components without any known height are marked in ``offset_unknown``. Holes that have
-    neither are filled, and marked so (`mirrorskin.engine.fill_holes`); filled pixels have no sigma.
+    Where there is a height but no normal, the surface has that height; near normals it gets the slope of the
+    smooth surface that fits the heights around, if one does. Where there is a normal but no height, slopes
+    determine the surface. Components without any height are marked in ``offset_unknown``. Holes that have
+    neither are filled, and marked so (`mirrorskin.engine.fill_holes`); filled pixels have no standard
+    deviation.
 
     Parameters
     ----------
-    onset : Onset
-        Or anything with ``height`` and ``sigma``, (H, W), mm; NaN where unknown.
-    normals : Normals
-        Or anything with ``vectors``, (H, W, 3), ``sigma``, (H, W), radians, and ``contact``, (H, W). In the
-        same pixels.
+    heights : Result or mapping
+        With ``height`` and ``height_sigma``, (H, W), mm; NaN where unknown. A map that is declared with the
+        quantity "height" serves as well. Heights of components whose offset is unknown are not used.
+    normals : Result or mapping
+        With ``normals``, (H, W, 3), and ``normals_sigma``, (H, W), radians; NaN where unknown. If there is
+        ``contact``, (H, W), normals where it is 0 are not used. If its process has a ``tilt``, radians, the
+        normals are those of a precession, whose errors depend on the direction.
     pixel_size : float or (float, float)
         Millimetres along x and y.
     mask : array_like, (H, W), optional
@@ -73,63 +80,80 @@ def fuse(
 
     Returns
     -------
-    Surface
+    Result
+        ``height``, ``height_sigma``, ``component``, ``offset_unknown`` and ``filled``; ``edges`` if robust.
 
     Raises
     ------
     mirrorskin.io.InputError
-        Maps of different sizes, no height and no normal at all, or a pixel size that cannot be.
+        A map is missing, maps have different sizes, there is no height and no normal at all, or the pixel
+        size is not possible.
     mirrorskin.engine.NotConverged
         The surface was not found.
 
     Examples
     --------
-    >>> from types import SimpleNamespace as Maps
-    >>> onset = Maps(height=np.array([[1.0, np.nan]]), sigma=np.array([[0.01, np.nan]]))
+    >>> heights = {"height": np.array([[1.0, np.nan]]), "height_sigma": np.array([[0.01, np.nan]])}
     >>> upright = np.array([[[0.0, 0.0, 1.0]] * 2])
-    >>> normals = Maps(vectors=upright, sigma=np.full((1, 2), 0.01), contact=np.ones((1, 2)))
-    >>> fuse(onset, normals, 0.1).height.tolist()
+    >>> normals = {"normals": upright, "normals_sigma": np.full((1, 2), 0.01)}
+    >>> fuse(heights, normals, 0.1).height.tolist()
     [[1.0, 1.0]]
     """
-    check_has("onset", onset, "height", "sigma")
-    check_has("normals", normals, "vectors", "sigma", "contact")
-    wanted = _check_shapes(onset, normals, mask)
-    slopes = find_slopes(
-        normals.vectors,
-        normals.sigma,
-        np.where(wanted, normals.contact, 0).astype(np.uint8),
-        getattr(normals, "tilt", None),
-        getattr(normals, "turns", 1),
-    )
-    press = PressHeights.of(onset.height, onset.sigma, wanted)
-    solver = FusionSolver(press, pixel_size, robust, open_device(device))
-    return solver.filled(solver.surface(slopes))
+    height_maps = _maps_of("heights", heights, "height", "height_sigma")
+    normal_maps = _maps_of("normals", normals, "normals", "normals_sigma")
+    wanted = _check_shapes(height_maps, normal_maps, mask)
+    contact = 1 if normal_maps.contact is None else normal_maps.contact
+    slopes = slopes_of(normal_maps, contact=np.where(wanted, contact, 0).astype(np.uint8))
+    height = absolute_heights(height_maps)
+    assert height is not None
+    known = AbsoluteHeights.of(height, height_maps.height_sigma, wanted)
+    size = check_pixel_size(pixel_size)
+    solver = FusionSolver(known, size, robust, open_device(device))
+    surface = solver.filled(solver.surface(slopes))
+    x, y = pixel_axes(wanted.shape, size)
+    if height_maps.x is not None and height_maps.y is not None:
+        x, y = height_maps.x, height_maps.y
+    return Result(_maps_of_surface(surface), x=x, y=y, process=describe_integration([surface]))
 
 
-def _check_shapes(onset: Onset, normals: Normals, mask: ArrayLike | None) -> Mask:
+def _maps_of(name: str, maps: Mapping[str, Any], *needed: str) -> Result:
+    """Return a mapping as a result, if it has the maps that are needed."""
+    if not isinstance(maps, Mapping):
+        what = " and ".join(needed)
+        raise InputError(f"{name} is a {type(maps).__name__}: give a result, or a mapping with {what}")
+    result = result_from(maps)
+    missing = [one for one in needed if result.name_of(one) is None]
+    if missing:
+        has = ", ".join(result) or "no maps"
+        raise InputError(f"{name} has no map {missing[0]}: it has {has}")
+    return result
+
+
+def _check_shapes(heights: Result, normals: Result, mask: ArrayLike | None) -> Mask:
     """Return where heights are wanted, if all maps are of one size."""
     shapes = {
-        "heights": np.shape(onset.height),
-        "their sigmas": np.shape(onset.sigma),
-        "normals": np.shape(normals.vectors)[:2],
-        "their sigmas ": np.shape(normals.sigma),
-        "contact": np.shape(normals.contact),
+        "height": np.shape(heights.height),
+        "height_sigma": np.shape(heights.height_sigma),
+        "normals": np.shape(normals.normals)[:2],
+        "normals_sigma": np.shape(normals.normals_sigma),
     }
+    if normals.contact is not None:
+        shapes["contact"] = np.shape(normals.contact)
     if mask is not None:
-        shapes["the mask"] = np.shape(mask)
-    size = shapes["heights"]
-    if len(size) != 2 or 0 in size or any(shape != size for shape in shapes.values()):
-        found = ", ".join(f"{name.strip()} {shape}" for name, shape in shapes.items())
-        raise InputError(f"maps of one size (H, W) are needed, there are: {found}")
-    return np.ones(size, bool) if mask is None else np.asarray(mask) != 0
+        shapes["mask"] = np.shape(mask)
+    rows, columns = size = shapes["height"] if len(shapes["height"]) == 2 else (0, 0)
+    if 0 in size or any(shape != size for shape in shapes.values()):
+        sizes = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+        raise InputError(f"maps of one size (H, W) are needed, there are: {sizes}")
+    return np.ones((rows, columns), bool) if mask is None else np.asarray(mask) != 0
 
 
-def fuse_sources(
+def fuse_recordings(
     vertical: Source,
     axial: Source,
     *,
-    press: Mapping[str, Any] | None = None,
-    rotation: Mapping[str, Any] | None = None,
+    press: Press | Mapping[str, Any] | None = None,
+    rotation: Rotation | Mapping[str, Any] | None = None,
     register: bool = True,
     robust: bool = False,
     memory_limit: int = MEMORY_LIMIT,
@@ -145,16 +169,16 @@ def fuse_sources(
     Parameters
     ----------
     vertical, axial : Source
-        On the same pixels. They are rewound first, if they can be, and are read as the calibrations that
-        they carry say.
-    press, rotation : mapping, optional
-        Further options of `reconstruct_press` and `reconstruct_rotation`: how to read the one and the other.
+        On the same pixels. They are rewound first, if they can be, and are read with the calibrations that
+        they carry.
+    press, rotation : Press and Rotation, or mappings of their options, optional
+        How to reconstruct the one and the other. Holes of the press are not filled.
     register : bool
         Whether frames follow the object; they must not where the pivot is unknown.
     robust : bool
         As for `fuse`.
     memory_limit : int
-        Bytes of host memory for frames on the move.
+        Bytes of host memory for frames that are read ahead.
     device : str or Device, optional
         See ``mirrorskin.kernels.device.open_device``.
     progress : callable, optional
@@ -168,59 +192,92 @@ def fuse_sources(
     Raises
     ------
     mirrorskin.io.InputError
-        Other motions, pixels that differ, no height at all, or what `reconstruct_press`,
-        `reconstruct_rotation` and `Registered` refuse.
+        Other motions, pixels that differ, no height at all, or what `Press`, `Rotation` and `Registered`
+        refuse.
     mirrorskin.engine.NotConverged
         The surface was not found.
     """
     vertical, axial = calibrated(vertical), calibrated(axial)
     pixel_size = _check_sources(vertical, axial)
-    rotation = rotation or {}
-    _check_rotation(axial, rotation)
     opened = open_device(device)
     common: dict[str, Any] = {"memory_limit": memory_limit, "device": opened}
-    heights = reconstruct_press(vertical, **(press or {}), fill=False, progress=progress, **common)
-    assert heights.height is not None
-    assert heights.height_sigma is not None
-    if not np.isfinite(heights.height).any():
+    turn = Rotation(**{**_options_of(rotation), **common})
+    _check_rotation(axial, turn)
+    pressed = Press(**{**_options_of(press), **common, "fill": False}).run(
+        vertical, progress, undistort=False
+    )
+    if not np.isfinite(pressed.height).any():
         raise InputError(f"{vertical.name}: no pixel turned light, so no height is known to fuse")
-    onset = PressHeights.of(heights.height, heights.height_sigma)
-    before = fill_with_nearest(heights.height)
-    solver, passes = FusionSolver(onset, pixel_size, robust, opened), _passes(axial, register)
+    before = fill_with_nearest(pressed.height)
+    known = AbsoluteHeights.of(pressed.height, pressed.height_sigma)
+    solver, passes = FusionSolver(known, pixel_size, robust, opened), _passes(axial, register)
     for number in range(passes):
-        found = estimate_rotation(
-            axial,
-            **rotation,
-            heights=before if register else None,
-            progress=_after(progress, vertical.shape[0] + number * axial.shape[0]),
-            **common,
-        )
+        method = turn.with_options(heights=before) if register else turn
+        done = vertical.shape[0] + number * axial.shape[0]
+        turned, slopes = _rotate(method, axial, _after(progress, done))
         # The first of several surfaces is hardly ever the last.
-        surface = solver.surface(_slopes_of(found), sigma=number > 0 or passes == 1)
-        moved = _moved(before, surface.height, found.normals.tilt, pixel_size)
+        surface = solver.surface(slopes, sigma=number > 0 or passes == 1)
+        moved = _moved(before, surface.height, float(turned.process["tilt"]), pixel_size)
         if moved <= _STILL:
             break
         before = fill_with_nearest(surface.height)
     if surface.sigma is None:
-        surface = solver.surface(_slopes_of(found))
+        surface = solver.surface(slopes)
     surface = solver.filled(surface)
     if progress:
         progress(frames_to_read(vertical, axial, register))
-    turned = attach_provenance(Result(), axial, opened, found.process)
-    process = _both(heights.process, turned.process) | describe_integration([surface]) | {"heights": "none"}
+    signed = attach_provenance(Result(), axial, opened, dict(turned.process))
+    process = _both(pressed.process, signed.process) | describe_integration([surface]) | {"heights": "none"}
     if register:
         process |= {"heights": "fused", "registrations": number + 1, "last_move_in_pixels": moved}
-    together = _put_together(heights, found, surface)
-    return undistorted(together.assign(process=process, calibration=turned.calibration), axial)
+    maps = _maps_of_surface(surface)
+    if maps["edges"] is None:
+        del maps["edges"]
+    else:
+        maps["edges"] = turned.edges | maps["edges"]
+    result = turned.assign(
+        maps,
+        status=pressed.status,
+        x=pressed.x,
+        y=pressed.y,
+        process=process,
+        calibration=signed.calibration,
+        declarations={"status": pressed.declaration("status")},
+    )
+    return undistorted(result, axial)
 
 
 def frames_to_read(vertical: Source, axial: Source, register: bool = True) -> int:
-    """Return how many frames `fuse_sources` reads at most."""
+    """Return how many frames `fuse_recordings` reads at most."""
     return vertical.shape[0] + _passes(axial, register) * axial.shape[0]
 
 
 def _passes(axial: Source, register: bool) -> int:
     return _PASSES if register and axial.rewindable else 1
+
+
+def _options_of(method: Method | Mapping[str, Any] | None) -> Mapping[str, Any]:
+    """Return the options of a method, or those that are given as a mapping."""
+    return method.chosen() if isinstance(method, Method) else method or {}
+
+
+def _rotate(method: Rotation, axial: Source, progress: Progress | None) -> tuple[Result, Slopes]:
+    """Return the normals of a rotation, and the slopes that are integrated."""
+    with naming(axial):
+        plan = method.plan(axial)
+        stream = plan.stream or axial
+        feed(stream, plan.operation, plan.frames, progress)
+        result = plan.operation.finish()
+    context = Context(axial, plan.operation, stream)
+    result = result.assign(dict.fromkeys(plan.omit), process={**plan.process, **result.process})
+    slopes = None
+    for step in plan.steps:
+        if isinstance(step, Integration):
+            slopes = step.slopes(result, context)
+        else:
+            result = step.apply(result, context)
+    assert slopes is not None
+    return result, slopes
 
 
 def _check_sources(vertical: Source, axial: Source) -> tuple[float, float]:
@@ -253,46 +310,30 @@ def _check_sources(vertical: Source, axial: Source) -> tuple[float, float]:
     return pixels[0]
 
 
-def _check_rotation(axial: Source, rotation: Mapping[str, Any]) -> None:
+def _check_rotation(axial: Source, rotation: Rotation) -> None:
     """Refuse a rotation that gives no normals, or not those of one picture."""
     known = axial.header.zenith_gain is not None or wall_response_of(axial) is not None
-    if not known and rotation.get("gain") is None:
+    if not known and rotation.zenith_gain is None:
         raise InputError(
             f"{axial.name} has no zenith gain, so no normals to fuse: give the gain, or a calibration"
         )
-    if at_poses(axial, rotation.get("tilt")):
+    if at_poses(axial, rotation.tilt):
         raise InputError(f"{axial.name} has a tilt of each frame: a fusion needs turns of one tilt")
-    if rotation.get("per_turn"):
+    if rotation.per_turn:
         raise InputError(f"{axial.name}: all turns make one surface: do not ask for each turn's own")
+    if rotation.heights is not None:
+        raise InputError(f"{axial.name}: frames are registered with the heights of the press: give no others")
 
 
-def _slopes_of(rotation: Rotation) -> Slopes:
-    normals = rotation.normals
-    return find_slopes(
-        normals.vectors,
-        normals.sigma,
-        normals.contact,
-        normals.tilt,
-        normals.turns,
-        rotation.independent_sigma,
-    )
-
-
-def _put_together(heights: Result, rotation: Rotation, surface: Surface) -> Result:
-    """Return the maps of a press, a rotation and the surface of both."""
-    edges = rotation.edges if surface.edges is None else rotation.edges | surface.edges
-    return rotation_maps(rotation).assign(
-        height=surface.height,
-        height_sigma=surface.sigma,
-        status=heights.status,
-        edges=edges,
-        filled=surface.filled,
-        component=surface.component,
-        offset_unknown=surface.offset_unknown.astype(np.uint8),
-        x=heights.x,
-        y=heights.y,
-        declarations={"status": heights.declaration("status")},
-    )
+def _maps_of_surface(surface: Surface) -> dict[str, Any]:
+    return {
+        "height": surface.height,
+        "height_sigma": surface.sigma,
+        "filled": surface.filled,
+        "component": surface.component,
+        "offset_unknown": surface.offset_unknown.astype(np.uint8),
+        "edges": surface.edges,
+    }
 
 
 def _moved(

@@ -1,4 +1,4 @@
-"""A surface from the heights of a press and the slopes of a rotation, weighted by inverse variance."""
+"""A surface from absolute heights and slopes, weighted by inverse variance."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ _SETTLED = 1e-3  # of half an interval, that it may still move
 
 
 @dataclass(frozen=True, slots=True)
-class PressHeights:
-    """Heights of a press."""
+class AbsoluteHeights:
+    """Heights with standard deviations, such as those of a press."""
 
     # (H, W), float64: millimetres, and their standard deviations; NaN where unknown.
     height: Doubles
@@ -73,13 +73,13 @@ class FusionSolver:
     a slope, or the pixel size cannot be; NotConverged where a surface was not found.
     """
 
-    def __init__(self, press: PressHeights, pixel_size: ArrayLike, robust: bool, device: Device) -> None:
+    def __init__(self, press: AbsoluteHeights, pixel_size: ArrayLike, robust: bool, device: Device) -> None:
         self._press, self._pixel_size = press, check_pixel_size(pixel_size)
         self._robust, self._device = robust, device
         self._near: Surface | None = None
 
     def surface(self, slopes: Slopes, *, sigma: bool = True) -> Surface:
-        """Return the surface of the press and of slopes."""
+        """Return the surface of the heights and of slopes."""
         press, near = self._press, self._near
         if not (slopes.known | press.known).any():
             raise InputError("there is nothing to fuse: no pixel has a height or a normal")
@@ -115,7 +115,7 @@ class FusionSolver:
         )
 
 
-def _correct_overstated(press: PressHeights, surface: Surface, slopes: Slopes) -> PressHeights:
+def _correct_overstated(press: AbsoluteHeights, surface: Surface, slopes: Slopes) -> AbsoluteHeights:
     """Raise sigmas to the size of the errors, where slopes show that most are much too small."""
     both = press.known & slopes.known
     if not both.any():
@@ -125,10 +125,12 @@ def _correct_overstated(press: PressHeights, surface: Surface, slopes: Slopes) -
     usual = float(np.median(np.abs(off - np.median(off)))) * 2 / _UNIFORM
     if usual < _OVERSTATED * float(np.median(press.sigma[both])):
         return press
-    return PressHeights(press.height, np.maximum(press.sigma, usual))
+    return AbsoluteHeights(press.height, np.maximum(press.sigma, usual))
 
 
-def _extend(slopes: Slopes, surface: Surface, press: PressHeights, pixel_size: tuple[float, float]) -> Slopes:
+def _extend(
+    slopes: Slopes, surface: Surface, press: AbsoluteHeights, pixel_size: tuple[float, float]
+) -> Slopes:
     """Give pixels with a height but no normal, near those with one, the slopes of the heights around.
 
     The window spans a terrace or more. Neighbours share data, so each slope counts only for its part of a
@@ -166,7 +168,7 @@ def _window(slopes: Slopes, sigma: float, pixel: float) -> float:
     return float(np.clip(terrace, _NARROWEST, _WIDEST))
 
 
-def _use_intervals(surface: Surface, press: PressHeights, slopes: Slopes) -> tuple[Doubles, Doubles]:
+def _use_intervals(surface: Surface, press: AbsoluteHeights, slopes: Slopes) -> tuple[Doubles, Doubles]:
     """Return known heights and their weights by their intervals, around a surface that is about right.
 
     Heights far from it are mistakes, and get no weight. Nor do those without a normal of their own, which are

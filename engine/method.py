@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,14 +84,15 @@ class Plan:
     def finish(
         self, result: Result, source: Source, more: Mapping[str, ProcessValue] | None = None
     ) -> Result:
-        """Return the operation's maps after all steps, with provenance, undistorted if there is a lens."""
+        """Return the operation's maps after all steps, with provenance, in the camera's pixels."""
         context = Context(source, self.operation, self.stream or source)
         result = result.assign(dict.fromkeys(self.omit))
-        result = result.assign(process={**self.process, **result.process, **(more or {})})
+        process = {"frames": self.operation.count, **self.process, **result.process, **(more or {})}
+        result = result.assign(process=process)
         for step in self.steps:
             result = step.apply(result, context)
-        device = self.operation.device if self.operation.on_device else None
-        return undistorted(attach_provenance(result, source, device, dict(result.process)), source)
+        device = self.operation.opened_device
+        return attach_provenance(result, source, device, dict(result.process))
 
 
 class Method(OnDevice):
@@ -112,23 +113,41 @@ class Method(OnDevice):
         """Return what is done with a source whose frames come while the body moves."""
         return self.plan(source)
 
-    def run(self, source: Source, progress: Progress | None = None) -> Result:
+    def check_motion(self, source: Source) -> None:
+        """Raise InputError unless the method applies to the source's motion."""
+        if self.motions and source.motion not in self.motions:
+            motions = " or ".join(self.motions)
+            raise InputError(
+                f"{source.name} has {source.motion} motion, but {type(self).__name__} needs {motions} motion"
+            )
+
+    def run(self, source: Source, progress: Progress | None = None, *, undistort: bool = True) -> Result:
         """Reconstruct a source.
+
+        Parameters
+        ----------
+        source : Source
+            It is rewound first, if it can be.
+        progress : callable, optional
+            Called with the number of frames so far.
+        undistort : bool
+            Whether maps are undistorted, if the source's calibration has a lens.
 
         Raises
         ------
         mirrorskin.io.InputError
             The source has another motion, or it and the options cannot be used.
         """
-        if self.motions and source.motion not in self.motions:
-            motions = " or ".join(self.motions)
-            raise InputError(
-                f"{source.name} has {source.motion} motion, but {type(self).__name__} needs {motions} motion"
-            )
+        self.check_motion(source)
         with naming(source):
             plan = self.plan(source)
             feed(plan.stream or source, plan.operation, plan.frames, progress)
-            return plan.finish(plan.operation.finish(), source)
+            result = plan.finish(plan.operation.finish(), source)
+        return undistorted(result, source) if undistort else result
+
+    def with_options(self, **options: Any) -> Self:
+        """Return a method of the same class in which some options differ."""
+        return type(self)(**{**self.chosen(), **options})
 
     def make(self, kind: Callable[..., Any], **changes: Any) -> Any:
         """Return an operation or step with this method's values of its options."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import cached_property, wraps
 from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, Protocol, Self, cast
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 P = ParamSpec("P")
 
+_COMPONENTS = {"displacement": (2,), "pose": (4,)}  # positions that are not single numbers
 _NOT_POSITIONS = ("lent", "frame_weights")  # keywords of push that are not positions of the body
 ABOUT_WEIGHTS = "Weight of each frame, such as its inverse variance; 0 for a missing frame. By default 1."
 """Description of ``frame_weights`` of array functions."""
@@ -55,6 +57,11 @@ class OnDevice(Configured):
     """What has a device: the attribute is opened on first use."""
 
     device: Device = cast(Any, _DeviceOption(**{**vars(_device), "name": "device"}))
+
+    @property
+    def opened_device(self) -> Device | None:
+        """The device, if it has been used."""
+        return vars(self).get("device")
 
 
 class Operation(ThreadSafe, OnDevice):
@@ -112,6 +119,8 @@ class Operation(ThreadSafe, OnDevice):
     """Whether frames are read for the device: ahead, or where kernels can read them without a copy."""
     long_blocks: ClassVar[bool] = False
     """Whether as many frames as possible should be pushed at once."""
+    updates_per_second: ClassVar[float] = 15.0
+    """Live, as many updates are of use."""
     _takes_lent: ClassVar[bool] = False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -167,8 +176,8 @@ class Operation(ThreadSafe, OnDevice):
         """Prepare for frames of a shape, (H, W), and type, and forget all earlier frames."""
         wanted = np.dtype(dtype)
         if self.dtypes is not None and wanted not in self.dtypes:
-            names = ", ".join(str(one) for one in self.dtypes)
-            raise InputError(f"frames of type {wanted}: {names} are needed")
+            *others, last = map(str, self.dtypes)
+            raise InputError(f"frames of type {wanted}: {', '.join(others)} or {last} are needed")
         if (self.shape, self.dtype) == (shape, wanted):
             self.reset()
             return
@@ -202,11 +211,27 @@ class Operation(ThreadSafe, OnDevice):
         """Return the maps of all frames; only `reset` may follow, so that buffers need not be copied."""
         return cast(Result, self.result())
 
+    def preview(self, seconds: float) -> Mapping[str, Any]:
+        """Return the maps that a display shows while the body moves, if possible within some seconds."""
+        return self.result()  # type: ignore[no-any-return]
+
+    def spare(self, seconds: float) -> None:
+        """Do what can wait, for some seconds at most: no frame is expected meanwhile."""
+
+    def warm(self) -> None:
+        """Push a frame of zeros and forget it, so that what is compiled on first use is ready."""
+        where = {name: np.zeros((1, *_COMPONENTS.get(name, ()))) for name in self.positions}
+        self.push(np.zeros((1, *self.shape), self.dtype), **where)
+        with suppress(InputError):
+            self.preview(0.0)
+        self.reset()
+
     def start_second_pass(self) -> None:
         """Prepare for the same frames once more."""
 
     def next_pass(self) -> None:
         """Begin the second pass, after all frames have been pushed once."""
+        self.check_count()
         self.start_second_pass()
         expected = self.count
         self._forget()
@@ -218,6 +243,13 @@ class Operation(ThreadSafe, OnDevice):
         rows, columns = self.shape
         at_once = max(1, self.memory_limit // (2 * rows * columns * self.dtype.itemsize))
         return np.empty((at_once, rows, columns), self.dtype)
+
+    def check_count(self) -> None:
+        """Raise InputError if fewer frames have been pushed than a result needs."""
+        if self.count < self.least_frames:
+            frames = "1 frame" if self.least_frames == 1 else f"{self.least_frames} frames"
+            pushed = f"{self.count} has been" if self.count == 1 else f"{self.count or 'none'} have been"
+            raise InputError(f"{type(self).__name__} needs at least {frames}; {pushed} pushed so far")
 
     def _check_frames(self, frames: Any) -> NDArray[Any]:
         """Return frames as an array that fits to earlier ones."""
@@ -277,9 +309,7 @@ def _checked_result(method: Callable[..., Any]) -> Callable[..., Result]:
     @wraps(method)
     def result(self: Operation) -> Result:
         name = type(self).__name__
-        if self.count < self.least_frames:
-            frames = "1 frame" if self.least_frames == 1 else f"{self.least_frames} frames"
-            raise InputError(f"{name} needs at least {frames}; {self.count or 'none'} pushed so far")
+        self.check_count()
         if self.passes == 2 and (self._pass == 1 or self.count != self._expected):
             raise InputError(f"{name} needs all frames twice, with next_pass() in between")
         found = method(self)
@@ -406,8 +436,8 @@ def array_function(
 
     def run(frames: NDArray[Any], where: dict[str, Any], given: dict[str, Any]) -> Result:
         limit = max(1, min(MEMORY_LIMIT, 2 * frames.nbytes))
-        positions = {one: values for one, values in where.items() if values is not None}
-        return apply(operation(memory_limit=limit, **given), frames, **positions)
+        given_positions = {one: values for one, values in where.items() if values is not None}
+        return apply(operation(memory_limit=limit, **given), frames, **given_positions)
 
     def function(*args: Any, **kwargs: Any) -> Result:
         given = signature.bind(*args, **kwargs).arguments

@@ -118,7 +118,7 @@ class Option:
             and (self.above is None or number > self.above)
         ):
             example = f", such as {self.example}" if self.example else ""
-            raise InputError(f"{self.name} {number:g}: {self.needed} is needed{example}")
+            raise InputError(f"{self.name} {value}: {self.needed} is needed{example}")
         return number
 
     @property

@@ -123,8 +123,8 @@ def _run_source(
         configured = operation.configured_for(source)
         feed(source, configured, progress=progress)
         result = configured.finish()
-    device = configured.device if configured.on_device else None
-    return attach_provenance(result, source, device, {**describe(configured, source), **result.process})
+    process = {**describe(configured, source), **result.process}
+    return attach_provenance(result, source, configured.opened_device, process)
 
 
 def check_motion(source: Source, operation: Operation) -> None:

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import cache
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +10,8 @@ from rotations import EIGHTHS, TILT, Setup
 from stacks import MadeUp, record
 
 from mirrorskin import engine, hw, io
-from mirrorskin.engine.fusion import frames_to_read, fuse_sources
+from mirrorskin.engine.fusion import frames_to_read, fuse_recordings
+from mirrorskin.engine.rotation.rotation import Rotation
 from mirrorskin.hw.twin import Axial, Body, Camera, Vertical
 
 NAN = np.float32(np.nan)
@@ -55,16 +55,15 @@ def by_equation_10(size, pixel, seed=1, setup=Setup(), steepest=55.0):  # noqa: 
     x, y, _, zenith = ball(size, pixel)
     seen = zenith <= steepest
     true = rotations.direction(np.radians(np.where(seen, zenith, 0)), np.arctan2(y, x))
-    known = {"phase": setup.phase, "tilt": setup.tilt, "gain": setup.slope, "offset": setup.offset}
-    normals = engine.estimate_normals(rotations.expose(true, setup, seed), **known)
-    return replace(normals, contact=(seen & (normals.contact > 0)).astype(np.uint8))
+    known = {"tilt": setup.tilt, "zenith_gain": setup.slope, "zenith_offset": setup.offset}
+    normals = engine.estimate_normals(rotations.expose(true, setup, seed), setup.phase, **known)
+    return normals.assign(contact=(seen & (normals.contact > 0)).astype(np.uint8))
 
 
 @cache
 def onset(size, pixel, step=0.1):
     """Return the heights of a press on the same ball."""
-    result = engine.reconstruct(press((size, size), pixel, step), fill=False)
-    return SimpleNamespace(height=result.height, sigma=result.height_sigma)
+    return engine.reconstruct(press((size, size), pixel, step), fill=False)
 
 
 def rms(errors):
@@ -87,14 +86,14 @@ def test_a_ball_by_equation_10_is_right_within_3_micrometres(setup):
     assert np.isnan(onset(size, pixel).height[zenith < 10]).all()
     assert surface.offset_unknown.tolist() == [False]
     assert not surface.filled.any()
-    assert 0.5 < np.mean((error / surface.sigma[inside]) ** 2) < 3
+    assert 0.5 < np.mean((error / surface.height_sigma[inside]) ** 2) < 3
 
 
 @pytest.mark.parametrize("pivot", [(0.0, 0.0, 0.0), (0.0, 0.0, 40.0)])
 def test_the_twin_s_ball_is_right_within_10_micrometres_after_registration(pivot):
     shape, pixel = (150, 150), 0.05
     turned = rotation(shape, pixel, pivot)
-    result = fuse_sources(press(shape, pixel), turned)
+    result = fuse_recordings(press(shape, pixel), turned)
     sure = result.contact > 0
     assert sure.sum() > 12_000
     error = (result.height - turned.truth.height)[sure]
@@ -109,7 +108,7 @@ def test_the_twin_s_ball_is_right_within_10_micrometres_after_registration(pivot
 def test_the_crater_that_both_leave_is_filled_and_marked():
     shape, pixel = (110, 110), 0.05
     turned = rotation(shape, pixel, body=Body())
-    result = fuse_sources(press(shape, pixel, depth=2.0), turned)
+    result = fuse_recordings(press(shape, pixel, depth=2.0), turned)
     zenith, filled = np.degrees(turned.truth.zenith), result.filled > 0
     assert filled[zenith < 10].all()
     assert not filled[zenith > 12].any()
@@ -136,12 +135,14 @@ def plane(dz_dx=0.3, dz_dy=-0.2, shape=SHAPE, pixel=0.1):
 
 def heights(values, sigma=0.01):
     values = np.asarray(values, np.float32)
-    return SimpleNamespace(height=values, sigma=np.where(np.isnan(values), NAN, np.float32(sigma)))
+    return io.Result(height=values, height_sigma=np.where(np.isnan(values), NAN, np.float32(sigma)))
 
 
 def directions(vectors, contact=None, sigma=0.01):
     contact = np.ones(vectors.shape[:2], np.uint8) if contact is None else contact.astype(np.uint8)
-    return SimpleNamespace(vectors=vectors, contact=contact, sigma=np.full(contact.shape, sigma, np.float32))
+    return io.Result(
+        normals=vectors, contact=contact, normals_sigma=np.full(contact.shape, sigma, np.float32)
+    )
 
 
 def nothing(shape=SHAPE):
@@ -175,7 +176,7 @@ def test_without_normals_heights_are_those_of_the_press():
     true, normals = plane()
     surface = engine.fuse(heights(true, 0.03), directions(normals, np.zeros(SHAPE)), 0.1)
     np.testing.assert_allclose(surface.height, true, rtol=1e-6)
-    np.testing.assert_allclose(surface.sigma, 0.03, rtol=1e-5)
+    np.testing.assert_allclose(surface.height_sigma, 0.03, rtol=1e-5)
     assert surface.offset_unknown.tolist() == [False]
     assert (surface.component == 0).all()
 
@@ -213,7 +214,7 @@ def test_heights_near_normals_go_on_smoothly():
     error = (surface.height - true)[:, 32:]
     assert rms((terraces - true)[10:12, 32:]) > 0.3
     assert rms(error) < 0.006
-    assert rms(error / surface.sigma[:, 32:]) < 2
+    assert rms(error / surface.height_sigma[:, 32:]) < 2
     assert (surface.component == 0).all()
 
 
@@ -229,7 +230,7 @@ def test_terraces_tell_more_than_their_standard_deviations_say():
     bias = np.mean((terraces - true)[some])
     assert abs(bias) > 0.004
     assert rms(error) < 0.25 * abs(bias)
-    assert rms(error / surface.sigma) < 3
+    assert rms(error / surface.height_sigma) < 3
 
 
 def test_gross_mistakes_of_the_press_are_left_out():
@@ -254,7 +255,7 @@ def test_heights_beside_the_normals_do_not_say_where_the_surface_is():
     contact = np.ones(true.shape)
     contact[:, 54:] = 0
     terraces[:, 54:] -= 0.06  # what is seen at a rim is seen late
-    known = SimpleNamespace(height=terraces, sigma=sigma)
+    known = io.Result(height=terraces, height_sigma=sigma)
     surface = engine.fuse(known, directions(normals, contact, 1e-3), 0.1)
     assert abs(np.mean((surface.height - true)[:, :54])) < 0.001
 
@@ -266,7 +267,7 @@ def test_heights_that_fit_no_surface_count_as_little_as_they_deserve():
     surface = engine.fuse(heights(known, 0.01), directions(normals, sigma=1e-3), 0.1)
     error = surface.height - true
     assert rms(error) < 0.02
-    assert 0.2 < rms(error / surface.sigma) < 3
+    assert 0.2 < rms(error / surface.height_sigma) < 3
 
 
 def test_holes_are_filled_from_absolute_heights_alone():
@@ -280,23 +281,92 @@ def test_holes_are_filled_from_absolute_heights_alone():
     np.testing.assert_array_equal(surface.filled, inside)
     assert surface.height == pytest.approx(true, abs=1e-3)
     assert (surface.component == 0).all()
-    assert np.isnan(surface.sigma[inside]).all()
+    assert np.isnan(surface.height_sigma[inside]).all()
+
+
+def bumps(pixel=0.1, shape=(60, 80)):
+    """Return a surface z = 0.2 sin(x) cos(y / 2) - 1, mm, and its normals, in float64."""
+    x, y = np.meshgrid(*io.pixel_axes(shape, (pixel, pixel)))
+    rise = 0.2 * np.cos(x) * np.cos(y / 2), -0.1 * np.sin(x) * np.sin(y / 2)
+    normals = np.stack([-rise[0], -rise[1], np.ones(shape)], axis=-1)
+    return 0.2 * np.sin(x) * np.cos(y / 2) - 1, normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+
+
+def as_of_a_focus_stack(true, rng, name="height", **others):
+    """Return heights with noise, NaN without texture, as a focus stack measures them."""
+    noisy = (true + rng.normal(0, 0.05, true.shape)).astype(np.float32)
+    noisy[rng.uniform(size=true.shape) < 0.3] = NAN
+    maps = {name: noisy, f"{name}_sigma": np.where(np.isnan(noisy), NAN, np.float32(0.05))}
+    return io.Result(maps, **others)
+
+
+def as_of_photometric_stereo(normals, rng, sigma=0.01):
+    """Return normals with noise, NaN in a shadow; there is neither a contact nor a tilt."""
+    noisy = normals + rng.normal(0, sigma / np.sqrt(2), normals.shape)
+    noisy = (noisy / np.linalg.norm(noisy, axis=-1, keepdims=True)).astype(np.float32)
+    noisy[20:30, 30:40] = NAN
+    return io.Result(normals=noisy, normals_sigma=np.where(np.isnan(noisy[..., 0]), NAN, np.float32(sigma)))
+
+
+def test_heights_and_normals_may_come_from_anywhere():
+    true, normals = bumps()
+    rng = np.random.default_rng(4)
+    heights, normals = as_of_a_focus_stack(true, rng), as_of_photometric_stereo(normals, rng)
+    surface = engine.fuse(heights, normals, 0.1)
+    error = surface.height - true
+    clear = np.isfinite(normals.normals_sigma)
+    assert rms(error[clear]) < 0.2 * 0.05
+    assert 0.3 < np.mean((error / surface.height_sigma)[clear] ** 2) < 3
+    assert surface.offset_unknown.tolist() == [0]
+    assert set(surface) == {"height", "height_sigma", "filled", "component", "offset_unknown"}
+    np.testing.assert_array_equal(surface.x, io.pixel_axes(true.shape, (0.1, 0.1))[0])
+    # A user's own height, an xarray dataset, and plain mappings are used in the same way.
+    own = {"depth": io.Map("depth of focus", "mm", quantity="height")}
+    depth = io.Result({name.replace("height", "depth"): heights[name] for name in heights}, declarations=own)
+    for one, other in (
+        (depth, normals),
+        (io.Result.from_xarray(depth.to_xarray()), io.Result.from_xarray(normals.to_xarray())),
+        (dict(heights), dict(normals)),
+    ):
+        np.testing.assert_array_equal(engine.fuse(one, other, 0.1).height, surface.height)
+
+
+def test_heights_without_a_known_offset_are_not_used():
+    true, normals = plane()
+    relative = heights(true + 5).assign(
+        component=np.zeros(SHAPE, np.int32), offset_unknown=np.ones(1, np.uint8)
+    )
+    surface = engine.fuse(relative, directions(normals), 0.1)
+    assert surface.offset_unknown.tolist() == [1]
+    assert surface.height == pytest.approx(true - true.mean(), abs=1e-5)
 
 
 BAD = {
-    "other heights": ({"onset": heights(np.zeros((3, 4)))}, "maps of one size .* heights \\(3, 4\\)"),
+    "other heights": ({"heights": heights(np.zeros((3, 4)))}, "maps of one size .* height \\(3, 4\\)"),
     "other normals": ({"normals": directions(plane(shape=(3, 4))[1])}, "normals \\(3, 4\\)"),
-    "one row": ({"onset": heights(np.zeros(4))}, "maps of one size \\(H, W\\) are needed"),
-    "another mask": ({"mask": np.ones((3, 4))}, "the mask \\(3, 4\\)"),
-    "nothing": ({"onset": nothing(), "normals": directions(plane()[1], np.zeros(SHAPE))}, "nothing to fuse"),
+    "one row": ({"heights": heights(np.zeros(4))}, "maps of one size \\(H, W\\) are needed"),
+    "another mask": ({"mask": np.ones((3, 4))}, "mask \\(3, 4\\)"),
+    "nothing": (
+        {"heights": nothing(), "normals": directions(plane()[1], np.zeros(SHAPE))},
+        "nothing to fuse",
+    ),
     "no size": ({"pixel_size": 0.0}, "pixel size 0.0"),
+    "no standard deviation": (
+        {"heights": io.Result(height=plane()[0])},
+        "heights has no map height_sigma: it has height",
+    ),
+    "no normals": (
+        {"normals": heights(plane()[0])},
+        "normals has no map normals: it has height, height_sigma",
+    ),
+    "no maps": ({"heights": plane()[0]}, "heights is a ndarray: give a result, or a mapping with height and"),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
 def test_what_cannot_be_fused_is_refused_in_one_line(case):
     changes, line = BAD[case]
-    given = {"onset": heights(plane()[0]), "normals": directions(plane()[1]), "pixel_size": 0.1} | changes
+    given = {"heights": heights(plane()[0]), "normals": directions(plane()[1]), "pixel_size": 0.1} | changes
     with pytest.raises(io.InputError, match=line) as caught:
         engine.fuse(**given)
     assert "\n" not in str(caught.value)
@@ -308,7 +378,7 @@ SMALL, PIXEL = (50, 50), 0.1
 
 
 def fused_anew(**options):
-    return fuse_sources(press(SMALL, PIXEL), rotation(SMALL, PIXEL), **options)
+    return fuse_recordings(press(SMALL, PIXEL), rotation(SMALL, PIXEL), **options)
 
 
 @cache
@@ -350,7 +420,7 @@ def test_recordings_are_named_by_their_hashes(tmp_path):
         for name, source in (("down.h5", press(SMALL, PIXEL)), ("round.h5", rotation(SMALL, PIXEL)))
     ]
     with io.open_recording(paths[0]) as down, io.open_recording(paths[1]) as turn:
-        result = fuse_sources(down, turn)
+        result = fuse_recordings(down, turn)
         hashes = down.fingerprint(), turn.fingerprint()
     assert (
         result.process["vertical_source_fingerprint"],
@@ -370,13 +440,22 @@ def test_options_reach_the_press_and_the_rotation():
     assert (told["axial_method"], told["axial_noise"]) == ("paper", 1.5)
 
 
+def test_options_may_be_those_of_methods():
+    methods = engine.Press(threshold=0.6, subframe=False), Rotation(method="paper", noise=1.5)
+    found = fused_anew(press=methods[0], rotation=methods[1])
+    options = {"threshold": 0.6, "subframe": False}, {"method": "paper", "noise": 1.5}
+    np.testing.assert_array_equal(found.height, fused_anew(press=options[0], rotation=options[1]).height)
+    with pytest.raises(io.InputError, match="registered with the heights of the press: give no others"):
+        fused_anew(rotation={"heights": np.zeros(SMALL)})
+
+
 def test_frames_may_stay_as_they_were_seen():
     header = replace(rotation(SMALL, PIXEL).header, pivot=None, press=None)
     turned = rotation(SMALL, PIXEL)
     turned.header = header
     with pytest.raises(io.InputError, match="does not say its press"):
-        fuse_sources(press(SMALL, PIXEL), turned)
-    result = fuse_sources(press(SMALL, PIXEL), turned, register=False)
+        fuse_recordings(press(SMALL, PIXEL), turned)
+    result = fuse_recordings(press(SMALL, PIXEL), turned, register=False)
     assert result.process["heights"] == "none"
     assert "registrations" not in result.process
     assert not np.array_equal(result.normals, fused().normals, equal_nan=True)
@@ -386,7 +465,7 @@ def test_progress_goes_to_the_last_frame():
     for register, most in ((True, 30 + 3 * 8), (False, 30 + 8)):
         done = []
         down, turn = press(SMALL, PIXEL), rotation(SMALL, PIXEL)
-        fuse_sources(down, turn, register=register, progress=done.append)
+        fuse_recordings(down, turn, register=register, progress=done.append)
         assert done == sorted(done)
         assert done[-1] == frames_to_read(down, turn, register) == most
 
@@ -396,7 +475,7 @@ def test_what_cannot_be_read_twice_is_registered_once():
     frames = np.empty(turned.shape, turned.dtype)
     turned.read(frames)
     live = MadeUp(frames, turned.header, phase=np.array(EIGHTHS))
-    result = fuse_sources(press(SMALL, PIXEL), live)
+    result = fuse_recordings(press(SMALL, PIXEL), live)
     assert result.process["registrations"] == 1
     sure = result.contact > 0
     assert rms((result.height - turned.truth.height)[sure]) < 0.01
@@ -437,7 +516,7 @@ UNFIT = {
 def test_sources_that_do_not_fit_are_refused_in_one_line(case):
     vertical, axial, line = UNFIT[case]
     with pytest.raises(io.InputError, match=line) as caught:
-        fuse_sources(vertical, axial)
+        fuse_recordings(vertical, axial)
     assert "\n" not in str(caught.value)
 
 
@@ -449,7 +528,7 @@ def test_turns_are_not_fused_one_by_one():
 def test_a_press_that_touched_nothing_has_no_height_to_fuse():
     dark = MadeUp(np.full((4, *SMALL), 20, np.uint8), DOWN.header, travel=np.arange(4.0))
     with pytest.raises(io.InputError, match="made up: no pixel turned light"):
-        fuse_sources(dark, rotation(SMALL, PIXEL))
+        fuse_recordings(dark, rotation(SMALL, PIXEL))
 
 
 def test_other_regions_of_one_size_are_refused(tmp_path):
@@ -461,4 +540,4 @@ def test_other_regions_of_one_size_are_refused(tmp_path):
         io.open_recording(turn, region=regions[1]) as axial,
         pytest.raises(io.InputError, match="regions from column 5, row 0 and regions from column 5, row 2"),
     ):
-        fuse_sources(vertical, axial)
+        fuse_recordings(vertical, axial)

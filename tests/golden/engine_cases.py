@@ -24,7 +24,8 @@ from scenes import (
 )
 
 from mirrorskin import engine, io
-from mirrorskin.engine.fusion import fuse_sources as engine_fuse_sources
+from mirrorskin.engine.fusion import fuse_recordings as engine_fuse_recordings
+from mirrorskin.engine.lock_in import Correlation
 from mirrorskin.engine.metrology import Quantity
 from mirrorskin.engine.metrology import fit_plane as engine_fit_plane
 from mirrorskin.engine.metrology import fit_sphere as engine_fit_sphere
@@ -32,7 +33,6 @@ from mirrorskin.engine.metrology import roughness as engine_roughness
 from mirrorskin.engine.metrology import section as engine_section
 from mirrorskin.engine.metrology import step_height as engine_step_height
 from mirrorskin.engine.rotation.registration import Registered
-from mirrorskin.engine.rotation.rotation import correlate_source as engine_correlate_source
 from mirrorskin.engine.streaming import push_block
 from mirrorskin.engine.summary import summarise as engine_summarise
 
@@ -55,31 +55,32 @@ def onset_maps(found: engine.Onset) -> Answer:
     }
 
 
-def wave_maps(found: engine.Correlation) -> Answer:
-    """Return what a correlation tells."""
+def wave_maps(found: io.Result) -> Answer:
+    """Return what a correlation finds."""
     return {
         "mean": found.mean,
         "cosine": found.cosine,
         "sine": found.sine,
         "residual": found.residual,
-        "frames": found.frames,
+        "frames": found.process["frames"],
         "modulation": found.modulation,
         "azimuth": found.azimuth,
     }
 
 
-def normal_maps(found: engine.Normals) -> Answer:
-    """Return what an estimate of normals tells."""
+def normal_maps(found: io.Result) -> Answer:
+    """Return what an estimate of normals finds."""
+    process = found.process
     return {
-        "vectors": found.vectors,
-        "sigma": found.sigma,
+        "vectors": found.normals,
+        "sigma": found.normals_sigma,
         "contact": found.contact,
         "mean": found.mean,
         "cosine": found.cosine,
         "sine": found.sine,
         "residual": found.residual,
-        "numbers": np.array([found.noise, found.shot, found.tilt]),
-        "counts": np.array([found.turns, found.frames]),
+        "numbers": np.array([process["noise"], process["shot_noise"], process["tilt"]]),
+        "counts": np.array([process["turns"], process["frames"]]),
         "zenith": found.zenith,
     }
 
@@ -96,6 +97,21 @@ def surface_maps(found: engine.Surface) -> Answer:
         "converged": found.converged,
         "method": found.method,
         "invalid": found.invalid,
+    }
+
+
+def fused_maps(found: io.Result) -> Answer:
+    """Return what a fusion finds; it raises an exception if it does not converge."""
+    return {
+        "height": found.height,
+        "sigma": found.height_sigma,
+        "component": found.component,
+        "offset_unknown": found.offset_unknown.astype(bool),
+        "filled": found.filled,
+        "edges": found.edges,
+        "converged": True,
+        "method": found.process["integration"],
+        "invalid": 0,
     }
 
 
@@ -344,10 +360,10 @@ def correlate_block_by_block() -> Answer:
     answers = {}
     for dtype in LEVELS:
         frames, phase = long_turn(dtype)
-        correlator = engine.Correlator(frames.shape[1:], frames.dtype)
+        operation = engine.Correlate()
         for block in blocks(frames, [3, 1, 8, 5], phase=phase):
-            push_block(correlator, block)
-        answers[dtype] = wave_maps(correlator.result())
+            push_block(operation, block)
+        answers[dtype] = wave_maps(operation.result())
     return named(**answers)
 
 
@@ -356,10 +372,10 @@ def correlate_a_sliding_window() -> Answer:
     answers = {}
     for dtype in LEVELS:
         frames, phase = long_turn(dtype)
-        correlator = engine.Correlator(frames.shape[1:], frames.dtype, window=10)
+        operation = engine.Correlate(window_frames=10)
         for number, block in enumerate(blocks(frames, [4, 9, 1, 3], phase=phase)):
-            push_block(correlator, block)
-            answers[f"{dtype}_{number}"] = wave_maps(correlator.result())
+            push_block(operation, block)
+            answers[f"{dtype}_{number}"] = wave_maps(operation.result())
     return named(**answers)
 
 
@@ -409,7 +425,8 @@ def normals_of(dtype: str = "uint16", phase: Any = EIGHTHS, **options: Any) -> A
     made = {name: options.pop(name) for name in ("noise_of", "lost", "shape") if name in options}
     made = {"noise": made.pop("noise_of", 1.0), **made}
     frames, gain, offset = turn(dtype, phase=phase, **made)
-    return normal_maps(engine.estimate_normals(frames, phase, tilt=TILT, gain=gain, offset=offset, **options))
+    known = {"tilt": TILT, "zenith_gain": gain, "zenith_offset": offset}
+    return normal_maps(engine.estimate_normals(frames, phase, **known, **options))
 
 
 ROTATION = {"vectors": NORMAL, "sigma": (1e-4, 1e-7), "zenith": NORMAL}
@@ -450,7 +467,8 @@ def estimate_normals_where_contact_is_lost() -> Answer:
 @case(FITTED, **ROTATION, numbers=(1e-4, 1e-7))
 def estimate_normals_and_the_tilt() -> Answer:
     frames, gain, offset = turn("uint16")
-    return normal_maps(engine.estimate_normals(frames, EIGHTHS, tilt="estimate", gain=gain, offset=offset))
+    known = {"tilt": "estimate", "zenith_gain": gain, "zenith_offset": offset}
+    return normal_maps(engine.estimate_normals(frames, EIGHTHS, **known))
 
 
 @case(FITTED, **ROTATION)
@@ -458,12 +476,10 @@ def estimate_normals_block_by_block() -> Answer:
     frames, phase = long_turn("uint16")
     answers = {}
     for per_turn in (False, True):
-        estimator = engine.NormalEstimator(
-            frames.shape[1:], frames.dtype, tilt=TILT, gain=3400.0, offset=150.0, per_turn=per_turn
-        )
+        operation = engine.Normals(tilt=TILT, zenith_gain=3400.0, zenith_offset=150.0, per_turn=per_turn)
         for block in blocks(frames, [5, 1, 9, 3], phase=phase):
-            push_block(estimator, block)
-        answers["each" if per_turn else "mean"] = normal_maps(estimator.result())
+            push_block(operation, block)
+        answers["each" if per_turn else "mean"] = normal_maps(operation.result())
     return named(**answers)
 
 
@@ -547,7 +563,7 @@ def registered_frames() -> Answer:
 
 @case(FITTED)
 def correlate_a_source() -> Answer:
-    return result_maps(engine_correlate_source(turn_source(2)))
+    return result_maps(Correlation().run(turn_source(2)))
 
 
 # Surfaces.
@@ -678,16 +694,16 @@ def integrate_several() -> Answer:
 def fuse() -> Answer:
     shape = (40, 52)
     frames, gain, offset = turn("uint16", shape)
-    normals = engine.estimate_normals(frames, EIGHTHS, tilt=TILT, gain=gain, offset=offset)
+    normals = engine.estimate_normals(frames, EIGHTHS, tilt=TILT, zenith_gain=gain, zenith_offset=offset)
     travel = np.arange(0.0, 1.0, 0.05)
     x, y = places(shape)
     starts = np.where(np.hypot(x, y) < 0.3, 9.0, -dome(shape)[0])
     counts = counted((travel[:, None, None] > starts).astype(float), "uint8")
     onset = engine.find_onset(counts, travel, dark=LEVELS["uint8"][0], bright=LEVELS["uint8"][1], noise=1.0)
     return named(
-        whole=surface_maps(engine.fuse(onset, normals, PIXEL)),
-        masked=surface_maps(engine.fuse(onset, normals, PIXEL, mask=disc(shape))),
-        robust=surface_maps(engine.fuse(onset, normals, PIXEL, robust=True)),
+        whole=fused_maps(engine.fuse(onset, normals, PIXEL)),
+        masked=fused_maps(engine.fuse(onset, normals, PIXEL, mask=disc(shape))),
+        robust=fused_maps(engine.fuse(onset, normals, PIXEL, robust=True)),
     )
 
 
@@ -699,7 +715,8 @@ def fuse_sources() -> Answer:
     dark, bright = (np.full(shape, level, np.float32) for level in LEVELS["uint8"])
     header = io.Header("vertical", pixel_size=PIXEL, dark=dark, bright=bright, camera="lab")
     down = Source(frames, header, travel=travel)
-    return result_maps(engine_fuse_sources(down, turn_source(pivot=(0.4, -0.3, 5.0)), press={"noise": 1.0}))
+    turned = turn_source(pivot=(0.4, -0.3, 5.0))
+    return result_maps(engine_fuse_recordings(down, turned, press={"noise": 1.0}))
 
 
 # Measures.

@@ -23,6 +23,9 @@ VOLATILE = (
 )
 """Words in the names of what differs from run to run, or from machine to machine."""
 
+RENAMED = {"low": "dark", "high": "bright", "axial_low": "axial_dark", "axial_high": "axial_bright"}
+"""Names in frozen processes that have become others since."""
+
 
 @dataclass(frozen=True, slots=True)
 class Case:
@@ -175,7 +178,8 @@ def _differ(one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
 def _compare_texts(found: str, frozen: str, within: Tolerance) -> tuple[bool, str]:
     if found == frozen:
         return True, "equal"
-    one, other = dict(_leaves(json.loads(found))), dict(_leaves(json.loads(frozen)))
+    one = dict(_leaves(json.loads(found)))
+    other = {RENAMED.get(place, place): value for place, value in _leaves(json.loads(frozen))}
     wrong = [place for place in sorted(one.keys() | other.keys()) if not _alike(place, one, other, within)]
     told = "; ".join(f"{place}: {other.get(place)!r} became {one.get(place)!r}" for place in wrong[:5])
     return not wrong, told or "equal but for rounding"

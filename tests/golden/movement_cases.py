@@ -108,13 +108,14 @@ def normals_of_poses() -> Answer:
     for dtype in ("uint8", "uint16"):
         for name, (direction, tilt) in ways.items():
             frames, axis, gain, offset = leaning(direction, tilt, dtype)
-            options: dict[str, Any] = {"gain": gain, "offset": offset, "noise": gain / 200}
-            estimator = engine.PoseEstimator(frames.shape[1:], frames.dtype, **options)
+            options = {"zenith_gain": gain, "zenith_offset": offset, "noise": gain / 200}
+            operation = engine.MovingNormals(**options)
             for part in np.split(np.arange(20), [3, 11]):
-                estimator.push(frames[part], pose=axis[part])
-            found = estimator.result()
-            whole = {"vectors": found.vectors, "sigma": found.sigma} if name == "whole" else {}
-            rocked = {"slope": found.slope, "slope_sigma": found.slope_sigma, "direction": found.direction}
+                operation.push(frames[part], pose=axis[part])
+            found = operation.result()
+            whole = {"vectors": found.normals, "sigma": found.normals_sigma} if name == "whole" else {}
+            direction = found.process.get("slope_direction")
+            rocked = {"slope": found.slope, "slope_sigma": found.slope_sigma, "direction": direction}
             told = {"status": found.status, **whole, **rocked}
             answers |= {f"{dtype}.{name}.{key}": value for key, value in told.items()}
     return answers

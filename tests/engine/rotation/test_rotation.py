@@ -72,7 +72,7 @@ def test_a_rotation_becomes_normals_and_what_goes_with_them(tmp_path):
     assert (result.x.shape, result.y.shape) == ((SHAPE[1],), (SHAPE[0],))
     said = {"method": "exact", "tilt_from": "recording", "turns": TURNS, "frames": 8 * TURNS}
     said |= {"per_turn": False, "tilt": TILT, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset}
-    said |= {"low": "range of the type", "high": "range of the type", "heights": "none"}
+    said |= {"dark": "range of the type", "bright": "range of the type", "heights": "none"}
     assert {name: result.process[name] for name in said} == said
     assert result.process["noise"] == pytest.approx(SETUP.spread, rel=0.1)
     assert done[-1] == 8 * TURNS
@@ -84,10 +84,10 @@ def test_a_rotation_becomes_normals_and_what_goes_with_them(tmp_path):
 
 def test_it_is_the_normals_of_the_frames():
     result = reconstruct(method="paper", noise=20.0)
-    known = {"tilt": TILT, "gain": SETUP.slope, "offset": SETUP.offset, "noise": 20.0}
+    known = {"tilt": TILT, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset, "noise": 20.0}
     found = engine.estimate_normals(frames(), PHASE, **known, method="paper")
-    np.testing.assert_array_equal(result.normals, found.vectors)
-    np.testing.assert_array_equal(result.normals_sigma, found.sigma)
+    np.testing.assert_array_equal(result.normals, found.normals)
+    np.testing.assert_array_equal(result.normals_sigma, found.normals_sigma)
     for name in ("zenith", "azimuth", "contact", "mean", "modulation", "residual"):
         np.testing.assert_array_equal(getattr(result, name), getattr(found, name))
 
@@ -137,7 +137,7 @@ def test_without_a_gain_there_is_the_wave_alone():
 
 def test_what_is_given_goes_before_what_the_source_says():
     wrong = replace(HEADER, zenith_gain=np.array(1.0), zenith_offset=np.array(9.0), tilt=0.3)
-    given = {"gain": SETUP.slope, "offset": SETUP.offset, "tilt": TILT}
+    given = {"zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset, "tilt": TILT}
     result = reconstruct(wrong, **given)
     alike(result, reconstruct())
     alike(reconstruct(replace(NO_GAIN, tilt=None), **given), result)
@@ -159,7 +159,7 @@ def test_maps_of_the_recording_are_used_and_said_so():
     )
     made = rotations.expose(DOME, replace(SETUP, phase=nine), seed=4)
     result = engine.reconstruct(source(header, frames=made, phase=np.array(nine)))
-    said = {result.process[name] for name in ("zenith_gain", "zenith_offset", "low", "high")}
+    said = {result.process[name] for name in ("zenith_gain", "zenith_offset", "dark", "bright")}
     assert said == {"map of the recording"}
     zenith = np.degrees(rotations.angles(DOME)[0])
     assert np.isnan(result.zenith[zenith < 24]).all()
@@ -279,11 +279,11 @@ REFUSED = {
     "a press's method": (
         {},
         {"method": "threshold"},
-        "made up is a rotation, which method 'threshold' cannot",
+        "^unknown method 'threshold'. Use exact or paper",
     ),
     "two frames": ({"frames": slice(2)}, {}, "^made up: 2 frames at 2 different phases"),
     "no phases": ({"phase": None}, {}, "^made up: phase is missing"),
-    "a gain of 0": ({}, {"gain": 0.0}, "^made up: zenith gain 0.0: counts per radian"),
+    "a gain of 0": ({}, {"zenith_gain": 0.0}, "^made up: zenith gain 0.0: counts per radian"),
     "a tilt of 40 degrees": ({}, {"tilt": 0.7}, "^made up: tilt 40.1.* deg: above 0"),
     "heights of others": ({}, {"heights": np.zeros((3, 3))}, r"heights have shape \(3, 3\)"),
 }
