@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.io import InputError, Result, open_result, pixel_axes
 from mirrorskin.io.arguments import as_array
+from mirrorskin.io.maps import declaration_of
 from mirrorskin.io.result import FIELDS, map_shape, size_of_maps
 
 if TYPE_CHECKING:
@@ -31,9 +32,9 @@ def as_result(
     Parameters
     ----------
     maps : Result, mapping, xarray.Dataset, path or array_like
-        A mapping has arrays by name, and may have the fields of a result, such as ``x`` and ``y``. A dataset
-        has maps with the dimensions y and x; units that differ from the declared ones are converted. A path
-        is that of a result file. An array is the map of ``quantity``.
+        A mapping has arrays by name; it may have the fields of a result, such as ``x`` and ``y``, and numbers
+        such as ``travel``. A dataset has maps with the dimensions y and x; other units than the declared ones
+        are converted. A path is that of a result file. An array is the map of ``quantity``.
     name : str
         The argument, for messages.
     quantity : str
@@ -94,30 +95,42 @@ def _converted(maps: Any, name: str, quantity: str) -> Result:
         dataset = maps if hasattr(maps, "data_vars") else maps.to_dataset(name=maps.name or quantity)
         return _of_one_size(Result.from_xarray(dataset), name)
     if isinstance(maps, Mapping):
-        fields = {one: value for one, value in maps.items() if one in FIELDS}
-        arrays = {
-            str(one): _number_or_array(f"{name}[{one!r}]", value)
-            for one, value in maps.items()
-            if one not in fields and value is not None
-        }
-        for axis in fields.keys() & {"x", "y"}:
-            fields[axis] = np.asarray(as_array(f"{name}[{axis!r}]", fields[axis]), np.float64)
-        return _of_one_size(Result(arrays, **fields), name)
+        return _of_one_size(_of_mapping(maps, name), name)
     if maps is None or type(maps) is object:
         raise InputError(
             f"{name} is {maps!r:.40}: a Result, a mapping, a dataset, a path or an array is needed"
         )
-    return Result({quantity: as_array(name, maps)})
+    array = as_array(name, maps)
+    if array.ndim < 2:
+        raise InputError(f"{name} has shape {array.shape}: a map (H, W) is needed")
+    return Result({quantity: array})
 
 
-def _number_or_array(name: str, value: Any) -> NDArray[Any] | float:
-    array = as_array(name, value)
-    return array if array.ndim else float(array)
+def _of_mapping(maps: Mapping[Any, Any], name: str) -> Result:
+    """Return arrays by name as a result; numbers and texts that are not declared go to its process."""
+    fields = {one: value for one, value in maps.items() if one in FIELDS and value is not None}
+    for axis in fields.keys() & {"x", "y"}:
+        fields[axis] = np.asarray(as_array(f"{name}[{axis!r}]", fields[axis]), np.float64)
+    arrays: dict[str, Any] = {}
+    process: dict[str, Any] = {}
+    for one, value in maps.items():
+        if one in fields or value is None:
+            continue
+        values = value if isinstance(value, str) else as_array(f"{name}[{one!r}]", value)
+        if isinstance(values, str) or (
+            not values.ndim and declaration_of(one, fields.get("declarations")).axes != "none"
+        ):
+            process[one] = values if isinstance(values, str) else values.item()
+        else:
+            arrays[one] = values if values.ndim else float(values)
+    return Result(arrays, **{**fields, "process": {**process, **fields.get("process", {})}})
 
 
 def _of_one_size(result: Result, name: str) -> Result:
     """Return a result if its maps are of one size."""
     size = map_shape(result)[-2:]
+    if len(size) < 2:
+        raise InputError(f"the maps of {name} are not of size (H, W)")
     for one, values in result.maps().items():
         own = size_of_maps(result.declaration(one), np.shape(values))[-2:]
         if own != size:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from mirrorskin.engine.inputs import Maps, as_result
 from mirrorskin.io import InputError, Result, Truth
 from mirrorskin.io.arguments import checked
 from mirrorskin.io.maps import SlipStatus
@@ -255,12 +256,12 @@ class Score:
 
 
 @checked
-def score(result: Result, truth: Truth) -> Score:
+def score(result: Maps, truth: Truth) -> Score:
     """Compare the maps of a result with the truth.
 
     Parameters
     ----------
-    result : Result
+    result : Result, mapping, xarray.Dataset, path or array_like, (H, W)
         With at least one of ``height``, ``normals``, ``azimuth``, ``contact``, ``edges``, ``slip_onset`` and
         ``displacement``; of a result for each turn, all turns are compared.
     truth : Truth
@@ -284,6 +285,7 @@ def score(result: Result, truth: Truth) -> Score:
     >>> score(io.Result(height=flat + 0.25), truth).height.rms
     0.25
     """
+    result = as_result(result, "result")
     if result.process.get(UNDISTORTED):
         remedy = "score one that was made without a scale in its calibration"
         raise InputError(f"the result is undistorted, the truth is that of the camera's pixels: {remedy}")

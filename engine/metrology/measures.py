@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from mirrorskin.engine.inputs import Maps, as_result
 from mirrorskin.engine.metrology.extent import areas, border, heights, volume
 from mirrorskin.engine.metrology.forms import Plane, Sphere, fit_plane, fit_sphere
 from mirrorskin.engine.metrology.patch import Patch, patch_of
@@ -49,8 +51,9 @@ class Measures:
 
 @checked
 def measure(
-    result: Result,
+    result: Maps,
     *,
+    pixel_size: ArrayLike | None = None,
     region: Region | None = None,
     form: FormName | None = None,
     cutoff: float | None = None,
@@ -60,8 +63,10 @@ def measure(
 
     Parameters
     ----------
-    result : Result
-        Of one picture, with heights and a pixel size.
+    result : Result, mapping, xarray.Dataset, path or array_like, (H, W)
+        Heights of one picture, mm, with their standard deviation, if available. An array is the height.
+    pixel_size : float or (float, float), optional
+        Millimetres along x and y; by default that of the result.
     region : Region, optional
         In its pixels; by default all of it.
     form : {"plane", "sphere", "none"}, optional
@@ -90,14 +95,15 @@ def measure(
     >>> round(measure(result, form="none").quantities["measured area"].value, 6)
     0.06
     """
-    patch, comparable = patch_of(result, region)
+    maps = as_result(result, "result", pixel_size=pixel_size)
+    patch, comparable = patch_of(maps, region)
     quantities, notes = heights(patch), list(patch.notes)
     quantities |= areas(patch)
     quantities |= _volumes(patch, quantities.get("rim height"))
     quantities |= _forms(patch, form, cutoff, notes)
     if section is not None:
         quantities |= _section(comparable, section, notes)
-    lens = None if result.calibration is None else result.calibration.lens
+    lens = None if maps.calibration is None else maps.calibration.lens
     scale = 0.0 if lens is None else lens.scale_sigma
     return Measures(_scaled(quantities, scale), [*notes, *_assumed(patch, scale)])
 

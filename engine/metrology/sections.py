@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.inputs import spacing
+from mirrorskin.engine.inputs import Maps, as_result, spacing
 from mirrorskin.engine.metrology.fitting import covariance
 from mirrorskin.engine.metrology.patch import heights_of
 from mirrorskin.engine.metrology.quantity import Quantity
@@ -54,17 +54,25 @@ class Section:
     unit: str = "mm"
 
 
-def section(result: Result, start: Point | None = None, end: Point | None = None) -> Section:
+def section(
+    result: Maps,
+    start: Point | None = None,
+    end: Point | None = None,
+    *,
+    pixel_size: ArrayLike | None = None,
+) -> Section:
     """Cut through the height map of a result.
 
     Parameters
     ----------
-    result : Result
-        Of one picture, with heights.
+    result : Result, mapping, xarray.Dataset, path or array_like, (H, W)
+        Heights of one picture, mm, with their standard deviation, if available. An array is the height.
     start, end : (float, float), optional
         Millimetres from the picture's centre, x to the right and y up. Without them, the row of the highest
         point is taken, from the picture's left to its right; the highest after a median over 3 x 3
         pixels, which leaves spikes out, measured or filled. Of a flat top it is the row in its middle.
+    pixel_size : float or (float, float), optional
+        Millimetres along x and y; by default that of the result.
 
     Returns
     -------
@@ -84,10 +92,11 @@ def section(result: Result, start: Point | None = None, end: Point | None = None
     >>> section(result, (-0.1, 0.0), (0.1, 0.0)).height.round(6).tolist()
     [0.0, 1.0, 2.0]
     """
-    height = heights_of(result)
+    maps = as_result(result, "result", pixel_size=pixel_size)
+    height = heights_of(maps)
     if (start is None) != (end is None):
         raise InputError("a section needs both ends, or neither")
-    x, y, unit = result.x, result.y, "mm"
+    x, y, unit = maps.x, maps.y, "mm"
     if x is None or y is None:
         if start is not None:
             raise InputError(
@@ -104,7 +113,7 @@ def section(result: Result, start: Point | None = None, end: Point | None = None
         _check_near((start, end), x, y, size)
     along, distance = _samples(start, end, size)
     column, row_of = (along[0] - x[0]) / size[0], (y[0] - along[1]) / size[1]
-    values = _between(result, height, SamplePoints.at(column, row_of, (height.shape[0], height.shape[1])))
+    values = _between(maps, height, SamplePoints.at(column, row_of, (height.shape[0], height.shape[1])))
     return Section(distance, along[0], along[1], *values, unit)
 
 

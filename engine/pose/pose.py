@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from mirrorskin.engine.inputs import Maps, as_result
 from mirrorskin.engine.pose.fit import Equations, PairFit
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import Doubles, Motion
-from mirrorskin.io import Result
 from mirrorskin.io.arguments import checked
 from mirrorskin.kernels.device import Device, open_device
 
@@ -90,8 +90,8 @@ class Pose:
 
 @checked
 def estimate_pose(
-    first: Result,
-    second: Result,
+    first: Maps,
+    second: Maps,
     pixel_size: ArrayLike | None = None,
     *,
     start: Pose | None = None,
@@ -114,9 +114,9 @@ def estimate_pose(
 
     Parameters
     ----------
-    first, second : Result
+    first, second : Result, mapping, xarray.Dataset or path
         ``height``, (H, W), mm, with ``height_sigma``, or ``normals``, (H, W, 3), with ``normals_sigma``, or
-        both; also `Result(height=..., ...)` of any arrays. The sizes may differ.
+        both. The sizes may differ.
     pixel_size : float or (float, float), optional
         mm; by default as the results say.
     start : Pose, optional
@@ -150,8 +150,9 @@ def estimate_pose(
     3
     """
     opened = open_device(device)
-    maps = PoseMap.of(first, pixel_size, opened), PoseMap.of(second, pixel_size, opened)
-    fit = PairFit(*maps, opened)
+    results = as_result(first, "first"), as_result(second, "second")
+    before, after = (PoseMap.of(result, pixel_size, opened) for result in results)
+    fit = PairFit(before, after, opened)
     return pose_of(fit, *fit.solve(None if start is None else start.motion))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from mirrorskin.engine.inputs import Maps, as_result
 from mirrorskin.engine.pose.fit import PairFit
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import STILL, Doubles, Motion
@@ -52,7 +54,7 @@ class Stitch:
 
 
 def stitch(
-    results: Sequence[Result],
+    results: Sequence[Maps],
     pixel_size: ArrayLike | None = None,
     *,
     names: Sequence[str] | None = None,
@@ -67,7 +69,7 @@ def stitch(
 
     Parameters
     ----------
-    results : sequence of Result
+    results : sequence of Result, mapping, xarray.Dataset or path
         Two or more, each with heights and what `estimate_pose` needs, and sharing a part with one before it.
         Of touches whose height's offset is unknown, it is made to agree with those before.
     pixel_size : float or (float, float), optional
@@ -96,12 +98,14 @@ def stitch(
     >>> whole.result.height.shape, whole.poses[1].translation.round(2).tolist()
     ((41, 71), [-1.0, 0.0, 0.0])
     """
-    if not isinstance(results, Sequence) or not all(isinstance(one, Result) for one in results):
-        raise InputError("the touches are no sequence of results: give a list of mirrorskin.io.Result")
+    if not isinstance(results, Sequence) or isinstance(results, str):
+        raise InputError(f"the touches are a {type(results).__name__}: give a list of results")
     if len(results) < 2:
         raise InputError(f"{len(results)} results make no larger surface: give two or more")
-    names = [f"result {number}" for number in range(len(results))] if names is None else names
-    touches = [select_turn(result, None) for result in results]
+    names = [_name_of(result, number) for number, result in enumerate(results)] if names is None else names
+    touches = [
+        select_turn(as_result(result, name), None) for result, name in zip(results, names, strict=True)
+    ]
     opened = open_device(device)
     maps = []
     for touch, name in zip(touches, names, strict=True):
@@ -114,6 +118,10 @@ def stitch(
     graph = _Graph(maps, names, opened)
     poses = graph.solve()
     return Stitch(_merged(touches, maps, poses, names), tuple(poses), len(graph.links))
+
+
+def _name_of(result: Maps, number: int) -> str:
+    return os.fspath(result) if isinstance(result, str | os.PathLike) else f"result {number}"
 
 
 class _Graph:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mirrorskin.engine.inputs import Maps, as_result
 from mirrorskin.engine.pose.fit import PairFit, complement
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import STILL, Doubles, Motion
@@ -64,8 +65,8 @@ class PoseTracker(ThreadSafe):
         self._fewest, self._worst = 0.0, np.inf  # pixels, and chi square
         self._back, self._way = STILL, STILL  # from the last result to the key, and from it to the one before
 
-    def push(self, result: Result) -> Pose:
-        """Take the next result, and return the motion from the first one to it.
+    def push(self, maps: Maps) -> Pose:
+        """Take the next result, or maps as for `estimate_pose`, and return the motion from the first to it.
 
         Raises
         ------
@@ -73,6 +74,7 @@ class PoseTracker(ThreadSafe):
             What `estimate_pose` refuses, or the result shares too few pixels with those before. It is left
             out, and the next is expected where this one was.
         """
+        result = as_result(maps, "result")
         if self._key is None:
             self._take_key(result, self._key_pose)
             return self._key_pose
