@@ -16,14 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mirrorskin.cli.groups import Command, ExistingPath, MotionOption, for_motions
+from mirrorskin.cli.groups import MOTIONS, Command, ExistingPath, MotionOption, for_motions
 
 if TYPE_CHECKING:
     from mirrorskin.engine.options import Configured, Option
 
 _CLASS = re.compile(r".+:[A-Za-z_]\w*")
 _LOADED = "mirrorskin.cli.declared"  # key of a context's class and its options
-_OF_RECORDINGS = ("pixel_size",)  # options that operations take from a recording
 _COPY = Path(__file__).with_suffix(".json")
 _UNITS = {  # placeholder in help, function of `mirrorskin.cli.quantity`, example
     "mm": ("LENGTH", "length", "0.1mm"),
@@ -39,7 +38,6 @@ _UNITS = {  # placeholder in help, function of `mirrorskin.cli.quantity`, exampl
 }
 _CLASS = re.compile(r".+:[A-Za-z_]\w*")
 _LOADED = "mirrorskin.cli.declared"  # key of a context's class and its options
-_OF_RECORDINGS = ("pixel_size",)  # options that operations take from a recording
 _COPY = Path(__file__).with_suffix(".json")
 _METAVARS = {
     "mm": "LENGTH",
@@ -90,14 +88,16 @@ class Term:
     def read_one(self, text: str, where: str) -> Any:
         """Return the value that a text stands for; ``where`` begins messages."""
         from mirrorskin.cli import quantity
+        from mirrorskin.io import InputError
 
         if text in self.words or self.kind in ("choice", "text"):
             return text
         plain = "integer" if self.kind == "integer" else "number"
-        value = getattr(quantity, _UNITS.get(self.unit, ("", plain))[1])(text, where)
+        try:
+            value = getattr(quantity, _UNITS.get(self.unit, ("", plain))[1])(text, where)
+        except InputError as error:
+            raise InputError(", or ".join([str(error), *self.words])) from error
         if self.least is not None and value < self.least:
-            from mirrorskin.io import InputError
-
             raise InputError(f"{where} {text}: a number of at least {self.least} is needed")
         return value
 
@@ -217,7 +217,7 @@ class ClassCommand(Command):
         from mirrorskin.io import InputError
 
         kind = load_operation(name)
-        terms = [one for one in terms_of({"": kind}) if one.name not in _OF_RECORDINGS]
+        terms = terms_of({"": kind})
         taken = {one.name for one in self.params if not getattr(one, "of_engine", False)}
         for one in terms:
             if one.name in taken:
@@ -305,16 +305,20 @@ def _by_motion(variants: list[Term], name: str) -> str:
 
 def declarations() -> dict[str, list[dict[str, Any]]]:
     """Return what ``declared.json`` contains: the options of each command."""
-    from mirrorskin.engine.method import Method
+    from mirrorskin.engine.lock_in import Correlation
     from mirrorskin.engine.reconstruction import method_for
 
-    methods = {one: method_for(one) for one in ("vertical", "axial", "horizontal", "twist")}
-    methods = {motion: kind for motion, kind in methods.items() if issubclass(kind, Method)}
-    return {"reconstruct": _rows(methods)}
-
-
-def _rows(kinds: Mapping[str, type[Configured]]) -> list[dict[str, Any]]:
-    return [{name: value for name, value in asdict(one).items() if value} for one in terms_of(kinds)]
+    methods: dict[str, type[Configured]] = {one: method_for(one) for one in MOTIONS}
+    fused = ("tilt", "zenith_gain", "zenith_offset", "robust")
+    terms = {
+        "reconstruct": terms_of(methods),
+        "correlate": terms_of({"": Correlation}),
+        "fuse": [one for one in terms_of({"": methods["axial"]}) if one.name in fused],
+    }
+    return {
+        command: [{name: value for name, value in asdict(one).items() if value} for one in options]
+        for command, options in terms.items()
+    }
 
 
 if __name__ == "__main__":

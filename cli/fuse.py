@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from mirrorskin.cli import options
+from mirrorskin.cli.declared import declared
 from mirrorskin.cli.groups import Argument, Option
+from mirrorskin.cli.stack import STACK, stack_options
 
 if TYPE_CHECKING:
     from mirrorskin.cli.stack import StackOptions
@@ -26,21 +28,7 @@ def command(
             show_default="VERTICAL-fused.h5",
         ),
     ] = None,
-    dataset: Annotated[
-        str | None, Option(metavar="PATH", help="The stack in others' files, of one name in both.")
-    ] = None,
-    travel_step: options.TravelStep = None,
-    travel_start: options.TravelStart = None,
-    travel: options.Travel = None,
-    phase_step: options.PhaseStep = None,
-    phases: options.Phases = None,
-    tilt: options.Tilt = None,
-    pixel_size: options.PixelSize = None,
-    region: options.Region = None,
-    zenith_gain: options.ZenithGain = None,
-    zenith_offset: options.ZenithOffset = None,
     calibration: options.Calibration = None,
-    robust: options.Robust = False,
     register: Annotated[
         bool,
         Option(help="Let the rotation's frames follow the object; without it, they need no press and pivot."),
@@ -48,41 +36,31 @@ def command(
     memory: options.Memory = "256MB",
     device: options.Device = None,
     as_json: options.Json = False,
+    **chosen: Annotated[Any, STACK.without("motion", "frames", "tilt"), declared("fuse")],
 ) -> None:
     """Make one surface of a press and a rotation."""
     from mirrorskin import io
     from mirrorskin.cli.output import progress, report_levels, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
-    from mirrorskin.cli.quantity import per_angle
-    from mirrorskin.cli.stack import stack_options
     from mirrorskin.engine.fusion import frames_to_read, fuse_sources
     from mirrorskin.engine.reconstruction import calibrated
 
-    known = stack_options(
-        travel_step=travel_step,
-        travel_start=travel_start,
-        travel=travel,
-        phase_step=phase_step,
-        phases=phases,
-        tilt=tilt,
-        pixel_size=pixel_size,
-        region=region,
-    )
-    gain = None if zenith_gain is None else per_angle(zenith_gain, "--zenith-gain")
-    rotation = {"gain": gain, "offset": zenith_offset, "tilt": known.get("tilt")}
+    files = [value for value in chosen.values() if isinstance(value, Path)]
+    known = stack_options(chosen)
+    robust = chosen.pop("robust", False)
     limit = bytes_of(memory, "--memory")
     target = output or vertical.with_name(f"{vertical.stem}-fused.h5")
     with (
-        _open(vertical, "vertical", dataset, known, limit) as pressed,
-        _open(axial, "axial", dataset, known, limit) as turned,
+        _open(vertical, "vertical", known, limit) as pressed,
+        _open(axial, "axial", known, limit) as turned,
     ):
-        io.check_output(target, vertical, axial, phases, travel, calibration, or_zarr=True)
+        io.check_output(target, vertical, axial, calibration, *files, or_zarr=True)
         shared = None if calibration is None else io.open_calibration(calibration)
         with progress("fusing", frames_to_read(pressed, turned, register)) as show:
             result = fuse_sources(
                 calibrated(pressed, shared),
                 calibrated(turned, shared),
-                rotation={name: value for name, value in rotation.items() if value is not None},
+                rotation=chosen,
                 register=register,
                 robust=robust,
                 memory_limit=limit,
@@ -95,7 +73,7 @@ def command(
     )
 
 
-def _open(path: Path, place: Motion, dataset: str | None, known: StackOptions, limit: int) -> Recording:
+def _open(path: Path, place: Motion, known: StackOptions, limit: int) -> Recording:
     """Open a recording; a file in another layout has the motion of its place on the command line."""
     from mirrorskin import io
     from mirrorskin.io.arrays import NUMPY_SUFFIXES
@@ -106,5 +84,5 @@ def _open(path: Path, place: Motion, dataset: str | None, known: StackOptions, l
     if path.suffix.lower() not in NUMPY_SUFFIXES:
         with open_file(path) as file:
             ours = file.marked(MARK)
-    mine = known if ours else {**known, "motion": place}
-    return io.open_recording(path, dataset=None if ours else dataset, memory_limit=limit, **mine)
+    mine: Any = {**known, "dataset": None} if ours else {**known, "motion": place}
+    return io.open_recording(path, memory_limit=limit, **mine)

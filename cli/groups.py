@@ -10,13 +10,16 @@ from enum import StrEnum
 from importlib import import_module
 from pathlib import Path
 from types import NoneType
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 
 import click
 from click.shell_completion import CompletionItem
 
+if TYPE_CHECKING:
+    from mirrorskin.io import Motion
+
 _WRITTEN = {"--output", "--record"}  # options that name what a command writes; other paths are read
-MOTIONS = ("vertical", "axial", "horizontal", "twist")
+MOTIONS: tuple[Motion, ...] = ("vertical", "axial", "horizontal", "twist")
 _COMMON = ("calibration", "memory", "device", "as_json")  # options that follow the declared ones in help
 _NOUNS = {"vertical": "press", "axial": "rotation", "horizontal": "slide", "rock": "rocking motion"}
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -58,15 +57,17 @@ def _operation_of(path: Path) -> str:
 
     `load_toml` reports what else is wrong with the file.
     """
-    with suppress(ValueError, RecursionError):
+    try:
         table = tomllib.loads(read_regular(path, _REMEDY, MAX_TEXT_BYTES).decode()).get("operation")
-        if isinstance(table, dict):
-            place, colon, name = str(table.get("class", "")).rpartition(":")
-            if not colon:
-                needed = 'MODULE:CLASS or FILE.py:CLASS is needed; write e.g. class = "mine.py:Wear"'
-                raise InputError(f"{path}: operation.class: {needed}")
-            return f"{Path(place).resolve() if place.endswith('.py') else place}:{name}"
-    return ""
+    except (ValueError, RecursionError):
+        return ""
+    if not isinstance(table, dict):
+        return ""
+    place, colon, name = str(table.get("class", "")).rpartition(":")
+    if not colon:
+        needed = 'MODULE:CLASS or FILE.py:CLASS is needed; write e.g. class = "mine.py:Wear"'
+        raise InputError(f"{path}: operation.class: {needed}")
+    return f"{Path(place).resolve() if place.endswith('.py') else place}:{name}"
 
 
 def _table(name: str, kind: type[Configured]) -> type[Struct]:

@@ -106,6 +106,8 @@ def missing_levels(process: Mapping[str, object]) -> str:
     >>> missing_levels({"dark": 12.0, "bright": estimated_level(182.0)})
     'no bright given: estimated as 182 counts'
     """
+    if "tilt_from" in process:  # of a rotation: dark and bright are only limits
+        return ""
     taken = {one: str(process.get(one, "")) for one in ("dark", "bright")}
     missing = [one for one, said in taken.items() if said == _ASSUMED or said.endswith(_ESTIMATED)]
     if not missing:

@@ -263,3 +263,55 @@ def test_a_cluster_is_given_the_same_jobs(monkeypatch, words, expected):
     code, out, _ = run("batch", "a.h5", "b.h5", "-o", "out", "--memory", "1MB", *words)
     assert (code, out.splitlines()[0]) == (0, "done: a.h5 in 0.5 s, 0 MB/s: well")
     assert given == [(make_jobs([Path("a.h5"), Path("b.h5")], Path("out")), 10**6, expected)]
+
+
+WEAR = """
+import numpy as np
+from mirrorskin import engine, io
+
+class Wear(engine.Operation):
+    travel_offset: float = engine.option(0.0, "mm", help="added to each travel")
+    wear = io.Map("depth of the wear", "mm", quantity="height")
+
+    def start(self, shape, dtype):
+        self.deepest = np.zeros(shape)
+    def push(self, frames, *, travel):
+        self.deepest -= self.travel_offset + travel[-1]
+    def result(self):
+        return {"wear": self.deepest}
+"""
+SETTINGS = '[operation]\nclass = "mine_of_a_batch.py:Wear"\ntravel-offset = "100um"\n'
+
+
+@pytest.mark.parametrize("workers", [[], pytest.param(["--workers", "1"], marks=pytest.mark.slow)])
+def test_a_user_s_operation_runs_in_a_batch_and_is_resumed(workers):
+    presses("press.h5")
+    rotation(Path("turn.h5"))
+    Path("mine_of_a_batch.py").write_text(WEAR)
+    Path("batch.toml").write_text(SETTINGS)
+    words = [
+        "batch",
+        "press.h5",
+        "turn.h5",
+        "-o",
+        "out",
+        "--settings",
+        "batch.toml",
+        "--memory",
+        "10kB",
+        *workers,
+    ]
+    first, again = run(*words, "--json"), run(*words, "--json")
+    states = [
+        {Path(one["source"]).name: one["state"] for one in json.loads(ended.out)["files"]}
+        for ended in (first, again)
+    ]
+    assert states == [{"press.h5": "done", "turn.h5": "failed"}, {"press.h5": "kept", "turn.h5": "failed"}]
+    message = next(one["message"] for one in json.loads(first.out)["files"] if one["state"] == "failed")
+    assert "travel is missing: Wear needs it of each frame" in message
+    found = io.open_result("out/press-result.h5")
+    assert found.declaration("wear").quantity == "height"
+    assert (found.process["operation"], found.process["travel_offset"]) == ("Wear", pytest.approx(0.1))
+    Path("batch.toml").write_text(SETTINGS.replace("100um", "0.2mm"))
+    changed = json.loads(run(*words, "--json").out)["files"]
+    assert [one["state"] for one in changed if "press" in one["source"]] == ["done"]

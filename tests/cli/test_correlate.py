@@ -119,7 +119,7 @@ CASES = {
         [],
         "theirs.h5 does not state the position of the body in each frame: give --phase-step or --ph",
     ),
-    "both": (theirs, ["--phase-step", "45deg", "--phases", "phases.txt"], "leave one out"),
+    "both": (theirs, ["--phase-step", "45deg", "--phases", "phases.txt"], "Remove one of them"),
     "seven phases": (theirs, ["--phases", "seven.txt"], "seven.txt lists 7 phases for 8 frames"),
     "no such phases": (theirs, ["--phases", "gone.txt"], "gone.txt: no such file"),
     "a number": (theirs, ["--phases", "number.txt"], "number.txt, line 2: 45: a unit is needed"),
@@ -176,9 +176,9 @@ def test_a_frequency_takes_the_place_of_the_phase(frequency, harmonic, amplitude
     ("words", "line"),
     [
         (["--frequency", "3"], "the time of each frame is unknown"),
-        (["--frequency", "fast"], "--frequency fast: hertz above 0 are needed"),
-        (["--frequency", "3", "--phase-step", "45deg"], "leave --phase-step and --phases out"),
-        (["--frequency", "3", "--frame-rate", "0"], "frame rate 0"),
+        (["--frequency", "fast"], "--frequency fast: a number is needed; write e.g. 0.25, or estimate"),
+        (["--frequency", "3", "--phase-step", "45deg"], "Remove --phase-step and --phases"),
+        (["--frequency", "3", "--frame-rate", "0"], "frame_rate 0: a number in frames/s above 0 is needed"),
     ],
 )
 def test_a_frequency_that_cannot_be_is_one_line(words, line):

@@ -191,8 +191,7 @@ def test_without_a_gain_there_is_no_zenith_and_a_line_says_why():
 
 PRESS = {
     "--travel-step": ["0.1mm"],
-    "--dark": ["3"],
-    "--bright": ["3"],
+    "--modulus": ["0.1MPa"],
     "--event": ["onset"],  # the default, but given
     "--threshold": ["0.5"],
     "--hold": ["2"],
@@ -267,7 +266,7 @@ CASES = {
     "one phase": ({}, ["--phase-step", "360deg"], "1 different phases"),
     "phases side by side": ({}, ["--phase-step", "0.001deg"], "too close together"),
     "seven phases": ({}, ["--phases", "seven.txt"], "seven.txt lists 7 phases for 8 frames"),
-    "phases twice": ({}, ["--phases", "seven.txt", "--phase-step", "45deg"], "leave one out"),
+    "phases twice": ({}, ["--phases", "seven.txt", "--phase-step", "45deg"], "Remove one of them"),
     "heights from nowhere": ({}, ["--heights", "gone.h5"], "gone.h5: no such file"),
     "no heights": ({}, ["--heights", "flat.h5"], "flat.h5 holds no heights"),
     "heights of another size": ({}, ["--heights", "small.h5"], "small.h5 holds the heights of"),

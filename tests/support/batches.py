@@ -72,7 +72,7 @@ BAD = {
     missing: "no such file",
     damaged: "damaged",
     truncated: "truncated",
-    horizontal: "has no pixel size, which slip takes: give ",
+    horizontal: "the pixel size is missing, which slip needs: give ",
     of_wrong_type: "of type int64",
     a_folder: "is a folder",
 }

@@ -136,7 +136,7 @@ def test_what_the_engine_raises_is_told(job, monkeypatch, error, said):
     def fail(*_, **__):
         raise error
 
-    monkeypatch.setattr(work, "reconstruct", fail)
+    monkeypatch.setattr(work, "run_class", fail)
     outcome = run_job(job, Plan())
     assert (outcome.state, outcome.motion) == ("failed", "vertical")
     assert outcome.message.endswith(said)
