@@ -34,7 +34,7 @@ _REFUSED = ("failed to map segment", "annot allocate memory", "can't start new t
 _HELP = "NoArgsIsHelpError"  # of a group that no command was named of; its message is the group's help
 
 PURPOSES = {
-    "demo": "Repeat the paper's experiments on the twin.",
+    "demo": "Draw the figures of the paper from experiments on the twin.",
     "simulate": "Record what the twin sees, with the truth.",
     "sample": "Write example data.",
     "import": "Make a recording of a video or pictures.",

@@ -21,7 +21,7 @@ noise = np.random.default_rng(1).normal(0, 40, light.shape)
 with h5py.File("theirs.h5", "w") as file:
     file["scan_7/camera/images"] = (light + noise).astype(np.uint16)
 
-# Ours: name the stack, say where the body was, and what is dark and bright.
+# Our part: name the dataset, and give the travel, the pixel size and the dark and bright levels.
 with io.open_recording(
     "theirs.h5",
     dataset="/scan_7/camera/images",

@@ -24,7 +24,7 @@ print(summarise(result))
 
 error = engine.score(result, press.truth).height
 print(f"mean error {error.mean:+.3f} mm, RMS {error.rms:.3f} mm, at {error.answered} pixels")
-print(f"a step of 0.1 mm at best: {0.1 / np.sqrt(12):.3f} mm")
+print(f"standard deviation of a step of 0.1 mm: {0.1 / np.sqrt(12):.3f} mm")
 
 figures = figures_of(result, name="a ball of 10 mm, from a press")
 for what in ("height", "section"):

@@ -24,7 +24,9 @@ result = engine.reconstruct(press)
 print(summarise(result))
 
 error = engine.score(result, press.truth).height
-print(f"RMS error {error.rms:.4f} mm where slopes were seen; a step at best: {0.02 / np.sqrt(12):.4f} mm")
+print(
+    f"RMS error {error.rms:.4f} mm on the slopes; standard deviation of a step: {0.02 / np.sqrt(12):.4f} mm"
+)
 
 cut = section(result, (-11.5, 0.0), (11.5, 0.0))
 print(f"along {cut.distance[-1]:.1f} mm: from {np.nanmin(cut.height):.3f} to {np.nanmax(cut.height):.3f} mm")
