@@ -56,7 +56,7 @@ PURPOSES = {
     "rig": "Look at a stage and a camera before they are used.",
     "calibrate": "Find out what a sensor's counts and pixels mean.",
     "twin": "Emulate a whole rig: its stage and its camera.",
-    "bench": "Time the kernels and whole paths against the limits and against others.",
+    "bench": "Time the core operations and the limits of a device.",
 }
 """What the commands are for, in the order of the help; each stands in the module of its name."""
 

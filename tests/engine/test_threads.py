@@ -14,9 +14,9 @@ import pytest
 from live_frames import paced, phases, press_frames, press_header, turn_frames, turn_header
 from speckle import Speckle
 from stacks import MadeUp
+from suite.scenes import SCALES, TILT
 
 from mirrorskin import engine
-from mirrorskin.bench.scenes import SCALES, TILT
 from mirrorskin.engine import live
 from mirrorskin.engine.live.status import STAGES, Monitor
 from mirrorskin.engine.press.estimated_levels import EstimatedLevels, EstimatedLevelSearch

@@ -1,8 +1,7 @@
-"""What is measured on: presses, turns of a rotation, slopes with masks and cuts; always the same ones."""
+"""Inputs of the cases: presses, turns of a rotation, slopes with masks and cuts. They never change."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -23,18 +22,17 @@ STEPS = 8  # frames of one turn
 PIXEL = 0.01  # size of a pixel of slopes, mm
 NOISE = 0.02  # standard deviation of a slope
 
-_NOISE = 1.5 / 208  # of a press, share of the way from dark to light
-_DEAD = 10_000  # one pixel in so many has no bright reference
-_NAN = 1_000_000  # one sample in so many is no number, where the type allows it
-_STEEPEST = np.radians(60)  # zenith at a ball's rim
-_RIM = 0.97  # share of a ball's radius from which contact is lost on one side
-_SAG = np.radians(15)  # by which a sheet that lost contact leans less
-_LOST = 0.3  # cosine of lean against azimuth from which it is lost
-_WAVES, _FINEST = 12, 12.0  # of slopes, and how many of the finest one lie along the longer side
-_SLOPE = 0.3  # root mean square of how steep the surface is
-_BLOB, _OUTSIDE = 25, 0.35  # blobs of a mask along the shorter side, share of the pixels outside
-_LENGTHS = (0.1, 0.4)  # of cuts, in shorter sides of the picture
-_MASK_ROWS = 500  # of a mask that is made pixel by pixel; a larger one is made small and drawn large
+_NOISE = 1.5 / 208  # of a press, divided by bright minus dark
+_DEAD = 10_000  # one pixel of this number has no bright reference
+_NAN = 1_000_000  # one float sample of this number is NaN
+_STEEPEST = np.radians(60)  # zenith at the rim of a ball
+_RIM = 0.97  # fraction of the radius beyond which contact is lost on one side
+_SAG = np.radians(15)  # by which the zenith is smaller where contact is lost
+_LOST = 0.3  # cosine between lean and azimuth above which contact is lost
+_WAVES, _FINEST = 12, 12.0  # of slopes; periods of the finest wave along the longer side
+_SLOPE = 0.3  # root mean square of the slopes
+_BLOB, _OUTSIDE = 25, 0.35  # blobs of a mask along the shorter side, fraction of the pixels outside
+_LENGTHS = (0.1, 0.4)  # of cuts, divided by the shorter side
 
 
 class Scale(NamedTuple):
@@ -59,25 +57,25 @@ def press_noise(dtype: np.dtype[Any]) -> float:
 
 
 def turn_noise(dtype: np.dtype[Any]) -> float:
-    """Return the standard deviation of a sample of a turn, counts, with what rounding adds."""
+    """Return the standard deviation of a sample of a turn, counts, including that of rounding."""
     noise = SCALES[dtype.name].noise
     return noise if dtype.kind == "f" else float(np.hypot(noise, 1 / np.sqrt(12)))
 
 
 def travel_of(count: int) -> NDArray[np.float64]:
-    """Return the travel of so many frames, mm."""
+    """Return the travel of `count` frames, mm."""
     return np.arange(count, dtype=np.float64) * 0.05
 
 
 def phases(count: int) -> NDArray[np.float64]:
-    """Return the phases of so many frames, radians: whole turns of 8 even steps."""
+    """Return the phases of `count` frames, radians: whole turns of 8 even steps."""
     return np.arange(count, dtype=np.float64) * (2 * np.pi / STEPS)
 
 
 def references(shape: Shape, dtype: np.dtype[Any]) -> tuple[Floats, Floats]:
-    """Return dark and bright counts of each pixel, as the mean of 8 reference frames has them.
+    """Return dark and bright counts of each pixel, as the mean of 8 reference frames would be.
 
-    They are multiples of 1/8; a few bright ones are NaN: dead pixels.
+    They are multiples of 1/8; a few bright ones are NaN, which marks dead pixels.
     """
     generator = np.random.default_rng(1)
     low, high = LEVELS[dtype.name]
@@ -90,9 +88,9 @@ def references(shape: Shape, dtype: np.dtype[Any]) -> tuple[Floats, Floats]:
 def fill_press(frames: NDArray[Any], stack: StackName = "press") -> None:
     """Fill a stack, (T, H, W), in place.
 
-    ``press``: the contact of a ball runs outwards from its hole at the level top, each pixel takes one to
-    four frames to turn light, and the corners stay dark. ``random``: each pixel turns light at once at a time
-    of its own, an eighth never, so that neighbours differ and no part of the picture is done early.
+    ``press``: the contact of a ball grows outwards from a hole at its level top, each pixel takes one to
+    four frames to turn light, and the corners stay dark. ``random``: each pixel turns light at once at a
+    random time, an eighth never, so that neighbours differ and no part of the picture is finished early.
     """
     shape = (frames.shape[1], frames.shape[2])
     generator = np.random.default_rng(0)
@@ -108,7 +106,7 @@ def fill_press(frames: NDArray[Any], stack: StackName = "press") -> None:
         counts += dark
         counts += grain[offset : offset + counts.size].reshape(shape)
         if frame.dtype.kind == "f":
-            # Fractions that float32 sums hold exactly: no answer hangs on how a sum is rounded.
+            # Fractions that sums of float32 represent exactly, so that no answer depends on rounding.
             np.divide(np.rint(64 * counts), 64, out=frame)
         else:
             _round(counts, frame)
@@ -117,9 +115,9 @@ def fill_press(frames: NDArray[Any], stack: StackName = "press") -> None:
 
 
 def _front(count: int, shape: Shape, generator: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return the frame at which each pixel begins to turn light, and the share that it gains a frame."""
+    """Return the frame at which each pixel starts to turn light, and the fraction that it gains a frame."""
     y, x = np.meshgrid(*(np.linspace(-1.05, 1.05, n) for n in shape), indexing="ij")
-    radius = np.hypot(x, y)  # 1 is where the ball leans by 45 degrees
+    radius = np.hypot(x, y)  # 1 where the ball leans by 45 degrees
     drop = np.sqrt(2) - np.sqrt(np.maximum(2 - radius**2, 1))
     start = 1 + 0.9 * count * drop / (np.sqrt(2) - 1)
     start[(radius < 0.3) | (radius > 1)] = np.inf
@@ -142,9 +140,9 @@ def _eighths(counts: NDArray[np.float64]) -> Floats:
 
 
 def fill_turns(frames: NDArray[Any]) -> None:
-    """Fill a stack, (N, H, W), in place with turns on a lattice of balls, as equation 10 has it.
+    """Fill a stack, (N, H, W), in place with turns on a lattice of balls (equation 10).
 
-    Between the balls the sheet is flat, which is where a turn's brightness is least like a cosine. At the
+    Between the balls the sheet is flat, where the brightness over a turn differs most from a cosine. At the
     rims it loses contact in the frames in which the body leans away.
     """
     generator = np.random.default_rng(0)
@@ -176,65 +174,49 @@ def _balls(shape: tuple[int, ...]) -> tuple[Floats, Floats, NDArray[np.bool_]]:
 
 
 def _angle(zenith: Floats, lean: Floats) -> Floats:
-    """Return the angle between normal and leaning axis: equation 10, by the half angle, exact near 0 too."""
+    """Return the angle between normal and leaning axis: equation 10 in half angles, exact near 0 too."""
     # hav(theta') = hav(theta + d) - sin(theta) sin(d) (1 - cos(phi - alpha)) / 2, with hav(x) = sin(x / 2)^2.
     half = np.square(np.sin((zenith + np.float32(TILT)) / 2))
     half -= np.sin(zenith) * np.float32(np.sin(TILT) / 2) * (1 - lean)
-    found: Floats = 2 * np.arcsin(np.sqrt(np.maximum(half, 0)))
-    return found
+    angle: Floats = 2 * np.arcsin(np.sqrt(np.maximum(half, 0)))
+    return angle
 
 
 def smooth_slopes(shape: Shape, seed: int = 0) -> Floats:
-    """Return slopes dz/dx and dz/dy of a sum of waves, (2, H, W); y runs up the picture."""
+    """Return slopes dz/dx and dz/dy of a sum of waves, (2, H, W); y points up the picture."""
+    generator = np.random.default_rng(seed)
+    y, x = (np.arange(n, dtype=np.float32) / max(shape) for n in shape)
     slopes = np.zeros((2, *shape), np.float32)
-    for phase, _, shares in _waves(shape, seed):
-        wave = np.sin(phase).astype(np.float32)
-        for slope, share in zip(slopes, shares, strict=True):
-            slope += np.float32(share) * wave
+    for count in np.geomspace(0.7, _FINEST, _WAVES):
+        angle, phase = generator.uniform(0, 2 * np.pi, 2)
+        direction = np.cos(angle), np.sin(angle)
+        turns = np.float32(count * direction[0]) * x - np.float32(count * direction[1]) * y[:, np.newaxis]
+        wave = np.sin(2 * np.pi * turns + phase).astype(np.float32)
+        for slope, part in zip(slopes, direction, strict=True):
+            slope += np.float32(part * _SLOPE * np.sqrt(2 / _WAVES)) * wave
     return slopes
 
 
-def smooth_heights(shape: Shape, seed: int = 0) -> NDArray[np.float64]:
-    """Return the heights of the same sum of waves, (H, W), mm."""
-    heights = np.zeros(shape)
-    for phase, steepness, (along, up) in _waves(shape, seed):
-        heights -= np.hypot(along, up) / steepness * np.cos(phase)
-    return heights
-
-
-def _waves(shape: Shape, seed: int) -> Iterator[tuple[NDArray[np.floating[Any]], float, tuple[float, float]]]:
-    """Give each wave's phase, (H, W), by how much that grows in a mm, and its slopes' amplitudes."""
-    generator = np.random.default_rng(seed)
-    y, x = (np.arange(n, dtype=np.float32) / max(shape) for n in shape)
-    for count in np.geomspace(0.7, _FINEST, _WAVES):
-        angle, phase = generator.uniform(0, 2 * np.pi, 2)
-        along, up = np.cos(angle), np.sin(angle)
-        turns = np.float32(count * along) * x - np.float32(count * up) * y[:, np.newaxis]
-        size = _SLOPE * np.sqrt(2 / _WAVES)
-        yield 2 * np.pi * turns + phase, 2 * np.pi * count / (max(shape) * PIXEL), (along * size, up * size)
-
-
 def noisy_slopes(shape: Shape, seed: int = 0) -> Floats:
-    """Return the slopes of the same surface as a camera's noise leaves them."""
-    generator = np.random.default_rng(seed)
-    noise = generator.standard_normal((2, *shape), np.float32)
+    """Return the slopes of the same surface with the noise of a camera."""
+    noise = np.random.default_rng(seed).standard_normal((2, *shape), np.float32)
     return smooth_slopes(shape, seed) + np.float32(NOISE) * noise
 
 
 def drifting_slopes(shape: Shape, count: int, share: float) -> list[Floats]:
-    """Return noisy slopes of so many frames that run in a circle, each as unlike the next.
+    """Return noisy slopes of `count` frames on a circle, each equally different from the next.
 
-    What changes from a frame to the next has a root mean square of `share` of that of the slopes: half of it
+    The change from a frame to the next has a root mean square of `share` of that of the slopes: half of it
     in the surface, half in the noise.
     """
     middle = noisy_slopes(shape)
-    ways = []
+    axes = []
     for seed in (1, 2):
         surface = smooth_slopes(shape, seed)
-        way = noisy_slopes(shape, seed) - np.float32(1 - NOISE / _rms(surface)) * surface
-        ways.append(np.float32(share * _rms(middle) / _rms(way) / (2 * np.sin(np.pi / count))) * way)
+        axis = noisy_slopes(shape, seed) - np.float32(1 - NOISE / _rms(surface)) * surface
+        axes.append(np.float32(share * _rms(middle) / _rms(axis) / (2 * np.sin(np.pi / count))) * axis)
     angles = 2 * np.pi * np.arange(count) / count
-    return [middle + np.float32(np.cos(a)) * ways[0] + np.float32(np.sin(a)) * ways[1] for a in angles]
+    return [middle + np.float32(np.cos(a)) * axes[0] + np.float32(np.sin(a)) * axes[1] for a in angles]
 
 
 def _rms(values: Floats) -> float:
@@ -248,36 +230,6 @@ def blob_mask(shape: Shape) -> Flags:
     noise = np.random.default_rng(0).standard_normal(shape, np.float32)
     hills = cv2.GaussianBlur(noise, (0, 0), min(shape) / _BLOB)
     return np.asarray(hills > np.quantile(hills, _OUTSIDE), np.uint8)
-
-
-def large_mask(shape: Shape) -> Flags:
-    """Return such a mask, quickly also of a large picture."""
-    import cv2
-
-    coarser = -(-shape[0] // _MASK_ROWS)
-    small = blob_mask((-(-shape[0] // coarser), -(-shape[1] // coarser)))
-    return np.asarray(cv2.resize(small, shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
-
-
-def comb(shape: Shape) -> Flags:
-    """Return a comb, one pixel wide: teeth in every other column hang from the first row; 1 inside."""
-    mask = np.zeros(shape, np.uint8)
-    mask[0] = mask[:, ::2] = 1
-    return mask
-
-
-def spiral(shape: Shape) -> Flags:
-    """Return a spiral, one pixel wide, between walls of one pixel; 1 inside."""
-    mask = np.zeros(shape, np.uint8)
-    top, left, bottom, right = 0, 0, shape[0] - 1, shape[1] - 1
-    mask[top, left] = 1
-    while top <= bottom and left <= right:
-        mask[top, max(left - 2, 0) : right + 1] = 1
-        mask[top : bottom + 1, right] = 1
-        mask[bottom, left : right + 1] = bottom - top > 1
-        mask[top + 2 : bottom + 1, left] |= np.uint8(right - left > 1)
-        top, left, bottom, right = top + 2, left + 2, bottom - 2, right - 2
-    return mask
 
 
 def random_cuts(shape: Shape, count: int) -> Flags:

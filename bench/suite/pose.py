@@ -7,47 +7,47 @@ import time
 
 import numpy as np
 
-from mirrorskin.bench.harness import OURS, Case, Cases, Row, Target
-from mirrorskin.bench.limits import beside_limits
+from mirrorskin.cli.bench.limits import time_works
+from mirrorskin.cli.bench.records import Case, Target
+from mirrorskin.cli.bench.timing import OURS, Work
 from mirrorskin.engine import Pose, PoseTracker
 from mirrorskin.io import Result, pixel_axes
 from mirrorskin.kernels.device import Device
+from suite.harness import Cases
 
 _SHAPE, _QUICK = (240, 320), (60, 80)
 _FIELD = 8.0  # mm across
-_FRAMES = 24  # of a circle, after which the object is where it was
+_FRAMES = 24  # of a circle that ends where it starts
 _REACH, _TURN = 0.4, 0.2  # mm and rad, of the circle
 _SIGMA, _NORMAL_SIGMA = 1e-3, 0.01  # mm and rad
-_BYTES = 32  # of a pixel's record
-_RATE = 200.0  # results a second that are aimed at
+_BYTES = 32  # of the record of a pixel
+_RATE = 200.0  # target, results a second
 
 
 def run_track(device: Device, quick: bool) -> Case:
-    """Time a tracker along a closed way: results in, the motion from the first to each out.
+    """Time a tracker along a closed path: results in, the motion since the first one out.
 
-    Bytes are those of the records of both maps that a result is compared by, each once.
+    Bytes are those of the records of both maps that are compared, each once.
     """
     shape = _QUICK if quick else _SHAPE
     angles = 2 * math.pi * np.arange(_FRAMES + 1) / _FRAMES
-    ways = [(_REACH * math.sin(a), _REACH * (1 - math.cos(a)), _TURN * math.sin(a)) for a in angles]
-    results = [_surface(shape, *way, seed) for seed, way in enumerate(ways)]
+    path = [(_REACH * math.sin(a), _REACH * (1 - math.cos(a)), _TURN * math.sin(a)) for a in angles]
+    results = [_surface(shape, *place, seed) for seed, place in enumerate(path)]
     seconds: list[float] = []
 
     def follow() -> Pose:
         tracker = PoseTracker(device=device)
         for result in results:
-            begun = time.perf_counter()
+            start = time.perf_counter()
             pose = tracker.push(result)
-            seconds.append(time.perf_counter() - begun)
+            seconds.append(time.perf_counter() - start)
         return pose
 
     last = follow()
     seconds.clear()
     moved = 2 * _BYTES * math.prod(shape)
-    limits, measured = beside_limits(
-        {OURS: follow}, moved, device, quick, lambda results: None, first="triad"
-    )
-    rows = [*limits, Row(OURS, measured[OURS], len(results) * moved, len(results))]
+    works = {OURS: Work(follow, len(results) * moved, len(results))}
+    rows = time_works(works, moved, device, quick, first="triad")
     lower, middle, upper = np.percentile(seconds, [25, 50, 75])
     drift = math.degrees(float(np.linalg.norm(last.rotation)))
     notes = (
@@ -55,14 +55,15 @@ def run_track(device: Device, quick: bool) -> Case:
         f"back at the start after {_FRAMES} results: off by {drift:.4f} degrees and"
         f" {1e3 * float(np.linalg.norm(last.translation)):.2f} micrometres",
     )
-    aims = (Target(OURS, f"at least {_RATE:.0f} results a second", f"{1 / middle:.0f}", 1 / middle >= _RATE),)
+    met = bool(1 / middle >= _RATE)
+    target = Target(OURS, f"at least {_RATE:.0f} results a second", f"{1 / middle:.0f}", met)
     title = f"motion along results of {' x '.join(map(str, shape))}: heights, normals and their sigmas"
-    absent = {"NormalFlow": "no package of pip has it"}
-    return Case("pose-track", title, rows, absent, notes, () if quick else aims)
+    absent = {"NormalFlow": "not available as a package"}
+    return Case("pose-track", title, list(rows.values()), absent, notes, () if quick else (target,))
 
 
 def _surface(shape: tuple[int, int], right: float, up: float, turn: float, seed: int) -> Result:
-    """Return waves on a dome that were turned about z and moved, with noise of their sigmas."""
+    """Return waves on a dome, rotated about z and moved, with noise of their standard deviations."""
     rng = np.random.default_rng(seed)
     x, y = pixel_axes(shape, (_FIELD / shape[1], _FIELD / shape[1]))
     across, high = np.meshgrid(x - right, y - up)

@@ -1,4 +1,4 @@
-"""The onset of the light state: the engine, the limits and NumPy, OpenCV, PyTorch and Numba on one stack."""
+"""The onset of the light state: the engine, the limits, NumPy, OpenCV, PyTorch and Numba on one stack."""
 
 from __future__ import annotations
 
@@ -6,107 +6,100 @@ import functools
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.bench.harness import (
-    OURS,
-    THREADS,
-    Case,
-    Cases,
-    Work,
-    agree,
-    check_memory,
-    missing,
-)
-from mirrorskin.bench.limits import time_call
-from mirrorskin.bench.scenes import LEVELS, StackName, fill_press, press_noise, references, travel_of
+from mirrorskin.cli.bench.records import THREADS, Case
+from mirrorskin.cli.bench.timing import OURS
 from mirrorskin.engine import find_onset
 from mirrorskin.engine.frames import estimate_noise, reference_maps, thin_out
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.onset import DARK, onset_heights, onset_levels, onset_near, onset_sure
+from suite.harness import Cases, agree, check_memory, missing, time_call
+from suite.scenes import LEVELS, StackName, fill_press, press_noise, references, travel_of
 
 Maps = dict[str, NDArray[Any]]
 Flags = NDArray[np.uint8]
 Levels = NDArray[Any]  # smallest light sample in the frames' type: one for all, (), or one a pixel, (H, W)
+Shape = tuple[int, int, int]
 
 _HD, _MEMORY, _QUICK = (64, 1080, 1920), (240, 2160, 3840), (12, 48, 64)
 _BYTE = np.dtype(np.uint8)
 _THRESHOLD = 0.5
 _MAPS = 64  # bytes a pixel for all maps
-_PLATEAU, _SURELY = 3.0, 6.0  # sigmas off its plateau, and below the level where it is surely dark
-# Threads of ours, and pixels of a tile: more leave the cache, fewer pay more for each call. NumPy has one
-# core, as most people use it; PyTorch has threads of its own.
+_PLATEAU, _CONFIDENT = (
+    3.0,
+    6.0,
+)  # standard deviations from the plateau, and below the level: docs/method/press.md
+# Threads of the pool, and pixels of a tile: more leave the cache, fewer pay more for each call. NumPy has one
+# core, as most people use it; PyTorch has its own threads.
 _TILES = {"NumPy": (1, 262_144), "OpenCV": (THREADS, 400_000), "PyTorch": (1, 1_200_000)}
 _NUMBA_TILE = 16_384
 _COUNTABLE = 255  # frames that a byte counts
 
 
-@dataclass(frozen=True, slots=True)
-class OnsetCase:
-    """A stack and what is found in it.
+def run_onset(name: str, shape: Shape, stack: StackName, full: bool, device: Device, quick: bool) -> Case:
+    """Time the onset, the limits and the peers on one stack; their maps must agree first.
 
     `full` is the full default: references of each pixel, hold 2, sub-frame; heights, sigma and status are
     compared. Else there is one threshold for all pixels, and the frames' numbers are compared (equation 4).
     """
-
-    name: str
-    shape: tuple[int, int, int] = _HD
-    stack: StackName = "random"
-    full: bool = False
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """Keywords of `find_onset`."""
-        if self.full:
-            dark, bright = references(self.shape[1:], _BYTE)
-            return {"dark": dark, "bright": bright}
-        low, high = LEVELS[_BYTE.name]
-        noise = press_noise(_BYTE)
-        return {"dark": low, "bright": high, "hold": 1, "subframe": False, "noise": noise}
-
-    @property
-    def known(self) -> References:
-        """What peers know: the same, prepared in the same way."""
-        shape = self.shape[1:] if self.full else ()
-        options = self.options
-        dark, bright = reference_maps(options["dark"], options["bright"], shape, _BYTE)  # type: ignore[arg-type]
-        level, plateau, light = onset_levels(bright, dark, _THRESHOLD, _BYTE)
-        return References(np.asarray(level), np.asarray(light), plateau)
-
-
-def run_onset(case: OnsetCase, device: Device, quick: bool) -> Case:
-    """Time the onset, the limits and the peers on one stack; their maps must be the same first."""
-    size = math.prod(case.shape)
-    check_memory(case.name, 2 * size + _MAPS * math.prod(case.shape[1:]))
-    frames = np.empty(case.shape, _BYTE)
-    fill_press(frames, case.stack)
+    shape = _QUICK if quick else shape
+    check_memory(name, 2 * math.prod(shape) + _MAPS * math.prod(shape[1:]))
+    frames = np.empty(shape, _BYTE)
+    fill_press(frames, stack)
     travel = travel_of(len(frames))
-    call = functools.partial(find_onset, frames, travel, device=device, **case.options)
-    theirs = _peer_works(case, frames, travel)
+    dark, bright = references(shape[1:], _BYTE) if full else LEVELS[_BYTE.name]
+    options: dict[str, Any] = {"dark": dark, "bright": bright}
+    if not full:
+        options |= {"hold": 1, "subframe": False, "noise": press_noise(_BYTE)}
+    maps = reference_maps(dark, bright, shape[1:] if full else (), _BYTE)  # type: ignore[arg-type]
+    level, plateau, light = onset_levels(maps[1], maps[0], _THRESHOLD, _BYTE)
+    known = References(np.asarray(level), np.asarray(light), plateau)
+    absent = missing("torch", "numba")
+    peers = _peers(full, frames, travel, known, absent)
 
     def check(results: dict[str, Any]) -> None:
-        words = ("height", "sigma", "status") if case.full else ("frame",)
+        words = ("height", "sigma", "status") if full else ("frame",)
         found = {word: getattr(results[OURS], word) for word in words}
-        for name in theirs:
-            if case.full:
+        for peer in peers:
+            if full:
                 near = {"height": np.spacing(np.abs(found["height"])), "sigma": 1e-5 * np.abs(found["sigma"])}
-                agree(name, results[name], found, near)
+                agree(peer, results[peer], found, near)
             else:  # a pixel with invalid input has no onset either
-                agree(name, {"frame": np.maximum(results[name], -1)}, found)
+                agree(peer, {"frame": np.maximum(results[peer], -1)}, found)
 
-    what = "full default" if case.full else "frame of the onset, one threshold, hold 1"
-    title = f"{what}; {' x '.join(map(str, case.shape))} uint8, {case.stack}"
-    absent = missing("torch", "numba")
-    known: dict[str, Any] = {"frames": len(frames), "peers": theirs, "check": check, "absent": absent}
-    return time_call(case.name, title, call, size, device, quick, **known)
+    what = "full default" if full else "frame of the onset, one threshold, hold 1"
+    title = f"{what}; {' x '.join(map(str, shape))} uint8, {stack}"
+    call = functools.partial(find_onset, frames, travel, device=device, **options)
+    return time_call(
+        name,
+        title,
+        call,
+        frames.nbytes,
+        device,
+        quick,
+        frames=len(frames),
+        peers=peers,
+        check=check,
+        absent=absent,
+    )
+
+
+_OPTIONS: dict[str, tuple[Shape, StackName, bool]] = {
+    "equation4-uint8": (_HD, "random", False),
+    "equation4-memory": (_MEMORY, "random", False),
+    "full-uint8": (_HD, "press", True),
+    "full-memory": (_MEMORY, "press", True),
+    "full-random": (_HD, "random", True),
+}
+CASES: Cases = {name: functools.partial(run_onset, name, *options) for name, options in _OPTIONS.items()}
 
 
 class References(NamedTuple):
-    """What is known of each pixel before the first frame, () or (H, W).
+    """Levels of each pixel before the first frame, () or (H, W).
 
     `level` is the float32 at which it turns light, NaN for a dead pixel, `light` the smallest sample that is
     light, `dark` its dark plateau.
@@ -126,23 +119,24 @@ FirstLight = Callable[[NDArray[Any], Levels, int], NDArray[np.int32]]
 `hold` light frames, 1 or 2, or of one that lasts to the end; -1 without one."""
 
 
-def _peer_works(case: OnsetCase, frames: NDArray[Any], travel: NDArray[np.float64]) -> dict[str, Work]:
-    known, absent = case.known, missing("torch", "numba")
-    peers: dict[str, Library] = {"NumPy": _numpy, "OpenCV": _opencv}
-    if "torch" not in absent and not case.full:  # heights would be NumPy's, as OpenCV's are
-        peers["PyTorch"] = _torch
+def _peers(
+    full: bool, frames: NDArray[Any], travel: NDArray[np.float64], known: References, absent: dict[str, str]
+) -> dict[str, Callable[[], object]]:
+    libraries: dict[str, Library] = {"NumPy": _numpy, "OpenCV": _opencv}
+    if "torch" not in absent and not full:  # heights would be NumPy's, as OpenCV's are
+        libraries["PyTorch"] = _torch
     noise = estimate_noise(thin_out(frames[0]), thin_out(frames[1]), True)
-    works: dict[str, Work] = {}
-    for name, library in peers.items():
+    works: dict[str, Callable[[], object]] = {}
+    for name, library in libraries.items():
         find = functools.partial(_first_light, library)
-        if case.full:
+        if full:
             works[name] = functools.partial(_heights, _TILES[name], find, frames, travel, known, noise)
         else:
             works[name] = functools.partial(_onsets, _TILES[name], find, frames, known, 1)
     if "numba" not in absent:
         works["Numba"] = (
             functools.partial(_numba_heights, frames, travel, known, noise)
-            if case.full
+            if full
             else functools.partial(numba_onsets, frames, known.light, 1)
         )
     return works
@@ -269,7 +263,7 @@ def _answer(
     height, sigma = (np.full(onset.shape, np.nan, np.float32) for _ in range(2))
     row, column = found = np.nonzero(status == 1)
     start, level, light = onset[found].astype(np.intp), known.level[found], known.light[found]
-    sure = onset_sure(level, light, _SURELY * noise)
+    sure = onset_sure(level, light, _CONFIDENT * noise)
 
     def last_below(bounds: NDArray[Any]) -> NDArray[np.intp]:
         """Go back from the onsets to the last frames that are below some bounds, or the first of all."""
@@ -340,7 +334,7 @@ def _numba_scan(each: bool, hold: int, *, whole: bool) -> Any:  # noqa: C901  # 
 
     @numba.njit(error_model="numpy")
     def answer(frames, pixel, start, travel, level, light, dark, noise):  # type: ignore[no-untyped-def]
-        surely = level - np.float32(_SURELY * noise)
+        surely = level - np.float32(_CONFIDENT * noise)
         way = level - dark
         near = level - max(np.float32(0.25) * way, np.float32(0))
         foot = start - 1
@@ -391,20 +385,3 @@ def _numba_scan(each: bool, hold: int, *, whole: bool) -> Any:  # noqa: C901  # 
                     height[p], sigma[p] = np.nan, np.nan
 
     return numba.njit(parallel=True, error_model="numpy")(heights if whole else onsets)
-
-
-_ONSET = (
-    OnsetCase("equation4-uint8"),
-    OnsetCase("equation4-memory", _MEMORY),
-    OnsetCase("full-uint8", full=True, stack="press"),
-    OnsetCase("full-memory", _MEMORY, full=True, stack="press"),
-    OnsetCase("full-random", full=True),
-)
-
-
-def _run(case: OnsetCase) -> Callable[[Device, bool], Case]:
-    small = replace(case, shape=_QUICK)
-    return lambda device, quick: run_onset(small if quick else case, device, quick)
-
-
-CASES: Cases = {case.name: _run(case) for case in _ONSET}

@@ -1,6 +1,6 @@
-"""Whole live runs: frames from memory that come when they are due; what rate is kept up, and how late.
+"""Whole live runs: frames from memory at their times; the rate that is sustained, and the latency.
 
-Aims: 1000 frames/s of 640 x 480 and 150 of 1920 x 1200 in a press without a loss; in a rotation with normals
+Targets: 1000 frames/s of 640 x 480 and 150 of 1920 x 1200 in a press without loss; in a rotation with normals
 and heights of 640 x 480, 60 updates a second, from frame to height in 15 ms (99 %: 30 ms).
 """
 
@@ -16,29 +16,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.bench.files import shared_memory
-from mirrorskin.bench.harness import Case, Cases, Target
-from mirrorskin.bench.scenes import SCALES, STEPS, TILT, fill_press, fill_turns
+from mirrorskin.cli.bench.records import Case, Target
 from mirrorskin.engine.live import RAISED, LiveEstimator, LivePress, LiveRotation, Loop, Status, Update
 from mirrorskin.io import Block, Header
 from mirrorskin.io.types import Closing, Floats
 from mirrorskin.kernels.device import Device
+from suite.files import shared_memory
+from suite.harness import Cases, Run
+from suite.scenes import SCALES, STEPS, TILT, fill_press, fill_turns
 
-_SLOTS = 256  # frames that wait for a late reader, as in the ring of a camera
+_SLOTS = 256  # frames of the ring buffer, as of a camera
 _PIXEL, _DEPTH = 0.03, 3.0  # mm
-_PRESS = 256  # frames that a press is made of; each is shown for as long as it takes
-_TURNS = 64  # frames after which a rotation begins again
-_KEPT_UP = 0.99  # share of the frames that were to come, that have
-_NEAR = 1e-2  # of the range, by which the last heights may differ from those that fit best
+_PRESS = 256  # different frames of a press; each is repeated
+_TURNS = 64  # frames after which a rotation repeats
+_KEPT_UP = 0.99  # of the specified frame rate
+_NEAR = 1e-2  # of the range, by which the last heights may differ from the converged ones
 _UPDATES, _MEDIAN, _SLOWEST = 60, 15, 30  # a second, and ms from frame to height
 
 
 class Paced(Closing):
-    """A live source of frames from memory, from the first read on, as from a camera that does not wait.
+    """A live source of frames from memory which starts with the first read and does not wait, as a camera.
 
-    A read waits for the next frame, and takes those with it that have come since the read before. They are
-    copied to a ring, as a camera does it, and lent. A reader that is late by more than the ring holds loses
-    the oldest of them, and `Block.dropped` says how many.
+    A read waits for the next frame, and returns it with those that arrived since the last read. They are
+    copied to a ring buffer, as by a camera, and lent. A reader that is later than the ring is long loses
+    the oldest of them; `Block.dropped` is their number.
     """
 
     name, rewindable = "memory", False
@@ -75,7 +76,7 @@ class Paced(Closing):
         return {self._position: np.concatenate([np.empty(0), *self._read])}
 
     def rewind(self) -> None:
-        """Refuse: time does not run back."""
+        """Refuse: time cannot be repeated."""
         raise RuntimeError("a live source cannot be rewound")
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
@@ -89,7 +90,9 @@ class Paced(Closing):
         length = min(due - first, 1 if out is None else len(out), slots - slot)
         number = np.arange(first, first + length)
         frames = self._ring[slot : slot + length]
-        np.take(self._frames, self._order(number), axis=0, out=frames, mode="clip")  # without a copy between
+        np.take(
+            self._frames, self._order(number), axis=0, out=frames, mode="clip"
+        )  # without an intermediate copy
         self._given = first + length
         place = np.asarray(self._places(number), np.float64)
         self._read.append(place)
@@ -97,7 +100,7 @@ class Paced(Closing):
         return Block(frames, first, time=number / self._rate, dropped=dropped, lent=True, **where)
 
     def _wait(self) -> int:
-        """Wait until the next frame is due, and return how many are by then."""
+        """Wait until the next frame is due, and return the number of frames due by then."""
         if self._start is None:
             self._start = self._clock()
         early = self._given / self._rate - self.now()
@@ -109,7 +112,7 @@ class Paced(Closing):
 
 @dataclass(frozen=True, slots=True)
 class LiveCase:
-    """Frames of uint8, (H, W), that come at a rate for some seconds; `least` must be kept up with."""
+    """Frames of uint8, (H, W), at a rate for some seconds; `least` is the rate that must be sustained."""
 
     name: str
     shape: tuple[int, int]
@@ -124,14 +127,14 @@ class LiveCase:
 
     @property
     def size(self) -> str:
-        """What comes, in words."""
+        """The frames in words."""
         rows, columns = self.shape
         return f"{columns} x {rows} uint8, {self.rate:g} frames/s for {self.seconds:g} s"
 
 
 @dataclass(frozen=True, slots=True)
 class Ran:
-    """What came of a run: counts, how long it took, the last update, and the machine's load before."""
+    """The outcome of a run: counts, seconds, the last update, and the load of the machine before."""
 
     status: Status
     seconds: float
@@ -140,7 +143,7 @@ class Ran:
 
 
 def run_press(case: LiveCase, device: Device, quick: bool) -> Case:
-    """Let a press go on while its heights are found."""
+    """Find heights during a press."""
     frames = np.empty((_PRESS, *case.shape), np.uint8)
     fill_press(frames)
     source = Paced(
@@ -153,12 +156,12 @@ def run_press(case: LiveCase, device: Device, quick: bool) -> Case:
     )
     ran = _run(source, LivePress(source, device=device))
     targets = () if quick else judge_press(ran, case.least)
-    title = f"heights of a press while it goes on; {case.size}"
+    title = f"heights during a press; {case.size}"
     return Case(case.name, title, [], {}, _notes(ran), targets)
 
 
 def run_rotation(case: LiveCase, device: Device, quick: bool) -> Case:
-    """Let a body go round while its normals, edges and heights are found."""
+    """Find normals, edges and heights during a rotation."""
     offset, gain, noise = SCALES["uint8"]
     frames = np.empty((_TURNS, *case.shape), np.uint8)
     fill_turns(frames)
@@ -180,9 +183,9 @@ def run_rotation(case: LiveCase, device: Device, quick: bool) -> Case:
     off = (height - best)[np.isfinite(best)].astype(np.float64)
     span = float(np.nanmax(best) - np.nanmin(best))
     rms, most = math.sqrt(float(np.mean(off**2))) / span, float(np.abs(off).max()) / span
-    note = f"the last heights miss those that fit best by {rms:.1e} of their range, at most {most:.1e}"
+    note = f"the last heights differ from the converged ones by {rms:.1e} of their range, at most {most:.1e}"
     targets = () if quick else judge_rotation(ran, rms)
-    title = f"normals, heights and edges of a rotation while it goes on; {case.size}"
+    title = f"normals, heights and edges during a rotation; {case.size}"
     return Case(case.name, title, [], {}, (*_notes(ran), note), targets)
 
 
@@ -199,7 +202,7 @@ def _run(source: Paced, estimator: LiveEstimator) -> Ran:
 
 
 def judge_press(ran: Ran, least: float) -> tuple[Target, ...]:
-    """Judge the rate that was kept up, and losses."""
+    """Judge the sustained rate, and losses."""
     rate, lost = ran.status.used / ran.seconds, ran.status.dropped + ran.status.skipped
     bound, met = f"at least {least:g} a second", rate >= _KEPT_UP * least
     return (
@@ -209,7 +212,7 @@ def judge_press(ran: Ran, least: float) -> tuple[Target, ...]:
 
 
 def judge_rotation(ran: Ran, rms: float) -> tuple[Target, ...]:
-    """Judge updates, how late they were, and how near the heights are to those that fit best."""
+    """Judge updates, their latency, and the difference of the heights from the converged ones."""
     rate, shown = ran.status.updates / ran.seconds, ran.status.latency[RAISED]
     median, p99 = 1e3 * shown.median, 1e3 * shown.p99
     what = "frame in to height out"
@@ -217,12 +220,12 @@ def judge_rotation(ran: Ran, rms: float) -> tuple[Target, ...]:
         Target("updates", f"at least {_UPDATES} a second", f"{rate:.1f} a second", rate >= _UPDATES),
         Target(f"{what}, median", f"at most {_MEDIAN} ms", f"{median:.1f} ms", median <= _MEDIAN),
         Target(f"{what}, 99 %", f"at most {_SLOWEST} ms", f"{p99:.1f} ms", p99 <= _SLOWEST),
-        Target("heights beside those that fit best", f"within {_NEAR:g}", f"{rms:.1e}", rms <= _NEAR),
+        Target("heights compared with the converged ones", f"within {_NEAR:g}", f"{rms:.1e}", rms <= _NEAR),
     )
 
 
 def _notes(ran: Ran) -> tuple[str, ...]:
-    """Say how it went, and what else the machine was doing."""
+    """Return counts, latencies and the load of the machine."""
     status = ran.status
     stages = "; ".join(
         f"{stage} {1e3 * latency.median:.2f} (99 % below {1e3 * latency.p99:.2f})"
@@ -236,9 +239,7 @@ def _notes(ran: Ran) -> tuple[str, ...]:
     return counts, f"milliseconds, median: {stages}", f"load of the machine before: {ran.load:.2f}"
 
 
-def _case(
-    case: LiveCase, run: Callable[[LiveCase, Device, bool], Case]
-) -> dict[str, Callable[[Device, bool], Case]]:
+def _case(case: LiveCase, run: Callable[[LiveCase, Device, bool], Case]) -> dict[str, Run]:
     short = replace(case, shape=(48, 64), rate=100.0, seconds=0.3)
     return {case.name: lambda device, quick: run(short if quick else case, device, quick)}
 

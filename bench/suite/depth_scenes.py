@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.bench.scenes import Shape
 from mirrorskin.engine import Camera
+from suite.scenes import Shape
 
 Map = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -1,8 +1,8 @@
 """Heights where surfaces hide parts of themselves: `robust`, plain least squares, and the published method.
 
-Aims, on every scene: no larger an error than the published method's and half of it on average, never more
+Targets, on every scene: no larger an error than the published method and half of it on average, never more
 than a tenth above that of plain least squares, twenty times as fast as the method; and 3 s for a megapixel.
-Heaps that no setting was chosen on are judged by medians and the worst.
+Heaps on which no setting was chosen are judged by medians and the worst.
 """
 
 from __future__ import annotations
@@ -14,21 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin import engine
-from mirrorskin.bench.bilateral import integrate_bilaterally
-from mirrorskin.bench.depth_scenes import HELD_OUT, SCENES, Scene
-from mirrorskin.bench.harness import (
-    OURS,
-    Case,
-    Cases,
-    Measured,
-    Row,
-    Timing,
-    Work,
-    at_most,
-    ratio_target,
-    take_turns,
-)
+from mirrorskin.cli.bench.records import Case, Row, Timing
+from mirrorskin.cli.bench.timing import OURS, Work, take_turns
 from mirrorskin.kernels.device import Device
+from suite.bilateral import integrate_bilaterally
+from suite.depth_scenes import HELD_OUT, SCENES, Scene
+from suite.harness import Cases, at_most, ratio_target
 
 _SHAPE, _QUICK, _LARGE = (256, 256), (24, 24), (1024, 1024)
 _PLAIN, _PEER, _HARDEST = "plain", "Cao et al.", "leaves"
@@ -37,7 +28,7 @@ _BYTES = 3 * 4 + 1 + 4  # of a pixel: normals, mask and heights
 
 
 def run_robust(device: Device, quick: bool) -> Case:
-    """Time each scene, ours in turns and the published method once, and judge heights by the true ones."""
+    """Time each scene, ours in turns and the published method once, and compare heights with the truth."""
     shape = _QUICK if quick else _SHAPE
     rows, notes, targets, ratios = [], [], [], []
     for name, make in list(SCENES.items())[:: 4 if quick else 1]:
@@ -67,10 +58,10 @@ def run_robust(device: Device, quick: bool) -> Case:
     targets.append(at_most(f"held-out heaps: worst of errors, of {_PLAIN}", float(to_plain.max()), _WORSE))
     if not quick:
         scene = SCENES[_HARDEST](_LARGE)
-        begun = time.perf_counter()
+        start = time.perf_counter()
         _integrate(scene, True, device)
-        seconds = time.perf_counter() - begun
-        rows.append(Row(f"{OURS}, {_HARDEST}, a megapixel", _once(seconds), _BYTES * scene.mask.size))
+        seconds = time.perf_counter() - start
+        rows.append(_once(f"{OURS}, {_HARDEST}, a megapixel", seconds, scene))
         targets.append(at_most(f"{_HARDEST}, a megapixel: s", seconds, _SECONDS))
         targets.append(at_most(f"mean of errors, of those of {_PEER}", float(np.mean(ratios)), _MEAN))
     count = len(ratios) + len(held)
@@ -82,31 +73,31 @@ def _compare(
     name: str, scene: Scene, device: Device, quick: bool
 ) -> tuple[list[Row], tuple[float, float, float], int]:
     """Return rows and errors of ours, plain and the published method, and the steps of that."""
-    works: dict[str, Work] = {
-        f"{OURS}, {name}": lambda: _integrate(scene, True, device),
-        f"{OURS}, {name}, {_PLAIN}": lambda: _integrate(scene, False, device),
+    size = _BYTES * scene.mask.size
+    works = {
+        f"{OURS}, {name}": Work(lambda: _integrate(scene, True, device), size),
+        f"{OURS}, {name}, {_PLAIN}": Work(lambda: _integrate(scene, False, device), size),
     }
     errors: list[float] = []
 
     def check(results: dict[str, Any]) -> None:
         errors.extend(scene.error(height) for height in results.values())
 
-    measured = take_turns(works, 1 if quick else _ROUNDS, device.profile, check)
-    begun = time.perf_counter()
+    rows = take_turns(works, 1 if quick else _ROUNDS, device.profile, check)
+    start = time.perf_counter()
     found, steps = integrate_bilaterally(scene)
-    measured[f"{_PEER}, {name}"] = _once(time.perf_counter() - begun)
-    rows = [Row(work, one, _BYTES * scene.mask.size) for work, one in measured.items()]
-    return rows, (errors[0], errors[1], scene.error(found)), steps
+    peer = _once(f"{_PEER}, {name}", time.perf_counter() - start, scene)
+    return [*rows.values(), peer], (errors[0], errors[1], scene.error(found)), steps
 
 
 CASES: Cases = {"integrate-robust": run_robust}
 
 
 def _integrate(scene: Scene, robust: bool, device: Device) -> NDArray[np.float32]:
-    known: dict[str, Any] = {"normals": scene.normals, "mask": scene.mask, "camera": scene.camera}
+    options: dict[str, Any] = {"normals": scene.normals, "mask": scene.mask, "camera": scene.camera}
     size = None if scene.camera else scene.pixel_size
-    return engine.integrate(pixel_size=size, robust=robust, sigma=False, device=device, **known).height
+    return engine.integrate(pixel_size=size, robust=robust, sigma=False, device=device, **options).height
 
 
-def _once(seconds: float) -> Measured:
-    return Measured(Timing.of([seconds]), {}, {}, {}, seconds, 0.0)
+def _once(name: str, seconds: float, scene: Scene) -> Row:
+    return Row(name=name, wall=Timing.of([seconds]), bytes=_BYTES * scene.mask.size, first=seconds)

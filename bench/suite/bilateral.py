@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.bench.depth_scenes import Scene
+from suite.depth_scenes import Scene
 
 Map = NDArray[np.float64]
 

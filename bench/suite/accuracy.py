@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.bench.harness import Case, Cases, Target, at_most, within
-from mirrorskin.bench.scenes import STEPS, TILT
+from mirrorskin.cli.bench.records import Case, Target
 from mirrorskin.engine import (
     Onset,
     Surface,
@@ -21,6 +20,8 @@ from mirrorskin.engine import (
     integrate,
 )
 from mirrorskin.kernels.device import Device
+from suite.harness import Cases, at_most, within
+from suite.scenes import STEPS, TILT
 
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
