@@ -73,6 +73,7 @@ lint: $(READY)
 types: $(READY)
 	@cd tests
 	../$(BIN)/mypy --strict --no-error-summary --config-file ../pyproject.toml $(PACKAGES:%=-p mirrorskin.%)
+	MYPYPATH=../bench ../$(BIN)/mypy --strict --no-error-summary --config-file ../pyproject.toml -p suite -m run
 
 # Damaged files and replies, MINUTES of them; what is neither read nor refused in one line is kept.
 MINUTES ?= 60
@@ -80,8 +81,9 @@ SEED ?= 0
 fuzz: $(READY)
 	@$(BIN)/python tests/fuzz/fuzz.py --minutes $(MINUTES) --seed $(SEED)
 
+# The suite of the developers, about an hour; 'mirrorskin bench' rates a device in half a minute.
 bench: $(READY)
-	@$(BIN)/mirrorskin bench
+	@$(BIN)/python bench/run.py run
 
 portability: $(READY)
 	@$(BIN)/python tests/portability/portability.py
@@ -92,7 +94,7 @@ gpu-check: .venv/.ptxas
 
 # The day that a GPU is there: tests, answers and limits, in gpu.json and gpu.md.
 gpu: $(READY)
-	@$(BIN)/python tests/portability/gpu.py
+	@PYTHONPATH=bench $(BIN)/python tests/portability/gpu.py
 
 clean:
 	@rm -rf .venv build site dist *.egg-info .hypothesis .import_linter_cache

@@ -1,220 +1,153 @@
-"""A run as plain data: the machine it was made on, and its cases; as JSON, checked when it is read again."""
+"""Run the benchmark suite, compare two runs, or make a page of runs: ``python bench/run.py --help``."""
 
 from __future__ import annotations
 
-import json
-import math
 import os
-import platform
-import re
-import subprocess
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from datetime import UTC, datetime
-from importlib import metadata
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from difflib import get_close_matches
+from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, Never
 
-from mirrorskin.bench.harness import THREADS, Case, Row
-from mirrorskin.io import InputError
-from mirrorskin.io.os_errors import MAX_TEXT_BYTES, read_regular
-from mirrorskin.kernels.device import Device
-
-Run = dict[str, Any]
-Data = Mapping[str, Any]
-
-_PACKAGES = (
-    "mirrorskin",
-    "numpy",
-    "pyopencl",
-    "pocl-binary-distribution",
-    "opencv-contrib-python-headless",
-    "torch",
-    "numba",
-    "scipy",
-    "pyamg",
+import click
+from suite import (
+    accuracy,
+    batch,
+    calls,
+    compare,
+    correlation,
+    integration,
+    live,
+    normals,
+    onset,
+    paths,
+    pose,
+    report,
+    robust,
+    twin,
 )
-_HUGE = 1e300
+from suite.harness import Cases, DisagreementError, InaccurateError
 
-# What a run is made of: a type, a list of one kind, an object of named kinds, or of any names ("*").
-_TIMING = {"median": float, "lower": float, "upper": float, "rounds": float}
-_ROW = {
-    "name": str,
-    "bytes": float,
-    "frames": float,
-    "operations": float,
-    "wall": _TIMING,
-    "device": {"*": _TIMING},
-    "kernels": {"*": float},
-    "moved": {"*": float},
-    "first": float,
-    "compile": float,
-    "bandwidth": float,
-    "share": float | None,
-    "kernel_share": float | None,
-}
-_TARGET = {"what": str, "bound": str, "measured": str, "met": bool}
-_CASE = {
-    "name": str,
-    "title": str,
-    "rows": [_ROW],
-    "absent": {"*": str},
-    "notes": [str],
-    "targets": [_TARGET],
-}
-_RUN = {
-    "date": str,
-    "commit": str | None,
-    "device": {"name": str, "platform": str, "driver": str, "kind": str},
-    "processor": str,
-    "threads": float,
-    "system": str,
-    "versions": {"*": str | None},
-    "quick": bool,
-    "cases": [_CASE],
-}
-_LATER: Mapping[str, Any] = {
-    "operations": 0,
-    "moved": {},
-    "notes": [],
-    "targets": [],
-}  # the first runs had none
-_CALLED = {str: "a text", float: "a number", bool: "true or false"}
+from mirrorskin.cli.bench.records import Case, describe_run, open_run
+from mirrorskin.io import InputError, check_output
+from mirrorskin.io.atomic import write_new
+from mirrorskin.kernels.device import open_device
+
+_MODULES = calls, onset, normals, correlation, integration, robust, twin, paths, batch, live, pose, accuracy
+CASES: Cases = {name: run for module in _MODULES for name, run in module.CASES.items()}
+_FILE = click.Path(path_type=Path)
 
 
-def as_data(device: Device, cases: Sequence[Case], quick: bool) -> Run:
-    """Return everything about a run as what JSON knows; a number that there is not is None."""
-    return {
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "commit": _commit(),
-        "device": asdict(device.info),
-        "processor": _processor(),
-        "threads": THREADS,
-        "system": f"{platform.system()} {platform.machine()}",
-        "versions": {"Python": platform.python_version(), **{name: _version(name) for name in _PACKAGES}},
-        "quick": quick,
-        "cases": [_case(case) for case in cases],
-    }
+@click.group()
+def main() -> None:
+    """Benchmarks of the development of mirrorskin. 'mirrorskin bench' rates a device."""
 
 
-def open_run(path: Path) -> Run:
-    """Return a run that ``mirrorskin bench -o`` wrote, also an earlier version of it.
+@main.command("run")
+@click.argument("patterns", nargs=-1, metavar="[CASE]...")
+@click.option("--output", "-o", type=_FILE, metavar="RUN.json", help="Write a run, and its tables to RUN.md.")
+@click.option("--folder", type=_FILE, metavar="DIR", help="Folder for temporary files of 2 GB.")
+@click.option("--device", metavar="NAME", help="As in 'mirrorskin devices'.")
+@click.option("--quick", is_flag=True, help="Small inputs, to check that works agree.")
+@click.option("--list", "list_", is_flag=True, help="Print the names of the cases only.")
+def run_cases(
+    patterns: tuple[str, ...],
+    output: Path | None,
+    folder: Path | None,
+    device: str | None,
+    quick: bool,
+    list_: bool,
+) -> None:
+    """Run all cases, or those whose names match patterns such as 'full-*'."""
+    names = choose(patterns or CASES)
+    if list_:
+        click.echo("\n".join(names))
+        return
+    if output is not None:
+        if output.suffix != ".json":
+            raise InputError(f"{output}: the name must end in .json")
+        check_output(output)
+        check_output(output.with_suffix(".md"))
+    opened = open_device(device)
+    cases: list[Case] = []
+    try:
+        with _temporary_files(folder):
+            for name in names:
+                click.echo(f"{len(cases) + 1} of {len(names)}: {name}", err=True)
+                cases.append(CASES[name](opened, quick))
+    finally:
+        if cases:  # also before an error or Ctrl-C: what is done took minutes
+            run = describe_run(opened, cases, quick)
+            click.echo(report.as_markdown(run))
+            if output is not None:
+                write_new(output, [run.as_json()])
+                write_new(output.with_suffix(".md"), [report.as_markdown(run).encode()])
+    check_accuracy(cases)
 
-    Raises
-    ------
-    InputError
-        The file cannot be read, is no JSON, or is not a run of the benchmark.
+
+@main.command("compare")
+@click.argument("before", type=_FILE, metavar="A.json")
+@click.argument("after", type=_FILE, metavar="B.json")
+def compare_runs(before: Path, after: Path) -> None:
+    """Compare two runs work by work: what changed by more than its rounds vary."""
+    click.echo(compare.as_text(open_run(before), open_run(after)))
+
+
+@main.command("report")
+@click.argument("runs", type=_FILE, nargs=-1, required=True, metavar="RUN.json...")
+@click.option("--output", "-o", type=_FILE, required=True, metavar="PAGE.md", help="Page to write.")
+def make_report(runs: tuple[Path, ...], output: Path) -> None:
+    """Make a page of runs, such as docs/benchmarks.md. Needs no device."""
+    if output.suffix != ".md":
+        raise InputError(f"{output}: the name must end in .md")
+    check_output(output, *runs)
+    write_new(output, [report.as_page({path: open_run(path) for path in runs}).encode()])
+
+
+def choose(patterns: Iterable[str]) -> list[str]:
+    """Return the names of the cases that match any pattern, in the order of `CASES`.
+
+    Raises InputError if a pattern matches none.
     """
-    data = read_regular(path, limit=MAX_TEXT_BYTES)
+    for pattern in patterns:
+        if not any(fnmatchcase(name, pattern) for name in CASES):
+            near = ", ".join(get_close_matches(pattern, CASES, cutoff=0))
+            raise InputError(
+                f"case {pattern!r}: there is no such case. The nearest are {near}; --list prints all"
+            )
+    return [name for name in CASES if any(fnmatchcase(name, pattern) for pattern in patterns)]
+
+
+def check_accuracy(cases: Iterable[Case]) -> None:
+    """Raise InaccurateError if a bound of accuracy was missed: a device that is fast and wrong fails."""
+    missed = [
+        f"{case.name}, {target.what}: {target.measured}, must be {target.bound}"
+        for case in cases
+        if case.name in accuracy.CASES
+        for target in case.targets
+        if not target.met
+    ]
+    if missed:
+        more = f" (and {len(missed) - 1} more)" if len(missed) > 1 else ""
+        raise InaccurateError(f"the device is not accurate: {missed[0]}{more}")
+
+
+@contextmanager
+def _temporary_files(folder: Path | None) -> Iterator[None]:
+    """Let temporary files, also those of programs that are started, go to a folder."""
+    if folder is None:
+        yield
+        return
+    if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
+        raise InputError(f"{folder} is not a writable folder. Choose another with --folder")
+    tempfile.tempdir = os.environ["TMPDIR"] = str(folder.resolve())
+    yield
+
+
+if __name__ == "__main__":
     try:
-        run = json.loads(data.decode(), parse_constant=_refuse)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is no JSON: name a file that 'mirrorskin bench -o' wrote") from error
-    try:
-        _check(run, _RUN, "it")
-    except _WrongError as error:
-        raise InputError(f"{path}: {error}: name a file that 'mirrorskin bench -o' wrote") from error
-    return dict(run)
-
-
-class _WrongError(Exception):
-    """Data is not of the kind it should be; the message says where."""
-
-
-def _refuse(word: str) -> Never:
-    raise ValueError(f"JSON knows no {word}")
-
-
-def _check(value: Any, kind: Any, where: str) -> None:
-    """Raise unless a value is of a kind; what later versions added is filled in."""
-    if isinstance(kind, list):
-        _require(isinstance(value, list), f"{where} is not a list")
-        for number, one in enumerate(value):
-            _check(one, kind[0], f"{where}[{number}]")
-    elif isinstance(kind, dict):
-        _require(isinstance(value, dict), f"{where} is not an object")
-        if "*" in kind:
-            kind = dict.fromkeys(value, kind["*"])
-        for name, inner in kind.items():
-            inside = name if where == "it" else f"{where}.{name}"
-            if name in _LATER:
-                value.setdefault(name, type(_LATER[name])())
-            _require(name in value, f"{inside} is missing")
-            _check(value[name], inner, inside)
-            if where.endswith("wall"):
-                _require(value[name] > 0, f"{inside} is not a positive number")
-    elif kind in (str, float, bool):
-        _require(_fits(value, kind), f"{where} is not {_CALLED[kind]}")
-    else:  # a type, or null
-        inner = kind.__args__[0]
-        _require(value is None or _fits(value, inner), f"{where} is not {_CALLED[inner]} or null")
-
-
-def _fits(value: Any, kind: type) -> bool:
-    if kind is float:
-        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _HUGE
-    return isinstance(value, kind)
-
-
-def _require(fits: bool, said: str) -> None:
-    if not fits:
-        raise _WrongError(said)
-
-
-def _case(case: Case) -> dict[str, Any]:
-    return {
-        "name": case.name,
-        "title": case.title,
-        "rows": [_row(case, row) for row in case.rows],
-        "absent": case.absent,
-        "notes": list(case.notes),
-        # Numbers of NumPy were compared, and JSON does not know its bool.
-        "targets": [{**asdict(target), "met": bool(target.met)} for target in case.targets],
-    }
-
-
-def _row(case: Case, row: Row) -> dict[str, Any]:
-    shares = {"share": case.share(row), "kernel_share": case.kernel_share(row)}
-    return {
-        "name": row.name,
-        "bytes": row.bytes,
-        "frames": row.frames,
-        "operations": row.operations,
-        **asdict(row.measured),
-        "bandwidth": row.bandwidth,
-        **{name: share if math.isfinite(share) else None for name, share in shares.items()},
-    }
-
-
-def _version(package: str) -> str | None:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None
-
-
-def _commit() -> str | None:
-    """Return the commit of our checkout, with ``-dirty`` after changes; None where this is not one."""
-    here = Path(__file__).resolve().parent
-    try:
-        _git(here, "ls-files", "--error-unmatch", "__init__.py")
-        return _git(here, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
-    except (OSError, subprocess.CalledProcessError):
-        return None
-
-
-def _git(folder: Path, *words: str) -> str:
-    # Told to leave the index alone: a benchmark writes nothing into a checkout.
-    environment = {**os.environ, "GIT_OPTIONAL_LOCKS": "0"}
-    command = ["git", "-C", str(folder), *words]
-    run = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
-    return run.stdout.strip()
-
-
-def _processor() -> str:
-    try:
-        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-    except OSError:
-        return platform.processor()
-    found = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
-    return found[1] if found else platform.processor()
+        main()
+    except (InputError, DisagreementError, InaccurateError) as error:
+        sys.exit(f"bench: {error}")

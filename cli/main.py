@@ -34,7 +34,7 @@ _REFUSED = ("failed to map segment", "annot allocate memory", "can't start new t
 _HELP = "NoArgsIsHelpError"  # of a group that no command was named of; its message is the group's help
 
 PURPOSES = {
-    "demo": "Repeat the paper's experiments on the twin.",
+    "demo": "Draw the figures of the paper from experiments on the twin.",
     "simulate": "Record what the twin sees, with the truth.",
     "sample": "Write example data.",
     "import": "Make a recording of a video or pictures.",
@@ -56,7 +56,7 @@ PURPOSES = {
     "rig": "Look at a stage and a camera before they are used.",
     "calibrate": "Find out what a sensor's counts and pixels mean.",
     "twin": "Emulate a whole rig: its stage and its camera.",
-    "bench": "Time the kernels and whole paths against the limits and against others.",
+    "bench": "Time the core operations and the limits of a device.",
 }
 """What the commands are for, in the order of the help; each stands in the module of its name."""
 

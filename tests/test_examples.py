@@ -3,6 +3,7 @@
 import doctest
 import importlib
 import inspect
+import re
 import runpy
 from pathlib import Path
 
@@ -35,8 +36,86 @@ def test_every_public_function_has_an_example(package):
     assert lacking == []
 
 
-@pytest.mark.parametrize("file", sorted((ROOT / "examples").glob("*.py")), ids=lambda file: file.stem)
-def test_a_script_of_the_examples_runs_and_says_what_it_found(file, monkeypatch, tmp_path, capsys):
+def forces(printed):
+    for found, sigma, true in numbers(printed, r": (\S+) ± (\S+) N, true (\S+) N"):
+        assert found == pytest.approx(true, rel=0.02)
+        assert 0 < sigma < 0.02 * true
+
+
+def moved(printed):
+    for found, true in numbers(printed, r"translation .*: (\S+) mm, true (\S+) mm"):
+        assert found == pytest.approx(true, abs=0.015)  # a quarter of a pixel
+    for found, true in numbers(printed, r"rotation .*: (\S+) degrees, true (\S+) degrees"):
+        assert found == pytest.approx(true, abs=0.25)
+
+
+def slipped(printed):
+    for found, true, closed in numbers(printed, r"found (\S+), true (\S+), closed form (\S+)"):
+        assert true == pytest.approx(closed, abs=0.02)
+        assert found == pytest.approx(true, abs=0.05)
+    for (error,) in numbers(printed, r"within (\S+) µm"):
+        assert error < 5
+    ((found, true),) = numbers(printed, r"(\S+) degrees, true (\S+)")
+    assert found == pytest.approx(true, rel=0.02)
+
+
+def vibrated(printed):
+    for found, expected in numbers(printed, r"RMS error (\S+?)(?: µm)?, expected (\S+)"):
+        assert found == pytest.approx(expected, rel=0.5)
+    ((found, true),) = numbers(printed, r"hysteresis: (\S+) µm, true (\S+) µm")
+    assert found == pytest.approx(true, abs=2)
+    ((found, true),) = numbers(printed, r"grows by (\S+) .* true (\S+)")
+    assert found == pytest.approx(true, rel=0.01)
+
+
+def compared(printed):
+    found = numbers(printed, r"RMS error (\S+) mm.* at (\d+) pixels; (\d+) pixels")
+    assert len(found) == 8
+    for number, (error, answered, untouched) in enumerate(found):
+        elastic = number % 4 >= 2
+        assert untouched > 0.3 * answered if elastic else untouched < 0.02 * answered
+        assert error > 0.4 if elastic else error < 0.3
+
+
+def fused(printed):
+    ((error,),) = numbers(printed, r"RMS error (\S+) um")
+    assert error < 5
+
+
+def rose(printed):
+    assert "median error 0.0" in printed
+
+
+def measured(printed):
+    ((error,),) = numbers(printed, r"RMS (?:error )?(\S+) mm")
+    assert 0 < error < 0.05
+
+
+def numbers(printed, pattern):
+    """Return the numbers of all matches of a pattern; there is at least one."""
+    found = [tuple(map(float, match.groups())) for match in re.finditer(pattern, printed)]
+    assert found, printed
+    return found
+
+
+SLOW = {
+    "force": forces,
+    "moving_object": moved,
+    "sensors": compared,
+    "slip": slipped,
+    "vibration": vibrated,
+}
+QUICK = {"coin": measured, "fused": fused, "own_data": measured, "sphere": measured, "steepest_rise": rose}
+
+
+def test_every_script_of_the_examples_is_tested():
+    assert {file.stem for file in (ROOT / "examples").glob("*.py")} == set(SLOW) | set(QUICK)
+
+
+@pytest.mark.parametrize("name", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
+def test_a_script_of_the_examples_runs_and_prints_what_is_true(name, monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
-    runpy.run_path(str(file), run_name="__main__")
-    assert "median error 0.0" in capsys.readouterr().out
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    runpy.run_path(str(ROOT / "examples" / f"{name}.py"), run_name="__main__")
+    (SLOW | QUICK)[name](capsys.readouterr().out)
+    assert list(tmp_path.glob("*.png")) or name == "steepest_rise"

@@ -1,28 +1,16 @@
 """Each case runs at a tiny size, its works agree, and it returns what reports are made of."""
 
-import json
-import subprocess
-import sys
-
 import numpy as np
 import pytest
+import run as program
+from bench_runs import row
+from click.testing import CliRunner
+from suite import integration
+from suite.harness import DisagreementError, InaccurateError, agree, call_targets
+from suite.scenes import blob_mask, noisy_slopes, random_cuts
 
-from mirrorskin.bench import integration, suite
-from mirrorskin.bench.harness import (
-    FIRST,
-    OURS,
-    Case,
-    DisagreementError,
-    InaccurateError,
-    Measured,
-    Row,
-    Target,
-    Timing,
-    agree,
-    call_targets,
-)
-from mirrorskin.bench.run import as_data
-from mirrorskin.bench.scenes import blob_mask, noisy_slopes, random_cuts
+from mirrorskin.cli.bench.records import Case, Target, describe_run, open_run
+from mirrorskin.cli.bench.timing import FIRST, OURS
 from mirrorskin.io import InputError
 from mirrorskin.kernels.device import open_device
 
@@ -30,7 +18,6 @@ QUICK = (
     "equation4-uint8",
     "full-uint8",
     "correlate-uint8",
-    "sliding",
     "normals-uint8",
     "call-edges",
     "integrate-mask",
@@ -38,8 +25,6 @@ QUICK = (
     "integrate-many",
     "integrate-robust",
     "twin",
-    "sweep-onset",
-    "sweep-changepoint-unknown",
     "file-press",
     "file-turns",
     "file-lab",
@@ -47,71 +32,62 @@ QUICK = (
     "file-s3",
     "batch-small",
     "live-vertical-vga",
-    "scaling-frames",
     "accuracy-surfaces",
 )
 
 
-def check_case(name):
+def check_case(name, path):
     device = open_device()
-    (case,) = suite.run_suite(device, [name], quick=True)
+    case = program.CASES[name](device, True)
     assert case.name == name
-    (data,) = as_data(device, [case], quick=True)["cases"]
-    assert json.loads(json.dumps(data, allow_nan=False)) == data
-    works = [row for row in case.rows if "limit" not in row.name]
-    assert all(row.measured.wall.median > 0 for row in works)
+    run = describe_run(device, [case], quick=True)
+    path.write_bytes(run.as_json())
+    assert open_run(path) == run
     assert name.startswith("accuracy-") == bool(case.targets)
+    if case.rows and case.rows[0].is_limit:
+        assert all(row.bytes for row in case.rows)
 
 
 @pytest.mark.parametrize("name", QUICK)
-def test_a_case_runs_at_a_tiny_size(name):
-    check_case(name)
+def test_a_case_runs_at_a_tiny_size(name, tmp_path):
+    check_case(name, tmp_path / "run.json")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in suite.NAMES if name not in QUICK])
-def test_every_other_case_runs_at_a_tiny_size(name):
-    check_case(name)
+@pytest.mark.parametrize("name", [name for name in program.CASES if name not in QUICK])
+def test_every_other_case_runs_at_a_tiny_size(name, tmp_path):
+    check_case(name, tmp_path / "run.json")
 
 
-def test_a_call_has_its_kernels_and_the_first_call_beside_it():
-    (case,) = suite.run_suite(open_device(), ["call-edges"], quick=True)
-    again, first = [row for row in case.rows if "limit" not in row.name]
-    assert set(again.measured.kernels) == set(again.measured.moved) != set()
+def test_a_call_has_its_kernels_and_the_first_call():
+    case = program.CASES["call-edges"](open_device(), True)
+    again, first = [row for row in case.rows if not row.is_limit]
+    assert set(again.kernels) == set(again.moved) != set()
     assert (again.name, first.name) == (OURS, FIRST)
 
 
-def test_a_call_aims_at_its_kernels_and_at_its_peers():
-    def row(name, ms, kernel=None):
-        timing = Timing(1e-3 * ms, 1e-3 * ms, 1e-3 * ms, 3)
-        device = {} if kernel is None else {"kernel": Timing(1e-3 * kernel, 0.0, 0.0, 3)}
-        return Row(name, Measured(timing, device, {}, {}, 1.0, 0.0), 100)
+def test_the_targets_of_a_call_are_its_kernels_and_its_peers():
+    def of(name, ms, kernel=None):
+        return row(name, 1e-3 * ms, moved=100, kernel=kernel and 1e-3 * kernel)
 
-    ours = row(OURS, 16.1, 10), row(FIRST, 18.9, 10), row(f"{OURS}, solve", 5, 5)
-    peers = row("NumPy", 150), row("Numba", 16.2), row("OpenCV, solve", 4)
-    found = [(one.what, one.met) for one in call_targets([row("read limit", 1), *ours, *peers])]
+    ours = of(OURS, 16.1, 10), of(FIRST, 18.9, 10), of(f"{OURS}, solve", 5, 5)
+    peers = of("NumPy", 150), of("Numba", 16.2), of("OpenCV, solve", 4)
+    rows = {one.name: one for one in (of("read limit", 1), *ours, *peers)}
+    found = [(one.what, one.met) for one in call_targets(rows)]
     assert found == [(OURS, False), (FIRST, True), (OURS, False), (OURS, True), (f"{OURS}, solve", False)]
 
 
-def test_importing_the_package_imports_no_case_peer_or_report():
-    loaded = (
-        "import sys, mirrorskin.bench; print([m for m in sys.modules if m.startswith('mirrorskin.bench.')])"
-    )
-    found = subprocess.run([sys.executable, "-c", loaded], check=True, capture_output=True, text=True)
-    assert found.stdout.strip() == "[]"
-
-
 def test_patterns_choose_cases_in_their_order():
-    assert suite.choose(["full-*", "equation4-uint8"])[:2] == ("equation4-uint8", "full-uint8")
-    with pytest.raises(InputError, match=r"case 'onset': no such case; the nearest are .*; --list names all"):
-        suite.choose(["onset"])
+    assert program.choose(["full-*", "equation4-uint8"])[:2] == ["equation4-uint8", "full-uint8"]
+    with pytest.raises(InputError, match=r"case 'onset': there is no such case.*; --list prints all"):
+        program.choose(["onset"])
 
 
 def test_an_inaccurate_device_fails():
-    cases = [Case("accuracy-press", "", [], {}, (), (Target("height", "at most 1", "3", False),))]
+    cases = [Case("accuracy-press", "", targets=(Target("height", "at most 1", "3", False),))]
     with pytest.raises(InaccurateError, match="accuracy-press, height: 3, must be at most 1"):
-        suite.check_accuracy(cases)
-    suite.check_accuracy([Case("file-press", "", [], {}, (), cases[0].targets)])
+        program.check_accuracy(cases)
+    program.check_accuracy([Case("file-press", "", targets=cases[0].targets)])
 
 
 def test_maps_that_differ_are_named_with_a_pixel():
@@ -119,7 +95,6 @@ def test_maps_that_differ_are_named_with_a_pixel():
     agree("peer", {"height": ours["height"] + 0.1}, ours, {"height": 0.2})
     agree("peer", {"height": ours["height"].copy()}, ours)
     other = {"height": np.array([[1.0, np.nan], [2.0, 4.0]])}
-    agree("peer", other, ours, spared=1)
     with pytest.raises(
         DisagreementError, match=r"peer differs from mirrorskin in the height of 1 of 4 .*\(1, 1\)"
     ):
@@ -128,16 +103,11 @@ def test_maps_that_differ_are_named_with_a_pixel():
         agree("peer", {}, ours)
 
 
-def test_shares_are_of_the_limit_above_or_of_the_case():
-    def row(name, seconds, limit=None):
-        timing = Timing(seconds, seconds, seconds, 3)
-        return Row(name, Measured(timing, {"kernel": timing}, {}, {}, 1.0, 0.0), 100, limit=limit)
-
-    first, second = row("read limit, small", 1.0), row("read limit, large", 2.0)
-    works = row("scan, small", 4.0, first), row("scan, large", 4.0, second), row("scan", 4.0)
-    case = Case("sweep", "", [first, second, *works], {})
-    assert [case.share(work) for work in works] == [0.25, 0.5, 0.25]
-    assert case.kernel_share(works[1]) == 0.5
+def test_shares_are_of_the_first_row_if_it_is_a_limit():
+    limit, work = row("read limit", 1.0, moved=100, kernel=0.5), row("scan", 4.0, moved=100, kernel=1.0)
+    case = Case("press", "", [limit, work])
+    assert (case.share(work), case.kernel_share(work)) == (0.25, 0.5)
+    assert np.isnan(Case("press", "", [work]).share(work))
 
 
 def test_a_direct_solution_solves_its_own_equations():
@@ -148,3 +118,76 @@ def test_a_direct_solution_solves_its_own_equations():
     assert np.abs(left).max() < 1e-12
     assert truth.error(truth.values) < 1e-15
     assert truth.error(truth.map) < 1e-6
+
+
+@pytest.fixture
+def cases(monkeypatch):
+    """Cases that take no time instead of those of the suite: one, two, accuracy-press, bad and stopped."""
+
+    def measured(device, quick):
+        return Case("one", f"quick: {quick}", [row("read limit", 1.0, moved=10), row(OURS, 1.0, moved=10)])
+
+    def inaccurate(device, quick):
+        targets = (
+            Target("height", "at most 0.1 um", "0.3 um", False),
+            Target("sigma", "at most 2", "9", False),
+        )
+        return Case("accuracy-press", "", targets=targets)
+
+    def refuse(device, quick):
+        raise InputError("case bad needs more than there is")
+
+    def interrupt(device, quick):
+        raise KeyboardInterrupt
+
+    runs = {"one": measured, "accuracy-press": inaccurate, "bad": refuse, "stopped": interrupt}
+    monkeypatch.setattr(program, "CASES", runs)
+
+
+def call(*words):
+    return CliRunner().invoke(program.main, [str(word) for word in words])
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "left"),
+    [("bad", InputError, ["one"]), ("accuracy-press", InaccurateError, ["one", "accuracy-press"])],
+)
+def test_what_was_measured_before_an_error_is_written(cases, tmp_path, name, error, left):
+    ended = call("run", "one", name, "-o", tmp_path / "run.json")
+    assert isinstance(ended.exception, error)
+    assert [case.name for case in open_run(tmp_path / "run.json").cases] == left
+    assert "## one: quick: False" in (tmp_path / "run.md").read_text(encoding="utf-8")
+
+
+def test_what_was_measured_before_ctrl_c_is_written(cases, tmp_path):
+    call("run", "one", "stopped", "-o", tmp_path / "run.json")
+    assert [case.name for case in open_run(tmp_path / "run.json").cases] == ["one"]
+
+
+def test_runs_are_compared_and_become_a_page(cases, tmp_path):
+    for name in ("a.json", "b.json"):
+        assert call("run", "one", "-o", tmp_path / name).exit_code == 0
+    compared = call("compare", tmp_path / "a.json", tmp_path / "b.json")
+    assert "works: 1 as before" in compared.output
+    made = call("report", tmp_path / "a.json", "-o", tmp_path / "page.md")
+    assert made.exit_code == 0
+    assert "a.json: " in (tmp_path / "page.md").read_text(encoding="utf-8")
+    assert call("run", "--list").output.split() == ["one", "accuracy-press", "bad", "stopped"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["run", "nothing"], "case 'nothing': there is no such case"),
+        (["run", "one", "-o", "run.txt"], "must end in .json"),
+        (["run", "one", "--folder", "none"], "none is not a writable folder"),
+        (["report", "run.json", "-o", "page.txt"], "must end in .md"),
+        (["compare", "none.json", "none.json"], "none.json"),
+    ],
+)
+def test_bad_input_is_refused(cases, tmp_path, monkeypatch, words, said):
+    monkeypatch.chdir(tmp_path)
+    ended = call(*words)
+    assert isinstance(ended.exception, InputError)
+    assert said in str(ended.exception)
+    assert not list(tmp_path.iterdir())

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from suite.bilateral import integrate_bilaterally
+from suite.depth_scenes import HELD_OUT, SCENES
 
-from mirrorskin.bench.bilateral import integrate_bilaterally
-from mirrorskin.bench.depth_scenes import HELD_OUT, SCENES
 from mirrorskin.engine import Camera
 
 SHAPE = 96, 128

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from live_frames import Clock, paced, phases, turn_frames, turn_header
+from suite.live import Ran, judge_press, judge_rotation
 
-from mirrorskin.bench.live import Ran, judge_press, judge_rotation
 from mirrorskin.engine.live import RAISED, Latency, Status, Update
 
 SHAPE = (20, 5, 7)

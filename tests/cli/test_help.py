@@ -104,7 +104,7 @@ def test_help_says_of_each_command_what_its_own_help_begins_with(commands):
         assert " ".join(commands[name].help.split()).startswith(purpose[:-1])
 
 
-@pytest.mark.parametrize("group", [(), ("calibrate",), ("rig",), ("twin",), ("bench",)])
+@pytest.mark.parametrize("group", [(), ("calibrate",), ("rig",), ("twin",)])
 def test_the_help_of_a_group_cuts_nothing_short(group, commands):
     said = " ".join(run(*group, "--help").out.partition("\nCommands:\n")[2].split())
     own = (
@@ -144,7 +144,7 @@ def test_a_group_alone_shows_its_help_as_it_is(group):
 
 
 def test_a_closed_pipe_ends_a_command_without_a_traceback():
-    command = [sys.executable, "-m", "mirrorskin.cli.main", "bench", "--list"]
+    command = [sys.executable, "-m", "mirrorskin.cli.main", "devices"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         process.stdout.close()
         assert process.stderr.read() == ""

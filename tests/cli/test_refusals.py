@@ -205,8 +205,8 @@ def test_a_claim_is_refused_before_memory_is_taken(tmp_path, monkeypatch):
         (["import", ".", "--motion", "vertical", "-o", "a.h5"], "--travel-step"),
         (["score", "nothing.h5", "--truth", "nothing.h5"], "no such file"),
         (["info", "nothing.h5"], "no such file"),
-        (["bench", "--case", "what"], "no such case"),
-        (["bench", "-o", "run.txt"], "ends in .json"),
+        (["bench", "--against", "what.json"], "no such file"),
+        (["bench", "-o", "run.txt"], "must end in .json"),
         (["bench", "-o", "no/such/run.json"], "no folder"),
     ],
 )

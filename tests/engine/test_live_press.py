@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from live_frames import PIXEL, Clock, paced, press_frames, press_header, turn_header
+from suite.scenes import references
 
-from mirrorskin.bench.scenes import references
 from mirrorskin.engine import Press, find_onset
 from mirrorskin.engine.live import LiveOperation, Loop
 from mirrorskin.io import InputError

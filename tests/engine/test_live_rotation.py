@@ -6,8 +6,8 @@ import threading
 import numpy as np
 import pytest
 from live_frames import PIXEL, Clock, paced, phases, press_header, turn_frames, turn_header
+from suite.scenes import SCALES, TILT
 
-from mirrorskin.bench.scenes import SCALES, TILT
 from mirrorskin.engine import Correlate, Rotation, estimate_normals, find_edges, integrate
 from mirrorskin.engine.integration.warm_start import WarmStartIntegrator
 from mirrorskin.engine.live import LiveOperation, Loop

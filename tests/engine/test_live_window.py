@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from live_frames import blocks, phases, turn_frames
+from suite.scenes import SCALES, TILT
 
-from mirrorskin.bench.scenes import SCALES, TILT
 from mirrorskin.engine import Correlate, Normals, correlate, estimate_normals
 from mirrorskin.engine.streaming import push_block
 from mirrorskin.io import InputError

@@ -144,7 +144,7 @@ COMMANDS = [
     ["report", "res.h5"],
     ["calibrate", "references", "--dark", "press.h5", "--bright", "press.h5"],
     ["calibrate", "elastic", "press.h5", "--ball", "4mm"],
-    ["bench", "report"],
+    ["bench", "--quick"],
 ]
 
 

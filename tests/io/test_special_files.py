@@ -40,7 +40,7 @@ COMMANDS = {
     "readings.csv": ("calibrate", "force", "sound.h5", "-o", "cal.h5", "--readings"),
     "batch.toml": ("batch", "sound.h5", "-o", "results", "--settings"),
     "rig.toml": ("rig", "check"),
-    "run.json": ("bench", "compare", "{}", "{}"),
+    "run.json": ("bench", "--quick", "--against"),
     "calibration.h5": ("reconstruct", "sound.h5", "-o", "out.h5", "--calibration"),
 }
 """Files of each kind, and a command that reads one."""

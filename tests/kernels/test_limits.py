@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from launches import launch
 
-from mirrorskin.bench.limits import CHAINS, CORES, LANES
+from mirrorskin.cli.bench.limits import CHAINS, CORES, LANES
 from mirrorskin.kernels import limits
 
 SHAPES = pytest.mark.parametrize("shape", [*CORES, *LANES], ids=str)

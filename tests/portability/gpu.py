@@ -14,19 +14,17 @@ import subprocess
 import sys
 import tempfile
 import time
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from gpu_check import ROOT, frozen_cases, taken_for_gpu
+from suite import report
 
-from mirrorskin.bench import harness, limits, report, run, suite
-from mirrorskin.kernels.device import Device, list_devices, open_device
+from mirrorskin.cli.bench.operations import measure_all
+from mirrorskin.cli.bench.records import describe_run
+from mirrorskin.kernels.device import list_devices, open_device
 
-SIZE = 256 << 20  # bytes that the limits move, on a GPU
-LAUNCHES = 1000
-BENCHES = ("equation4-uint8", "full-uint8", "normals-uint8", "correlate-uint8", "integrate-rectangle")
 TESTS_TAKE = 240  # seconds at most
 LOOSER = 10  # times the tolerance of the frozen answers, which are those of one machine's arithmetic
 FEW = 1e-3  # of an array may differ by more: pixels on the other side of a threshold
@@ -45,16 +43,17 @@ def main() -> int:
     answers = compare_answers()
     wrong = {name: said for name, said in answers.items() if said}
     say("answers", f"{len(answers) - len(wrong)} of {len(answers)} as on the CPU", begin)
-    cases = [limits_of(device, SIZE >> 5 * quick), *suite.run_suite(device, BENCHES, quick)]
+    cases = list(measure_all(device, quick))
     say("benchmarks", f"{len(cases)} cases", begin)
-    data = {**run.as_data(device, cases, quick), "tests": tests, "answers": answers}
+    run = describe_run(device, cases, quick)
+    data = {**json.loads(run.as_json()), "tests": tests, "answers": answers}
     output.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
     lines = [
         f"{len(answers) - len(wrong)} of {len(answers)} answers are the CPU's; device tests: {tests}.",
         "",
     ]
     lines += [f"- {name}: {key} {words}" for name, said in wrong.items() for key, words in said.items()]
-    page = "\n".join([report.as_markdown(data), "## Tests and answers", "", *lines, ""])
+    page = "\n".join([report.as_markdown(run), "## Tests and answers", "", *lines, ""])
     output.with_suffix(".md").write_text(page, encoding="utf-8")
     print(*lines, f"written to {output} and {output.with_suffix('.md')}", sep="\n")
     return 0 if not wrong and re.fullmatch(r"\d+ passed.*", tests) else 1
@@ -109,24 +108,6 @@ def differs(answers: dict[str, Any], frozen: dict[str, Any], key: str, within: t
         return "" if same else said
     wrong = ~np.isclose(mine.astype(float), theirs.astype(float), *loose, equal_nan=True)
     return "" if np.mean(wrong) <= FEW else f"{said}; {np.count_nonzero(wrong)} of {wrong.size} by too much"
-
-
-def limits_of(device: Device, size: int) -> harness.Case:
-    """Time reading, copying, combining, multiplying, and runs of kernels that do next to nothing."""
-    memory, arithmetic = limits.Limits(device, size), limits.Arithmetic(device, size // 4)
-    empty = {f"{LAUNCHES} launches": partial(launch, device, device.array("launches", (64,), np.uint32))}
-    works = {**memory.works(), **arithmetic.works(), **empty}
-    measured = harness.take_turns(works, harness.ROUNDS, device.profile, lambda _: None, None)
-    rows = [*memory.rows(measured), arithmetic.row(measured)]
-    rows += [harness.Row(name, measured[name], 0) for name in empty]
-    return harness.Case("limits", "The device's own limits", rows, {})
-
-
-def launch(device: Device, words: Any) -> None:
-    kernel = device.kernel("limits", "copy_all", STRIDE=1, LANES=4, WORDS=1)
-    for _ in range(LAUNCHES):
-        kernel(1, words=words, count=1, moved=32)
-    device.finish()
 
 
 if __name__ == "__main__":

@@ -1,22 +1,16 @@
-"""Runs of the benchmark as JSON tells them, made up."""
+"""Runs of benchmarks, made up."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
-Data = dict[str, Any]
+from mirrorskin.cli.bench.records import Case, Machine, Row, Run, Target, Timing
 
 
-def timing(seconds: float, spread: float = 0.05, rounds: int = 7) -> Data:
-    """Return a median and quartiles that lie by a share of it on either side."""
-    return {
-        "median": seconds,
-        "lower": seconds * (1 - spread),
-        "upper": seconds * (1 + spread),
-        "rounds": rounds,
-    }
+def timing(seconds: float, spread: float = 0.05, rounds: int = 7) -> Timing:
+    """Return a median, and quartiles a fraction of it below and above."""
+    return Timing(seconds, seconds * (1 - spread), seconds * (1 + spread), rounds)
 
 
 def row(
@@ -25,58 +19,52 @@ def row(
     *,
     moved: int = 0,
     operations: int = 0,
+    frames: int = 0,
     kernel: float | None = None,
-    share: float | None = None,
     spread: float = 0.05,
     rounds: int = 7,
-) -> Data:
-    """Return a work that takes so long, and so long in kernels."""
-    return {
-        "name": name,
-        "bytes": moved,
-        "frames": 0,
-        "operations": operations,
-        "wall": timing(seconds, spread, rounds),
-        "device": {} if kernel is None else {"kernel": timing(kernel, spread, rounds)},
-        "kernels": {} if kernel is None else {"some_kernel": kernel},
-        "moved": {} if kernel is None else {"some_kernel": moved},
-        "first": seconds,
-        "compile": 0,
-        "bandwidth": moved / seconds,
-        "share": share,
-        "kernel_share": None,
-    }
+) -> Row:
+    """Return a work with its time, and its time in kernels."""
+    return Row(
+        name=name,
+        wall=timing(seconds, spread, rounds),
+        bytes=moved,
+        frames=frames,
+        operations=operations,
+        device={} if kernel is None else {"kernel": timing(kernel, spread, rounds)},
+        kernels={} if kernel is None else {"some_kernel": kernel},
+        moved={} if kernel is None else {"some_kernel": moved},
+        first=seconds,
+    )
 
 
-def target(what: str, met: bool, measured: str = "1.3 times") -> Data:
-    """Return an aim that was reached, or was not."""
-    return {"what": what, "bound": "at most 1.25 times", "measured": measured, "met": met}
+def target(what: str, met: bool, measured: str = "1.3 times") -> Target:
+    """Return a target that was met, or was not."""
+    return Target(what, "at most 1.25 times", measured, met)
 
 
-def case(name: str, *rows: Data, targets: tuple[Data, ...] = (), notes: tuple[str, ...] = ()) -> Data:
+def case(name: str, *rows: Row, targets: tuple[Target, ...] = (), notes: tuple[str, ...] = ()) -> Case:
     """Return a case of these rows."""
-    told = {"absent": {}, "notes": list(notes), "targets": list(targets)}
-    return {"name": name, "title": f"all about {name}", "rows": list(rows), **told}
+    return Case(name, f"all about {name}", list(rows), {}, notes, targets)
 
 
-def run(*cases: Data, **changes: Any) -> Data:
-    """Return a run of these cases, on a machine that does not exist."""
-    device = {"name": "Some GPU", "platform": "Some platform", "driver": "1.0", "kind": "gpu"}
-    return {
+def run(*cases: Case, **changes: Any) -> Run:
+    """Return a run of these cases on a machine that does not exist."""
+    values: dict[str, Any] = {
         "date": "2026-11-21T12:00:00+00:00",
         "commit": "0123456789abcdef",
-        "device": device,
+        "device": Machine("Some GPU", "Some platform", "1.0", "gpu"),
         "processor": "Some processor",
         "threads": 2,
         "system": "Linux x86_64",
         "versions": {"Python": "3.11.7", "mirrorskin": "0.1.0", "numpy": "2.4.6", "torch": None},
         "quick": False,
         "cases": list(cases),
-        **changes,
     }
+    return Run(**{**values, **changes})
 
 
-def save(data: Data, path: Path) -> Path:
-    """Write a run as `mirrorskin bench -o` does, and return where."""
-    path.write_text(json.dumps(data), encoding="utf-8")
+def save(made: Run, path: Path) -> Path:
+    """Write a run as `mirrorskin bench -o` does, and return its path."""
+    path.write_bytes(made.as_json())
     return path

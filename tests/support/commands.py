@@ -9,7 +9,7 @@ import sys
 from typing import NamedTuple
 from unittest import mock
 
-from mirrorskin.cli.demo import presses, rotation
+from mirrorskin.cli import demo
 from mirrorskin.cli.main import main
 
 # Pixels across and down of what is small; the press and the rotation on the sphere are fused.
@@ -36,31 +36,24 @@ def run(*words: object) -> Ended:
     return Ended(code, out.getvalue(), said.getvalue())
 
 
-def small_experiments() -> tuple[presses.Experiment, ...]:
-    """Return the demo's own experiments over the same fields and travels, of few pixels and frames."""
+def small_presses() -> dict[str, demo.Press]:
+    """Return the demo's presses over the same fields and travels, with few pixels and frames."""
     frames = 8
-    return tuple(
-        dataclasses.replace(
-            one,
+    return {
+        name: dataclasses.replace(
+            press,
             size=size,
-            pixel_size=one.pixel_size * one.size / size,
+            pixel_size=press.pixel_size * press.size / size,
             frames=frames,
-            step=one.step * one.frames / frames,
+            step=press.step * press.frames / frames,
         )
-        for one in presses.EXPERIMENTS
-        for size in [_SPHERE if one.thing == "sphere" else _SIZE]
+        for name, press in demo.PRESSES.items()
+        for size in [_SPHERE if press.object == "sphere" else _SIZE]
+    }
+
+
+def small_turn() -> demo.Turn:
+    """Return the demo's rotation over the same field, with few pixels."""
+    return dataclasses.replace(
+        demo.TURN, size=_SPHERE, pixel_size=demo.TURN.pixel_size * demo.TURN.size / _SPHERE
     )
-
-
-def small_rotations() -> tuple[rotation.Experiment, ...]:
-    """Return the demo's own rotations over the same fields, of few pixels."""
-    return tuple(
-        dataclasses.replace(one, size=_SPHERE, pixel_size=one.pixel_size * one.size / _SPHERE)
-        for one in rotation.EXPERIMENTS
-    )
-
-
-def main_with_a_small_demo() -> None:
-    """Run the command line of a process, with `mirrorskin demo` small."""
-    presses.EXPERIMENTS, rotation.EXPERIMENTS = small_experiments(), small_rotations()
-    main()

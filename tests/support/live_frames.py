@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from suite import scenes
+from suite.live import Paced
 
-from mirrorskin.bench import scenes
-from mirrorskin.bench.live import Paced
 from mirrorskin.io import Block, Header
 
 PIXEL = 0.05

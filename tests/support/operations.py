@@ -11,9 +11,9 @@ from live_frames import phases, press_frames, turn_frames
 from numpy.typing import NDArray
 from speckle import Speckle
 from stacks import MadeUp
+from suite.scenes import SCALES, TILT
 
 from mirrorskin import engine
-from mirrorskin.bench.scenes import SCALES, TILT
 from mirrorskin.engine.press.growth import Growth
 from mirrorskin.engine.press.levels import Levels
 from mirrorskin.engine.rotation.last_turn import LastTurn

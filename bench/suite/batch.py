@@ -1,0 +1,132 @@
+"""A batch of small recordings: the time of a file beyond computation, reading and writing.
+
+Target: at most 5 ms a file.
+"""
+
+from __future__ import annotations
+
+import math
+import mmap
+import shutil
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin import io
+from mirrorskin.cli.bench.limits import time_works
+from mirrorskin.cli.bench.records import Case, Target
+from mirrorskin.cli.bench.timing import OURS, Work
+from mirrorskin.engine import find_onset
+from mirrorskin.engine.batch.jobs import Job, Plan, make_jobs
+from mirrorskin.engine.batch.local import run_local
+from mirrorskin.kernels.device import Device
+from suite.files import MAPS, Frames, make_press, new_folder, record, sync, to_result
+from suite.harness import Cases, DisagreementError, agree, check_memory
+
+BATCH, LOOP = f"{OURS}, batch", f"{OURS}, open, reconstruct and save in a loop"
+LEAST = "kernels and plain reads and writes alone"
+
+_COUNT, _SHAPE, _FEW, _QUICK = 200, (32, 480, 640), 3, (12, 48, 64)
+_BOUND = 5.0  # ms a file
+_ROUNDS = 5
+_COPIES = 16  # of the frames of a file: the limits exceed the cache
+
+
+def run_batch(device: Device, quick: bool) -> Case:
+    """Time a batch next to its minimum: frames mapped into memory, kernels, and maps written as bytes."""
+    count, shape = (_FEW, _QUICK) if quick else (_COUNT, _SHAPE)
+    size, extra = count * math.prod(shape), MAPS * math.prod(shape[1:])
+    check_memory("batch-small", size + 2 * extra)
+    with new_folder("batch-small", size + count * extra) as folder:
+        press = make_press(shape)
+        jobs = make_jobs(_record_all(press, count, folder), folder / "results")
+        results = jobs[0].target.parent
+        least = partial(_do_least, jobs, press, _frames_offset(jobs[0].source), device)
+        clear = partial(_clear, results)
+        works = {
+            LEAST: Work(least, size, count * shape[0], before=clear),
+            LOOP: Work(partial(_loop, jobs, device), size, count * shape[0], before=clear),
+            BATCH: Work(partial(_run, jobs, device), size, count * shape[0], before=clear),
+        }
+
+        def check(found: dict[str, Any]) -> None:
+            maps = {LOOP: found[LOOP]}
+            maps |= {f"{BATCH}, {job.target.name}": io.open_result(job.target).maps() for job in jobs}
+            for name, mine in maps.items():
+                agree(name, mine, found[LEAST], whose=f"{OURS}, in memory")
+
+        copies = min(count, _COPIES) * math.prod(shape)
+        rows = time_works(works, copies, device, quick, check, rounds=_ROUNDS)
+    each = {name: 1e3 * rows[name].wall.median / count for name in works}
+    note = f"a file: {', '.join(f'{name} {ms:.2f} ms' for name, ms in each.items())}"
+    over = each[BATCH] - each[LEAST]
+    value = f"{over:.2f} ms ({each[BATCH]:.2f} of which {each[LEAST]:.2f} compute and I/O)"
+    bound = f"at most {_BOUND:g} ms a file beyond compute and I/O"
+    targets = () if quick else (Target(f"{BATCH}, overhead", bound, value, over <= _BOUND),)
+    title = (
+        f"{count} presses, full default, references of each pixel, no holes filled; "
+        f"{' x '.join(map(str, shape))} uint8 each, contiguous"
+    )
+    return Case("batch-small", title, list(rows.values()), {}, (note,), targets)
+
+
+CASES: Cases = {"batch-small": run_batch}
+
+
+def _record_all(press: Frames, count: int, folder: Path) -> list[Path]:
+    """Write recordings of one press: all have the same frames."""
+    first, *others = [folder / f"press-{number:03}.h5" for number in range(count)]
+    record(press, first)
+    for path in others:
+        shutil.copyfile(first, path)
+        sync(path)
+    return [first, *others]
+
+
+def _frames_offset(path: Path) -> int:
+    """Return the byte of a recording at which its frames start."""
+    import h5py
+
+    from mirrorskin.io.layout import STACK
+
+    with h5py.File(path) as file:
+        return int(file[STACK].id.get_offset())
+
+
+def _clear(results: Path) -> None:
+    shutil.rmtree(results, ignore_errors=True)
+    results.mkdir()
+
+
+def _do_least(jobs: list[Job], press: Frames, offset: int, device: Device) -> dict[str, NDArray[Any]]:
+    """Map, search and write each file; return the maps of the last one."""
+    block, header = press.block, press.header
+    assert block.travel is not None
+    maps: dict[str, NDArray[Any]] = {}
+    for job in jobs:
+        with job.source.open("rb") as file:
+            memory = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        frames = np.frombuffer(memory, press.dtype, block.frames.size, offset).reshape(press.shape)
+        onset = find_onset(frames, block.travel, dark=header.dark, bright=header.bright, device=device)
+        maps = {"height": onset.height, "height_sigma": onset.sigma, "status": onset.status}
+        with job.target.open("wb") as out:
+            for values in maps.values():
+                out.write(values.data)
+    return maps
+
+
+def _loop(jobs: list[Job], device: Device) -> dict[str, NDArray[Any]]:
+    """Open, reconstruct and save each file; return the maps of the last one."""
+    for job in jobs:
+        result = to_result(job.source, job.target, device)
+    return result.maps()
+
+
+def _run(jobs: list[Job], device: Device) -> None:
+    """Run the batch; no job may fail or find its result."""
+    for outcome in run_local(jobs, Plan(), [device]):
+        if outcome.state != "done":
+            raise DisagreementError(f"{BATCH}: {outcome.job.source.name} {outcome.state}: {outcome.message}")

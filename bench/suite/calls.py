@@ -1,0 +1,174 @@
+"""Whole calls: functions on arrays without peers, and commands and imports in processes of their own."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mirrorskin import engine
+from mirrorskin.cli.bench.records import Case, Row, Target, Timing
+from mirrorskin.cli.bench.timing import OURS
+from mirrorskin.hw.twin import Axial, Twin, Vertical
+from mirrorskin.io import Recorder
+from mirrorskin.kernels.device import Device
+from mirrorskin.kernels.errors import DeviceError
+from suite.files import new_folder
+from suite.harness import Cases, check_memory, time_call
+from suite.scenes import (
+    LEVELS,
+    PIXEL,
+    SCALES,
+    STEPS,
+    TILT,
+    Shape,
+    fill_press,
+    fill_turns,
+    phases,
+    press_noise,
+    roof,
+    travel_of,
+    turn_noise,
+)
+
+_HD, _QUICK = (1080, 1920), (48, 64)
+_PRESS = 16  # frames
+_WORKING = 400  # bytes of a pixel for maps and what is kept
+_BYTE = np.dtype(np.uint8)
+
+_SCENE, _QUICK_SCENE = (480, 480), (96, 96)
+_FRAMES = 30  # of a press that a command reconstructs
+_FIELD = 12.0  # side of its picture, mm
+_ROUNDS = 7
+_WITHIN = {"reconstruct press": 0.5, "reconstruct turn": 0.5, "fuse": 1.5}  # seconds of a command
+_KINDS = "upload", "kernel", "download"
+
+Call = tuple[Callable[[], object], int, int]
+"""A call, the bytes that it moves, and its frames."""
+
+
+def _change_point(shape: Shape, device: Device) -> Call:
+    frames = np.empty((_PRESS, *shape), np.uint8)
+    fill_press(frames)
+    dark, bright = LEVELS[_BYTE.name]
+    options: dict[str, Any] = {"dark": dark, "bright": bright, "noise": press_noise(_BYTE), "device": device}
+    return partial(engine.find_change_point, frames, travel_of(_PRESS), **options), frames.nbytes, _PRESS
+
+
+def _edges(shape: Shape, device: Device) -> Call:
+    maps = roof(shape)
+    return partial(engine.find_edges, *maps, device=device), sum(one.nbytes for one in maps), 0
+
+
+def _fuse(shape: Shape, device: Device) -> Call:
+    frames, turns = (np.empty((count, *shape), np.uint8) for count in (_PRESS, STEPS))
+    fill_press(frames)
+    fill_turns(turns)
+    offset, gain, _ = SCALES[_BYTE.name]
+    dark, bright = LEVELS[_BYTE.name]
+    onset = engine.find_onset(frames, travel_of(_PRESS), dark=dark, bright=bright, device=device)
+    options: dict[str, Any] = {"tilt": TILT, "gain": gain, "offset": offset, "noise": turn_noise(_BYTE)}
+    normals = engine.estimate_normals(turns, phases(STEPS), device=device, **options)
+    moved = (4 + 3 * 4) * math.prod(shape)  # heights and normals
+    return partial(engine.fuse, onset, normals, PIXEL, device=device), moved, 0
+
+
+_FUNCTIONS = {
+    "change-point": (f"change-points between known levels of {_PRESS} x {{}} uint8", _change_point),
+    "edges": ("edges of normals of {}", _edges),
+    "fuse": (f"one surface of a press of {_PRESS} and a turn of {STEPS} x {{}}", _fuse),
+}
+
+
+def run_function(function: str, device: Device, quick: bool) -> Case:
+    """Time a function of the engine."""
+    shape, name = _QUICK if quick else _HD, f"call-{function}"
+    check_memory(name, (_WORKING + 2 * _PRESS) * math.prod(shape))
+    title, make = _FUNCTIONS[function]
+    call, moved, frames = make(shape, device)
+    return time_call(
+        name, title.format(f"{shape[0]} x {shape[1]}"), call, moved, device, quick, frames=frames
+    )
+
+
+def run_commands(device: Device, quick: bool) -> Case:
+    """Time commands from process start to end: a press, a turn, and both fused."""
+    shape, name = _QUICK_SCENE if quick else _SCENE, "call-commands"
+    movements = {"press": Vertical(np.linspace(0.1, 3.0, _FRAMES)), "turn": Axial(phases(STEPS), TILT, 1.0)}
+    rows, notes, targets = [], [], []
+    with new_folder(name, 4 * (_FRAMES + STEPS) * math.prod(shape)) as folder:
+        recordings = {what: folder / f"{what}.h5" for what in movements}
+        for what, movement in movements.items():
+            sensor: dict[str, Any] = {"pixel_size": _FIELD / shape[0], "movement": movement, "device": device}
+            twin = Twin(object="sphere", shape=shape, pattern="linear", **sensor)
+            with Recorder(twin, recordings[what]) as recorder:
+                recorder.drain(lambda count: None)
+        inputs = {f"reconstruct {what}": [str(path)] for what, path in recordings.items()}
+        for what, words in {**inputs, "fuse": [str(path) for path in recordings.values()]}.items():
+            output = folder / "result.h5"
+            command = [sys.executable, "-m", "mirrorskin.cli.main", what.split()[0], *words]
+            command += ["-o", str(output), "--json", "--device", device.info.title]
+            row = _time_process(f"{OURS} {what}", command, 1 if quick else _ROUNDS, output)
+            most, took = _WITHIN[what], row.wall.median
+            rows.append(row)
+            notes.append(f"{row.name}: {1e3 * took:.0f} ms, {100 * row.kernel / took:.0f} % in kernels")
+            targets.append(Target(row.name, f"at most {most:g} s", f"{took:.2f} s", took <= most))
+    title = f"commands on a press of {_FRAMES} and a turn of {STEPS} x {shape[0]} x {shape[1]} uint8"
+    return Case(name, title, rows, {}, tuple(notes), () if quick else tuple(targets))
+
+
+def run_import(_: Device, quick: bool) -> Case:
+    """Time processes that import the engine, what a press or a turn needs of it, and NumPy alone."""
+    lines = "import mirrorskin.engine", "from mirrorskin.engine import reconstruct", "import numpy"
+    rounds = 1 if quick else _ROUNDS
+    rows = [_time_process(line, [sys.executable, "-c", line], rounds) for line in lines]
+    return Case("call-import", "a process that imports, from start to end", rows)
+
+
+def _time_process(name: str, command: list[str], rounds: int, output: Path | None = None) -> Row:
+    """Time a process after one untimed run; the profile in its JSON is the device's account.
+
+    The `output` is removed before each run, since it takes longer to replace a file.
+    """
+    seconds: list[float] = []
+    profiles: list[list[dict[str, Any]]] = []
+    for _ in range(rounds + 1):
+        if output is not None:
+            output.unlink(missing_ok=True)
+        start = time.perf_counter()
+        process = subprocess.run(command, capture_output=True, text=True)
+        seconds.append(time.perf_counter() - start)
+        if process.returncode:
+            last = (process.stderr.strip() or "no message").splitlines()[-1]
+            raise DeviceError(f"{' '.join(command[1:4])} ended with {process.returncode}: {last}")
+        profiles.append(json.loads(process.stdout)["profile"] if process.stdout else [])
+
+    def total(profile: list[dict[str, Any]], kind: str) -> float:
+        return float(sum(record["seconds"] for record in profile if record["kind"] == kind))
+
+    device = {kind: [total(profile, kind) for profile in profiles[1:]] for kind in _KINDS}
+    kernels = [record for record in profiles[-1] if record["kind"] == "kernel"]
+    return Row(
+        name=name,
+        wall=Timing.of(seconds[1:]),
+        device={kind: Timing.of(values) for kind, values in device.items() if any(values)},
+        kernels={record["name"]: record["seconds"] for record in kernels},
+        moved={record["name"]: record["bytes"] for record in kernels},
+        first=seconds[0],
+        compile=total(profiles[0], "compile"),
+    )
+
+
+CASES: Cases = {
+    **{f"call-{function}": partial(run_function, function) for function in _FUNCTIONS},
+    "call-commands": run_commands,
+    "call-import": run_import,
+}

@@ -1,0 +1,251 @@
+"""Whole live runs: frames from memory at their times; the rate that is sustained, and the latency.
+
+Targets: 1000 frames/s of 640 x 480 and 150 of 1920 x 1200 in a press without loss; in a rotation with normals
+and heights of 640 x 480, 60 updates a second, from frame to height in 15 ms (99 %: 30 ms).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.cli.bench.records import Case, Target
+from mirrorskin.engine.live import RAISED, LiveEstimator, LivePress, LiveRotation, Loop, Status, Update
+from mirrorskin.io import Block, Header
+from mirrorskin.io.types import Closing, Floats
+from mirrorskin.kernels.device import Device
+from suite.files import shared_memory
+from suite.harness import Cases, Run
+from suite.scenes import SCALES, STEPS, TILT, fill_press, fill_turns
+
+_SLOTS = 256  # frames of the ring buffer, as of a camera
+_PIXEL, _DEPTH = 0.03, 3.0  # mm
+_PRESS = 256  # different frames of a press; each is repeated
+_TURNS = 64  # frames after which a rotation repeats
+_KEPT_UP = 0.99  # of the specified frame rate
+_NEAR = 1e-2  # of the range, by which the last heights may differ from the converged ones
+_UPDATES, _MEDIAN, _SLOWEST = 60, 15, 30  # a second, and ms from frame to height
+
+
+class Paced(Closing):
+    """A live source of frames from memory which starts with the first read and does not wait, as a camera.
+
+    A read waits for the next frame, and returns it with those that arrived since the last read. They are
+    copied to a ring buffer, as by a camera, and lent. A reader that is later than the ring is long loses
+    the oldest of them; `Block.dropped` is their number.
+    """
+
+    name, rewindable = "memory", False
+
+    def __init__(
+        self,
+        frames: NDArray[Any],
+        order: Callable[[NDArray[np.int64]], NDArray[np.int64]],
+        header: Header,
+        places: Callable[[NDArray[np.int64]], NDArray[np.floating]],
+        rate: float,
+        count: int,
+        *,
+        slots: int = _SLOTS,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], object] = time.sleep,
+    ) -> None:
+        self.header, self.motion = header, header.motion
+        self.shape, self.dtype = (count, *frames.shape[1:]), frames.dtype
+        self._frames, self._order, self._places = frames, order, places
+        self._rate, self._clock, self._sleep = rate, clock, sleep
+        self._ring = shared_memory((slots, *frames.shape[1:]), frames.dtype)
+        self._start: float | None = None
+        self._given = 0
+        self._read: list[Floats] = []
+        self._position = "phase" if self.motion == "axial" else "travel"
+
+    def now(self) -> float:
+        """Return the seconds since the first frame was due."""
+        return 0.0 if self._start is None else self._clock() - self._start
+
+    def positions(self) -> Mapping[str, Floats]:
+        """Return the positions of all frames read so far."""
+        return {self._position: np.concatenate([np.empty(0), *self._read])}
+
+    def rewind(self) -> None:
+        """Refuse: time cannot be repeated."""
+        raise RuntimeError("a live source cannot be rewound")
+
+    def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
+        """Wait for the next frame; see ``Source.read``."""
+        if self._given == self.shape[0]:
+            return None
+        due, slots = self._wait(), len(self._ring)
+        dropped = max(0, due - self._given - slots)
+        first = self._given + dropped
+        slot = first % slots
+        length = min(due - first, 1 if out is None else len(out), slots - slot)
+        number = np.arange(first, first + length)
+        frames = self._ring[slot : slot + length]
+        np.take(
+            self._frames, self._order(number), axis=0, out=frames, mode="clip"
+        )  # without an intermediate copy
+        self._given = first + length
+        place = np.asarray(self._places(number), np.float64)
+        self._read.append(place)
+        where: dict[str, Any] = {self._position: place}
+        return Block(frames, first, time=number / self._rate, dropped=dropped, lent=True, **where)
+
+    def _wait(self) -> int:
+        """Wait until the next frame is due, and return the number of frames due by then."""
+        if self._start is None:
+            self._start = self._clock()
+        early = self._given / self._rate - self.now()
+        if early > 0:
+            self._sleep(early)
+        due = max(self._given + 1, int(self.now() * self._rate) + 1)
+        return min(int(self.shape[0]), due)
+
+
+@dataclass(frozen=True, slots=True)
+class LiveCase:
+    """Frames of uint8, (H, W), at a rate for some seconds; `least` is the rate that must be sustained."""
+
+    name: str
+    shape: tuple[int, int]
+    rate: float
+    seconds: float
+    least: float = 0.0
+
+    @property
+    def count(self) -> int:
+        """Frames."""
+        return round(self.rate * self.seconds)
+
+    @property
+    def size(self) -> str:
+        """The frames in words."""
+        rows, columns = self.shape
+        return f"{columns} x {rows} uint8, {self.rate:g} frames/s for {self.seconds:g} s"
+
+
+@dataclass(frozen=True, slots=True)
+class Ran:
+    """The outcome of a run: counts, seconds, the last update, and the load of the machine before."""
+
+    status: Status
+    seconds: float
+    last: Update
+    load: float
+
+
+def run_press(case: LiveCase, device: Device, quick: bool) -> Case:
+    """Find heights during a press."""
+    frames = np.empty((_PRESS, *case.shape), np.uint8)
+    fill_press(frames)
+    source = Paced(
+        frames,
+        lambda number: number * _PRESS // case.count,
+        Header("vertical", pixel_size=(_PIXEL, _PIXEL)),
+        lambda number: number * (_DEPTH / case.count),
+        case.rate,
+        case.count,
+    )
+    ran = _run(source, LiveOperation(source, Press(device=device)))
+    targets = () if quick else judge_press(ran, case.least)
+    title = f"heights during a press; {case.size}"
+    return Case(case.name, title, [], {}, _notes(ran), targets)
+
+
+def run_rotation(case: LiveCase, device: Device, quick: bool) -> Case:
+    """Find normals, edges and heights during a rotation."""
+    offset, gain, noise = SCALES["uint8"]
+    frames = np.empty((_TURNS, *case.shape), np.uint8)
+    fill_turns(frames)
+    scale: dict[str, Any] = {"zenith_gain": np.asarray(gain), "zenith_offset": np.asarray(offset)}
+    source = Paced(
+        frames,
+        lambda number: number % _TURNS,
+        Header("axial", pixel_size=(_PIXEL, _PIXEL), tilt=TILT, **scale),
+        lambda number: number * (math.tau / STEPS),
+        case.rate,
+        case.count,
+    )
+    noise = math.hypot(noise, 1 / math.sqrt(12))
+    estimator = LiveRotation(source, window=STEPS, noise=noise, device=device)
+    ran = _run(source, estimator)
+    best, height = estimator.result().height, ran.last.height
+    assert best is not None
+    assert height is not None
+    off = (height - best)[np.isfinite(best)].astype(np.float64)
+    span = float(np.nanmax(best) - np.nanmin(best))
+    rms, most = math.sqrt(float(np.mean(off**2))) / span, float(np.abs(off).max()) / span
+    note = f"the last heights differ from the converged ones by {rms:.1e} of their range, at most {most:.1e}"
+    targets = () if quick else judge_rotation(ran, rms)
+    title = f"normals, heights and edges during a rotation; {case.size}"
+    return Case(case.name, title, [], {}, (*_notes(ran), note), targets)
+
+
+def _run(source: Paced, estimator: LiveOperation) -> Ran:
+    last: list[Update] = []
+
+    def keep(update: Update, status: Status) -> None:
+        last[:] = [update]
+
+    estimator.warm()
+    load, begun = os.getloadavg()[0], time.monotonic()
+    status = Loop(source, estimator, on_update=keep).run()
+    return Ran(status, time.monotonic() - begun, last[0], load)
+
+
+def judge_press(ran: Ran, least: float) -> tuple[Target, ...]:
+    """Judge the sustained rate, and losses."""
+    rate, lost = ran.status.used / ran.seconds, ran.status.dropped + ran.status.skipped
+    bound, met = f"at least {least:g} a second", rate >= _KEPT_UP * least
+    return (
+        Target("frames that were used", bound, f"{rate:.1f} a second", met),
+        Target("frames dropped or skipped", "none", f"{lost} of {ran.status.frames}", lost == 0),
+    )
+
+
+def judge_rotation(ran: Ran, rms: float) -> tuple[Target, ...]:
+    """Judge updates, their latency, and the difference of the heights from the converged ones."""
+    rate, shown = ran.status.updates / ran.seconds, ran.status.latency[RAISED]
+    median, p99 = 1e3 * shown.median, 1e3 * shown.p99
+    what = "frame in to height out"
+    return (
+        Target("updates", f"at least {_UPDATES} a second", f"{rate:.1f} a second", rate >= _UPDATES),
+        Target(f"{what}, median", f"at most {_MEDIAN} ms", f"{median:.1f} ms", median <= _MEDIAN),
+        Target(f"{what}, 99 %", f"at most {_SLOWEST} ms", f"{p99:.1f} ms", p99 <= _SLOWEST),
+        Target("heights compared with the converged ones", f"within {_NEAR:g}", f"{rms:.1e}", rms <= _NEAR),
+    )
+
+
+def _notes(ran: Ran) -> tuple[str, ...]:
+    """Return counts, latencies and the load of the machine."""
+    status = ran.status
+    stages = "; ".join(
+        f"{stage} {1e3 * latency.median:.2f} (99 % below {1e3 * latency.p99:.2f})"
+        for stage, latency in status.latency.items()
+        if math.isfinite(latency.median)
+    )
+    counts = (
+        f"{status.frames} frames in {ran.seconds:.1f} s, {status.used} used, {status.skipped} skipped,"
+        f" {status.dropped} dropped; {status.updates} updates"
+    )
+    return counts, f"milliseconds, median: {stages}", f"load of the machine before: {ran.load:.2f}"
+
+
+def _case(case: LiveCase, run: Callable[[LiveCase, Device, bool], Case]) -> dict[str, Run]:
+    short = replace(case, shape=(48, 64), rate=100.0, seconds=0.3)
+    return {case.name: lambda device, quick: run(short if quick else case, device, quick)}
+
+
+CASES: Cases = {
+    **_case(LiveCase("live-vertical-vga", (480, 640), 1000.0, 60.0, least=1000.0), run_press),
+    **_case(LiveCase("live-vertical-1920x1200", (1200, 1920), 165.0, 30.0, least=150.0), run_press),
+    **_case(LiveCase("live-axial-vga", (480, 640), 66.0, 60.0), run_rotation),
+}

@@ -1,0 +1,49 @@
+"""Normals of one turn of an axial rotation: the engine and the limits."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import numpy as np
+
+from mirrorskin.cli.bench.records import Case
+from mirrorskin.engine import estimate_normals
+from mirrorskin.kernels.device import Device
+from suite.harness import Cases, check_memory, time_call
+from suite.scenes import SCALES, STEPS, TILT, fill_turns, phases, turn_noise
+
+_QUICK = (48, 64)
+_MAPS = 3 * 4 + 4 + 1 + 4  # bytes of a pixel: normal, sigma, contact and mean
+_WORKING = 160  # bytes of a pixel for what all works keep
+
+
+def run_normals(name: str, kind: str, shape: tuple[int, int], device: Device, quick: bool) -> Case:
+    """Time the exact method on one turn; bytes are those of the frames and of the maps, each once."""
+    shape, dtype = _QUICK if quick else shape, np.dtype(kind)
+    moved = math.prod(shape) * (STEPS * dtype.itemsize + _MAPS)
+    check_memory(name, 2 * moved + _WORKING * math.prod(shape))
+    frames = np.empty((STEPS, *shape), dtype)
+    fill_turns(frames)
+    offset, gain, _ = SCALES[kind]
+    call = partial(
+        estimate_normals,
+        frames,
+        phases(STEPS),
+        tilt=TILT,
+        gain=gain,
+        offset=offset,
+        noise=turn_noise(dtype),
+        device=device,
+    )
+    title = f"exact method to normals, sigma, contact and mean; {STEPS} x {shape[0]} x {shape[1]} {kind}"
+    return time_call(name, title, call, moved, device, quick, frames=STEPS, first="triad")
+
+
+CASES: Cases = {
+    **{
+        f"normals-{kind}": partial(run_normals, f"normals-{kind}", kind, (1080, 1920))
+        for kind in ("uint8", "uint16", "float32")
+    },
+    "normals-4k": partial(run_normals, "normals-4k", "uint8", (2160, 3840)),
+}

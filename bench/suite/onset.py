@@ -1,0 +1,387 @@
+"""The onset of the light state: the engine, the limits, NumPy, OpenCV, PyTorch and Numba on one stack."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.cli.bench.records import THREADS, Case
+from mirrorskin.cli.bench.timing import OURS
+from mirrorskin.engine import find_onset
+from mirrorskin.engine.frames import estimate_noise, reference_maps, thin_out
+from mirrorskin.kernels.device import Device
+from mirrorskin.kernels.onset import DARK, onset_heights, onset_levels, onset_near, onset_sure
+from suite.harness import Cases, agree, check_memory, missing, time_call
+from suite.scenes import LEVELS, StackName, fill_press, press_noise, references, travel_of
+
+Maps = dict[str, NDArray[Any]]
+Flags = NDArray[np.uint8]
+Levels = NDArray[Any]  # smallest light sample in the frames' type: one for all, (), or one a pixel, (H, W)
+Shape = tuple[int, int, int]
+
+_HD, _MEMORY, _QUICK = (64, 1080, 1920), (240, 2160, 3840), (12, 48, 64)
+_BYTE = np.dtype(np.uint8)
+_THRESHOLD = 0.5
+_MAPS = 64  # bytes a pixel for all maps
+_PLATEAU, _CONFIDENT = (
+    3.0,
+    6.0,
+)  # standard deviations from the plateau, and below the level: docs/method/press.md
+# Threads of the pool, and pixels of a tile: more leave the cache, fewer pay more for each call. NumPy has one
+# core, as most people use it; PyTorch has its own threads.
+_TILES = {"NumPy": (1, 262_144), "OpenCV": (THREADS, 400_000), "PyTorch": (1, 1_200_000)}
+_NUMBA_TILE = 16_384
+_COUNTABLE = 255  # frames that a byte counts
+
+
+def run_onset(name: str, shape: Shape, stack: StackName, full: bool, device: Device, quick: bool) -> Case:
+    """Time the onset, the limits and the peers on one stack; their maps must agree first.
+
+    `full` is the full default: references of each pixel, hold 2, sub-frame; heights, sigma and status are
+    compared. Else there is one threshold for all pixels, and the frames' numbers are compared (equation 4).
+    """
+    shape = _QUICK if quick else shape
+    check_memory(name, 2 * math.prod(shape) + _MAPS * math.prod(shape[1:]))
+    frames = np.empty(shape, _BYTE)
+    fill_press(frames, stack)
+    travel = travel_of(len(frames))
+    dark, bright = references(shape[1:], _BYTE) if full else LEVELS[_BYTE.name]
+    options: dict[str, Any] = {"dark": dark, "bright": bright}
+    if not full:
+        options |= {"hold": 1, "subframe": False, "noise": press_noise(_BYTE)}
+    maps = reference_maps(dark, bright, shape[1:] if full else (), _BYTE)  # type: ignore[arg-type]
+    level, plateau, light = onset_levels(maps[1], maps[0], _THRESHOLD, _BYTE)
+    known = References(np.asarray(level), np.asarray(light), plateau)
+    absent = missing("torch", "numba")
+    peers = _peers(full, frames, travel, known, absent)
+
+    def check(results: dict[str, Any]) -> None:
+        words = ("height", "sigma", "status") if full else ("frame",)
+        found = {word: getattr(results[OURS], word) for word in words}
+        for peer in peers:
+            if full:
+                near = {"height": np.spacing(np.abs(found["height"])), "sigma": 1e-5 * np.abs(found["sigma"])}
+                agree(peer, results[peer], found, near)
+            else:  # a pixel with invalid input has no onset either
+                agree(peer, {"frame": np.maximum(results[peer], -1)}, found)
+
+    what = "full default" if full else "frame of the onset, one threshold, hold 1"
+    title = f"{what}; {' x '.join(map(str, shape))} uint8, {stack}"
+    call = functools.partial(find_onset, frames, travel, device=device, **options)
+    return time_call(
+        name,
+        title,
+        call,
+        frames.nbytes,
+        device,
+        quick,
+        frames=len(frames),
+        peers=peers,
+        check=check,
+        absent=absent,
+    )
+
+
+_OPTIONS: dict[str, tuple[Shape, StackName, bool]] = {
+    "equation4-uint8": (_HD, "random", False),
+    "equation4-memory": (_MEMORY, "random", False),
+    "full-uint8": (_HD, "press", True),
+    "full-memory": (_MEMORY, "press", True),
+    "full-random": (_HD, "random", True),
+}
+CASES: Cases = {name: functools.partial(run_onset, name, *options) for name, options in _OPTIONS.items()}
+
+
+class References(NamedTuple):
+    """Levels of each pixel before the first frame, () or (H, W).
+
+    `level` is the float32 at which it turns light, NaN for a dead pixel, `light` the smallest sample that is
+    light, `dark` its dark plateau.
+    """
+
+    level: NDArray[np.float32]
+    light: Levels
+    dark: NDArray[np.float32]
+
+    def of(self, rows: slice) -> References:
+        """Return those of some rows; those of all pixels as they are."""
+        return References(*(values[rows] if values.ndim else values for values in self))
+
+
+FirstLight = Callable[[NDArray[Any], Levels, int], NDArray[np.int32]]
+"""``(frames, light, hold)`` to the number of each pixel's onset, (H, W): the first frame of the first run of
+`hold` light frames, 1 or 2, or of one that lasts to the end; -1 without one."""
+
+
+def _peers(
+    full: bool, frames: NDArray[Any], travel: NDArray[np.float64], known: References, absent: dict[str, str]
+) -> dict[str, Callable[[], object]]:
+    libraries: dict[str, Library] = {"NumPy": _numpy, "OpenCV": _opencv}
+    if "torch" not in absent and not full:  # heights would be NumPy's, as OpenCV's are
+        libraries["PyTorch"] = _torch
+    noise = estimate_noise(thin_out(frames[0]), thin_out(frames[1]), True)
+    works: dict[str, Callable[[], object]] = {}
+    for name, library in libraries.items():
+        find = functools.partial(_first_light, library)
+        if full:
+            works[name] = functools.partial(_heights, _TILES[name], find, frames, travel, known, noise)
+        else:
+            works[name] = functools.partial(_onsets, _TILES[name], find, frames, known, 1)
+    if "numba" not in absent:
+        works["Numba"] = (
+            functools.partial(_numba_heights, frames, travel, known, noise)
+            if full
+            else functools.partial(numba_onsets, frames, known.light, 1)
+        )
+    return works
+
+
+def _in_tiles(tiles: tuple[int, int], frames: NDArray[Any], fill: Callable[[slice], None]) -> None:
+    """Fill all rows in tiles of at most so many pixels, on so many cores."""
+    threads, pixels = tiles
+    count = max(1, min(pixels // frames.shape[2], -(-frames.shape[1] // threads)))
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(fill, (slice(row, row + count) for row in range(0, frames.shape[1], count))))
+
+
+def _onsets(
+    tiles: tuple[int, int], find: FirstLight, frames: NDArray[Any], known: References, hold: int
+) -> NDArray[np.int32]:
+    onset = np.empty(frames.shape[1:], np.int32)
+
+    def fill(rows: slice) -> None:
+        onset[rows] = find(frames[:, rows], known.of(rows).light, hold)
+
+    _in_tiles(tiles, frames, fill)
+    return onset
+
+
+def _heights(
+    tiles: tuple[int, int],
+    find: FirstLight,
+    frames: NDArray[Any],
+    travel: NDArray[np.float64],
+    known: References,
+    noise: float,
+) -> Maps:
+    height, sigma = (np.full(frames.shape[1:], np.nan, np.float32) for _ in range(2))
+    status = np.empty(height.shape, np.uint8)
+
+    def fill(rows: slice) -> None:
+        part, mine = frames[:, rows], known.of(rows)
+        onset = find(part, mine.light, 2)
+        height[rows], sigma[rows], status[rows] = _answer(part, onset, travel, mine, noise)
+
+    _in_tiles(tiles, frames, fill)
+    return {"height": height, "sigma": sigma, "status": status}
+
+
+def _first_light(library: Library, frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.int32]:
+    """Count with a library the frames that leave a pixel undecided; see `FirstLight`."""
+    shape = frames.shape[1:]
+    less, count = library(light)
+    undecided, few = np.full(shape, 255, np.uint8), np.zeros(shape, np.uint8)
+    onset = np.zeros(shape, np.int32)
+    for number, dark in enumerate(_dark_frames(frames, hold, less), 1):
+        count(undecided, dark, few)
+        if number % _COUNTABLE == 0 or number == len(frames):
+            onset += few
+            few[:] = 0
+    onset[undecided != 0] = DARK
+    return onset
+
+
+def _dark_frames(frames: NDArray[Any], hold: int, less: Less) -> Iterator[Flags]:
+    """Yield for each frame where no run of `hold` light frames begins, in a mask that is used again."""
+    dark, after = np.empty((2, *frames.shape[1:]), np.uint8)
+    less(frames[0], dark)
+    for frame in frames[1:]:
+        less(frame, after)
+        if hold == 2:
+            np.bitwise_or(dark, after, out=dark)
+        yield dark
+        dark, after = after, dark
+    yield dark
+
+
+Less = Callable[[NDArray[Any], Flags], object]
+Count = Callable[[Flags, Flags, Flags], None]
+Library = Callable[[Levels], tuple[Less, Count]]
+"""Levels to two functions that work in place: `less` makes a mask of where a frame is below them, 1 or 255,
+and `count` takes what is not in a mask from the undecided pixels, and adds 1 to the counts of the rest."""
+
+
+def _numpy(light: Levels) -> tuple[Less, Count]:
+    def count(undecided: Flags, dark: Flags, few: Flags) -> None:
+        np.bitwise_and(undecided, dark, out=undecided)
+        np.add(few, undecided, out=few)
+
+    return lambda frame, out: np.less(frame, light, out=out.view(bool)), count
+
+
+def _opencv(light: Levels) -> tuple[Less, Count]:
+    import cv2
+
+    level: Any = light if light.ndim else float(light)
+
+    def count(undecided: Flags, dark: Flags, few: Flags) -> None:
+        cv2.bitwise_and(undecided, dark, dst=undecided)
+        cv2.add(few, cv2.min(undecided, 1.0), dst=few)  # type: ignore[call-overload]
+
+    return lambda frame, out: cv2.compare(frame, level, cv2.CMP_LT, dst=out), count
+
+
+def _torch(light: Levels) -> tuple[Less, Count]:
+    import torch
+
+    torch.set_num_threads(THREADS)
+    tensor = torch.from_numpy
+    level: Any = tensor(light) if light.ndim else light.item()
+
+    def count(undecided: Flags, dark: Flags, few: Flags) -> None:
+        tensor(undecided).bitwise_and_(tensor(dark))
+        tensor(few).add_(tensor(undecided))
+
+    return lambda frame, out: torch.lt(tensor(frame), level, out=tensor(out)), count
+
+
+def _answer(
+    frames: NDArray[Any],
+    onset: NDArray[np.int32],
+    travel: NDArray[np.float64],
+    known: References,
+    noise: float,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
+    """Return height, sigma and status of onsets in NumPy: the full default, decision 2."""
+    status = np.select([np.isnan(known.level), onset == DARK, onset == 0], [0, 2, 3], 1).astype(np.uint8)
+    height, sigma = (np.full(onset.shape, np.nan, np.float32) for _ in range(2))
+    row, column = found = np.nonzero(status == 1)
+    start, level, light = onset[found].astype(np.intp), known.level[found], known.light[found]
+    sure = onset_sure(level, light, _CONFIDENT * noise)
+
+    def last_below(bounds: NDArray[Any]) -> NDArray[np.intp]:
+        """Go back from the onsets to the last frames that are below some bounds, or the first of all."""
+        frame, todo = start - 1, np.arange(len(start))
+        while len(todo := todo[frame[todo] > 0]):
+            todo = todo[frames[frame[todo], row[todo], column[todo]] >= bounds[todo]]
+            frame[todo] -= 1
+        return frame
+
+    below, foot = last_below(sure), last_below(onset_near(level, known.dark[found], sure))
+    last, slack = len(frames) - 1, _PLATEAU * noise
+    before, at, *later = (frames[np.minimum(start + k, last), row, column] for k in (-1, 0, 1, 2))
+    height[found], sigma[found], _ = onset_heights(
+        start, below, foot, frames[foot + 1, row, column], before, at, np.fmin(*later), level,
+        known.dark[found], travel, noise, slack, slack * np.sqrt(2), True,
+    )  # fmt: skip
+    return height, sigma, status
+
+
+def numba_onsets(frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.int32]:
+    """Find onsets with Numba: tiles on all cores, frame by frame, so that the inner loop is vector code."""
+    onset = np.empty(frames.shape[1:], np.int32)
+    each = light.ndim > 0
+    scan = _numba_scan(each, hold, whole=False)
+    scan(frames.reshape(len(frames), -1), light.reshape(-1) if each else light[()], onset.reshape(-1))
+    return onset
+
+
+def _numba_heights(
+    frames: NDArray[Any], travel: NDArray[np.float64], known: References, noise: float
+) -> Maps:
+    shape = frames.shape[1:]
+    maps = {"height": np.empty(shape, np.float32), "sigma": np.empty(shape, np.float32)}
+    maps |= {"status": np.empty(shape, np.uint8)}
+    run = _numba_scan(True, 2, whole=True)
+    flat = (values.reshape(-1) for values in (*known, *maps.values()))
+    run(frames.reshape(len(frames), -1), travel, *flat, noise)
+    return maps
+
+
+@functools.cache
+def _numba_scan(each: bool, hold: int, *, whole: bool) -> Any:  # noqa: C901  # to compile
+    """Compile the search for onsets, with a level of each pixel or one for all, and heights if `whole`."""
+    import numba
+
+    numba.set_num_threads(min(THREADS, numba.config.NUMBA_NUM_THREADS))
+
+    @numba.njit
+    def search(frames, first, end, light, onset):  # type: ignore[no-untyped-def]
+        count, pixels = len(frames), end - first
+        undecided, few = np.ones(pixels, np.uint8), np.zeros(pixels, np.uint8)
+        onset[:] = 0
+        for t in range(count):
+            # Cut from a whole row: of a part of all rows, Numba does not know that samples lie side by side.
+            now, then = frames[t, first:end], frames[min(t + hold, count) - 1, first:end]
+            for p in range(pixels):
+                sample = now[p] if hold == 1 else min(now[p], then[p])
+                open_ = undecided[p] & np.uint8(sample < (light[p] if each else light))
+                undecided[p] = open_
+                few[p] += open_
+            if (t + 1) % _COUNTABLE == 0 or t + 1 == count:
+                for p in range(pixels):
+                    onset[p] += few[p]
+                    few[p] = 0
+        for p in range(pixels):
+            if undecided[p]:
+                onset[p] = -1
+
+    @numba.njit(error_model="numpy")
+    def answer(frames, pixel, start, travel, level, light, dark, noise):  # type: ignore[no-untyped-def]
+        surely = level - np.float32(_CONFIDENT * noise)
+        way = level - dark
+        near = level - max(np.float32(0.25) * way, np.float32(0))
+        foot = start - 1
+        while foot > 0 and (
+            frames[foot, pixel] >= light or frames[foot, pixel] > surely or frames[foot, pixel] >= near
+        ):
+            foot -= 1
+        below = start - 1
+        while below > 0 and (frames[below, pixel] >= light or frames[below, pixel] > surely):
+            below -= 1
+        low, high = np.float64(frames[start - 1, pixel]), np.float64(frames[start, pixel])
+        last = len(frames) - 1
+        after = np.fmin(frames[min(start + 1, last), pixel], frames[min(start + 2, last), pixel])
+        sudden_step = _PLATEAU * noise * math.sqrt(2)
+        from_dark, to_light = low <= dark + _PLATEAU * noise, high >= after - sudden_step
+        step = high - low
+        sudden = from_dark and to_light
+        jumped = foot + 1 < start and frames[foot + 1, pixel] >= after - way / 8 and way >= 34 * noise
+        end = foot + 1 if jumped else start
+        from_dark, to_light = from_dark or low <= dark + step / 8, to_light or high >= after - step / 8
+        share = (min(np.float64(level), high) - low) / step
+        width = travel[end] - travel[end - 1]
+        line = width * noise * math.sqrt(share * share + (1 - share) * (1 - share)) / step
+        hovers = not jumped and (step <= sudden_step or (start - 2 - below) * step > 2.5 * sudden_step)
+        interval = (travel[start] - travel[below] if hovers else width) / math.sqrt(12)
+        spread = math.sqrt(line * line + interval * interval) if from_dark or to_light else line
+        sudden = sudden or jumped
+        height = -(travel[end - 1] + width * (0.5 if sudden else share))
+        return height, interval if sudden or hovers else spread
+
+    def onsets(frames, light, onset):  # type: ignore[no-untyped-def]
+        for tile in numba.prange(-(-len(onset) // _NUMBA_TILE)):
+            first, end = tile * _NUMBA_TILE, min(len(onset), (tile + 1) * _NUMBA_TILE)
+            search(frames, first, end, light[first:end] if each else light, onset[first:end])
+
+    def heights(frames, travel, level, light, dark, height, sigma, status, noise):  # type: ignore[no-untyped-def]
+        for tile in numba.prange(-(-len(status) // _NUMBA_TILE)):
+            first, end = tile * _NUMBA_TILE, min(len(status), (tile + 1) * _NUMBA_TILE)
+            onset = np.empty(end - first, np.int32)
+            search(frames, first, end, light[first:end], onset)
+            for p in range(first, end):
+                start = onset[p - first]
+                dead = np.isnan(level[p])
+                status[p] = 0 if dead else 2 if start == -1 else 3 if start == 0 else 1
+                if status[p] == 1:
+                    height[p], sigma[p] = answer(frames, p, start, travel, level[p], light[p], dark[p], noise)
+                else:
+                    height[p], sigma[p] = np.nan, np.nan
+
+    return numba.njit(parallel=True, error_model="numpy")(heights if whole else onsets)

@@ -1,0 +1,89 @@
+"""The motion of an object along a stream of results."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+
+from mirrorskin.cli.bench.limits import time_works
+from mirrorskin.cli.bench.records import Case, Target
+from mirrorskin.cli.bench.timing import OURS, Work
+from mirrorskin.engine import Pose, PoseTracker
+from mirrorskin.io import Result, pixel_axes
+from mirrorskin.kernels.device import Device
+from suite.harness import Cases
+
+_SHAPE, _QUICK = (240, 320), (60, 80)
+_FIELD = 8.0  # mm across
+_FRAMES = 24  # of a circle that ends where it starts
+_REACH, _TURN = 0.4, 0.2  # mm and rad, of the circle
+_SIGMA, _NORMAL_SIGMA = 1e-3, 0.01  # mm and rad
+_BYTES = 32  # of the record of a pixel
+_RATE = 200.0  # target, results a second
+
+
+def run_track(device: Device, quick: bool) -> Case:
+    """Time a tracker along a closed path: results in, the motion since the first one out.
+
+    Bytes are those of the records of both maps that are compared, each once.
+    """
+    shape = _QUICK if quick else _SHAPE
+    angles = 2 * math.pi * np.arange(_FRAMES + 1) / _FRAMES
+    path = [(_REACH * math.sin(a), _REACH * (1 - math.cos(a)), _TURN * math.sin(a)) for a in angles]
+    results = [_surface(shape, *place, seed) for seed, place in enumerate(path)]
+    seconds: list[float] = []
+
+    def follow() -> Pose:
+        tracker = PoseTracker(device=device)
+        for result in results:
+            start = time.perf_counter()
+            pose = tracker.push(result)
+            seconds.append(time.perf_counter() - start)
+        return pose
+
+    last = follow()
+    seconds.clear()
+    moved = 2 * _BYTES * math.prod(shape)
+    works = {OURS: Work(follow, len(results) * moved, len(results))}
+    rows = time_works(works, moved, device, quick, first="triad")
+    lower, middle, upper = np.percentile(seconds, [25, 50, 75])
+    drift = math.degrees(float(np.linalg.norm(last.rotation)))
+    notes = (
+        f"a result: median {1e3 * middle:.2f} ms, quartiles {1e3 * lower:.2f}-{1e3 * upper:.2f}",
+        f"back at the start after {_FRAMES} results: off by {drift:.4f} degrees and"
+        f" {1e3 * float(np.linalg.norm(last.translation)):.2f} micrometres",
+    )
+    met = bool(1 / middle >= _RATE)
+    target = Target(OURS, f"at least {_RATE:.0f} results a second", f"{1 / middle:.0f}", met)
+    title = f"motion along results of {' x '.join(map(str, shape))}: heights, normals and their sigmas"
+    absent = {"NormalFlow": "not available as a package"}
+    return Case("pose-track", title, list(rows.values()), absent, notes, () if quick else (target,))
+
+
+def _surface(shape: tuple[int, int], right: float, up: float, turn: float, seed: int) -> Result:
+    """Return waves on a dome, rotated about z and moved, with noise of their standard deviations."""
+    rng = np.random.default_rng(seed)
+    x, y = pixel_axes(shape, (_FIELD / shape[1], _FIELD / shape[1]))
+    across, high = np.meshgrid(x - right, y - up)
+    cosine, sine = math.cos(turn), math.sin(turn)
+    u, v = cosine * across + sine * high, cosine * high - sine * across
+    height = -0.03 * (u * u + 0.7 * v * v) + 0.05 * np.sin(1.5 * u + 0.3) * np.cos(1.2 * v)
+    p = -0.06 * u + 0.075 * np.cos(1.5 * u + 0.3) * np.cos(1.2 * v)
+    q = -0.042 * v - 0.06 * np.sin(1.5 * u + 0.3) * np.sin(1.2 * v)
+    slopes = np.stack([cosine * p - sine * q, sine * p + cosine * q], axis=-1)
+    slopes += rng.normal(0, _NORMAL_SIGMA / math.sqrt(2), slopes.shape)
+    normals = np.dstack([-slopes, np.ones(shape)])
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    return Result(
+        height=(height + rng.normal(0, _SIGMA, shape)).astype(np.float32),
+        height_sigma=np.full(shape, _SIGMA, np.float32),
+        normals=normals.astype(np.float32),
+        normals_sigma=np.full(shape, _NORMAL_SIGMA, np.float32),
+        x=x,
+        y=y,
+    )
+
+
+CASES: Cases = {"pose-track": run_track}

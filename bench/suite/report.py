@@ -1,0 +1,254 @@
+"""A run as tables: of each case, and on a page of one or several runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mirrorskin.cli.bench.records import Case, Row, Run, as_ms, as_percent
+from mirrorskin.cli.bench.timing import FIRST, OURS
+
+HEAD = ("work", "ms", "quartiles", "kernels", "copies", "GB/s", "frames/s", "of limit", "kernels")
+TARGET_HEAD = ("target", "bound", "measured", "met")
+
+LEGEND = (
+    "ms: median by the host's clock, from the call to its return; kernels and copies: as reported by "
+    "the device. of limit: bandwidth divided by that of the first row, by the clock; then the same "
+    "of kernels alone. Bytes are those of the input and of the output, each once."
+)
+
+_ABOUT = (
+    "The measurements of `make bench`. `python bench/run.py report` made this page of the runs at its end: "
+    "make it anew rather than change it. `mirrorskin bench` measures the core operations on your device."
+)
+_COMMANDS = """```sh
+pip install '.[bench]'                            # peers: Numba, PyTorch, pyamg, besides NumPy, SciPy, OpenCV
+python bench/run.py run --list                    # the cases
+python bench/run.py run 'call-*' -o mine.json     # some of them; the tables of all works go to mine.md
+python bench/run.py compare before.json mine.json # what is faster or slower by more than its rounds vary
+python bench/run.py report mine.json -o page.md   # a page like this one
+```"""
+_METHOD = (
+    "The works of a case take turns in one process: the engine, the limits of memory (read, copy, triad) "
+    "on the same number of bytes, and peers, each as an expert of the library would use it. All must return "
+    "the same maps before anything is timed. A time is the median of up to 15 rounds by the host's clock, "
+    "from the call until the device is done. A limit is what the same device did in the same rounds with "
+    "nothing else to do. Compare within a run rather than between runs, or let `compare` judge by "
+    "the quartiles."
+)
+_TARGETS = "Targets, and the measured values."
+_CALLS = (
+    "Calls as users make them, NumPy arrays in and maps out, and commands from process start to end, in "
+    "milliseconds: reading the same bytes from memory, the kernels, a call after others, one without "
+    "memory kept from earlier calls, and the fastest peer that returns the same maps."
+)
+_PEERS = (
+    "Each work of the engine next to the fastest peer with the same result. of limit: bandwidth divided by "
+    "that of memory; where this is small, arithmetic or the overhead of calls is the limit."
+)
+_ACCURACY = "Answers of this device compared with known truths, each a number and its bound."
+
+Machine = Mapping[str, Case]  # cases by name
+
+
+def as_rows(case: Case) -> list[list[str]]:
+    """Return the table of a case as cells under `HEAD`."""
+    return [_cells(case, row) for row in case.rows]
+
+
+def as_targets(case: Case) -> list[list[str]]:
+    """Return the targets of a case as cells under `TARGET_HEAD`."""
+    return [[one.what, one.bound, one.measured, "yes" if one.met else "no"] for one in case.targets]
+
+
+def as_notes(case: Case) -> list[str]:
+    """Return the lines below the table of a case."""
+    firsts = [f"{row.name} {row.first:.2f} s" for row in case.rows if not row.is_limit]
+    compiling = sum(row.compile for row in case.rows)
+    warm_up = f"first call: {', '.join(firsts)}; {compiling:.2f} s in total for building OpenCL kernels"
+    absent = (f"{name}: {why}" for name, why in case.absent.items())
+    return [*([warm_up] if firsts else []), *case.notes, *absent]
+
+
+def as_table(head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: bool = True) -> str:
+    """Return a table of a page; columns of numbers, those after the first, are set to the right."""
+    lines = [head, ["---"] + ["---:" if numbers else "---"] * (len(head) - 1), *rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |" for cells in lines)
+
+
+def as_markdown(run: Run) -> str:
+    """Return a run with all its tables and notes as a page, and at its end what it was made with."""
+    parts = [f"# Benchmarks, run of {run.date[:10]}", LEGEND]
+    for case in run.cases:
+        parts.append(f"## {case.name}: {case.title}")
+        for head, rows, numbers in ((HEAD, as_rows(case), True), (TARGET_HEAD, as_targets(case), False)):
+            parts += [as_table(head, rows, numbers=numbers)] if rows else []
+        parts += as_notes(case)
+    versions = ", ".join(f"{name} {version or 'not installed'}" for name, version in run.versions.items())
+    return "\n\n".join([*parts, "## Machine", f"{run.title}.", f"{versions}."]) + "\n"
+
+
+def as_page(runs: Mapping[Path, Run]) -> str:
+    """Return the page of some runs."""
+    machines = _gather(runs.values())
+    parts = ["# Benchmarks", _ABOUT, "## How to measure", _COMMANDS, _METHOD]
+    for title, about, describe in (
+        ("Targets", _TARGETS, _targets),
+        ("Calls", _CALLS, _calls),
+        ("Works and peers", _PEERS, _peers),
+        ("Accuracy", _ACCURACY, _accuracy),
+    ):
+        parts += _topic(title, about, machines, describe)
+    parts += ["## Machine and runs", _runs(runs)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _gather(runs: Iterable[Run]) -> dict[str, Machine]:
+    """Return cases by machine; of a case that several runs of one machine have, the last one counts."""
+    machines: dict[str, dict[str, Case]] = {}
+    for run in runs:
+        machines.setdefault(run.machine, {}).update({case.name: case for case in run.cases})
+    return dict(machines)
+
+
+def _runs(runs: Mapping[Path, Run]) -> str:
+    """List the machines, and what each run was made with."""
+    lines = []
+    for machine in dict.fromkeys(run.machine for run in runs.values()):
+        lines.append(f"- {machine}:")
+        for path, run in runs.items():
+            if run.machine == machine:
+                quick = "; made with `--quick`: the times mean nothing" if run.quick else ""
+                code = (run.commit or str(run.versions.get("mirrorskin")))[:12]
+                lines.append(f"    - {path.name}: {run.date[:10]}, mirrorskin {code}{quick}")
+    versions: dict[str, dict[str, None]] = {}
+    for run in runs.values():
+        for name, version in run.versions.items():
+            versions.setdefault(name, {}).update({version: None} if version else {})
+    used = ", ".join(f"{name} {' and '.join(found)}" for name, found in versions.items() if found)
+    return "\n".join([*lines, f"- With {used}."])
+
+
+def _topic(
+    title: str, about: str, machines: Mapping[str, Machine], describe: Callable[[Machine], list[str]]
+) -> list[str]:
+    """Return a heading and the parts of each machine; nothing if no machine has any."""
+    parts = []
+    for name, machine in machines.items():
+        if mine := describe(machine):
+            parts += [*([f"**{name}**"] if len(machines) > 1 else []), *mine]
+    return [f"## {title}", about, *parts] if parts else []
+
+
+def _targets(machine: Machine) -> list[str]:
+    cases = [case for case in machine.values() if not case.name.startswith("accuracy-")]
+    cells = [[case.name, *row] for case in cases for row in as_targets(case)]
+    return [as_table(("case", *TARGET_HEAD), cells, numbers=False)] if cells else []
+
+
+def _calls(machine: Machine) -> list[str]:
+    """Return whole calls with limit, kernels and fastest peer, and commands with their kernels."""
+    cells = []
+    for case in machine.values():
+        works = {row.name: row for row in case.rows if not row.is_limit}
+        limit = next((as_ms(row.wall.median) for row in case.rows if row.is_limit), "")
+        whole = FIRST in works
+        ours = [works[OURS]] if whole else works.values() if case.name.startswith("call-") else []
+        for row in ours:
+            rival = _fastest(row, works.values()) if whole else None
+            cells.append(
+                [
+                    case.title if whole else f"{case.title}: {row.name}",
+                    limit,
+                    as_ms(row.kernel) if "kernel" in row.device else "",
+                    as_ms(row.wall.median),
+                    as_ms(works[FIRST].wall.median) if whole else "",
+                    f"{_who(rival)} {as_ms(rival.wall.median)}" if rival else "",
+                ]
+            )
+    head = ("call", "limit, ms", "kernels", "call", "first call", "fastest peer")
+    return [as_table(head, cells)] if cells else []
+
+
+def _peers(machine: Machine) -> list[str]:
+    """Return each work of ours that a peer does too, or that has a target, next to the fastest peer."""
+    cells = []
+    for case in machine.values():
+        if case.name.startswith(("accuracy-", "call-")):
+            continue
+        works = [row for row in case.rows if not row.is_limit]
+        rivals = {row.name: _fastest(row, works) for row in works if _is_ours(row)}
+        wanted = {target.what for target in case.targets} | {name for name in rivals if rivals[name]}
+        alone = not any(rivals.values())
+        cells += [
+            [case.name, *_pair(case, row, rivals[row.name])]
+            for row in works
+            if _is_ours(row) and (alone or row.name in wanted)
+        ]
+    head = ("case", "work", "ms", "GB/s", "of limit", "fastest peer", "ms", "times as fast")
+    about = [f"- {name}: {machine[name].title}" for name in dict.fromkeys(row[0] for row in cells)]
+    return [as_table(head, cells), "\n".join(about)] if cells else []
+
+
+def _is_ours(row: Row) -> bool:
+    """Return whether a row is the engine's: by its name, or because it used the device."""
+    return OURS in row.name or "kernel" in row.device
+
+
+def _fastest(row: Row, works: Iterable[Row]) -> Row | None:
+    """Return the fastest peer that does the same: the part after the comma of their names is equal."""
+    same = [one for one in works if not _is_ours(one) and _part(one) == _part(row)]
+    return min(same, key=lambda one: one.wall.median, default=None)
+
+
+def _pair(case: Case, row: Row, rival: Row | None) -> list[str]:
+    mine = row.wall.median
+    cells = [
+        row.name,
+        as_ms(mine),
+        f"{row.bandwidth / 1e9:.2f}" if row.bytes else "",
+        as_percent(case.share(row)) if row.bytes else "",
+    ]
+    if rival is None:
+        return [*cells, "", "", ""]
+    return [*cells, _who(rival), as_ms(rival.wall.median), f"{rival.wall.median / mine:.1f}"]
+
+
+def _accuracy(machine: Machine) -> list[str]:
+    """Return how many bounds each case of accuracy keeps, and which it does not."""
+    cells = []
+    for case in machine.values():
+        if case.name.startswith("accuracy-"):
+            missed = [f"{one.what}: {one.measured}" for one in case.targets if not one.met]
+            kept = f"{len(case.targets) - len(missed)} of {len(case.targets)}"
+            cells.append([case.name, case.title, kept, "; ".join(missed) or "none"])
+    head = ("case", "about", "bounds that are kept", "missed")
+    return [as_table(head, cells, numbers=False)] if cells else []
+
+
+def _who(row: Row) -> str:
+    return row.name.partition(", ")[0]
+
+
+def _part(row: Row) -> str:
+    return row.name.partition(", ")[2]
+
+
+def _cells(case: Case, row: Row) -> list[str]:
+    wall, copies = (
+        row.wall,
+        [row.device[kind].median for kind in ("upload", "download") if kind in row.device],
+    )
+    shares = (case.share(row), case.kernel_share(row)) if row.bytes else (np.nan, np.nan)
+    return [
+        row.name,
+        as_ms(wall.median),
+        f"{as_ms(wall.lower)}-{as_ms(wall.upper)}",
+        as_ms(row.kernel) if "kernel" in row.device else "",
+        as_ms(sum(copies)) if copies else "",
+        f"{row.bandwidth / 1e9:.2f}" if row.bytes else "",
+        f"{row.frames / wall.median:.0f}" if row.frames else "",
+        *map(as_percent, shares),
+    ]

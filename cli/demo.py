@@ -1,0 +1,295 @@
+"""``mirrorskin demo``: the figures of the paper, from its experiments on the digital twin."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import click
+
+from mirrorskin.cli import options
+from mirrorskin.cli.groups import Option
+from mirrorskin.cli.output import print_json, print_table, progress
+
+if TYPE_CHECKING:
+    from mirrorskin import hw, io
+    from mirrorskin.engine import Score
+    from mirrorskin.hw.twin import Movement
+
+Results = dict[str, "io.Result"]
+Scores = dict[str, "Score"]
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """An object of the twin under a square picture; `frames` are those of the press or of the turn."""
+
+    object: str
+    title: str
+    size: int  # pixels
+    pixel_size: float  # mm
+    frames: int
+
+
+@dataclass(frozen=True)
+class Press(Experiment):
+    """A press of the paper's section 3.2."""
+
+    step: float  # mm
+    surface: bool = False  # drawn in space as well
+    detail: tuple[float, float] | None = None  # heights, mm, that have a colour scale of their own
+
+    def movement(self) -> Movement:
+        """Return the steps of the press."""
+        from mirrorskin import hw, io
+
+        return hw.twin.Vertical(io.Steps(self.step, self.step).positions(self.frames))
+
+
+@dataclass(frozen=True)
+class Turn(Experiment):
+    """The axial rotation of the paper's section 4.2, about a point of the pressed sheet."""
+
+    press: float  # mm
+    tilt: float  # degrees
+
+    def movement(self) -> Movement:
+        """Return one turn of even steps."""
+        from mirrorskin import hw, io
+
+        phase = io.Steps(2 * math.pi / self.frames).positions(self.frames)
+        return hw.twin.Axial(phase, math.radians(self.tilt), self.press)
+
+
+PRESSES = {
+    "fig5": Press("sphere", "Fig. 5: sphere, 10 mm, 30 x 0.1 mm", 240, 0.05, 30, 0.1, surface=True),
+    "fig6": Press(
+        "coin", "Fig. 6: 5 yen coin, 22 mm, 90 x 0.02 mm", 640, 0.041, 90, 0.02, detail=(-0.3, 0.02)
+    ),
+}
+TURN = Turn("sphere", "Fig. 10 (a): sphere, 10 mm, 8 x 45 deg", 240, 0.05, 8, 1.5, 2.5)
+_TURN, _FUSED_PRESS = "fig10a", "fig5"
+# The method of the normals, and whether the frames are registered with the true heights.
+_METHODS = {"paper": ("paper", False), "exact": ("exact", False), "exact, registered": ("exact", True)}
+_STEPS = len(PRESSES) + 2
+
+_HEIGHTS = ["figure", "method", "answered", "RMS", "mean", "99 %", "filled", "RMS of filled"]
+_HEIGHTS_LEGEND = """\
+Errors of heights in micrometres. answered: measured pixels whose true height is known. filled: pixels
+without a measurement that are surrounded by measured ones; only 'RMS of filled' includes them. A rotation
+gives relative heights: their mean error is subtracted. registered: the frames follow the object, by its
+true heights; the fused surface is registered with the heights that it found."""
+_NORMALS = [
+    "figure",
+    "method",
+    "answered",
+    "median",
+    "RMS",
+    "99 %",
+    "chi2",
+    "lost and flagged",
+    "wrongly flagged",
+]
+_NORMALS_LEGEND = """\
+Angles between normals and truth in degrees. answered: share of the pixels in contact in every frame that
+have an answer and are marked as in contact. chi2: mean of (error / predicted error)^2. The dark end of the
+linear pattern hides zeniths below 13 degrees, its bright end those above 43."""
+_MICROMETRES = 1e3  # in a millimetre
+
+
+def command(
+    output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Folder for all files.")] = Path(
+        "demo"
+    ),
+    overwrite: Annotated[
+        bool, Option("--overwrite", help="Replace recordings of an earlier demo in that folder.")
+    ] = False,
+    device: options.Device = None,
+    as_json: options.Json = False,
+) -> None:
+    """Draw the figures of the paper from experiments on the twin."""
+    from mirrorskin import io, view
+
+    view.check_drawing()
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise io.InputError(
+            f"{output}: the folder cannot be created: {error.strerror}. Choose another with -o"
+        ) from error
+    scores: dict[str, Scores] = {}
+    for number, (name, press) in enumerate(PRESSES.items(), 1):
+        _announce(number, press.title)
+        scores[name] = _draw_press(name, press, output, device, overwrite)
+    _announce(_STEPS - 1, TURN.title)
+    truth, results = _turn(output, device, overwrite)
+    scores[_TURN] = _judge(results, truth)
+    _announce(_STEPS, "a press and a rotation, fused")
+    scores |= _draw_surfaces(results, truth, output, device)
+    if as_json:
+        print_json(scores)
+        return
+    _print_heights({name: found for name, found in scores.items() if name != _TURN})
+    click.echo()
+    _print_normals(scores[_TURN])
+    click.echo(f"recordings, results and figures are in {output}: look at {output / 'fig5.png'}")
+
+
+def _announce(number: int, title: str) -> None:
+    click.echo(f"{number} of {_STEPS}: {title}", err=True)
+
+
+def _draw_press(name: str, press: Press, folder: Path, device: str | None, overwrite: bool) -> Scores:
+    """Press on the object, reconstruct with sub-frame onsets and by eq. 4, and draw both."""
+    from mirrorskin import engine, io, view
+
+    path = folder / f"{name}.h5"
+    truth = _record(press, path, device, overwrite, references="ball")
+    results: Results = {}
+    with io.open_recording(path) as recording:
+        for method, subframe in (("sub-frame", True), ("eq. 4", False)):
+            with progress("reconstructing", recording.shape[0]) as show:
+                results[method] = engine.reconstruct(
+                    recording, subframe=subframe, device=device, progress=show
+                )
+    io.save_result(results["sub-frame"], folder / f"{name}-result.h5")
+    figure = folder / f"{name}.png"
+    view.height_figure(results, truth, press.title, figure, surface=press.surface, detail=press.detail)
+    return _judge(results, truth)
+
+
+def _turn(folder: Path, device: str | None, overwrite: bool) -> tuple[io.Truth, Results]:
+    """Turn about the centre of the sheet, and draw the normals by each method."""
+    from mirrorskin import engine, io, view
+
+    path = folder / f"{_TURN}.h5"
+    truth = _record(TURN, path, device, overwrite, pattern="linear")
+    results: Results = {}
+    with io.open_recording(path) as recording:
+        for name, (method, registered) in _METHODS.items():
+            heights = truth.height if registered else None
+            results[name] = engine.reconstruct(recording, method=method, heights=heights, device=device)
+            io.save_result(results[name], folder / f"{_TURN}-{name.replace(', ', '-')}-result.h5")
+    view.normal_figure(results, truth, TURN.title, path.with_suffix(".png"))
+    return truth, results
+
+
+def _draw_surfaces(turned: Results, truth: io.Truth, folder: Path, device: str | None) -> dict[str, Scores]:
+    """Draw the heights of the rotation, and those of the press and the rotation fused."""
+    from mirrorskin import io, view
+
+    rotation = {"rotation, registered": turned["exact, registered"], "rotation": turned["exact"]}
+    title = "Fig. 10 (b): sphere, 10 mm, integrated from its normals"
+    view.surface_figure(rotation, truth, title, folder / "fig10b.png")
+    fused = {
+        "press": io.open_result(folder / f"{_FUSED_PRESS}-result.h5"),
+        "rotation": turned["exact"],
+        "press and rotation": _fuse(folder, device),
+    }
+    title = "Fig. 5 and Fig. 10 fused: sphere, 10 mm, from a press and a rotation"
+    view.surface_figure(fused, truth, title, folder / "fused.png")
+    del fused["rotation"]  # already part of fig10b
+    return {"fig10b": _judge(rotation, truth), "fused": _judge(fused, truth)}
+
+
+def _fuse(folder: Path, device: str | None) -> io.Result:
+    """Fuse the recordings of the press and of the rotation, and save the result."""
+    from mirrorskin import io
+    from mirrorskin.engine.fusion import frames_to_read, fuse_sources
+
+    with (
+        io.open_recording(folder / f"{_FUSED_PRESS}.h5") as vertical,
+        io.open_recording(folder / f"{_TURN}.h5") as axial,
+        progress("fusing", frames_to_read(vertical, axial, register=True)) as show,
+    ):
+        result = fuse_sources(vertical, axial, device=device, progress=show)
+    io.save_result(result, folder / "fused-result.h5")
+    return result
+
+
+def _record(
+    experiment: Press | Turn, path: Path, device: str | None, overwrite: bool, **sensor: str
+) -> io.Truth:
+    """Record an experiment with the camera of a laboratory; return the truth."""
+    from mirrorskin import io
+
+    twin = _twin(experiment, device, **sensor)
+    with (
+        io.Recorder(twin, path, truth=lambda: twin.truth, overwrite=overwrite) as recorder,
+        progress("simulating", twin.shape[0]) as show,
+    ):
+        recorder.drain(show)
+    return twin.truth
+
+
+def _twin(experiment: Press | Turn, device: str | None, **sensor: str) -> hw.Twin:
+    """Return the paper's ideal sensor; its camera has noise, uneven pixels and a lens."""
+    from mirrorskin import hw
+
+    options: dict[str, Any] = sensor
+    return hw.Twin(
+        object=experiment.object,
+        shape=(experiment.size, experiment.size),
+        pixel_size=experiment.pixel_size,
+        movement=experiment.movement(),
+        camera=hw.twin.Camera(
+            noise=1.0, electrons=40.0, gain_deviation=0.02, offset_deviation=0.5, point_spread=0.5
+        ),
+        device=device,
+        **options,
+    )
+
+
+def _judge(results: Results, truth: io.Truth) -> Scores:
+    from mirrorskin import engine
+
+    return {name: engine.score(result, truth) for name, result in results.items()}
+
+
+def _print_heights(scores: Mapping[str, Scores]) -> None:
+    """Print the errors of all heights, and what the columns are."""
+    rows = [
+        [figure, method, *_height_cells(score)]
+        for figure, by_method in scores.items()
+        for method, score in by_method.items()
+    ]
+    print_table(_HEIGHTS, rows)
+    click.echo(_HEIGHTS_LEGEND)
+
+
+def _height_cells(score: Score) -> list[str]:
+    measured, filled = score.height, score.filled
+    assert measured is not None
+    return [
+        f"{measured.answered} px",
+        f"{_MICROMETRES * measured.rms:.1f}",
+        f"{_MICROMETRES * measured.mean:+.1f}",
+        f"{_MICROMETRES * measured.p99:.1f}",
+        f"{filled.answered if filled else 0} px",
+        f"{_MICROMETRES * filled.rms:.1f}" if filled else "-",
+    ]
+
+
+def _print_normals(scores: Scores) -> None:
+    """Print the errors of all normals, and what the columns are."""
+    print_table(_NORMALS, [[_TURN, method, *_normal_cells(score)] for method, score in scores.items()])
+    click.echo(_NORMALS_LEGEND)
+
+
+def _normal_cells(score: Score) -> list[str]:
+    normal, contact = score.normal, score.contact
+    assert normal is not None
+    flags = ["-", "-"]
+    if contact is not None:
+        flags = [f"{100 * contact.lost_flagged:.1f} %", f"{100 * contact.wrongly_flagged:.1f} %"]
+    return [
+        f"{100 * normal.coverage:.1f} %",
+        f"{normal.median:.2f}",
+        f"{normal.rms:.2f}",
+        f"{normal.p99:.2f}",
+        f"{normal.chi_square:.2f}",
+        *flags,
+    ]

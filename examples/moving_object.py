@@ -1,0 +1,81 @@
+"""An object that moves between touches.
+
+An object without symmetry rolls and turns by 40 degrees between ten touches. Each touch is a press and a
+rotation, fused to one surface; the tracker compares these surfaces and returns the motion since the first.
+"""
+
+import math
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mirrorskin import engine, hw, io, view
+from mirrorskin.engine.fusion import fuse_sources
+from mirrorskin.hw.twin import Axial, Camera, HeightMap, Vertical
+
+TOUCHES, SIZE, FIELD = 10, 80, 5.0  # touches, pixels of a side, mm
+SIDE, SAMPLES = 9.0, 240  # of the object: mm, and samples of its height map
+DEPTH = 1.4  # mm of the deepest press, from the object's origin
+
+
+def pebble(x, y):
+    """Return the height of a dome with waves, which no motion maps to itself."""
+    dome = x * x / 10 + y * y / 7 + x * y / 30
+    return 0.1 * np.sin(1.5 * x + 0.3) * np.cos(1.2 * y) + 0.06 * np.sin(2.1 * y + x) - dome
+
+
+def moved(turn, shift):
+    """Return the object after a rotation, (3, 3), and a translation, (3,)."""
+    pixel = (SIDE / SAMPLES, SIDE / SAMPLES)
+    x, y = io.pixel_axes((SAMPLES, SAMPLES), pixel)
+    place = np.stack([*np.meshgrid(x, y), np.zeros((SAMPLES, SAMPLES))], axis=-1)
+    for _ in range(20):  # fixed-point iteration for the height of the moved object
+        own = (place - shift) @ turn
+        place[..., 2] += pebble(own[..., 0], own[..., 1]) - own[..., 2]
+    return HeightMap(place[..., 2], pixel, "pebble")
+
+
+def touch(thing, depth, seed):
+    """Press on an object, rotate about the middle of the pressed sheet, and fuse both."""
+    turn = Axial(math.tau / 12 * np.arange(12), math.radians(2.5), depth, (0.0, 0.0, depth))
+    movements = {"uniform": Vertical(0.05 * np.arange(1, 31)), "linear": turn}
+    press, rotation = (
+        hw.Twin(
+            object=thing,
+            shape=(SIZE, SIZE),
+            pixel_size=FIELD / SIZE,
+            movement=movement,
+            pattern=pattern,
+            camera=Camera(
+                noise=1.0,
+                electrons=40.0,
+                gain_deviation=0.02,
+                offset_deviation=0.5,
+                point_spread=0.5,
+                seed=2 * seed + number,
+            ),
+        )
+        for number, (pattern, movement) in enumerate(movements.items())
+    )
+    return fuse_sources(press, rotation)
+
+
+share = np.linspace(0, 1, TOUCHES)
+shifts = np.stack([share, 0.6 * np.sin(math.pi * share), -0.05 * share], axis=1)  # mm
+turns = np.radians(np.stack([8 * np.sin(math.tau * share), 10 * share, 40 * share], axis=1))
+
+tracker, results, poses = engine.PoseTracker(), [], []
+for number, (turn, shift) in enumerate(zip(turns, shifts, strict=True)):
+    thing = moved(Rotation.from_rotvec(turn).as_matrix(), shift)
+    results.append(touch(thing, DEPTH + shift[2], number))
+    poses.append(tracker.push(results[-1]))
+
+last = poses[-1]
+for axis, found, true in zip("xyz", last.translation, shifts[-1], strict=True):
+    print(f"translation along {axis}: {found:+.4f} mm, true {true:+.4f} mm")
+for axis, found, true in zip("xyz", np.degrees(last.rotation), np.degrees(turns[-1]), strict=True):
+    print(f"rotation about {axis}: {found:+.3f} degrees, true {true:+.3f} degrees")
+
+followed = view.Followed(results[0], results[-1], poses, turns, shifts)
+view.pose_figure(followed, "An object that rolls and turns between touches", Path("pose.png"))

@@ -1,0 +1,104 @@
+"""Three vibrations: strokes, rocking and dither.
+
+A press that goes up and down averages its strokes and measures the hysteresis of the stage. A body that
+rocks about one axis gives the slope along that axis. A press that dithers in contact gives the rate at
+which the lit area grows.
+"""
+
+import math
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+from mirrorskin import engine, hw, io, view
+from mirrorskin.engine.rotation.rotation import correlate_source
+from mirrorskin.hw.twin import Camera, HeightMap, Leaning, Vertical
+from mirrorskin.io.positions import stroke_starts
+
+SIZE, FIELD = 110, 6.0  # pixels of a side, mm
+LAB = Camera(noise=1.0, electrons=40.0, gain_deviation=0.02, offset_deviation=0.5, point_spread=0.5)
+
+
+def simulate(thing, movement, *, camera=LAB, **sensor):
+    """Return a twin, and its frames."""
+    known = {"shape": (SIZE, SIZE), "pixel_size": FIELD / SIZE, "camera": camera, **sensor}
+    twin = hw.Twin(object=thing, movement=movement, **known)
+    frames = np.empty(twin.shape, twin.dtype)
+    twin.read(frames)
+    twin.rewind()
+    return twin, frames
+
+
+def rms(values):
+    """Return the root mean square of the values that there are."""
+    return float(np.sqrt(np.nanmean(np.square(values, dtype=float))))
+
+
+# 16 strokes of a stage with a backlash of 0.05 mm: on the way up it lags behind the travel that it reports.
+TRAVEL, TURN, BACKLASH, STROKES = 1.2, 0.388, 0.05, 16
+travel = TRAVEL / 2 * (1 - np.cos(TURN * np.arange(round(STROKES * math.tau / TURN))))
+true = [0.0]
+for place in travel[1:]:
+    true.append(float(np.clip(true[-1], place, place + BACKLASH)))
+twin, frames = simulate("sphere", Vertical(np.array(true)), references="exact")
+# Pixels that hardly turn bright, at the zenith where the wall begins, are crossed by noise.
+truth = np.where(twin.truth.zenith > math.radians(14), twin.truth.height, np.nan)
+reached = truth > -TRAVEL + BACKLASH
+search = engine.StrokeSearch(twin.shape[1:], twin.dtype, dark=twin.header.dark, bright=twin.header.bright)
+curve = []
+ends = stroke_starts(travel, 1)[::2].tolist()
+for start, stop in zip([0, *ends], ends, strict=False):
+    search.push(frames[start:stop], travel=travel[start:stop])
+    onset = search.result().onset
+    error = np.where(reached, onset.height - truth, np.nan)
+    curve.append((len(curve) + 1.0, rms(error), rms(np.where(np.isfinite(error), onset.sigma, np.nan))))
+search.push(frames[ends[-1] :], travel=travel[ends[-1] :])
+strokes = search.result()
+x, y = io.pixel_axes(twin.shape[1:], twin.header.pixel_size)
+pressed = io.Result(
+    height=strokes.onset.height,
+    height_sigma=strokes.onset.sigma,
+    status=strokes.onset.status,
+    hysteresis=strokes.hysteresis,
+    hysteresis_sigma=strokes.hysteresis_sigma,
+    strokes=strokes.onsets,
+    x=x,
+    y=y,
+)
+lag = 1000 * float(np.nanmean(pressed.hysteresis[np.isfinite(truth)]))
+count, found, expected = (round(curve[-1][0]), 1000 * curve[-1][1], 1000 * curve[-1][2])
+print(f"height after {count} strokes: RMS error {found:.1f} µm, expected {expected:.1f} µm")
+print(f"hysteresis: {lag:.1f} µm, true {1000 * BACKLASH:.0f} µm")
+
+# A body that rocks by 2.5 degrees about the tip of a pyramid with five sides.
+SIDES, DIRECTION, DEPTH, PIXEL = 5, 0.6, 1.2, 9.0 / 600
+x, y = io.pixel_axes((600, 600), (PIXEL, PIXEL))
+around = math.tau * np.arange(SIDES)[:, None, None] / SIDES
+distance = (x * np.cos(around) + y[:, None] * np.sin(around)).max(axis=0)
+pyramid = HeightMap(-math.tan(math.radians(24)) * distance, (PIXEL, PIXEL), "pyramid")
+tilt = math.radians(2.5) * np.sin(0.385 * np.arange(48))
+movement = Leaning(np.full(48, DIRECTION), tilt, DEPTH, (0.0, 0.0, DEPTH))
+twin, _ = simulate(pyramid, movement, pattern="linear")
+rocked = engine.reconstruct(twin)
+slope = -np.tan(twin.truth.zenith) * np.cos(twin.truth.azimuth - float(rocked.process["slope_direction"]))
+# Not next to the ridges and the border of the contact.
+one_side = ndimage.maximum_filter(slope, 7) - ndimage.minimum_filter(slope, 7) < 1e-3
+slope = np.where(one_side & ndimage.binary_erosion(twin.truth.contact == 1, iterations=2), slope, np.nan)
+error = np.where(rocked.contact == 1, rocked.slope - slope, np.nan)
+sigma = np.where(np.isfinite(error), rocked.slope_sigma, np.nan)
+print(f"slope: RMS error {rms(error):.4f}, expected {rms(sigma):.4f}")
+
+# A press that dithers by 0.05 mm on a ball in elastic contact; without noise the area grows by `growth`.
+SWING, contact = 0.05, {"contact": "elastic", "references": "exact"}
+twin, _ = simulate("sphere", Vertical(1.0 + SWING * np.cos(math.tau / 7.3 * np.arange(74))), **contact)
+dithered = correlate_source(twin, dither=True)
+noiseless = Camera(np.dtype(np.uint16), noise=0.0)
+twin, frames = simulate("sphere", Vertical(1.0 + SWING * np.array([-0.5, 0.5])), camera=noiseless, **contact)
+share = (frames - twin.header.dark.astype(float)) / (twin.header.bright - twin.header.dark)
+growth = float(np.sum(share[1] - share[0])) * (FIELD / SIZE) ** 2 / SWING
+found = (dithered.process["area_growth"], dithered.process["area_growth_sigma"])
+print(f"lit area: grows by {found[0]:.3f} ± {found[1]:.3f} mm² for each mm of travel, true {growth:.3f}")
+
+figure = view.Vibration(curve, pressed, truth, BACKLASH, rocked, slope, dithered, growth)
+view.vibration_figure(figure, "Strokes, rocking and dither", Path("vibration.png"))
