@@ -198,14 +198,14 @@ def _draw_surfaces(turned: Results, truth: io.Truth, folder: Path, device: str |
 def _fuse(folder: Path, device: str | None) -> io.Result:
     """Fuse the recordings of the press and of the rotation, and save the result."""
     from mirrorskin import io
-    from mirrorskin.engine.fusion import frames_to_read, fuse_sources
+    from mirrorskin.engine.fusion import frames_to_read, fuse_recordings
 
     with (
         io.open_recording(folder / f"{_FUSED_PRESS}.h5") as vertical,
         io.open_recording(folder / f"{_TURN}.h5") as axial,
         progress("fusing", frames_to_read(vertical, axial, register=True)) as show,
     ):
-        result = fuse_sources(vertical, axial, device=device, progress=show)
+        result = fuse_recordings(vertical, axial, device=device, progress=show)
     io.save_result(result, folder / "fused-result.h5")
     return result
 

@@ -11,7 +11,7 @@ import numpy as np
 from mirrorskin import engine, hw, io, view
 from mirrorskin.engine.calibration.force import fit_stiffness, known_press
 from mirrorskin.engine.calibration.gel import ball_onset, fit_gel
-from mirrorskin.engine.press.press import reconstruct_press
+from mirrorskin.engine.press.press import Press
 from mirrorskin.hw.twin import Body, Camera, Sphere, Vertical
 
 SIZE, PIXEL = 56, 8.64 / 56  # pixels of a side, and mm
@@ -44,7 +44,7 @@ def true_force(twin):
 # The gel: how far ahead of the contact pixels turn bright, learned from two balls of known diameter.
 balls = {4: press(4, 1.2, 0), 8: press(8, 1.2, 1)}
 gel = fit_gel(
-    [ball_onset(reconstruct_press(twin, fill=False), twin, size / 2) for size, twin in balls.items()]
+    [ball_onset(Press(fill=False).run(twin), twin, size / 2) for size, twin in balls.items()]
 ).gel
 camera = io.CameraId("", (SIZE, SIZE), np.dtype(balls[4].dtype))
 known = io.Calibration(camera, gel=gel)

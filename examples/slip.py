@@ -33,10 +33,10 @@ def find_slip(movement, stick_ratio):
     frames = np.empty(twin.shape, twin.dtype)
     twin.read(frames)
     contact = twin.sheet(0).contact
-    search = engine.SlipSearch(twin.shape[1:], twin.dtype, PIXEL, motion=twin.motion, contact=contact)
-    search.push(frames, **{search.position: movement.path})
+    slip = engine.Slip(pixel_size=PIXEL, motion=twin.motion, contact=contact)
+    slip.push(frames, **{"twist" if twin.motion == "twist" else "displacement": movement.path})
     x, y = io.pixel_axes(twin.shape[1:], (PIXEL, PIXEL))
-    return view.Slipped(search.result(), twin.truth, contact, stick_ratio, x, y)
+    return view.Slipped(slip.result(), twin.truth, contact, stick_ratio, x, y)
 
 
 # A slide to 0.9 of the distance at which the whole contact slips.
@@ -56,7 +56,7 @@ for name, found in (("slide", slid), ("twist", twisted)):
         for what, ratio in zip(("found", "true", "closed form"), radii, strict=True)
     )
     print(f"{name}: displacement within {error:.2f} µm RMS; of the contact's radius sticks: {ratios}")
-print(f"twist: {math.degrees(twisted.found.angle):.3f} degrees, true {-math.degrees(twist.path[-1]):.3f}")
+print(f"twist: {math.degrees(twisted.found.process["angle"]):.3f} degrees, true {-math.degrees(twist.path[-1]):.3f}")
 
 title = "Slip: a ball of 10 mm, friction 0.5 (black: contact; red: what sticks at the end)"
 view.slip_figure(slid, twisted, title, Path("slip.png"))

@@ -12,7 +12,7 @@ import numpy as np
 from scipy import ndimage
 
 from mirrorskin import engine, hw, io, view
-from mirrorskin.engine.rotation.rotation import correlate_source
+from mirrorskin.engine.lock_in import Correlation
 from mirrorskin.hw.twin import Camera, HeightMap, Leaning, Vertical
 from mirrorskin.io.positions import stroke_starts
 
@@ -45,20 +45,20 @@ twin, frames = simulate("sphere", Vertical(np.array(true)), references="exact")
 # Pixels that hardly turn bright, at the zenith where the wall begins, are crossed by noise.
 truth = np.where(twin.truth.zenith > math.radians(14), twin.truth.height, np.nan)
 reached = truth > -TRAVEL + BACKLASH
-search = engine.StrokeSearch(twin.shape[1:], twin.dtype, dark=twin.header.dark, bright=twin.header.bright)
+search = engine.Strokes(dark=twin.header.dark, bright=twin.header.bright)
 curve = []
 ends = stroke_starts(travel, 1)[::2].tolist()
 for start, stop in zip([0, *ends], ends, strict=False):
     search.push(frames[start:stop], travel=travel[start:stop])
-    onset = search.result().onset
+    onset = search.result()
     error = np.where(reached, onset.height - truth, np.nan)
-    curve.append((len(curve) + 1.0, rms(error), rms(np.where(np.isfinite(error), onset.sigma, np.nan))))
+    curve.append((len(curve) + 1.0, rms(error), rms(np.where(np.isfinite(error), onset.height_sigma, np.nan))))
 search.push(frames[ends[-1] :], travel=travel[ends[-1] :])
 strokes = search.result()
 x, y = io.pixel_axes(twin.shape[1:], twin.header.pixel_size)
 pressed = io.Result(
     height=strokes.onset.height,
-    height_sigma=strokes.onset.sigma,
+    height_sigma=strokes.onset.height_sigma,
     status=strokes.onset.status,
     hysteresis=strokes.hysteresis,
     hysteresis_sigma=strokes.hysteresis_sigma,
@@ -92,7 +92,7 @@ print(f"slope: RMS error {rms(error):.4f}, expected {rms(sigma):.4f}")
 # A press that dithers by 0.05 mm on a ball in elastic contact; without noise the area grows by `growth`.
 SWING, contact = 0.05, {"contact": "elastic", "references": "exact"}
 twin, _ = simulate("sphere", Vertical(1.0 + SWING * np.cos(math.tau / 7.3 * np.arange(74))), **contact)
-dithered = correlate_source(twin, dither=True)
+dithered = Correlation(dither=True).run(twin)
 noiseless = Camera(np.dtype(np.uint16), noise=0.0)
 twin, frames = simulate("sphere", Vertical(1.0 + SWING * np.array([-0.5, 0.5])), camera=noiseless, **contact)
 share = (frames - twin.header.dark.astype(float)) / (twin.header.bright - twin.header.dark)

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.cli.bench.records import Case, Target
-from mirrorskin.engine.live import RAISED, LiveEstimator, LivePress, LiveRotation, Loop, Status, Update
+from mirrorskin.engine import Press, Rotation
+from mirrorskin.engine.live import RAISED, LiveOperation, Loop, Status, Update
 from mirrorskin.io import Block, Header
 from mirrorskin.io.types import Closing, Floats
 from mirrorskin.kernels.device import Device
@@ -175,9 +176,9 @@ def run_rotation(case: LiveCase, device: Device, quick: bool) -> Case:
         case.count,
     )
     noise = math.hypot(noise, 1 / math.sqrt(12))
-    estimator = LiveRotation(source, window=STEPS, noise=noise, device=device)
-    ran = _run(source, estimator)
-    best, height = estimator.result().height, ran.last.height
+    operation = LiveOperation(source, Rotation(window_frames=STEPS, noise=noise, device=device))
+    ran = _run(source, operation)
+    best, height = operation.result().height, ran.last.height
     assert best is not None
     assert height is not None
     off = (height - best)[np.isfinite(best)].astype(np.float64)
@@ -189,15 +190,15 @@ def run_rotation(case: LiveCase, device: Device, quick: bool) -> Case:
     return Case(case.name, title, [], {}, (*_notes(ran), note), targets)
 
 
-def _run(source: Paced, estimator: LiveOperation) -> Ran:
+def _run(source: Paced, operation: LiveOperation) -> Ran:
     last: list[Update] = []
 
     def keep(update: Update, status: Status) -> None:
         last[:] = [update]
 
-    estimator.warm()
+    operation.warm()
     load, begun = os.getloadavg()[0], time.monotonic()
-    status = Loop(source, estimator, on_update=keep).run()
+    status = Loop(source, operation, on_update=keep).run()
     return Ran(status, time.monotonic() - begun, last[0], load)
 
 

@@ -11,7 +11,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image, PointCloud2, PointField
 
 from mirrorskin import hw
-from mirrorskin.engine.live import LivePress, Loop
+from mirrorskin.engine.live import LiveOperation, Loop
 
 FRAME = "sensor"  # x right and y up in the picture, z towards the sensor
 ENCODINGS = {"uint8": "mono8", "uint16": "mono16", "float32": "32FC1"}
@@ -72,10 +72,10 @@ def main(rig_file, depth):
     try:
         with hw.open_rig(hw.load_rig(rig_file)) as rig:
             with hw.SweepScan(rig, hw.VerticalPlan(0.0, depth, speed=SPEED)) as scan:
-                estimator = LivePress(scan)
-                estimator.warm()
-                Loop(scan, estimator, on_update=node.show).run()
-            node.finish(estimator.result())
+                operation = LiveOperation(scan, engine.Press())
+                operation.warm()
+                Loop(scan, operation, on_update=node.show).run()
+            node.finish(operation.result())
     finally:
         node.destroy_node()
         rclpy.shutdown()

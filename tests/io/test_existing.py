@@ -137,7 +137,7 @@ def desk(tmp_path, monkeypatch):
 
 COMMANDS = [
     ["reconstruct", "press.h5"],
-    ["run", "mirrorskin.engine.press.onset:OnsetSearch", "press.h5"],
+    ["run", "mirrorskin.engine:Onset", "press.h5"],
     ["fuse", "press.h5", "press.h5"],
     ["stitch", "res.h5", "res.h5"],
     ["correlate", "press.h5"],

@@ -13,7 +13,7 @@ from rotations import EIGHTHS, TILT
 from stacks import MadeUp
 
 from mirrorskin import engine, hw, io
-from mirrorskin.engine.live import LiveRotation
+from mirrorskin.engine.live import LiveOperation
 from mirrorskin.engine.rotation.registration import Registered, Sight
 from mirrorskin.engine.rotation.rotation import FirstTurn
 from mirrorskin.engine.streaming import push_block
@@ -171,7 +171,7 @@ def test_a_uniform_pattern_leaves_the_wave_alone():
 
 def test_live_normals_are_those_of_the_calibration():
     source = scene().source()
-    live = LiveRotation(source, window=8, noise=1.05, edges=False)
+    live = LiveOperation(source, engine.Rotation(window_frames=8, noise=1.05))
     push_block(live, source.read(np.empty_like(scene().frames)))
     assert np.isfinite(live.maps()["normals"]).any()
     result = live.result()
