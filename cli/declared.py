@@ -19,7 +19,7 @@ import click
 from mirrorskin.cli.groups import MOTIONS, Command, ExistingPath, MotionOption, for_motions
 
 if TYPE_CHECKING:
-    from mirrorskin.engine.options import Configured, Option
+    from mirrorskin.engine.options import Option
 
 _CLASS = re.compile(r".+:[A-Za-z_]\w*")
 _LOADED = "mirrorskin.cli.declared"  # key of a context's class and its options
@@ -211,7 +211,7 @@ class ClassCommand(Command):
             message = f"{name} has no option {error.option_name}. Its options are {flags}"
             raise click.UsageError(message, ctx) from None
 
-    def _load(self, name: str) -> tuple[type[Configured], list[DeclaredOption]]:
+    def _load(self, name: str) -> tuple[type[Any], list[DeclaredOption]]:
         """Return the class with this name, and its options."""
         from mirrorskin.engine.running import load_operation
         from mirrorskin.io import InputError
@@ -247,7 +247,7 @@ class ClassCommand(Command):
                 formatter.write_text(f"{kind.__name__}: {purpose}")
 
 
-def terms_of(kinds: Mapping[str, type[Configured]]) -> list[Term]:
+def terms_of(kinds: Mapping[str, type[Any]]) -> list[Term]:
     """Return the options of classes, by the motion that each is for; those of one name become one.
 
     A class with the motion ``""`` is for any motion.
@@ -308,7 +308,7 @@ def declarations() -> dict[str, list[dict[str, Any]]]:
     from mirrorskin.engine.lock_in import Correlation
     from mirrorskin.engine.reconstruction import method_for
 
-    methods: dict[str, type[Configured]] = {one: method_for(one) for one in MOTIONS}
+    methods: dict[str, type[Any]] = {one: method_for(one) for one in MOTIONS}
     fused = ("tilt", "zenith_gain", "zenith_offset", "robust")
     terms = {
         "reconstruct": terms_of(methods),

@@ -12,7 +12,7 @@ from msgspec import Meta, Struct, defstruct, field, structs
 from mirrorskin.cli.declared import Term, term_of
 from mirrorskin.cli.stack import STACK, stack_options
 from mirrorskin.engine.batch.jobs import TABLES, Plan
-from mirrorskin.engine.options import Configured, Option
+from mirrorskin.engine.options import Option
 from mirrorskin.engine.reconstruction import method_for
 from mirrorskin.engine.rotation.tilt import check_tilt
 from mirrorskin.engine.running import load_operation
@@ -31,7 +31,7 @@ def read_settings(path: Path | None, memory_limit: int) -> Plan:
     """Read what a batch does with every recording."""
     if path is None:
         return Plan(memory_limit=memory_limit)
-    kinds: dict[str, type[Configured]] = {table: method_for(motion) for motion, table in TABLES.items()}
+    kinds: dict[str, type[Any]] = {table: method_for(motion) for motion, table in TABLES.items()}
     if operation := _operation_of(path):
         try:
             kinds = {"operation": load_operation(operation)}
@@ -70,7 +70,7 @@ def _operation_of(path: Path) -> str:
     return f"{Path(place).resolve() if place.endswith('.py') else place}:{name}"
 
 
-def _table(name: str, kind: type[Configured]) -> type[Struct]:
+def _table(name: str, kind: type[Any]) -> type[Struct]:
     """Return the model of a table with the options of a class."""
     fields = [(one.name, _type(one) | None, None) for one in kind.options.values() if not one.python_only]
     if name == "operation":
@@ -104,7 +104,7 @@ def _given(table: Struct) -> dict[str, Any]:
     return {name: value for name, value in structs.asdict(table).items() if value is not None}
 
 
-def _options(values: Mapping[str, Any], kind: type[Configured], where: str) -> dict[str, Any]:
+def _options(values: Mapping[str, Any], kind: type[Any], where: str) -> dict[str, Any]:
     """Return options in their units, checked."""
     found = {}
     for name, value in values.items():

@@ -40,21 +40,21 @@ class Focus(Operation):
     on_device = True
 
     noise: float | None = option(
-        None,
-        "counts",
+        default=None,
+        unit="counts",
         within=(0, None),
         help="standard deviation of a sample; it must be specified",
     )
     radius: int = option(
-        4,
-        "pixels",
+        default=4,
+        unit="pixels",
         within=(1, 50),
         help="half of the window's side: sharpness is that of N = (2 radius + 1)^2 pixels, fewer at the"
         " picture's border",
     )
     reach: int = option(
-        2,
-        "frames",
+        default=2,
+        unit="frames",
         within=(1, 50),
         help="frames on each side of the sharpest one that the peak is fitted to, as far as there are any",
     )

@@ -57,8 +57,8 @@ class Fringes(Operation):
     on_device = long_blocks = True
 
     noise: ArrayLike | None = option(
-        None,
-        "counts",
+        default=None,
+        unit="counts",
         map=True,
         within=(0, None),
         help="standard deviation of a sample, a number or a map (H, W)",

@@ -27,8 +27,8 @@ class Correlation(Method, options_of=(Correlate,)):
     """Mean, cosine and sine of the phase in each pixel's brightness, over all frames of a recording."""
 
     frequency: float | Literal["estimate"] | None = option(
-        None,
-        "Hz",
+        default=None,
+        unit="Hz",
         above=0,
         words=("estimate",),
         help="frequency, or estimate it: the phase is 2 pi times frequency times the time since the first"
@@ -36,10 +36,14 @@ class Correlation(Method, options_of=(Correlate,)):
         shown_default="the phase of the source",
     )
     frame_rate: float | None = option(
-        None, "frames/s", above=0, help="frames per second", shown_default="the times of the source"
+        default=None,
+        unit="frames/s",
+        above=0,
+        help="frames per second",
+        shown_default="the times of the source",
     )
     dither: bool = option(
-        False,
+        default=False,
         help="the phase is that of the travel of a press that dithers, and the growth of the contact is"
         " added; see `mirrorskin.engine.Growth`",
     )

@@ -16,8 +16,10 @@ from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.io import Calibrated, InputError, Result
 
 if TYPE_CHECKING:
+    from mirrorskin.engine.options import Option
     from mirrorskin.io import Source
     from mirrorskin.io.types import ProcessValue
+    from mirrorskin.kernels.device import Device
 
 
 @dataclass(frozen=True)
@@ -95,15 +97,26 @@ class Plan:
         return attach_provenance(result, source, device, dict(result.process))
 
 
-class Method(OnDevice):
+if TYPE_CHECKING:  # type checkers do not know the options of `options_of`
+
+    class _Options:
+        options: ClassVar[Mapping[str, Option]]
+        device: Device
+
+        def __init_subclass__(cls, options_of: Sequence[type[Configured]] = ()) -> None: ...
+
+        def __init__(self, **options: Any) -> None: ...
+
+        def __getattr__(self, name: str) -> Any: ...
+else:
+    _Options = OnDevice
+
+
+class Method(_Options):
     """Base of methods. Their options are those of their operations and steps."""
 
     motions: ClassVar[tuple[str, ...]] = ()
     """Motions of recordings that the method applies to; none for all."""
-
-    if TYPE_CHECKING:  # the options of `options_of`
-
-        def __getattr__(self, name: str) -> Any: ...
 
     def plan(self, source: Source) -> Plan:
         """Return what is done with a source: its operation, steps and frames."""
@@ -151,7 +164,7 @@ class Method(OnDevice):
 
     def make(self, kind: Callable[..., Any], **changes: Any) -> Any:
         """Return an operation or step with this method's values of its options."""
-        return kind(**{**self.part(kind), **changes})  # type: ignore[arg-type]
+        return kind(**{**self.part(kind), **changes})
 
 
 def undistorted(result: Result, source: Source) -> Result:

@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cached_property, wraps
-from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, Protocol, Self, cast
+from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, Protocol, Self, cast, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -39,29 +39,39 @@ class _DeviceOption(Option):
         vars(holder)["_device"] = value
 
     def stored(self, holder: object) -> Any:
-        return vars(holder).get("device", vars(holder)["_device"])
+        return vars(holder).get("_opened_device", vars(holder)["_device"])
 
-    def __get__(self, holder: object, owner: type) -> Any:
+    @overload
+    def __get__(self, holder: None, owner: type) -> Option: ...
+
+    @overload
+    def __get__(self, holder: object, owner: type) -> Device: ...
+
+    def __get__(self, holder: object | None, owner: type) -> Any:
         if holder is None:
             return self
-        vars(holder)["device"] = opened = open_device(vars(holder)["_device"])
-        return opened
+        if "_opened_device" not in vars(holder):
+            vars(holder)["_opened_device"] = open_device(vars(holder)["_device"])
+        return vars(holder)["_opened_device"]
+
+    def __set__(self, holder: object, value: str | Device | None) -> None:
+        raise AttributeError("options are read-only: use with_options(device=...)")
 
 
-_device = option(
-    None, help="device to compute on; see `mirrorskin.kernels.device.open_device`", python_only=True
+_device: Option = option(
+    default=None, help="device to compute on; see `mirrorskin.kernels.device.open_device`", python_only=True
 )
 
 
 class OnDevice(Configured):
     """What has a device: the attribute is opened on first use."""
 
-    device: Device = cast(Any, _DeviceOption(**{**vars(_device), "name": "device"}))
+    device: _DeviceOption = _DeviceOption(**{**vars(_device), "name": "device"})
 
     @property
     def opened_device(self) -> Device | None:
         """The device, if it has been used."""
-        return vars(self).get("device")
+        return vars(self).get("_opened_device")
 
 
 class Operation(ThreadSafe, OnDevice):
@@ -84,7 +94,7 @@ class Operation(ThreadSafe, OnDevice):
     Examples
     --------
     >>> class Brightest(Operation):
-    ...     least: float = option(0.0, "counts", help="counts below which a pixel is 0")
+    ...     least: float = option(default=0.0, unit="counts", help="counts below which a pixel is 0")
     ...     brightest = Map("largest brightness", "counts")
     ...     def start(self, shape, dtype):
     ...         self.most = np.zeros(shape)
@@ -99,7 +109,7 @@ class Operation(ThreadSafe, OnDevice):
     """
 
     memory_limit: int = option(
-        MEMORY_LIMIT,
+        default=MEMORY_LIMIT,
         help="bytes of host memory for frames that are read ahead",
         within=(1, None),
         python_only=True,
@@ -113,7 +123,7 @@ class Operation(ThreadSafe, OnDevice):
     """Frames that a result needs."""
     maps: ClassVar[Mapping[str, Map]] = {}
     """The declared maps by name."""
-    positions: Mapping[str, bool] = {}
+    positions: ClassVar[Mapping[str, bool]] = {}
     """What ``push`` takes of each frame, and whether it needs it; an object's may depend on its options."""
     on_device: ClassVar[bool] = False
     """Whether frames are read for the device: ahead, or where kernels can read them without a copy."""

@@ -143,9 +143,9 @@ class Option:
 
 
 def option(
+    *,
     default: Any,
     unit: str = "",
-    *,
     help: str,  # noqa: A002  # the name that argparse and click use
     within: tuple[float | None, float | None] = (None, None),
     above: float | None = None,
@@ -192,7 +192,7 @@ def option(
     Examples
     --------
     >>> class Crossing(Configured):
-    ...     threshold: float = option(0.5, "share", within=(0, 1), help="level that counts as bright")
+    ...     threshold: float = option(default=0.5, unit="share", within=(0, 1), help="level of light")
     >>> Crossing(threshold=0.25).threshold, Crossing().threshold
     (0.25, 0.5)
     >>> Crossing(threshold=2)
@@ -274,7 +274,6 @@ class Configured:
     def part(self, kind: type[Configured]) -> dict[str, Any]:
         """Return the values of the options that another class has as well."""
         return {name: one.stored(self) for name, one in self.options.items() if name in kind.options}
-
 
 
 def signature_of(

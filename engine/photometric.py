@@ -46,42 +46,42 @@ class PhotometricStereo(Operation):
     on_device = True
 
     light: ArrayLike | None = option(
-        None,
+        default=None,
         help="vectors towards the lamp of each frame, (T, 3): x to the right, y up, z to the camera, as long"
         " as the lamp is bright",
         shown_default="a lamp at `zenith` whose azimuth is the phase of the frame",
         python_only=True,
     )
     zenith: float | None = option(
-        None,
-        "rad",
+        default=None,
+        unit="rad",
         above=0,
         within=(None, np.pi / 2),
         help="angle between the direction of the lamp and that of the camera; needed without `light`",
     )
     dark: ArrayLike | None = option(
-        None,
-        "counts",
+        default=None,
+        unit="counts",
         map=True,
         help="brightness without a lamp, a number or a map (H, W)",
         shown_default="that of the recording or calibration; of arrays, 0",
     )
     bright: float | None = option(
-        None,
-        "counts",
+        default=None,
+        unit="counts",
         above=0,
         help="brightness from which on a sample is saturated, and left out",
         shown_default="the greatest value of an integer type",
     )
     shadow: float = option(
-        0.0,
-        "counts",
+        default=0.0,
+        unit="counts",
         within=(0, None),
         help="brightness above dark up to which a sample is in shadow, and left out: 4 times the noise",
     )
     noise: ArrayLike | None = option(
-        None,
-        "counts",
+        default=None,
+        unit="counts",
         map=True,
         within=(0, None),
         help="standard deviation of a sample, a number or a map (H, W)",
@@ -100,7 +100,7 @@ class PhotometricStereo(Operation):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self.positions = {} if self.light is not None else {"phase": True}
+        self.positions = {} if self.light is not None else {"phase": True}  # type: ignore[misc]
 
     def configured_for(self, source: Source) -> Self:
         """Return the operation with the source's dark level, if none is specified."""

@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Protocol
 
 from mirrorskin.engine.operation import Operation
 from mirrorskin.io import Block, InputError, Source
 
 Progress = Callable[[int], None]
+
+
+class Receiver(Protocol):
+    """What frames are pushed into: an operation, offline or live."""
+
+    @property
+    def positions(self) -> Mapping[str, bool]:
+        """What ``push`` takes of each frame, and whether it needs it."""
+
+    def push(self, *args: Any, **kwargs: Any) -> None:
+        """Take in the next frames."""
 
 
 def feed(
@@ -68,7 +80,7 @@ def _feed_once(source: Source, operation: Operation, frames: range, progress: Pr
             progress(done)
 
 
-def push_block(operation: Operation, block: Block, part: slice = slice(None)) -> None:
+def push_block(operation: Receiver, block: Block, part: slice = slice(None)) -> None:
     """Push what a source yields, or a part of it: frames and what the operation needs of each."""
     given = {}
     for name, needed in operation.positions.items():

@@ -43,9 +43,7 @@ def true_force(twin):
 
 # The gel: how far ahead of the contact pixels turn bright, learned from two balls of known diameter.
 balls = {4: press(4, 1.2, 0), 8: press(8, 1.2, 1)}
-gel = fit_gel(
-    [ball_onset(Press(fill=False).run(twin), twin, size / 2) for size, twin in balls.items()]
-).gel
+gel = fit_gel([ball_onset(Press(fill=False).run(twin), twin, size / 2) for size, twin in balls.items()]).gel
 camera = io.CameraId("", (SIZE, SIZE), np.dtype(balls[4].dtype))
 known = io.Calibration(camera, gel=gel)
 

@@ -56,7 +56,8 @@ for name, found in (("slide", slid), ("twist", twisted)):
         for what, ratio in zip(("found", "true", "closed form"), radii, strict=True)
     )
     print(f"{name}: displacement within {error:.2f} µm RMS; of the contact's radius sticks: {ratios}")
-print(f"twist: {math.degrees(twisted.found.process["angle"]):.3f} degrees, true {-math.degrees(twist.path[-1]):.3f}")
+turned = math.degrees(twisted.found.process["angle"])
+print(f"twist: {turned:.3f} degrees, true {-math.degrees(twist.path[-1]):.3f}")
 
 title = "Slip: a ball of 10 mm, friction 0.5 (black: contact; red: what sticks at the end)"
 view.slip_figure(slid, twisted, title, Path("slip.png"))

@@ -14,7 +14,7 @@ class SteepestRise(engine.Operation):
 
     motions = ("vertical",)
 
-    least: float = engine.option(0.0, "counts", help="rise above which there is a height")
+    least: float = engine.option(default=0.0, unit="counts", help="rise above which there is a height")
 
     height = TABLE["height"]
     rise = io.Map("largest rise of the brightness", "counts")

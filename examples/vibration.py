@@ -52,20 +52,12 @@ for start, stop in zip([0, *ends], ends, strict=False):
     search.push(frames[start:stop], travel=travel[start:stop])
     onset = search.result()
     error = np.where(reached, onset.height - truth, np.nan)
-    curve.append((len(curve) + 1.0, rms(error), rms(np.where(np.isfinite(error), onset.height_sigma, np.nan))))
+    curve.append(
+        (len(curve) + 1.0, rms(error), rms(np.where(np.isfinite(error), onset.height_sigma, np.nan)))
+    )
 search.push(frames[ends[-1] :], travel=travel[ends[-1] :])
-strokes = search.result()
 x, y = io.pixel_axes(twin.shape[1:], twin.header.pixel_size)
-pressed = io.Result(
-    height=strokes.onset.height,
-    height_sigma=strokes.onset.height_sigma,
-    status=strokes.onset.status,
-    hysteresis=strokes.hysteresis,
-    hysteresis_sigma=strokes.hysteresis_sigma,
-    strokes=strokes.onsets,
-    x=x,
-    y=y,
-)
+pressed = search.result().assign(x=x, y=y)
 lag = 1000 * float(np.nanmean(pressed.hysteresis[np.isfinite(truth)]))
 count, found, expected = (round(curve[-1][0]), 1000 * curve[-1][1], 1000 * curve[-1][2])
 print(f"height after {count} strokes: RMS error {found:.1f} µm, expected {expected:.1f} µm")

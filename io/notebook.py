@@ -153,10 +153,10 @@ def _as_picture(dataset: xarray.Dataset) -> xarray.Dataset:
         if places.ndim == 1 and len(places) > 1 and np.all(sign * np.diff(places) < 0):
             dataset = dataset.isel({name: slice(None, None, -1)})
     swapped = {"x": "y", "y": "x"}
-    for name, variable in dataset.data_vars.items():
+    for label, variable in dataset.data_vars.items():
         names = [str(one) for one in variable.dims]
         if {"x", "y"} <= {*names} and names.index("x") < names.index("y"):
-            dataset = dataset.assign({name: variable.transpose(*(swapped.get(one, one) for one in names))})
+            dataset = dataset.assign({label: variable.transpose(*(swapped.get(one, one) for one in names))})
     return dataset
 
 

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.slip.search import Slip
-from mirrorskin.io import InputError, Truth
+from mirrorskin.io import InputError, Result, Truth
 from mirrorskin.io.types import Floats
 from mirrorskin.view.canvas import draw_image, extent, new_figure, save_figure
 from mirrorskin.view.colours import DIVERGING, ERROR, SEQUENTIAL
@@ -28,7 +27,8 @@ class Slipped:
 
     Attributes
     ----------
-    found : Slip
+    found : Result
+        The maps of `mirrorskin.engine.slip.Slip`.
     truth : Truth
         Truth with displacement and slip_onset.
     contact : ndarray, (H, W), bool
@@ -39,7 +39,7 @@ class Slipped:
         mm.
     """
 
-    found: Slip
+    found: Result
     truth: Truth
     contact: NDArray[np.bool_]
     closed: Floats
@@ -60,7 +60,8 @@ class Slipped:
     @property
     def onset_error(self) -> Floats:
         """Estimated onset minus the true one, (H, W); NaN where either sticks."""
-        return self.found.slip_onset - self.onset
+        error: Floats = self.found.slip_onset - self.onset
+        return error
 
     @property
     def displacement_error(self) -> Floats:
@@ -70,10 +71,18 @@ class Slipped:
         return error
 
     @property
+    def distance(self) -> Floats:
+        """Distance that the body has slid, mm, or angle that it has turned, radians, in each frame, (T,)."""
+        distance = (
+            self.found.slide_distance if self.found.slide_distance is not None else self.found.twist_angle
+        )
+        return np.asarray(distance, np.float64)
+
+    @property
     def true_ratio(self) -> Floats:
         """True share of the contact that sticks, (T,)."""
         onset = self.onset[self.contact]
-        return np.array([1 - np.mean(onset <= way) for way in self.found.way])
+        return np.array([1 - np.mean(onset <= distance) for distance in self.distance])
 
 
 def slip_figure(slid: Slipped, twisted: Slipped, title: str, path: Path) -> None:
@@ -146,10 +155,10 @@ def _outline(axes: Axes, slid: Slipped) -> None:
 
 
 def _draw_stick_ratio(axes: Axes, slid: Slipped, scale: float, label: str, theory: str) -> None:
-    way = scale * slid.found.way
-    axes.plot(way, slid.closed, color="0.6", lw=3, label=theory)
-    axes.plot(way, slid.true_ratio, color="tab:red", lw=1, label="truth of the twin")
-    axes.plot(way, slid.found.stick_ratio, "o", ms=4, label="found")
+    distance = scale * slid.distance
+    axes.plot(distance, slid.closed, color="0.6", lw=3, label=theory)
+    axes.plot(distance, slid.true_ratio, color="tab:red", lw=1, label="truth of the twin")
+    axes.plot(distance, slid.found.stick_ratio, "o", ms=4, label="estimated")
     axes.set(xlabel=label, ylabel="share of the contact that sticks", ylim=(0, 1.05), title="stick ratio")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)

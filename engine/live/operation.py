@@ -96,8 +96,8 @@ class LiveOperation(ThreadSafe):
                 found = self.operation.preview(seconds)
         except InputError:
             return {}
-        quantity = found.name_of if isinstance(found, Result) else lambda name: name
-        maps = {name: found.get(quantity(name)) for name in _SHOWN}
+        names = {name: found.name_of(name) or name for name in _SHOWN} if isinstance(found, Result) else {}
+        maps = {name: found.get(names.get(name, name)) for name in _SHOWN}
         if maps["offset_unknown"] is not None:  # of each piece, or of all
             maps["offset_unknown"] = bool(np.any(maps["offset_unknown"]))
         contact, size = maps["contact"], self._source.header.pixel_size

@@ -38,28 +38,28 @@ class PressOperation(Operation):
     on_device = long_blocks = True
 
     hold: int = option(
-        2,
-        "frames",
+        default=2,
+        unit="frames",
         within=(1, np.iinfo(np.int32).max),
         help="consecutive light frames that confirm an onset, or dark frames that confirm a release",
     )
     dark: ArrayLike | None = option(
-        None,
-        "counts",
+        default=None,
+        unit="counts",
         map=True,
         help="brightness without light, a number or a map (H, W)",
         shown_default="that of the recording or calibration; of arrays, the least value of their type",
     )
     bright: ArrayLike | None = option(
-        None,
-        "counts",
+        default=None,
+        unit="counts",
         map=True,
         help="brightness with full light, a number or a map (H, W)",
         shown_default="that of the recording or calibration; of arrays, the greatest value of their type",
     )
     noise: float | None = option(
-        None,
-        "counts",
+        default=None,
+        unit="counts",
         within=(0, None),
         help="standard deviation of a sample",
         shown_default="estimated from the first two frames",
@@ -75,7 +75,7 @@ class CrossingOperation(PressOperation):
     """Base of operations that search for threshold crossings."""
 
     subframe: bool = option(
-        True,
+        default=True,
         help="interpolate between the frames around the event; without it, the paper's equation 4 as printed",
     )
 

@@ -68,13 +68,13 @@ class Growth(CorrelationOperation):
     dark: ArrayLike | None = PressOperation.dark
     bright: ArrayLike | None = PressOperation.bright
     pixel_size: tuple[float, float] | None = option(
-        None,
+        default=None,
         help="size of a pixel along x and y, mm, for the growth of the area",
         shown_default="that of the recording",
         python_only=True,
     )
     dither: TravelWave | None = option(
-        None,
+        default=None,
         help="first harmonic of the travel, if it is known beforehand",
         shown_default="estimated from the travel of all frames in a first pass",
         python_only=True,

@@ -32,8 +32,8 @@ class Levels(ThresholdOperation):
     """
 
     thresholds: Sequence[float] = option(
-        None,
-        "share",
+        default=None,
+        unit="share",
         within=(0, 1),
         several=True,
         help="shares of the range from dark to bright, from the lowest to the highest, for a wall with"
@@ -41,8 +41,8 @@ class Levels(ThresholdOperation):
         shown_default="one threshold",
     )
     inclinations: Sequence[float] = option(
-        None,
-        "rad",
+        default=None,
+        unit="rad",
         within=(0, None),
         several=True,
         help="inclination of the sheet at which each of the thresholds is passed",

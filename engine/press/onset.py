@@ -23,7 +23,7 @@ class ThresholdOperation(CrossingOperation):
     """Base of operations that search for one event at one or several thresholds."""
 
     event: Event = option(
-        "onset",
+        default="onset",
         choices=("onset", "release"),
         help="event to find: dark to light while travel increases, or light to dark while it decreases",
     )
@@ -90,21 +90,21 @@ class Onset(ThresholdOperation):
     """
 
     threshold: float = option(
-        0.5,
-        "share",
+        default=0.5,
+        unit="share",
         within=(0, 1),
         help="share of the range from dark to bright at which a pixel counts as light",
     )
     dark_sigma: float = option(
-        0.0,
-        "counts",
+        default=0.0,
+        unit="counts",
         within=(0, None),
         help="standard deviation of the pixels' own dark levels about `dark`",
         python_only=True,
     )
     bright_sigma: float = option(
-        0.0,
-        "counts",
+        default=0.0,
+        unit="counts",
         within=(0, None),
         help="standard deviation of the pixels' own bright levels about `bright`",
         python_only=True,

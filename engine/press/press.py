@@ -38,8 +38,8 @@ class Elastomer(Step):
 
     threshold: float = Onset.threshold
     modulus: float | None = option(
-        None,
-        "MPa",
+        default=None,
+        unit="MPa",
         above=0,
         help="Young's modulus, for pressure and force; forces also need the calibration's gel",
         shown_default="that of the calibration",
@@ -98,7 +98,7 @@ class HoleFilling(Step):
     """Fill holes, such as flat tops, which never turn light; see `mirrorskin.engine.fill_holes`."""
 
     fill: bool = option(
-        True,
+        default=True,
         help="fill holes, such as flat tops, which never turn light, if the pixel size is known; they are"
         " marked in `filled`, and have no standard deviation",
     )
@@ -134,7 +134,7 @@ class Press(Method, options_of=(Onset, Levels, Elastomer, HoleFilling)):
     motions = ("vertical",)
 
     method: PressMethod = option(
-        "threshold",
+        default="threshold",
         choices=("threshold", "change-point"),
         help="first crossing of the threshold, or most likely change",
     )
@@ -217,7 +217,7 @@ class Press(Method, options_of=(Onset, Levels, Elastomer, HoleFilling)):
 
     def _lowest(self, operation: PressOperation) -> float:
         """Return the threshold that heights belong to."""
-        return self.thresholds[0] if isinstance(operation, Levels) else self.threshold
+        return float(self.thresholds[0] if isinstance(operation, Levels) else self.threshold)
 
 
 def _with_levels(

@@ -127,14 +127,14 @@ class Correlate(CorrelationOperation):
     """
 
     harmonic: int = option(
-        1,
+        default=1,
         within=(1, None),
         help="multiple of the phase that is fitted: alpha is this multiple. Other multiples do not contribute"
         " if the phases are evenly spaced over whole turns",
     )
     window_frames: int | None = option(
-        None,
-        "frames",
+        default=None,
+        unit="frames",
         within=(3, WINDOW),
         help=f"number of the last frames that are fitted, 3 to {WINDOW}: a turn of an endless rotation",
         shown_default="all frames",

@@ -70,10 +70,13 @@ class LastTurn(Normals):
     updates_per_second = math.inf
 
     pixel_size: tuple[float, float] | None = option(
-        None, help="pixel size along x and y, mm, for heights", python_only=True
+        default=None, help="pixel size along x and y, mm, for heights", python_only=True
     )
     press: float | None = option(
-        None, "mm", help="distance by which the body is lowered, for a calibrated response", python_only=True
+        default=None,
+        unit="mm",
+        help="distance by which the body is lowered, for a calibrated response",
+        python_only=True,
     )
 
     def configured_for(self, source: Source) -> Self:
@@ -182,10 +185,12 @@ class LastTurn(Normals):
 
     def _plane(self, phase: float) -> NDArray[Any]:
         """Return a frame of a plane whose zenith is in the middle of the visible range."""
-        gain, offset, tilt = self.zenith_gain, self.zenith_offset, self.tilt
-        swing = 1.0 if gain is None or tilt is None or isinstance(tilt, str) else gain * np.asarray(tilt)
-        level = 0.0 if offset is None else offset + (0.5 if gain is None else 0.5 * np.asarray(gain))
-        ends = [one for one in (self.dark, self.bright) if one is not None]
+        gain = None if self.zenith_gain is None else np.asarray(self.zenith_gain, np.float64)
+        tilt = None if self.tilt is None or isinstance(self.tilt, str) else np.asarray(self.tilt, np.float64)
+        swing = 1.0 if gain is None or tilt is None else gain * tilt
+        offset = np.asarray(0.0 if self.zenith_offset is None else self.zenith_offset, np.float64)
+        level = offset if self.zenith_offset is None else offset + (0.5 if gain is None else 0.5 * gain)
+        ends = [np.asarray(one, np.float64) for one in (self.dark, self.bright) if one is not None]
         if len(ends) == 2:
             level = np.mean(np.stack(np.broadcast_arrays(*ends)), axis=0)
         most = np.iinfo(self.dtype).max if self.dtype.kind == "u" else np.inf

@@ -56,15 +56,16 @@ class NormalsOperation(SensorOptions, Operation):
     on_device = True
 
     longest: int | None = option(
-        None,
-        "frames",
+        default=None,
+        unit="frames",
         within=(1, LONGEST),
         help=f"number of frames of the longest turn, up to {LONGEST}, for which memory is reserved",
         shown_default=f"that of the recording, otherwise {LONGEST}",
         python_only=True,
     )
     per_turn: bool = option(
-        False, help="return each turn alone, in maps with a leading axis, instead of the mean over turns"
+        default=False,
+        help="return each turn alone, in maps with a leading axis, instead of the mean over turns",
     )
 
     normals = TABLE["normals"]
@@ -348,25 +349,25 @@ class Normals(NormalsOperation):
     """
 
     tilt: ArrayLike | None = option(  # of `estimate_normals`, an array is one of each frame
-        None,
-        "rad",
+        default=None,
+        unit="rad",
         words=("estimate",),
         help="half-angle of the precession, or estimate it from the first turn; the estimate is wrong if the"
         " pivot is far from the surface",
         shown_default="that of the recording",
     )
     method: NormalMethod = option(
-        "exact", choices=NORMAL_METHODS, help="most likely normals, or the paper's equations 14 to 22"
+        default="exact", choices=NORMAL_METHODS, help="most likely normals, or the paper's equations 14 to 22"
     )
     response: Response | None = option(
-        None,
+        default=None,
         help="calibrated response of a sensor that is not linear, used instead of the zenith's gain and"
         " offset and of dark and bright; see mirrorskin.engine.rotation.response",
         python_only=True,
     )
     window_frames: int | None = option(
-        None,
-        "frames",
+        default=None,
+        unit="frames",
         within=(3, WINDOW),
         help=f"number of the last frames that are used, 3 to {WINDOW}: one turn of an endless rotation. Noise"
         " and tilt are estimated from the first of these turns",

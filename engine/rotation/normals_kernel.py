@@ -41,38 +41,38 @@ class SensorOptions(Configured):
     """Options of operations that estimate normals: what is known of the sensor."""
 
     zenith_gain: ArrayLike | None = option(
-        None,
-        "counts/rad",
+        default=None,
+        unit="counts/rad",
         map=True,
         help="brightness per zenith angle, a number or a map (H, W); negative if steeper is darker",
         shown_default="that of the recording or calibration",
     )
     zenith_offset: ArrayLike | None = option(
-        None,
-        "counts",
+        default=None,
+        unit="counts",
         map=True,
         help="brightness at zenith 0, a number or a map (H, W)",
         shown_default="that of the recording or calibration, otherwise 0",
     )
     dark: ArrayLike | None = option(
-        None,
-        "counts",
+        default=None,
+        unit="counts",
         map=True,
         help="lowest brightness that is linear in the zenith, a number or a map (H, W); samples that are"
         " expected to be darker are left out",
         shown_default="that of the recording or calibration, otherwise none",
     )
     bright: ArrayLike | None = option(
-        None,
-        "counts",
+        default=None,
+        unit="counts",
         map=True,
         help="highest brightness that is linear in the zenith, a number or a map (H, W); samples that are"
         " expected to be brighter are left out",
         shown_default="that of the recording or calibration, otherwise none",
     )
     noise: float | None = option(
-        None,
-        "counts",
+        default=None,
+        unit="counts",
         above=0,
         help="standard deviation of a sample",
         shown_default="estimated from the residuals of the first turn, as read noise and shot noise",

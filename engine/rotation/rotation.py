@@ -63,7 +63,7 @@ class Rotation(Method, options_of=(NormalsOperation, Integration)):
     method: NormalMethod = Normals.method
     tilt: ArrayLike | None = Normals.tilt
     heights: Any = option(
-        None,
+        default=None,
         file="RES.h5",
         help="heights of the surface, mm, by which frames are registered for the shift of the pivot; under a"
         " calibrated response they are found in a first pass over the source otherwise",

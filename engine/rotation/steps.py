@@ -62,7 +62,7 @@ class Integration(Step):
     """
 
     robust: bool = option(
-        False,
+        default=False,
         help="let the surface break at discontinuities that are found in it; they are drawn as edges, too",
     )
 

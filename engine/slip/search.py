@@ -80,41 +80,46 @@ class Slip(Operation):
     on_device = True
 
     contact: Maps | None = option(
-        None,
+        default=None,
         file="RES.h5",
         help="where the skin touches the object in the first frame: the result of a press, or a map that is"
         " not 0 there. A pressure determines contact; heights alone are those of light, which runs ahead of"
         " an elastic contact",
         shown_default="where the skin followed the object by half of its movement, 2 to 9 % too wide",
     )
-    per_frame: bool = option(False, help="return the displacement in each frame, not only in the last")
+    per_frame: bool = option(
+        default=False, help="return the displacement in each frame, not only in the last"
+    )
     window_size: int = option(
-        8, "pixels", within=(6, None), help="side of the windows in which the texture is followed"
+        default=8,
+        unit="pixels",
+        within=(6, None),
+        help="side of the windows in which the texture is followed",
     )
     window_step: int = option(
-        4, "pixels", within=(1, None), help="distance between the centres of adjacent windows"
+        default=4, unit="pixels", within=(1, None), help="distance between the centres of adjacent windows"
     )
     noise: float | None = option(
-        None,
-        "counts",
+        default=None,
+        unit="counts",
         above=0,
         within=(None, 1e9),
         help="standard deviation of a sample",
         shown_default="estimated from the residuals, window by window",
     )
     motion: Literal["horizontal", "twist"] = option(
-        "horizontal",
+        default="horizontal",
         choices=("horizontal", "twist"),
         help="motion of the body: a slide along the sheet, or a rotation about its axis; that of a source",
         python_only=True,
     )
     pixel_size: ArrayLike | None = option(
-        None,
+        default=None,
         help="millimetres along x and y, one number or both; that of a source",
         python_only=True,
     )
     centre: tuple[float, float] = option(
-        (0.0, 0.0),
+        default=(0.0, 0.0),
         help="where the body's axis is, mm from the centre of the frames along x and y; that of a source",
         python_only=True,
     )
@@ -129,7 +134,7 @@ class Slip(Operation):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self._position = "displacement" if self.motion == "horizontal" else "twist"
-        self.positions = {self._position: True}
+        self.positions = {self._position: True}  # type: ignore[misc]
 
     @property
     def declarations(self) -> Mapping[str, Map]:

@@ -15,8 +15,8 @@ class Traction(Step):
     """Traction and force along the sheet, if Young's modulus is known."""
 
     modulus: float | None = option(
-        None,
-        "MPa",
+        default=None,
+        unit="MPa",
         above=0,
         help="Young's modulus, for traction and the force along the sheet",
         shown_default="that of the calibration",

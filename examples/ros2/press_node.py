@@ -10,7 +10,7 @@ import rclpy
 from rclpy.node import Node
 from sensor_msgs.msg import Image, PointCloud2, PointField
 
-from mirrorskin import hw
+from mirrorskin import engine, hw
 from mirrorskin.engine.live import LiveOperation, Loop
 
 FRAME = "sensor"  # x right and y up in the picture, z towards the sensor

@@ -270,7 +270,7 @@ import numpy as np
 from mirrorskin import engine, io
 
 class Wear(engine.Operation):
-    travel_offset: float = engine.option(0.0, "mm", help="added to each travel")
+    travel_offset: float = engine.option(default=0.0, unit="mm", help="added to each travel")
     wear = io.Map("depth of the wear", "mm", quantity="height")
 
     def start(self, shape, dtype):

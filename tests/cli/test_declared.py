@@ -21,18 +21,20 @@ def test_the_copy_of_the_declarations_is_up_to_date():
 
 
 class Onsets(Configured):
-    threshold: float = option(0.5, "share", within=(0, 1), help="level")
-    noise: float = option(None, "counts", help="noise", shown_default="the first frames")
-    length: float = option(0.1, "mm", help="some length")
-    method: str = option("threshold", choices=("threshold", "change-point"), help="how onsets are found")
-    hidden: object = option(None, help="only in Python", python_only=True)
+    threshold: float = option(default=0.5, unit="share", within=(0, 1), help="level")
+    noise: float = option(default=None, unit="counts", help="noise", shown_default="the first frames")
+    length: float = option(default=0.1, unit="mm", help="some length")
+    method: str = option(
+        default="threshold", choices=("threshold", "change-point"), help="how onsets are found"
+    )
+    hidden: object = option(default=None, help="only in Python", python_only=True)
 
 
 class Turns(Configured):
-    noise: float = option(None, "counts", help="noise", shown_default="the first turn")
-    tilt: float = option(math.radians(2.5), "rad", words=("estimate",), help="half-angle")
-    method: str = option("exact", choices=("exact", "paper"), help="how normals are found")
-    robust: bool = option(False, help="keep breaks")
+    noise: float = option(default=None, unit="counts", help="noise", shown_default="the first turn")
+    tilt: float = option(default=math.radians(2.5), unit="rad", words=("estimate",), help="half-angle")
+    method: str = option(default="exact", choices=("exact", "paper"), help="how normals are found")
+    robust: bool = option(default=False, help="keep breaks")
 
 
 TERMS = {one.name: one for one in terms_of({"vertical": Onsets, "axial": Turns})}
@@ -51,7 +53,7 @@ def test_options_of_one_name_become_one_that_names_the_motions_where_they_differ
 
 def test_options_of_one_name_but_different_units_are_refused():
     class Other(Configured):
-        noise: float = option(None, "mm", help="noise")
+        noise: float = option(default=None, unit="mm", help="noise")
 
     with pytest.raises(TypeError, match="noise is declared with different kinds or units"):
         terms_of({"vertical": Onsets, "axial": Other})
@@ -80,7 +82,7 @@ def test_defaults_and_placeholders_are_written_as_on_the_command_line():
 )
 def test_values_are_read_in_the_unit_of_the_declaration(unit, text, value):
     class One(Configured):
-        x: float = option(None, unit, help="some value")
+        x: float = option(default=None, unit=unit, help="some value")
 
     assert term_of(One.options["x"]).read(text, "--x") == pytest.approx(value)
 

@@ -35,8 +35,8 @@ __kernel void above_mean(__global const FRAME *frames, const int count, const in
 class Mean(engine.Operation):
     """Height from the number of frames that are brighter than the mean of all."""
 
-    travel_offset: float = engine.option(0.0, "mm", within=(-1, 1), help="added to all travels")
-    margin: float = engine.option(5.0, "counts", within=(0, None), help="by how much brighter a frame must be")
+    travel_offset: float = engine.option(default=0.0, unit="mm", within=(-1, 1), help="added to all travels")
+    margin: float = engine.option(default=5.0, unit="counts", within=(0, None), help="by how much brighter a frame must be")
     depth = io.Map("depth at which the pixel is brighter than its mean", "mm", quantity="height", displayed="µm")
     kind = io.Map("kind of pixel", codes={0: "never bright", 1: "bright at the end"}, undefined=0)
     motions, passes = ("vertical",), 2

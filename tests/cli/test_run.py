@@ -22,7 +22,7 @@ from mirrorskin.io import Map
 class Light(engine.Operation):
     '''Frames in which a pixel is light.'''
 
-    level: float = engine.option(100.0, "counts", help="counts above which a pixel is light")
+    level: float = engine.option(default=100.0, unit="counts", help="counts above which a pixel is light")
     light = Map("frames in which a pixel is light")
 
     def start(self, shape, dtype):
@@ -33,17 +33,17 @@ class Light(engine.Operation):
         return {"light": self.number}
 
 class Deep(Light):
-    travel_offset: float = engine.option(0.0, "mm", help="added to each travel")
-    tilt: float | None = engine.option(None, "rad", words=["estimate"], help="tilt", shown_default="no")
-    weights: list = engine.option(None, "share", several=True, within=(0, 1), help="some shares")
-    twice: bool = engine.option(False, help="count each frame twice")
+    travel_offset: float = engine.option(default=0.0, unit="mm", help="added to each travel")
+    tilt: float | None = engine.option(default=None, unit="rad", words=["estimate"], help="tilt", shown_default="no")
+    weights: list = engine.option(default=None, unit="share", several=True, within=(0, 1), help="some shares")
+    twice: bool = engine.option(default=False, help="count each frame twice")
 
     @property
     def passes(self):
         return 2 if self.twice else 1
 
 class Frames(Light):
-    frames: int = engine.option(1, help="frames")
+    frames: int = engine.option(default=1, help="frames")
 
 class Broken:
     pass

@@ -152,8 +152,8 @@ WEAR = """
 from mirrorskin import engine
 
 class Wear(engine.Operation):
-    travel_offset: float = engine.option(0.0, "mm", help="added to each travel")
-    angles: list = engine.option(None, "rad", several=True, help="angles")
+    travel_offset: float = engine.option(default=0.0, unit="mm", help="added to each travel")
+    angles: list = engine.option(default=None, unit="rad", several=True, help="angles")
 """
 
 

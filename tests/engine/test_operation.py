@@ -19,7 +19,9 @@ FRAME = FRAMES[0].nbytes
 class Moments(engine.Operation):
     """The sum of the frames, and of each times its travel, in floats in the order of the frames."""
 
-    factor: float = engine.option(1.0, "mm", within=(0, 10), help="what each travel is multiplied by")
+    factor: float = engine.option(
+        default=1.0, unit="mm", within=(0, 10), help="what each travel is multiplied by"
+    )
 
     def start(self, shape, dtype):
         self.total, self.moment = np.zeros(shape, np.uint64), np.zeros(shape, np.float32)

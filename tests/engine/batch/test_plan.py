@@ -71,7 +71,7 @@ WEAR = """
 from mirrorskin import engine
 
 class Wear(engine.Operation):
-    offset: float = engine.option(0.5, "mm", help="offset")
+    offset: float = engine.option(default=0.5, unit="mm", help="offset")
 """
 
 
