@@ -98,7 +98,6 @@ class Slip(Operation):
         None,
         "counts",
         above=0,
-        within=(None, 1e9),
         help="standard deviation of a sample",
         shown_default="estimated from the residuals, window by window",
     )
