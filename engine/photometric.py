@@ -55,8 +55,7 @@ class PhotometricStereo(Operation):
     zenith: float | None = option(
         default=None,
         unit="rad",
-        above=0,
-        within=(None, np.pi / 2),
+        within=(0, np.pi / 2),
         help="angle between the direction of the lamp and that of the camera; needed without `light`",
     )
     dark: ArrayLike | None = option(

@@ -103,7 +103,6 @@ class Slip(Operation):
         default=None,
         unit="counts",
         above=0,
-        within=(None, 1e9),
         help="standard deviation of a sample",
         shown_default="estimated from the residuals, window by window",
     )

@@ -120,7 +120,7 @@ FLAT = np.zeros((2, 3))
         (None, "result is None: a Result, a mapping, a dataset, a path or an array is needed"),
         ({}, "the result has no heights"),
         ({"height": "high"}, "the result has no heights"),
-        ({"height": [[0, 1], [2]]}, "result['height'] is no array"),
+        ({"height": [[0, 1], [2]]}, "result['height'] is "),
         (
             {"height": FLAT, "height_sigma": FLAT[:1]},
             "map height_sigma of result has size (1, 3), others have",

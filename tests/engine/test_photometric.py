@@ -132,7 +132,7 @@ FRAMES = lit(LAMPS)
     [
         ({}, "phase is missing: PhotometricStereo needs it of each frame"),
         ({"phase": AZIMUTH[:8]}, "specify the zenith"),
-        ({"phase": AZIMUTH[:8], "zenith": 2.0}, "zenith 2.0: a number in rad of at most 1.5708 is needed"),
+        ({"phase": AZIMUTH[:8], "zenith": 2.0}, "a number in rad from 0 to 1.5708 is needed"),
         ({"phase": AZIMUTH[:3], "zenith": 0.5}, "phase has shape (3,) for 8 frames"),
         ({"phase": AZIMUTH[:8], "light": LAMPS}, "PhotometricStereo does not take phase"),
         ({"light": AZIMUTH[:8]}, "light has shape (8,): (T, 3) is needed"),

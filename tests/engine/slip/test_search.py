@@ -220,7 +220,7 @@ def test_bad_input_is_one_line():
         ({"window_size": 4}, "window_size 4"),
         ({"window_size": 200}, "window_size 200: 6 to 128 pixels"),
         ({"window_step": 65}, "window_step 65: 1 to 64 pixels"),
-        ({"noise": 0.0}, "noise 0: a number in counts"),
+        ({"noise": 0.0}, r"noise 0(\.0)?: a number in counts above 0 is needed"),
         ({"pixel_size": None}, "the pixel size is missing"),
     ]:
         with pytest.raises(InputError, match=message):
