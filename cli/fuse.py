@@ -42,7 +42,7 @@ def command(
     from mirrorskin import io
     from mirrorskin.cli.output import progress, report_levels, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
-    from mirrorskin.engine.fusion import frames_to_read, fuse_sources
+    from mirrorskin.engine.fusion import frames_to_read, fuse_recordings
     from mirrorskin.engine.reconstruction import calibrated
 
     files = [value for value in chosen.values() if isinstance(value, Path)]
@@ -57,7 +57,7 @@ def command(
         io.check_output(target, vertical, axial, calibration, *files, or_zarr=True)
         shared = None if calibration is None else io.open_calibration(calibration)
         with progress("fusing", frames_to_read(pressed, turned, register)) as show:
-            result = fuse_sources(
+            result = fuse_recordings(
                 calibrated(pressed, shared),
                 calibrated(turned, shared),
                 rotation=chosen,

@@ -12,7 +12,7 @@ from commands import run
 from stacks import record
 
 from mirrorskin import engine, hw, io
-from mirrorskin.engine.fusion import fuse_sources
+from mirrorskin.engine.fusion import fuse_recordings
 from mirrorskin.hw.twin import Axial, Camera, Vertical
 
 SHAPE, PIXEL = (44, 48), 0.25
@@ -126,7 +126,7 @@ def test_json_tells_the_engine_s_surface_and_where_it_came_from():
     assert told["process"]["vertical_source"].endswith("press.h5")
     assert told["process"]["axial_source"].endswith("turn.h5")
     with io.open_recording("press.h5") as vertical, io.open_recording("turn.h5") as axial:
-        expected = fuse_sources(vertical, axial)
+        expected = fuse_recordings(vertical, axial)
     np.testing.assert_array_equal(result.height, expected.height)
     np.testing.assert_array_equal(result.filled, expected.filled)
 
@@ -168,7 +168,7 @@ def test_both_are_read_as_a_calibration_says():
     references = io.References(dark, bright, little, little, np.zeros(shape, np.uint8))
     io.save_calibration(io.Calibration(io.CameraId("", shape, np.dtype("uint8")), references), "cal.h5")
     plain, told = fuse()[0], fuse("--calibration", "cal.h5")[0]
-    assert told.process["vertical_bright"] == told.process["axial_high"] == "map of the calibration"
+    assert told.process["vertical_bright"] == told.process["axial_bright"] == "map of the calibration"
     np.testing.assert_array_equal(told.calibration.references.bright, bright)
     np.testing.assert_allclose(told.height, plain.height, atol=1e-4)
     io.save_calibration(io.Calibration(io.CameraId("other", shape, np.dtype("uint8"))), "cal.h5")
@@ -237,5 +237,5 @@ def test_a_surface_that_was_not_found_is_one_line_and_no_file(monkeypatch):
     def fails(*sources, **options):
         raise engine.NotConverged("the residual is 0.3 after 100 iterations: allow more")
 
-    monkeypatch.setattr("mirrorskin.engine.fusion.fuse_sources", fails)
+    monkeypatch.setattr("mirrorskin.engine.fusion.fuse_recordings", fails)
     assert refused(code=1) == "the residual is 0.3 after 100 iterations: allow more"

@@ -196,7 +196,7 @@ def test_what_a_module_itself_lacks_is_not_hidden():
 
 
 def test_what_the_page_says_runs():
-    page = (ROOT / "docs" / "estimators.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "operations.md").read_text(encoding="utf-8")
     own, code, declared, with_kernel = re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
     Path("light.py").write_text(own)
     Path("light_on_device.py").write_text(with_kernel)
