@@ -28,6 +28,7 @@ from .rotation.edges import find_edges
 from .rotation.frequency import Frequency, estimate_frequency
 from .rotation.moving_normals import MovingNormals, estimate_normals
 from .rotation.normals import Normals
+from .rotation.rotation import Rotation
 from .running import run
 from .scoring import Score, score
 from .slip.displacement import find_displacement
@@ -55,6 +56,7 @@ __all__ = [
     "Pose",
     "PoseTracker",
     "Press",
+    "Rotation",
     "Score",
     "Sliding",
     "Slip",

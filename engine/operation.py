@@ -443,6 +443,7 @@ def array_function(
         given = signature.bind(*args, **kwargs).arguments
         frames = as_array("frames", given.pop("frames"))
         where = {one: given.pop(one, None) for one in (*positions, *optional)}
+        where = {one: None if values is None else as_array(one, values) for one, values in where.items()}
         return (compute or run)(frames, where, given)
 
     before = "frames : array_like, (T, H, W)\n    Raw counts.\n"

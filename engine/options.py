@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Literal, dataclass_transform
 import numpy as np
 
 from mirrorskin.io import InputError
-from mirrorskin.io.arguments import as_array
+from mirrorskin.io.arguments import as_array, shown
 
 Kind = Literal["number", "integer", "flag", "choice", "numbers", "map", "file", "object"]
 
@@ -89,12 +89,12 @@ class Option:
         if self.kind in ("object", "file"):
             return value
         if self.kind == "choice":
-            if value not in self.choices:
-                raise InputError(f"unknown {self.name} {value!r}. Use {' or '.join(self.choices)}")
+            if not isinstance(value, str) or value not in self.choices:
+                raise InputError(f"unknown {self.name} {shown(value)}. Use {' or '.join(self.choices)}")
             return str(value)
         if self.kind == "flag":
             if not isinstance(value, bool | np.bool_):
-                raise InputError(f"{self.name} is {value!r:.40}: use True or False")
+                raise InputError(f"{self.name} is {shown(value)}: use True or False")
             return bool(value)
         if self.kind == "numbers":
             values = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
@@ -108,7 +108,7 @@ class Option:
         scalar = isinstance(value, np.ndarray | np.generic) and value.ndim == 0 and value.dtype.kind in "buif"
         if not scalar and (not isinstance(value, Real) or (whole and not hasattr(value, "__index__"))):
             what = "a whole number" if whole else "a number"
-            raise InputError(f"{self.name} is {value!r:.40}: {what} is needed")
+            raise InputError(f"{self.name} is {shown(value)}: {what} is needed")
         number = int(value) if whole else float(value)
         low, high = self.within
         if not (

@@ -76,6 +76,8 @@ def describe(configured: Configured, source: Source | None = None) -> dict[str, 
             found[name] = value
         elif isinstance(value, Sequence):
             found[name] = str(list(value))
+        elif isinstance(value, np.ndarray) and value.ndim == 0:
+            found[name] = float(value)
         elif isinstance(value, np.ndarray):
             own = source is not None and getattr(source.header, name, None) is value
             found[name] = "map of the recording" if own else "map given"

@@ -96,7 +96,7 @@ def as_array(name: str, value: Any) -> NDArray[Any]:
     except (ValueError, TypeError) as error:  # rows of different lengths
         raise InputError(f"{name} is no array: {_line(error)}") from error
     if array.dtype.kind not in "buif":
-        raise InputError(f"{name} is {_shown(value)}: numbers are needed")
+        raise InputError(f"{name} is {shown(value)}: numbers are needed")
     mask = np.ma.getmaskarray(value) if masked else None
     if mask is None or not mask.any():
         return array
@@ -110,7 +110,7 @@ def as_array(name: str, value: Any) -> NDArray[Any]:
 def check_has(name: str, value: Any, *parts: str) -> None:
     """Raise InputError unless an argument has some attributes."""
     if not all(hasattr(value, part) for part in parts):
-        raise InputError(f"{name} is {_shown(value)}: something with {' and '.join(parts)} is needed")
+        raise InputError(f"{name} is {shown(value)}: something with {' and '.join(parts)} is needed")
 
 
 def _as_array_or_number(name: str, value: Any) -> Any:
@@ -124,29 +124,29 @@ def _as_array_or_word(words: set[str], name: str, value: Any) -> Any:
 def _check_number(name: str, value: Any) -> Any:
     scalar = isinstance(value, np.ndarray | np.generic) and not value.ndim and value.dtype.kind in "buif"
     if not (scalar or isinstance(value, Real)):
-        raise InputError(f"{name} is {_shown(value)}: a number is needed")
+        raise InputError(f"{name} is {shown(value)}: a number is needed")
     return value
 
 
 def _check_count(name: str, value: Any) -> Any:
     if not hasattr(value, "__index__") or isinstance(value, bool | np.ndarray):
-        raise InputError(f"{name} is {_shown(value)}: a whole number is needed")
+        raise InputError(f"{name} is {shown(value)}: a whole number is needed")
     return value
 
 
 def _check_kind(kind: str, name: str, value: Any) -> Any:
     if not any(one.__name__ == kind for one in type(value).__mro__):
-        raise InputError(f"{name} is {_shown(value)}: a mirrorskin.io.{kind} is needed")
+        raise InputError(f"{name} is {shown(value)}: a mirrorskin.io.{kind} is needed")
     return value
 
 
 def _check_path(name: str, value: Any) -> Any:
     if not isinstance(value, str | os.PathLike):
-        raise InputError(f"{name} is {_shown(value)}: a path is needed")
+        raise InputError(f"{name} is {shown(value)}: a path is needed")
     return value
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
     """Return a value in few letters, or its type."""
     if value is None or isinstance(value, str | int | float | complex):
         text = repr(value)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.frames import reference_pair
+from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.operation import travel_function
 from mirrorskin.engine.options import option
 from mirrorskin.engine.press.crossing import PressOperation
@@ -103,6 +104,9 @@ class Growth(CorrelationOperation):
     def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         """Prepare for frames of a shape and type."""
         super().start(shape, dtype)
+        self._pixel_size = None if self.pixel_size is None else check_pixel_size(self.pixel_size)
+        if not isinstance(self.dither, TravelWave | None):
+            raise InputError(f"dither is a {type(self.dither).__name__}: a TravelWave is needed")
         self._levels = reference_pair(self.dark, self.bright, shape, dtype)
         self._wave = self.dither
 
@@ -134,8 +138,8 @@ class Growth(CorrelationOperation):
         growth = fit.cosine * per_count
         sigma = fit.residual * math.sqrt(2 / self.count) * per_count
         process: dict[str, ProcessValue] = {"travel": wave.mean, "travel_amplitude": wave.amplitude}
-        if self.pixel_size is not None:
-            pixel = math.prod(self.pixel_size)
+        if self._pixel_size is not None:
+            pixel = math.prod(self._pixel_size)
             process["area_growth"] = pixel * float(np.nansum(growth))
             process["area_growth_sigma"] = pixel * math.sqrt(float(np.nansum(sigma**2)))
         return fit.assign(

@@ -397,6 +397,8 @@ class Normals(NormalsOperation):
     def _make_kernel(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> NormalKernel:
         if self.tilt is None:
             raise InputError("tilt is missing: give the half-angle of the precession, such as 2.5deg")
+        if not isinstance(self.response, Response | None):
+            raise InputError(f"response is a {type(self.response).__name__}: a Response is needed")
         tilt = cast('float | Literal["estimate"]', self.tilt)
         return NormalKernel(
             self, self.device, shape, dtype, tilt=tilt, method=self.method, response=self.response

@@ -34,6 +34,7 @@ SLOPE_MAPS = "slopes", "slope_errors", "zeniths"
 _TABLES = 64  # turns whose tables the device has at once
 _TURN_PLANES, _POSE_PLANES = 6, 13  # of a table
 _ENOUGH = 500  # pixels to estimate the noise from
+_MOST_NOISE = 1e12  # counts
 _MAP_BYTES = 33  # of a pixel, in all of them
 
 
@@ -276,4 +277,6 @@ def vector_lanes(device: Device) -> int:
 
 def _even_noise(noise: float) -> CountNoise:
     """Return the noise of samples that all have the same standard deviation, counts."""
+    if noise > _MOST_NOISE:
+        raise InputError(f"noise {noise:g}: a standard deviation of at most {_MOST_NOISE:g} counts is needed")
     return CountNoise(noise**2, 0.0, noise**2)

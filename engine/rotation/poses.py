@@ -63,7 +63,10 @@ def check_poses(
         if known.shape != (count, 3) or not np.allclose(np.linalg.norm(known, axis=1), 1, atol=_UNIT):
             raise InputError(f"axis of shape {known.shape} for {count} frames: a unit vector each is needed")
         check_tilts(np.arctan2(np.hypot(known[:, 0], known[:, 1]), known[:, 2]), count)
-    depth = np.zeros(count) if travel is None else np.broadcast_to(np.asarray(travel, np.float64), count)
+    depth = np.zeros(count) if travel is None else np.asarray(travel, np.float64)
+    if depth.shape not in ((), (count,)):
+        raise InputError(f"travel has shape {depth.shape} for {count} frames: one number a frame is needed")
+    depth = np.broadcast_to(depth, count)
     if not np.isfinite(depth).all():
         raise InputError("travel is not finite: every frame needs a number, mm")
     return np.column_stack([known, depth])

@@ -11,7 +11,6 @@ from stacks import MadeUp, record
 
 from mirrorskin import engine, hw, io
 from mirrorskin.engine.fusion import frames_to_read, fuse_recordings
-from mirrorskin.engine.rotation.rotation import Rotation
 from mirrorskin.hw.twin import Axial, Body, Camera, Vertical
 
 NAN = np.float32(np.nan)
@@ -441,7 +440,7 @@ def test_options_reach_the_press_and_the_rotation():
 
 
 def test_options_may_be_those_of_methods():
-    methods = engine.Press(threshold=0.6, subframe=False), Rotation(method="paper", noise=1.5)
+    methods = engine.Press(threshold=0.6, subframe=False), engine.Rotation(method="paper", noise=1.5)
     found = fused_anew(press=methods[0], rotation=methods[1])
     options = {"threshold": 0.6, "subframe": False}, {"method": "paper", "noise": 1.5}
     np.testing.assert_array_equal(found.height, fused_anew(press=options[0], rotation=options[1]).height)

@@ -10,7 +10,6 @@ import inspect
 import math
 from collections.abc import Callable, Iterator
 from functools import cache
-from types import SimpleNamespace as Maps
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from mirrorskin.kernels.errors import DeviceError
 
 REFUSALS = (io.InputError, engine.NotConverged, DeviceError)
 SHAPE = (16, 20)
-_COUNTS = "mean", "cosine", "sine", "residual"  # of a pixel's samples, which may be infinite themselves
+_COUNTS = "mean", "cosine", "sine", "modulation", "residual"  # of a pixel's samples, which may be infinite themselves
 ELSEWHERE = {"reconstruct", "run", "free_memory"}
 """Public functions that take no arrays of numbers: sources and nothing, which other tests see to."""
 
@@ -54,17 +53,20 @@ def calls() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
     result = io.Result(height=height, height_sigma=sure, normals=normals, normals_sigma=sure, **places)
     wave = 0.5 + 0.1 * np.sin(np.arange(64) * 0.8)
     dither = (100 + 40 * (wave[:, None, None] - 0.5) + 0 * _FAR).astype(np.float32)
-    onset, turned = Maps(height=height, sigma=sure), Maps(vectors=normals, sigma=sure, contact=contact)
+    heights = {"height": height, "height_sigma": sure}
+    turned = {"normals": normals, "normals_sigma": sure, "contact": contact}
     disc = _FAR < 5
     made: dict[str, dict[str, Any]] = {
         "find_onset": {"frames": _press(), "travel": np.linspace(0, 1, 8), "noise": 1.0},
         "find_change_point": {"frames": _press(), "travel": np.linspace(0, 1, 8)},
-        "estimate_normals": {"frames": _rotation(phases), "phase": phases, "tilt": 0.04, "gain": 300.0},
+        "estimate_normals": {
+            "frames": _rotation(phases), "phase": phases, "tilt": 0.04, "zenith_gain": 300.0,
+        },
         "correlate": {"frames": _rotation(phases), "phase": phases},
         "integrate": {"normals": normals, "pixel_size": 0.1},
         "invert_laplacian": {"right": np.ones((16, 19)), "down": np.ones((15, 20))},
         "fill_holes": {"height": height, "sigma": sure, "pixel_size": 0.1},
-        "find_edges": {"vectors": normals, "sigma": sure, "contact": contact},
+        "find_edges": {"normals": normals, "normals_sigma": sure, "contact": contact},
         "find_displacement": {
             "reference": _texture(), "frames": _texture()[None], "pixel_size": 0.1, "noise": 1.0,
         },
@@ -92,7 +94,7 @@ def calls() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
         "stitch": {"results": [result, result], "pixel_size": 0.1},
         "measure": {"result": result},
         "score": {"result": result, "truth": io.Truth(height, flat, flat, contact)},
-        "fuse": {"onset": onset, "normals": turned, "pixel_size": 0.1},
+        "fuse": {"heights": heights, "normals": turned, "pixel_size": 0.1},
     }  # fmt: skip
     return {name: (getattr(engine, name), arguments) for name, arguments in made.items()}
 
@@ -178,6 +180,9 @@ def _given_arrays(name: str) -> dict[str, np.ndarray]:
 
 
 def _arrays(answer: Any) -> Iterator[tuple[str, np.ndarray]]:
+    if isinstance(answer, io.Result):
+        maps = {name: map_ for name, map_ in answer.maps().items() if name not in _COUNTS}
+        yield from ((name, map_) for name, map_ in maps.items() if map_.dtype.kind == "f")
     for name in getattr(answer, "__dataclass_fields__", ()):
         if name in _COUNTS:
             continue

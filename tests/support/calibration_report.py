@@ -23,8 +23,10 @@ from calibration_scorer import Judge, Score, Surface
 from mirrorskin import engine, io
 from mirrorskin.engine.calibration import brightness, gel, references, tilt, tilt_tracks, wall
 from mirrorskin.engine.calibration.gel import ball_onset
-from mirrorskin.engine.rotation.normals import Normals
-from mirrorskin.engine.rotation.rotation import estimate_rotation
+from mirrorskin.engine.method import Context
+from mirrorskin.engine.rotation.rotation import Rotation
+from mirrorskin.engine.rotation.steps import RegistrationErrors
+from mirrorskin.engine.streaming import feed
 
 APART = 3.9  # mm between the calibration's balls
 REACH = 10.0  # mm, that held-out objects go from the middle
@@ -89,14 +91,18 @@ def as_designed(lab: Lab, calibration: io.Calibration) -> tuple[io.Calibration, 
     assert taken is not None
     low, high = lab.rig.dark_zenith, lab.rig.light_zenith
     gain = (taken.bright.astype(float) - taken.dark) / (high - low)
-    scale = {"gain": gain, "offset": taken.dark - low * gain}
+    scale = {"zenith_gain": gain, "zenith_offset": taken.dark - low * gain}
     return replace(calibration, zenith=None), scale
 
 
-def normals_of(frames: Frames, calibration: io.Calibration, **options: Any) -> Normals:
+def normals_of(frames: Frames, calibration: io.Calibration, **options: Any) -> io.Result:
     """Return the normals of an object that was turned about, without the heights that fit them."""
     frames.rewind()
-    return estimate_rotation(io.Calibrated(frames, calibration), **options).normals
+    source = io.Calibrated(frames, calibration)
+    plan = Rotation(**options).plan(source)
+    stream = plan.stream or source
+    feed(stream, plan.operation, plan.frames)
+    return RegistrationErrors().apply(plan.operation.finish(), Context(source, plan.operation, stream))
 
 
 def field_scores(
@@ -111,9 +117,9 @@ def field_scores(
         bound = scorer.bounds(lab.rig, seen, CREASE * lab.pixel_size, lab.half)
         frames = lab.turned(surface, press, 20 + number)
         found = normals_of(frames, plain, **scale)
-        before.add(found.zenith, found.azimuth, seen, bound, found.sigma)
+        before.add(found.zenith, found.azimuth, seen, bound, found.normals_sigma)
         found = normals_of(frames, calibration)
-        after.add(found.zenith, found.azimuth, seen, bound, found.sigma)
+        after.add(found.zenith, found.azimuth, seen, bound, found.normals_sigma)
     return before.score(), after.score()
 
 

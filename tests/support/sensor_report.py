@@ -310,9 +310,10 @@ def mistakes() -> Table:
     rows = []
     for name, numbers in wrong.items():
         phase, tilt, gain, offset = numbers
-        found = engine.estimate_normals(frames, phase, tilt=tilt, gain=gain, offset=offset, noise=0.1)
+        known = {"tilt": tilt, "zenith_gain": gain, "zenith_offset": offset, "noise": 0.1}
+        found = engine.estimate_normals(frames, phase, **known)
         zenith, azimuth = rotations.angles(normals)
-        other_zenith, other_azimuth = rotations.angles(found.vectors.astype(float))
+        other_zenith, other_azimuth = rotations.angles(found.normals.astype(float))
         turned = np.angle(np.exp(1j * (other_azimuth - azimuth)))
         means = (np.degrees(np.nanmean(part, axis=-1)) for part in (other_zenith - zenith, turned))
         rows.append((name, *(f"{value:+.2f}" for pair in zip(*means, strict=True) for value in pair)))

@@ -10,6 +10,7 @@ from scipy import optimize
 
 from mirrorskin import engine, hw, io
 from mirrorskin.hw.twin import Camera, Vertical
+from mirrorskin.io.arrays import ArrayRecording
 
 RADIUS, DEPTH, SWING = 5.0, 1.0, 0.05
 DITHER = DEPTH + SWING * np.cos(2 * np.pi / 7.3 * np.arange(110))
@@ -118,3 +119,28 @@ def test_a_travel_that_is_no_dither_is_one_line(travel, line):
     with pytest.raises(io.InputError, match=line) as caught:
         engine.find_growth(frames, travel)
     assert "\n" not in str(caught.value)
+
+
+def test_the_frames_are_read_once_if_the_travel_is_known_and_twice_otherwise(elastic):
+    elastic.rewind()
+    frames = elastic.read(np.empty(elastic.shape, elastic.dtype)).frames.copy()
+    known = {"dark": elastic.header.dark, "bright": elastic.header.bright, "pixel_size": (PIXEL, PIXEL)}
+    found = engine.find_growth(frames, DITHER, **known)
+    source = ArrayRecording(frames, {"travel": DITHER}, {"dark": known["dark"], "bright": known["bright"]})
+    operation = engine.Growth().configured_for(source)
+    assert (operation.passes, engine.Growth(**known).passes) == (1, 2)
+    once = engine.run(source, engine.Growth(pixel_size=(PIXEL, PIXEL)))
+    blocks = engine.Growth(**known)
+    for number in range(2):
+        if number:
+            blocks.next_pass()
+        for part in np.split(np.arange(len(frames)), [3, 50]):
+            blocks.push(frames[part], travel=DITHER[part])
+    for other in (once, blocks.result()):
+        for name in ("growth", "growth_sigma", "azimuth", "residual"):
+            np.testing.assert_array_equal(other[name], found[name])
+        assert other.process["area_growth"] == found.process["area_growth"]
+    blocks.reset()
+    blocks.push(frames, travel=DITHER)
+    with pytest.raises(io.InputError, match="needs all frames twice"):
+        blocks.result()

@@ -10,6 +10,8 @@ from rotations import EIGHTHS, TILT, Setup
 from stacks import MadeUp, assert_same
 
 from mirrorskin import engine, hw, io
+from mirrorskin.engine.method import Context
+from mirrorskin.engine.rotation.steps import Edges, Integration
 from mirrorskin.hw.twin import Axial, Body, Camera
 
 SHAPE = (20, 24)
@@ -298,3 +300,63 @@ def test_what_cannot_be_used_is_refused_in_one_line(case):
     with pytest.raises(io.InputError, match=message) as caught:
         engine.reconstruct(made, **options)
     assert "\n" not in str(caught.value)
+
+
+def test_operations_run_over_a_source_with_what_it_knows():
+    result = engine.run(source(), engine.Normals)
+    known = {"tilt": TILT, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset}
+    alike(result, engine.estimate_normals(frames(), PHASE, **known))
+    assert (result.process["operation"], result.process["tilt"]) == ("Normals", TILT)
+    assert (result.process["zenith_gain"], result.process["turns"]) == (SETUP.slope, TURNS)
+    wave = engine.run(source(), engine.Correlate(window_frames=8))
+    np.testing.assert_array_equal(wave.cosine, engine.correlate(frames()[-8:], PHASE[-8:]).cosine)
+    last = engine.run(source(), engine.Normals(window_frames=8, noise=20.0))
+    alike(last, engine.estimate_normals(frames()[-8:], PHASE[-8:], noise=20.0, **known))
+    with pytest.raises(io.InputError, match="tilt is missing"):
+        engine.run(source(replace(HEADER, tilt=None)), engine.Normals)
+    with pytest.raises(io.InputError, match="window have no weights"):
+        engine.Normals(window_frames=8, **known).push(
+            frames(), phase=PHASE, frame_weights=np.ones(len(PHASE))
+        )
+
+
+@pytest.mark.parametrize("operation", [engine.Normals, engine.Correlate])
+def test_a_stack_that_is_lent_may_be_followed_by_other_frames(operation):
+    known = {"tilt": TILT, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset}
+    known = known if operation is engine.Normals else {}
+    lent, copied = operation(**known), operation(**known)
+    lent.push(frames()[:12], phase=PHASE[:12], lent=True)
+    first = lent.result()
+    alike(lent.result(), first)
+    assert lent.room.shape[1:] == SHAPE
+    for part in np.split(np.arange(12, len(PHASE)), [5]):
+        lent.push(frames()[part], phase=PHASE[part])
+    copied.push(frames(), phase=PHASE)
+    alike(lent.result(), copied.result())
+    lent.reset()
+    lent.push(frames()[:12], phase=PHASE[:12])
+    alike(lent.result(), first)
+
+
+def test_steps_may_be_applied_to_the_result_of_an_operation():
+    made = source(OF_A_SURFACE)
+    operation = engine.Normals(window_frames=24, noise=20.0).configured_for(made)
+    operation.push(frames(), phase=PHASE)
+    context = Context(made, operation, made)
+    result = Integration().apply(Edges().apply(operation.result(), context), context)
+    whole = reconstruct(OF_A_SURFACE, noise=20.0)
+    assert np.median(np.abs(result.height - whole.height)) < 0.002
+    assert (result.edges.shape, result.offset_unknown.tolist()) == (SHAPE, [1])
+
+
+def test_heights_may_be_a_map_a_result_or_a_file(tmp_path):
+    io.save_result(io.Result(height=FLAT), tmp_path / "flat.h5")
+    given = reconstruct(OF_A_SURFACE, heights=FLAT)
+    alike(reconstruct(OF_A_SURFACE, heights=io.Result(height=FLAT)), given)
+    alike(reconstruct(OF_A_SURFACE, heights={"height": FLAT}), given)
+    alike(reconstruct(OF_A_SURFACE, heights=tmp_path / "flat.h5"), given)
+    relative = io.Result(
+        height=FLAT, component=np.zeros(SHAPE, np.int32), offset_unknown=np.ones(1, np.uint8)
+    )
+    with pytest.raises(io.InputError, match="no height is a number"):
+        reconstruct(OF_A_SURFACE, heights=relative)
