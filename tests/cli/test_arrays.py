@@ -108,7 +108,7 @@ def test_the_travel_of_a_real_stage_places_heights():
         ),
         (["ball.npy", "--travel", "ball.npz"], "ball.npz is no text: write one length a frame in it"),
         (["ball.npy", "--travel", "t.txt"], "t.txt lists 2 travels for 12 frames: one a frame is needed"),
-        (["ball.npy", "--travel", "t.txt", *STEPS], "leave --travel-step and --travel-start out"),
+        (["ball.npy", "--travel", "t.txt", *STEPS], "Remove --travel-step and --travel-start"),
         (["ball.npy", "--travel", "ball.npy"], "lists 2304 travels for 12 frames"),
         (["cut.npy", *STEPS], "cut.npy is not a NumPy array"),
         (["cut.npz", *STEPS], "cut.npz is not a NumPy array"),
@@ -159,7 +159,7 @@ def test_frames_with_phases_are_a_rotation():
     phase = np.arange(8) * np.pi / 4
     frames = np.broadcast_to((100 + 20 * np.cos(phase))[:, None, None], (8, 6, 7)).astype(np.float32)
     found = engine.reconstruct(
-        frames, phase=phase, tilt=0.05, pixel_size=(0.1, 0.1), gain=400.0, offset=0.0, noise=0.5
+        frames, phase=phase, tilt=0.05, pixel_size=(0.1, 0.1), zenith_gain=400.0, zenith_offset=0.0, noise=0.5
     )
     assert found.normals.shape == (6, 7, 3)
     assert found.process["source"] == "the array of frames"

@@ -178,7 +178,7 @@ def test_a_frequency_takes_the_place_of_the_phase(frequency, harmonic, amplitude
         (["--frequency", "3"], "the time of each frame is unknown"),
         (["--frequency", "fast"], "--frequency fast: a number is needed; write e.g. 0.25, or estimate"),
         (["--frequency", "3", "--phase-step", "45deg"], "Remove --phase-step and --phases"),
-        (["--frequency", "3", "--frame-rate", "0"], "frame_rate 0: a number in frames/s above 0 is needed"),
+        (["--frequency", "3", "--frame-rate", "0"], "frame_rate 0.0: a number in frames/s above 0 is needed"),
     ],
 )
 def test_a_frequency_that_cannot_be_is_one_line(words, line):

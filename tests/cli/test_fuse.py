@@ -168,7 +168,7 @@ def test_both_are_read_as_a_calibration_says():
     references = io.References(dark, bright, little, little, np.zeros(shape, np.uint8))
     io.save_calibration(io.Calibration(io.CameraId("", shape, np.dtype("uint8")), references), "cal.h5")
     plain, told = fuse()[0], fuse("--calibration", "cal.h5")[0]
-    assert told.process["vertical_bright"] == told.process["axial_high"] == "map of the calibration"
+    assert told.process["vertical_bright"] == told.process["axial_bright"] == "map of the calibration"
     np.testing.assert_array_equal(told.calibration.references.bright, bright)
     np.testing.assert_allclose(told.height, plain.height, atol=1e-4)
     io.save_calibration(io.Calibration(io.CameraId("other", shape, np.dtype("uint8"))), "cal.h5")
