@@ -1,4 +1,4 @@
-"""How near a device's answers are to known truths: cases of targets, all of which must be met."""
+"""Accuracy of a device: answers compared with known truths. All targets of these cases must be met."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ Mask = NDArray[np.bool_]
 _FRAMES = 40
 _STEP = 0.05  # mm of travel a frame
 _LEVELS = {"uint8": (20.0, 220.0), "uint16": (300.0, 3500.0), "float32": (20.0, 220.0)}
-_CHANGE_NOISE = 0.01  # of the way from dark to light
+_CHANGE_NOISE = 0.01  # divided by bright minus dark
 _SHAPE, _SMALL = (240, 320), (48, 64)
 
 
 def run_press(device: Device, quick: bool) -> Case:
-    """Hold onsets and change-points of sudden changes and ramps against their truth, in each type.
+    """Compare onsets and change-points of sudden changes and ramps with their truth, in each type.
 
-    A sudden change lies anywhere in its interval: no more can be known, and the error is that of a uniform
-    number. Of a ramp, two samples on either side of the level show when it was crossed, by a
-    straight line; noise in them is all that is wrong with it.
+    A sudden change is anywhere in the interval between two frames, so that its error has a uniform
+    distribution. On a ramp, a straight line through the samples on both sides of the level gives the
+    crossing, whose error is due to their noise alone.
     """
     shape = _SMALL if quick else _SHAPE
     slack = 4 / np.sqrt(2 * shape[0] * shape[1])  # of a root mean square: four of its standard errors
@@ -46,12 +46,12 @@ def run_press(device: Device, quick: bool) -> Case:
     for kind in _LEVELS:
         targets += _sudden(kind, shape, device, slack)
         targets += _ramps(kind, shape, device, slack)
-    title = f"onset and change-point of {_FRAMES} x {shape[0]} x {shape[1]} changes whose place is known"
+    title = f"onset and change-point of {_FRAMES} x {shape[0]} x {shape[1]} changes at known times"
     return _case("accuracy-press", title, targets)
 
 
 def _sudden(kind: str, shape: tuple[int, int], device: Device, slack: float) -> list[Target]:
-    """Return targets of changes from one frame to the next."""
+    """Return targets of changes between two frames."""
     place = np.random.default_rng(1).uniform(2, _FRAMES - 2, shape)
     frames, known = _changes(kind, place, 0.0)
     found = find_onset(frames, **known, noise=_press_noise(kind), device=device)
@@ -66,17 +66,17 @@ def _sudden(kind: str, shape: tuple[int, int], device: Device, slack: float) -> 
 
 
 def _ramps(kind: str, shape: tuple[int, int], device: Device, slack: float) -> list[Target]:
-    """Return targets of ramps of 6 frames, and the share of the noise that the best estimate has."""
+    """Return targets of ramps of 6 frames, and of the error relative to that of the best estimate."""
     lasts = 6.0
     place = np.random.default_rng(2).uniform(2 + lasts, _FRAMES - 2 - lasts, shape)
     frames, known = _changes(kind, place, lasts)
     noise = _press_noise(kind)
     onset = find_onset(frames, **known, noise=noise, device=device)
     change = find_change_point(frames, **known, noise=noise, device=device)
-    share = np.ceil(place) - place  # of the interval that lies behind the crossing
+    share = np.ceil(place) - place  # of the interval after the crossing
     span = _LEVELS[kind][1] - _LEVELS[kind][0]
     line = noise * lasts / span * np.sqrt(np.mean(share**2 + (1 - share) ** 2))
-    best = noise * lasts / span / np.sqrt(lasts)  # Cramer and Rao: as many samples on the ramp, levels known
+    best = noise * lasts / span / np.sqrt(lasts)  # Cramer-Rao bound for known levels
     error, other = _frame_error(onset, place), _frame_error(change, place)
     return [
         at_most(f"{kind}, ramps: RMS error of a straight line's", _rms(error) / line, 1.1 + slack),
@@ -88,7 +88,7 @@ def _ramps(kind: str, shape: tuple[int, int], device: Device, slack: float) -> l
 
 
 def _changes(kind: str, place: Doubles, lasts: float) -> tuple[NDArray[Any], dict[str, Any]]:
-    """Return frames that cross half of the way at a place, (T, H, W), and travel, dark and bright."""
+    """Return frames, (T, H, W), that cross the threshold at a time, and travel, dark and bright."""
     dark, bright = _LEVELS[kind]
     number = np.arange(_FRAMES)[:, np.newaxis, np.newaxis]
     share = np.clip((number - place) / lasts + 0.5, 0, 1) if lasts else (number >= place).astype(float)
@@ -99,13 +99,13 @@ def _changes(kind: str, place: Doubles, lasts: float) -> tuple[NDArray[Any], dic
 
 
 def _press_noise(kind: str) -> float:
-    """Return the standard deviation of a sample, counts, with what rounding adds."""
+    """Return the standard deviation of a sample, counts, including that of rounding."""
     light = _CHANGE_NOISE * (_LEVELS[kind][1] - _LEVELS[kind][0])
     return light if kind == "float32" else float(np.hypot(light, 1 / np.sqrt(12)))
 
 
 def _frame_error(found: Onset, place: Doubles) -> Doubles:
-    """Return by how many frames the height is wrong; NaN without an answer."""
+    """Return the error of the height in frames; NaN without an answer."""
     return np.asarray(-found.height.astype(np.float64) / _STEP - place)
 
 
@@ -117,7 +117,7 @@ def _rms(error: Doubles) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 
-# Degrees; a normal at the tilt meets an axis of the body, where linear theory is at its limit.
+# Degrees. At the tilt a normal is parallel to an axis of the body, where linear theory has its limit.
 _BINS = (0, 1), (1, 2), (2.4, 2.6), (3, 5), (5, 10), (10, 20), (20, 35), (35, 50), (50, 58)
 _DRAWS, _FEW_DRAWS = 10_000, 2_000
 _PHASES = np.arange(STEPS, dtype=np.float64) * (2 * np.pi / STEPS)
@@ -134,12 +134,12 @@ class Sensor:
 
     @property
     def spread(self) -> float:
-        """Standard deviation of a sample, with what rounding adds."""
+        """Standard deviation of a sample, including that of rounding."""
         return self.noise if self.kind == "float32" else float(np.hypot(self.noise, 1 / np.sqrt(12)))
 
     @property
     def known(self) -> dict[str, Any]:
-        """What the estimator is given."""
+        """The options of the estimator."""
         return {"tilt": TILT, "gain": self.gain, "offset": self.offset, "noise": self.spread}
 
 
@@ -151,7 +151,7 @@ _SENSORS = (
 
 
 def expose(normals: Doubles, sensor: Sensor, seed: int) -> NDArray[Any]:
-    """Return the frames, (STEPS, ...), that normals, (..., 3), make by equation 10, with noise."""
+    """Return the frames, (STEPS, ...), of normals, (..., 3), by equation 10, with noise."""
     angle = np.arccos(np.clip(_axes() @ np.moveaxis(normals, -1, 0).reshape(3, -1), -1, 1))
     counts = sensor.offset + sensor.gain * angle.reshape(STEPS, *normals.shape[:-1])
     counts += np.random.default_rng(seed).normal(0, sensor.noise, counts.shape)
@@ -166,7 +166,7 @@ def toward(zenith: Doubles, azimuth: Doubles) -> Doubles:
 
 
 def run_normals(device: Device, quick: bool) -> Case:
-    """Hold normals against the Cramer-Rao bound of equation 10, zenith by zenith, in each type."""
+    """Compare normals with the Cramer-Rao bound of equation 10 in bins of zenith, in each type."""
     draws = _FEW_DRAWS if quick else _DRAWS
     slack = 0.02 + 3 / np.sqrt(draws)
     generator = np.random.default_rng(5)
@@ -199,31 +199,31 @@ def _score_normals(truth: Doubles, sensor: Sensor, device: Device, slack: float)
 def _bound(normals: Doubles, sensor: Sensor) -> Doubles:
     """Return the least mean square error of an unbiased estimate, radians squared, (...).
 
-    Each frame gives the angle from an axis: the information is (gain / sigma)^2 times the sum of u u', with u
-    the tangent at the normal that points away from the axis. In the plane across the normal, its trace is N
-    and its determinant follows from that of the sum of squares.
+    Each frame measures the angle to an axis: the information is (gain / sigma)^2 times the sum of u u', with
+    u the tangent at the normal that points away from the axis. Its trace is N, and its determinant in the
+    plane perpendicular to the normal follows from the trace of its square.
     """
     total = np.zeros((*normals.shape, 3))
     for axis in _axes():
         away = (normals @ axis)[..., np.newaxis] * normals - axis
         away /= np.linalg.norm(away, axis=-1, keepdims=True)
         total += away[..., :, np.newaxis] * away[..., np.newaxis, :]
-    # u u' is nothing along the normal: one eigenvalue is 0, two follow from trace and determinant.
+    # One eigenvalue, along the normal, is 0; the others follow from trace and determinant.
     trace = np.trace(total, axis1=-2, axis2=-1)
     product = (trace**2 - np.trace(total @ total, axis1=-2, axis2=-1)) / 2
     return np.asarray(trace / product * (sensor.spread / sensor.gain) ** 2)
 
 
 def _axes() -> Doubles:
-    """Return the body's axis at each phase, (STEPS, 3): it leans away from the phase."""
+    """Return the axis of the body at each phase, (STEPS, 3): it leans away from the phase."""
     return toward(np.full(STEPS, TILT), _PHASES + np.pi)
 
 
 _PIXEL = 0.05  # mm
 _RADIUS = 5.0  # of the ball, mm
 _PRESS_STEP = 0.1  # of the press, mm
-_LIT = np.radians([11.8, 45.0])  # zenith of what turns light
-_DEEP = np.radians(57.0)  # as far as the sheet lies on the ball
+_LIT = np.radians([11.8, 45.0])  # zeniths that turn light
+_DEEP = np.radians(57.0)  # zenith up to which the sheet touches the ball
 _SLOPE_NOISE = 0.02  # of a slope
 
 
@@ -236,7 +236,7 @@ class Known(NamedTuple):
 
 
 def run_surfaces(device: Device, quick: bool) -> Case:
-    """Hold heights from exact slopes against the surfaces they are of: whole pictures, masks and noise."""
+    """Compare heights from exact slopes with analytic surfaces: whole pictures, masks and noise."""
     shape = (45, 60) if quick else (600, 801)
     targets = []
     for name, (make, bound) in _SURFACES.items():
@@ -255,7 +255,7 @@ def _plane(x: Doubles, y: Doubles) -> Known:
 
 
 def _cubic(x: Doubles, y: Doubles) -> Known:
-    """Return a polynomial of third degree, for which the rule of four pixels is exact."""
+    """Return a polynomial of third degree, which the rule of four pixels integrates exactly."""
     u, v = x / np.ptp(x), y / np.ptp(x)
     height = np.ptp(x) * (0.3 * u**3 - 0.2 * u**2 + 0.4 * v**3 + 0.1 * u)
     return Known(height, 0.9 * u**2 - 0.4 * u + 0.1, 1.2 * v**2)
@@ -287,7 +287,7 @@ _SURFACES: dict[str, tuple[Callable[[Doubles, Doubles], Known], float]] = {
 
 
 def _noisy(device: Device, quick: bool) -> list[Target]:
-    """Return targets of noisy slopes: that sigma is what errors are."""
+    """Return the target that the errors of noisy slopes agree with sigma."""
     shape, draws = ((24, 30), 3) if quick else ((60, 80), 20)
     known = _waves(*_grid(shape))
     generator, square = np.random.default_rng(9), []
@@ -302,7 +302,7 @@ def _noisy(device: Device, quick: bool) -> list[Target]:
 
 
 def run_fusion(device: Device, quick: bool) -> Case:
-    """Hold the fused surface of a ball against it: a press in steps, and a turn of equation 10 with noise."""
+    """Compare the fused surface of a ball with it: a press in steps, and a turn of equation 10 with noise."""
     size = 101 if quick else 201
     x, y = _grid((size, size))
     x, y = 201 / size * x, 201 / size * y
@@ -337,7 +337,7 @@ def run_fusion(device: Device, quick: bool) -> Case:
 
 
 def _grid(shape: tuple[int, int]) -> tuple[Doubles, Doubles]:
-    """Return x and y of the pixels, mm, from the picture's centre; y runs up."""
+    """Return x and y of the pixels, mm, from the centre of the picture; y points up."""
     x = _PIXEL * (np.arange(shape[1]) - (shape[1] - 1) / 2)
     y = -_PIXEL * (np.arange(shape[0]) - (shape[0] - 1) / 2)
     wide, high = np.meshgrid(x, y)

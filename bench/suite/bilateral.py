@@ -1,4 +1,4 @@
-"""Bilateral normal integration as its paper has it, in double precision: a peer of robust integration.
+"""Bilateral normal integration as published, in double precision: a peer of robust integration.
 
 Cao, Santo, Shi, Okura, Matsushita: Bilateral normal integration, ECCV 2022 (arXiv 2207.08551).
 """
@@ -20,14 +20,13 @@ _MOST, _CLOSE = 5000, 1e-3  # iterations of conjugate gradients, and the relativ
 def integrate_bilaterally(
     scene: Scene, k: float = 2.0, most: int = 150, rest: float = 1e-4
 ) -> tuple[Map, int]:
-    """Return heights, or depths if the scene has a camera, (H, W), and how many times weights were found.
+    """Return heights, (H, W), and the number of times that weights were found.
 
-    With z the depth in pixels, or its logarithm, a pixel has four equations, to its right and left, up and
-    down: n_z times the one-sided difference of z is n_x or n_y. Seen by a pinhole of focal length f, n_z is
-    f n_z - x n_x - y n_y with x and y from the principal point. The squares are weighted, where there are
-    both sides, by w = 1 / (1 + exp(-k (b^2 - a^2))), a and b being n_z times the difference on this side and
-    on the other; w is 1/2 at first. Weights and z are found in turns, z by conjugate gradients with Jacobi
-    preconditioner from the last z on, until the energy changes by less than `rest` of itself.
+    With z the depth in pixels, a pixel has four equations, to its right and left, up and down: n_z times the
+    one-sided difference of z is n_x or n_y. Where there are both sides, the squares are weighted by
+    w = 1 / (1 + exp(-k (b^2 - a^2))), a and b being n_z times the difference on this side and on the other;
+    w is 1/2 at first. Weights and z are found in turns, z by conjugate gradients with Jacobi preconditioner
+    from the last z, until the energy changes by less than `rest` of itself.
     """
     from scipy import sparse
     from scipy.special import expit
@@ -46,51 +45,48 @@ def integrate_bilaterally(
             break
         square = (differences**2).reshape(2, 2, -1)
         share = np.where(both, expit(k * (square[:, ::-1] - square)), there.reshape(2, 2, -1))
-    found = np.full(scene.mask.shape, np.nan)
-    found[scene.mask] = np.exp(depth) if scene.camera else -scene.pixel_size * depth
-    return found, steps
+    height = np.full(scene.mask.shape, np.nan)
+    height[scene.mask] = -scene.pixel_size * depth
+    return height, steps
 
 
 def _solve(matrix: Any, source: Map, start: Map) -> Map:
-    """Solve by conjugate gradients; SciPy's spend most of their time on waking threads for sums."""
+    """Solve by conjugate gradients; those of SciPy spend most of their time on threads for sums."""
 
     def dot(one: Map, other: Map) -> float:
         return float(np.einsum("i,i", one, other))
 
-    found, rest = start.copy(), source - matrix @ start
+    x, residual = start.copy(), source - matrix @ start
     inverse = 1 / np.maximum(matrix.diagonal(), 1e-30)
-    way, old = np.zeros_like(rest), np.inf
+    direction, old = np.zeros_like(residual), np.inf
     for _ in range(_MOST):
-        if dot(rest, rest) <= _CLOSE**2 * dot(source, source):
+        if dot(residual, residual) <= _CLOSE**2 * dot(source, source):
             break
-        scaled = inverse * rest
-        new = dot(rest, scaled)
-        way = scaled + new / old * way
-        image = matrix @ way
-        step, old = new / dot(way, image), new
-        found += step * way
-        rest -= step * image
-    return found
+        scaled = inverse * residual
+        new = dot(residual, scaled)
+        direction = scaled + new / old * direction
+        image = matrix @ direction
+        step, old = new / dot(direction, image), new
+        x += step * direction
+        residual -= step * image
+    return x
 
 
 def _equations(scene: Scene) -> tuple[Any, Map, NDArray[np.bool_]]:
-    """Return matrix (4 N, N), right side (4 N,) and which neighbours there are: right, left, up, down."""
+    """Return matrix (4 N, N), right side (4 N,) and which neighbours exist: right, left, up, down."""
     from scipy import sparse
 
     mask, (across, up, towards) = scene.mask, np.moveaxis(scene.normals[scene.mask], -1, 0)
     row, column = np.nonzero(mask)
-    if scene.camera:
-        x, y = scene.camera.principal_point or ((mask.shape[1] - 1) / 2, (mask.shape[0] - 1) / 2)
-        towards = scene.camera.focal_length * towards - (column - x) * across - (y - row) * up
     ringed = np.pad(np.where(mask, np.cumsum(mask).reshape(mask.shape) - 1, -1), 1, constant_values=-1)
     here = np.arange(len(row))
     parts, wanted, there = [], [], []
     for below, right, slope in ((0, 1, across), (0, -1, across), (-1, 0, up), (1, 0, up)):
         other = ringed[row + 1 + below, column + 1 + right]
-        found = other >= 0
-        factor = np.where(found, (right - below) * towards, 0.0)
-        places = np.tile(here, 2), np.concatenate([np.where(found, other, here), here])
+        exists = other >= 0
+        factor = np.where(exists, (right - below) * towards, 0.0)
+        places = np.tile(here, 2), np.concatenate([np.where(exists, other, here), here])
         parts.append(sparse.coo_array((np.concatenate([factor, -factor]), places), (len(here),) * 2))
-        wanted.append(np.where(found, slope, 0.0))
-        there.append(found)
+        wanted.append(np.where(exists, slope, 0.0))
+        there.append(exists)
     return sparse.csr_array(sparse.vstack(parts)), np.concatenate(wanted), np.concatenate(there)

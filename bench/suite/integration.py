@@ -309,8 +309,8 @@ def _cut(right: Mask, down: Mask, known: Mask, edges: Mask, slopes: Floats) -> N
     row, column = np.nonzero(known & edges)
     here = values[:, row + 1, column + 1].astype(np.float64)
     unlike = np.empty((4, len(row)))
-    for far, (below, beside) in zip(unlike, _AROUND, strict=True):
-        there = np.s_[row + 1 + below, column + 1 + beside]
+    for far, (below, right_of) in zip(unlike, _AROUND, strict=True):
+        there = np.s_[row + 1 + below, column + 1 + right_of]
         far[:] = np.where(free[there], np.sum(np.square(values[:, *there] - here), axis=0), np.inf)
     nearest = np.where(np.isfinite(unlike).any(axis=0), unlike.argmin(axis=0), -1)
     for number, (links, up, left) in enumerate(((right, 0, 0), (right, 0, 1), (down, 0, 0), (down, 1, 0))):

@@ -143,7 +143,7 @@ def _peers(
 
 
 def _in_tiles(tiles: tuple[int, int], frames: NDArray[Any], fill: Callable[[slice], None]) -> None:
-    """Fill all rows in tiles of at most so many pixels, on so many cores."""
+    """Fill all rows in tiles, given as (cores, pixels of a tile)."""
     threads, pixels = tiles
     count = max(1, min(pixels // frames.shape[2], -(-frames.shape[1] // threads)))
     with ThreadPoolExecutor(threads) as pool:
@@ -334,16 +334,16 @@ def _numba_scan(each: bool, hold: int, *, whole: bool) -> Any:  # noqa: C901  # 
 
     @numba.njit(error_model="numpy")
     def answer(frames, pixel, start, travel, level, light, dark, noise):  # type: ignore[no-untyped-def]
-        surely = level - np.float32(_CONFIDENT * noise)
+        confident = level - np.float32(_CONFIDENT * noise)
         way = level - dark
         near = level - max(np.float32(0.25) * way, np.float32(0))
         foot = start - 1
         while foot > 0 and (
-            frames[foot, pixel] >= light or frames[foot, pixel] > surely or frames[foot, pixel] >= near
+            frames[foot, pixel] >= light or frames[foot, pixel] > confident or frames[foot, pixel] >= near
         ):
             foot -= 1
         below = start - 1
-        while below > 0 and (frames[below, pixel] >= light or frames[below, pixel] > surely):
+        while below > 0 and (frames[below, pixel] >= light or frames[below, pixel] > confident):
             below -= 1
         low, high = np.float64(frames[start - 1, pixel]), np.float64(frames[start, pixel])
         last = len(frames) - 1

@@ -7,7 +7,6 @@ within the memory that is allowed.
 
 from __future__ import annotations
 
-import functools
 import gc
 import json
 import math
@@ -55,7 +54,7 @@ IN_MEMORY = f"{OURS}, frames in memory"
 READ, H5PY = f"{OURS}, frames read", "h5py, frames read"
 PLAIN = f"{PATH}, equation 4"
 _ZARR_PATH, _OBJECTS = f"{PATH}, from Zarr", "s3fs, objects fetched"
-_ARGMAX, _NUMBA = "h5py and NumPy argmax, file to result", "h5py and Numba, file to result"
+_ARGMAX = "h5py and NumPy argmax, file to result"
 
 _QUICK, _QUICK_TURNS = (12, 48, 64), (64, 48, 64)
 _PRESS, _TURNS, _LAB, _BUDGET = (1907, 1024, 1024), (16_000, 240, 320), (256, 1080, 1920), (6_500, 480, 640)
@@ -204,25 +203,22 @@ def run_lab(device: Device, quick: bool) -> Case:
     shape = _QUICK if quick else _LAB
     size, extra = math.prod(shape), MAPS * math.prod(shape[1:])
     check_memory("file-lab", 4 * size + extra)
-    absent, labs = missing("numba"), {_ARGMAX: _lab_argmax}
-    labs |= {} if absent else {_NUMBA: _lab_numba}
     with new_folder("file-lab", size + 10 * extra) as folder:
         press, path = make_press(shape), folder / "press.h5"
         record(press, path)
         with io.open_recording(path) as recording:
             dataset = recording.dataset
-        given = path, dataset, *references(shape[1:], press.dtype), folder / "heights.npy"
+        lab = partial(_lab_argmax, path, dataset, *references(shape[1:], press.dtype), folder / "heights.npy")
         calls: dict[str, Callable[[], Any]] = {
             PATH: partial(to_result, path, folder / "result.h5", device),
             PLAIN: partial(to_result, path, folder / "plain.h5", device, subframe=False),
-            **{name: partial(lab, *given) for name, lab in labs.items()},
+            _ARGMAX: lab,
         }
         works = {name: Work(call, size, shape[0]) for name, call in calls.items()}
 
         def check(results: dict[str, Any]) -> None:
             full, plain = results[PATH].height, results[PLAIN].height
-            for name in labs:
-                agree(name, {"height": results[name]}, {"height": plain}, whose=PLAIN)
+            agree(_ARGMAX, {"height": results[_ARGMAX]}, {"height": plain}, whose=PLAIN)
             assert press.block.travel is not None
             above, step = full - plain, press.block.travel[1] - press.block.travel[0]
             inside = (above > -_ROUNDING) & (above < step + _ROUNDING) | np.isnan(full) & np.isnan(plain)
@@ -231,16 +227,10 @@ def run_lab(device: Device, quick: bool) -> Case:
                 raise DisagreementError(f"{PATH}: {off}; nothing was timed")
 
         rows = time_works(works, size, device, quick, check, rounds=ROUNDS)
-    bounds = {_ARGMAX: 10.0, _NUMBA: 2.0}
-    targets = [
-        ratio_target(PATH, bounds[name], rows[PATH], rows[name], name, faster=True)
-        for name in labs
-        if not quick
-    ]
-    title = (
-        f"heights by equation 4 with hold 2, saved; ours the full default as well; {_size(shape)}, contiguous"
-    )
-    return Case("file-lab", title, list(rows.values()), absent, (), tuple(targets))
+    target = ratio_target(PATH, 10.0, rows[PATH], rows[_ARGMAX], _ARGMAX, faster=True)
+    what = "heights by equation 4 with hold 2, saved; ours the full default as well"
+    title = f"{what}; {_size(shape)}, contiguous"
+    return Case("file-lab", title, list(rows.values()), {}, (), () if quick else (target,))
 
 
 def _lab_argmax(path: Path, dataset: str, dark: Floats, bright: Floats, target: Path) -> Floats:
@@ -258,23 +248,6 @@ def _lab_argmax(path: Path, dataset: str, dark: Floats, bright: Floats, target: 
     return _save(onset, travel, target)
 
 
-def _lab_numba(path: Path, dataset: str, dark: Floats, bright: Floats, target: Path) -> Floats:
-    """Do the same loop with a Numba kernel: in each frame, all pixels on all cores."""
-    import h5py
-
-    look, level = _numba_look(), np.ceil(dark + (bright - dark) / 2)
-    level = np.where(np.isnan(level), 255, level).astype(np.uint8)  # a dead pixel is dark
-    with h5py.File(path) as file:
-        stack, travel = file[dataset], _travel_in(file)
-        frame, was_light = np.empty(stack.shape[1:], stack.dtype), np.zeros(level.shape, bool)
-        onset = np.full(level.shape, -1, np.int32)
-        for number in range(len(stack)):
-            stack.read_direct(frame, np.s_[number])
-            look(frame.reshape(-1), level.reshape(-1), number, was_light.reshape(-1), onset.reshape(-1))
-    onset[(onset < 0) & was_light] = len(travel) - 1
-    return _save(onset, travel, target)
-
-
 def _travel_in(file: Any) -> NDArray[np.float64]:
     return np.asarray(file["/entry/instrument/stage/travel"][()])
 
@@ -283,19 +256,6 @@ def _save(onset: NDArray[Any], travel: NDArray[np.float64], target: Path) -> Flo
     height = np.where(onset > 0, -travel[onset], np.nan).astype(np.float32)
     np.save(target, height)
     return height
-
-
-@functools.cache
-def _numba_look() -> Any:
-    import numba
-
-    def look(frame, level, number, was_light, onset):  # type: ignore[no-untyped-def]
-        for p in numba.prange(len(frame)):
-            light = frame[p] >= level[p]
-            onset[p] = number - 1 if (onset[p] < 0) & light & was_light[p] else onset[p]
-            was_light[p] = light
-
-    return numba.njit(parallel=True)(look)
 
 
 def run_budget(device: Device, quick: bool) -> Case:

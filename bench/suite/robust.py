@@ -94,9 +94,14 @@ CASES: Cases = {"integrate-robust": run_robust}
 
 
 def _integrate(scene: Scene, robust: bool, device: Device) -> NDArray[np.float32]:
-    options: dict[str, Any] = {"normals": scene.normals, "mask": scene.mask, "camera": scene.camera}
-    size = None if scene.camera else scene.pixel_size
-    return engine.integrate(pixel_size=size, robust=robust, sigma=False, device=device, **options).height
+    return engine.integrate(
+        normals=scene.normals,
+        mask=scene.mask,
+        pixel_size=scene.pixel_size,
+        robust=robust,
+        sigma=False,
+        device=device,
+    ).height
 
 
 def _once(name: str, seconds: float, scene: Scene) -> Row:

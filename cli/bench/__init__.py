@@ -40,10 +40,10 @@ def command(
     """Time the core operations and the limits of a device.
 
     Measures find_onset, correlate and integrate on simulated frames, and the device's bandwidth, arithmetic
-    and launches; compares both with a table. Takes about a minute.
+    and launches; compares both with a table. Takes about half a minute.
     """
     from mirrorskin import io
-    from mirrorskin.cli.bench.operations import COUNT, measure_all
+    from mirrorskin.cli.bench.operations import MEASUREMENTS
     from mirrorskin.cli.bench.records import describe_run, open_run
     from mirrorskin.cli.output import progress
     from mirrorskin.io.atomic import write_new
@@ -56,9 +56,9 @@ def command(
     table = open_run(against or TABLE)
     opened = open_device(device)
     cases = []
-    with progress("measuring", COUNT) as show:
-        for case in measure_all(opened, quick):
-            cases.append(case)
+    with progress("measuring", len(MEASUREMENTS)) as show:
+        for measure in MEASUREMENTS:
+            cases.append(measure(opened, quick))
             show(len(cases))
     run = describe_run(opened, cases, quick)
     if as_json:

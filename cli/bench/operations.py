@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from mirrorskin import engine, hw
 from mirrorskin.cli.bench.limits import call_works, measure_limits, time_works
 from mirrorskin.cli.bench.records import Case
+from mirrorskin.cli.bench.timing import ROUNDS
 from mirrorskin.kernels.device import Device
 
 Shape = tuple[int, int, int]
@@ -66,14 +67,12 @@ def measure_integration(device: Device, quick: bool) -> Case:
     return _time("integration", title, call, moved, 0, device, quick, first="triad")
 
 
-def measure_all(device: Device, quick: bool) -> Iterator[Case]:
-    """Measure the limits of a device, and each operation."""
-    yield measure_limits(device, LIMIT_BYTES >> (6 * quick), 1 if quick else 7)
-    for measure in (measure_onset, measure_correlation, measure_integration):
-        yield measure(device, quick)
+def measure_device(device: Device, quick: bool) -> Case:
+    """Measure the limits of a device."""
+    return measure_limits(device, LIMIT_BYTES >> (6 * quick), 1 if quick else ROUNDS)
 
 
-COUNT = 4  # cases of `measure_all`
+MEASUREMENTS = (measure_device, measure_onset, measure_correlation, measure_integration)
 
 
 def _time(

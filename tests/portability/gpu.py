@@ -21,7 +21,7 @@ import numpy as np
 from gpu_check import ROOT, frozen_cases, taken_for_gpu
 from suite import report
 
-from mirrorskin.cli.bench.operations import measure_all
+from mirrorskin.cli.bench.operations import MEASUREMENTS
 from mirrorskin.cli.bench.records import describe_run
 from mirrorskin.kernels.device import list_devices, open_device
 
@@ -43,7 +43,7 @@ def main() -> int:
     answers = compare_answers()
     wrong = {name: said for name, said in answers.items() if said}
     say("answers", f"{len(answers) - len(wrong)} of {len(answers)} as on the CPU", begin)
-    cases = list(measure_all(device, quick))
+    cases = [measure(device, quick) for measure in MEASUREMENTS]
     say("benchmarks", f"{len(cases)} cases", begin)
     run = describe_run(device, cases, quick)
     data = {**json.loads(run.as_json()), "tests": tests, "answers": answers}
