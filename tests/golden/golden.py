@@ -127,7 +127,10 @@ def _compare_usual(found: NDArray[Any], frozen: NDArray[Any]) -> tuple[bool, str
     if (found.dtype, found.ndim) != (frozen.dtype, frozen.ndim) and frozen.dtype.kind != "U":
         return False, f"{frozen.dtype} {frozen.shape} became {found.dtype} {found.shape}"
     if frozen.dtype.kind == "U":
-        one, other = ([place for place, _ in _leaves(json.loads(str(text)))] for text in (found, frozen))
+        one, other = (
+            sorted(RENAMED.get(place, place) for place, _ in _leaves(json.loads(str(text))))
+            for text in (found, frozen)
+        )
         return one == other, "tells of other things" if one != other else "tells of the same"
     if found.shape != frozen.shape:
         return True, f"{frozen.shape} became {found.shape}"
