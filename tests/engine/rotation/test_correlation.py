@@ -132,7 +132,7 @@ def test_blocks_make_no_difference(device, dtype, weights):
             same(found[0], found[-1])
             same(operation.result(), found[-1])
             operation.reset()
-            with pytest.raises(InputError, match="none pushed"):
+            with pytest.raises(InputError, match="none have been pushed"):
                 operation.result()
             same(push(operation, lent, phase, weight, cuts, lent=True).result(), found[0])
 
@@ -217,7 +217,7 @@ def test_a_window_answers_as_soon_as_its_phases_determine_a_fit(device):
     frames = swing("uint8", MEASURED)
     operation = Correlate(window_frames=8, device=device)
     for count in range(3):
-        message = f"{count} frames at {count} different phases" if count else "none pushed"
+        message = f"{count} frames at {count} different phases" if count else "none have been pushed"
         with pytest.raises(InputError, match=message):
             operation.result()
         push(operation, frames[count : count + 1], MEASURED[count : count + 1])

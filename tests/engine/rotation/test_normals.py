@@ -336,7 +336,7 @@ REFUSED = {
         stack(dtype=np.float64),
         EIGHTHS,
         {},
-        "frames of type float64: uint8, uint16, float32 are needed",
+        "frames of type float64: uint8, uint16 or float32 are needed",
     ),
     "phases of others": (stack(), EIGHTHS[:7], {}, r"phase has shape \(7,\) for 8 frames"),
     "two phases": (stack(), [0, 3] * 4, {}, "8 frames at 2 different phases do not determine a fit"),
@@ -351,10 +351,15 @@ REFUSED = {
     "no tilt": (stack(), EIGHTHS, {"tilt": 0.0}, "tilt 0 deg: above 0 and up to 30 deg is needed"),
     "a tilt of 40 degrees": (stack(), EIGHTHS, {"tilt": np.radians(40)}, "tilt 40 deg: above 0"),
     "a tilt that cannot be seen": (stack(), EIGHTHS, {"tilt": "estimate"}, "to estimate the tilt"),
-    "no noise": (stack(), EIGHTHS, {"noise": 0.0}, "noise 0: a number in counts above 0 is needed"),
+    "no noise": (stack(), EIGHTHS, {"noise": 0.0}, "noise 0.0: a number in counts above 0 is needed"),
     "noise of no number": (stack(), EIGHTHS, {"noise": np.nan}, "noise nan: a number in counts above 0"),
     "no scale": (stack(), EIGHTHS, {"zenith_gain": None}, "a zenith gain is needed"),
-    "no gain": (stack(), EIGHTHS, {"zenith_gain": np.zeros(SHAPE)}, "gain of every pixel is 0 or no number"),
+    "no gain": (
+        stack(),
+        EIGHTHS,
+        {"zenith_gain": np.zeros(SHAPE)},
+        "gain of every pixel is 0 or not a number",
+    ),
     "a gain of no number": (
         stack(),
         EIGHTHS,
@@ -384,7 +389,7 @@ def test_what_cannot_be_used_is_refused_in_one_line(case):
 def test_a_block_that_does_not_fit_is_refused_and_changes_nothing():
     frames, phase = frames_of(turns=2), phases(SETUP, 2)
     estimator = estimator_of(None)
-    with pytest.raises(InputError, match="none pushed so far"):
+    with pytest.raises(InputError, match="none have been pushed"):
         estimator.result()
     push(estimator, frames[:10], phase[:10])
     wrong = [
