@@ -30,9 +30,9 @@ from mirrorskin.kernels.device import Device, open_device
 
 Mask = NDArray[np.bool_]
 
-_SAME = 1e-6  # share by which pixel sizes may differ
+_SAME = 1e-6  # largest relative difference of pixel sizes
 _PASSES = 3  # over the axial frames, at most
-_STILL = 0.02  # of a pixel, by which points may move between passes
+_STILL = 0.02  # pixels that points may move between the last two passes
 
 
 @checked
@@ -288,22 +288,24 @@ def _check_sources(vertical: Source, axial: Source) -> tuple[float, float]:
     for motion, source in wanted.items():
         if source.motion != motion:
             raise InputError(
-                f"{source.name} is of {source.motion} motion: a vertical one and an axial one are needed"
+                f"{source.name} has {source.motion} motion: a vertical one and an axial one are needed"
             )
         if source.header.pixel_size is None:
-            raise InputError(f"{source.name} does not say its pixel size, which fusion needs: give it")
+            raise InputError(f"{source.name} has no pixel size, which a fusion needs: give it")
     sizes = [(source.shape[2], source.shape[1]) for source in (vertical, axial)]
     pixels = [source.header.pixel_size or (0.0, 0.0) for source in (vertical, axial)]
-    ways = []
+    differences = []
     if sizes[0] != sizes[1]:
-        ways.append(" and ".join(f"{width} x {height} pixels" for width, height in sizes))
+        differences.append(" and ".join(f"{width} x {height} pixels" for width, height in sizes))
     origins = [getattr(source, "origin", (0, 0)) for source in (vertical, axial)]
     if origins[0] != origins[1]:
-        ways.append(" and ".join(f"regions from column {column}, row {row}" for row, column in origins))
+        differences.append(
+            " and ".join(f"regions from column {column}, row {row}" for row, column in origins)
+        )
     if not np.allclose(pixels[0], pixels[1], rtol=_SAME, atol=0):
-        ways.append(" and ".join(f"pixels of {width:g} x {height:g} mm" for width, height in pixels))
-    if ways:
-        differ = "; ".join(ways)
+        differences.append(" and ".join(f"pixels of {width:g} x {height:g} mm" for width, height in pixels))
+    if differences:
+        differ = "; ".join(differences)
         raise InputError(
             f"{vertical.name} and {axial.name} differ: {differ}: record both with the same camera and crop"
         )
@@ -311,7 +313,7 @@ def _check_sources(vertical: Source, axial: Source) -> tuple[float, float]:
 
 
 def _check_rotation(axial: Source, rotation: Rotation) -> None:
-    """Refuse a rotation that gives no normals, or not those of one picture."""
+    """Raise InputError unless a rotation has the normals of one picture."""
     known = axial.header.zenith_gain is not None or wall_response_of(axial) is not None
     if not known and rotation.zenith_gain is None:
         raise InputError(
@@ -320,7 +322,7 @@ def _check_rotation(axial: Source, rotation: Rotation) -> None:
     if at_poses(axial, rotation.tilt):
         raise InputError(f"{axial.name} has a tilt of each frame: a fusion needs turns of one tilt")
     if rotation.per_turn:
-        raise InputError(f"{axial.name}: all turns make one surface: do not ask for each turn's own")
+        raise InputError(f"{axial.name}: all turns make one surface: leave per_turn out")
     if rotation.heights is not None:
         raise InputError(f"{axial.name}: frames are registered with the heights of the press: give no others")
 
@@ -339,20 +341,20 @@ def _maps_of_surface(surface: Surface) -> dict[str, Any]:
 def _moved(
     before: NDArray[np.float32], after: NDArray[np.float32], tilt: float, pixel_size: tuple[float, float]
 ) -> float:
-    """Return by how many pixels nearly all points move when their heights become others."""
+    """Return the shift, pixels, that 99 % of the points do not exceed when their heights change."""
     change = np.abs(before - after)[np.isfinite(after)]
     return float(np.percentile(change, 99) * np.sin(tilt) / min(pixel_size)) if change.size else 0.0
 
 
 def _after(progress: Progress | None, done: int) -> Progress | None:
-    """Return a progress that counts on from so many frames."""
+    """Return a progress that begins to count at a number of frames."""
     return None if progress is None else lambda count: progress(done + count)
 
 
 def _both(vertical: Mapping[str, ProcessValue], axial: Mapping[str, ProcessValue]) -> dict[str, ProcessValue]:
-    """Join two processes: once what is the same of both, the rest under the movements' names."""
+    """Join two processes: shared values once, others with the name of the motion in front."""
     shared = {name: axial[name] for name in ("program", "version", "date", "device", "driver")}
-    made = shared | {"source": f"{vertical['source']}, {axial['source']}", "method": "fusion"}
-    for motion, process in ("vertical", vertical), ("axial", axial):
-        made |= {f"{motion}_{name}": value for name, value in process.items() if name not in shared}
-    return made
+    process = shared | {"source": f"{vertical['source']}, {axial['source']}", "method": "fusion"}
+    for motion, values in ("vertical", vertical), ("axial", axial):
+        process |= {f"{motion}_{name}": value for name, value in values.items() if name not in shared}
+    return process

@@ -74,7 +74,7 @@ class Growth(CorrelationOperation):
         shown_default="that of the recording",
         python_only=True,
     )
-    dither: TravelWave | None = option(
+    travel_wave: TravelWave | None = option(
         default=None,
         help="first harmonic of the travel, if it is known beforehand",
         shown_default="estimated from the travel of all frames in a first pass",
@@ -92,32 +92,32 @@ class Growth(CorrelationOperation):
             if getattr(self, name) is None
         }
         travel: Doubles | None = getattr(source, "travel", None)
-        if self.dither is None and travel is not None:
-            changes["dither"] = travel_wave(travel, source.shape[0])
+        if self.travel_wave is None and travel is not None:
+            changes["travel_wave"] = first_harmonic(travel, source.shape[0])
         return self.with_options(**changes)
 
     @property
     def passes(self) -> int:
         """How often all frames are pushed: twice if the travel is not known beforehand."""
-        return 2 if self.dither is None else 1
+        return 2 if self.travel_wave is None else 1
 
     def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         """Prepare for frames of a shape and type."""
         super().start(shape, dtype)
         self._pixel_size = None if self.pixel_size is None else check_pixel_size(self.pixel_size)
-        if not isinstance(self.dither, TravelWave | None):
-            raise InputError(f"dither is a {type(self.dither).__name__}: a TravelWave is needed")
+        if not isinstance(self.travel_wave, TravelWave | None):
+            raise InputError(f"travel_wave is a {type(self.travel_wave).__name__}: a TravelWave is needed")
         self._levels = reference_pair(self.dark, self.bright, shape, dtype)
-        self._wave = self.dither
+        self._wave = self.travel_wave
 
     def clear(self) -> None:
         """Forget the frames so far."""
         super().clear()
-        self._wave = self.dither
+        self._wave = self.travel_wave
 
     def start_second_pass(self) -> None:
         """Estimate the first harmonic of the travel of all frames."""
-        self._wave = travel_wave(self.pushed("travel"), self.count)
+        self._wave = first_harmonic(self.pushed("travel"), self.count)
 
     def push(self, frames: NDArray[Any], *, travel: ArrayLike, lent: bool = False) -> None:
         """Take in the next frames, (n, H, W), and the travel of each, (n,) mm."""
@@ -177,7 +177,7 @@ find_growth = travel_function(
 )
 
 
-def travel_wave(travel: ArrayLike | None, frames: int) -> TravelWave:
+def first_harmonic(travel: ArrayLike | None, frames: int) -> TravelWave:
     """Return the first harmonic of a travel; InputError if it does not dither."""
     values = check_strokes(travel, frames, "travel")
     frame = np.arange(frames, dtype=np.float64)

@@ -394,7 +394,7 @@ class TurnSums(_Sums):
 
 
 class WindowSums(_Sums):
-    """The last frames of an endless rotation, in a ring: they are summed when the fit is asked for.
+    """The last frames of an endless rotation, in a ring buffer; they are summed when the fit is computed.
 
     Map ``ring`` of each band holds its rows of the frames; the oldest frame of a full window is in its plane
     ``oldest``, and the next frame goes there.

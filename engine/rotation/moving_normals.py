@@ -130,7 +130,7 @@ class MovingNormals(NormalsOperation):
 
 
 class NormalsFunction(Protocol[P]):
-    """A function of frames, (T, H, W), what says where the body was in each, and options."""
+    """A function of frames, (T, H, W), the pose of the body in each, and options."""
 
     def __call__(
         self,

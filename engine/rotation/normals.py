@@ -218,7 +218,7 @@ class NormalsOperation(SensorOptions, Operation):
             self._phase, self._weights = self._phase[end:], self._weights[end:]
 
     def _cut(self, phase: Doubles) -> list[slice]:
-        """Cut frames into turns, none of which may be too long."""
+        """Return the frames of each turn; InputError if a turn is too long."""
         turns = self._turns_in(phase)
         longest = max(turn.stop - turn.start for turn in turns)
         if longest > self._longest:
@@ -440,7 +440,7 @@ class Normals(NormalsOperation):
             self._window.push(frames, alpha)
 
     def result(self) -> Result:
-        """Return the maps of all turns, the last of which ends with the last frame, or of the window."""
+        """Return the maps of the window, or of all turns; the last turn ends with the last frame."""
         return super().result() if self.window_frames is None else self._window_result()
 
     def finish(self) -> Result:

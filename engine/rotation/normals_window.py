@@ -22,9 +22,9 @@ _ROOM = 16  # frames that may be pushed at once without a copy
 class NormalWindow:
     """Estimates normals of a window of the last frames on the device, for `mirrorskin.engine.Normals`.
 
-    Noise and tilt are those of the first full window, unless they are given. Its frames are kept on
-    the device, in a ring that the correlation's sums share: the normals are those of ``estimate_normals``
-    from the same frames, bit by bit, and the correlation is that of ``correlate``.
+    Noise and tilt are estimated from the first full window, unless they are given. Its frames are kept on
+    the device, in a ring buffer that the correlation shares. Normals and correlation are equal to those that
+    ``estimate_normals`` and ``correlate`` compute from the same frames, bit by bit.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class NormalWindow:
 
     @property
     def bands(self) -> list[Band]:
-        """Where the maps are that `estimate` leaves, by the names of `MAPS`."""
+        """The rows on the device, with the maps that `estimate` computes, named as in `MAPS`."""
         return self._sums.bands
 
     def reset(self) -> None:
@@ -75,7 +75,7 @@ class NormalWindow:
                 self._model = self._kernel.estimate_model(self._samples(), self._fit())
 
     def estimate(self, bare: bool = True) -> None:
-        """Put the estimate of the window's normals on the device's queue; their maps lie in the bands.
+        """Enqueue the estimate of the window's normals; it writes to the maps of the bands.
 
         ``bare`` leaves out mean, cosine, sine and residual. InputError: the window is not full, or its phases
         do not determine a normal.
@@ -90,7 +90,7 @@ class NormalWindow:
                 self._estimated = ring.last_use
 
     def place(self, heights: NDArray[np.floating]) -> None:
-        """Set how high the object stands from now on, (H, W), mm above the rest plane; with a response."""
+        """Set the height of the object from now on, (H, W), mm above the rest plane; with a response."""
         for band in self.bands:
             band.write("scale", heights[band.rows], plane=4)
 
@@ -129,7 +129,7 @@ class NormalWindow:
         phase, weight = self._sums.frames
         fit = turn_fit(phase, weight) if self.is_full else None
         if fit is None:
-            check_phases(phase[weight > 0])  # says what is wrong
+            check_phases(phase[weight > 0])  # raises an error that names the problem
             raise InputError(f"{self.count} frames: a window of {self.length} is not full yet")
         return fit
 

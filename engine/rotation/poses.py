@@ -15,13 +15,13 @@ from mirrorskin.io.positions import check_phase
 from mirrorskin.io.types import body_axes
 
 PRESSES = 0.02
-"""Share of the greatest travel by which travel differs between frames where the body presses as well."""
+"""Least range of travel of a body that presses as well, as a share of the greatest travel."""
 
 _SAME = 1e-4  # share of the axes' greatest part up to which a part is none
 _PLANE = 1e-2  # share of the axes' swing in a plane up to which a swing across it is none
 _UPRIGHT = 0.05  # sine of the angle to the vertical up to which a plane is upright
 _FRAMES_OF_SECOND = 9  # least frames to fit second orders with the first
-_UNIT = 1e-6  # by which the length of a unit vector may be wrong
+_UNIT = 1e-6  # tolerance of the length of a unit vector
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +48,7 @@ def check_poses(
     axis: ArrayLike | None = None,
     travel: ArrayLike | None = None,
 ) -> Doubles:
-    """Return the axis and the travel of each frame, (count, 4), from what says where the body was.
+    """Return the axis and the travel of each frame, (count, 4), from its phase and tilt, or its axis.
 
     InputError: both an axis and a phase, neither, or numbers that cannot be a pose.
     """
@@ -73,7 +73,7 @@ def check_poses(
 
 
 def rocks(phase: ArrayLike | None) -> bool:
-    """Tell whether there are two phases, half a turn apart."""
+    """Return whether there are two phases, half a turn apart."""
     if phase is None:
         return False
     steps: Doubles = np.unique(np.round(np.mod(np.asarray(phase, np.float64), 2 * np.pi), 6))

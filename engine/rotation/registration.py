@@ -1,4 +1,4 @@
-"""Axial frames resampled along with the object, which the body's tilting moves through the picture."""
+"""Axial frames, resampled so that they follow the object, which the tilt of the body moves in the picture."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ class Registered:
     the mean pose.
 
     A camera whose lines of sight lean towards an axis, by k for each millimetre from it, sees the point p at
-    the pixel of X where (p.x, p.y) = X - k p.z (X - axis). To the first order in k, that adds to the way of
-    the pixel ::
+    the pixel of X where (p.x, p.y) = X - k p.z (X - axis). To the first order in k, that adds to the shift
+    of the pixel ::
 
         k (p'.z - p.z) (X - axis) + k p.z (p' - p)
 
@@ -113,7 +113,7 @@ class Registered:
             "gain": self.device.given("gain", gain),
         }
         self._height = self.device.given("height", height)
-        places = _mendable(offset, gain)
+        places = _interpolated_pixels(offset, gain)
         self._places = self.device.given("places", places, np.int32) if len(places) else None
         self._noise = self.device.given("noise", np.zeros((2, rows, columns), np.float32))
         self._shift = self.device.array("shift", (2, 4 if sight is None else 7), np.float32)
@@ -124,7 +124,7 @@ class Registered:
 
     @property
     def noise_gain(self) -> NDArray[np.float32]:
-        """By what the noise of a sample is scaled, (H, W), RMS over the frames read since the first.
+        """Factor of the noise of a sample, (H, W), RMS over the frames read since the first.
 
         NaN where there was no sample. It is that of noise which is independent from pixel to pixel, and equal
         on their shared scale; that of registered neighbours is not independent.
@@ -201,7 +201,7 @@ class _Geometry:
     @classmethod
     def of(cls, source: Source, header: Header, sight: Sight | None) -> Self:
         if source.motion != "axial":
-            raise InputError(f"{source.name} is of {source.motion} motion: only axial ones can be registered")
+            raise InputError(f"{source.name} has {source.motion} motion: only axial ones can be registered")
         pixel_size, tilt, press, pivot = (
             _known(source, header, name) for name in ("pixel_size", "tilt", "press", "pivot")
         )
@@ -226,14 +226,14 @@ class _Geometry:
         lean = self.sight.lean
         moved[0] += lean * rise * self.press * (self.press - self.pivot[2])
         moved[3] += lean * rise * (2 * self.press - self.pivot[2])
-        # By how much the point rises; times the lean, so far the pixel goes for each mm from the axis.
+        # Rise of the point; times the lean, it is the shift of the pixel per mm from the axis.
         up = -rise * outwards - drop * (self.press - self.pivot[2])
-        ways = self._radial(lean * up, -lean * rise * along_x * cosine, lean * rise * along_y * sine)
-        ways[:, :4] += np.outer([cosine, sine], moved)
-        return np.asarray(ways / [[along_x], [-along_y]], np.float32)
+        shifts = self._radial(lean * up, -lean * rise * along_x * cosine, lean * rise * along_y * sine)
+        shifts[:, :4] += np.outer([cosine, sine], moved)
+        return np.asarray(shifts / [[along_x], [-along_y]], np.float32)
 
     def _radial(self, number: float, column: float, row: float) -> NDArray[np.float64]:
-        """Return the way, mm, of pixels that go so far for each millimetre from the axis, (2, 7)."""
+        """Return the shift, mm, of pixels that move in proportion to their distance from the axis, (2, 7)."""
         assert self.sight is not None
         x, y = (corner - axis for corner, axis in zip(self.corner, self.sight.axis, strict=True))
         along_x, along_y = self.pixel_size
@@ -251,10 +251,11 @@ def _fill(array: Array, values: NDArray[Any]) -> None:
     array.upload()
 
 
-def _mendable(offset: NDArray[np.float32], gain: NDArray[np.float32]) -> NDArray[np.int32]:
-    """List the pixels without a scale between two that have one, as ``registration_mend`` takes them, (n, 5).
+def _interpolated_pixels(offset: NDArray[np.float32], gain: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Return the pixels without a scale between two that have one, (n, 5), for ``registration_mend``.
 
-    Opposite ones, so that a slope between them does no harm: beside and above, else those at the corners.
+    The two are opposite neighbours, so that a slope cancels: left and right or above and below, otherwise
+    those at the corners.
     """
     sound = np.pad(np.isfinite(offset) & np.isfinite(gain) & (gain != 0), BORDER)
     stride = sound.shape[1]
@@ -271,13 +272,13 @@ def _mendable(offset: NDArray[np.float32], gain: NDArray[np.float32]) -> NDArray
 
 
 def _known(source: Source, header: Header, name: str) -> Any:
-    """Return what a header says, or raise InputError where it says nothing, or no number."""
+    """Return a value of a header; InputError if it is missing or not finite."""
     value = getattr(header, name)
     words = name.replace("_", " ")
     if value is None:
         raise InputError(
-            f"{source.name} does not say its {words}: record it with pixel size, tilt, press and pivot, which"
-            " registration needs"
+            f"{source.name} has no {words}, which registration needs: record it with pixel size, tilt, press"
+            " and pivot"
         )
     if not np.isfinite(value).all():
         raise InputError(f"{source.name}: {words} is {value}: registration needs finite numbers")

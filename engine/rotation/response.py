@@ -128,8 +128,8 @@ def initial_response(wall: WallResponse, source: Source, header: Header) -> Resp
     if header.pixel_size is None or header.press is None:
         missing = "pixel size" if header.pixel_size is None else "press"
         raise InputError(
-            f"{source.name} does not say its {missing}, and the calibrated response goes by place: record it,"
-            " or give the zenith gain to do without the response"
+            f"{source.name} has no {missing}, and the calibrated response depends on the place: record it, or"
+            " give the zenith gain to do without the response"
         )
     axes = pixel_axes(source.shape[1:], header.pixel_size)
     with naming(source):

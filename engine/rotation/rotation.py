@@ -71,7 +71,7 @@ class Rotation(Method, options_of=(NormalsOperation, Integration)):
     window_frames: int | None = Normals.window_frames
 
     def plan(self, source: Source) -> Plan:
-        """Return the operation for a source: by its poses, and by what is known of its brightness."""
+        """Return the operation for a source; it depends on the poses and on the known response."""
         wall = self._wall_of(source)
         if self.zenith_gain is None and source.header.zenith_gain is None and wall is None:
             return self._correlation(source)
@@ -108,7 +108,9 @@ class Rotation(Method, options_of=(NormalsOperation, Integration)):
     def _correlation(self, source: Source) -> Plan:
         if self.per_turn or self.heights is not None:
             what = "turns of their own" if self.per_turn else "use for heights"
-            raise InputError(f"{source.name} has no zenith gain, so no normals, and no {what}: give the gain")
+            raise InputError(
+                f"{source.name} has no zenith gain, so no normals, and no {what}: give zenith_gain"
+            )
         operation = self.make(Correlate, memory_limit=_at_most(self.memory_limit, source))
         return Plan(operation, process={"method": "correlation", "zenith": _NO_GAIN})
 
@@ -202,8 +204,7 @@ class Rotation(Method, options_of=(NormalsOperation, Integration)):
         tilt = header.tilt if self.tilt is None else None if self.tilt == "estimate" else self.tilt
         if tilt is None and self.tilt != "estimate":
             raise InputError(
-                f"{source.name} does not say how far the body leaned: give the tilt, such as 2.5deg,"
-                " or have it estimated"
+                f"{source.name} has no tilt: give it, such as 2.5deg, or estimate it from the first turn"
             )
         gain = header.zenith_gain if self.zenith_gain is None else np.asarray(self.zenith_gain, np.float64)
         offset = header.zenith_offset if self.zenith_offset is None else self.zenith_offset
@@ -260,7 +261,7 @@ def _with_tilts(tilt: float, block: Block) -> Block:
 def at_poses(source: Source, tilt: ArrayLike | None = None) -> bool:
     """Return whether the frames of a source are at any known poses, not on whole turns of one tilt.
 
-    A source that does not know its positions beforehand is asked for its first frame, if it can be rewound.
+    The first frame is read if the source does not have its positions beforehand and can be rewound.
     """
     if tilt is not None or source.motion != "axial":
         return False

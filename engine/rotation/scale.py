@@ -67,14 +67,16 @@ def make_scale(
     rate, zero = known["zenith gain"], known["zenith offset"]
     sound = np.isfinite(rate) & (rate != 0)
     if not sound.any():
-        what = f"zenith gain {rate}" if rate.ndim == 0 else "the zenith gain of every pixel is 0 or no number"
+        what = (
+            f"zenith gain {rate}" if rate.ndim == 0 else "the zenith gain of every pixel is 0 or not a number"
+        )
         raise InputError(f"{what}: counts per radian other than 0 are needed; calibrate, or leave it out")
     if not np.isfinite(zero).any():
-        raise InputError("the zenith offset is no number: give the counts at zenith 0, such as 10")
+        raise InputError("the zenith offset is not a number: give the counts at zenith 0, such as 10")
     for name in ("dark", "bright"):
         if name in known and not np.isfinite(known[name]).any():
             raise InputError(
-                f"{name} is no number: give the counts at which brightness ends, or leave it out"
+                f"{name} is not a number: give the counts at which brightness ends, or leave it out"
             )
     if "dark" in known and "bright" in known and not np.any(known["dark"] < known["bright"]):
         raise InputError("dark is not below bright at any pixel: are they swapped?")

@@ -452,7 +452,7 @@ def test_frames_may_stay_as_they_were_seen():
     header = replace(rotation(SMALL, PIXEL).header, pivot=None, press=None)
     turned = rotation(SMALL, PIXEL)
     turned.header = header
-    with pytest.raises(io.InputError, match="does not say its press"):
+    with pytest.raises(io.InputError, match="has no press, which registration needs"):
         fuse_recordings(press(SMALL, PIXEL), turned)
     result = fuse_recordings(press(SMALL, PIXEL), turned, register=False)
     assert result.process["heights"] == "none"
@@ -493,10 +493,10 @@ class Other:
 DOWN, ROUND = Other("down.h5"), Other("round.h5", "axial")
 UNFIT = {
     "swapped": (ROUND, DOWN, "round.h5 is the rotation and down.h5 the press: give the press first"),
-    "two presses": (DOWN, Other("b.h5"), "b.h5 is of vertical motion: a vertical one and an axial one"),
-    "two rotations": (Other("a.h5", "axial"), ROUND, "a.h5 is of axial motion"),
-    "a twist": (DOWN, Other("b.h5", "twist"), "b.h5 is of twist motion"),
-    "no pixel size": (Other("a.h5", pixel_size=None), ROUND, "a.h5 does not say its pixel size"),
+    "two presses": (DOWN, Other("b.h5"), "b.h5 has vertical motion: a vertical one and an axial one"),
+    "two rotations": (Other("a.h5", "axial"), ROUND, "a.h5 has axial motion"),
+    "a twist": (DOWN, Other("b.h5", "twist"), "b.h5 has twist motion"),
+    "no pixel size": (Other("a.h5", pixel_size=None), ROUND, "a.h5 has no pixel size"),
     "other size": (
         DOWN,
         Other("b.h5", "axial", (8, 60, 40)),

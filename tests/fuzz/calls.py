@@ -20,8 +20,8 @@ from mirrorskin.kernels.errors import DeviceError
 REFUSALS = (io.InputError, engine.NotConverged, DeviceError)
 SHAPE = (16, 20)
 _COUNTS = "mean", "cosine", "sine", "modulation", "residual"  # of a pixel's samples, which may be infinite themselves
-ELSEWHERE = {"reconstruct", "run", "free_memory"}
-"""Public functions that take no arrays of numbers: sources and nothing, which other tests see to."""
+ELSEWHERE = {"reconstruct", "run", "free_memory", "option"}
+"""Public functions that take no arrays of numbers; other tests call them."""
 
 _ROW, _COLUMN = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
 _FAR = np.hypot(_ROW - 7.5, _COLUMN - 9.5)

@@ -9,6 +9,7 @@ from commands import run
 from scipy import optimize
 
 from mirrorskin import engine, hw, io
+from mirrorskin.engine.lock_in import Correlation
 from mirrorskin.hw.twin import Camera, Vertical
 from mirrorskin.io.arrays import ArrayRecording
 
@@ -144,3 +145,25 @@ def test_the_frames_are_read_once_if_the_travel_is_known_and_twice_otherwise(ela
     blocks.push(frames, travel=DITHER)
     with pytest.raises(io.InputError, match="needs all frames twice"):
         blocks.result()
+
+
+def test_a_recording_of_a_dither_has_growth_and_correlation(elastic, tmp_path):
+    elastic.rewind()
+    with io.Recorder(elastic, tmp_path / "d.h5") as recorder:
+        recorder.drain(lambda count: None)
+    with io.open_recording(tmp_path / "d.h5") as recording:
+        result = Correlation(dither=True).run(recording)
+        alone = engine.run(recording, engine.Growth)
+        with pytest.raises(io.InputError, match="takes the phase from the travel: leave harmonic out"):
+            Correlation(dither=True, harmonic=2).run(recording)
+    said = {
+        "method": "correlation",
+        "zenith": "none: the recording has no zenith gain",
+        "frames": len(DITHER),
+    }
+    assert {name: result.process[name] for name in said} == said
+    assert result.process["area_growth"] == alone.process["area_growth"]
+    assert set(result) == {
+        *("growth", "growth_sigma", "azimuth", "mean", "cosine", "sine", "modulation", "residual"),
+    }
+    np.testing.assert_array_equal(result.growth, alone.growth)

@@ -157,7 +157,7 @@ def test_what_the_calibration_is_wrong_by_counts_in_the_errors_that_are_told():
 
 @pytest.mark.parametrize("missing", ["pixel_size", "press"])
 def test_a_recording_that_does_not_say_where_pixels_look_is_refused(missing):
-    with pytest.raises(io.InputError, match=f"does not say its {missing.replace('_', ' ')}"):
+    with pytest.raises(io.InputError, match=f"has no {missing.replace('_', ' ')}"):
         engine.reconstruct(scene().source(**{missing: None}))
 
 

@@ -354,7 +354,12 @@ REFUSED = {
     "no noise": (stack(), EIGHTHS, {"noise": 0.0}, "noise 0.0: a number in counts above 0 is needed"),
     "noise of no number": (stack(), EIGHTHS, {"noise": np.nan}, "noise nan: a number in counts above 0"),
     "no scale": (stack(), EIGHTHS, {"zenith_gain": None}, "a zenith gain is needed"),
-    "no gain": (stack(), EIGHTHS, {"zenith_gain": np.zeros(SHAPE)}, "gain of every pixel is 0 or no number"),
+    "no gain": (
+        stack(),
+        EIGHTHS,
+        {"zenith_gain": np.zeros(SHAPE)},
+        "gain of every pixel is 0 or not a number",
+    ),
     "a gain of no number": (
         stack(),
         EIGHTHS,

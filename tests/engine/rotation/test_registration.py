@@ -231,9 +231,9 @@ def test_it_is_a_source_like_its_own():
 
 
 BAD: dict[str, tuple[dict[str, Any], Any, str]] = {
-    "vertical": ({"motion": "vertical"}, None, "of vertical motion: only axial ones"),
-    "no pixel size": ({"pixel_size": None}, None, "does not say its pixel size"),
-    "no pivot": ({"pivot": None}, None, "does not say its pivot"),
+    "vertical": ({"motion": "vertical"}, None, "has vertical motion: only axial ones"),
+    "no pixel size": ({"pixel_size": None}, None, "has no pixel size"),
+    "no pivot": ({"pivot": None}, None, "has no pivot"),
     "tilt is NaN": ({"tilt": np.nan}, None, "tilt is nan"),
     "pivot is infinite": ({"pivot": (0.0, np.inf, 0.0)}, None, "pivot is .*inf"),
     "another size": ({}, np.zeros((23, 30)), r"shape \(23, 30\), the frames are 23 x 31"),

@@ -170,7 +170,7 @@ def test_maps_of_the_recording_are_used_and_said_so():
 
 def test_the_tilt_is_estimated_on_request_only():
     unknown = replace(HEADER, tilt=None)
-    with pytest.raises(io.InputError, match=r"^made up does not say how far the body leaned: give the tilt"):
+    with pytest.raises(io.InputError, match=r"^made up has no tilt: give it"):
         reconstruct(unknown)
     result = reconstruct(unknown, tilt="estimate")
     assert result.process["tilt_from"] == "estimate"
