@@ -157,11 +157,11 @@ class SlipScore:
     Attributes
     ----------
     answered, touched : int
-        Pixels in contact of which it is said whether they slipped, and all in contact.
+        Pixels in contact with the status slipped or sticks, and all pixels in contact.
     coverage : float
         Share of these that were answered.
     recall, precision : float
-        Share of the slipped pixels that were found, and of those found that slipped; pixels beside a border
+        Share of the slipped pixels that were found, and of those found that slipped; pixels next to a border
         of contact or slip are left out.
     stick_radius, true_stick_radius : float
         At the end, as shares of the contact's radius: square roots of the share of the answered pixels that
@@ -294,7 +294,7 @@ def score(result: Maps, truth: Truth) -> Score:
         raise InputError(f"the result is {size} pixels, the truth {truth.height.shape}: not of one stack")
     touched = truth.contact.astype(bool)
     azimuth = result.azimuth if result.normals is None else None
-    # Registered frames tell of the object's points, the truth of the picture's pixels.
+    # Maps of registered frames are those of the object's points, the truth is that of the picture's pixels.
     follows = bool(result.process.get("registered", result.process.get("heights", "none") != "none"))
     contact, edges = (None, None) if follows else (result.contact, result.edges)
     height, filled = _score_heights(result, truth.height, touched)
@@ -320,7 +320,7 @@ _SLIP_MAPS = ("displacement", "slip_onset", "status")
 
 
 def _why_slip_is_left_out(result: Result, truth: Truth) -> str | None:
-    """Say why slip that a result has cannot be compared with the truth; None if it can, or there is none."""
+    """Return why slip that a result has cannot be compared with the truth; None if it can, or has none."""
     if result.slip_onset is None and result.displacement is None:
         return None
     missing = [name for name in _SLIP_MAPS if name not in result]
@@ -348,7 +348,7 @@ def _distance(result: Result) -> Doubles | None:
 
 
 def _score_slip(result: Result, truth: Truth, touched: Mask) -> SlipScore:
-    """Score what slides and twists tell in the frames of the result, which are the truth's first."""
+    """Score displacement and slip in the frames of the result, which are the first of the truth."""
     onset, moved, distance = result.slip_onset, result.displacement, _distance(result)
     assert onset is not None
     assert moved is not None

@@ -74,7 +74,7 @@ def rim(patch: Patch) -> Quantity | None:
 
 
 def border(mask: Mask, *, ends: bool = False) -> Mask:
-    """Return the pixels of a mask beside one outside of it, or with ``ends`` beside the picture's end."""
+    """Return the pixels of a mask next to one outside of it, or with ``ends`` at the picture's end."""
     from scipy import ndimage
 
     return np.asarray(mask & ~ndimage.binary_erosion(mask, border_value=not ends))
@@ -128,10 +128,10 @@ def _lowest(patch: Patch) -> Quantity:
     if patch.sigma is not None:
         counts = counts & ~find_uncertain(patch.sigma, counts)
     height = np.where(counts, patch.height, np.inf)
-    # Only pixels with one beside them that is as low: a single low pixel does not count.
+    # Only pixels with an adjacent one that is as low: a single low pixel does not count.
     around = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
-    beside = cv2.erode(height, around, borderType=cv2.BORDER_CONSTANT, borderValue=math.inf)
-    pair = np.where(height >= beside, height, np.inf)
+    adjacent = cv2.erode(height, around, borderType=cv2.BORDER_CONSTANT, borderValue=math.inf)
+    pair = np.where(height >= adjacent, height, np.inf)
     place = np.unravel_index(int(np.argmin(pair if np.isfinite(pair).any() else height)), height.shape)
     value = float(height[place])
     sigma = np.nan if patch.sigma is None else float(patch.sigma[place])

@@ -139,7 +139,7 @@ def _forms(
         )
     if rough.uncertain:
         notes.append(
-            f"pixels left out of roughness and lowest point, far less sure than others: {rough.uncertain}"
+            f"pixels left out of roughness and lowest point, far less certain than others: {rough.uncertain}"
         )
     return found | rough.quantities()
 

@@ -37,8 +37,8 @@ class Section:
     x, y : ndarray, (n,), float64
         Where it runs, from the picture's centre, in ``unit``.
     height, sigma : ndarray, (n,), float64
-        Millimetres: heights between four pixels, NaN beside a hole and between components; and their standard
-        deviations, NaN where they are not known or a height was filled.
+        Millimetres: heights between four pixels, NaN next to a hole and between components; and their
+        standard deviations, NaN where they are unknown or a height was filled.
     filled : ndarray, (n,), bool
         Where a height was filled, not measured.
     unit : {"mm", "px"}
@@ -120,7 +120,7 @@ def section(
 def apex(height: NDArray[np.floating]) -> tuple[int, int]:
     """Return row and column of the highest point, after a median that leaves spikes out.
 
-    The median takes NaN for lower than everything. InputError where there is no height.
+    The median treats NaN as lower than everything. InputError if there is no height.
     """
     import cv2
 
@@ -131,7 +131,7 @@ def apex(height: NDArray[np.floating]) -> tuple[int, int]:
     below = np.nextafter(np.float32(lowest), np.float32(-np.inf)) - np.float32(1)
     smooth = cv2.medianBlur(np.where(known, height, below).astype(np.float32), _WINDOW)
     smooth[~known] = below
-    # Where all that is known is thinner than the window, there is no median to go by.
+    # Where all that is known is thinner than the window, the median is undefined.
     chosen = smooth if np.any(smooth > below) else np.where(known, height, below)
     row, column = np.unravel_index(int(np.argmax(chosen)), height.shape)
     return int(row), int(column)

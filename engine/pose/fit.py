@@ -19,13 +19,13 @@ from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.pose import BLOCK, PARTS, SUMS
 
 _UPPER = np.triu_indices(6)
-_FLOOR = 1e-5  # of the mean information: what rounding and the pixels' size leave of none
-_LIKELY = 0.5, 0.02  # times the pretended information that a step's direction needs, near and away
+_FLOOR = 1e-5  # of the mean information: what rounding and the pixel size leave where there is none
+_LIKELY = 0.5, 0.02  # times the spurious information that a step's direction needs, near and away
 _AWAY = 3.0  # chi square of a motion that is away
 _FEWEST = 20  # pixels that two maps must share
 _COARSEST = 24  # pixels along the shorter side of the coarsest maps
 _STEPS, _STILL = 40, 1e-2  # steps at most, and the step in standard deviations that ends them
-_BLOCKS = 100  # whose scatter tells as much of the covariance's form as independence does
+_BLOCKS = 100  # whose scatter is as informative about the covariance's form as independence
 _POOR = 2.0  # typical chi square from which on other starts are tried
 _ANGLES, _SHIFTS, _REACH, _SHARED, _TRIED = 24, 13, 0.8, 0.2, 6  # of the search
 _NONE = np.zeros((6, 0))
@@ -39,7 +39,7 @@ class Equations:
     ----------
     pixels : float
     normal_matrix, unbiased : ndarray, (6, 6)
-        J'WJ, and J'WK, in which noise of the Jacobians averages out; J'WJ where K was not asked for.
+        J'WJ, and J'WK, in which the noise of the Jacobians averages out; J'WJ if K was not computed.
     right : ndarray, (6,)
         J'Wr, and `scores`, (blocks, 6), of each block.
     chi_square : float
@@ -51,13 +51,13 @@ class Equations:
     heights: NDArray[np.float64]
     normals: NDArray[np.float64]
 
-    def __init__(self, sums: NDArray[np.float32], size: float, beside: bool) -> None:
+    def __init__(self, sums: NDArray[np.float32], size: float, unbiased: bool) -> None:
         scale = _scale_of(size)
         parts = np.split(sums.astype(np.float64), PARTS[1:-1], axis=1)
         upper, scores, chi, expected, self.heights, self.normals, whole = parts
         self.normal_matrix: NDArray[Any] = _symmetric(upper.sum(axis=0), scale)
         own = whole.sum(axis=0).reshape(6, 6) * np.outer(scale, scale)
-        self.unbiased: NDArray[Any] = own if beside else self.normal_matrix
+        self.unbiased: NDArray[Any] = own if unbiased else self.normal_matrix
         self.scores: NDArray[np.float64] = scores * scale
         self.right: NDArray[Any] = self.scores.sum(axis=0)
         self.pixels: float = max(float(self.normals.sum()), float(self.heights.sum()))
@@ -67,34 +67,38 @@ class Equations:
         self.typical: float = float(np.median(chi[used] / expected[used])) if used.any() else math.inf
 
     def free(self, noise: float | None = None) -> Doubles:
-        """Return orthonormal directions, (6, k), about which the maps say nothing.
+        """Return orthonormal directions, (6, k), that the maps do not determine.
 
-        The noise of the Jacobian pretends information on every direction. What it pretends is missing where
-        two Jacobians of independent noise are multiplied; a direction of which that is more than half, or
-        more yet where the fit is worse than the sigmas say, is one of these.
+        The noise of the Jacobian adds spurious information on every direction, which the product of two
+        Jacobians of independent noise does not have. A direction is undetermined if more than half of its
+        information is spurious; the limit is lower if the fit is worse than the standard deviations predict.
         """
         full = self.normal_matrix + _FLOOR * np.trace(self.normal_matrix) / 6 * np.eye(6)
-        told, ways = eigh((self.unbiased + self.unbiased.T) / 2, full)
+        share, directions = eigh((self.unbiased + self.unbiased.T) / 2, full)
         noise = noise or max(self.chi_square, 1.0)
-        return np.linalg.qr(ways[:, told < noise / (1 + noise)])[0]
+        return np.linalg.qr(directions[:, share < noise / (1 + noise)])[0]
 
     def covariance(self, free: Doubles) -> Doubles:
         """Return the covariance of the motion outside of some directions.
 
-        The scatter of the blocks' scores makes it, however errors of neighbours go together. Few blocks tell
-        its size but hardly its form, which is then more that of independent errors.
+        It is estimated from the scatter of the blocks' scores, so that errors of adjacent pixels may be
+        correlated. A few blocks determine its size but hardly its form, which is then closer to that of
+        independent errors.
         """
-        ways = complement(free)
-        count, alone = int(np.count_nonzero(self.normals + self.heights)), ways.T @ self.normal_matrix @ ways
-        scatter = ways.T @ self.scores.T @ self.scores @ ways * count / max(count - 6, 1)
+        directions = complement(free)
+        count, alone = (
+            int(np.count_nonzero(self.normals + self.heights)),
+            directions.T @ self.normal_matrix @ directions,
+        )
+        scatter = directions.T @ self.scores.T @ self.scores @ directions * count / max(count - 6, 1)
         size = np.trace(np.linalg.solve(alone, scatter)) / len(alone)
         middle = (count * scatter + _BLOCKS * size * alone) / (count + _BLOCKS)
-        inverse = np.linalg.inv(ways.T @ self.unbiased @ ways)
-        return np.asarray(ways @ inverse @ middle @ inverse.T @ ways.T)
+        inverse = np.linalg.inv(directions.T @ self.unbiased @ directions)
+        return np.asarray(directions @ inverse @ middle @ inverse.T @ directions.T)
 
 
 def _scale_of(size: float) -> Doubles:
-    """Return what makes of turns and shifts such in units of the object's size."""
+    """Return the factors that convert rotations and translations to units of the object's size."""
     return np.repeat([1 / size, 1.0], 3)
 
 
@@ -120,11 +124,11 @@ class PairFit:
     def __init__(self, first: PoseMap, second: PoseMap, device: Device) -> None:
         self.first, self.second, self.device = first, second, device
 
-    def equations(self, motion: Motion, beside: bool = False, step: int = 1) -> Equations:
+    def equations(self, motion: Motion, unbiased: bool = False, step: int = 1) -> Equations:
         """Return the sums at a motion."""
-        return Equations(self._sums([motion], beside, step)[0], self.second.size, beside)
+        return Equations(self._sums([motion], unbiased, step)[0], self.second.size, unbiased)
 
-    def _sums(self, motions: Sequence[Motion], beside: bool = False, step: int = 1) -> NDArray[np.float32]:
+    def _sums(self, motions: Sequence[Motion], unbiased: bool = False, step: int = 1) -> NDArray[np.float32]:
         """Return the sums of each block at each motion, (n, blocks, SUMS)."""
         first, second = self.first, self.second
         rows, columns = first.records.shape[:2]
@@ -133,7 +137,7 @@ class PairFit:
         maps = *second.middle, *first.grid, *second.grid, first.least, second.least
         poses = self.device.given("poses", [[*one.turn.ravel(), *one.shift, *maps] for one in motions])
         sums = self.device.array("sums", (len(motions), blocks, SUMS), np.float32, zeroed=False)
-        self.device.kernel("pose", "pose_equations", BESIDE=int(beside))(
+        self.device.kernel("pose", "pose_equations", BESIDE=int(unbiased))(
             len(motions) * blocks,
             count=len(motions),
             rows=rows,
@@ -150,9 +154,9 @@ class PairFit:
         return sums.download()
 
     def solve(self, start: Motion | None = None, near: bool = False) -> tuple[Motion, Equations, Doubles]:
-        """Return the motion, its equations, and what they leave free, from a start, or from none and many.
+        """Return the motion, its equations, and the directions that they leave free.
 
-        One that is ``near`` needs no coarse maps.
+        Without a start, no motion and many others are tried. A start that is ``near`` needs no coarse maps.
         """
         levels = [self] if near else self._levels()
         found, typical = self._descend(levels, start or STILL)
@@ -162,14 +166,14 @@ class PairFit:
             start = other[0] if found is other[0] else None
         if found is None:
             raise InputError("the two maps share too few pixels: give a start, or results that overlap")
-        now = self.equations(found, beside=True)
+        now = self.equations(found, unbiased=True)
         free = now.free()
         if free.shape[1] == 6:
             raise InputError("the maps determine no motion: the surface is too plain for its noise")
         if free.shape[1]:
             again = self._descend(levels, start or STILL, free)[0]
             found = found if again is None else again
-            now = self.equations(found, beside=True)
+            now = self.equations(found, unbiased=True)
         return found, now, free
 
     def _levels(self) -> list[PairFit]:
@@ -226,30 +230,30 @@ class PairFit:
             ]
 
     def refine(self, motion: Motion, free: Doubles = _NONE) -> Motion | None:
-        """Return the motion from which no step but the free ones leads further; None without overlap."""
+        """Return the motion at which no step outside of the free directions remains; None without overlap."""
         for _ in range(_STEPS):
-            now = self.equations(motion, beside=not free.size)
+            now = self.equations(motion, unbiased=not free.size)
             if now.pixels < _FEWEST:
                 return None
-            ways = complement(free if free.size else now.free(_LIKELY[now.chi_square > _AWAY]))
-            if not ways.size:
+            directions = complement(free if free.size else now.free(_LIKELY[now.chi_square > _AWAY]))
+            if not directions.size:
                 break
-            motion, moved = self.step(motion, now, ways)
+            motion, moved = self.step(motion, now, directions)
             if moved < _STILL:
                 break
         return motion
 
-    def step(self, motion: Motion, now: Equations, ways: Doubles) -> tuple[Motion, float]:
+    def step(self, motion: Motion, now: Equations, directions: Doubles) -> tuple[Motion, float]:
         """Return where the Gauss-Newton step in some directions leads, and its length in sigmas."""
-        matrix = ways.T @ now.normal_matrix @ ways
+        matrix = directions.T @ now.normal_matrix @ directions
         matrix += _FLOOR / 10 * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
-        step = -ways @ np.linalg.solve(matrix, ways.T @ now.right)
+        step = -directions @ np.linalg.solve(matrix, directions.T @ now.right)
         step /= max(float(np.linalg.norm(step)) / (_LONGEST * self.second.size), 1.0)
         sigmas = math.sqrt(step @ now.normal_matrix @ step / max(now.chi_square, 1.0))
         return motion.small_step(step * _scale_of(self.second.size), self.second.middle), sigmas
 
     def at_origin(self) -> Doubles:
-        """Return what makes of steps as these equations have them small motions about the origin, (6, 6)."""
+        """Return the matrix, (6, 6), that converts steps of these equations to motions about the origin."""
         moved = np.eye(6)
         moved[3:, :3] = cross_matrix(self.second.middle)
         moved[:, :3] /= self.second.size

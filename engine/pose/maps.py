@@ -20,8 +20,8 @@ from mirrorskin.kernels.pose import FAR
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-_STEEPEST = 0.17  # cosine of the zenith beyond which slopes have no use
-_UNTOLD = 1e6  # radians^2, of normals that are not compared
+_STEEPEST = 0.17  # cosine of the zenith beyond which slopes are not used
+_NOT_COMPARED = 1e6  # radians^2, of normals that are not compared
 _BORDER = np.ones((5, 5), np.uint8)  # pixels round edges and the border of contact that are left out
 
 
@@ -54,7 +54,7 @@ class PoseMap:
         usable = (
             np.isfinite(height) & (normals[..., 2] > _STEEPEST) & np.isfinite(square) & ~_doubtful(result)
         )
-        if not ((variance < FAR) & usable).any() and not ((square < _UNTOLD) & usable).any():
+        if not ((variance < FAR) & usable).any() and not ((square < _NOT_COMPARED) & usable).any():
             raise InputError(
                 "a map has no usable pixel with a sigma: give heights with height_sigma, or with normals and "
                 "normals_sigma"
@@ -105,14 +105,12 @@ def _grid(result: Result, pixel_size: ArrayLike | None) -> tuple[float, float, f
     if pixel_size is not None:
         x, y = pixel_axes(height.shape, check_pixel_size(pixel_size))
     if x is None or y is None or min(len(x), len(y)) < 2:
-        raise InputError(
-            "the result does not say where its pixels are, or has one row of them: give pixel_size"
-        )
+        raise InputError("the result has no pixel size, or has one row of pixels: give pixel_size")
     return float(x[0]), float(y[0]), float(x[1] - x[0]), float(y[0] - y[1])
 
 
 def _heights(result: Result) -> tuple[Floats, Floats]:
-    """Return heights, and their variances; `FAR` where they say nothing that normals do not say."""
+    """Return heights and their variances; `FAR` where they add nothing to the normals."""
     height = np.asarray(result.height, np.float32)
     if result.height_sigma is None:
         return height, np.full(height.shape, FAR, np.float32)
@@ -126,15 +124,15 @@ def _heights(result: Result) -> tuple[Floats, Floats]:
 def _normals(
     result: Result, height: Floats, grid: tuple[float, float, float, float], device: Device
 ) -> tuple[Floats, Floats]:
-    """Return normals and their mean square errors; where there are none, those of the heights, untold."""
+    """Return normals and their mean square errors; without normals, the heights' own, not compared."""
     if result.normals is None:
         slopes = _gradient(height, grid, device)
         normals = np.dstack([-slopes, np.ones_like(height)])
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-        return normals.astype(np.float32), np.full(height.shape, _UNTOLD, np.float32)
+        return normals.astype(np.float32), np.full(height.shape, _NOT_COMPARED, np.float32)
     normals = np.asarray(_same(result.normals, (*height.shape, 3), "normals"), np.float32)
     if result.normals_sigma is None:
-        return normals, np.full(height.shape, _UNTOLD, np.float32)
+        return normals, np.full(height.shape, _NOT_COMPARED, np.float32)
     sigma = np.asarray(_same(result.normals_sigma, height.shape, "normals_sigma"), np.float32)
     return normals, np.where(sigma > 0, sigma, np.float32(np.nan)) ** 2
 
@@ -148,7 +146,7 @@ def _same(values: Any, shape: tuple[int, ...], name: str) -> Any:
 
 
 def _doubtful(result: Result) -> Mask:
-    """Return where a result is not to be trusted: filled, or close to edges and to where contact ends."""
+    """Return where a result is unreliable: filled, or close to edges and to the border of contact."""
     assert result.height is not None
     border = np.zeros(result.height.shape, np.uint8)
     for lines in (result.edges, None if result.contact is None else result.contact == 0):

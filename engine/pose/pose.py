@@ -1,4 +1,4 @@
-"""The rigid motion of an object between two results, and how sure it is."""
+"""The rigid motion of an object between two results, and its covariance."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ class Pose:
     translation : ndarray, (3,), float64
         t, mm.
     covariance : ndarray, (6, 6), float64
-        Of a small rotation d (radians) and translation e (mm) after the motion, by which the true one
-        differs: x' = x' + d x x' + e. Along `undetermined` it is 0, and means nothing.
+        Covariance of the small rotation d (radians) and translation e (mm) from the motion to the true one:
+        x' + d x x' + e. It is 0 along `undetermined`, where it has no meaning.
     chi_square : float
-        Of the fit, for each degree of freedom; 1 where the maps' sigmas say how they differ.
+        Of the fit, for each degree of freedom; 1 if the maps differ by their standard deviations.
     pixels : int
         Pixels of the first map that have a counterpart in the second.
     undetermined : ndarray, (k, 6), float64
-        Orthonormal directions (d, e) about which the maps say nothing, such as a ball's spin.
+        Orthonormal directions (d, e) that the maps do not determine, such as a ball's spin.
     """
 
     rotation: Doubles
@@ -63,7 +63,7 @@ class Pose:
         return self.motion.apply(np.asarray(points, np.float64))
 
     def inverse(self) -> Pose:
-        """Return the motion back, with what its covariance becomes."""
+        """Return the inverse motion and its covariance."""
         back = self.motion.inverse()
         change = back.adjoint()
         return self._changed(back, change @ self.covariance @ change.T, self.undetermined @ change.T)
@@ -71,7 +71,8 @@ class Pose:
     def then(self, other: Pose) -> Pose:
         """Return this motion followed by another of independent errors.
 
-        What one of them leaves undetermined the whole does, too; chi square and pixels are the other's.
+        A direction that one of them leaves undetermined is undetermined; chi square and pixels are the
+        other's.
         """
         change = other.motion.adjoint()
         covariance = change @ self.covariance @ change.T + other.covariance
@@ -80,9 +81,9 @@ class Pose:
 
     def _changed(self, motion: Motion, covariance: Doubles, free: Doubles) -> Pose:
         """Return a motion with its errors; its undetermined directions are orthonormalised."""
-        ways, sizes, _ = np.linalg.svd(free.T, full_matrices=False)
+        directions, sizes, _ = np.linalg.svd(free.T, full_matrices=False)
         vector = np.asarray(Rotation.from_matrix(motion.turn).as_rotvec(), np.float64)
-        kept = ways[:, sizes > _ALIKE].T
+        kept = directions[:, sizes > _ALIKE].T
         return replace(
             self, rotation=vector, translation=motion.shift, covariance=covariance, undetermined=kept
         )
@@ -105,12 +106,12 @@ def estimate_pose(
     variances of both maps, from coarse maps to fine ones. Where no fit is found from no motion, turns about z
     and shifts of all sizes are tried.
 
-    Left out are filled pixels, and those within two pixels of `edges` and of the border of `contact`. Heights
-    of unknown offset were integrated from the normals, and say nothing besides: they only tell where points
-    are. The pose is then between the two results' own coordinates, and its z is undetermined.
+    Filled pixels are left out, and those within two pixels of `edges` and of the border of `contact`. Heights
+    of unknown offset were integrated from the normals and contain no more information: they only determine
+    where points are. The pose is then between the two results' own coordinates, and its z is undetermined.
 
-    The covariance is that of the scatter of the equations over blocks of 8 x 8 pixels, so errors may be alike
-    in neighbouring pixels, and larger than their sigmas say.
+    The covariance is estimated from the scatter of the equations over blocks of 8 x 8 pixels, so errors of
+    adjacent pixels may be correlated, and larger than their standard deviations.
 
     Parameters
     ----------
@@ -157,7 +158,7 @@ def estimate_pose(
 
 
 def pose_of(fit: PairFit, motion: Motion, now: Equations, free: Doubles) -> Pose:
-    """Return a fit's motion about the picture's centre, and what its equations say of it."""
+    """Return a fit's motion about the picture's centre, with its covariance."""
     moved = fit.at_origin()
     covariance = moved @ now.covariance(free) @ moved.T
     fitted = Pose(np.zeros(3), np.zeros(3), covariance, now.chi_square, int(now.pixels), np.zeros((0, 6)))

@@ -26,7 +26,7 @@ from mirrorskin.kernels.device import Device, open_device
 _SHARED = 0.2  # of the smaller map's pixels, from which on two touches are compared
 _ALIKE = 4.0  # of chi square, that two touches which are compared may have for a link
 _ROUNDS, _NEWTON = 5, 8  # steps of the poses, and of a height along z
-_LEVELLINGS = 3  # of a touch of unknown offset: how high it lies says where its pixels are
+_LEVELLINGS = 3  # of a touch of unknown offset, whose height determines where its pixels are
 _APART = 4.0  # sigmas between a touch and the mean, from which on they disagree
 _LARGEST = 1 << 28  # pixels of the whole
 _UNFIT = 1e-9  # of the largest information, below which a direction has none
@@ -40,7 +40,7 @@ class Stitch:
     ----------
     result : Result
         Height, its standard deviation, status (0 no height, 1 one touch or touches that agree, 2 touches that
-        differ by more than 4 of their sigmas), contact and, where all touches have them, normals; x and y as
+        differ by more than 4 standard deviations), contact and, if all touches have them, normals; x and y as
         in the first touch. The standard deviation includes that of the poses.
     poses : tuple of Pose
         The motion of the object from the first touch to each, the first being none.
@@ -75,7 +75,7 @@ def stitch(
     pixel_size : float or (float, float), optional
         mm; by default as the results say.
     names : sequence of str, optional
-        What messages call the results.
+        Names of the results in messages, by default their paths or numbers.
     device : str or Device, optional
         See ``mirrorskin.kernels.device.open_device``.
 
@@ -110,7 +110,9 @@ def stitch(
     maps = []
     for touch, name in zip(touches, names, strict=True):
         if touch.height_sigma is None:
-            raise InputError(f"{name} has no height_sigma, by which heights are merged: reconstruct it again")
+            raise InputError(
+                f"{name} has no height_sigma, which is needed to merge heights: reconstruct it again"
+            )
         try:
             maps.append(PoseMap.of(touch, pixel_size, opened))
         except InputError as error:
@@ -153,7 +155,7 @@ class _Graph:
         raise InputError(f"{names[new]} shares too little with those before it: give results that overlap")
 
     def _compare(self, first: int, second: int) -> None:
-        """Link two touches that lie over each other, as far as is known, if they are alike there."""
+        """Link two touches that overlap, as far as is known, if they agree there."""
         start = self._motions[first].inverse().then(self._motions[second])
         fit = PairFit(self._maps[first], self._maps[second], self._device)
         if fit.equations(start).pixels < _SHARED * self._smaller(first, second):
@@ -182,9 +184,9 @@ class _Graph:
                 weight = _information(link)
                 parts = {first: -between.adjoint(), second: np.eye(6)}
                 for one, left in parts.items():
-                    for other, beside in parts.items():
+                    for other, right_part in parts.items():
                         if one and other:
-                            normal[_part(one), _part(other)] += left.T @ weight @ beside
+                            normal[_part(one), _part(other)] += left.T @ weight @ right_part
                     if one:
                         right[_part(one)] -= left.T @ weight @ rest
             covariance = np.linalg.pinv(normal, _UNFIT, hermitian=True)
@@ -248,7 +250,7 @@ def _merged(
 
 
 def _axes(maps: Sequence[PoseMap], poses: Sequence[Pose]) -> tuple[Doubles, Doubles]:
-    """Return x and y of pixels, as those of the first map, that hold all of them, mm."""
+    """Return x and y, mm, of pixels on the first map's grid that contain all maps."""
     x, y, step_x, step_y = maps[0].grid
     corners = []
     for one, pose in zip(maps, poses, strict=True):
@@ -262,11 +264,11 @@ def _axes(maps: Sequence[PoseMap], poses: Sequence[Pose]) -> tuple[Doubles, Doub
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Moved:
-    """A touch where the first one has its pixels: (H, W), NaN where it has nothing."""
+    """A touch at the pixels of the first one: (H, W), NaN where it has no height."""
 
     height: Doubles
     variance: Doubles  # with the pose's and, where it was levelled, the offset's
-    common: Doubles  # of that, what all pixels share: the pose's and the offset's
+    common: Doubles  # the part of it that all pixels share: the pose's and the offset's
     contact: NDArray[np.bool_]
     normals: Doubles | None
     normal_variance: Doubles | None
@@ -369,10 +371,10 @@ class _Sums:
             return np.asarray(self._height / self._weight)
 
     def level(self, height: Doubles, variance: Doubles, lever: Doubles) -> tuple[float, Doubles, float]:
-        """Return what brings heights, (n,), to those so far, its mean lever, and its variance.
+        """Return the offset of heights, (n,), to those so far, its mean lever, and its variance.
 
-        Pixels' own errors are independent. What pixels share by their poses no mean takes away; of several
-        touches their weighted mean is the most that it can be. All is NaN where no pixel is shared.
+        The pixels' own errors are independent. Errors that pixels share by their poses do not average out;
+        for several touches their weighted mean is an upper bound. All is NaN if no pixel is shared.
         """
         off = self.mean().ravel() - height
         shared = np.isfinite(off) & np.isfinite(variance)

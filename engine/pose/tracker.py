@@ -21,12 +21,13 @@ _LOST = 3.0  # times the key's first chi square, from which on the motion is loo
 
 
 class PoseTracker(ThreadSafe):
-    """Finds where an object is in each of a stream of results, against where it was in the first.
+    """Estimates the motion of an object from the first of a stream of results to each of them.
 
     Each result is compared with a key: the first one, and later the last before too few pixels were shared.
-    So errors grow with the keys, not with the results. A result is expected where a steady motion would have
-    brought the object; steps on every fourth pixel each way lead from there, and a last one takes all pixels.
-    What the key cannot tell is found with the first result after it, and is held still.
+    Errors therefore grow with the number of keys, not with that of results. The start is the motion
+    extrapolated from the last two results; steps on every fourth row and column follow, and a last one uses
+    all pixels. Directions that the key does not determine are found with the first result after it, and are
+    held constant.
 
     Parameters
     ----------
@@ -38,7 +39,7 @@ class PoseTracker(ThreadSafe):
     Attributes
     ----------
     keys : int
-        How many results became keys.
+        Number of results that became keys.
 
     Examples
     --------
@@ -63,7 +64,7 @@ class PoseTracker(ThreadSafe):
         self._key_pose = Pose(np.zeros(3), np.zeros(3), np.zeros((6, 6)), 1.0, 0, np.zeros((0, 6)))
         self._free: Doubles | None = None
         self._fewest, self._worst = 0.0, np.inf  # pixels, and chi square
-        self._back, self._way = STILL, STILL  # from the last result to the key, and from it to the one before
+        self._back, self._last = STILL, STILL  # from the last result to the key, and to the one before
 
     def push(self, maps: Maps) -> Pose:
         """Take the next result, or maps as for `estimate_pose`, and return the motion from the first to it.
@@ -71,8 +72,8 @@ class PoseTracker(ThreadSafe):
         Raises
         ------
         mirrorskin.io.InputError
-            What `estimate_pose` refuses, or the result shares too few pixels with those before. It is left
-            out, and the next is expected where this one was.
+            What `estimate_pose` refuses, or the result shares too few pixels with earlier ones. It is left
+            out.
         """
         result = as_result(maps, "result")
         if self._key is None:
@@ -81,13 +82,13 @@ class PoseTracker(ThreadSafe):
         if self._free is None:
             return self._first_after_key(result)
         fit = PairFit(self._map(result, curved=False), self._key, self._device)
-        ways, motion = complement(self._free), self._way.then(self._back)
+        directions, motion = complement(self._free), self._last.then(self._back)
         for step in (_COARSE, 1):
             for _ in range(_STEPS):
                 now = fit.equations(motion, step=step)
                 if now.pixels < _FEWEST:
                     return self._look_for(result)
-                motion, moved = fit.step(motion, now, ways)
+                motion, moved = fit.step(motion, now, directions)
                 if moved < _STILL:
                     break
         if now.chi_square > self._worst:
@@ -98,10 +99,10 @@ class PoseTracker(ThreadSafe):
         return pose
 
     def _first_after_key(self, result: Result) -> Pose:
-        """Return the pose of a result that also tells what the key leaves undetermined."""
+        """Return the pose of the first result after a key, and find the directions that are undetermined."""
         assert self._key is not None
         fit = PairFit(self._map(result), self._key, self._device)
-        motion, now, self._free = fit.solve(self._way.then(self._back), near=True)
+        motion, now, self._free = fit.solve(self._last.then(self._back), near=True)
         self._fewest, self._worst = _SHARED * now.pixels, _LOST * max(now.chi_square, 1.0)
         return self._moved_to(motion, pose_of(fit, motion, now, self._free))
 
@@ -113,8 +114,8 @@ class PoseTracker(ThreadSafe):
         return self._moved_to(motion, pose_of(fit, motion, now, free))
 
     def _moved_to(self, motion: Motion, found: Pose) -> Pose:
-        """Keep a motion back to the key, and return the pose that it makes."""
-        self._way = motion.then(self._back.inverse())
+        """Store the motion back to the key, and return the pose."""
+        self._last = motion.then(self._back.inverse())
         self._back = motion
         return self._key_pose.then(found.inverse())
 

@@ -51,11 +51,11 @@ def find_displacement(
 ) -> Result:
     """Find how far the texture of a reference has moved in frames.
 
-    Least squares in square windows, of which each may move, strain and turn (an affine field), and whose
-    brightness may change by a gain and a plane; see the documentation, "Slip". What is seen at the pixel x of
-    the reference is seen at x + displacement in the frame. Each frame begins where those before it lead to,
-    so that steps may be as long as half of the texture's grain; after a longer one, coarser resolutions and
-    the correlation of the whole picture are tried.
+    Least squares in square windows. Each may move, strain and turn (an affine field), and its brightness may
+    change by a gain and a plane; see the documentation, "Slip". The texture at the pixel x of the reference
+    is at x + displacement in the frame. The start of each frame is extrapolated from earlier ones, so that
+    steps may be as long as half of the texture's grain; after a longer one, coarser resolutions and the
+    correlation of the whole picture are tried.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def find_displacement(
     dtype = check_dtype(np.asarray(reference).dtype)
     check_frames(frames, dtype, np.shape(reference))
     if not np.isfinite(reference).all():
-        raise InputError("the reference has samples that are no numbers: leave out a part that has none")
+        raise InputError("the reference has samples that are not finite: leave out the part that has them")
     size = check_pixel_size(pixel_size)
     check_windows(np.shape(reference), window_size, window_step)
     if noise is not None and not 0 < noise < 1e9:
@@ -123,12 +123,12 @@ def find_displacement(
 
 @dataclass(frozen=True, slots=True)
 class Texture:
-    """What the windows of a reference can tell.
+    """Information in the windows of a reference.
 
     Attributes
     ----------
     covariance : ndarray, (rows, columns, 2, 2), float64
-        Of a displacement, pixels^2, to the right and down.
+        Covariance of a displacement, pixels^2, to the right and down.
     there : ndarray, (rows, columns), bool
         Whether the texture's derivatives have at least the variance of those of noise, in every direction.
     usable : ndarray, (rows, columns), bool
@@ -147,7 +147,7 @@ class Texture:
 
     @classmethod
     def of(cls, tracker: Tracker, variance: Doubles, noise: float | None) -> Texture:
-        """Judge a tracker's reference; ``variance``, (rows, columns), is that of a sample as frames have it.
+        """Evaluate a tracker's reference; ``variance``, (rows, columns), is that of a sample in the frames.
 
         Both the reference and a frame have noise, so that the covariance is 2 variance / information.
         """
@@ -197,9 +197,9 @@ def _maps(
 
 
 def misfit(field: NodeField, texture: Texture, window: int) -> Doubles:
-    """Return by what a frame's misfit, beyond noise, raises sigma, as a factor, (rows, columns, 1).
+    """Return the factor, (rows, columns, 1), by which a frame's misfit beyond noise raises sigma.
 
-    What light that changes leaves is alike over some samples, and counts as many times.
+    Residuals of brightness that changes are correlated over some samples, and are weighted by their number.
     """
     chance = 1 + 2 * math.sqrt(2) / window  # two standard deviations of a window's variance
     more = np.fmax(field.variance / texture.variance - chance, 0)
@@ -207,11 +207,10 @@ def misfit(field: NodeField, texture: Texture, window: int) -> Doubles:
 
 
 def bending_variance(displacement: Doubles, variance: Doubles, step: int, window: int) -> Doubles:
-    """Return about how much a displacement that bends is off in the middle of its windows, squared.
+    """Return the approximate squared bias, (rows, columns, 2), of displacements that bend within windows.
 
-    Of nodes, (rows, columns, 2), and the variance by noise. An affine field misses the mean of the
-    second-order terms, window^2 / 24 times the Laplacian. That is made of displacements a window apart; what
-    noise makes of it is left out.
+    An affine field misses the mean of the second-order terms, window^2 / 24 times the Laplacian, which is
+    computed from displacements a window apart. Its noise, from the ``variance``, is subtracted.
     """
     apart = max(1, round(window / step))
     laplacian = np.zeros(displacement.shape)

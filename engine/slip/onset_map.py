@@ -1,4 +1,4 @@
-"""When the skin breaks loose, node by node: the most likely map of onsets, of all frames at once."""
+"""Onsets of slip at nodes: the most likely map, estimated from all frames at once."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ Doubles = NDArray[np.float64]
 _CANDIDATES = 48  # onsets that a search begins with
 _EVIDENCE = 8.0  # of the log-likelihood over that of no departure, for a node's onset to begin with
 _ROUNDS = 20
-_SETTLED = 1e-3  # of the way, in a round
-_FARTHEST = 0.08  # of the way, by which an onset changes in a round
-_LOCKING = 0.05  # pixels: sigma of how far displacements are drawn to halves of a pixel
+_SETTLED = 1e-3  # of the path, in a round
+_FARTHEST = 0.08  # of the path, the largest change of an onset in a round
+_LOCKING = 0.05  # pixels: sigma of the bias of displacements towards halves of a pixel
 _POWER_SIGMA = 0.1  # those of slides and twists differ by twice that
-_APART = 9  # nodes, beyond which errors of onsets do not depend on each other
-_NEVER = 1.5  # of the way: an onset that has not come
+_APART = 9  # nodes, beyond which errors of onsets are independent
+_NEVER = 1.5  # of the path: an onset that has not happened
 _FLOOR = 1e-6  # of an equation's weight, so that there is always a solution
 
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What departures of a motion are like.
+    """Prior knowledge of the departures of a motion.
 
     Attributes
     ----------
     power : float
-        By which a departure grows, known to +- 0.1.
+        Exponent of the departure, accurate to ±0.1.
     onset_bend : float
         Standard deviation of the third difference of onsets over the radius of the contact, as a share of
-        the way.
+        the path.
     growth_bend : float
         That of the second difference of the growth's logarithm.
     """
@@ -48,10 +48,10 @@ class Expected:
 
 @dataclass(frozen=True, slots=True)
 class OnsetMap:
-    """Onsets of departure, and their standard deviations, (rows, columns), in the unit of the way.
+    """Onsets of departure, and their standard deviations, (rows, columns), in the unit of the path.
 
-    An onset behind the end of the way has not come. One before its begin says that the departure was under
-    way from the first.
+    An onset beyond the end of the path has not happened. If it is before the start of the path, the departure
+    began before the first frame.
     """
 
     onset: Doubles
@@ -61,25 +61,25 @@ class OnsetMap:
 def fit_onsets(
     departure: Doubles,
     sigma: Doubles,
-    way: Doubles,
+    distance: Doubles,
     window: float,
     radius: float,
     expected: Expected,
     locking: Doubles,
 ) -> OnsetMap:
-    """Fit ``growth (way - onset)^power``, zero before the onset, to departures as windows see them.
+    """Fit ``growth (distance - onset)^power``, zero before the onset, to departures blurred by windows.
 
-    A window's answer is the mean over it. Where the onset changes by ``slope`` from node to node, that is the
-    mean over onsets within +- slope window / 2. The map of growth is smooth, with small second differences,
-    and that of onsets with small third ones: under a ball it is a paraboloid. Both are found together by
-    Gauss-Newton steps, and with them by how much displacements are drawn to halves of a pixel. To what noise
-    makes uncertain, sigma adds by how much another power changes the onset.
+    A window's departure is the mean over it. Where the onset changes by ``slope`` from node to node, it is
+    the mean over onsets within ± slope window / 2. The map of growth has small second differences, and that
+    of onsets small third ones: under a ball it is a paraboloid. Both are estimated together by Gauss-Newton
+    steps, with the amplitude by which displacements are biased towards halves of a pixel. The standard
+    deviation combines the noise and the change of the onset for another power.
 
     Parameters
     ----------
     departure : (T, rows, columns), mm, of the frames after the reference; NaN where there is none
     sigma : (rows, columns), mm, of a departure; half of its variance is the reference's, common to all frames
-    way : (T,), of the body since the reference
+    distance : (T,), of the body since the reference, along its path
     window : nodes, over which a departure is a mean
     radius : nodes, of a disc as large as the contact
     expected : of the motion
@@ -89,7 +89,7 @@ def fit_onsets(
     known = np.isfinite(departure).all(axis=0) & np.isfinite(sigma)
     scale = np.divide(1.0, sigma, out=np.zeros(sigma.shape), where=known)
     data = _whitened(np.where(known, departure * scale, 0.0))
-    length, times = float(way[-1]), (way / way[-1])[:, None, None]
+    length, times = float(distance[-1]), (distance / distance[-1])[:, None, None]
     locks = _whitened(np.where(known, locking * scale, 0.0))
     second, third = (_bending(known.shape, order) for order in (2, 3))
     onset_stiff = third * (radius**3 / expected.onset_bend) ** 2
@@ -102,7 +102,7 @@ def fit_onsets(
     log_growth, lock = np.zeros_like(onset), np.zeros(2)
     for number in range(_ROUNDS):
         half = np.hypot(*np.gradient(onset)) * window / 2
-        half = np.maximum(half, max(0.5, 2.0 - 0.5 * number) / len(way))  # wider at first
+        half = np.maximum(half, max(0.5, 2.0 - 0.5 * number) / len(distance))  # wider at first
         growth = usual * np.exp(log_growth) * scale
         shape, rate = (_whitened(growth * part) for part in _blurred(times - onset, half, power))
         columns = np.stack([-rate, shape])

@@ -19,7 +19,7 @@ from mirrorskin.kernels.displacement import AFFINE, MARGIN, PARAMETERS, basis, i
 Doubles = NDArray[np.float64]
 
 ITERATIONS = 8
-"""Times that a frame is fetched back at most; after a start from the frame before, 2 are needed."""
+"""Times that a frame is warped back at most; after a start from the frame before, 2 are needed."""
 GRADIENT_NOISE = 1.3923
 """Variance of a cubic spline's derivative at a sample, of samples with noise of variance 1."""
 
@@ -31,14 +31,14 @@ _SETTLED = 0.03  # pixels: the linearisation is then wrong by less than a thousa
 _FARTHEST = 1.5  # pixels in one iteration
 _KERNEL = (
     np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
-)  # over nodes, of the field by which frames are fetched back
+)  # over nodes, for the field that frames are warped back with
 _HOLD = 0.01  # weight of the field before, of the median node's
 _TILE = 4096  # pixels of a core's item
 
 
 @dataclass(frozen=True, slots=True)
 class NodeField:
-    """What a frame says at the nodes.
+    """Displacement of a frame at the nodes.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class NodeField:
     variance : ndarray, (rows, columns), float64
         Of a sample, counts^2, as the residual in the window has it.
     found : ndarray, (rows, columns), bool
-        Whether the frame was fetched back to within half a pixel, and then has at least half of the
+        Whether the frame was warped back to within half a pixel, and then has at least half of the
         reference's contrast.
     """
 
@@ -57,9 +57,9 @@ class NodeField:
 
 
 class Tracker:
-    """Least squares in windows (Lucas and Kanade, 1981), all of which share one frame that is fetched back.
+    """Least squares in windows (Lucas and Kanade, 1981), which share one frame that is warped back.
 
-    A frame F is fetched back by a smooth field U: W(p) = F(p + U(p)). With the reference R and its gradient
+    A frame F is warped back by a smooth field U: W(p) = F(p + U(p)). With the reference R and its gradient
     g, in each window ::
 
         R - W + g U = g a + brightness (1, x, y) + gain R
@@ -297,10 +297,10 @@ class _Level:
         return maps["answer"].download().astype(np.float64)
 
     def _next_field(self, field: Doubles, affine: Doubles) -> Doubles:
-        """Return the field that windows make together, each weighted by how well it shows its movement.
+        """Return the field of all windows, each weighted by how well its movement is determined.
 
-        Each window says where it and its neighbours go, (6, rows, columns): so an affine field stays one, and
-        goes on where windows leave the picture. Where none is near, the field stays.
+        Each window predicts the displacement of its neighbours, (6, rows, columns), so that an affine field
+        remains affine and continues where windows leave the picture. Far from all windows, the field is kept.
         """
         known = np.isfinite(affine[0])
         weight = np.where(known, self._trust, 0.0)

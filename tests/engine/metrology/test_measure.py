@@ -243,7 +243,7 @@ def test_uncertain_pixels_count_neither_as_lowest_nor_as_rough():
     found = engine.measure(result_of(height, height_sigma=sigma), form="plane")
     assert found.quantities["lowest point"].value > -0.005
     assert found.quantities["Sz"].value < 10
-    assert "pixels left out of roughness and lowest point, far less sure than others: 2" in found.notes
+    assert "pixels left out of roughness and lowest point, far less certain than others: 2" in found.notes
     sure = engine.measure(result_of(height, sigma=0.001), form="plane").quantities
     assert sure["lowest point"].value == pytest.approx(-0.8)
     assert sure["Sz"].value > 800
