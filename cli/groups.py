@@ -204,12 +204,13 @@ class ExistingPath(_AnyPath):
         return super().convert(value, param, ctx)
 
 
-class _NameOrFile(click.ParamType[str]):
+class NameOrFile(click.ParamType[str]):
     """A text that names something, or a file if it has an ending."""
 
     name = "text"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the text; a file must exist."""
         if Path(value).suffix:
             ExistingPath().convert(value, param, ctx)
         return value
@@ -217,6 +218,7 @@ class _NameOrFile(click.ParamType[str]):
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
+        """Let the shell complete the name of a file."""
         return [CompletionItem(incomplete, type="file")]
 
 
@@ -264,7 +266,7 @@ def _parameter(parameter: inspect.Parameter, hint: Any) -> click.Parameter:
     settings = dict(said.settings)
     bounds = {name: settings.pop(name) for name in ("min", "max") if name in settings}
     or_file, written = settings.pop("or_file", False), not _WRITTEN.isdisjoint(said.names)
-    settings["type"] = _NameOrFile() if or_file else _type(kind, bounds, written)
+    settings["type"] = NameOrFile() if or_file else _type(kind, bounds, written)
     settings["required"] = parameter.default is parameter.empty
     if parameter.default is not parameter.empty and not many:
         default = parameter.default

@@ -51,6 +51,14 @@ Region = Annotated[
 LiveFrames = Annotated[
     bool, Option("--live", help="Only the frames that a live run used, with the positions it had.")
 ]
+
+
+def result_option(default: str) -> Option:
+    """Return the option of a result to write."""
+    text = "Result to write: HDF5, or NAME.zarr."
+    return Option("--output", "-o", metavar="RES.h5", help=text, show_default=default)
+
+
 ResultFile = Annotated[Path, Argument(metavar="RES.h5", help="Result to take.")]
 Turn = Annotated[
     int | None,
