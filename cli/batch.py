@@ -39,15 +39,16 @@ _OPTIONS = re.compile("--(dataset|motion|travel|travel-step|travel-start|phase-s
 def command(
     recordings: Annotated[
         list[str],
-        Argument(metavar="FILE...", help="Recordings; '*' and '**' are understood, quoted as well."),
+        Argument(metavar="FILE...", help="Recordings; '*' and '**' are expanded, also if quoted."),
     ],
     output: Annotated[
-        Path, Option("--output", "-o", metavar="DIR", help="Folder for results, made if missing.")
+        Path, Option("--output", "-o", metavar="DIR", help="Folder for results, created if it is missing.")
     ],
     settings: Annotated[
         Path | None,
         Option(
-            metavar="FILE.toml", help="How to reconstruct, in tables [stack], [press], [rotation], [slip]."
+            metavar="FILE.toml",
+            help="Options, in tables [stack], [press], [rotation], [slip], or [stack] and [operation].",
         ),
     ] = None,
     device: Annotated[
@@ -71,9 +72,16 @@ def command(
     memory: options.Memory = "256MB",
     as_json: options.Json = False,
 ) -> None:
-    """Reconstruct many recordings; what is finished is kept, so that a batch can go on."""
-    _refuse_both(device, workers, scheduler)
-    part, parts = _shard(shard)
+    """Reconstruct many recordings; results that exist are kept, so that a batch can be resumed."""
+    from mirrorskin.io import InputError
+
+    workers_of = {"--device": device, "--workers": workers, "--scheduler": scheduler}
+    names = [name for name, value in workers_of.items() if value]
+    if len(names) > 1:
+        raise InputError(f"{' and '.join(names)} exclude each other. Give one of them")
+    part, parts = map(int, match.groups()) if (match := _SHARD.fullmatch(shard or "1/1")) else (0, 0)
+    if not 1 <= part <= parts:
+        raise InputError(f"--shard {shard}: a part and the number of parts is needed; write e.g. 1/4")
     found = _find(recordings, output)
 
     from mirrorskin.cli.quantity import memory as bytes_of
@@ -81,7 +89,7 @@ def command(
     from mirrorskin.engine.batch.jobs import make_jobs
 
     plan = read_settings(settings, bytes_of(memory, "--memory"))
-    # All are named before they are parted, so that every machine gives a recording's result the same name.
+    # All are named before they are divided, so that every machine gives a result the same name.
     jobs = make_jobs(found, output)
     if parts > 1:
         jobs = sorted(jobs, key=lambda job: job.target)[part - 1 :: parts]
@@ -98,26 +106,6 @@ def command(
             show.ended(outcome)
     _report(outcomes, output, time.perf_counter() - start, as_json)
     raise click.exceptions.Exit(int(any(outcome.state == "failed" for outcome in outcomes)))
-
-
-def _refuse_both(device: Sequence[str] | None, workers: int | None, scheduler: str | None) -> None:
-    """Refuse more than one choice of who does the work."""
-    from mirrorskin.io import InputError
-
-    given = {"--device": device, "--workers": workers, "--scheduler": scheduler}
-    names = [name for name, value in given.items() if value]
-    if len(names) > 1:
-        raise InputError(f"{' and '.join(names)} each tell who does the work: give one of them")
-
-
-def _shard(text: str | None) -> tuple[int, int]:
-    """Return which part of how many is to be done."""
-    from mirrorskin.io import InputError
-
-    part, parts = map(int, match.groups()) if (match := _SHARD.fullmatch(text or "1/1")) else (0, 0)
-    if not 1 <= part <= parts:
-        raise InputError(f"--shard {text}: a part and how many there are is needed; write e.g. 1/4")
-    return part, parts
 
 
 def _find(words: Sequence[str], folder: Path) -> list[Path]:

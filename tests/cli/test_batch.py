@@ -199,7 +199,7 @@ def test_a_terminal_shows_a_table(monkeypatch):
         (["-o", "out"], "FILE..."),
         (["a.h5", "-o", "out", "--memory", "5"], "a unit is needed"),
         (["a.h5", "-o", "out", "--workers", "0"], "--workers"),
-        (["a.h5", "-o", "out", "--shard", "3/2"], "--shard 3/2: a part and how many there are is needed"),
+        (["a.h5", "-o", "out", "--shard", "3/2"], "--shard 3/2: a part and the number of parts is needed"),
         (["no.h5", "-o", "out"], "no.h5: no such file"),
         (["a.h5", "-o", "out", "--workers", "2", "--device", "0"], "--device and --workers"),
         (["a.h5", "-o", "out", "--workers", "2", "--scheduler", "tcp://x:1"], "--workers and --scheduler"),
