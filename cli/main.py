@@ -218,7 +218,7 @@ class OutputError(Exception):
 
 
 class _StandardOutput(FileIO):
-    """Standard output whose errors are told apart from those of other files."""
+    """Standard output whose errors differ from those of other files."""
 
     def write(self, data: Any) -> int:
         if not data:  # Click tries streams with nothing, which /dev/full refuses
@@ -288,7 +288,7 @@ def program() -> None:
     _guard_streams()
     try:
         main()
-    finally:  # all is said and put away: another Ctrl-C ends the interpreter without a traceback
+    finally:  # everything is closed: another Ctrl-C ends the interpreter without a traceback
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 

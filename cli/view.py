@@ -111,7 +111,7 @@ def _check(output: Path, result: Path) -> None:
 def _show(
     shown: Result, path: Path, name: str, ends: Ends | None, maps: list[str] | None, output: Path | None
 ) -> None:
-    """Draw what is asked for, into a window, a picture or a folder."""
+    """Draw maps into a window, a picture or a folder."""
     from mirrorskin import io
     from mirrorskin.view.canvas import has_screen, show_figure, write_figure
     from mirrorskin.view.result import figures_of, overview

@@ -191,7 +191,7 @@ def test_a_terminal_shows_a_table(monkeypatch):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["x*.h5", "-o", "out"], "x*.h5: no file answers to that"),
+        (["x*.h5", "-o", "out"], "x*.h5: no file matches"),
         (["a.h5", "-o", "no/out"], "there is no folder no: make it first"),
         (["a.h5", "-o", "a.h5"], "a.h5 is no folder"),
         (["a.h5", "-o", "/proc/out"], "/proc/out cannot be made"),
@@ -238,7 +238,7 @@ def test_ctrl_c_leaves_whole_results_and_says_how_to_go_on(folder):
     assert all(io.open_result(f"out/{name}").height is not None for name in found)
     said = said.replace("mirrorskin: it is being stopped; two more Ctrl-C end it at once\n", "")
     told = int(said.split()[2])
-    assert said == f"ended after {told} of 300: the same command goes on from there\n"
+    assert said == f"ended after {told} of 300: the same command resumes it\n"
     assert told - 1 - rest.count("done: ") in (0, 1)  # it may end between the count and the line
     assert len(found) - told in (0, 1)
 
