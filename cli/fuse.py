@@ -29,7 +29,7 @@ def command(
     as_json: options.Json = False,
     **chosen: Annotated[Any, STACK.without("motion", "frames", "tilt"), declared("fuse")],
 ) -> None:
-    """Make one surface of a press and a rotation."""
+    """Fuse a press and a rotation to one surface."""
     from mirrorskin import io
     from mirrorskin.cli.output import progress, report_levels, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of

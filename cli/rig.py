@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mirrorskin.hw.stage import Stage
 
 app = Group(
-    help="Look at a stage and a camera before they are used, and move it by hand.", no_args_is_help=True
+    help="Check a stage and a camera before they are used, and move it by hand.", no_args_is_help=True
 )
 
 _SLOW = 0.1  # of an axis's speed, for moves by hand
