@@ -28,26 +28,27 @@ if TYPE_CHECKING:
     from mirrorskin.engine.batch.jobs import Job, Plan
     from mirrorskin.engine.batch.work import Outcome
 
-# How the commands name results unasked.
+# Names of results by default.
 _RESULTS = ("-result.h5", "-correlation.h5", "-fused.h5")
 _SHARD = re.compile("([0-9]{1,6})/([0-9]{1,6})")
 _ROWS = 12  # of files that have ended
-# What other commands have as options, a batch has in its settings.
+# Options of other commands that are settings of a batch.
 _OPTIONS = re.compile("--(dataset|motion|travel|travel-step|travel-start|phase-step|pixel-size)(?![a-z-])")
 
 
 def command(
     recordings: Annotated[
         list[str],
-        Argument(metavar="FILE...", help="Recordings; '*' and '**' are understood, quoted as well."),
+        Argument(metavar="FILE...", help="Recordings; '*' and '**' are expanded, also if quoted."),
     ],
     output: Annotated[
-        Path, Option("--output", "-o", metavar="DIR", help="Folder for results, made if missing.")
+        Path, Option("--output", "-o", metavar="DIR", help="Folder for results, created if it is missing.")
     ],
     settings: Annotated[
         Path | None,
         Option(
-            metavar="FILE.toml", help="How to reconstruct, in tables [stack], [press], [rotation], [slip]."
+            metavar="FILE.toml",
+            help="Options, in tables [stack], [press], [rotation], [slip], or [stack] and [operation].",
         ),
     ] = None,
     device: Annotated[
@@ -59,7 +60,7 @@ def command(
         ),
     ] = None,
     workers: Annotated[
-        int | None, Option(metavar="N", min=1, help="Use so many processes of this machine (Dask).")
+        int | None, Option(metavar="N", min=1, help="Number of processes on this machine (Dask).")
     ] = None,
     scheduler: Annotated[
         str | None, Option(metavar="ADDRESS", help="Use a Dask cluster: tcp://node1:8786.")
@@ -71,9 +72,16 @@ def command(
     memory: options.Memory = "256MB",
     as_json: options.Json = False,
 ) -> None:
-    """Reconstruct many recordings; what is finished is kept, so that a batch can go on."""
-    _refuse_both(device, workers, scheduler)
-    part, parts = _shard(shard)
+    """Reconstruct many recordings; results that exist are kept, so that a batch can be resumed."""
+    from mirrorskin.io import InputError
+
+    workers_of = {"--device": device, "--workers": workers, "--scheduler": scheduler}
+    names = [name for name, value in workers_of.items() if value]
+    if len(names) > 1:
+        raise InputError(f"{' and '.join(names)} exclude each other. Give one of them")
+    part, parts = map(int, match.groups()) if (match := _SHARD.fullmatch(shard or "1/1")) else (0, 0)
+    if not 1 <= part <= parts:
+        raise InputError(f"--shard {shard}: a part and the number of parts is needed; write e.g. 1/4")
     found = _find(recordings, output)
 
     from mirrorskin.cli.quantity import memory as bytes_of
@@ -81,7 +89,7 @@ def command(
     from mirrorskin.engine.batch.jobs import make_jobs
 
     plan = read_settings(settings, bytes_of(memory, "--memory"))
-    # All are named before they are parted, so that every machine gives a recording's result the same name.
+    # All are named before they are divided, so that every machine gives a result the same name.
     jobs = make_jobs(found, output)
     if parts > 1:
         jobs = sorted(jobs, key=lambda job: job.target)[part - 1 :: parts]
@@ -100,28 +108,8 @@ def command(
     raise click.exceptions.Exit(int(any(outcome.state == "failed" for outcome in outcomes)))
 
 
-def _refuse_both(device: Sequence[str] | None, workers: int | None, scheduler: str | None) -> None:
-    """Refuse more than one choice of who does the work."""
-    from mirrorskin.io import InputError
-
-    given = {"--device": device, "--workers": workers, "--scheduler": scheduler}
-    names = [name for name, value in given.items() if value]
-    if len(names) > 1:
-        raise InputError(f"{' and '.join(names)} each tell who does the work: give one of them")
-
-
-def _shard(text: str | None) -> tuple[int, int]:
-    """Return which part of how many is to be done."""
-    from mirrorskin.io import InputError
-
-    part, parts = map(int, match.groups()) if (match := _SHARD.fullmatch(text or "1/1")) else (0, 0)
-    if not 1 <= part <= parts:
-        raise InputError(f"--shard {text}: a part and how many there are is needed; write e.g. 1/4")
-    return part, parts
-
-
 def _find(words: Sequence[str], folder: Path) -> list[Path]:
-    """Find the recordings; results that lie among them are left out."""
+    """Return the recordings, without results among them."""
     from mirrorskin.io import InputError
     from mirrorskin.io.url import Url, is_zarr, path_of
     from mirrorskin.io.zarr import find_stores
@@ -142,20 +130,20 @@ def _find(words: Sequence[str], folder: Path) -> list[Path]:
             if (path.is_file() or is_zarr(path)) and not any(map(is_zarr, path.parents))
         ]
         if not answers:
-            raise InputError(f"{word}: no file answers to that: name recordings")
+            raise InputError(f"{word}: no file matches. Name recordings")
         found += answers
     if not any(isinstance(path, Url) or os.path.lexists(path) for path in found):
         raise InputError(f"{found[0]}: no such file")
     recordings = [path for path in found if not _is_result(path, folder)]
     if not recordings:
-        raise InputError(f"{words[0]}: nothing but results: name recordings")
+        raise InputError(f"{words[0]}: results only. Name recordings")
     if len(recordings) < len(found):
         click.echo(f"left out, as results: {len(found) - len(recordings)} files", err=True)
     return recordings
 
 
 def _is_result(path: Path, folder: Path) -> bool:
-    """Tell whether a file is a result, or was one of those in a folder before it was damaged."""
+    """Return whether a file is a result, or was one in this folder before it was damaged."""
     from mirrorskin.io import InputError
     from mirrorskin.io.hdf5 import Hdf5File
     from mirrorskin.io.result_file import MARK
@@ -170,7 +158,7 @@ def _is_result(path: Path, folder: Path) -> bool:
 
 
 def _prepare(folder: Path, jobs: Sequence[Job]) -> None:
-    """Make the folder, see that it can be written to, and clear away what a killed batch left there."""
+    """Create the folder, check that it can be written to, and remove what a killed batch left there."""
     from mirrorskin import io
     from mirrorskin.io.atomic import remove_leftovers
     from mirrorskin.io.os_errors import as_input_error
@@ -199,7 +187,7 @@ def _run(
     scheduler: str | None,
     show: _Show,
 ) -> Generator[Outcome, None, None]:
-    """Do the jobs here, or on a cluster; devices and workers are asked for only if something is to do."""
+    """Run the jobs here, or on a cluster; devices are opened and workers started only if there is work."""
     from mirrorskin.engine.batch.work import find_settled
 
     todo = []
@@ -228,12 +216,12 @@ def _reporting_interruption(outcomes: Sequence[Outcome], total: int) -> Iterator
     try:
         yield
     except (KeyboardInterrupt, SystemExit):
-        click.echo(f"ended after {len(outcomes)} of {total}: the same command goes on from there", err=True)
+        click.echo(f"ended after {len(outcomes)} of {total}: the same command resumes it", err=True)
         raise
 
 
 def _report(outcomes: Sequence[Outcome], folder: Path, seconds: float, as_json: bool) -> None:
-    """Print what became of all."""
+    """Print the outcomes of all recordings."""
     from mirrorskin.cli.output import print_json
 
     states = Counter({"done": 0, "kept": 0, "failed": 0})
@@ -259,7 +247,7 @@ def _fields(outcome: Outcome) -> dict[str, Any]:
 
 @contextmanager
 def _show_batch(total: int, as_json: bool) -> Iterator[_Show]:
-    """Show how a batch of so many files goes."""
+    """Show the progress of a batch with a total number of files."""
     if sys.stderr.isatty() and (as_json or sys.stdout.isatty()):
         from rich.console import Console
         from rich.live import Live
@@ -273,23 +261,23 @@ def _show_batch(total: int, as_json: bool) -> Iterator[_Show]:
 
 
 def _problem(outcome: Outcome) -> str:
-    """Tell in a line what is wrong, and with which file."""
+    """Return a line about what is wrong, and with which file."""
     name, message = str(outcome.job.source), " ".join(outcome.message.split())
     message = _OPTIONS.sub(r"\1 in [stack] of --settings", message)
     return printable(message if name in message else f"{name}: {message}")
 
 
 class _Show:
-    """Shows how a batch goes: a line for each file, if wanted."""
+    """Shows the progress of a batch: a line for each file, if wanted."""
 
     def __init__(self, wanted: bool) -> None:
         self._wanted = wanted
 
     def under_way(self, job: Job, frames: int, /) -> None:
-        """Take note, from any thread, that so many frames of a job were read."""
+        """Receive, from any thread, the number of frames of a job that were read."""
 
     def ended(self, outcome: Outcome, /) -> None:
-        """Take note of what became of a job."""
+        """Receive the outcome of a job."""
         if not self._wanted:
             return
         line = f"{outcome.state}: {printable(str(outcome.job.source))}"
@@ -301,7 +289,7 @@ class _Show:
 
 
 class _Table(_Show):
-    """The files under way, the last that ended, and a bar of all."""
+    """The files in progress, the last that ended, and a bar of all."""
 
     def __init__(self, total: int) -> None:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -328,7 +316,7 @@ class _Table(_Show):
         self._bar.update(self._task, advance=1, description=counts)
 
     def render(self) -> RenderableType:
-        """Draw it as it is now."""
+        """Draw the current state."""
         from rich.console import Group
         from rich.table import Table
         from rich.text import Text

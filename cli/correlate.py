@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from mirrorskin.cli import options
 from mirrorskin.cli.declared import declared
-from mirrorskin.cli.groups import Argument, Option
+from mirrorskin.cli.groups import Argument
 from mirrorskin.cli.stack import STACK, stack_options
 
 _TRAVEL = ("travel", "travel_step", "travel_start")
@@ -15,16 +15,7 @@ _TRAVEL = ("travel", "travel_step", "travel_start")
 
 def command(
     stack: Annotated[Path, Argument(metavar="STACK", help="Frames in HDF5, of any layout.")],
-    output: Annotated[
-        Path | None,
-        Option(
-            "--output",
-            "-o",
-            metavar="RES.h5",
-            help="Result to write: HDF5, or NAME.zarr.",
-            show_default="STACK-correlation.h5",
-        ),
-    ] = None,
+    output: Annotated[Path | None, options.result_option("STACK-correlation.h5")] = None,
     memory: options.Memory = "256MB",
     device: options.Device = None,
     as_json: options.Json = False,

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mirrorskin.cli.groups import MOTIONS, Command, ExistingPath, MotionOption, for_motions
+from mirrorskin.cli.groups import MOTIONS, Command, ExistingPath, MotionOption, NameOrFile, for_motions
 
 if TYPE_CHECKING:
     from mirrorskin.engine.options import Option
@@ -35,6 +35,7 @@ _UNITS = {  # placeholder in help, function of `mirrorskin.cli.quantity`, exampl
     "mm,mm": ("LENGTH[,LENGTH]", "lengths", "0.03mm"),
     "region": ("X,Y,WxH", "region", "100,50,640x480"),
     "range": ("A:B", "frame_range", "10:200"),
+    "WxH": ("WxH", "frame_size", "640x480"),
 }
 _CLASS = re.compile(r".+:[A-Za-z_]\w*")
 _LOADED = "mirrorskin.cli.declared"  # key of a context's class and its options
@@ -65,6 +66,7 @@ class Term:
     motions: Sequence[str] = ()
     default: str = ""  # as on the command line
     least: int | None = None
+    most: int | None = None
 
     @property
     def example(self) -> str:
@@ -90,7 +92,7 @@ class Term:
         from mirrorskin.cli import quantity
         from mirrorskin.io import InputError
 
-        if text in self.words or self.kind in ("choice", "text"):
+        if text in self.words or self.kind in ("choice", "text", "name"):
             return text
         plain = "integer" if self.kind == "integer" else "number"
         try:
@@ -99,6 +101,8 @@ class Term:
             raise InputError(", or ".join([str(error), *self.words])) from error
         if self.least is not None and value < self.least:
             raise InputError(f"{where} {text}: a number of at least {self.least} is needed")
+        if self.most is not None and value > self.most:
+            raise InputError(f"{where} {text}: a number of at most {self.most} is needed")
         return value
 
     @property
@@ -118,6 +122,8 @@ class DeclaredOption(MotionOption):
             settings = {"type": click.Choice([*one.choices])}
         elif one.kind == "file":
             settings = {"type": ExistingPath(), "metavar": one.file or one.unit}
+        elif one.kind == "name":
+            settings = {"type": NameOrFile(), "metavar": one.unit}
         elif one.kind == "switch":
             settings = {"is_flag": True}
         elif one.kind != "flag":
@@ -181,15 +187,21 @@ def term(
     *,
     motions: Sequence[str] = (),
     kind: str = "number",
+    choices: Sequence[str] = (),
     least: int | None = None,
+    most: int | None = None,
+    shown: str = "",
 ) -> Term:
     """Return an option of a command that the engine does not declare.
 
-    ``kind`` is "number", "integer", "switch", "text" or "file"; of a text or a file, ``unit`` is the
-    placeholder in help.
-    ``default`` is a text as on the command line.
+    ``kind`` is "number", "integer", "switch", "text", "file" or "name" (a file if it has an ending); of the
+    last three, ``unit`` is the placeholder in help. ``default`` is a text as on the command line; ``shown``
+    is what help says instead.
     """
-    return Term(name, kind, for_motions(motions, text), unit, motions=motions, default=default, least=least)
+    kind = "choice" if choices else kind
+    return Term(
+        name, kind, for_motions(motions, text), unit, shown, choices, (), "", motions, default, least, most
+    )
 
 
 class ClassCommand(Command):

@@ -67,7 +67,7 @@ def command(
 
 
 def _part(output: list[Path], result: Path, turn: int | None) -> tuple[list[Path], list[Path]]:
-    """Return what is to be written as Zarr, and the rest, all of which can be."""
+    """Return the outputs in Zarr and the others, after checking all of them."""
     from mirrorskin.io import InputError, check_output
     from mirrorskin.io.url import is_zarr
     from mirrorskin.io.zarr_export import check_store

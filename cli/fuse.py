@@ -18,16 +18,7 @@ if TYPE_CHECKING:
 def command(
     vertical: Annotated[Path, Argument(metavar="VERTICAL", help="Recording of a press, in HDF5.")],
     axial: Annotated[Path, Argument(metavar="AXIAL", help="Recording of a rotation, in HDF5.")],
-    output: Annotated[
-        Path | None,
-        Option(
-            "--output",
-            "-o",
-            metavar="RES.h5",
-            help="Result to write: HDF5, or NAME.zarr.",
-            show_default="VERTICAL-fused.h5",
-        ),
-    ] = None,
+    output: Annotated[Path | None, options.result_option("VERTICAL-fused.h5")] = None,
     calibration: options.Calibration = None,
     register: Annotated[
         bool,
@@ -38,7 +29,7 @@ def command(
     as_json: options.Json = False,
     **chosen: Annotated[Any, STACK.without("motion", "frames", "tilt"), declared("fuse")],
 ) -> None:
-    """Make one surface of a press and a rotation."""
+    """Fuse a press and a rotation to one surface."""
     from mirrorskin import io
     from mirrorskin.cli.output import progress, report_levels, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of

@@ -1,4 +1,4 @@
-"""Commands made of functions with annotated parameters, and groups that import them when they are named."""
+"""Commands from functions with annotated parameters, and groups that import them on first use."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from click.shell_completion import CompletionItem
 if TYPE_CHECKING:
     from mirrorskin.io import Motion
 
-_WRITTEN = {"--output", "--record"}  # options that name what a command writes; other paths are read
+_WRITTEN = {"--output", "--record"}  # options of files to write; other paths are read
 MOTIONS: tuple[Motion, ...] = ("vertical", "axial", "horizontal", "twist")
 _COMMON = ("calibration", "memory", "device", "as_json")  # options that follow the declared ones in help
 _NOUNS = {"vertical": "press", "axial": "rotation", "horizontal": "slide", "rock": "rocking motion"}
@@ -36,11 +36,11 @@ class Option:
 
 
 class Argument(Option):
-    """What is said of an argument."""
+    """Settings of click for an argument."""
 
 
 class MotionOption(click.Option):
-    """An option that may apply to some motions only, others of which `refuse_foreign` refuses."""
+    """An option that may apply to some motions only; see `refuse_foreign`."""
 
     def __init__(self, names: Sequence[str], *, motions: Sequence[str] = (), **settings: Any) -> None:
         self.motions = tuple(motions)
@@ -75,15 +75,15 @@ def refuse_foreign(context: click.Context, motion: str, name: str = "this") -> N
 
 
 class Group(click.Group):
-    """A group whose help says in full, and in the order given, what its commands are for."""
+    """A group whose help lists the purposes of its commands in full and in the given order."""
 
     def add(self, function: Callable[..., Any], name: str | None = None) -> Callable[..., Any]:
-        """Make a command of a function; also as a decorator."""
+        """Add a command that calls a function; also as a decorator."""
         self.add_command(make_command(name or function.__name__, function))
         return function
 
     def purposes(self) -> Mapping[str, str]:
-        """Return what each command is for."""
+        """Return the purposes of the commands by name."""
         return {name: (command.help or "").split("\n\n")[0] for name, command in self.commands.items()}
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -91,7 +91,7 @@ class Group(click.Group):
         return list(self.commands)
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Return the commands and options that begin so; unlike click's own, it imports no command."""
+        """Return matching commands and options; unlike that of click, it imports no command."""
         commands = [
             CompletionItem(name, help=purpose)
             for name, purpose in self.purposes().items()
@@ -115,7 +115,7 @@ class LazyGroup(Group):
         self._purposes = purposes
 
     def purposes(self) -> Mapping[str, str]:
-        """Return what was given: no command is needed for it."""
+        """Return the given purposes, without importing a command."""
         return self._purposes
 
 
@@ -163,7 +163,7 @@ class Command(click.Command):
 
 
 class _Argument(click.Argument):
-    """An argument that the help tells of."""
+    """An argument that help lists."""
 
     def __init__(self, name: str, settings: dict[str, Any]) -> None:
         self._help = settings.pop("help")
@@ -187,7 +187,7 @@ class _AnyPath(click.Path):
 
 
 class ExistingPath(_AnyPath):
-    """What a command reads: one that is not there is told before anything heavy is imported."""
+    """The path of a file to read; a missing one is reported before anything heavy is imported."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the path of a file that exists, or an address."""
@@ -195,21 +195,22 @@ class ExistingPath(_AnyPath):
 
         path = path_of(value)
         try:
-            if not isinstance(path, Url):  # the command says whether there is something at an address
+            if not isinstance(path, Url):  # the command checks addresses
                 path.stat()
         except (FileNotFoundError, NotADirectoryError):
             raise _Missing(f"{value}: no such file") from None
-        except OSError:  # the command says more of it
+        except OSError:  # the command reports it
             pass
         return super().convert(value, param, ctx)
 
 
-class _NameOrFile(click.ParamType[str]):
-    """A text that names something, or a file if it has an ending."""
+class NameOrFile(click.ParamType[str]):
+    """A name, or a file if it has an ending."""
 
     name = "text"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the text; a file must exist."""
         if Path(value).suffix:
             ExistingPath().convert(value, param, ctx)
         return value
@@ -217,6 +218,7 @@ class _NameOrFile(click.ParamType[str]):
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
+        """Let the shell complete the name of a file."""
         return [CompletionItem(incomplete, type="file")]
 
 
@@ -232,7 +234,7 @@ class _Words(click.Choice[Any]):
 
 
 class _Commands(Mapping[str, Any]):
-    """Commands by name, each made when it is asked for."""
+    """Commands by name, each imported on first use."""
 
     def __init__(self, package: str, names: tuple[str, ...]) -> None:
         self._package, self._names = package, names
@@ -256,7 +258,7 @@ class _Commands(Mapping[str, Any]):
 
 
 def _parameter(parameter: inspect.Parameter, hint: Any) -> click.Parameter:
-    """Return a parameter of click's: its type from the annotation, its name from the function."""
+    """Return the parameter of click for a parameter of a function."""
     kind, said = get_args(hint)[:2]
     kind = next((one for one in get_args(kind) if NoneType in get_args(kind) and one is not NoneType), kind)
     many = get_origin(kind) is list
@@ -264,7 +266,7 @@ def _parameter(parameter: inspect.Parameter, hint: Any) -> click.Parameter:
     settings = dict(said.settings)
     bounds = {name: settings.pop(name) for name in ("min", "max") if name in settings}
     or_file, written = settings.pop("or_file", False), not _WRITTEN.isdisjoint(said.names)
-    settings["type"] = _NameOrFile() if or_file else _type(kind, bounds, written)
+    settings["type"] = NameOrFile() if or_file else _type(kind, bounds, written)
     settings["required"] = parameter.default is parameter.empty
     if parameter.default is not parameter.empty and not many:
         default = parameter.default

@@ -26,7 +26,7 @@ def command(
     overwrite: options.Overwrite = False,
     **given: Annotated[Any, POSITIONS],
 ) -> None:
-    """Make a recording of a video or pictures."""
+    """Convert a video or pictures to a recording."""
     from mirrorskin import io
     from mirrorskin.cli.output import printable, progress
 

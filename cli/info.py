@@ -17,7 +17,7 @@ def command(
     ] = False,
     as_json: options.Json = False,
 ) -> None:
-    """Tell what a file holds."""
+    """Show what a file contains."""
     from mirrorskin import io
 
     facts = io.describe(file)

@@ -37,24 +37,24 @@ PURPOSES = {
     "demo": "Draw the figures of the paper from experiments on the twin.",
     "simulate": "Record what the twin sees, with the truth.",
     "sample": "Write example data.",
-    "import": "Make a recording of a video or pictures.",
+    "import": "Convert a video or pictures to a recording.",
     "capture": "Move the stage, and record what the camera sees.",
     "live": "Reconstruct while the stage moves.",
     "reconstruct": "Reconstruct heights from a press, normals and heights from a rotation, or slip.",
     "correlate": "Fit mean, cosine and sine of the phase to each pixel's brightness.",
     "run": "Run an operation over a recording: built-in, or your own.",
-    "fuse": "Make one surface of a press and a rotation.",
-    "stitch": "Make one larger surface of several touches.",
+    "fuse": "Fuse a press and a rotation to one surface.",
+    "stitch": "Join several touches to one larger surface.",
     "batch": "Reconstruct many recordings.",
     "view": "Show the maps of a result, a section and a histogram of heights.",
     "measure": "Measure a height map: heights, areas, volumes, plane or sphere, roughness, steps.",
     "report": "Write a page with pictures, numbers and the surface.",
     "export": "Write a result as meshes, points, pictures, tables or arrays.",
-    "score": "Compare a result with a simulation's truth.",
-    "info": "Tell what a file holds.",
+    "score": "Compare a result with the ground truth of a simulation.",
+    "info": "Show what a file contains.",
     "devices": "List the OpenCL devices of this machine.",
-    "rig": "Look at a stage and a camera before they are used.",
-    "calibrate": "Find out what a sensor's counts and pixels mean.",
+    "rig": "Check a stage and a camera before they are used.",
+    "calibrate": "Calibrate brightness, scale, tilt and elasticity of a sensor.",
     "twin": "Emulate a whole rig: its stage and its camera.",
     "bench": "Time the core operations and the limits of a device.",
 }
@@ -218,7 +218,7 @@ class OutputError(Exception):
 
 
 class _StandardOutput(FileIO):
-    """Standard output whose errors are told apart from those of other files."""
+    """Standard output whose errors differ from those of other files."""
 
     def write(self, data: Any) -> int:
         if not data:  # Click tries streams with nothing, which /dev/full refuses
@@ -288,7 +288,7 @@ def program() -> None:
     _guard_streams()
     try:
         main()
-    finally:  # all is said and put away: another Ctrl-C ends the interpreter without a traceback
+    finally:  # everything is closed: another Ctrl-C ends the interpreter without a traceback
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 

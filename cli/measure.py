@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Any
 
 import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.groups import Option
 from mirrorskin.cli.output import print_fields, print_json
+from mirrorskin.cli.stack import STACK
 
 
 class FormName(StrEnum):
@@ -23,7 +24,6 @@ class FormName(StrEnum):
 def command(
     result: options.ResultFile,
     turn: options.Turn = None,
-    region: options.Region = None,
     form: Annotated[
         FormName | None,
         Option(
@@ -44,6 +44,7 @@ def command(
         ),
     ] = None,
     as_json: options.Json = False,
+    **given: Annotated[Any, STACK.only("region")],
 ) -> None:
     """Measure a height map: heights, areas, volumes, plane or sphere, roughness, steps."""
     from mirrorskin import engine, io
@@ -51,7 +52,7 @@ def command(
 
     measures = engine.measure(
         io.select_turn(io.open_result(result), turn),
-        region=None if region is None else quantity.region(region, "--region"),
+        region=given.get("region"),
         form=None if form is None else form.value,
         cutoff=None if cutoff is None else quantity.length(cutoff, "--cutoff"),
         section=None if section is None else quantity.segment(section, "--section"),

@@ -32,25 +32,17 @@ Json = Annotated[bool, Option("--json", help="Print machine-readable output.")]
 Device = Annotated[
     str | None, Option(metavar="NAME", help="Number or part of the name, as in 'mirrorskin devices'.")
 ]
-ZenithGain = Annotated[
-    str | None,
-    Option(metavar="COUNTS/ANGLE", help="Rotation: of the zenith, 5.7/deg; else the file's."),
-]
-ZenithOffset = Annotated[float | None, Option(metavar="COUNTS", help="Rotation: brightness at zenith 0.")]
-Robust = Annotated[
-    bool,
-    Option("--robust", help="Rotation: find where the surface breaks, and do not smooth that over."),
-]
-PixelSize = Annotated[
-    str | None, Option(metavar="LENGTH[,LENGTH]", help="Size of a pixel at the sheet: 0.03mm.")
-]
-Region = Annotated[
-    str | None,
-    Option(metavar="X,Y,WxH", help="Only W x H pixels, from column X and row Y on: 100,50,640x480."),
-]
 LiveFrames = Annotated[
     bool, Option("--live", help="Only the frames that a live run used, with the positions it had.")
 ]
+
+
+def result_option(default: str) -> Option:
+    """Return the option of a result to write."""
+    text = "Result to write: HDF5, or NAME.zarr."
+    return Option("--output", "-o", metavar="RES.h5", help=text, show_default=default)
+
+
 ResultFile = Annotated[Path, Argument(metavar="RES.h5", help="Result to take.")]
 Turn = Annotated[
     int | None,

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from mirrorskin.io import Result
 
 _NO_GEL = "none: the calibration has no gel"
-_UNTOLD = "none: "  # how a result's process says that a map is missing, before it says why
+_UNTOLD = "none: "  # begins the reason for a missing map in a process
 
 
 def save_and_report(result: Result, path: Path, device: str | None, as_json: bool) -> None:
-    """Write a result and say in a line what it holds, or in JSON how it came about as well."""
+    """Write a result and print its summary in a line, or with its process as JSON."""
     from mirrorskin import io
     from mirrorskin.engine.summary import summarise
     from mirrorskin.kernels.device import open_device
@@ -49,7 +49,7 @@ def _pieces(result: Result) -> dict[str, int]:
 
 
 def _words(components: int = 1, offset_unknown: int = 0) -> Iterator[str]:
-    """Tell of pieces what is worth a word."""
+    """Yield remarks about connected pieces."""
     if components > 1:
         yield f"in {components} pieces"
     if offset_unknown:
@@ -67,7 +67,7 @@ def printable(value: object) -> str:
 
 
 def print_json(value: Any) -> None:
-    """Print a value as JSON; dataclasses become objects, and what is no number null."""
+    """Print a value as JSON; dataclasses become objects, and NaN and infinities null."""
     click.echo(json.dumps(_plain(value), indent=2))
 
 
@@ -79,7 +79,7 @@ def print_fields(fields: Mapping[str, object]) -> None:
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print rows under their heads, in columns as wide as they need."""
+    """Print rows under their heads in aligned columns."""
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
     for row in (head, *rows):
         cells = (f"{printable(cell):<{width}}" for cell, width in zip(row, widths, strict=True))
@@ -99,7 +99,7 @@ def _plain(value: Any) -> Any:
 
 
 def report_missing_maps(name: str, process: Mapping[str, object], remedies: Mapping[str, str]) -> None:
-    """Say which maps and forces a result lacks, why, what would bring them, and what a gel did."""
+    """Print which maps and forces are missing, why, and the remedy; and what was done about a gel."""
     for what, remedy in remedies.items():
         said = str(process.get(what))
         if said.startswith(_UNTOLD):
@@ -115,7 +115,7 @@ def report_missing_maps(name: str, process: Mapping[str, object], remedies: Mapp
 
 
 def report_levels(name: str, process: Mapping[str, object]) -> None:
-    """Say which levels of dark and bright nobody gave, and what was taken."""
+    """Print which levels of dark and bright were not given, and what was assumed."""
     from mirrorskin.engine.provenance import missing_levels
 
     said = missing_levels(process)
@@ -124,7 +124,7 @@ def report_levels(name: str, process: Mapping[str, object]) -> None:
 
 
 def report_contact(name: str, process: Mapping[str, object]) -> None:
-    """Say where the contact of a slide or a twist is wider than the skin's."""
+    """Print a warning if the contact of a slide or a twist is wider than that of the skin."""
     widened = {
         "estimated": "the contact is estimated and too wide, and so is slip;"
         " give --contact, a press's result",

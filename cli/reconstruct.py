@@ -9,7 +9,7 @@ import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.declared import declared
-from mirrorskin.cli.groups import Argument, Option, refuse_foreign
+from mirrorskin.cli.groups import Argument, refuse_foreign
 from mirrorskin.cli.stack import RECORDING, stack_options
 
 _REMEDIES = {"zenith": "--zenith-gain", "height": "--pixel-size"}  # by maps that are missing
@@ -18,16 +18,7 @@ _REMEDIES = {"zenith": "--zenith-gain", "height": "--pixel-size"}  # by maps tha
 def command(
     context: click.Context,
     recording: Annotated[Path, Argument(metavar="REC.h5", help="Frames in HDF5, Zarr, NPY or NPZ.")],
-    output: Annotated[
-        Path | None,
-        Option(
-            "--output",
-            "-o",
-            metavar="RES.h5",
-            help="Result to write: HDF5, or NAME.zarr.",
-            show_default="REC-result.h5",
-        ),
-    ] = None,
+    output: Annotated[Path | None, options.result_option("REC-result.h5")] = None,
     live: options.LiveFrames = False,
     calibration: options.Calibration = None,
     memory: options.Memory = "256MB",

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mirrorskin.hw.stage import Stage
 
 app = Group(
-    help="Look at a stage and a camera before they are used, and move it by hand.", no_args_is_help=True
+    help="Check a stage and a camera before they are used, and move it by hand.", no_args_is_help=True
 )
 
 _SLOW = 0.1  # of an axis's speed, for moves by hand
@@ -65,7 +65,7 @@ def check(
     move: Annotated[bool, Option("--move", help="Home it, and move each axis a little.")] = False,
     as_json: options.Json = False,
 ) -> None:
-    """Open a rig and tell whether it is as its file says; nothing moves without --move."""
+    """Open a rig and compare it with its file; nothing moves without --move."""
     from mirrorskin.hw.errors import HardwareError
     from mirrorskin.hw.rig.check import check_rig
     from mirrorskin.hw.rig_file import load_rig
@@ -136,7 +136,7 @@ def probe(
     ] = None,
     step: Annotated[str, Option(metavar="LENGTH", help="From place to place.")] = "0.05mm",
 ) -> None:
-    """Lower the body until the picture shows contact, lift it, and tell the zero of the travel."""
+    """Lower the body until the picture shows contact, lift it, and print the zero of the travel."""
     from mirrorskin.cli.quantity import length
     from mirrorskin.hw.rig.probe import find_contact
     from mirrorskin.hw.rig.rig import open_rig

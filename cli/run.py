@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from mirrorskin.cli import options
 from mirrorskin.cli.declared import ClassCommand
-from mirrorskin.cli.groups import Argument, Option, make_command
+from mirrorskin.cli.groups import Argument, make_command
 from mirrorskin.cli.stack import RECORDING, stack_options
 
 
@@ -16,16 +16,7 @@ def command(
         str, Argument(metavar="MODULE:CLASS", help="Class in a module or file: mine:Sum, or mine.py:Sum.")
     ],
     recording: Annotated[Path, Argument(metavar="REC.h5", help="Frames in HDF5, Zarr, NPY or NPZ.")],
-    output: Annotated[
-        Path | None,
-        Option(
-            "--output",
-            "-o",
-            metavar="RES.h5",
-            help="Result to write: HDF5, or NAME.zarr.",
-            show_default="REC-CLASS.h5",
-        ),
-    ] = None,
+    output: Annotated[Path | None, options.result_option("REC-CLASS.h5")] = None,
     live: options.LiveFrames = False,
     memory: options.Memory = "256MB",
     device: options.Device = None,

@@ -215,7 +215,7 @@ def _axial(values: Mapping[str, Any], given: Mapping[str, Any]) -> AxialPlan:
 
 
 def _pace(given: Mapping[str, Any], unit: str, example: str) -> dict[str, Any]:
-    """Read the step and the speed, as in ``0.5mm/s``, of which one is given, in mm or rad."""
+    """Return the step or the speed, such as ``0.5mm/s``, in mm or rad."""
     from mirrorskin.cli import quantity
     from mirrorskin.io import InputError
 

@@ -15,7 +15,7 @@ def command(
     truth: Annotated[Path, Option(metavar="REC.h5", help="Simulated recording, with the truth.")],
     as_json: options.Json = False,
 ) -> None:
-    """Compare a result with a simulation's truth."""
+    """Compare a result with the ground truth of a simulation."""
     import click
 
     from mirrorskin import engine, io

@@ -1,56 +1,63 @@
-"""Options of the twin that several commands share, worded once."""
+"""Options of the twin that several commands share."""
 
 from __future__ import annotations
 
-from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated, cast
+from collections.abc import Mapping
+from typing import Any
 
-from mirrorskin.cli.groups import Option
+from mirrorskin.cli.declared import Terms, term
 
-if TYPE_CHECKING:
+_OBJECT = (
+    "sphere, cone, cylinder, plane, step, texture, coin, or a file: heights in NPY, PNG or TIFF, or a mesh in"
+    " STL, PLY or OBJ"
+)
+
+
+def sensor_terms(size: str, pixel_size: str) -> Terms:
+    """Return the options of a sensor and its object, with these defaults."""
+    return Terms(
+        [
+            term("object", _OBJECT, "NAME", "sphere", kind="name"),
+            term("size", "pixels across and down", "WxH", size),
+            term("pixel_size", "size of a pixel", "mm,mm", pixel_size),
+            term(
+                "contact",
+                "the sheet takes the object's shape (eq. 1), or resists",
+                default="conform",
+                choices=("conform", "elastic"),
+            ),
+            term(
+                "optics",
+                "light depends on the zenith alone, or is traced to the wall",
+                default="ideal",
+                choices=("ideal", "cylinder"),
+            ),
+            term(
+                "pattern",
+                "wall: uniform, for presses; linear in the zenith, for rotations; or a picture",
+                "NAME",
+                "uniform",
+                kind="name",
+            ),
+            term(
+                "texture",
+                "flakes of the mirror coat, or printed dots, which move with the skin",
+                default="none",
+                choices=("none", "flakes", "dots", "random-dots"),
+            ),
+            term("texture_size", "width of a flake, or diameter of a dot", "mm", "0.1mm"),
+            term("texture_contrast", "greatest share of the light that flakes or dots take", "", "0.5"),
+        ]
+    )
+
+
+def sensor_options(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keywords of `mirrorskin.hw.Twin` that these options describe."""
     from mirrorskin.hw.twin import SheetTexture
-    from mirrorskin.hw.twin import TextureName as Kind
 
-
-class ContactName(StrEnum):
-    """How the sheet lies on the object."""
-
-    conform = "conform"
-    elastic = "elastic"
-
-
-class OpticsName(StrEnum):
-    """How the light of a slope is found."""
-
-    ideal = "ideal"
-    cylinder = "cylinder"
-
-
-class TextureName(StrEnum):
-    """What can be seen of the sheet itself."""
-
-    none = "none"
-    flakes = "flakes"
-    dots = "dots"
-    random_dots = "random-dots"
-
-
-Size = Annotated[str, Option(metavar="WxH", help="Pixels across and down.")]
-PixelSize = Annotated[str, Option(metavar="LENGTH[,LENGTH]", help="Size of a pixel.")]
-Contact = Annotated[ContactName, Option(help="The sheet takes the object's shape (eq. 1), or resists.")]
-Texture = Annotated[
-    TextureName, Option(help="Flakes of the mirror coat, or printed dots: they move with the skin.")
-]
-TextureSize = Annotated[str, Option(metavar="LENGTH", help="Width of a flake, or diameter of a dot.")]
-TextureContrast = Annotated[float, Option(help="Share of the light that flakes or dots take at most.")]
-Optics = Annotated[OpticsName, Option(help="Light goes by the zenith alone, or is traced to the wall.")]
-
-
-def sheet_texture(kind: TextureName, size: str, contrast: float) -> SheetTexture | None:
-    """Return the texture that options describe."""
-    from mirrorskin.cli.quantity import length
-    from mirrorskin.hw.twin import SheetTexture
-
-    if kind is TextureName.none:
-        return None
-    return SheetTexture(cast("Kind", kind.value), length(size, "--texture-size"), contrast)
+    columns, rows = values["size"]
+    texture = None
+    if values["texture"] != "none":
+        texture = SheetTexture(values["texture"], values["texture_size"], values["texture_contrast"])
+    names = ("pixel_size", "contact", "optics", "pattern")
+    return {"shape": (rows, columns), "texture": texture, **{name: values[name] for name in names}}

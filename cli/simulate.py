@@ -4,36 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
-from mirrorskin.cli import options, sensor
+from mirrorskin.cli import options
 from mirrorskin.cli.declared import Terms, term
-from mirrorskin.cli.groups import Argument, Option, refuse_foreign
+from mirrorskin.cli.groups import Argument, refuse_foreign
+from mirrorskin.cli.sensor import sensor_options, sensor_terms
 
 if TYPE_CHECKING:
     from mirrorskin.hw.twin import Movement
 
 FRAMES_MAX = 10**7
 _FRAMES = 30
-
-
-class FrameType(StrEnum):
-    """Types of a sample."""
-
-    uint8 = "uint8"
-    uint16 = "uint16"
-    float32 = "float32"
-
-
-class ReferenceName(StrEnum):
-    """Where the references come from."""
-
-    ball = "ball"
-    exact = "exact"
 
 
 _PRESS, _TURN, _SIDEWAYS = ("vertical",), ("axial",), ("horizontal", "twist")
@@ -82,125 +67,95 @@ MOVEMENT = Terms(
 """The options of the body's movement."""
 
 
+TWIN = Terms(
+    [
+        *sensor_terms("480x480", "0.025mm").terms,
+        term(
+            "object_shift",
+            "centre of the object from the picture's",
+            "X,Y",
+            "0mm,0mm",
+            kind="text",
+        ),
+        term(
+            "frames",
+            "frames to record",
+            kind="integer",
+            least=1,
+            most=FRAMES_MAX,
+            shown="30; of a rotation one turn",
+        ),
+        *MOVEMENT.terms,
+        term("air_gap", "gap between body and wall", "mm", "0mm"),
+        term("asymmetry", "asymmetry of the lamps, as a share of their light", "", "0"),
+        term("scatter", "scatter of the sheet's flakes", "rad", "3deg"),
+        term("friction", "coefficient between sheet and object", "", "0.8"),
+        term("modulus", "Young's modulus of the body, which scales all forces", "MPA", "1.0"),
+        term("camera_distance", "pinhole above the sheet", "mm", shown="rays are parallel"),
+        term("point_spread", "blur of the lens, one sigma", "pixels", "0"),
+        term("dtype", "type of a sample", default="uint8", choices=("uint8", "uint16", "float32")),
+        term("bits", "bits of a uint16 sample: 10, 12 or 16", kind="integer", shown="12"),
+        term("noise", "read noise, one sigma", "counts", "1.5"),
+        term("electrons", "electrons in one count of these bits, for shot noise", shown="no shot noise"),
+        term("gain_deviation", "deviation of the pixels' gains, one sigma", "", "0"),
+        term("offset_deviation", "deviation of the pixels' offsets, one sigma", "counts", "0"),
+        term("frame_rate", "frames a second", "Hz", "30"),
+        term("exposure", "time during which the body moves in each frame", "s", "0s"),
+        term(
+            "references",
+            "dark and bright are recorded with a ball, as in a lab, or are exact",
+            default="ball",
+            choices=("ball", "exact"),
+        ),
+        term("seed", "the same seed gives the same recording", "", "0", kind="integer"),
+    ]
+)
+_BODY = ("air_gap", "asymmetry", "scatter", "friction", "modulus")
+_CAMERA = (
+    *("bits", "noise", "gain_deviation", "offset_deviation", "frame_rate", "exposure", "point_spread"),
+    "seed",
+)
+
+
 def command(
     context: click.Context,
     motion: Annotated[options.MotionName, Argument(help="How the body moves.")],
     output: options.NewRecording,
-    thing: Annotated[
-        str,
-        Option(
-            "--object",
-            metavar="NAME",
-            or_file=True,
-            help="sphere, cone, cylinder, plane, step, texture, coin, or a file:"
-            " heights in NPY, PNG or TIFF, or a mesh in STL, PLY or OBJ.",
-        ),
-    ] = "sphere",
-    object_shift: Annotated[
-        str, Option(metavar="X,Y", help="Where the object's centre lies, from the picture's.")
-    ] = "0mm,0mm",
-    size: sensor.Size = "480x480",
-    pixel_size: sensor.PixelSize = "0.025mm",
-    frames: Annotated[
-        int | None,
-        Option(min=1, max=FRAMES_MAX, help="Frames to take.", show_default="30; of a rotation one turn"),
-    ] = None,
-    contact: sensor.Contact = sensor.ContactName.conform,
-    optics: sensor.Optics = sensor.OpticsName.ideal,
-    pattern: Annotated[
-        str,
-        Option(
-            metavar="NAME", or_file=True, help="Of the wall: uniform, linear in the zenith, or a picture."
-        ),
-    ] = "uniform",
-    air_gap: Annotated[str, Option(metavar="LENGTH", help="Between body and wall.")] = "0mm",
-    asymmetry: Annotated[float, Option(help="Of the lamps, as a share of their light.")] = 0.0,
-    scatter: Annotated[str, Option(metavar="ANGLE", help="Of the sheet's flakes.")] = "3deg",
-    friction: Annotated[float, Option(help="Coefficient, between sheet and object.")] = 0.8,
-    modulus: Annotated[
-        float, Option(metavar="MPA", help="Young's modulus of the body, which scales all forces.")
-    ] = 1.0,
-    texture: sensor.Texture = sensor.TextureName.none,
-    texture_size: sensor.TextureSize = "0.1mm",
-    texture_contrast: sensor.TextureContrast = 0.5,
-    camera_distance: Annotated[
-        str | None,
-        Option(metavar="LENGTH", help="Pinhole above the sheet; without it rays are parallel."),
-    ] = None,
-    point_spread: Annotated[float, Option(metavar="PIXELS", help="Of the lens, one sigma.")] = 0.0,
-    dtype: Annotated[FrameType, Option(help="Type of a sample.")] = FrameType.uint8,
-    bits: Annotated[int | None, Option(help="Of a uint16 sample: 10, 12 or 16.", show_default="12")] = None,
-    noise: Annotated[float, Option(metavar="COUNTS", help="Read noise, one sigma.")] = 1.5,
-    electrons: Annotated[
-        float | None, Option(metavar="N", help="In one count of these bits, for shot noise.")
-    ] = None,
-    gain_deviation: Annotated[float, Option(help="Of the pixels' gains, one sigma.")] = 0.0,
-    offset_deviation: Annotated[
-        float, Option(metavar="COUNTS", help="Of the pixels' offsets, one sigma.")
-    ] = 0.0,
-    frame_rate: Annotated[float, Option(metavar="HZ", help="Frames a second.")] = 30.0,
-    exposure: Annotated[
-        str, Option(metavar="TIME", help="Exposure during which the body moves; 0: it stands still.")
-    ] = "0s",
-    references: Annotated[
-        ReferenceName, Option(help="Dark and bright: taken with a ball, as in a lab, or exact.")
-    ] = ReferenceName.ball,
-    seed: Annotated[int, Option(help="The same seed, the same recording.")] = 0,
     compression: options.Compression = options.CompressionName.raw,
     overwrite: options.Overwrite = False,
     device: options.Device = None,
-    **given: Annotated[Any, MOVEMENT],
+    **given: Annotated[Any, TWIN],
 ) -> None:
     """Record what the twin sees, with the truth."""
     import numpy as np
 
     from mirrorskin import hw, io
     from mirrorskin.cli.output import printable, progress
-    from mirrorskin.cli.quantity import angle, duration, frame_size, length, lengths, vector
+    from mirrorskin.cli.quantity import vector
     from mirrorskin.hw.twin import Body, Camera
 
+    values = TWIN.filled(given)
     # A name without a suffix is that of a shape, and not of a file to keep.
-    files = [source for source in map(Path, (thing, pattern)) if source.suffix]
+    files = [source for name in ("object", "pattern") if (source := Path(values[name])).suffix]
     io.check_output(output, *files, replaces="anything" if overwrite else "nothing")
     refuse_foreign(context, motion)
-    columns, rows = frame_size(size, "--size")
-    along = vector(object_shift, 2, "--object-shift")
+    right, up = vector(values["object_shift"], 2, "--object-shift")
     twin = hw.Twin(
-        object=thing,
-        object_shift=(along[0], along[1]),
-        shape=(rows, columns),
-        pixel_size=lengths(pixel_size, "--pixel-size"),
-        movement=make_movement(motion, frames, given),
-        contact=contact.value,
-        optics=optics.value,
-        pattern=pattern,
-        body=Body(
-            air_gap=length(air_gap, "--air-gap"),
-            asymmetry=asymmetry,
-            scatter=angle(scatter, "--scatter"),
-            friction=friction,
-            modulus=modulus,
-        ),
+        object=values["object"],
+        object_shift=(right, up),
+        **sensor_options(values),
+        movement=make_movement(motion, values),
+        body=Body(**{name: values[name] for name in _BODY}),
         camera=Camera(
-            np.dtype(dtype.value),
-            bits=bits,
-            noise=noise,
-            electrons=float("inf") if electrons is None else electrons,
-            gain_deviation=gain_deviation,
-            offset_deviation=offset_deviation,
-            frame_rate=frame_rate,
-            exposure=duration(exposure, "--exposure"),
-            point_spread=point_spread,
-            distance=float("inf")
-            if camera_distance is None
-            else length(camera_distance, "--camera-distance"),
-            seed=seed,
+            np.dtype(values["dtype"]),
+            **{name: values[name] for name in _CAMERA},
+            electrons=math.inf if values["electrons"] is None else values["electrons"],
+            distance=math.inf if values["camera_distance"] is None else values["camera_distance"],
         ),
-        texture=sensor.sheet_texture(texture, texture_size, texture_contrast),
-        references=references.value,
+        references=values["references"],
         device=device,
     )
-    count = twin.shape[0]
+    count, rows, columns = twin.shape
     with (
         io.Recorder(
             twin, output, compression.value, truth=lambda: twin.truth, overwrite=overwrite
@@ -211,16 +166,16 @@ def command(
     click.echo(printable(f"{output}: {count} frames of {columns} x {rows}: {twin.header.title}"))
 
 
-def make_movement(motion: str, frames: int | None, given: Mapping[str, Any]) -> Movement:
-    """Return the twin's movement that options describe; `MOVEMENT` has the defaults."""
+def make_movement(motion: str, values: Mapping[str, Any]) -> Movement:
+    """Return the twin's movement that options describe."""
     import numpy as np
 
     from mirrorskin import io
     from mirrorskin.cli.quantity import vector
     from mirrorskin.hw import twin
 
-    values = MOVEMENT.filled(given)
-    count, press = frames or _FRAMES, values["press"]
+    frames, press = values["frames"], values["press"]
+    count = frames or _FRAMES
     if motion == "vertical":
         travel = io.Steps(values["travel_step"], values["travel_start"]).positions(count)
         if values["strokes"] is not None:

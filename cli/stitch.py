@@ -22,7 +22,7 @@ def command(
     as_json: options.Json = False,
     **given: Annotated[Any, STACK.only("pixel_size")],
 ) -> None:
-    """Make one larger surface of several touches."""
+    """Join several touches to one larger surface."""
     from mirrorskin import engine, io
     from mirrorskin.cli.output import save_and_report
 

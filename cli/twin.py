@@ -7,12 +7,14 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import click
 
-from mirrorskin.cli import options, sensor
+from mirrorskin.cli import options
+from mirrorskin.cli.declared import Terms, term
 from mirrorskin.cli.groups import Group, Option
+from mirrorskin.cli.sensor import sensor_options, sensor_terms
 
 _LOOK = 0.2  # seconds between checks of the camera
 _LOG = "twin.log"
@@ -23,6 +25,16 @@ _SIDEWAYS = (
     "twist --press 1mm --angle 10deg --step 2deg",
 )
 
+RIG = Terms(
+    [
+        *sensor_terms("320x240", "0.04mm").terms,
+        term("rate", "frames a second", "Hz", "20"),
+        term("delay", "time from a frame's exposure to its sending", "s", "50ms"),
+        term("jitter", "jitter of that delay, one sigma", "s", "0s"),
+        term("seed", "seed of noise and jitter", "", "0", kind="integer"),
+    ]
+)
+
 app = Group(help="Emulate a whole rig: its stage and its camera.", no_args_is_help=True)
 
 
@@ -31,31 +43,6 @@ def serve(
     output: Annotated[
         Path, Option("--output", "-o", metavar="DIR", help="Folder for the rig file, rig.toml.")
     ] = Path("emulated-rig"),
-    thing: Annotated[
-        str,
-        Option(
-            "--object", metavar="NAME", or_file=True, help="What to press on, as in 'mirrorskin simulate'."
-        ),
-    ] = "sphere",
-    size: sensor.Size = "320x240",
-    pixel_size: sensor.PixelSize = "0.04mm",
-    pattern: Annotated[
-        str,
-        Option(
-            metavar="NAME",
-            or_file=True,
-            help="Of the wall: uniform, for presses; linear, for rotations; or a picture.",
-        ),
-    ] = "uniform",
-    contact: sensor.Contact = sensor.ContactName.conform,
-    optics: sensor.Optics = sensor.OpticsName.ideal,
-    texture: sensor.Texture = sensor.TextureName.none,
-    texture_size: sensor.TextureSize = "0.1mm",
-    texture_contrast: sensor.TextureContrast = 0.5,
-    rate: Annotated[float, Option(metavar="HZ", help="Frames a second.")] = 20.0,
-    delay: Annotated[str, Option(metavar="TIME", help="From a frame's exposure to its sending.")] = "50ms",
-    jitter: Annotated[str, Option(metavar="TIME", help="Of that delay, one sigma.")] = "0s",
-    seed: Annotated[int, Option(help="Of noise and jitter.")] = 0,
     device: options.Device = None,
     background: Annotated[
         bool,
@@ -64,6 +51,7 @@ def serve(
         ),
     ] = False,
     ready: Annotated[int | None, Option("--ready-fd", hidden=True)] = None,
+    **given: Annotated[Any, RIG],
 ) -> None:
     """Run an emulated rig: a stage behind a serial port, with the twin as its camera.
 
@@ -73,29 +61,16 @@ def serve(
     if background and ready is None:
         _start_in_background()
         return
-    from mirrorskin.cli.quantity import duration, frame_size, lengths
     from mirrorskin.hw.emulator.rig import EmulatedRig
 
-    columns, rows = frame_size(size, "--size")
+    values = RIG.filled(given)
     EmulatedRig.check_folder(output)
-    rig = EmulatedRig(
-        thing,
-        shape=(rows, columns),
-        pixel_size=lengths(pixel_size, "--pixel-size"),
-        pattern=pattern,
-        contact=contact.value,
-        optics=optics.value,
-        texture=sensor.sheet_texture(texture, texture_size, texture_contrast),
-        rate=rate,
-        delay=duration(delay, "--delay"),
-        jitter=duration(jitter, "--jitter"),
-        seed=seed,
-        home=True,
-        device=device,
-    )
+    times = {name: values[name] for name in ("rate", "delay", "jitter", "seed")}
+    rig = EmulatedRig(values["object"], **sensor_options(values), **times, home=True, device=device)
     with rig, rig.serve() as server:
         path = rig.write(output, server.url)
-        what = f"{thing} under {columns} x {rows} pixels at {rate:g} frames a second"
+        columns, rows = values["size"]
+        what = f"{values['object']} under {columns} x {rows} pixels at {values['rate']:g} frames a second"
         click.echo(f"{path}: {what}; stage at {rig.port.url}, camera at {server.url}")
         if ready is None:
             scale = rig.settings.camera.zenith_gain

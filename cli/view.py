@@ -58,22 +58,15 @@ def command(
     ends = None if section is None else segment(section, "--section")
     name = result.name if turn is None else f"{result.name}, turn {turn}"
     if space is not None:
-        _refuse_beside_space(map_, section, output)
+        for option, given in (("--map", map_), ("--section", section), ("-o", output)):
+            if given is not None:
+                raise io.InputError(f"{option} needs pictures, which --3d does not draw. Remove one of them")
         _show_in_space(result, turn, space, name)
         return
     view.check_drawing()
     if output is not None:
         _check(output, result)
     _show(io.select_turn(io.open_result(result), turn), result, name, ends, map_, output)
-
-
-def _refuse_beside_space(map_: list[str] | None, section: str | None, output: Path | None) -> None:
-    """Refuse options of pictures where a surface is shown instead."""
-    from mirrorskin import io
-
-    for option, given in (("--map", map_), ("--section", section), ("-o", output)):
-        if given is not None:
-            raise io.InputError(f"{option} is of pictures, and --3d shows none: leave one of them out")
 
 
 def _show_in_space(path: Path, turn: int | None, where: str, name: str) -> None:
@@ -90,28 +83,24 @@ def _show_in_space(path: Path, turn: int | None, where: str, name: str) -> None:
         click.echo(printable(f"written to {where}: 'rerun {where}' shows it"))
 
 
-def _is_picture(output: Path) -> bool:
-    return output.suffix.lower() == _PICTURE
-
-
 def _check(output: Path, result: Path) -> None:
     """Refuse a place that cannot be written to, before anything is drawn."""
     from mirrorskin import io
 
-    if _is_picture(output):
+    if output.suffix.lower() == _PICTURE:
         io.check_output(output, result)
     elif output.suffix and not output.is_dir():
         raise io.InputError(f"-o {output}: name a picture that ends in {_PICTURE}, or a folder")
     else:
         nearest = next(one for one in (output, *output.absolute().parents) if one.exists())
         if not nearest.is_dir():
-            raise io.InputError(f"{output} cannot be made: {nearest} is no folder; name another with -o")
+            raise io.InputError(f"{output} cannot be created: {nearest} is not a folder. Use another -o")
 
 
 def _show(
     shown: Result, path: Path, name: str, ends: Ends | None, maps: list[str] | None, output: Path | None
 ) -> None:
-    """Draw what is asked for, into a window, a picture or a folder."""
+    """Draw maps into a window, a picture or a folder."""
     from mirrorskin import io
     from mirrorskin.view.canvas import has_screen, show_figure, write_figure
     from mirrorskin.view.result import figures_of, overview
@@ -123,23 +112,18 @@ def _show(
     if output is None:
         output = path.with_name(f"{path.stem}-view{_PICTURE}")
         io.check_output(output)
-    if _is_picture(output):
+    if output.suffix.lower() == _PICTURE:
         figures = {output: overview(shown, name=name, section=ends, maps=maps)}
     else:
         each = figures_of(shown, name=name, section=ends, maps=maps)
         figures = {output / f"{which}{_PICTURE}": figure for which, figure in each.items()}
-        _make_folder(output)
+        try:
+            output.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            problem = f"{output} cannot be created: {error.strerror}"
+            raise io.InputError(f"{problem}. Choose another with -o") from error
     if no_screen:
         click.echo("there is no screen for a window", err=True)
     for target, figure in figures.items():
         write_figure(figure, target)
         click.echo(printable(f"written to {target}"))
-
-
-def _make_folder(folder: Path) -> None:
-    from mirrorskin import io
-
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise io.InputError(f"{folder} cannot be made: {error.strerror}; name another with -o") from error

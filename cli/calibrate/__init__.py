@@ -8,7 +8,7 @@ from mirrorskin.cli.calibrate import check, elastic, force, references, scale, s
 from mirrorskin.cli.groups import Group
 
 app = Group(
-    help="Find out what a sensor's counts and pixels mean.\n\n"
+    help="Calibrate brightness, scale, tilt and elasticity of a sensor.\n\n"
     "The order is references, scale, zenith, tilt, elastic, force; each adds its part to the same calibration"
     " file, and leaves out what the sensor does not need. Then 'check' measures the errors that remain.",
     no_args_is_help=True,

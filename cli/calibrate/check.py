@@ -24,7 +24,7 @@ def command(
     device: options.Device = None,
     as_json: options.Json = False,
 ) -> None:
-    """Tell the errors left over the field, in mm and degrees, before and after the calibration."""
+    """Show the remaining errors over the field, in mm and degrees, before and after the calibration."""
     from mirrorskin import io
     from mirrorskin.cli.output import print_json, print_table
     from mirrorskin.cli.quantity import length

@@ -46,7 +46,9 @@ def command(
     spread = 0.0 if force_sigma is None else newtons_of(force_sigma, "--force-sigma")
     known = inputs.check_call(output, presses, None)
     if known is None or known.gel is None:
-        raise io.InputError(f"{output} has no gel, by which presses become loads: calibrate elastic first")
+        raise io.InputError(
+            f"{output} has no gel, which is needed to compute loads: run calibrate elastic first"
+        )
     stack = stack_options(given)
     with inputs.open_all(presses, stack, known, output) as (sources, camera):
         found = []

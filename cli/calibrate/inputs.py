@@ -191,7 +191,7 @@ def turn_plan(press: str | None, tilt: float | None, phase_step: float | None, e
 
     if press is None:
         raise InputError(
-            f"--press is missing: say how far the body is lowered on the ball, as in --press {example}"
+            f"--press is missing: give the travel of the press on the ball, such as --press {example}"
         )
     return AxialPlan(
         length(press, "--press"),

@@ -108,9 +108,11 @@ def _check_call(
     if overwrite and rig is None:
         raise InputError("--overwrite is for recordings taken with --rig: remove it")
     if press is not None and (rig is None or not rolled):
-        raise InputError("--press says how far a ball is pressed on a rig: give --rig and --rolled, too")
+        raise InputError("--press needs --rig and --rolled")
     if rig is not None and rolled and not brights and press is None:
-        raise InputError("--press is missing: say how far the body is lowered on the ball, as in --press 2mm")
+        raise InputError(
+            "--press is missing: give the travel at which the body presses on the ball, such as --press 2mm"
+        )
 
 
 def _still(name: str, rig: Path, frames: int, number: int = 1) -> inputs.Place:
@@ -127,7 +129,7 @@ def _balls(rig: Path, places: int, frames: int, press: str | None) -> list[input
 
 
 def _measure(darks: Sequence[Path], brights: Sequence[Path], rolled: bool) -> tuple[Measured, CameraId]:
-    """Measure references, and find of which camera they are."""
+    """Return the references and their camera."""
     from mirrorskin import io
     from mirrorskin.cli.output import progress
     from mirrorskin.engine.calibration.references import measure_references
@@ -165,7 +167,7 @@ def _missing(measured: Measured, noise: float | None, refuse: bool) -> dict[str,
             )
         if count and refuse:
             raise InputError(
-                f"{known}: {count} more frames are needed for --noise {noise:g}, beside {level.frames}"
+                f"{known}: {count} more frames than {level.frames} are needed for --noise {noise:g}"
             )
         if count:
             missing[name] = count

@@ -130,7 +130,7 @@ def command(
 
 
 def _read(paths: Sequence[Path], output: Path) -> tuple[list[tuple[str, NDArray[Any]]], CameraId]:
-    """Read all pictures, and the means of recordings, and find of which camera they are."""
+    """Return all pictures, the means of recordings, and their camera."""
     from mirrorskin import io
     from mirrorskin.engine.calibration.board import mean_of_still
     from mirrorskin.io.pictures import PICTURE_SUFFIXES, read_picture

@@ -11,6 +11,7 @@ import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import inputs
+from mirrorskin.cli.declared import declared
 from mirrorskin.cli.groups import Argument, Option
 from mirrorskin.cli.stack import STACK, stack_options
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 _NEGLIGIBLE = math.radians(0.1)  # of azimuth, or of the mean lean
 _SURE = 3.0  # standard errors from which on even less is worth a line
+_RESPONSE = declared("fuse").only("zenith_gain", "zenith_offset")
 _ANGLES = ("tilt", "phase_offset", "major_axis", "centre_x", "centre_y")
 
 
@@ -39,8 +41,6 @@ def command(
         list[Path] | None,
         Option(metavar="REC.h5", help="Axial recording of an inclined plate; may be given again."),
     ] = None,
-    zenith_gain: options.ZenithGain = None,
-    zenith_offset: options.ZenithOffset = None,
     rig: inputs.OptionalRig = None,
     places: inputs.Places = 5,
     press: Annotated[str | None, inputs.press_option("0.5mm")] = None,
@@ -50,7 +50,7 @@ def command(
     settle: inputs.Settle = None,
     overwrite: inputs.Overwrite = False,
     as_json: options.Json = False,
-    **given: Annotated[Any, STACK.only("phase_step", "phases", "pixel_size")],
+    **given: Annotated[Any, STACK.only("phase_step", "phases", "pixel_size"), _RESPONSE],
 ) -> None:
     """Find half-angle, phase offset, direction, ellipticity and pivot of the rotation, with their errors."""
     from mirrorskin import io
@@ -61,6 +61,7 @@ def command(
 
     paths, flats, wedges = list(balls or []), list(flat or []), list(wedge or [])
     radius = length(ball, "--ball") / 2
+    response = given.pop("zenith_gain", None), given.pop("zenith_offset", None)
     known = inputs.check_call(
         output, paths, rig, [*flats, *wedges], press=press, tilt=tilt, settle=settle, overwrite=overwrite
     )
@@ -72,7 +73,7 @@ def command(
         given = {}
     stack = stack_options(given)
     with inputs.open_all([*paths, *flats, *wedges], stack, known, output) as (sources, camera):
-        light = _brightness(sources[0], known, zenith_gain, zenith_offset)
+        light = _brightness(sources[0], known, *response)
         tracks, plates = [], []
         with progress("looking", len(sources)) as show:
             for number, source in enumerate(sources, 1):
@@ -95,14 +96,13 @@ def command(
 
 
 def _brightness(
-    source: Source, known: Calibration | None, gain: str | None, offset: float | None
+    source: Source, known: Calibration | None, gain: float | None, offset: float | None
 ) -> Brightness:
     """Return the response of the calibration, else the one that is linear in the zenith."""
     from dataclasses import replace
 
     import numpy as np
 
-    from mirrorskin.cli.quantity import per_angle
     from mirrorskin.engine.calibration.ball import pixel_size_of
     from mirrorskin.engine.calibration.brightness import LinearBrightness, WallBrightness
     from mirrorskin.io import InputError
@@ -112,7 +112,7 @@ def _brightness(
     if known is not None and known.references is not None:
         header = replace(header, dark=known.references.dark, bright=known.references.bright)
     if gain is not None:
-        header = replace(header, zenith_gain=np.asarray(per_angle(gain, "--zenith-gain"), np.float64))
+        header = replace(header, zenith_gain=np.asarray(gain, np.float64))
     if offset is not None:
         header = replace(header, zenith_offset=np.asarray(offset, np.float64))
     if known is not None and known.zenith is not None and gain is None and offset is None:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mirrorskin.io import Calibration, Precession, Source, WallResponse
 
 _PRINTED = "radius", "rim", "axis_x", "axis_y", "sight_0", "lamp_x", "lamp_y", "scatter"
-_DOUBTFUL = 0.1  # degrees by which zeniths of the median pixel may be off without a warning
+_DOUBTFUL = 0.1  # degrees: error of the zenith at the median pixel above which a warning is printed
 
 
 class PatternName(StrEnum):

@@ -191,7 +191,7 @@ def test_a_terminal_shows_a_table(monkeypatch):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["x*.h5", "-o", "out"], "x*.h5: no file answers to that"),
+        (["x*.h5", "-o", "out"], "x*.h5: no file matches"),
         (["a.h5", "-o", "no/out"], "there is no folder no: make it first"),
         (["a.h5", "-o", "a.h5"], "a.h5 is no folder"),
         (["a.h5", "-o", "/proc/out"], "/proc/out cannot be made"),
@@ -199,7 +199,7 @@ def test_a_terminal_shows_a_table(monkeypatch):
         (["-o", "out"], "FILE..."),
         (["a.h5", "-o", "out", "--memory", "5"], "a unit is needed"),
         (["a.h5", "-o", "out", "--workers", "0"], "--workers"),
-        (["a.h5", "-o", "out", "--shard", "3/2"], "--shard 3/2: a part and how many there are is needed"),
+        (["a.h5", "-o", "out", "--shard", "3/2"], "--shard 3/2: a part and the number of parts is needed"),
         (["no.h5", "-o", "out"], "no.h5: no such file"),
         (["a.h5", "-o", "out", "--workers", "2", "--device", "0"], "--device and --workers"),
         (["a.h5", "-o", "out", "--workers", "2", "--scheduler", "tcp://x:1"], "--workers and --scheduler"),
@@ -238,7 +238,7 @@ def test_ctrl_c_leaves_whole_results_and_says_how_to_go_on(folder):
     assert all(io.open_result(f"out/{name}").height is not None for name in found)
     said = said.replace("mirrorskin: it is being stopped; two more Ctrl-C end it at once\n", "")
     told = int(said.split()[2])
-    assert said == f"ended after {told} of 300: the same command goes on from there\n"
+    assert said == f"ended after {told} of 300: the same command resumes it\n"
     assert told - 1 - rest.count("done: ") in (0, 1)  # it may end between the count and the line
     assert len(found) - told in (0, 1)
 

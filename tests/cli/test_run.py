@@ -12,6 +12,7 @@ from commands import run
 from stacks import assert_same, record, sphere
 
 from mirrorskin import engine, io
+from mirrorskin.engine.running import load_operation
 
 ROOT = Path(__file__).parents[2]
 MINE = """
@@ -176,18 +177,56 @@ def test_help_shows_the_options_of_the_class(words):
     assert "--level COUNTS Counts above which a pixel is light. [default: 100]" in text
 
 
-def test_a_built_in_operation_and_a_method_run_by_their_names():
-    with io.open_recording("press.h5") as source:
-        onset, press = (
-            engine.run(source, engine.Onset(threshold=0.4)),
-            engine.reconstruct(source, threshold=0.4),
-        )
-    for name, expected in (("Onset", onset), ("Press", press)):
-        ended = run("run", f"mirrorskin.engine:{name}", "press.h5", "--threshold", "0.4")
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory):
+    """Return a small recording of each motion."""
+    folder = tmp_path_factory.mktemp("recordings")
+    small = ("--size", "32x24", "--pixel-size", "0.2mm")
+    words = {
+        "press": ["vertical", "--frames", "8", "--travel-step", "0.2mm"],
+        "turn": ["axial", "--pattern", "linear"],
+        "slide": ["horizontal", "--frames", "6", "--texture", "dots", "--texture-size", "0.5mm"],
+    }
+    for name, one in words.items():
+        ended = run("simulate", *one, *small, "-o", folder / f"{name}.h5")
         assert ended.code == 0, ended.said
-        found = io.open_result(f"press-{name}.h5")
-        assert found.process["threshold"] == 0.4
-        assert_same(found.assign(process={}), expected.assign(process={}))
+    return folder
+
+
+BUILT_IN = {
+    "Onset": ("press", {"threshold": 0.4}),
+    "ChangePoint": ("press", {"hold": 1}),
+    "Strokes": ("press", {"subframe": False}),
+    "Press": ("press", {"threshold": 0.4}),
+    "Correlate": ("turn", {"harmonic": 1}),
+    "Normals": ("turn", {"method": "paper"}),
+    "rotation.rotation:Rotation": ("turn", {"robust": True}),
+    "Slip": ("slide", {"window_size": 10}),
+    "Sliding": ("slide", {"per_frame": True}),
+}
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_built_in_operations_and_methods_run_as_in_python(name, recordings):
+    motion, options = BUILT_IN[name]
+    place, _, kind = name.rpartition(":")
+    module = f"mirrorskin.engine.{place}" if place else "mirrorskin.engine"
+    words = [
+        f"{'--no-' if value is False else '--'}{one.replace('_', '-')}" for one, value in options.items()
+    ]
+    words += [str(value) for value in options.values() if not isinstance(value, bool)]
+    path = recordings / f"{motion}.h5"
+    ended = run("run", f"{module}:{kind}", path, *words, "-o", "out.h5")
+    assert ended.code == 0, ended.said
+    operation = load_operation(f"{module}:{kind}")(**options)
+    with io.open_recording(path) as source:
+        expected = (
+            operation.run(source) if isinstance(operation, engine.Method) else engine.run(source, operation)
+        )
+    found = io.open_result("out.h5")
+    for option, value in options.items():
+        assert found.process.get(option, value) == value
+    assert_same(found.assign(process={}), expected.assign(process={}))
 
 
 def test_what_a_module_itself_lacks_is_not_hidden():

@@ -188,7 +188,7 @@ def test_without_options_a_press_is_the_documented_one():
     assert told["--frames"].startswith("30; of a rotation one turn")
     assert told["--travel-start"] == told["--travel-step"] == "0.1mm"
     np.testing.assert_allclose(found.travel, 0.1 * np.arange(1, 31))
-    assert told["--frame-rate"] == "30.0"
+    assert told["--frame-rate"] == "30"
     np.testing.assert_allclose(found.time, np.arange(30) / 30)
 
 

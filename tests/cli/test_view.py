@@ -81,15 +81,15 @@ def test_of_turns_one_is_chosen_and_a_picture_s_ending_may_be_in_capitals(result
         (["-o", "{}"], "name a picture that ends in .png, or a folder"),
         (["-o", "a.jpg"], "name a picture that ends in .png, or a folder"),
         (["-o", "nowhere/a.png"], "no folder"),
-        (["-o", "{}/folder"], "ball.h5 is no folder; name another with -o"),
+        (["-o", "{}/folder"], "ball.h5 is not a folder. Use another -o"),
         (["-o", "a.png/folder", "--map", "nothing"], "has no nothing to draw"),
         (["--section", "1mm,0mm"], "two points are needed"),
         (["--section", "0.9mm,0.9mm:1mm,1mm"], "no height is known along the section"),
         (["--turn", "0"], "leave --turn out"),
         (["--3d", "here"], "--3d here: give window, browser or a FILE.rrd"),
         (["--3d", "{}"], "give window, browser or a FILE.rrd"),
-        (["--3d", "window", "--map", "height"], "--map is of pictures"),
-        (["--3d", "window", "-o", "a.png"], "-o is of pictures"),
+        (["--3d", "window", "--map", "height"], "--map needs pictures, which --3d does not draw"),
+        (["--3d", "window", "-o", "a.png"], "-o needs pictures, which --3d does not draw"),
     ],
 )
 def test_what_cannot_be_is_one_clear_line(result, monkeypatch, words, told):
