@@ -81,7 +81,7 @@ SEED ?= 0
 fuzz: $(READY)
 	@$(BIN)/python tests/fuzz/fuzz.py --minutes $(MINUTES) --seed $(SEED)
 
-# The suite of the developers, about an hour; 'mirrorskin bench' rates a device in half a minute.
+# The suite of the developers; 'mirrorskin bench' rates a device in half a minute.
 bench: $(READY)
 	@$(BIN)/python bench/run.py run
 

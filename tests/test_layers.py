@@ -1,6 +1,7 @@
 """The house's import rule (pyproject.toml, importlinter) holds."""
 
 import importlib.metadata
+import re
 import subprocess
 import sys
 import tomllib
@@ -24,6 +25,13 @@ def test_every_folder_is_under_the_rule():
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     layers = settings["tool"]["importlinter"]["contracts"][0]["layers"]
     assert packages == {name.removeprefix("mirrorskin.") for layer in layers for name in layer.split(" | ")}
+
+
+def test_the_package_imports_no_development_tool():
+    packages = [path.parent for path in ROOT.glob("*/__init__.py")]
+    tools = re.compile(r"^\s*(from|import) (bench|suite|examples|tests)\b", re.MULTILINE)
+    files = [file for package in packages for file in package.rglob("*.py")]
+    assert [file for file in files if tools.search(file.read_text(encoding="utf-8"))] == []
 
 
 def test_the_package_has_its_parts_and_its_version():

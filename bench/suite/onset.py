@@ -114,11 +114,6 @@ class References(NamedTuple):
         return References(*(values[rows] if values.ndim else values for values in self))
 
 
-FirstLight = Callable[[NDArray[Any], Levels, int], NDArray[np.int32]]
-"""``(frames, light, hold)`` to the number of each pixel's onset, (H, W): the first frame of the first run of
-`hold` light frames, 1 or 2, or of one that lasts to the end; -1 without one."""
-
-
 def _peers(
     full: bool, frames: NDArray[Any], travel: NDArray[np.float64], known: References, absent: dict[str, str]
 ) -> dict[str, Callable[[], object]]:
@@ -126,18 +121,16 @@ def _peers(
     if "torch" not in absent and not full:  # heights would be NumPy's, as OpenCV's are
         libraries["PyTorch"] = _torch
     noise = estimate_noise(thin_out(frames[0]), thin_out(frames[1]), True)
-    works: dict[str, Callable[[], object]] = {}
-    for name, library in libraries.items():
-        find = functools.partial(_first_light, library)
-        if full:
-            works[name] = functools.partial(_heights, _TILES[name], find, frames, travel, known, noise)
-        else:
-            works[name] = functools.partial(_onsets, _TILES[name], find, frames, known, 1)
+    run = _heights if full else _onsets
+    works: dict[str, Callable[[], object]] = {
+        name: functools.partial(run, _TILES[name], library, frames, travel, known, noise)
+        for name, library in libraries.items()
+    }
     if "numba" not in absent:
         works["Numba"] = (
             functools.partial(_numba_heights, frames, travel, known, noise)
             if full
-            else functools.partial(numba_onsets, frames, known.light, 1)
+            else functools.partial(_numba_onsets, frames, known.light)
         )
     return works
 
@@ -151,12 +144,12 @@ def _in_tiles(tiles: tuple[int, int], frames: NDArray[Any], fill: Callable[[slic
 
 
 def _onsets(
-    tiles: tuple[int, int], find: FirstLight, frames: NDArray[Any], known: References, hold: int
+    tiles: tuple[int, int], library: Library, frames: NDArray[Any], _: object, known: References, __: float
 ) -> NDArray[np.int32]:
     onset = np.empty(frames.shape[1:], np.int32)
 
     def fill(rows: slice) -> None:
-        onset[rows] = find(frames[:, rows], known.of(rows).light, hold)
+        onset[rows] = _first_light(library, frames[:, rows], known.of(rows).light, 1)
 
     _in_tiles(tiles, frames, fill)
     return onset
@@ -164,7 +157,7 @@ def _onsets(
 
 def _heights(
     tiles: tuple[int, int],
-    find: FirstLight,
+    library: Library,
     frames: NDArray[Any],
     travel: NDArray[np.float64],
     known: References,
@@ -175,7 +168,7 @@ def _heights(
 
     def fill(rows: slice) -> None:
         part, mine = frames[:, rows], known.of(rows)
-        onset = find(part, mine.light, 2)
+        onset = _first_light(library, part, mine.light, 2)
         height[rows], sigma[rows], status[rows] = _answer(part, onset, travel, mine, noise)
 
     _in_tiles(tiles, frames, fill)
@@ -183,7 +176,10 @@ def _heights(
 
 
 def _first_light(library: Library, frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.int32]:
-    """Count with a library the frames that leave a pixel undecided; see `FirstLight`."""
+    """Return the first frame of the first run of `hold` light frames, 1 or 2, or of one at the end.
+
+    It is -1 without one. A library counts the frames that leave a pixel undecided.
+    """
     shape = frames.shape[1:]
     less, count = library(light)
     undecided, few = np.full(shape, 255, np.uint8), np.zeros(shape, np.uint8)
@@ -198,7 +194,7 @@ def _first_light(library: Library, frames: NDArray[Any], light: Levels, hold: in
 
 
 def _dark_frames(frames: NDArray[Any], hold: int, less: Less) -> Iterator[Flags]:
-    """Yield for each frame where no run of `hold` light frames begins, in a mask that is used again."""
+    """Yield for each frame where no run of `hold` light frames starts, in a mask that is reused."""
     dark, after = np.empty((2, *frames.shape[1:]), np.uint8)
     less(frames[0], dark)
     for frame in frames[1:]:
@@ -283,12 +279,10 @@ def _answer(
     return height, sigma, status
 
 
-def numba_onsets(frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.int32]:
-    """Find onsets with Numba: tiles on all cores, frame by frame, so that the inner loop is vector code."""
+def _numba_onsets(frames: NDArray[Any], light: Levels) -> NDArray[np.int32]:
+    """Find onsets with Numba: tiles on all cores, frame by frame so that the inner loop is vector code."""
     onset = np.empty(frames.shape[1:], np.int32)
-    each = light.ndim > 0
-    scan = _numba_scan(each, hold, whole=False)
-    scan(frames.reshape(len(frames), -1), light.reshape(-1) if each else light[()], onset.reshape(-1))
+    _numba_scan(1, whole=False)(frames.reshape(len(frames), -1), light[()], onset.reshape(-1))
     return onset
 
 
@@ -298,14 +292,14 @@ def _numba_heights(
     shape = frames.shape[1:]
     maps = {"height": np.empty(shape, np.float32), "sigma": np.empty(shape, np.float32)}
     maps |= {"status": np.empty(shape, np.uint8)}
-    run = _numba_scan(True, 2, whole=True)
+    run = _numba_scan(2, whole=True)
     flat = (values.reshape(-1) for values in (*known, *maps.values()))
     run(frames.reshape(len(frames), -1), travel, *flat, noise)
     return maps
 
 
 @functools.cache
-def _numba_scan(each: bool, hold: int, *, whole: bool) -> Any:  # noqa: C901  # to compile
+def _numba_scan(hold: int, *, whole: bool) -> Any:  # noqa: C901  # to compile
     """Compile the search for onsets, with a level of each pixel or one for all, and heights if `whole`."""
     import numba
 
@@ -317,11 +311,11 @@ def _numba_scan(each: bool, hold: int, *, whole: bool) -> Any:  # noqa: C901  # 
         undecided, few = np.ones(pixels, np.uint8), np.zeros(pixels, np.uint8)
         onset[:] = 0
         for t in range(count):
-            # Cut from a whole row: of a part of all rows, Numba does not know that samples lie side by side.
+            # Slices of a row, which Numba knows to be contiguous, unlike slices of all rows.
             now, then = frames[t, first:end], frames[min(t + hold, count) - 1, first:end]
             for p in range(pixels):
                 sample = now[p] if hold == 1 else min(now[p], then[p])
-                open_ = undecided[p] & np.uint8(sample < (light[p] if each else light))
+                open_ = undecided[p] & np.uint8(sample < (light[p] if whole else light))
                 undecided[p] = open_
                 few[p] += open_
             if (t + 1) % _COUNTABLE == 0 or t + 1 == count:
@@ -368,7 +362,7 @@ def _numba_scan(each: bool, hold: int, *, whole: bool) -> Any:  # noqa: C901  # 
     def onsets(frames, light, onset):  # type: ignore[no-untyped-def]
         for tile in numba.prange(-(-len(onset) // _NUMBA_TILE)):
             first, end = tile * _NUMBA_TILE, min(len(onset), (tile + 1) * _NUMBA_TILE)
-            search(frames, first, end, light[first:end] if each else light, onset[first:end])
+            search(frames, first, end, light, onset[first:end])
 
     def heights(frames, travel, level, light, dark, height, sigma, status, noise):  # type: ignore[no-untyped-def]
         for tile in numba.prange(-(-len(status) // _NUMBA_TILE)):
