@@ -19,7 +19,13 @@ from mirrorskin.kernels.errors import DeviceError
 
 REFUSALS = (io.InputError, engine.NotConverged, DeviceError)
 SHAPE = (16, 20)
-_COUNTS = "mean", "cosine", "sine", "modulation", "residual"  # of a pixel's samples, which may be infinite themselves
+_COUNTS = (
+    "mean",
+    "cosine",
+    "sine",
+    "modulation",
+    "residual",
+)  # of a pixel's samples, which may be infinite themselves
 ELSEWHERE = {"reconstruct", "run", "free_memory", "option"}
 """Public functions that take no arrays of numbers; other tests call them."""
 
