@@ -22,6 +22,7 @@ from mirrorskin.io.arguments import as_array, shown
 Kind = Literal["number", "integer", "flag", "choice", "numbers", "map", "file", "object"]
 
 _LAST = ("device", "memory_limit")  # options that come last in signatures and help
+_ANY = 2**31 - 1  # an upper limit that messages do not mention
 _COLUMNS = 100  # of the lines of a docstring
 _INTEGERS = ("frames", "pixels", "turns")  # units of counts
 _EXAMPLES = {"share": "0.5", "mm": "0.1", "rad": "0.05", "counts": "1.5", "frames": "2", "pixels": "8"}
@@ -131,7 +132,7 @@ class Option:
         """What a number must be, such as ``a share from 0 to 1``."""
         noun = _NOUNS.get(self.unit, "a number" + (f" in {self.unit}" if self.unit else ""))
         low, high = self.within
-        if low is not None and high is not None:
+        if low is not None and high is not None and high < _ANY:
             limits = f" from {low:g} to {high:g}"
         elif low is not None:
             limits = f" of at least {low:g}"

@@ -61,7 +61,7 @@ def test_the_steps_of_the_start_run_one_after_the_other(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("page", "words"), WRITTEN, ids=[f"{page}: {' '.join(w)}" for page, w in WRITTEN])
 def test_a_command_of_the_documentation_is_understood(page, words, monkeypatch):
-    monkeypatch.setattr(groups._ExistingPath, "convert", click.Path.convert)  # files need not be there
+    monkeypatch.setattr(groups.ExistingPath, "convert", click.Path.convert)  # files need not be there
     understood(words)
 
 

@@ -57,7 +57,7 @@ def _sudden(kind: str, shape: tuple[int, int], device: Device, slack: float) -> 
     found = find_onset(frames, **known, noise=_press_noise(kind), device=device)
     first = np.ceil(place)
     error = _frame_error(found, place) * np.sqrt(12)
-    sigma = float(np.mean(found.sigma)) / _STEP * np.sqrt(12)
+    sigma = float(np.mean(found.height_sigma)) / _STEP * np.sqrt(12)
     return [
         at_most(f"{kind}, sudden: onsets in another frame", float(np.mean(found.frame != first)), 0),
         within(f"{kind}, sudden: RMS error of 1/sqrt(12) frame", _rms(error), 1 - slack, 1 + slack),
@@ -110,7 +110,7 @@ def _frame_error(found: Onset, place: Doubles) -> Doubles:
 
 
 def _chi_square(found: Onset, error: Doubles) -> float:
-    return float(np.mean((error * _STEP / found.sigma) ** 2))
+    return float(np.mean((error * _STEP / found.height_sigma) ** 2))
 
 
 def _rms(error: Doubles) -> float:
@@ -182,11 +182,16 @@ def run_normals(device: Device, quick: bool) -> Case:
 def _score_normals(truth: Doubles, sensor: Sensor, device: Device, slack: float) -> list[Target]:
     frames = expose(truth, sensor, 6)
     found = estimate_normals(frames, _PHASES, **sensor.known, device=device)
-    across = np.linalg.norm(np.cross(found.vectors.astype(np.float64), truth), axis=-1)
+    across = np.linalg.norm(np.cross(found.normals.astype(np.float64), truth), axis=-1)
     square = np.arcsin(np.minimum(across, 1)) ** 2
     targets = []
     for bin_, mine, sigma, lost, least in zip(
-        _BINS, square, found.sigma.astype(np.float64), found.contact == 0, _bound(truth, sensor), strict=True
+        _BINS,
+        square,
+        found.normals_sigma.astype(np.float64),
+        found.contact == 0,
+        _bound(truth, sensor),
+        strict=True,
     ):
         where = f"{sensor.kind}, zenith {bin_[0]} to {bin_[1]} degrees"
         ratio = float(np.sqrt(mine.mean() / least.mean()))

@@ -111,7 +111,7 @@ def _do_least(jobs: list[Job], press: Frames, offset: int, device: Device) -> di
             memory = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         frames = np.frombuffer(memory, press.dtype, block.frames.size, offset).reshape(press.shape)
         onset = find_onset(frames, block.travel, dark=header.dark, bright=header.bright, device=device)
-        maps = {"height": onset.height, "height_sigma": onset.sigma, "status": onset.status}
+        maps = {"height": onset.height, "height_sigma": onset.height_sigma, "status": onset.status}
         with job.target.open("wb") as out:
             for values in maps.values():
                 out.write(values.data)

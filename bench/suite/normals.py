@@ -31,7 +31,7 @@ def run_normals(name: str, kind: str, shape: tuple[int, int], device: Device, qu
         frames,
         phases(STEPS),
         tilt=TILT,
-        gain=gain,
+        zenith_gain=gain,
         offset=offset,
         noise=turn_noise(dtype),
         device=device,

@@ -155,7 +155,8 @@ def _check_rotation(
         gain, offset = (np.where(sound, part, np.median(part[sound])) for part in (gain, offset))
         plain = replace(calibration, zenith=None, gel=None)
         source.rewind()
-        first = reconstruct(source, calibration=plain, gain=gain, offset=offset - rim * gain, device=device)
+        linear = {"zenith_gain": gain, "zenith_offset": offset - rim * gain}
+        first = reconstruct(source, calibration=plain, device=device, **linear)
         before = _normal_errors(first, truth, cells)
     after = _normal_errors(found, truth, cells)
     return Check(ball, (float(centre[0]), float(centre[1])), *_axes(found), after, before)

@@ -122,7 +122,7 @@ class LiveOperation(ThreadSafe):
             The frames do not determine them.
         """
         with naming(self._source):
-            process = {"live": True, "every": self.every}
+            process = {"live": True, **({"every": self.every} if self.every > 1 else {})}
             result = self._plan.finish(self.operation.result(), self._source, process)
         return undistorted(result, self._source)
 

@@ -258,7 +258,7 @@ def test_a_file_that_fails_ends_a_capture_in_a_line(emulated, tmp_path):
         (["vertical", "--stop", "1mm", "--step", "1mm", "--settle", "-1s"], "at least 0"),
         (
             ["vertical", "--stop", "1mm", "--step", "1mm", "--press", "1mm"],
-            "--press applies to rotations, rocking motions, slides and twists only; this is a press. Remove it",
+            "--press applies to rotations, rocking motions, slides and twists only; this is a press",
         ),
         (
             ["axial", "--press", "1mm", "--phase-step", "45deg", "--stop", "1mm"],

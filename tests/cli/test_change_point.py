@@ -52,7 +52,7 @@ def test_the_method_reaches_the_engine(folder, levels):
     [
         (["--no-subframe"], "needs method 'threshold'"),
         (["--hold", "13"], "hold 13"),
-        (["--threshold", "1"], "threshold 1: a change-point needs a share between 0 and 1"),
+        (["--threshold", "1"], "threshold 1.0: a change-point needs a share between 0 and 1"),
         (["--method", "guess"], "guess"),
     ],
 )

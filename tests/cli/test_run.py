@@ -35,7 +35,9 @@ class Light(engine.Operation):
 
 class Deep(Light):
     travel_offset: float = engine.option(default=0.0, unit="mm", help="added to each travel")
-    tilt: float | None = engine.option(default=None, unit="rad", words=["estimate"], help="tilt", shown_default="no")
+    tilt: float | None = engine.option(
+        default=None, unit="rad", words=["estimate"], help="tilt", shown_default="no"
+    )
     weights: list = engine.option(default=None, unit="share", several=True, within=(0, 1), help="some shares")
     twice: bool = engine.option(default=False, help="count each frame twice")
 
@@ -141,7 +143,7 @@ DEEP = ("run", "mine_of_a_test:Deep", "press.h5")
         (["--travel-offset", "0.1"], "--travel-offset 0.1: a unit is needed; write e.g. 0.1mm"),
         (["--travel-offset", "2deg"], "--travel-offset 2deg: degrees are not a length"),
         (["--tilt", "guess"], "--tilt guess: a number and a unit are needed"),
-        (["--weights", "0.1,2"], "weights 2: a share from 0 to 1 is needed"),
+        (["--weights", "0.1,2"], "weights 2.0: a share from 0 to 1 is needed"),
         (["--device", "abacus"], "abacus"),
     ],
 )

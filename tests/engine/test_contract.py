@@ -82,9 +82,8 @@ def test_running_it_over_a_recording_gives_the_same(name):
     found = engine.run(case.source(), case.make())
     assert_same(found, whole(case))
     assert found.process["operation"] == case.kind.__name__
-    chosen = {
-        one: value for one, value in case.options.items() if isinstance(value, str | bool | int | float)
-    }
+    numbers = {one: value for one, value in case.options.items() if isinstance(value, bool | int | float)}
+    chosen = {one: value for one, value in numbers.items() if one not in ("tilt", "noise")}  # estimated
     assert {one: found.process[one] for one in chosen} == chosen
 
 

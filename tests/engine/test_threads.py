@@ -152,7 +152,8 @@ def test_every_class_that_is_pushed_to_is_thread_safe():
         if inspect.isclass(one) and one.__module__ == module.__name__ and not name.startswith("_")
         if callable(getattr(one, "push", None)) and callable(getattr(one, "result", None))
     }
-    inside = {"NormalWindow", "WarmStartIntegrator"}  # used by one operation, under its lock
+    inside = {"NormalWindow", "WarmStartIntegrator", "StackSums", "TurnSums", "WindowSums"}
+    # Those are used by one operation each, under its lock.
     assert {one.__name__ for one in public if not issubclass(one, ThreadSafe)} <= inside
 
 

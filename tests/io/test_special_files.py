@@ -74,7 +74,7 @@ def outcomes(lines):
     support = Path(__file__).parents[1] / "support"
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, json.dumps(lines)],
-        env={**os.environ, "PYTHONPATH": str(support)},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(support), os.environ.get("PYTHONPATH", "")])},
         capture_output=True,
         text=True,
         timeout=LIMIT,

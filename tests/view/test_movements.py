@@ -18,18 +18,11 @@ ONSET = np.where([[True, True, True, False, True]] * 4, np.arange(5.0), np.nan)
 def slipped(**changed: object) -> view.Slipped:
     moved = np.zeros((3, 4, 5, 2), np.float32)
     truth = io.Truth(HERE, HERE, HERE, CONTACT, **({"displacement": moved, "slip_onset": ONSET} | changed))  # type: ignore[arg-type]
-    found = engine.Slip(
+    found = io.Result(
         displacement=moved[-1] + np.float32(0.25),
-        displacement_sigma=HERE.astype(np.float32),
         slip_onset=(ONSET + 0.5).astype(np.float32),
-        slip_onset_sigma=HERE.astype(np.float32),
-        status=HERE.astype(np.uint8),
-        contact=CONTACT.astype(np.uint8),
         stick_ratio=np.ones(3),
-        centre=None,
-        angle=None,
-        way=np.array([0.0, 1.0, 2.0]),
-        noise=1.0,
+        slide_distance=np.array([0.0, 1.0, 2.0]),
     )
     return view.Slipped(found, truth, CONTACT, np.ones(3), np.arange(5.0), np.arange(4.0)[::-1])
 
