@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,9 +11,10 @@ import click
 
 from mirrorskin.cli.declared import Terms, term
 from mirrorskin.cli.groups import Argument, Option, refuse_foreign
+from mirrorskin.cli.options import MotionName
 
 if TYPE_CHECKING:
-    from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, Plan, RockPlan, TwistPlan, VerticalPlan
+    from mirrorskin.hw.rig.plans import Plan
     from mirrorskin.hw.rig.rig import Rig
     from mirrorskin.hw.rig.scan import StepScan
     from mirrorskin.hw.rig.sweep import SweepScan
@@ -25,16 +25,7 @@ SETTLE = 0.1
 """Seconds from rest to the first exposure, of a motion with stops."""
 
 
-class ScanName(StrEnum):
-    """Motions that a rig can do."""
-
-    vertical = "vertical"
-    axial = "axial"
-    horizontal = "horizontal"
-    twist = "twist"
-
-
-Motion = Annotated[ScanName, Argument(help="How the body moves.")]
+Motion = Annotated[MotionName, Argument(help="How the body moves.")]
 RigFile = Annotated[
     Path, Option("--rig", metavar="RIG.toml", help="Rig file; 'mirrorskin rig new' writes a template.")
 ]
@@ -92,14 +83,7 @@ def make_plan(context: click.Context, given: Mapping[str, Any], settings: RigSet
     motion = str(context.params["motion"])
     kind = "rock" if given.get("rock") and motion == "axial" else motion
     refuse_foreign(context, kind)
-    makers: dict[str, Callable[..., Plan]] = {
-        "vertical": _vertical,
-        "axial": _axial,
-        "rock": _rock,
-        "horizontal": _horizontal,
-        "twist": _twist,
-    }
-    plan = makers[kind](PLAN.filled(given), given)
+    plan = _plan(kind, PLAN.filled(given), given)
     check_steps(plan, given)
     check_plan(plan, settings.stage, settings.name)
     return plan
@@ -173,45 +157,27 @@ def _remains(recorder: StreamRecorder) -> str:
     return f"{recorder.file} was cut short and holds {recorder.written} frames{older}"
 
 
-def _vertical(values: Mapping[str, Any], given: Mapping[str, Any]) -> VerticalPlan:
-    from mirrorskin.hw.rig.plans import VerticalPlan
+def _plan(kind: str, values: Mapping[str, Any], given: Mapping[str, Any]) -> Plan:
+    from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, RockPlan, TwistPlan, VerticalPlan
     from mirrorskin.io import InputError
 
-    start, stop = values["start"], _needed(given, "stop", "2mm")
-    if "stroke_depth" in given:
-        if "strokes" not in given or "start" in given:
-            raise InputError("--stroke-depth needs --strokes, and takes the place of --start")
-        start = stop - given["stroke_depth"]
-    return VerticalPlan(start, stop, strokes=given.get("strokes", 1), **_pace(given, "mm", "0.5mm/s"))
-
-
-def _rock(values: Mapping[str, Any], given: Mapping[str, Any]) -> RockPlan:
-    from mirrorskin.hw.rig.plans import RockPlan
-
-    pace = _pace(given, "rad", "2deg/s")
-    return RockPlan(_needed(given, "press", "1mm"), values["tilt"], values["phase"], **pace)
-
-
-def _horizontal(values: Mapping[str, Any], given: Mapping[str, Any]) -> HorizontalPlan:
-    from mirrorskin.hw.rig.plans import HorizontalPlan
-
-    press, distance = _needed(given, "press", "1mm"), _needed(given, "distance", "0.5mm")
-    pace = _pace(given, "mm", "0.5mm/s")
-    return HorizontalPlan(press, distance, values["direction"], wait=values["wait"], **pace)
-
-
-def _twist(values: Mapping[str, Any], given: Mapping[str, Any]) -> TwistPlan:
-    from mirrorskin.hw.rig.plans import TwistPlan
-
-    press, angle = _needed(given, "press", "1mm"), _needed(given, "angle", "10deg")
-    return TwistPlan(press, angle, wait=values["wait"], **_pace(given, "rad", "2deg/s"))
-
-
-def _axial(values: Mapping[str, Any], given: Mapping[str, Any]) -> AxialPlan:
-    from mirrorskin.hw.rig.plans import AxialPlan
-
+    if kind == "vertical":
+        start, stop = values["start"], _needed(given, "stop", "2mm")
+        if "stroke_depth" in given:
+            if "strokes" not in given or "start" in given:
+                raise InputError("--stroke-depth needs --strokes, and takes the place of --start")
+            start = stop - given["stroke_depth"]
+        return VerticalPlan(start, stop, strokes=given.get("strokes", 1), **_pace(given, "mm", "0.5mm/s"))
     press = _needed(given, "press", "1mm")
-    return AxialPlan(press, values["tilt"], values["turns"], values["phase_step"], values["rate"])
+    if kind == "axial":
+        return AxialPlan(press, *(values[name] for name in ("tilt", "turns", "phase_step", "rate")))
+    if kind == "rock":
+        return RockPlan(press, values["tilt"], values["phase"], **_pace(given, "rad", "2deg/s"))
+    if kind == "horizontal":
+        distance, pace = _needed(given, "distance", "0.5mm"), _pace(given, "mm", "0.5mm/s")
+        return HorizontalPlan(press, distance, values["direction"], wait=values["wait"], **pace)
+    angle, pace = _needed(given, "angle", "10deg"), _pace(given, "rad", "2deg/s")
+    return TwistPlan(press, angle, wait=values["wait"], **pace)
 
 
 def _pace(given: Mapping[str, Any], unit: str, example: str) -> dict[str, Any]:
