@@ -16,7 +16,7 @@ from mirrorskin.cli.output import print_json, print_table, progress
 
 if TYPE_CHECKING:
     from mirrorskin import hw, io
-    from mirrorskin.engine import Score
+    from mirrorskin.engine.scoring import Score
     from mirrorskin.hw.twin import Movement
 
 Results = dict[str, "io.Result"]

@@ -28,7 +28,7 @@ def command(
 
     io.check_output(output, *results, or_zarr=True)
     touches = [io.open_result(path) for path in results]
-    whole = engine.stitch(
+    whole = engine.pose.stitch(
         touches, given.get("pixel_size"), names=[str(path) for path in results], device=device
     )
     save_and_report(whole.result, output, device, as_json)

@@ -27,7 +27,7 @@ class Focus(Operation):
     Examples
     --------
     >>> from mirrorskin import engine
-    >>> focus = engine.Focus(noise=0.1)
+    >>> focus = engine.focus.Focus(noise=0.1)
     >>> texture = np.random.default_rng(0).normal(size=(20, 20)).astype(np.float32)
     >>> for travel in range(9):
     ...     focus.push((np.exp(-((travel - 3.7) ** 2) / 9) * texture[None]).astype("f4"), travel=[travel])
@@ -152,7 +152,7 @@ find_focus = travel_function(
     >>> texture = np.random.default_rng(0).normal(size=(20, 20))
     >>> travel = np.arange(9.0)
     >>> frames = np.exp(-((travel - 3.7) ** 2) / 9)[:, None, None] * texture
-    >>> focus = engine.find_focus(frames.astype(np.float32), travel, noise=0.01)
+    >>> focus = engine.focus.find_focus(frames.astype(np.float32), travel, noise=0.01)
     >>> round(float(focus.height[10, 10]), 2), round(float(focus.height_sigma[10, 10]), 4)
     (-3.7, 0.0023)
     """,

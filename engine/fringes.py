@@ -45,7 +45,7 @@ class Fringes(Operation):
     Examples
     --------
     >>> from mirrorskin import engine
-    >>> fringes = engine.Fringes()
+    >>> fringes = engine.fringes.Fringes()
     >>> for shift in np.arange(4) * np.pi / 2:
     ...     fringes.push(np.full((1, 1, 2), 9 + np.cos(0.5 - shift), np.float32), phase=[shift])
     >>> fringes.result().phase.round(4).tolist()
@@ -159,7 +159,7 @@ fit_fringes = phase_function(
     >>> from mirrorskin import engine
     >>> shift = np.arange(4) * np.pi / 2
     >>> frames = (100 + 50 * np.cos(0.5 - shift)[:, None, None] * np.ones((2, 3))).astype(np.float32)
-    >>> fringes = engine.fit_fringes(frames, shift, noise=2)
+    >>> fringes = engine.fringes.fit_fringes(frames, shift, noise=2)
     >>> round(float(fringes.phase[0, 0]), 4), round(float(fringes.phase_sigma[0, 0]), 4)
     (0.5, 0.0283)
     """,
@@ -205,7 +205,7 @@ def unwrap_frequencies(fringes: Sequence[Maps], frequency: ArrayLike, *, start: 
     >>> from mirrorskin import engine
     >>> wrapped = np.array([1.0, 8.0, 64.0])[:, None, None] % (2 * np.pi)
     >>> fringes = [{"phase": phase, "phase_sigma": [[0.05]]} for phase in wrapped]
-    >>> engine.unwrap_frequencies(fringes, [1, 8, 64]).phase.round(4).tolist()
+    >>> engine.fringes.unwrap_frequencies(fringes, [1, 8, 64]).phase.round(4).tolist()
     [[64.0]]
     """
     if not isinstance(fringes, Sequence) or isinstance(fringes, str):
@@ -268,7 +268,7 @@ def decode_gray(frames: NDArray[Any], threshold: ArrayLike, *, noise: ArrayLike)
     >>> from mirrorskin import engine
     >>> stripe = np.arange(8)[None]
     >>> frames = np.stack([(stripe ^ stripe >> 1) >> bit & 1 for bit in (2, 1, 0)]) * 100
-    >>> engine.decode_gray(frames, 50, noise=2).stripe.tolist()
+    >>> engine.fringes.decode_gray(frames, 50, noise=2).stripe.tolist()
     [[0, 1, 2, 3, 4, 5, 6, 7]]
     """
     if frames.ndim != 3 or not 0 < len(frames) <= 30:
@@ -323,7 +323,8 @@ def unwrap_gray(fringes: Maps, stripes: Maps, *, width: float = np.pi, start: fl
     >>> from mirrorskin import engine
     >>> true = np.linspace(0.1, 25, 6)[None]
     >>> fringes = {"phase": true % (2 * np.pi), "phase_sigma": np.full(true.shape, 0.05)}
-    >>> engine.unwrap_gray(fringes, {"stripe": true // np.pi, "risk": 0 * true}).phase.round(2).tolist()
+    >>> stripes = {"stripe": true // np.pi, "risk": 0 * true}
+    >>> engine.fringes.unwrap_gray(fringes, stripes).phase.round(2).tolist()
     [[0.1, 5.08, 10.06, 15.04, 20.02, 25.0]]
     """
     wrapped, errors = _phase_of(fringes, "fringes")

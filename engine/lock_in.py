@@ -32,7 +32,7 @@ class Correlation(Method, options_of=(Correlate,)):
         above=0,
         words=("estimate",),
         help="frequency, or estimate it: the phase is 2 pi times frequency times the time since the first"
-        " frame. To estimate it, the source is read twice; see `mirrorskin.engine.estimate_frequency`",
+        " frame. To estimate it, the source is read twice; see `engine.rotation.estimate_frequency`",
         shown_default="the phase of the source",
     )
     frame_rate: float | None = option(
@@ -45,7 +45,7 @@ class Correlation(Method, options_of=(Correlate,)):
     dither: bool = option(
         default=False,
         help="the phase is that of the travel of a press that dithers, and the growth of the contact is"
-        " added; see `mirrorskin.engine.Growth`",
+        " added; see `mirrorskin.engine.press.Growth`",
     )
 
     def plan(self, source: Source) -> Plan:

@@ -35,7 +35,7 @@ class PhotometricStereo(Operation):
     Examples
     --------
     >>> from mirrorskin import engine
-    >>> stereo = engine.PhotometricStereo(zenith=np.pi / 4)
+    >>> stereo = engine.photometric.PhotometricStereo(zenith=np.pi / 4)
     >>> for azimuth in np.arange(4) * np.pi / 2:
     ...     stereo.push(np.full((1, 1, 2), 50 + 30 * np.cos(azimuth), np.float32), phase=[azimuth])
     >>> round(float(stereo.result().normals[0, 0, 0]), 4)
@@ -218,7 +218,7 @@ photometric_stereo = optional_phase_function(
     >>> from mirrorskin import engine
     >>> azimuth = np.arange(6) * np.pi / 3
     >>> frames = (70 + 20 * np.cos(azimuth - 1))[:, None, None] * np.ones((2, 3), np.float32)
-    >>> found = engine.photometric_stereo(frames.astype(np.float32), azimuth, zenith=0.6, noise=1)
+    >>> found = engine.photometric.photometric_stereo(frames.astype(np.float32), azimuth, zenith=0.6, noise=1)
     >>> [round(float(part), 3) for part in found.normals[0, 0]], round(float(found.normals_sigma[0, 0]), 4)
     ([0.208, 0.324, 0.923], 0.0153)
     """,

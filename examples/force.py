@@ -64,6 +64,6 @@ for number, (diameter, depth) in enumerate([(3, 0.81), (5, 0.51), (5, 1.02), (7,
     found, sigma = results[name].force, results[name].force_sigma
     print(f"{name}: {found:.4f} ± {sigma:.4f} N, true {truths[name]:.4f} N")
 
-pressure = engine.find_force(twin.truth.height, depth, PIXEL, MODULUS).pressure
+pressure = engine.force.find_force(twin.truth.height, depth, PIXEL, MODULUS).pressure
 title = "Forces of presses: gel of 100 kPa, calibrated with a scale"
 view.force_figure(results, truths, pressure, title, Path("force.png"))

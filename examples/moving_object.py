@@ -65,7 +65,7 @@ share = np.linspace(0, 1, TOUCHES)
 shifts = np.stack([share, 0.6 * np.sin(math.pi * share), -0.05 * share], axis=1)  # mm
 turns = np.radians(np.stack([8 * np.sin(math.tau * share), 10 * share, 40 * share], axis=1))
 
-tracker, results, poses = engine.PoseTracker(), [], []
+tracker, results, poses = engine.pose.PoseTracker(), [], []
 for number, (turn, shift) in enumerate(zip(turns, shifts, strict=True)):
     thing = moved(Rotation.from_rotvec(turn).as_matrix(), shift)
     results.append(touch(thing, DEPTH + shift[2], number))

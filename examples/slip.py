@@ -33,7 +33,7 @@ def find_slip(movement, stick_ratio):
     frames = np.empty(twin.shape, twin.dtype)
     twin.read(frames)
     contact = twin.sheet(0).contact
-    slip = engine.Slip(pixel_size=PIXEL, motion=twin.motion, contact=contact)
+    slip = engine.slip.Slip(pixel_size=PIXEL, motion=twin.motion, contact=contact)
     slip.push(frames, **{"twist" if twin.motion == "twist" else "displacement": movement.path})
     x, y = io.pixel_axes(twin.shape[1:], (PIXEL, PIXEL))
     return view.Slipped(slip.result(), twin.truth, contact, stick_ratio, x, y)

@@ -45,7 +45,7 @@ twin, frames = simulate("sphere", Vertical(np.array(true)), references="exact")
 # Pixels that hardly turn bright, at the zenith where the wall begins, are crossed by noise.
 truth = np.where(twin.truth.zenith > math.radians(14), twin.truth.height, np.nan)
 reached = truth > -TRAVEL + BACKLASH
-search = engine.Strokes(dark=twin.header.dark, bright=twin.header.bright)
+search = engine.press.Strokes(dark=twin.header.dark, bright=twin.header.bright)
 curve = []
 ends = stroke_starts(travel, 1)[::2].tolist()
 for start, stop in zip([0, *ends], ends, strict=False):

@@ -10,15 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.cli.bench.records import Case, Target
-from mirrorskin.engine import (
-    Onset,
-    Surface,
-    estimate_normals,
-    find_change_point,
-    find_onset,
-    fuse,
-    integrate,
-)
+from mirrorskin.engine import Onset, estimate_normals, find_change_point, find_onset, fuse, integrate
+from mirrorskin.engine.integration import Surface
 from mirrorskin.kernels.device import Device
 from suite.harness import Cases, at_most, within
 from suite.scenes import STEPS, TILT

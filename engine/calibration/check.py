@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.calibration.ball import see_ball
 from mirrorskin.engine.provenance import naming
-from mirrorskin.engine.reconstruction import reconstruct
+from mirrorskin.engine.reconstruction import calibrated
+from mirrorskin.engine.rotation.rotation import Rotation
 from mirrorskin.io import Calibration, InputError, Result, Source, WallResponse
 from mirrorskin.kernels.device import Device
 
@@ -155,8 +156,8 @@ def _check_rotation(
         gain, offset = (np.where(sound, part, np.median(part[sound])) for part in (gain, offset))
         plain = replace(calibration, zenith=None, gel=None)
         source.rewind()
-        linear = {"zenith_gain": gain, "zenith_offset": offset - rim * gain}
-        first = reconstruct(source, calibration=plain, device=device, **linear)
+        linear = Rotation(zenith_gain=gain, zenith_offset=offset - rim * gain, device=device)
+        first = linear.run(calibrated(source, plain))
         before = _normal_errors(first, truth, cells)
     after = _normal_errors(found, truth, cells)
     return Check(ball, (float(centre[0]), float(centre[1])), *_axes(found), after, before)

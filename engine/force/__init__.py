@@ -1,1 +1,5 @@
 """Forces and stresses between sensor and object, from how the elastomer is deformed."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

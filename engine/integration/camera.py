@@ -48,7 +48,7 @@ class Camera:
     >>> import numpy as np
     >>> from mirrorskin import engine
     >>> normals = np.broadcast_to([1.0, 0.0, 1.0], (9, 101, 3))
-    >>> camera = engine.Camera(focal_length=200.0)
+    >>> camera = engine.integration.Camera(focal_length=200.0)
     >>> depth = engine.integrate(normals=normals, camera=camera).height
     >>> round(float(depth[4, 100] / depth[4, 0]), 4)
     1.6667

@@ -77,7 +77,7 @@ def integrate(
         Surface normals in place of slopes: along x, y and z, which runs towards the camera; of any length.
         Not finite or 0 where there is none; where the surface faces away, or is seen within 0.6 degrees of
         edge-on, they count as none.
-    camera : mirrorskin.engine.Camera, optional
+    camera : mirrorskin.engine.integration.Camera, optional
         What saw the normals; by default one so far away that all lines of sight are along z. With a camera,
         ``height``, known and initial heights are *depths* Z > 0: distances from the pinhole along the optical
         axis, which grow away from the camera. The logarithm of Z is integrated: a pixel to the right it rises

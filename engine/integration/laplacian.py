@@ -76,7 +76,7 @@ def invert_laplacian(
     >>> from mirrorskin import engine
     >>> held = np.zeros((40, 60))
     >>> held[:, [0, -1]] = 1.0
-    >>> inverse = engine.invert_laplacian(np.ones((40, 59)), np.ones((39, 60)), held)
+    >>> inverse = engine.integration.invert_laplacian(np.ones((40, 59)), np.ones((39, 60)), held)
     >>> arrivals = np.zeros((40, 60))
     >>> arrivals[:, -1] = 1.0
     >>> share = (inverse @ arrivals.ravel()).reshape(40, 60)

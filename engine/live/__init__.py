@@ -1,4 +1,4 @@
-"""Results while the body moves: the same estimators as offline, within a bounded time."""
+"""Operations and methods while the body moves, within a bounded time."""
 
 import lazy_loader
 

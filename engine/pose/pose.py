@@ -144,7 +144,7 @@ def estimate_pose(
     ...     normals = np.dstack([(x - at) / 5, y / 5, z / 5])
     ...     sure = np.full(x.shape, 0.01)
     ...     return io.Result(height=z - 5, height_sigma=0.1 * sure, normals=normals, normals_sigma=sure)
-    >>> pose = engine.estimate_pose(ball(0.0), ball(0.2), pixel_size=0.1)
+    >>> pose = engine.pose.estimate_pose(ball(0.0), ball(0.2), pixel_size=0.1)
     >>> pose.apply([0, 0, -5]).round(3).tolist()  # the ball's centre; about its spin nothing is known
     [0.2, 0.0, -5.0]
     >>> len(pose.undetermined)

@@ -62,7 +62,7 @@ def stitch(
 ) -> Stitch:
     """Put the maps of several touches of one object together into one larger surface.
 
-    The motion from each touch to the next is found as by `mirrorskin.engine.estimate_pose`, then those
+    The motion from each touch to the next is found as by `mirrorskin.engine.pose.estimate_pose`, then those
     between all others that share a fifth of their pixels. A least-squares fit of all motions, weighted by
     their covariances, makes the poses (a pose graph: Lu and Milios, Autonomous Robots 4, 1997). Heights of
     all touches are then brought to the pixels of the first, and merged by their inverse variances.
@@ -94,7 +94,7 @@ def stitch(
     ...     sure = np.full(x.shape, 0.01)
     ...     height = 0.2 * np.sin(x - at) * np.cos(y)
     ...     return io.Result(height=height, height_sigma=0.1 * sure, normals=normals, normals_sigma=sure)
-    >>> whole = engine.stitch([waves(0.0), waves(-1.0)], pixel_size=0.1)
+    >>> whole = engine.pose.stitch([waves(0.0), waves(-1.0)], pixel_size=0.1)
     >>> whole.result.height.shape, whole.poses[1].translation.round(2).tolist()
     ((41, 71), [-1.0, 0.0, 0.0])
     """

@@ -52,7 +52,7 @@ class PoseTracker(ThreadSafe):
     ...     sure = np.full(x.shape, 0.01)
     ...     height = 0.2 * np.sin(x - at) * np.cos(y)
     ...     return io.Result(height=height, height_sigma=0.1 * sure, normals=normals, normals_sigma=sure)
-    >>> tracker = engine.PoseTracker(pixel_size=0.1)
+    >>> tracker = engine.pose.PoseTracker(pixel_size=0.1)
     >>> [float(tracker.push(waves(0.05 * number)).translation[0].round(2)) for number in range(3)]
     [0.0, 0.05, 0.1]
     """

@@ -1,1 +1,5 @@
 """A press or its release: heights from the frame in which a pixel turns light or dark."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -59,7 +59,7 @@ class Growth(CorrelationOperation):
     >>> from mirrorskin import engine
     >>> travel = 1 + 0.02 * np.cos(0.7 * np.arange(90))
     >>> frames = (100 + 300 * (travel - 1)[:, None, None] * np.ones((2, 3))).astype(np.float32)
-    >>> result = engine.run(frames, engine.Growth(dark=0, bright=200), travel=travel)
+    >>> result = engine.run(frames, engine.press.Growth(dark=0, bright=200), travel=travel)
     >>> round(result.process["travel_amplitude"], 3)
     0.02
     """

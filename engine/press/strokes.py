@@ -37,7 +37,7 @@ class Strokes(CrossingOperation):
     >>> from mirrorskin import engine
     >>> travel = 0.5 - 0.5 * np.cos(0.8 * np.arange(60))
     >>> frames = np.where(travel > 0.3, 255, 0).astype(np.uint8)[:, np.newaxis, np.newaxis]
-    >>> found = engine.run(frames, engine.Strokes(noise=1.0), travel=travel)
+    >>> found = engine.run(frames, engine.press.Strokes(noise=1.0), travel=travel)
     >>> int(found.strokes[0, 0]), bool(abs(found.height[0, 0] + 0.3) < 0.03)
     (8, True)
     """

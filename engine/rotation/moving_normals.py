@@ -39,7 +39,7 @@ class MovingNormals(NormalsOperation):
     --------
     >>> import numpy as np
     >>> from mirrorskin import engine
-    >>> operation = engine.MovingNormals(zenith_gain=300, noise=1.0)
+    >>> operation = engine.rotation.MovingNormals(zenith_gain=300, noise=1.0)
     >>> for lean in 0.05 * np.sin(0.8 * np.arange(16)):
     ...     axis = [[np.sin(lean), 0.0, np.cos(lean)]]
     ...     operation.push(np.full((1, 2, 3), 150 - 300 * lean, np.float32), pose=axis)

@@ -55,7 +55,7 @@ class Rotation(Method, options_of=(NormalsOperation, Integration)):
     only; without a pixel size, no heights. Heights are relative: the mean of each component is 0.
 
     If the source has a tilt of each frame, or two phases half a turn apart, its frames are at any known
-    poses; see `mirrorskin.engine.MovingNormals`. Rocking determines a slope and no heights.
+    poses; see `mirrorskin.engine.rotation.MovingNormals`. Rocking determines a slope and no heights.
     """
 
     motions = ("axial",)

@@ -66,7 +66,7 @@ class Slip(Operation):
     >>> from mirrorskin import engine
     >>> texture = np.random.default_rng(1).normal(100, 20, (60, 80))
     >>> texture = cv2.GaussianBlur(texture, (0, 0), 1.5).astype(np.float32)
-    >>> slip = engine.Slip(pixel_size=0.1, contact=np.ones((60, 80)), noise=0.1)
+    >>> slip = engine.slip.Slip(pixel_size=0.1, contact=np.ones((60, 80)), noise=0.1)
     >>> for k in range(4):  # the body moves to the right, the skin sticks to the object
     ...     slip.push(np.roll(texture, -k, axis=1)[None], displacement=[[0.1 * k, 0.0]])
     >>> found = slip.result()

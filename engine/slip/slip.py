@@ -52,7 +52,7 @@ class Sliding(Method, options_of=(Slip, Traction)):
     """Displacement of the skin and slip in a slide or a twist; with Young's modulus also the force.
 
     ``traction``, ``force_x`` and ``force_y`` assume that there is no load along the sheet in the first frame.
-    ``process`` contains ``angle``, ``centre_x`` and ``centre_y`` of a twist; see `mirrorskin.engine.Slip`.
+    ``process`` contains ``angle``, ``centre_x`` and ``centre_y`` of a twist; see `Slip`.
     """
 
     motions = ("horizontal", "twist")

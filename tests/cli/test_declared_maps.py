@@ -237,7 +237,7 @@ def test_poses_are_estimated_from_the_map_that_is_a_height():
     worn = of("wear").assign(height=bumps)
     assert list(worn) == ["wear", "wear_sigma"]
     built_in = io.Result(height=bumps, height_sigma=SIGMA, x=X, y=Y)
-    found, expected = (engine.estimate_pose(one, one) for one in (worn, built_in))
+    found, expected = (engine.pose.estimate_pose(one, one) for one in (worn, built_in))
     np.testing.assert_array_equal(found.translation, expected.translation)
 
 

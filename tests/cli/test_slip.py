@@ -50,7 +50,7 @@ def test_a_slide_is_told_as_the_search_finds_it_in_its_frames(slide, contact, fo
     touched = io.open_result(contact).contact
     with io.open_recording(slide) as recording:
         block = recording.read(np.empty(recording.shape, recording.dtype))
-        search = engine.Slip(contact=touched, per_frame=True).configured_for(recording)
+        search = engine.slip.Slip(contact=touched, per_frame=True).configured_for(recording)
         search.push(block.frames, displacement=block.displacement)
     told = search.result()
     for name in ("displacement", "displacement_sigma", "slip_onset", "slip_onset_sigma", "status", "contact"):

@@ -36,25 +36,25 @@ def noisy(frames, noise, seed):
 @pytest.mark.parametrize("sharpest", [4.0, 4.1, 4.25])
 def test_waves_of_one_length_are_exact_without_noise(reach, sharpest):
     frames = textured(sharpest=sharpest).astype(np.float32)
-    found = engine.find_focus(frames, TRAVEL, noise=0, reach=reach)
+    found = engine.focus.find_focus(frames, TRAVEL, noise=0, reach=reach)
     np.testing.assert_allclose(found.height, -sharpest, atol=2e-4)
 
 
 def test_steps_may_be_uneven_and_go_up():
     travel = np.cumsum(np.random.default_rng(1).uniform(0.2, 0.8, 18))[::-1]
-    found = engine.find_focus(textured(travel).astype(np.float32), travel, noise=0)
+    found = engine.focus.find_focus(textured(travel).astype(np.float32), travel, noise=0)
     np.testing.assert_allclose(found.height, -4.2, atol=2e-4)
 
 
 def test_texture_of_all_lengths_is_right_to_a_twentieth_of_a_step():
     frames = textured(waves=lambda generator: np.sqrt(generator.uniform(0.02**2, 0.3**2, 200)))
-    found = engine.find_focus(frames.astype(np.float32), TRAVEL, noise=0)
+    found = engine.focus.find_focus(frames.astype(np.float32), TRAVEL, noise=0)
     assert abs(np.median(found.height) + 4.2) < 0.5 / 20
 
 
 def test_the_standard_error_knows_a_curve_that_is_no_gaussian():
     frames = textured(waves=lambda generator: np.sqrt(generator.uniform(0.02**2, 0.3**2, 200)))
-    found = engine.find_focus(noisy(frames, 0.1, 0), TRAVEL, noise=0.1)
+    found = engine.focus.find_focus(noisy(frames, 0.1, 0), TRAVEL, noise=0.1)
     ratio = (found.height + 4.2) / found.height_sigma
     assert 0.1 < np.mean(ratio**2) < 2  # 100 by noise alone
 
@@ -62,13 +62,13 @@ def test_the_standard_error_knows_a_curve_that_is_no_gaussian():
 def test_contrast_in_two_frames_has_no_vertex():
     strength = np.array([0, 0, 0, 1, 0.9, 0, 0, 0, 0], np.float32)[:, None, None]
     texture = np.random.default_rng(0).normal(100, 10, SHAPE).astype(np.float32)
-    found = engine.find_focus(strength * texture, np.arange(9.0), noise=0.1)
+    found = engine.focus.find_focus(strength * texture, np.arange(9.0), noise=0.1)
     assert (found.status == 2).all()
 
 
 def test_a_slope_is_followed():
     slope = 4 + 0.02 * (np.arange(SHAPE[1]) - 23.5)
-    found = engine.find_focus(textured(sharpest=slope).astype(np.float32), TRAVEL, noise=0)
+    found = engine.focus.find_focus(textured(sharpest=slope).astype(np.float32), TRAVEL, noise=0)
     error = (found.height + slope)[:, 6:-6]
     assert np.sqrt(np.mean(error**2)) < 0.03
 
@@ -77,7 +77,7 @@ def test_a_slope_is_followed():
 def test_the_standard_error_is_the_scatter(noise, reach):
     frames, square = textured(), []
     for seed in range(40):
-        found = engine.find_focus(noisy(frames, noise, seed), TRAVEL, noise=noise, reach=reach)
+        found = engine.focus.find_focus(noisy(frames, noise, seed), TRAVEL, noise=noise, reach=reach)
         sound = found.status == 1
         assert sound.mean() > 0.9
         square.append(np.mean(((found.height + 4.2) / found.height_sigma)[sound] ** 2))
@@ -85,19 +85,19 @@ def test_the_standard_error_is_the_scatter(noise, reach):
 
 
 def test_sharpness_is_the_contrast_without_the_noise():
-    found = engine.find_focus(noisy(textured(sharpest=4.0), 3.0, 0), TRAVEL, noise=3.0)
-    clean = engine.find_focus(textured(sharpest=4.0).astype(np.float32), TRAVEL, noise=0)
+    found = engine.focus.find_focus(noisy(textured(sharpest=4.0), 3.0, 0), TRAVEL, noise=3.0)
+    clean = engine.focus.find_focus(textured(sharpest=4.0).astype(np.float32), TRAVEL, noise=0)
     assert np.mean(found.sharpness**2) == pytest.approx(np.mean(clean.sharpness**2), rel=0.01)
 
 
 def test_a_picture_without_texture_has_no_peak():
-    found = engine.find_focus(noisy(np.full((18, *SHAPE), 100.0), 2.0, 0), TRAVEL, noise=2.0)
+    found = engine.focus.find_focus(noisy(np.full((18, *SHAPE), 100.0), 2.0, 0), TRAVEL, noise=2.0)
     assert (found.status != 1).mean() > 0.999
     assert np.isnan(found.height[found.status != 1]).all()
 
 
 def test_a_peak_at_the_end_of_the_stack_is_said():
-    found = engine.find_focus(textured(sharpest=9.5).astype(np.float32), TRAVEL, noise=0)
+    found = engine.focus.find_focus(textured(sharpest=9.5).astype(np.float32), TRAVEL, noise=0)
     assert (found.status == 3).all()
     assert np.isnan(found.height).all()
 
@@ -106,7 +106,7 @@ def test_a_missing_sample_is_left_out_and_a_missing_pixel_invalid():
     frames = textured().astype(np.float32)
     frames[6, 9, 9] = np.nan
     frames[:, 30, 30] = np.nan
-    found = engine.find_focus(frames, TRAVEL, noise=0)
+    found = engine.focus.find_focus(frames, TRAVEL, noise=0)
     assert found.height[9, 9] == pytest.approx(-4.2, abs=1e-3)
     assert found.status[30, 30] == found.status[26, 34] == 0
     assert found.status[25, 30] == 1
@@ -114,8 +114,8 @@ def test_a_missing_sample_is_left_out_and_a_missing_pixel_invalid():
 
 def test_frames_that_come_one_by_one_give_the_same():
     frames = noisy(textured(), 2.0, 0).clip(0, 255).astype(np.uint8)
-    whole = engine.find_focus(frames, TRAVEL, noise=2.0)
-    focus = engine.Focus(noise=2.0)
+    whole = engine.focus.find_focus(frames, TRAVEL, noise=2.0)
+    focus = engine.focus.Focus(noise=2.0)
     focus.push(frames[3:9], travel=TRAVEL[3:9])
     result = engine.run(list(frames), focus, travel=TRAVEL)  # which resets it
     np.testing.assert_array_equal(result.height, whole.height)
@@ -143,4 +143,4 @@ FRAMES = textured().astype(np.float32)
 )
 def test_bad_input_is_one_line(arguments, line):
     with pytest.raises(io.InputError, match=re.escape(line)):
-        engine.find_focus(**{"frames": FRAMES, "travel": TRAVEL, "noise": 1, **arguments})
+        engine.focus.find_focus(**{"frames": FRAMES, "travel": TRAVEL, "noise": 1, **arguments})

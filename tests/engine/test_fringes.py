@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mirrorskin import engine, io
+from mirrorskin.engine.fringes import Fringes, decode_gray, fit_fringes, unwrap_frequencies, unwrap_gray
 
 TURN = 2 * np.pi
 EVEN = np.arange(5) * TURN / 5
@@ -29,7 +30,7 @@ def wrap(angle):
 def fitted(noise, place=FIELD):
     """Phases and standard deviations of the field seen with fringes of several frequencies."""
     stacks = [shown(TURN * rate * place, EVEN, noise, seed=rate) for rate in RATES]
-    return [engine.fit_fringes(stack, EVEN, noise=noise) for stack in stacks]
+    return [fit_fringes(stack, EVEN, noise=noise) for stack in stacks]
 
 
 def given(phase, sigma):
@@ -51,60 +52,60 @@ def coded(noise, contrast=40.0, seed=5):
 
 @pytest.mark.parametrize("shift", [EVEN, UNEVEN, -UNEVEN[:3]], ids=["even", "uneven", "three"])
 def test_phases_without_noise_are_those_encoded(shift):
-    fringes = engine.fit_fringes(shown(TURN * 3 * FIELD, shift), shift, noise=1)
+    fringes = fit_fringes(shown(TURN * 3 * FIELD, shift), shift, noise=1)
     np.testing.assert_allclose(wrap(fringes.phase - TURN * 3 * FIELD), 0, atol=3e-6)
 
 
 def test_mean_and_modulation_are_those_encoded():
-    fringes = engine.fit_fringes(shown(FIELD, UNEVEN), UNEVEN)
+    fringes = fit_fringes(shown(FIELD, UNEVEN), UNEVEN)
     np.testing.assert_allclose(fringes.mean, 100, rtol=1e-5)
     np.testing.assert_allclose(fringes.modulation, 40, rtol=1e-5)
 
 
 def test_frames_that_come_one_by_one_give_the_same():
     frames = shown(TURN * FIELD, UNEVEN, 2, "uint8")
-    whole = engine.fit_fringes(frames, UNEVEN)
-    result = engine.run(list(frames), engine.Fringes, phase=UNEVEN)
+    whole = fit_fringes(frames, UNEVEN)
+    result = engine.run(list(frames), Fringes, phase=UNEVEN)
     np.testing.assert_allclose(result.phase, whole.phase, atol=1e-6)
     np.testing.assert_allclose(result.phase_sigma, whole.phase_sigma, rtol=1e-4)
     assert result.process["noise"] == pytest.approx(whole.process["noise"], rel=1e-4)
 
 
 def test_an_operation_that_was_reset_has_forgotten():
-    fringes = engine.Fringes(noise=1)
+    fringes = Fringes(noise=1)
     fringes.push(shown(FIELD + 1, EVEN), phase=EVEN)
     fringes.reset()
     fringes.push(shown(FIELD, UNEVEN), phase=UNEVEN)
     found = fringes.result()
     np.testing.assert_allclose(found.phase, FIELD, atol=3e-6)
-    expected = engine.fit_fringes(shown(FIELD, UNEVEN), UNEVEN, noise=1)
+    expected = fit_fringes(shown(FIELD, UNEVEN), UNEVEN, noise=1)
     np.testing.assert_allclose(found.phase_sigma, expected.phase_sigma, rtol=1e-4)
 
 
 def test_a_frame_of_weight_0_is_left_out_and_weights_are_inverse_variances():
     frames = shown(TURN * FIELD, UNEVEN, 1.5)
-    expected = engine.fit_fringes(np.delete(frames, 2, 0), np.delete(UNEVEN, 2))
-    fringes = engine.Fringes()
+    expected = fit_fringes(np.delete(frames, 2, 0), np.delete(UNEVEN, 2))
+    fringes = Fringes()
     fringes.push(frames, phase=UNEVEN, frame_weights=[1, 1, 0, 1, 1, 1])
     found = fringes.result()
     np.testing.assert_allclose(found.phase, expected.phase, atol=1e-5)
     np.testing.assert_allclose(found.phase_sigma, expected.phase_sigma, rtol=1e-3)
-    twice = engine.Fringes(noise=2)
+    twice = Fringes(noise=2)
     twice.push(frames, phase=UNEVEN, frame_weights=np.full(6, 4.0))
-    once = engine.fit_fringes(frames, UNEVEN, noise=2)
+    once = fit_fringes(frames, UNEVEN, noise=2)
     np.testing.assert_allclose(twice.result().phase_sigma, once.phase_sigma / 2, rtol=1e-4)
 
 
 @pytest.mark.parametrize("count", [3, 4, 8])
 def test_the_standard_error_of_even_shifts_is_the_cramer_rao_bound(count):
     shift = np.arange(count) * TURN / count
-    fringes = engine.fit_fringes(shown(TURN * FIELD, shift), shift, noise=2)
+    fringes = fit_fringes(shown(TURN * FIELD, shift), shift, noise=2)
     np.testing.assert_allclose(fringes.phase_sigma, 2 * np.sqrt(2 / count) / 40, rtol=1e-4)
 
 
 @pytest.mark.parametrize("shift", [EVEN, UNEVEN], ids=["even", "uneven"])
 def test_the_standard_error_is_the_scatter_at_every_phase(shift):
-    fringes = engine.fit_fringes(shown(TURN * FIELD, shift, 1.5), shift)
+    fringes = fit_fringes(shown(TURN * FIELD, shift, 1.5), shift)
     square = (wrap(fringes.phase - TURN * FIELD) / fringes.phase_sigma) ** 2
     for part in np.split(square, 8, axis=1):
         assert part.mean() == pytest.approx(1, abs=0.1)
@@ -115,23 +116,23 @@ def test_noise_is_told_from_the_residual(count):
     shift = np.arange(count) * TURN / count
     frames = shown(FIELD, shift, 1.5)
     frames[:, :, :100] = 10  # no fringes there, and no noise
-    assert engine.fit_fringes(frames, shift).process["noise"] == pytest.approx(1.5, rel=0.04)
+    assert fit_fringes(frames, shift).process["noise"] == pytest.approx(1.5, rel=0.04)
 
 
 def test_a_pixel_without_fringes_has_no_phase():
-    fringes = engine.fit_fringes(np.full((5, 1, 1), 7, np.uint8), EVEN, noise=1)
+    fringes = fit_fringes(np.full((5, 1, 1), 7, np.uint8), EVEN, noise=1)
     assert np.isnan(fringes.phase).all()
     assert np.isposinf(fringes.phase_sigma).all()
 
 
 def test_frequencies_unwrap_exactly_without_noise():
-    found = engine.unwrap_frequencies(fitted(0), RATES)
+    found = unwrap_frequencies(fitted(0), RATES)
     np.testing.assert_allclose(found.phase, TURN * 36 * FIELD, atol=3e-6)
     assert (found.risk <= 1e-3).all()
 
 
 def test_frequencies_unwrap_the_whole_field_in_noise():
-    found = engine.unwrap_frequencies(fitted(1.0), RATES)  # the coarsest to 0.016 rad
+    found = unwrap_frequencies(fitted(1.0), RATES)  # the coarsest to 0.016 rad
     error = found.phase - TURN * 36 * FIELD
     assert np.abs(error).max() < np.pi
     assert np.mean((error / found.phase_sigma) ** 2) == pytest.approx(1, abs=0.05)
@@ -140,13 +141,13 @@ def test_frequencies_unwrap_the_whole_field_in_noise():
 def test_the_field_may_have_its_zero_in_the_middle():
     true = np.linspace(-3, 3, 50)[np.newaxis]
     fringes = given(wrap(np.stack([true, 7 * true])), 0.01)
-    found = engine.unwrap_frequencies(fringes, [1, 7], start=-np.pi)
+    found = unwrap_frequencies(fringes, [1, 7], start=-np.pi)
     np.testing.assert_allclose(found.phase, 7 * true)
 
 
 def test_the_risk_is_how_often_the_order_is_wrong():
     place = 0.25 + 0.5 * FIELD  # far from the ends
-    found = engine.unwrap_frequencies(fitted(14.0, place), RATES)
+    found = unwrap_frequencies(fitted(14.0, place), RATES)
     wrong = np.abs(found.phase - TURN * 36 * place) > np.pi
     for low, high in [(0.0, 1e-3), (0.01, 0.1), (0.1, 0.3), (0.3, 0.6)]:
         part = (found.risk >= low) & (found.risk < high)
@@ -155,28 +156,28 @@ def test_the_risk_is_how_often_the_order_is_wrong():
 
 
 def test_the_end_of_the_field_is_at_risk_where_it_may_be_the_other_end():
-    found = engine.unwrap_frequencies(given(np.full((1, 1, 2), [[0.02, 1.0]]), 0.02), [1])
+    found = unwrap_frequencies(given(np.full((1, 1, 2), [[0.02, 1.0]]), 0.02), [1])
     assert found.risk[0].tolist() == pytest.approx([0.1587, 0], abs=1e-4)
 
 
 def test_the_gray_code_of_every_stripe_is_read():
     stripe = np.arange(2**BITS)[np.newaxis]
     frames = np.stack([(stripe ^ stripe >> 1) >> bit & 1 for bit in reversed(range(BITS))])
-    np.testing.assert_array_equal(engine.decode_gray(frames, 0.5, noise=0.05).stripe, stripe)
+    np.testing.assert_array_equal(decode_gray(frames, 0.5, noise=0.05).stripe, stripe)
 
 
 @pytest.mark.parametrize("noise", [0.0, 5.0])
 def test_a_gray_code_unwraps_the_whole_field(noise):
     true = TURN * 2 ** (BITS - 1) * FIELD
-    fringes = engine.fit_fringes(shown(true, EVEN, noise), EVEN, noise=noise)
-    stripes = engine.decode_gray(coded(noise), fringes.mean, noise=fringes.process["noise"])
-    found = engine.unwrap_gray(fringes, stripes)
+    fringes = fit_fringes(shown(true, EVEN, noise), EVEN, noise=noise)
+    stripes = decode_gray(coded(noise), fringes.mean, noise=fringes.process["noise"])
+    found = unwrap_gray(fringes, stripes)
     assert np.abs(found.phase - true).max() < np.pi
     assert (found.risk <= 1e-3).all()
 
 
 def test_the_risk_of_a_gray_code_is_a_little_more_than_how_often_the_number_is_off():
-    found = engine.decode_gray(coded(14.0), 100, noise=14)
+    found = decode_gray(coded(14.0), 100, noise=14)
     risk, off = found.risk, np.abs(found.stripe - np.floor(2**BITS * FIELD)) > 1
     assert 0.65 * risk.mean() < off.mean() < risk.mean()
     assert off[risk <= 1e-3].mean() < 1e-3
@@ -184,19 +185,19 @@ def test_the_risk_of_a_gray_code_is_a_little_more_than_how_often_the_number_is_o
 
 def test_what_is_missing_is_never_safe():
     gone = np.full((1, 1, 1), np.nan)
-    found = engine.unwrap_frequencies(given(gone, gone), [1])
-    stripes = engine.decode_gray(gone, 1, noise=1)
-    grays = engine.unwrap_gray(*given(gone, gone), stripes)
+    found = unwrap_frequencies(given(gone, gone), [1])
+    stripes = decode_gray(gone, 1, noise=1)
+    grays = unwrap_gray(*given(gone, gone), stripes)
     assert [one.risk.item() for one in (found, stripes, grays)] == [1, 1, 1]
     assert np.isnan(found.phase).all()
 
 
 def test_fringes_of_a_dataset_and_of_a_file_unwrap_as_the_results_do(tmp_path):
     fringes = fitted(1.0)
-    expected = engine.unwrap_frequencies(fringes, RATES)
+    expected = unwrap_frequencies(fringes, RATES)
     path = tmp_path / "fine.h5"
     io.save_result(fringes[2], path)
-    found = engine.unwrap_frequencies([fringes[0], fringes[1].to_xarray(), path], RATES)
+    found = unwrap_frequencies([fringes[0], fringes[1].to_xarray(), path], RATES)
     for name in ("phase", "phase_sigma", "order", "risk"):
         np.testing.assert_array_equal(found[name], expected[name])
     assert found.declaration("phase").unit == found.declaration("phase_sigma").unit == "rad"
@@ -209,21 +210,30 @@ STRIPES = {"stripe": np.ones((1, 1)), "risk": np.ones((1, 1))}
 @pytest.mark.parametrize(
     ("call", "line"),
     [
-        (lambda: engine.fit_fringes(shown(FIELD, EVEN[:3]), EVEN[:3]), "no residual"),
-        (lambda: engine.fit_fringes(shown(FIELD, EVEN[:2]), EVEN[:2]), "Fringes needs at least 3 frames"),
-        (lambda: engine.fit_fringes(shown(FIELD, EVEN), EVEN, noise=-1), "noise -1: a number in counts"),
-        (lambda: engine.fit_fringes(shown(FIELD, EVEN), EVEN, noise=-FIELD), "noise is below 0"),
-        (lambda: engine.fit_fringes(shown(FIELD, EVEN), EVEN, noise=[1, 2]), "noise has shape (2,)"),
-        (lambda: engine.unwrap_frequencies([ONE], [1, 2]), "frequency has shape (2,)"),
-        (lambda: engine.unwrap_frequencies([ONE, ONE], [2, 1]), "coarse to fine"),
-        (lambda: engine.unwrap_frequencies(ONE, [1]), "fringes are a dict: a list of results"),
-        (lambda: engine.unwrap_frequencies([ONE["phase"]], [1]), "fringes[0] has no phase_sigma"),
-        (lambda: engine.unwrap_frequencies([ONE | {"phase": FIELD}], [1]), "give maps of one size"),
-        (lambda: engine.decode_gray(ONE["phase"], 1, noise=1), "frames have shape (1, 1)"),
-        (lambda: engine.decode_gray(ONE["phase"][None], [1, 2], noise=1), "threshold has shape (2,)"),
-        (lambda: engine.unwrap_gray(ONE, ONE), "stripes has no stripe and no risk"),
-        (lambda: engine.unwrap_gray(ONE, {"stripe": FIELD, "risk": FIELD}), "stripes have shape (50, 400)"),
-        (lambda: engine.unwrap_gray(ONE, STRIPES, width=TURN), "at most half a fringe"),
+        (lambda: fit_fringes(shown(FIELD, EVEN[:3]), EVEN[:3]), "no residual"),
+        (
+            lambda: fit_fringes(shown(FIELD, EVEN[:2]), EVEN[:2]),
+            "Fringes needs at least 3 frames",
+        ),
+        (
+            lambda: fit_fringes(shown(FIELD, EVEN), EVEN, noise=-1),
+            "noise -1: a number in counts",
+        ),
+        (lambda: fit_fringes(shown(FIELD, EVEN), EVEN, noise=-FIELD), "noise is below 0"),
+        (lambda: fit_fringes(shown(FIELD, EVEN), EVEN, noise=[1, 2]), "noise has shape (2,)"),
+        (lambda: unwrap_frequencies([ONE], [1, 2]), "frequency has shape (2,)"),
+        (lambda: unwrap_frequencies([ONE, ONE], [2, 1]), "coarse to fine"),
+        (lambda: unwrap_frequencies(ONE, [1]), "fringes are a dict: a list of results"),
+        (lambda: unwrap_frequencies([ONE["phase"]], [1]), "fringes[0] has no phase_sigma"),
+        (lambda: unwrap_frequencies([ONE | {"phase": FIELD}], [1]), "give maps of one size"),
+        (lambda: decode_gray(ONE["phase"], 1, noise=1), "frames have shape (1, 1)"),
+        (lambda: decode_gray(ONE["phase"][None], [1, 2], noise=1), "threshold has shape (2,)"),
+        (lambda: unwrap_gray(ONE, ONE), "stripes has no stripe and no risk"),
+        (
+            lambda: unwrap_gray(ONE, {"stripe": FIELD, "risk": FIELD}),
+            "stripes have shape (50, 400)",
+        ),
+        (lambda: unwrap_gray(ONE, STRIPES, width=TURN), "at most half a fringe"),
     ],
 )
 def test_bad_input_is_one_line(call, line):

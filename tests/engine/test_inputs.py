@@ -68,15 +68,15 @@ def test_everything_is_measured_alike(kind, tmp_path):
 def test_motions_are_estimated_and_touches_stitched_alike(kind, tmp_path):
     first, second = surface(), surface((0.02, -0.01, 0.05), (-0.4, 0.1, 0.02), 1)
     other = given(second, kind, tmp_path)
-    expected, found = (engine.estimate_pose(first, one) for one in (second, other))
+    expected, found = (engine.pose.estimate_pose(first, one) for one in (second, other))
     np.testing.assert_allclose(found.translation, expected.translation, atol=1e-7)
     np.testing.assert_allclose(found.sigma, expected.sigma, rtol=1e-4)
-    trackers = [engine.PoseTracker() for _ in range(2)]
+    trackers = [engine.pose.PoseTracker() for _ in range(2)]
     for tracker in trackers:
         tracker.push(first)
     expected, found = (tracker.push(one) for tracker, one in zip(trackers, (second, other), strict=True))
     np.testing.assert_allclose(found.translation, expected.translation, atol=1e-7)
-    whole, together = (engine.stitch([first, one]).result for one in (second, other))
+    whole, together = (engine.pose.stitch([first, one]).result for one in (second, other))
     np.testing.assert_allclose(together.height, whole.height, atol=1e-6)
     assert together.process["touch_1"] == (str(other) if kind == "file" else "result 1")
 

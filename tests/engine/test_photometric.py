@@ -7,6 +7,7 @@ import pytest
 from stacks import MadeUp
 
 from mirrorskin import engine, io
+from mirrorskin.engine.photometric import PhotometricStereo, photometric_stereo
 
 AZIMUTH = np.arange(12) * 2 * np.pi / 12
 ROW, COLUMN = np.mgrid[1:-1:60j, -1:1:60j]
@@ -45,14 +46,14 @@ def bound(lamps):
 
 @pytest.mark.parametrize("lamps", [round_lamps(0.3), LAMPS], ids=["round", "anywhere"])
 def test_a_ball_is_exact_without_noise(lamps):
-    found = engine.photometric_stereo(lit(lamps), light=lamps)
+    found = photometric_stereo(lit(lamps), light=lamps)
     np.testing.assert_allclose(found.normals[INSIDE], BALL[INSIDE], atol=2e-6)
     np.testing.assert_allclose(found.albedo[INSIDE], ALBEDO[INSIDE], rtol=2e-6)
 
 
 def test_shadows_and_highlights_are_left_out():
     frames = lit(round_lamps(1.0), "uint8", dark=160.0)  # to 300 counts
-    found = engine.photometric_stereo(frames, light=round_lamps(1.0), dark=160)
+    found = photometric_stereo(frames, light=round_lamps(1.0), dark=160)
     known = INSIDE & (found.samples > 4)
     assert known.mean() > 0.5
     assert (found.samples[known] < 12).mean() > 0.6
@@ -60,8 +61,8 @@ def test_shadows_and_highlights_are_left_out():
 
 
 def test_too_few_lamps_are_no_answer():
-    found = engine.photometric_stereo(lit(LAMPS[:2]), light=LAMPS[:2], noise=1)
-    flat = engine.photometric_stereo(lit(LAMPS[[0, 1, 0, 1]]), light=LAMPS[[0, 1, 0, 1]])
+    found = photometric_stereo(lit(LAMPS[:2]), light=LAMPS[:2], noise=1)
+    flat = photometric_stereo(lit(LAMPS[[0, 1, 0, 1]]), light=LAMPS[[0, 1, 0, 1]])
     assert np.isnan([found.normals, flat.normals]).all()
 
 
@@ -69,7 +70,7 @@ def test_the_standard_error_is_the_cramer_rao_bound():
     lamps = round_lamps(0.3)
     lamps = lamps * np.linspace(0.5, 1.5, 12)[:, None]
     lit_by_all = np.all(np.einsum("hwk,tk->thw", BALL, lamps) > 0, axis=0)[INSIDE]
-    found = engine.photometric_stereo(lit(lamps), light=lamps, noise=2)
+    found = photometric_stereo(lit(lamps), light=lamps, noise=2)
     np.testing.assert_allclose(
         found.normals_sigma[INSIDE][lit_by_all], 2 * bound(lamps)[lit_by_all], rtol=1e-4
     )
@@ -77,7 +78,7 @@ def test_the_standard_error_is_the_cramer_rao_bound():
 
 def test_the_standard_errors_are_the_scatter():
     lamps = round_lamps(0.5)
-    found = engine.photometric_stereo(lit(lamps, noise=0.5), light=lamps, shadow=2)
+    found = photometric_stereo(lit(lamps, noise=0.5), light=lamps, shadow=2)
     assert found.process["noise"] == pytest.approx(0.5, rel=0.03)
     assert np.mean((angle(found.normals) / found.normals_sigma[INSIDE]) ** 2) == pytest.approx(1, abs=0.07)
     error = (found.albedo - ALBEDO)[INSIDE] / found.albedo_sigma[INSIDE]
@@ -88,15 +89,15 @@ def test_a_lamp_that_goes_round_is_the_correlation_of_a_rotation():
     frames = lit(round_lamps(0.3), noise=0.5) + 30  # nowhere dark
     wave = engine.correlate(frames, AZIMUTH)
     vector = np.dstack([wave.cosine / np.sin(0.3), wave.sine / np.sin(0.3), wave.mean / np.cos(0.3)])
-    found = engine.photometric_stereo(frames, AZIMUTH, zenith=0.3)
+    found = photometric_stereo(frames, AZIMUTH, zenith=0.3)
     np.testing.assert_allclose(found.normals * found.albedo[..., None], vector, atol=2e-3)
     np.testing.assert_allclose(found.residual, wave.residual, rtol=1e-3)
 
 
 def test_frames_that_come_one_by_one_give_the_same():
     frames, lamps = lit(round_lamps(0.4), "uint8", 2), round_lamps(0.4)
-    whole = engine.photometric_stereo(frames, light=lamps, shadow=8)
-    stereo = engine.PhotometricStereo(light=lamps, shadow=8)
+    whole = photometric_stereo(frames, light=lamps, shadow=8)
+    stereo = PhotometricStereo(light=lamps, shadow=8)
     stereo.push(frames[:5])
     result = engine.run(list(frames), stereo)  # which resets it
     np.testing.assert_array_equal(result.normals, whole.normals)
@@ -106,7 +107,7 @@ def test_frames_that_come_one_by_one_give_the_same():
 
 
 def test_a_lamp_is_needed_for_each_frame_and_no_more():
-    stereo = engine.PhotometricStereo(light=LAMPS)
+    stereo = PhotometricStereo(light=LAMPS)
     stereo.push(FRAMES[:6])
     assert np.isfinite(stereo.result().normals[INSIDE]).any()
     with pytest.raises(io.InputError, match="light has 8 vectors: one is needed for each of 6 frames"):
@@ -119,8 +120,8 @@ def test_the_dark_level_is_that_of_the_recording():
     frames = lit(round_lamps(0.3), dark=20.0)
     header = io.Header("axial", dark=np.full(ROW.shape, 20, np.float32))
     source = MadeUp(frames, header, phase=AZIMUTH)
-    found = engine.run(source, engine.PhotometricStereo(zenith=0.3))
-    expected = engine.photometric_stereo(frames, AZIMUTH, zenith=0.3, dark=20.0)
+    found = engine.run(source, PhotometricStereo(zenith=0.3))
+    expected = photometric_stereo(frames, AZIMUTH, zenith=0.3, dark=20.0)
     np.testing.assert_array_equal(found.normals, expected.normals)
 
 
@@ -145,11 +146,11 @@ FRAMES = lit(LAMPS)
 )
 def test_bad_input_is_one_line(arguments, line):
     with pytest.raises(io.InputError, match=re.escape(line)):
-        engine.photometric_stereo(FRAMES, **arguments)
+        photometric_stereo(FRAMES, **arguments)
 
 
 @pytest.mark.parametrize("azimuth", [[0, np.pi, 0, np.pi], np.pi / 2 * np.array([1, -1, 1, -1])])
 def test_lamps_in_a_plane_determine_no_normal(azimuth):
-    found = engine.photometric_stereo(lit(round_lamps(0.6, np.array(azimuth))), azimuth, zenith=0.6, noise=1)
+    found = photometric_stereo(lit(round_lamps(0.6, np.array(azimuth))), azimuth, zenith=0.6, noise=1)
     assert np.isnan(found.normals).all()
     assert np.isnan(found.normals_sigma).all()

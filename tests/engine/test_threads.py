@@ -250,7 +250,7 @@ def test_threads_that_integrate_at_once_get_what_each_gets_alone():
     assert found == alone * 3
 
 
-@pytest.mark.parametrize("kind", [engine.Onset, engine.Strokes])
+@pytest.mark.parametrize("kind", [engine.Onset, engine.press.Strokes])
 def test_an_operation_that_refuses_frames_goes_on_as_if_they_had_not_come(kind):
     frames, travel = operations.PRESS, operations.TRAVEL
     search, whole = kind(), kind()

@@ -85,7 +85,7 @@ def normal_maps(found: io.Result) -> Answer:
     }
 
 
-def surface_maps(found: engine.Surface) -> Answer:
+def surface_maps(found: engine.integration.Surface) -> Answer:
     """Return what an integration tells; how many rounds it took is its own affair."""
     return {
         "height": found.height,
@@ -383,7 +383,7 @@ def correlate_a_sliding_window() -> Answer:
 def fit_fringes() -> Answer:
     answers = {}
     for dtype in LEVELS:
-        found = engine.fit_fringes(turn(dtype, SMALL, UNEVEN)[0], UNEVEN)
+        found = engine.fringes.fit_fringes(turn(dtype, SMALL, UNEVEN)[0], UNEVEN)
         answers[dtype] = {
             **{name: found[name] for name in ("phase", "mean", "modulation", "residual")},
             "sigma": found.phase_sigma,
@@ -398,7 +398,7 @@ def find_focus() -> Answer:
     sharp = np.exp(-((travel[:, None, None] + 2 * dome(SMALL)[0] - 0.6) ** 2))
     answers = {}
     for dtype in LEVELS:
-        found = engine.find_focus(counted(texture * sharp, dtype), travel, noise=0.01)
+        found = engine.focus.find_focus(counted(texture * sharp, dtype), travel, noise=0.01)
         answers[dtype] = {
             name: getattr(found, name) for name in ("height", "height_sigma", "status", "sharpness")
         }
@@ -415,7 +415,7 @@ def photometric_stereo() -> Answer:
     share += np.random.default_rng(4).normal(0, 0.01, share.shape)
     answers = {}
     for dtype, (dark, _) in LEVELS.items():
-        found = engine.photometric_stereo(counted(share, dtype), light=light, dark=dark)
+        found = engine.photometric.photometric_stereo(counted(share, dtype), light=light, dark=dark)
         answers[dtype] = {name: {**found, **found.process}[name] for name in known}
     return named(**answers)
 

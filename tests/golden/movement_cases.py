@@ -12,6 +12,7 @@ from scenes import LEVELS, PIXEL, counted, dome, places
 from speckle import Speckle
 
 from mirrorskin import engine
+from mirrorskin.engine import force, pose, press, slip
 
 MOVED: Tolerance = (1e-3, 1e-5)  # mm: a thousandth of a pixel, where Gauss-Newton steps end
 POSE: Tolerance = (1e-3, 2e-6)  # radians and mm
@@ -40,7 +41,7 @@ def stroke_search() -> Answer:
         dark, bright = LEVELS[dtype]
         found = {}
         for event in ("onset", "release"):
-            search = engine.Strokes(event=event, dark=dark, bright=bright)
+            search = press.Strokes(event=event, dark=dark, bright=bright)
             for part in np.split(np.arange(len(frames)), [1, 17, 30]):
                 search.push(frames[part], travel=travel[part])
             found[event] = search.result()
@@ -60,8 +61,8 @@ def stroke_search() -> Answer:
 @case(FORCE)
 def find_force() -> Answer:
     height = np.where(np.hypot(*places((40, 52))) < 1.1, dome((40, 52), 0.4)[0], np.nan)
-    found = engine.find_force(height, 0.2, PIXEL, 0.1, sigma=0.002, travel_sigma=0.005, modulus_sigma=0.001)
-    soft = engine.find_force(height, 0.2, PIXEL, 0.1, compliance=0.02)
+    found = force.find_force(height, 0.2, PIXEL, 0.1, sigma=0.002, travel_sigma=0.005, modulus_sigma=0.001)
+    soft = force.find_force(height, 0.2, PIXEL, 0.1, compliance=0.02)
     return {
         "pressure": found.pressure,
         "contact": found.contact != 0,
@@ -75,7 +76,7 @@ def find_tangential_force() -> Answer:
     contact = np.hypot(x - 0.1, y) < 0.7
     shift = np.stack([0.05 - 0.02 * np.hypot(x, y) ** 2, 0.01 * x * y], axis=-1)
     shift += np.random.default_rng(3).normal(0, 5e-4, shift.shape)
-    found = engine.find_tangential_force(
+    found = force.find_tangential_force(
         shift, PIXEL, 0.1, contact=contact, sigma=5e-4, window_size=4, modulus_sigma=0.001
     )
     return {
@@ -150,7 +151,7 @@ def find_displacement() -> Answer:
     for dtype in ("uint8", "float32"):
         frames = np.stack([drift(k) for k in range(4)])
         frames = frames if dtype == "float32" else np.clip(frames.round(), 0, 255).astype(dtype)
-        found = engine.find_displacement(frames[0], frames[1:], PIXEL, window_size=12, window_step=4)
+        found = slip.find_displacement(frames[0], frames[1:], PIXEL, window_size=12, window_step=4)
         answers |= {
             f"{dtype}.displacement": found.displacement[:, ::3, ::3],
             f"{dtype}.sigma": found.displacement_sigma[0, ::3, ::3],
@@ -166,7 +167,7 @@ def slip_search() -> Answer:
     x, y = np.meshgrid(np.arange(72) - 36, np.arange(64) - 32)
     contact = np.hypot(x, y) < 26
     for motion, position in (("horizontal", "displacement"), ("twist", "twist")):
-        search = engine.Slip(pixel_size=PIXEL, motion=motion, contact=contact)
+        search = slip.Slip(pixel_size=PIXEL, motion=motion, contact=contact)
         for k in range(12):
             search.push(slipping(motion, k)[None], **{position: places_of(motion, k)})
         found = search.result()
@@ -215,7 +216,7 @@ def estimate_pose() -> Answer:
             sampled(form, *way, rng=random)
             for way in (((0, 0, 0), (0, 0, 0)), ((0.02, -0.03, 0.1), (0.1, -0.05, 0.02)))
         ]
-        pose = engine.estimate_pose(*pair)
+        pose = pose.estimate_pose(*pair)
         answers |= {
             f"{form.__name__}.rotation": pose.rotation,
             f"{form.__name__}.translation": pose.translation,
@@ -228,7 +229,7 @@ def estimate_pose() -> Answer:
 
 @case(POSE)
 def pose_tracker() -> Answer:
-    random, tracker = np.random.default_rng(2), engine.PoseTracker()
+    random, tracker = np.random.default_rng(2), pose.PoseTracker()
     found = [
         tracker.push(sampled(bumpy, (0, 0, 0.03 * k), (0.15 * k, 0.03 * k, 0), rng=random)) for k in range(12)
     ]

@@ -56,7 +56,7 @@ def reference(frames, pose, weights, gain):
 def test_kernel_and_reference_agree(device, name, dtype, pressed):
     frames, pose = made_frames(POSES[name], dtype, pressed=pressed)
     weights = np.random.default_rng(1).uniform(0.5, 2, COUNT)
-    operation = engine.MovingNormals(
+    operation = engine.rotation.MovingNormals(
         zenith_gain=GAINS[dtype], zenith_offset=OFFSET, noise=NOISE, device=device
     )
     operation.push(frames[:, np.newaxis], pose=pose, frame_weights=weights)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mirrorskin.engine import Pose
+from mirrorskin.engine.pose import Pose
 from mirrorskin.io import Result, pixel_axes
 
 Map = NDArray[np.float64]

@@ -14,6 +14,8 @@ from stacks import MadeUp
 from suite.scenes import SCALES, TILT
 
 from mirrorskin import engine
+from mirrorskin.engine.fringes import Fringes, fit_fringes
+from mirrorskin.engine.photometric import PhotometricStereo, photometric_stereo
 from mirrorskin.engine.press.growth import Growth
 from mirrorskin.engine.press.levels import Levels
 from mirrorskin.engine.rotation.last_turn import LastTurn
@@ -87,13 +89,13 @@ CASES = {
         engine.Onset, PRESS, ON_TRAVEL, {**LEVELS, "dark_sigma": 1.0, "bright_sigma": 2.0}, engine.find_onset
     ),
     "Levels": Case(Levels, PRESS, ON_TRAVEL, {"thresholds": [0.3, 0.7], "inclinations": [0.2, 0.4]}),
-    "Strokes": Case(engine.Strokes, PRESS, {"travel": STROKES}),
+    "Strokes": Case(engine.press.Strokes, PRESS, {"travel": STROKES}),
     "ChangePoint": Case(engine.ChangePoint, PRESS, ON_TRAVEL, LEVELS, engine.find_change_point),
     "ChangePoint between unknown levels": Case(
         engine.ChangePoint, PRESS, ON_TRAVEL, function=engine.find_change_point
     ),
-    "Growth": Case(Growth, PRESS, {"travel": DITHER}, LEVELS, engine.find_growth),
-    "Focus": Case(engine.Focus, PRESS, ON_TRAVEL, {"noise": 2.0}, engine.find_focus),
+    "Growth": Case(Growth, PRESS, {"travel": DITHER}, LEVELS, engine.press.find_growth),
+    "Focus": Case(engine.focus.Focus, PRESS, ON_TRAVEL, {"noise": 2.0}, engine.focus.find_focus),
     "Correlate": Case(engine.Correlate, TURNS, ON_PHASE, {}, engine.correlate, **ROTATION),
     "Correlate of a window": Case(
         engine.Correlate, TURNS, ON_PHASE, {"window_frames": 8}, engine.correlate, **ROTATION
@@ -112,16 +114,16 @@ CASES = {
         LastTurn, TURNS, ON_PHASE, {"tilt": TILT, "window_frames": 8, **SENSOR}, **ROTATION
     ),
     "MovingNormals": Case(
-        engine.MovingNormals, ROCKED, {"pose": body_axes(0 * LEAN, LEAN)},
+        engine.rotation.MovingNormals, ROCKED, {"pose": body_axes(0 * LEAN, LEAN)},
         {"zenith_gain": 400.0, "noise": 1.0}, **ROTATION,
     ),
     "Slip": Case(
-        engine.Slip, SKIN, {"displacement": SLIDE},
+        engine.slip.Slip, SKIN, {"displacement": SLIDE},
         {"pixel_size": PIXEL, "contact": np.ones(SKIN.shape[1:])}, motion="horizontal",
     ),
-    "Fringes": Case(engine.Fringes, TURNS, ON_PHASE, {}, engine.fit_fringes, **ROTATION),
+    "Fringes": Case(Fringes, TURNS, ON_PHASE, {}, fit_fringes, **ROTATION),
     "PhotometricStereo": Case(
-        engine.PhotometricStereo, TURNS, {}, {"light": LAMPS}, engine.photometric_stereo, **ROTATION
+        PhotometricStereo, TURNS, {}, {"light": LAMPS}, photometric_stereo, **ROTATION
     ),
 }  # fmt: skip
 CUTS = {

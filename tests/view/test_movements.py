@@ -45,7 +45,7 @@ def test_slip_without_truth_is_refused() -> None:
 def followed(first: io.Result) -> view.Followed:
     vector, shift, error = np.array([0.1, 0.2, -0.3]), np.array([1.0, 2.0, 0.5]), np.array([0.01, 0.0, -0.02])
     turn = Rotation.from_rotvec(error)
-    found = engine.Pose(
+    found = engine.pose.Pose(
         rotation=(turn * Rotation.from_rotvec(vector)).as_rotvec(),
         translation=turn.apply(shift) + np.array([0.03, 0.02, 0.01]),
         covariance=np.diag(np.arange(1.0, 7.0) ** 2),

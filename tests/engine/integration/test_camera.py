@@ -9,7 +9,7 @@ from mirrorskin import engine, io
 
 SHAPE = 61, 96
 FOCAL, POINT = (50.0, 40.0), (51.0, 27.5)  # the corners are seen at 47 to 54 degrees from the axis
-CAMERA = engine.Camera(FOCAL, POINT)
+CAMERA = engine.integration.Camera(FOCAL, POINT)
 
 
 def rays(shape=SHAPE, focal=FOCAL, point=POINT):
@@ -33,7 +33,7 @@ def sphere(centre, radius, scale=1):
     depth = (along - np.sqrt(np.where(root > 0, root, np.nan))) / square
     normals = (seen * depth[..., np.newaxis] - centre) / radius
     slant = -np.sum(normals * seen, axis=-1) / np.sqrt(square)
-    return depth, normals, slant > 0.3, engine.Camera(tuple(focal), tuple(point))
+    return depth, normals, slant > 0.3, engine.integration.Camera(tuple(focal), tuple(point))
 
 
 def apart(found, depth, mask):
@@ -46,7 +46,7 @@ def apart(found, depth, mask):
 def test_planes_are_exact_at_oblique_rays(device, normal):
     shape, focal = (244, 384), (200.0, 160.0)
     depth, normals = plane(normal, 300.0, shape=shape, focal=focal, point=(204.0, 110.0))
-    camera = engine.Camera(focal, (204.0, 110.0))
+    camera = engine.integration.Camera(focal, (204.0, 110.0))
     found = engine.integrate(normals=normals, camera=camera, device=device)
     assert apart(found.height, depth, np.ones(shape, bool)) < 2e-6
     assert np.mean(np.log(found.height)) == pytest.approx(0, abs=1e-6)
@@ -133,4 +133,4 @@ def test_bad_input_is_refused_in_one_line(message):
 @pytest.mark.parametrize("numbers", [(0,), (np.nan,), ((1, 2, 3),), (5, (1,)), (5, (1, np.inf))])
 def test_numbers_that_are_no_camera_s_are_refused(numbers):
     with pytest.raises(io.InputError, match=r"focal length|principal point"):
-        engine.Camera(*numbers)
+        engine.integration.Camera(*numbers)

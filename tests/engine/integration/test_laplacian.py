@@ -31,7 +31,7 @@ def matrix(right, down, diagonal):
 
 def test_it_solves_what_sparse_elimination_does(device):
     held = HELD + 1e-3 * (RIGHT.mean())
-    inverse = engine.invert_laplacian(RIGHT, DOWN, held, device=device)
+    inverse = engine.integration.invert_laplacian(RIGHT, DOWN, held, device=device)
     exact = algebra.spsolve(matrix(RIGHT, DOWN, held), SOURCE.ravel())
     found = inverse @ SOURCE.ravel()
     assert inverse.shape == (exact.size, exact.size)
@@ -40,7 +40,7 @@ def test_it_solves_what_sparse_elimination_does(device):
 
 def test_a_singular_one_is_inverted_where_it_can_be():
     held = np.where(np.indices(SHAPE)[1] > 40, HELD, 0.0)  # the left component and lone pixels have none
-    inverse = engine.invert_laplacian(RIGHT, DOWN, held)
+    inverse = engine.integration.invert_laplacian(RIGHT, DOWN, held)
     found, a = inverse @ SOURCE.ravel(), matrix(RIGHT, DOWN, held)
     count, label = sparse.csgraph.connected_components(a)
     source = SOURCE.ravel().copy()
@@ -57,7 +57,7 @@ def test_one_cycle_is_a_preconditioner():
     held = HELD + 1e-2
     a, cycle, steps = (
         matrix(RIGHT, DOWN, held),
-        engine.invert_laplacian(RIGHT, DOWN, held, tolerance=None),
+        engine.integration.invert_laplacian(RIGHT, DOWN, held, tolerance=None),
         [],
     )
     u, v = np.random.default_rng(5).normal(size=(2, held.size))
@@ -71,7 +71,7 @@ def test_one_cycle_is_a_preconditioner():
 
 def test_a_solver_in_float64_needs_few_steps_with_it():
     a, steps = matrix(RIGHT, DOWN, HELD + 1e-2), []
-    inverse = engine.invert_laplacian(RIGHT, DOWN, HELD + 1e-2)
+    inverse = engine.integration.invert_laplacian(RIGHT, DOWN, HELD + 1e-2)
     found, told = algebra.cg(a, SOURCE.ravel(), M=inverse, rtol=1e-12, callback=steps.append)
     assert told == 0
     assert len(steps) <= 4
@@ -93,8 +93,8 @@ BAD = {
 @pytest.mark.parametrize("message", BAD)
 def test_bad_input_is_refused_in_one_line(message):
     with pytest.raises(io.InputError) as error:
-        engine.invert_laplacian(*BAD[message])
+        engine.integration.invert_laplacian(*BAD[message])
     assert message in str(error.value)
     assert "\n" not in str(error.value)
     with pytest.raises(io.InputError, match="no numbers"):
-        engine.invert_laplacian(*ONES) @ np.full(12, np.nan)
+        engine.integration.invert_laplacian(*ONES) @ np.full(12, np.nan)

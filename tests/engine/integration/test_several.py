@@ -90,7 +90,7 @@ def test_a_product_with_a_matrix_is_one_with_its_columns(device):
     right, down, held = np.ones((9, 10)), np.ones((8, 11)), np.full((9, 11), 0.1)
     columns = RANDOM.normal(size=(99, 5)) * [1, 1e-6, 1e6, 0, 1]
     for tolerance in (1e-6, None):
-        inverse = engine.invert_laplacian(right, down, held, tolerance=tolerance, device=device)
+        inverse = engine.integration.invert_laplacian(right, down, held, tolerance=tolerance, device=device)
         found = inverse @ columns
         for column, answer in zip(columns.T, found.T, strict=True):
             np.testing.assert_allclose(answer, inverse @ column, atol=1e-5 * np.abs(answer).max())

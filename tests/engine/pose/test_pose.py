@@ -24,7 +24,7 @@ def mean_chi_square(draws: int, shape: tuple[int, int]) -> float:
         rng = np.random.default_rng(seed)
         vector, shift = draw(rng)
         pair = (sampled(bumpy, *way, rng=rng, shape=shape) for way in ((), (vector, shift)))
-        pose = engine.estimate_pose(*pair)
+        pose = engine.pose.estimate_pose(*pair)
         error = error_of(pose, vector, shift)
         found.append(error @ np.linalg.solve(pose.covariance, error) / 6)
     return float(np.mean(found))
@@ -44,7 +44,7 @@ def test_errors_of_many_draws_are_as_large_as_the_covariance_says() -> None:
 def test_what_a_surface_cannot_tell_is_undetermined(form, free: int, size: float) -> None:
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        pose = engine.estimate_pose(sampled(form, rng=rng), sampled(form, *draw(rng, size), rng=rng))
+        pose = engine.pose.estimate_pose(sampled(form, rng=rng), sampled(form, *draw(rng, size), rng=rng))
         assert len(pose.undetermined) == free
         assert np.isfinite(pose.rotation).all()
         assert np.isinf(pose.sigma).any() == (free > 0)
@@ -56,15 +56,15 @@ def test_a_ball_is_known_by_its_centre_alone() -> None:
     for seed in range(30):
         rng = np.random.default_rng(seed)
         vector, shift = draw(rng)
-        pose = engine.estimate_pose(sampled(ball, rng=rng), sampled(ball, vector, shift, rng=rng))
-        wanted = engine.Pose(vector, shift, *[None] * 4).apply(centre)
+        pose = engine.pose.estimate_pose(sampled(ball, rng=rng), sampled(ball, vector, shift, rng=rng))
+        wanted = engine.pose.Pose(vector, shift, *[None] * 4).apply(centre)
         found.append(error_at(pose, centre, wanted, np.eye(3)))
     assert np.mean(found) == pytest.approx(1.0, abs=0.4)
 
 
 def test_nothing_moves_where_nothing_is_known_to() -> None:
     rng = np.random.default_rng(0)
-    pose = engine.estimate_pose(sampled(ball, rng=rng), sampled(ball, (0, 0, 0.8), rng=rng))
+    pose = engine.pose.estimate_pose(sampled(ball, rng=rng), sampled(ball, (0, 0, 0.8), rng=rng))
     np.testing.assert_allclose(pose.rotation, 0, atol=2e-3)
     np.testing.assert_allclose(pose.translation, 0, atol=5e-3)
 
@@ -72,7 +72,7 @@ def test_nothing_moves_where_nothing_is_known_to() -> None:
 def test_large_motions_are_found_from_nothing() -> None:
     rng = np.random.default_rng(1)
     vector, shift = np.array([0.05, -0.1, 1.7]), np.array([0.6, -0.4, 0.1])
-    pose = engine.estimate_pose(sampled(bumpy, rng=rng), sampled(bumpy, vector, shift, rng=rng))
+    pose = engine.pose.estimate_pose(sampled(bumpy, rng=rng), sampled(bumpy, vector, shift, rng=rng))
     assert np.abs(error_of(pose, vector, shift)).max() < 0.005
     assert pose.chi_square == pytest.approx(1, abs=0.1)
 
@@ -80,7 +80,7 @@ def test_large_motions_are_found_from_nothing() -> None:
 def test_a_motion_that_leaves_little_in_common_is_found_and_no_other() -> None:
     rng = np.random.default_rng(0)
     pair = (sampled(bumpy, (0, 0, 0), shift, rng=rng, shape=(40, 50)) for shift in ((0, 0, 0), (1.5, 0, 0)))
-    pose = engine.estimate_pose(*pair)
+    pose = engine.pose.estimate_pose(*pair)
     assert pose.chi_square < 1.2
     np.testing.assert_allclose(pose.rotation, 0, atol=0.01)
     np.testing.assert_allclose(pose.translation, (1.5, 0, 0), atol=0.01)
@@ -90,16 +90,16 @@ def test_a_start_leads_to_the_same_motion() -> None:
     rng = np.random.default_rng(2)
     vector, shift = np.array([0.05, -0.1, 1.7]), np.array([0.6, -0.4, 0.1])
     pair = sampled(bumpy, rng=rng), sampled(bumpy, vector, shift, rng=rng)
-    near = dataclasses.replace(engine.estimate_pose(*pair), rotation=vector, translation=shift)
-    pose = engine.estimate_pose(*pair, start=near)
-    np.testing.assert_allclose(pose.rotation, engine.estimate_pose(*pair).rotation, atol=1e-4)
+    near = dataclasses.replace(engine.pose.estimate_pose(*pair), rotation=vector, translation=shift)
+    pose = engine.pose.estimate_pose(*pair, start=near)
+    np.testing.assert_allclose(pose.rotation, engine.pose.estimate_pose(*pair).rotation, atol=1e-4)
 
 
 def test_heights_alone_are_enough() -> None:
     rng = np.random.default_rng(3)
     vector, shift = draw(rng)
     pair = [sampled(bumpy, *way, rng=rng) for way in ((), (vector, shift))]
-    pose = engine.estimate_pose(*(one.assign(normals=None, normals_sigma=None) for one in pair))
+    pose = engine.pose.estimate_pose(*(one.assign(normals=None, normals_sigma=None) for one in pair))
     assert np.abs(error_of(pose, vector, shift)).max() < 0.005
 
 
@@ -110,7 +110,7 @@ def test_integrated_heights_leave_z_open() -> None:
         made = sampled(bumpy, *way, rng=rng)
         pieces = np.zeros(made.height.shape, np.int32), np.ones(1, np.uint8)
         pair.append(made.assign(component=pieces[0], offset_unknown=pieces[1]))
-    (free,) = engine.estimate_pose(*pair).undetermined
+    (free,) = engine.pose.estimate_pose(*pair).undetermined
     np.testing.assert_allclose(np.abs(free), [0, 0, 0, 0, 0, 1], atol=1e-6)
 
 
@@ -125,7 +125,7 @@ def test_pixels_near_the_border_of_contact_do_not_count() -> None:
         normals = made.normals.copy()
         normals[:, 28:36, 0] += 0.2
         pair.append(made.assign(contact=contact, normals=normals))
-    pose = engine.estimate_pose(*pair)
+    pose = engine.pose.estimate_pose(*pair)
     assert pose.chi_square == pytest.approx(1, abs=0.1)
     assert np.abs(error_of(pose, vector, shift)).max() < 0.005
 
@@ -143,7 +143,7 @@ def test_errors_on_results_from_frames_are_as_large_as_the_covariance_says(
             thing = make_object(name, (128, 128), (0.07, 0.07))
             before, deep = turned(thing, seed)
             after, deep_after = turned(Moved(thing, shift, angle), seed + 100)
-            pose = engine.estimate_pose(before, after)
+            pose = engine.pose.estimate_pose(before, after)
             assert len(pose.undetermined) == free
             point, wanted = np.array([0, 0, top + deep]), np.array([*shift, top + deep_after])
             ways = np.eye(3)[:2]
@@ -174,4 +174,4 @@ def refusals() -> dict[str, tuple[io.Result, io.Result, str]]:
 def test_what_cannot_be_compared_is_refused(name: str) -> None:
     first, second, said = refusals()[name]
     with pytest.raises(io.InputError, match=said):
-        engine.estimate_pose(first, second)
+        engine.pose.estimate_pose(first, second)

@@ -22,7 +22,7 @@ def touches(seed=0, moves=MOVES, **known):
 
 @pytest.fixture(scope="module")
 def whole():
-    return engine.stitch(touches())
+    return engine.pose.stitch(touches())
 
 
 def errors(result):
@@ -78,7 +78,7 @@ def test_a_touch_of_unknown_offset_takes_that_of_the_others():
         y=second.y,
         **relative,
     )
-    found = engine.stitch([first, shifted]).result
+    found = engine.pose.stitch([first, shifted]).result
     assert np.sqrt(np.nanmean(errors(found) ** 2)) < 2e-3
     assert found.offset_unknown is None
 
@@ -97,7 +97,7 @@ def test_the_offset_and_the_pose_of_a_levelled_touch_are_in_its_sigma(relative):
             component=np.zeros((60, 70), np.int32),
             offset_unknown=np.ones(1, np.uint8),
         )
-        found = engine.stitch(pair).result
+        found = engine.pose.stitch(pair).result
         error = errors(found) - (0.4 if relative == 0 else 0)  # heights are the first touch's
         squares.append(np.nanmean((error / found.height_sigma) ** 2))
     assert 0.5 < np.mean(squares) < 1.5
@@ -115,7 +115,7 @@ def test_touches_that_differ_say_so():
         x=second.x,
         y=second.y,
     )
-    found = engine.stitch([first, other]).result
+    found = engine.pose.stitch([first, other]).result
     assert (found.status[21:29, 31:39] == 2).all()
     assert (found.height_sigma[21:29, 31:39] > 0.005).all()
     assert (found.status == 2).sum() < 130
@@ -124,12 +124,12 @@ def test_touches_that_differ_say_so():
 def test_what_shares_nothing_is_refused_by_name():
     far = sampled(lambda x, y: bumpy(x + 40.0, 3 * y), rng=np.random.default_rng(1))
     with pytest.raises(io.InputError, match=r"other\.h5 shares too little"):
-        engine.stitch([touches()[0], far], names=["one.h5", "other.h5"])
+        engine.pose.stitch([touches()[0], far], names=["one.h5", "other.h5"])
 
 
 def test_a_single_result_is_refused():
     with pytest.raises(io.InputError, match="two or more"):
-        engine.stitch(touches(moves=MOVES[:1]))
+        engine.pose.stitch(touches(moves=MOVES[:1]))
 
 
 def test_heights_without_sigma_are_refused_by_name():
@@ -142,4 +142,4 @@ def test_heights_without_sigma_are_refused_by_name():
         y=second.y,
     )
     with pytest.raises(io.InputError, match=r"two\.h5 has no height_sigma"):
-        engine.stitch([first, bare], names=["one.h5", "two.h5"])
+        engine.pose.stitch([first, bare], names=["one.h5", "two.h5"])

@@ -10,7 +10,7 @@ from mirrorskin import engine, io
 
 
 def test_a_stream_is_followed_over_keys_with_honest_errors() -> None:
-    rng, tracker = np.random.default_rng(0), engine.PoseTracker()
+    rng, tracker = np.random.default_rng(0), engine.pose.PoseTracker()
     for number in range(24):
         vector, shift = np.array([0, 0, 0.02 * number]), np.array([0.1 * number, 0.02 * number, 0])
         pose = tracker.push(sampled(bumpy, vector, shift, rng=rng))
@@ -21,7 +21,7 @@ def test_a_stream_is_followed_over_keys_with_honest_errors() -> None:
 
 
 def test_a_result_that_shares_nothing_is_refused() -> None:
-    rng, tracker = np.random.default_rng(1), engine.PoseTracker()
+    rng, tracker = np.random.default_rng(1), engine.pose.PoseTracker()
     tracker.push(sampled(bumpy, rng=rng))
     with pytest.raises(io.InputError, match="share too few pixels"):
         tracker.push(sampled(bumpy, shift=(50, 0, 0), rng=rng))

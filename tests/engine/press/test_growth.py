@@ -23,7 +23,7 @@ def test_a_disc_grows_as_hertz_says():
     x, y = io.pixel_axes((SIZE, SIZE), (PIXEL, PIXEL))
     square = x**2 + y[:, np.newaxis] ** 2
     frames = np.where(square <= RADIUS * DITHER[:, np.newaxis, np.newaxis], 220, 20).astype(np.uint8)
-    found = engine.find_growth(frames, DITHER, dark=20, bright=220, pixel_size=(PIXEL, PIXEL))
+    found = engine.press.find_growth(frames, DITHER, dark=20, bright=220, pixel_size=(PIXEL, PIXEL))
     assert (found.process["travel"], found.process["travel_amplitude"]) == pytest.approx(
         (DEPTH, SWING), rel=1e-3
     )
@@ -63,7 +63,7 @@ def light_border(depth, slope):
 def test_the_light_of_the_elastic_twin_grows_as_the_surface_around_a_ball(elastic):
     frames = elastic.read(np.empty(elastic.shape, elastic.dtype)).frames
     dark, bright = elastic.header.dark, elastic.header.bright
-    found = engine.find_growth(frames, DITHER, dark=dark, bright=bright, pixel_size=(PIXEL, PIXEL))
+    found = engine.press.find_growth(frames, DITHER, dark=dark, bright=bright, pixel_size=(PIXEL, PIXEL))
     light = np.sum((frames.astype(float) - dark) / (bright - dark), axis=(1, 2)) * PIXEL**2
     assert found.process["area_growth"] == pytest.approx(np.polyfit(DITHER - DEPTH, light, 2)[1], rel=0.01)
     # Half the light is at the slope of the inner border, which lies on the ball itself.
@@ -80,7 +80,7 @@ def test_it_is_as_sure_as_it_says():
     steep = random.uniform(0.2, 3, (60, 70))
     counts = 100 + 200 * steep * (DITHER - DEPTH)[:, np.newaxis, np.newaxis]
     frames = (counts + random.normal(0, 4, counts.shape)).astype(np.float32)
-    found = engine.find_growth(frames, DITHER, dark=0, bright=200, pixel_size=(0.1, 0.1))
+    found = engine.press.find_growth(frames, DITHER, dark=0, bright=200, pixel_size=(0.1, 0.1))
     error = found.growth - steep
     assert np.mean((error / found.growth_sigma) ** 2) == pytest.approx(1, abs=0.06)
     assert abs(found.process["area_growth"] - 0.01 * steep.sum()) < 4 * found.process["area_growth_sigma"]
@@ -97,7 +97,7 @@ def test_the_command_adds_it_to_the_correlation(elastic, tmp_path):
     elastic.rewind()
     frames = elastic.read(np.empty(elastic.shape, elastic.dtype)).frames
     header = elastic.header
-    found = engine.find_growth(
+    found = engine.press.find_growth(
         frames, DITHER, dark=header.dark, bright=header.bright, pixel_size=(PIXEL, PIXEL)
     )
     np.testing.assert_allclose(result.growth, found.growth, atol=1e-3)
@@ -118,7 +118,7 @@ def test_the_command_adds_it_to_the_correlation(elastic, tmp_path):
 def test_a_travel_that_is_no_dither_is_one_line(travel, line):
     frames = np.zeros((len(travel), 2, 3), np.uint8)
     with pytest.raises(io.InputError, match=line) as caught:
-        engine.find_growth(frames, travel)
+        engine.press.find_growth(frames, travel)
     assert "\n" not in str(caught.value)
 
 
@@ -126,12 +126,12 @@ def test_the_frames_are_read_once_if_the_travel_is_known_and_twice_otherwise(ela
     elastic.rewind()
     frames = elastic.read(np.empty(elastic.shape, elastic.dtype)).frames.copy()
     known = {"dark": elastic.header.dark, "bright": elastic.header.bright, "pixel_size": (PIXEL, PIXEL)}
-    found = engine.find_growth(frames, DITHER, **known)
+    found = engine.press.find_growth(frames, DITHER, **known)
     source = ArrayRecording(frames, {"travel": DITHER}, {"dark": known["dark"], "bright": known["bright"]})
-    operation = engine.Growth().configured_for(source)
-    assert (operation.passes, engine.Growth(**known).passes) == (1, 2)
-    once = engine.run(source, engine.Growth(pixel_size=(PIXEL, PIXEL)))
-    blocks = engine.Growth(**known)
+    operation = engine.press.Growth().configured_for(source)
+    assert (operation.passes, engine.press.Growth(**known).passes) == (1, 2)
+    once = engine.run(source, engine.press.Growth(pixel_size=(PIXEL, PIXEL)))
+    blocks = engine.press.Growth(**known)
     for number in range(2):
         if number:
             blocks.next_pass()
@@ -153,7 +153,7 @@ def test_a_recording_of_a_dither_has_growth_and_correlation(elastic, tmp_path):
         recorder.drain(lambda count: None)
     with io.open_recording(tmp_path / "d.h5") as recording:
         result = Correlation(dither=True).run(recording)
-        alone = engine.run(recording, engine.Growth)
+        alone = engine.run(recording, engine.press.Growth)
         with pytest.raises(io.InputError, match="takes the phase from the travel: leave harmonic out"):
             Correlation(dither=True, harmonic=2).run(recording)
     said = {

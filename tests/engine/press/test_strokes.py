@@ -37,7 +37,7 @@ class Found(NamedTuple):
 def strokes_of(frames, travel, blocks=(), **options):
     results = []
     for event in ("onset", "release"):
-        strokes = engine.Strokes(event=event, **({"dark": DARK, "bright": BRIGHT} | options))
+        strokes = engine.press.Strokes(event=event, **({"dark": DARK, "bright": BRIGHT} | options))
         for part in np.split(np.arange(len(frames)), blocks):
             strokes.push(frames[part], travel=travel[part])
         results.append(strokes.result())
@@ -154,7 +154,7 @@ def test_a_rest_before_a_stroke_up_is_no_stroke():
 
 def test_a_search_that_was_reset_remembers_nothing():
     frames = made_press(UNEVEN, DEPTH)
-    search = engine.Strokes(dark=DARK, bright=BRIGHT)
+    search = engine.press.Strokes(dark=DARK, bright=BRIGHT)
     search.push(255 - frames, travel=UNEVEN)
     search.reset()
     search.push(frames, travel=UNEVEN)

@@ -7,6 +7,7 @@ import pytest
 
 from mirrorskin import engine, io
 from mirrorskin.engine.lock_in import Correlation
+from mirrorskin.engine.rotation import estimate_frequency
 from mirrorskin.io.frames import FrameSequence
 
 RATE, COUNT, HERTZ = 60.0, 150, 7.321
@@ -36,7 +37,7 @@ def test_it_reaches_the_cramer_rao_bound_and_says_so(case):
     if case == "few of many":
         amplitude[8:] = 0
     phase = random.uniform(0, 2 * np.pi, len(amplitude))
-    found = [engine.estimate_frequency(waves(amplitude, phase, time, seed=seed), time) for seed in range(250)]
+    found = [estimate_frequency(waves(amplitude, phase, time, seed=seed), time) for seed in range(250)]
     error = np.array([one.hertz for one in found]) - HERTZ
     assert np.sqrt(np.mean(error**2)) / bound(amplitude, time) == pytest.approx(1, abs=0.12)
     assert np.mean([(e / one.sigma) ** 2 for e, one in zip(error, found, strict=True)]) == pytest.approx(
@@ -89,13 +90,19 @@ def test_a_harmonic_is_the_fit_of_a_multiple_of_the_phase(harmonic, dtype, devic
 @pytest.mark.parametrize(
     ("call", "line"),
     [
-        (lambda: engine.estimate_frequency(np.zeros(5), np.arange(5)), "5 frames .* at least 8"),
-        (lambda: engine.estimate_frequency(np.zeros(9), np.arange(9)[::-1]), "times do not increase"),
+        (lambda: estimate_frequency(np.zeros(5), np.arange(5)), "5 frames .* at least 8"),
         (
-            lambda: engine.estimate_frequency(waves(np.zeros(3), np.zeros(3)), TIME),
+            lambda: estimate_frequency(np.zeros(9), np.arange(9)[::-1]),
+            "times do not increase",
+        ),
+        (
+            lambda: estimate_frequency(waves(np.zeros(3), np.zeros(3)), TIME),
             "nothing oscillates beyond the noise",
         ),
-        (lambda: engine.estimate_frequency(np.full((9, 2), np.nan), np.arange(9)), "a missing sample"),
+        (
+            lambda: estimate_frequency(np.full((9, 2), np.nan), np.arange(9)),
+            "a missing sample",
+        ),
         (
             lambda: engine.correlate(np.zeros((9, 2, 2), "u1"), np.arange(9), harmonic=0),
             "harmonic 0: a number of at least 1",

@@ -131,7 +131,7 @@ def test_the_same_frames_give_the_same_result_however_they_are_cut(device):
     pose = np.column_stack([axes, PRESS])
     results = []
     for cuts in ([], [1, 2, 9, 30]):
-        estimator = engine.MovingNormals(longest=24, noise=NOISE, device=device, **SCALE)
+        estimator = engine.rotation.MovingNormals(longest=24, noise=NOISE, device=device, **SCALE)
         for part in np.split(FRAME, cuts):
             estimator.push(frames[part], pose=pose[part])
             if len(part) > 5:

@@ -9,7 +9,7 @@ import pytest
 from speckle import Speckle
 
 from mirrorskin import io
-from mirrorskin.engine import find_displacement
+from mirrorskin.engine.slip import find_displacement
 from mirrorskin.hw.twin import SheetTexture
 from mirrorskin.io import InputError
 

@@ -12,7 +12,7 @@ from speckle import Speckle
 from stacks import MadeUp
 
 from mirrorskin import engine, io
-from mirrorskin.engine import Slip
+from mirrorskin.engine.slip import Slip
 from mirrorskin.io import InputError
 
 SHAPE, PIXEL, NOISE = (128, 140), 0.05, 1.5
@@ -284,7 +284,7 @@ def test_a_modulus_gives_traction_and_force(slid):
     found = engine.reconstruct(source, contact=INSIDE, modulus=0.1)
     assert found.process["modulus"] == "0.1 MPa, given"
     assert found.force_x < -3 * found.force_x_sigma
-    expected = engine.find_tangential_force(slid[0], PIXEL, 0.1, window_size=8)
+    expected = engine.force.find_tangential_force(slid[0], PIXEL, 0.1, window_size=8)
     np.testing.assert_array_equal(found.traction, expected.traction)
     assert (found.force_x, found.force_y_sigma) == (expected.force_x, expected.force_y_sigma)
     assert found.traction[..., 0].sum() * PIXEL**2 == pytest.approx(found.force_x, rel=0.1)
