@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.calibration.ball import see_ball
 from mirrorskin.engine.provenance import naming
-from mirrorskin.engine.reconstruction import calibrated
+from mirrorskin.engine.reconstruction import calibrated, reconstruct
 from mirrorskin.engine.rotation.rotation import Rotation
 from mirrorskin.io import Calibration, InputError, Result, Source, WallResponse
 from mirrorskin.kernels.device import Device

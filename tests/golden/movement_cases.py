@@ -216,13 +216,13 @@ def estimate_pose() -> Answer:
             sampled(form, *way, rng=random)
             for way in (((0, 0, 0), (0, 0, 0)), ((0.02, -0.03, 0.1), (0.1, -0.05, 0.02)))
         ]
-        pose = pose.estimate_pose(*pair)
+        moved = pose.estimate_pose(*pair)
         answers |= {
-            f"{form.__name__}.rotation": pose.rotation,
-            f"{form.__name__}.translation": pose.translation,
-            f"{form.__name__}.sigma": pose.sigma,
-            f"{form.__name__}.chi_square": pose.chi_square,
-            f"{form.__name__}.free": len(pose.undetermined),
+            f"{form.__name__}.rotation": moved.rotation,
+            f"{form.__name__}.translation": moved.translation,
+            f"{form.__name__}.sigma": moved.sigma,
+            f"{form.__name__}.chi_square": moved.chi_square,
+            f"{form.__name__}.free": len(moved.undetermined),
         }
     return answers
 
