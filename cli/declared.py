@@ -92,7 +92,7 @@ class Term:
         from mirrorskin.cli import quantity
         from mirrorskin.io import InputError
 
-        if text in self.words or self.kind in ("choice", "text", "name"):
+        if text in self.words or self.kind in ("choice", "text", "file", "name"):
             return text
         plain = "integer" if self.kind == "integer" else "number"
         try:

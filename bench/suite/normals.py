@@ -32,7 +32,7 @@ def run_normals(name: str, kind: str, shape: tuple[int, int], device: Device, qu
         phases(STEPS),
         tilt=TILT,
         zenith_gain=gain,
-        offset=offset,
+        zenith_offset=offset,
         noise=turn_noise(dtype),
         device=device,
     )

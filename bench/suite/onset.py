@@ -62,11 +62,12 @@ def run_onset(name: str, shape: Shape, stack: StackName, full: bool, device: Dev
     peers = _peers(full, frames, travel, known, absent)
 
     def check(results: dict[str, Any]) -> None:
-        words = ("height", "sigma", "status") if full else ("frame",)
+        words = ("height", "height_sigma", "status") if full else ("frame",)
         found = {word: getattr(results[OURS], word) for word in words}
         for peer in peers:
             if full:
-                near = {"height": np.spacing(np.abs(found["height"])), "sigma": 1e-5 * np.abs(found["sigma"])}
+                sigma = 1e-5 * np.abs(found["height_sigma"])
+                near = {"height": np.spacing(np.abs(found["height"])), "height_sigma": sigma}
                 agree(peer, results[peer], found, near)
             else:  # a pixel with invalid input has no onset either
                 agree(peer, {"frame": np.maximum(results[peer], -1)}, found)
@@ -172,7 +173,7 @@ def _heights(
         height[rows], sigma[rows], status[rows] = _answer(part, onset, travel, mine, noise)
 
     _in_tiles(tiles, frames, fill)
-    return {"height": height, "sigma": sigma, "status": status}
+    return {"height": height, "height_sigma": sigma, "status": status}
 
 
 def _first_light(library: Library, frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.int32]:
@@ -290,7 +291,7 @@ def _numba_heights(
     frames: NDArray[Any], travel: NDArray[np.float64], known: References, noise: float
 ) -> Maps:
     shape = frames.shape[1:]
-    maps = {"height": np.empty(shape, np.float32), "sigma": np.empty(shape, np.float32)}
+    maps = {"height": np.empty(shape, np.float32), "height_sigma": np.empty(shape, np.float32)}
     maps |= {"status": np.empty(shape, np.uint8)}
     run = _numba_scan(2, whole=True)
     flat = (values.reshape(-1) for values in (*known, *maps.values()))

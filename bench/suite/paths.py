@@ -80,7 +80,7 @@ def run_turns(device: Device, quick: bool) -> Case:
     title = (
         f"exact method to normals, mean of {shape[0] // STEPS} turns, no heights; {_size(shape)}, contiguous"
     )
-    scale = {"gain": SCALES["uint8"].gain, "offset": SCALES["uint8"].offset}
+    scale = {"zenith_gain": SCALES["uint8"].gain, "zenith_offset": SCALES["uint8"].offset}
     return _beside_memory("file-turns", title, make_turns, shape, "raw", scale, device, quick)
 
 

@@ -198,12 +198,12 @@ def recordings(tmp_path_factory):
 BUILT_IN = {
     "Onset": ("press", {"threshold": 0.4}),
     "ChangePoint": ("press", {"hold": 1}),
-    "Strokes": ("press", {"subframe": False}),
+    "press:Strokes": ("press", {"subframe": False}),
     "Press": ("press", {"threshold": 0.4}),
     "Correlate": ("turn", {"harmonic": 1}),
     "Normals": ("turn", {"method": "paper"}),
     "rotation.rotation:Rotation": ("turn", {"robust": True}),
-    "Slip": ("slide", {"window_size": 10}),
+    "slip:Slip": ("slide", {"window_size": 10}),
     "Sliding": ("slide", {"per_frame": True}),
 }
 

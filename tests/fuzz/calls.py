@@ -26,7 +26,7 @@ _COUNTS = (
     "modulation",
     "residual",
 )  # of a pixel's samples, which may be infinite themselves
-ELSEWHERE = {"reconstruct", "run", "free_memory", "option"}
+ELSEWHERE = {"reconstruct", "run", "option"}
 """Public functions that take no arrays of numbers; other tests call them."""
 
 _ROW, _COLUMN = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
@@ -103,12 +103,26 @@ def calls() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
         "score": {"result": result, "truth": io.Truth(height, flat, flat, contact)},
         "fuse": {"heights": heights, "normals": turned, "pixel_size": 0.1},
     }  # fmt: skip
-    return {name: (getattr(engine, name), arguments) for name, arguments in made.items()}
+    return {name: (_functions()[name], arguments) for name, arguments in made.items()}
+
+
+@cache
+def _functions() -> dict[str, Callable[..., Any]]:
+    """Return the public functions of the engine, and of its sub-packages for single computations."""
+    packages = "focus", "force", "fringes", "integration", "photometric", "pose", "press", "rotation", "slip"
+    found = {}
+    for package in [engine, *(getattr(engine, name) for name in packages)]:
+        names = getattr(package, "__all__", None) or [name for name in vars(package) if name[0] != "_"]
+        for name in names:
+            function = getattr(package, name)
+            if inspect.isfunction(function) and function.__module__.startswith(package.__name__):
+                found[name] = function
+    return found
 
 
 def public_functions() -> set[str]:
     """Return the names of the engine's public functions."""
-    return {name for name in engine.__all__ if inspect.isfunction(getattr(engine, name))}
+    return set(_functions())
 
 
 def odd_values(sound: Any) -> Iterator[tuple[str, Any]]:

@@ -23,9 +23,6 @@ VOLATILE = (
 )
 """Words in the names of what differs from run to run, or from machine to machine."""
 
-RENAMED = {"low": "dark", "high": "bright", "axial_low": "axial_dark", "axial_high": "axial_bright"}
-"""Names in frozen processes that have become others since."""
-
 
 @dataclass(frozen=True, slots=True)
 class Case:
@@ -128,8 +125,7 @@ def _compare_usual(found: NDArray[Any], frozen: NDArray[Any]) -> tuple[bool, str
         return False, f"{frozen.dtype} {frozen.shape} became {found.dtype} {found.shape}"
     if frozen.dtype.kind == "U":
         one, other = (
-            sorted(RENAMED.get(place, place) for place, _ in _leaves(json.loads(str(text))))
-            for text in (found, frozen)
+            sorted(place for place, _ in _leaves(json.loads(str(text)))) for text in (found, frozen)
         )
         return one == other, "tells of other things" if one != other else "tells of the same"
     if found.shape != frozen.shape:
@@ -182,7 +178,7 @@ def _compare_texts(found: str, frozen: str, within: Tolerance) -> tuple[bool, st
     if found == frozen:
         return True, "equal"
     one = dict(_leaves(json.loads(found)))
-    other = {RENAMED.get(place, place): value for place, value in _leaves(json.loads(frozen))}
+    other = dict(_leaves(json.loads(frozen)))
     wrong = [place for place in sorted(one.keys() | other.keys()) if not _alike(place, one, other, within)]
     told = "; ".join(f"{place}: {other.get(place)!r} became {one.get(place)!r}" for place in wrong[:5])
     return not wrong, told or "equal but for rounding"

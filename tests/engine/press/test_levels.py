@@ -118,7 +118,7 @@ def test_the_command_takes_them_repeated_or_with_commas(press, found, tmp_path, 
         np.testing.assert_array_equal(io.open_result("a.h5").slope_max, found.slope_max)
     for words, said in (
         (["--thresholds", "0.2,0.8"], "2 thresholds and 0 inclinations"),
-        (["--threshold", "half"], "--thresholds half: a number is needed"),
+        (["--threshold", "half"], "--threshold half: a number is needed"),
     ):
         ended = run("reconstruct", "press.h5", *words, "-o", "b.h5")
         assert (ended.code, ended.said.count("\n")) == (2, 1)
