@@ -37,18 +37,6 @@ _UNITS = {  # placeholder in help, function of `mirrorskin.cli.quantity`, exampl
     "range": ("A:B", "frame_range", "10:200"),
     "WxH": ("WxH", "frame_size", "640x480"),
 }
-_CLASS = re.compile(r".+:[A-Za-z_]\w*")
-_LOADED = "mirrorskin.cli.declared"  # key of a context's class and its options
-_COPY = Path(__file__).with_suffix(".json")
-_METAVARS = {
-    "mm": "LENGTH",
-    "rad": "ANGLE",
-    "MPa": "PRESSURE",
-    "N": "FORCE",
-    "s": "TIME",
-    "counts/rad": "COUNTS/ANGLE",
-    "Hz": "HZ",
-}
 
 
 @dataclass(frozen=True)
@@ -115,7 +103,7 @@ class DeclaredOption(MotionOption):
     """The option of click for a term; its value is in the term's unit. ``of_engine``: see `ClassCommand`."""
 
     def __init__(self, one: Term, of_engine: bool = True) -> None:
-        self._term, self.of_engine = one, of_engine
+        self._term, self.of_engine, self.unit = one, of_engine, one.unit
         names = [f"{one.flag}/--no-{one.flag[2:]}" if one.kind == "flag" else one.flag, one.name]
         settings: dict[str, Any] = {}
         if one.kind == "choice":
@@ -207,7 +195,8 @@ def term(
 class ClassCommand(Command):
     """A command one of whose words may be MODULE:CLASS: then it has the options of that class.
 
-    They replace other options of the engine.
+    They replace other options of the engine. An option that the command has, too, with the same unit, such as
+    the tilt of a live rotation, is for both.
     """
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -229,13 +218,16 @@ class ClassCommand(Command):
         from mirrorskin.io import InputError
 
         kind = load_operation(name)
-        terms = terms_of({"": kind})
-        taken = {one.name for one in self.params if not getattr(one, "of_engine", False)}
-        for one in terms:
-            if one.name in taken:
+        own = {one.name: one for one in self.params if not getattr(one, "of_engine", False)}
+        terms = []
+        for one in terms_of({"": kind}):
+            same = own.get(one.name)
+            if same is None:
+                terms.append(one)
+            elif not isinstance(same, DeclaredOption) or same.unit != one.unit:
                 raise InputError(
-                    f"{name} has an option {one.name}, and so has 'mirrorskin {self.name}'. Rename that of"
-                    " the class"
+                    f"{name} has an option {one.name}, and so has 'mirrorskin {self.name}' for something else."
+                    " Rename that of the class"
                 )
         return kind, [DeclaredOption(one) for one in terms]
 

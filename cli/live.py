@@ -84,8 +84,9 @@ def command(
     rig = load_rig(rig_file)
     planned = {one.name for one in scans.PLAN.terms}
     plan = scans.make_plan(context, {name: one for name, one in given.items() if name in planned}, rig)
-    chosen = {name: one for name, one in given.items() if name not in planned}
     kind = method_for(plan.motion) if operation is None else load_operation(operation)
+    shared = () if operation is None else kind.options
+    chosen = {name: one for name, one in given.items() if name in shared or name not in planned}
     computed = kind(device=device, **chosen)
     if overwrite and record is None:
         raise io.InputError("--overwrite is for --record: leave it out")

@@ -401,6 +401,46 @@ def test_a_slide_is_told_recorded_and_kept_and_repeated(fake, tmp_path):
 OWN = str(Path(__file__).parents[2] / "examples" / "steepest_rise.py") + ":SteepestRise"
 
 
+@pytest.mark.parametrize(
+    ("words", "where", "flags", "options"),
+    [
+        (PRESS, "engine:Onset", "", {}),
+        (
+            PRESS,
+            "engine:ChangePoint",
+            "--dark 0 --bright 200 --noise 1",
+            {"dark": 0, "bright": 200, "noise": 1},
+        ),
+        (
+            PRESS,
+            "engine.press:Levels",
+            "--thresholds 0.2,0.7 --inclinations 0.2rad,0.5rad",
+            {"thresholds": [0.2, 0.7], "inclinations": [0.2, 0.5]},
+        ),
+        (PRESS, "engine.focus:Focus", "--noise 1", {"noise": 1}),
+        (TURN, "engine:Correlate", "", {}),
+        (TURN, "engine:Normals", "", {"tilt": math.radians(2.5)}),
+        (TURN, "engine.fringes:Fringes", "--noise 1", {"noise": 1}),
+    ],
+)
+def test_a_built_in_operation_gives_the_same_live_as_over_the_recording(
+    fake, tmp_path, words, where, flags, options
+):
+    if words is TURN:
+        fake.picture = slanted()
+        fake.camera_settings |= {"zenith_gain": math.radians(GAIN), "zenith_offset": OFFSET}
+    record, output = tmp_path / "rec.h5", tmp_path / "res.h5"
+    chosen = "--operation", f"mirrorskin.{where}", *flags.split()
+    done = fake.run(*words, *chosen, "--record", str(record), "-o", str(output))
+    assert done.exit_code == 0, done.stderr
+    with io.open_recording(record, live=True) as recording:
+        again = engine.run(recording, load_operation(f"mirrorskin.{where}")(**options))
+    found = io.open_result(output)
+    assert [*found] == [*again]
+    for name in again:
+        np.testing.assert_array_equal(found[name], again[name], err_msg=name)
+
+
 def test_an_operation_of_the_user_s_gives_the_same_live_as_over_the_recording(fake, tmp_path):
     record, output = tmp_path / "rec.h5", tmp_path / "res.h5"
     done = fake.run(*PRESS, "--operation", OWN, "--least", "1", "--record", str(record), "-o", str(output))

@@ -114,7 +114,7 @@ def test_region_frames_and_travel_are_those_of_reconstruct():
         ),
         (
             "mine_of_a_test:Frames",
-            "has an option frames, and so has 'mirrorskin run'. Rename that of the class",
+            "has an option frames, and so has 'mirrorskin run' for something else. Rename that of the class",
         ),
     ],
 )
