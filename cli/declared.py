@@ -226,8 +226,8 @@ class ClassCommand(Command):
                 terms.append(one)
             elif not isinstance(same, DeclaredOption) or same.unit != one.unit:
                 raise InputError(
-                    f"{name} has an option {one.name}, and so has 'mirrorskin {self.name}' for something else."
-                    " Rename that of the class"
+                    f"{name} has an option {one.name}, and so has 'mirrorskin {self.name}' for something"
+                    " else. Rename that of the class"
                 )
         return kind, [DeclaredOption(one) for one in terms]
 
