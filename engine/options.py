@@ -267,6 +267,13 @@ class Configured:
             )
         for name, one in self.options.items():
             one.store(self, one.check(options[name]) if name in options else one.default)
+        self.check_options()
+
+    def check_options(self) -> None:
+        """Raise InputError if the options do not fit together; called at the end of construction.
+
+        The message starts with the name of the option to change.
+        """
 
     def chosen(self) -> dict[str, Any]:
         """Return the value of each option by name."""

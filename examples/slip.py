@@ -97,4 +97,4 @@ for row, name, movement, theory, closed, unit, scale in (
 
 turned = math.degrees(result.process["angle"])
 print(f"twist: {turned:.3f} degrees, true {-math.degrees(twist.path[-1]):.3f}")
-figure.savefig("slip.png", dpi=110)
+figure.savefig("slip.png", dpi=80)
