@@ -78,8 +78,8 @@ def _check_levels(thresholds: Sequence[float] | None, inclinations: Sequence[flo
         )
     if len(angles) != len(shares):
         raise InputError(
-            f"inclinations must be as many as thresholds ({len(angles)} and {len(shares)}): give the sheet's"
-            " inclination at which each threshold is passed, from the lowest on"
+            f"inclinations do not match: {len(shares)} thresholds and {len(angles)} inclinations. Give the"
+            " sheet's inclination at which each threshold is passed, from the lowest on"
         )
     rising = all(low < high for low, high in zip([0.0, *angles], [*angles, math.pi / 2], strict=True))
     if not rising:

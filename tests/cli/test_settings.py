@@ -217,7 +217,7 @@ def test_a_tilt_may_be_estimated(settings):
             'method = "change-point"\nthresholds = [0.5]\ninclinations = ["5deg"]',
             "thresholds and inclinations need method 'threshold'",
         ),
-        ("press", "thresholds = [0.5]", "inclinations must be as many as thresholds (0 and 1): give"),
+        ("press", "thresholds = [0.5]", "inclinations do not match: 1 thresholds and 0 inclinations. Give"),
         ("press", "thresholds = [0.5, 0.4]", "thresholds 0.5, 0.4: give them from the lowest"),
         ("slip", "window-size = 0", "window-size is 0: a number of pixels"),
         ("rotation", 'zenith-gain = "5.7"', "zenith-gain 5.7: a number over a unit of angle"),
