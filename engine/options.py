@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Literal, dataclass_transform
 import numpy as np
 
 from mirrorskin.io import InputError
-from mirrorskin.io.arguments import as_array, shown
+from mirrorskin.io.arguments import as_array, check_flag, shown
 
 Kind = Literal["number", "integer", "flag", "choice", "numbers", "map", "file", "object"]
 
@@ -94,9 +94,7 @@ class Option:
                 raise InputError(f"unknown {self.name} {shown(value)}. Use {' or '.join(self.choices)}")
             return str(value)
         if self.kind == "flag":
-            if not isinstance(value, bool | np.bool_):
-                raise InputError(f"{self.name} is {shown(value)}: use True or False")
-            return bool(value)
+            return check_flag(self.name, value)
         if self.kind == "numbers":
             values = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
             return [self._number(one) for one in values]
