@@ -45,7 +45,7 @@ def read_settings(path: Path | None, memory_limit: int) -> Plan:
     given = {name: _given(getattr(settings, name)) for name in tables}
     opening = _opening(given["stack"], f"{path}: stack.")
     chosen: dict[str, Any] = {
-        name: _options(given[name], kind, f"{path}: {name}.") for name, kind in kinds.items()
+        name: _options(given[name], kind, f"{path}: {name}") for name, kind in kinds.items()
     }
     if operation:
         chosen = {"operation": operation, "operation_options": chosen["operation"]}
@@ -105,13 +105,13 @@ def _given(table: Struct) -> dict[str, Any]:
 
 
 def _options(values: Mapping[str, Any], kind: type[Any], where: str) -> dict[str, Any]:
-    """Return options in their units, checked."""
+    """Return options in their units, with which the class can be constructed."""
     found = {}
     for name, value in values.items():
         if name == "class_":
             continue
         one, term = kind.options[name], term_of(kind.options[name])
-        place = f"{where}{name.replace('_', '-')}"
+        place = f"{where}.{name.replace('_', '-')}"
         if one.kind == "file":
             found[name] = Path(value)
             continue
@@ -119,11 +119,18 @@ def _options(values: Mapping[str, Any], kind: type[Any], where: str) -> dict[str
             value = [term.read_one(part, place) if isinstance(part, str) else part for part in value]
         elif isinstance(value, str):
             value = term.read_one(value, place)
-        try:
-            found[name] = one.check(value)
-        except InputError as error:
-            raise InputError(f"{where}{error}") from error
-    return found
+        found[name] = value
+    try:
+        chosen: dict[str, Any] = kind(**found).chosen()
+    except InputError as error:
+        raise InputError(f"{where}{_with_key(str(error), kind)}") from error
+    return {name: chosen[name] for name in found}
+
+
+def _with_key(message: str, kind: type[Any]) -> str:
+    """Return a message about options after the name of a table: with the key, if it starts with an option."""
+    name, space, rest = message.partition(" ")
+    return f".{name.replace('_', '-')}{space}{rest}" if name in kind.options else f": {message}"
 
 
 def _opening(values: dict[str, Any], where: str) -> dict[str, Any]:

@@ -148,6 +148,7 @@ def _check_shapes(heights: Result, normals: Result, mask: ArrayLike | None) -> M
     return np.ones((rows, columns), bool) if mask is None else np.asarray(mask) != 0
 
 
+@checked
 def fuse_recordings(
     vertical: Source,
     axial: Source,

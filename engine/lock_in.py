@@ -48,6 +48,12 @@ class Correlation(Method, options_of=(Correlate,)):
         " added; see `mirrorskin.engine.press.Growth`",
     )
 
+    def check_options(self) -> None:
+        """Raise InputError if the phase of a dither is given in another way, too."""
+        if self.dither and (self.harmonic != 1 or self.frequency is not None):
+            other = "harmonic" if self.harmonic != 1 else "frequency"
+            raise InputError(f"dither takes the phase from the travel: leave {other} out")
+
     def plan(self, source: Source) -> Plan:
         """Return the correlation with the phase that the options name."""
         limit = max(1, min(self.memory_limit, 2 * math.prod(source.shape) * source.dtype.itemsize))
@@ -56,9 +62,6 @@ class Correlation(Method, options_of=(Correlate,)):
             "zenith": "none: the recording has no zenith gain",
         }
         if self.dither:
-            if self.harmonic != 1 or self.frequency is not None:
-                other = "harmonic" if self.harmonic != 1 else "frequency"
-                raise InputError(f"dither takes the phase from the travel: leave {other} out")
             growth: Growth = self.make(Growth, memory_limit=limit)
             return Plan(growth.configured_for(source), process=process)
         if self.harmonic != 1:

@@ -122,7 +122,7 @@ class Operation(ThreadSafe, OnDevice):
     least_frames: ClassVar[int] = 1
     """Frames that a result needs."""
     maps: ClassVar[Mapping[str, Map]] = {}
-    """The declared maps by name."""
+    """The declared maps by name: the class attributes that are maps."""
     positions: ClassVar[Mapping[str, bool]] = {}
     """What ``push`` takes of each frame, and whether it needs it; an object's may depend on its options."""
     on_device: ClassVar[bool] = False
@@ -134,6 +134,11 @@ class Operation(ThreadSafe, OnDevice):
     _takes_lent: ClassVar[bool] = False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
+        if "maps" in vars(cls):
+            raise InputError(
+                f"{cls.__name__} assigns maps: declare each map as a class attribute, such as"
+                ' wear = io.Map("depth of the wear", "mm")'
+            )
         found: dict[str, Map] = {}
         for base in reversed(cls.__mro__):
             found |= {name: one for name, one in vars(base).items() if isinstance(one, Map)}

@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Literal, dataclass_transform
 import numpy as np
 
 from mirrorskin.io import InputError
-from mirrorskin.io.arguments import as_array, shown
+from mirrorskin.io.arguments import as_array, check_flag, shown
 
 Kind = Literal["number", "integer", "flag", "choice", "numbers", "map", "file", "object"]
 
@@ -94,9 +94,7 @@ class Option:
                 raise InputError(f"unknown {self.name} {shown(value)}. Use {' or '.join(self.choices)}")
             return str(value)
         if self.kind == "flag":
-            if not isinstance(value, bool | np.bool_):
-                raise InputError(f"{self.name} is {shown(value)}: use True or False")
-            return bool(value)
+            return check_flag(self.name, value)
         if self.kind == "numbers":
             values = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
             return [self._number(one) for one in values]
@@ -267,6 +265,13 @@ class Configured:
             )
         for name, one in self.options.items():
             one.store(self, one.check(options[name]) if name in options else one.default)
+        self.check_options()
+
+    def check_options(self) -> None:
+        """Raise InputError if the options do not fit together; called at the end of construction.
+
+        The message starts with the name of the option to change.
+        """
 
     def chosen(self) -> dict[str, Any]:
         """Return the value of each option by name."""

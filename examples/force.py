@@ -6,9 +6,10 @@ presses then follow from their frames alone, and are compared with those of the 
 
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 
-from mirrorskin import engine, hw, io, view
+from mirrorskin import engine, hw, io
 from mirrorskin.engine.calibration.force import fit_stiffness, known_press
 from mirrorskin.engine.calibration.gel import ball_onset, fit_gel
 from mirrorskin.engine.press.press import Press
@@ -56,14 +57,34 @@ weighed = [
 for part in (gel, fit_stiffness(weighed, gel).stiffness):
     known = io.update_calibration(Path("force-cal.h5"), part, camera)
 
-results, truths = {}, {}
+forces, sigmas, truths = [], [], []
 for number, (diameter, depth) in enumerate([(3, 0.81), (5, 0.51), (5, 1.02), (7, 0.75), (9, 1.05)]):
     twin = press(diameter, depth, 40 + number)
+    result, true = engine.reconstruct(twin, known, fill=False), true_force(twin)
     name = f"ball {diameter} mm, {depth:g} mm deep"
-    results[name], truths[name] = engine.reconstruct(twin, known, fill=False), true_force(twin)
-    found, sigma = results[name].force, results[name].force_sigma
-    print(f"{name}: {found:.4f} ± {sigma:.4f} N, true {truths[name]:.4f} N")
+    print(f"{name}: {result.force:.4f} ± {result.force_sigma:.4f} N, true {true:.4f} N")
+    forces.append(result.force)
+    sigmas.append(result.force_sigma)
+    truths.append(true)
 
-pressure = engine.force.find_force(twin.truth.height, depth, PIXEL, MODULUS).pressure
-title = "Forces of presses: gel of 100 kPa, calibrated with a scale"
-view.force_figure(results, truths, pressure, title, Path("force.png"))
+# The pressure of the last press, a cut through it, and the errors of all forces.
+pressure, x = 1000 * result.pressure, result.x  # kPa
+true = 1000 * engine.force.find_force(twin.truth.height, depth, PIXEL, MODULUS).pressure
+forces, sigmas, truths = np.array(forces), np.array(sigmas), np.array(truths)
+error, row = 100 * (forces - truths) / truths, SIZE // 2
+
+figure, axes = plt.subplots(1, 3, figsize=(14, 4.5), layout="constrained")
+side = SIZE * PIXEL / 2
+picture = axes[0].imshow(pressure, extent=(-side, side, -side, side))
+figure.colorbar(picture, ax=axes[0], label="pressure (kPa)")
+axes[0].axhline(result.y[row], color="tab:red", linestyle=":")
+axes[0].set(xlabel="x (mm)", ylabel="y (mm)", title=name)
+axes[1].plot(x, true[row], color="0.6", linewidth=3, label="true")
+axes[1].plot(x, pressure[row], ".", label="estimated")
+axes[1].set(xlabel="x (mm)", ylabel="pressure (kPa)", title="along the dotted line")
+axes[1].legend()
+axes[2].axhline(0, color="0.6")
+axes[2].errorbar(truths, error, 100 * sigmas / truths, fmt="o", capsize=3)
+rms = np.sqrt(np.mean(error**2))
+axes[2].set(xlabel="true force (N)", ylabel="error (%)", title=f"{len(error)} presses: RMS error {rms:.2g} %")
+figure.savefig("force.png", dpi=110)

@@ -5,12 +5,12 @@ rotation, fused to one surface; the tracker compares these surfaces and returns 
 """
 
 import math
-from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mirrorskin import engine, hw, io, view
+from mirrorskin import engine, hw, io
 from mirrorskin.engine.fusion import fuse_recordings
 from mirrorskin.hw.twin import Axial, Camera, HeightMap, Vertical
 
@@ -77,5 +77,35 @@ for axis, found, true in zip("xyz", last.translation, shifts[-1], strict=True):
 for axis, found, true in zip("xyz", np.degrees(last.rotation), np.degrees(turns[-1]), strict=True):
     print(f"rotation about {axis}: {found:+.3f} degrees, true {true:+.3f} degrees")
 
-followed = view.Followed(results[0], results[-1], poses, turns, shifts)
-view.pose_figure(followed, "An object that rolls and turns between touches", Path("pose.png"))
+# Errors are the small motions from the true to the estimated poses.
+rotations = np.array([pose.rotation for pose in poses])
+translations = np.array([pose.translation for pose in poses])
+small = Rotation.from_rotvec(rotations) * Rotation.from_rotvec(turns).inv()
+sigmas = np.array([pose.sigma for pose in poses])  # of rotation, then of translation
+
+figure, axes = plt.subplots(2, 3, figsize=(14, 8), layout="constrained")
+for panel, result, name in ((axes[0, 0], results[0], "first"), (axes[1, 0], results[-1], "last")):
+    panel.set_facecolor("lightsteelblue")  # no height
+    picture = panel.imshow(result.height, extent=(-FIELD / 2, FIELD / 2, -FIELD / 2, FIELD / 2))
+    figure.colorbar(picture, ax=panel, label="height (mm)")
+    panel.plot(*shifts.T[:2], color="w", linewidth=2, label="true path")
+    panel.plot(*translations.T[:2], "o", markersize=4, color="tab:red", label="estimated")
+    panel.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{name} touch, and the path of the origin")
+    panel.legend(loc="lower right")
+
+rows = [
+    ("translation (mm)", translations, shifts, "µm", 1000 * (translations - small.apply(shifts)), 1000, 3),
+    ("rotation (°)", *np.degrees([rotations, turns]), "°", np.degrees(small.as_rotvec()), 180 / math.pi, 0),
+]
+for (_, path, wrong), (label, found, true, unit, error, scale, first) in zip(axes, rows, strict=True):
+    for part, axis in enumerate("xyz"):
+        colour, sigma = f"C{part}", scale * sigmas[:, first + part]
+        path.plot(true[:, part], color=colour, linewidth=1)
+        path.plot(found[:, part], "o", color=colour, markersize=4, label=axis)
+        wrong.fill_between(range(TOUCHES), -sigma, sigma, color=colour, alpha=0.2, linewidth=0)
+        wrong.plot(error[:, part], "o-", color=colour, markersize=4, linewidth=1)
+    path.set(xlabel="touch", ylabel=label, title="estimated (dots) and true (lines)")
+    path.legend()
+    rms = np.sqrt(np.mean(error[1:] ** 2))
+    wrong.set(xlabel="touch", ylabel=f"error ({unit})", title=f"RMS error {rms:.2g} {unit}; bands: ± 1 sigma")
+figure.savefig("pose.png", dpi=110)

@@ -6,12 +6,12 @@ which the lit area grows.
 """
 
 import math
-from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 from scipy import ndimage
 
-from mirrorskin import engine, hw, io, view
+from mirrorskin import engine, hw, io
 from mirrorskin.engine.lock_in import Correlation
 from mirrorskin.hw.twin import Camera, HeightMap, Leaning, Vertical
 from mirrorskin.io.positions import stroke_starts
@@ -92,5 +92,50 @@ growth = float(np.sum(share[1] - share[0])) * (FIELD / SIZE) ** 2 / SWING
 found = (dithered.process["area_growth"], dithered.process["area_growth_sigma"])
 print(f"lit area: grows by {found[0]:.3f} ± {found[1]:.3f} mm² for each mm of travel, true {growth:.3f}")
 
-figure = view.Vibration(curve, pressed, truth, BACKLASH, rocked, slope, dithered, growth)
-view.vibration_figure(figure, "Strokes, rocking and dither", Path("vibration.png"))
+# The strokes: height after each, hysteresis, and errors divided by their standard deviations.
+figure, axes = plt.subplots(2, 3, figsize=(15, 8), layout="constrained")
+count, height_error, height_sigma = np.array(curve).T
+panel = axes[0, 0]
+panel.loglog(count, 1000 * height_error, "o", label="RMS error")
+panel.loglog(count, 1000 * height_sigma, label="predicted")
+panel.loglog(count, 1000 * height_error[0] / np.sqrt(count), ":", color="0.6", label="first error / √strokes")
+panel.set(xlabel="strokes down", ylabel="height (µm)", title="an oscillating press", xticks=[1, 2, 4, 8, 16])
+panel.minorticks_off()
+panel.set_yticks([6, 10, 20, 30, 60])
+for axis in (panel.xaxis, panel.yaxis):
+    axis.set_major_formatter("{x:g}")
+panel.legend()
+valid = np.isfinite(pressed.hysteresis + truth)
+lags = 1000 * pressed.hysteresis[valid]
+panel = axes[0, 1]
+panel.hist(lags, np.linspace(*np.percentile(lags, [0.2, 99.8]), 60))
+panel.axvline(1000 * BACKLASH, color="tab:red", label="true")
+panel.set(xlabel="release - onset (µm)", ylabel="pixels", title=f"hysteresis: mean {lag:.1f} µm")
+panel.legend()
+bins, panel = np.linspace(-4, 4, 65), axes[0, 2]
+for name, ratio in (
+    ("height", (pressed.height - truth) / pressed.height_sigma),
+    ("hysteresis", (pressed.hysteresis - BACKLASH)[valid] / pressed.hysteresis_sigma[valid]),
+    ("slope", error / sigma),
+):
+    label = f"{name}: mean square {np.nanmean(ratio**2):.2f}"
+    panel.hist(ratio[np.isfinite(ratio)], bins, density=True, histtype="step", label=label)
+panel.plot(bins, np.exp(-(bins**2) / 2) / math.sqrt(math.tau), color="0.6", label="normal")
+panel.set(xlabel="error / standard deviation", ylim=(0, 1.1), title="errors and their prediction")
+panel.legend()
+
+# The maps of rocking and dither.
+measured = np.where(rocked.contact == 1, rocked.slope, np.nan)
+largest = np.nanpercentile(dithered.growth, 99.5)
+area = f"dither: {found[0]:.2f} mm²/mm, true {growth:.2f}"
+for panel, values, label, title, limit in (
+    (axes[1, 0], measured, "slope", "rocking: slope along one direction", np.nanmax(np.abs(slope))),
+    (axes[1, 1], error, "error of the slope", f"its error: RMS {rms(error):.3f}", 4 * rms(error)),
+    (axes[1, 2], dithered.growth, "growth (1/mm)", area, largest),
+):
+    panel.set_facecolor("lightsteelblue")  # undefined
+    extent = (-FIELD / 2, FIELD / 2, -FIELD / 2, FIELD / 2)
+    picture = panel.imshow(values, extent=extent, vmin=-limit, vmax=limit, cmap="coolwarm")
+    figure.colorbar(picture, ax=panel, label=label)
+    panel.set(xlabel="x (mm)", ylabel="y (mm)", title=title)
+figure.savefig("vibration.png", dpi=110)

@@ -26,8 +26,8 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 
     Arguments annotated ``ArrayLike`` or ``NDArray`` may be lists and the like; they are converted to arrays
     and must hold numbers. Masked values become NaN (frames of integers then become float32), or 0 in maps of
-    integers, such as contact. For ``float``, ``int``, a path, ``Result`` and ``Truth`` the type must match.
-    Other annotations are not checked.
+    integers, such as contact. For ``float``, ``int``, ``bool``, a path, ``Result`` and ``Truth`` the type
+    must match. Other annotations are not checked.
 
     Raises
     ------
@@ -81,6 +81,8 @@ def _check_of(kinds: list[str]) -> Callable[[str, Any], Any] | None:
         return _check_number
     if kinds in (["int"], ["int", "None"]):
         return _check_count
+    if kinds == ["bool"]:
+        return check_flag
     if first in ("Result", "Truth") and len(kinds) == 1:
         return functools.partial(_check_kind, first)
     return _check_path if kinds == ["str", "Path"] else None
@@ -132,6 +134,13 @@ def _check_count(name: str, value: Any) -> Any:
     if not hasattr(value, "__index__") or isinstance(value, bool | np.ndarray):
         raise InputError(f"{name} is {shown(value)}: a whole number is needed")
     return value
+
+
+def check_flag(name: str, value: Any) -> bool:
+    """Return a flag as a bool, or raise InputError if it is something else."""
+    if not isinstance(value, bool | np.bool_):
+        raise InputError(f"{name} is {shown(value)}: use True or False")
+    return bool(value)
 
 
 def _check_kind(kind: str, name: str, value: Any) -> Any:

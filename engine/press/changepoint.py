@@ -59,13 +59,16 @@ class ChangePoint(PressOperation):
         """Declarations of the maps; the legend of the status depends on the event."""
         return {**self.maps, "status": STATUS[self.event]}
 
-    def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
-        """Prepare for frames of a shape and type."""
+    def check_options(self) -> None:
+        """Raise InputError unless a change can be searched for with this threshold and hold."""
         if not 0 < self.threshold < 1:
             what = "a change-point needs a share between 0 and 1, such as 0.5"
             raise InputError(f"threshold {self.threshold}: {what}")
         if self.hold > REACH:
             raise InputError(f"hold {self.hold}: a change-point needs a number of frames from 1 to {REACH}")
+
+    def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
+        """Prepare for frames of a shape and type."""
         self._release = self.event == "release"
         self._noise = Noise(self.noise, dtype.kind == "u")
         self._length = max(1, self.memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))

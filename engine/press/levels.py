@@ -51,9 +51,9 @@ class Levels(ThresholdOperation):
     slope_min = TABLE["slope_min"]
     slope_max = TABLE["slope_max"]
 
-    def __init__(self, **options: Any) -> None:
-        super().__init__(**options)
-        self._angles = _check_levels(self.thresholds, self.inclinations)
+    def check_options(self) -> None:
+        """Raise InputError unless thresholds and inclinations rise, and are equally many."""
+        _check_levels(self.thresholds, self.inclinations)
 
     def shares(self) -> Sequence[float]:
         """Return the thresholds."""
@@ -65,15 +65,12 @@ class Levels(ThresholdOperation):
         light = [np.isin(one.status, (PressStatus.ONSET, PressStatus.LIGHT_AT_START)) for one in found]
         passed = np.sum(np.logical_and.accumulate(light), axis=0).astype(np.intp)
         passed[found[0].status == PressStatus.INVALID_INPUT] = -1  # the last entry of the bounds, NaN
-        least = np.array([0, *self._angles, np.nan], np.float32)
-        greatest = np.array([*self._angles, np.nan, np.nan], np.float32)
+        least = np.array([0, *self.inclinations, np.nan], np.float32)
+        greatest = np.array([*self.inclinations, np.nan, np.nan], np.float32)
         return self.as_result(found[0], slope_min=least[passed], slope_max=greatest[passed])
 
 
-def _check_levels(
-    thresholds: Sequence[float] | None, inclinations: Sequence[float] | None
-) -> Sequence[float]:
-    """Return the inclinations, or raise InputError unless they and the thresholds fit together."""
+def _check_levels(thresholds: Sequence[float] | None, inclinations: Sequence[float] | None) -> None:
     shares, angles = list(thresholds or ()), list(inclinations or ())
     if not shares or any(high <= low for low, high in pairwise(shares)):
         raise InputError(
@@ -81,14 +78,13 @@ def _check_levels(
         )
     if len(angles) != len(shares):
         raise InputError(
-            f"{len(shares)} thresholds and {len(angles)} inclinations: give the sheet's inclination at which"
-            " each threshold is passed, from the lowest on"
+            f"inclinations do not match: {len(shares)} thresholds and {len(angles)} inclinations. Give the"
+            " sheet's inclination at which each threshold is passed, from the lowest on"
         )
     rising = all(low < high for low, high in zip([0.0, *angles], [*angles, math.pi / 2], strict=True))
     if not rising:
         degrees = _listed(map(math.degrees, angles))
         raise InputError(f"inclinations {degrees} deg: they must rise with the thresholds, between 0 and 90")
-    return angles
 
 
 def _listed(numbers: Any) -> str:

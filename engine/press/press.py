@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.method import Context, Method, Plan, Step
-from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.options import option
 from mirrorskin.engine.press.changepoint import ChangePoint
 from mirrorskin.engine.press.crossing import Event, PressOperation
@@ -139,6 +138,25 @@ class Press(Method, options_of=(Onset, Levels, Elastomer, HoleFilling)):
         help="first crossing of the threshold, or most likely change",
     )
 
+    @property
+    def _has_levels(self) -> bool:
+        return self.thresholds is not None or self.inclinations is not None
+
+    def check_options(self) -> None:
+        """Raise InputError if the method cannot be used with the other options."""
+        if self.method == "threshold":
+            if self._has_levels:
+                self.make(Levels)
+            return
+        if self._has_levels:
+            raise InputError("thresholds and inclinations need method 'threshold'")
+        if not self.subframe:
+            raise InputError(
+                "subframe is False, but a change-point lies between frames: equation 4 as printed needs"
+                " method 'threshold'"
+            )
+        self.make(ChangePoint)
+
     def plan(self, source: Source) -> Plan:
         """Return the operation for a source: by its travel, the method, and what is known of the levels."""
         oscillates = _oscillates(source)
@@ -151,10 +169,9 @@ class Press(Method, options_of=(Onset, Levels, Elastomer, HoleFilling)):
         process = self._process(source, frames, operation)
         if levels is not None:
             operation, process = _with_levels(operation, levels, process)
-        if kind is ChangePoint:
-            self._check_change_point(source, operation)
-            if operation.passes == 2:
-                process |= dict.fromkeys(("dark", "bright"), "each pixel's own")
+        if operation.passes == 2:
+            _check_rewindable(source)
+            process |= dict.fromkeys(("dark", "bright"), "each pixel's own")
         return Plan(operation, self._steps(operation), process, frames, _OMIT)
 
     def live_plan(self, source: Source) -> Plan:
@@ -166,29 +183,15 @@ class Press(Method, options_of=(Onset, Levels, Elastomer, HoleFilling)):
 
     def _kind(self, source: Source, oscillates: bool) -> type[PressOperation]:
         """Return the class of operations that finds the heights."""
-        levels = self.thresholds is not None or self.inclinations is not None
-        if levels and (oscillates or self.method != "threshold"):
-            raise InputError(
-                f"{source.name}: inclinations need the method 'threshold' and a press that goes down once"
-            )
+        if oscillates and self._has_levels:
+            raise InputError(f"{source.name}: inclinations need a press that goes down once")
         if oscillates and self.method != "threshold":
             raise InputError(f"{source.name}: travel oscillates, which needs the method 'threshold'")
-        if levels:
+        if self._has_levels:
             return Levels
         if oscillates:
             return Strokes
         return Onset if self.method == "threshold" else ChangePoint
-
-    def _check_change_point(self, source: Source, operation: Operation) -> None:
-        if not self.subframe:
-            raise InputError(
-                "a change-point lies between frames: equation 4 as printed needs method 'threshold'"
-            )
-        if operation.passes == 2 and not source.rewindable:
-            raise InputError(
-                f"{source.name} cannot be read twice, as a change between unknown levels needs: "
-                "give dark and bright"
-            )
 
     def _estimated(self, source: Source, frames: range, operation: PressOperation) -> EstimatedLevels | None:
         """Estimate levels that neither the options nor the source specify."""
@@ -218,6 +221,14 @@ class Press(Method, options_of=(Onset, Levels, Elastomer, HoleFilling)):
     def _lowest(self, operation: PressOperation) -> float:
         """Return the threshold that heights belong to."""
         return float(self.thresholds[0] if isinstance(operation, Levels) else self.threshold)
+
+
+def _check_rewindable(source: Source) -> None:
+    if not source.rewindable:
+        raise InputError(
+            f"{source.name} cannot be read twice, as a change between unknown levels needs: "
+            "give dark and bright"
+        )
 
 
 def _with_levels(

@@ -33,6 +33,8 @@ from mirrorskin.engine.rotation.normals_kernel import (
 from mirrorskin.engine.rotation.normals_window import NormalWindow
 from mirrorskin.engine.rotation.poses import PoseFit
 from mirrorskin.engine.rotation.response import Response, initial_response, wall_response_of
+from mirrorskin.engine.rotation.scale import check_gain
+from mirrorskin.engine.rotation.tilt import check_tilt
 from mirrorskin.engine.tiling import Band, cut_into_bands, join_rows, room_of
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.maps import TABLE
@@ -81,6 +83,11 @@ class NormalsOperation(SensorOptions, Operation):
 
     _kernel_maps: tuple[str, ...] = MAPS
     _width = 0  # components of a frame's position; 0 for a number
+
+    def check_options(self) -> None:
+        """Raise InputError if the zenith's gain is 0."""
+        if self.zenith_gain is not None:
+            check_gain(self.zenith_gain)
 
     def configured_for(self, source: Source) -> Self:
         """Return the operation with what the source says of the sensor, where it is not given."""
@@ -373,6 +380,12 @@ class Normals(NormalsOperation):
         " and tilt are estimated from the first of these turns",
         shown_default="all turns",
     )
+
+    def check_options(self) -> None:
+        """Raise InputError if the zenith's gain is 0, or no body tilts so."""
+        super().check_options()
+        if not isinstance(self.tilt, str | None):
+            check_tilt(cast(float, self.tilt))
 
     def configured_for(self, source: Source) -> Self:
         """Return the operation with what the source says of sensor and rotation, where it is not given."""

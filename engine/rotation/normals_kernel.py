@@ -17,7 +17,7 @@ from mirrorskin.engine.rotation.poses import PoseFit
 from mirrorskin.engine.rotation.residual_noise import CountNoise, residual_noise
 from mirrorskin.engine.rotation.response import Response
 from mirrorskin.engine.rotation.scale import make_scale
-from mirrorskin.engine.rotation.tilt import check_tilt, estimate_tilt
+from mirrorskin.engine.rotation.tilt import estimate_tilt
 from mirrorskin.engine.tiling import Band, Planes
 from mirrorskin.io import InputError
 from mirrorskin.kernels.array import Operand
@@ -125,7 +125,7 @@ class NormalKernel:
                 f"method {method!r} assumes brightness that is linear in the zenith, not the calibrated one:"
                 " use exact, or leave the calibration out"
             )
-        self._tilt = None if isinstance(tilt, str) else check_tilt(tilt)
+        self._tilt = None if isinstance(tilt, str) else tilt
         self._noise = None if options.noise is None else _even_noise(options.noise)
         self._dtype, self._method, self._step = dtype, method, thinning(shape)
         levels = options.zenith_gain, options.zenith_offset, options.dark, options.bright

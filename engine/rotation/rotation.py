@@ -70,6 +70,12 @@ class Rotation(Method, options_of=(NormalsOperation, Integration)):
     )
     window_frames: int | None = Normals.window_frames
 
+    def check_options(self) -> None:
+        """Raise InputError if options do not fit together or cannot be those of a rotation."""
+        if self.heights is not None and self.tilt == "estimate":
+            raise InputError("heights register frames, which needs a tilt: give it instead of 'estimate'")
+        self.make(Normals)
+
     def plan(self, source: Source) -> Plan:
         """Return the operation for a source; it depends on the poses and on the known response."""
         wall = self._wall_of(source)
@@ -79,8 +85,6 @@ class Rotation(Method, options_of=(NormalsOperation, Integration)):
             return self._poses(source)
         header = self._header(source)
         heights = _heights_of(self.heights, source)
-        if heights is not None and self.tilt == "estimate":
-            raise InputError(f"{source.name}: registering frames with heights needs a known tilt: give it")
         if wall is None:
             return self._linear(source, header, heights)
         return self._calibrated(source, header, wall, heights)

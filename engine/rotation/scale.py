@@ -65,12 +65,7 @@ def make_scale(
     }
     known = {name: _as_map(name, value, shape) for name, value in given.items() if value is not None}
     rate, zero = known["zenith gain"], known["zenith offset"]
-    sound = np.isfinite(rate) & (rate != 0)
-    if not sound.any():
-        what = (
-            f"zenith gain {rate}" if rate.ndim == 0 else "the zenith gain of every pixel is 0 or not a number"
-        )
-        raise InputError(f"{what}: counts per radian other than 0 are needed; calibrate, or leave it out")
+    check_gain(rate)
     if not np.isfinite(zero).any():
         raise InputError("the zenith offset is not a number: give the counts at zenith 0, such as 10")
     for name in ("dark", "bright"):
@@ -81,13 +76,22 @@ def make_scale(
     if "dark" in known and "bright" in known and not np.any(known["dark"] < known["bright"]):
         raise InputError("dark is not below bright at any pixel: are they swapped?")
     with np.errstate(divide="ignore", invalid="ignore"):
-        per_count = np.where(sound & np.isfinite(zero), 1 / rate, np.nan)
+        sound = np.isfinite(rate) & (rate != 0) & np.isfinite(zero)
+        per_count = np.where(sound, 1 / rate, np.nan)
         ends = [
             (known.get(name, np.asarray(end)) - zero) * per_count
             for name, end in (("dark", -np.inf), ("bright", np.inf))
         ]
     planes = zero, per_count, np.fmin(*ends), np.fmax(*ends)
     return Scale(np.stack(np.broadcast_arrays(*planes)).astype(np.float64))
+
+
+def check_gain(gain: ArrayLike) -> None:
+    """Raise InputError if a zenith gain is 0 or not a number at every pixel."""
+    rate = np.asarray(gain, np.float64)
+    if not np.any(np.isfinite(rate) & (rate != 0)):
+        what = f"zenith_gain {rate}" if rate.ndim == 0 else "zenith_gain is 0 or not a number at every pixel"
+        raise InputError(f"{what}: counts per radian other than 0 are needed; calibrate, or leave it out")
 
 
 def _as_map(name: str, values: ArrayLike, shape: tuple[int, int]) -> Doubles:

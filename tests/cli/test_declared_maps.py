@@ -316,6 +316,13 @@ def test_a_declaration_that_does_not_fit_is_one_line(maps, result, message):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("maps", [DECLARED, {"a": "mm"}, {}])
+def test_declarations_in_a_mapping_are_refused_in_one_line(maps):
+    with pytest.raises(io.InputError, match=r"^Wrong assigns maps: declare each map as a class") as caught:
+        type("Wrong", (engine.Operation,), {"maps": maps, "a": io.Map(unit="mm")})
+    assert "\n" not in str(caught.value)
+
+
 @EACH
 def test_a_result_with_declared_maps_can_be_pickled(name):
     assert_same(pickle.loads(pickle.dumps(of(name))), of(name))

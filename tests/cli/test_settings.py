@@ -26,7 +26,7 @@ frames = "10:200"
 
 [press]
 event = "release"
-method = "change-point"
+method = "threshold"
 threshold = 0.25
 thresholds = [0.25]
 inclinations = ["12deg"]
@@ -84,7 +84,7 @@ def test_every_key_arrives_in_the_engine_s_words_and_units(settings):
     }
     assert plan.press == {
         "event": "release",
-        "method": "change-point",
+        "method": "threshold",
         "threshold": 0.25,
         "thresholds": [0.25],
         "inclinations": [pytest.approx(math.radians(12))],
@@ -197,6 +197,28 @@ def test_a_tilt_may_be_estimated(settings):
             'tilt = "steep"',
             "tilt steep: a number and a unit are needed; write e.g. 2.5deg, or estimate",
         ),
+        ("rotation", 'tilt = "0deg"', "tilt 0 deg: above 0 and up to 30 deg is needed"),
+        ("rotation", 'zenith-gain = "0/deg"', "zenith-gain 0.0: counts per radian other than 0"),
+        (
+            "rotation",
+            'tilt = "estimate"\nheights = "ball.h5"',
+            "heights register frames, which needs a tilt: give it",
+        ),
+        (
+            "press",
+            'method = "change-point"\nsubframe = false',
+            "subframe is False, but a change-point lies between frames",
+        ),
+        ("press", 'method = "change-point"\nthreshold = 0', "threshold 0.0: a change-point needs a share"),
+        ("press", 'method = "change-point"\nthreshold = 1', "threshold 1.0: a change-point needs a share"),
+        ("press", 'method = "change-point"\nhold = 13', "hold 13: a change-point needs a number of frames"),
+        (
+            "press",
+            'method = "change-point"\nthresholds = [0.5]\ninclinations = ["5deg"]',
+            "thresholds and inclinations need method 'threshold'",
+        ),
+        ("press", "thresholds = [0.5]", "inclinations do not match: 1 thresholds and 0 inclinations. Give"),
+        ("press", "thresholds = [0.5, 0.4]", "thresholds 0.5, 0.4: give them from the lowest"),
         ("slip", "window-size = 0", "window-size is 0: a number of pixels"),
         ("rotation", 'zenith-gain = "5.7"', "zenith-gain 5.7: a number over a unit of angle"),
         ("rotation", "noise = 0", "noise is 0: a number in counts above 0 is needed"),
@@ -211,6 +233,19 @@ def test_what_cannot_be_used_is_told_with_file_table_and_key(settings, table, li
         settings(f"[{table}]\n{line}\n")
     assert str(refused.value).startswith(f"b.toml: {table}.{said}")
     assert "\n" not in str(refused.value)
+
+
+BAND = """
+from mirrorskin import engine, io
+
+class Band(engine.Operation):
+    low: float = engine.option(default=0.0, unit="counts", help="lowest brightness")
+    high: float = engine.option(default=1.0, unit="counts", help="highest brightness")
+
+    def check_options(self):
+        if self.low >= self.high:
+            raise io.InputError("a band needs low below high")
+"""
 
 
 @pytest.mark.parametrize(
@@ -229,12 +264,21 @@ def test_what_cannot_be_used_is_told_with_file_table_and_key(settings, table, li
             "b.toml: operation.depth is not known: there are class, threshold",
         ),
         (
+            "[operation]\nclass = 'mirrorskin.engine:ChangePoint'\nthreshold = 0",
+            "b.toml: operation.threshold 0.0: a change-point needs a share",
+        ),
+        (
+            "[operation]\nclass = 'mine.py:Band'\nlow = 2.0",
+            "b.toml: operation: a band needs low below high",
+        ),
+        (
             "[operation]\nclass = 'mirrorskin.engine:Onset'\n[press]\nhold = 2",
             "b.toml: press is not known: there are stack, operation",
         ),
     ],
 )
 def test_a_file_that_makes_no_sense_is_told(settings, text, said):
+    Path("mine.py").write_text(BAND)
     with pytest.raises(io.InputError) as refused:
         settings(text)
     assert str(refused.value).startswith(said)

@@ -519,6 +519,18 @@ def test_sources_that_do_not_fit_are_refused_in_one_line(case):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("wrong", [np.zeros(3), "yes", None, 1])
+def test_flags_that_are_no_flags_are_refused_in_one_line(wrong):
+    line = r"^robust is .*: use True or False$"
+    for function, maps in (
+        (engine.fuse, (nothing(), {}, 0.1)),
+        (engine.integrate, ()),
+        (fuse_recordings, UNFIT["no gain"][:2]),
+    ):
+        with pytest.raises(io.InputError, match=line):
+            function(*maps, robust=wrong)
+
+
 def test_turns_are_not_fused_one_by_one():
     with pytest.raises(io.InputError, match="all turns make one surface"):
         fused_anew(rotation={"per_turn": True})

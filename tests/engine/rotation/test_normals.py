@@ -358,7 +358,7 @@ REFUSED = {
         stack(),
         EIGHTHS,
         {"zenith_gain": np.zeros(SHAPE)},
-        "gain of every pixel is 0 or not a number",
+        "zenith_gain is 0 or not a number at every pixel",
     ),
     "a gain of no number": (
         stack(),

@@ -285,8 +285,8 @@ REFUSED = {
     ),
     "two frames": ({"frames": slice(2)}, {}, "^made up: 2 frames at 2 different phases"),
     "no phases": ({"phase": None}, {}, "^made up: phase is missing"),
-    "a gain of 0": ({}, {"zenith_gain": 0.0}, "^made up: zenith gain 0.0: counts per radian"),
-    "a tilt of 40 degrees": ({}, {"tilt": 0.7}, "^made up: tilt 40.1.* deg: above 0"),
+    "a gain of 0": ({}, {"zenith_gain": 0.0}, "^zenith_gain 0.0: counts per radian"),
+    "a tilt of 40 degrees": ({}, {"tilt": 0.7}, "^tilt 40.1.* deg: above 0"),
     "heights of others": ({}, {"heights": np.zeros((3, 3))}, r"heights have shape \(3, 3\)"),
 }
 
