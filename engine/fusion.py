@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.fusion_solver import AbsoluteHeights, FusionSolver
+from mirrorskin.engine.inputs import Maps, as_result, pixel_size_of
 from mirrorskin.engine.integration.surface import Surface
-from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.method import Context, Method, undistorted
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.press.press import Press
@@ -24,7 +24,7 @@ from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Motion, Result, Source, pixel_axes
 from mirrorskin.io.arguments import checked
-from mirrorskin.io.result import absolute_heights, result_from
+from mirrorskin.io.result import absolute_heights
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.device import Device, open_device
 
@@ -37,9 +37,9 @@ _STILL = 0.02  # pixels that points may move between the last two passes
 
 @checked
 def fuse(
-    heights: Mapping[str, Any],
-    normals: Mapping[str, Any],
-    pixel_size: ArrayLike,
+    heights: Maps,
+    normals: Maps,
+    pixel_size: ArrayLike | None = None,
     *,
     mask: ArrayLike | None = None,
     robust: bool = False,
@@ -62,15 +62,15 @@ def fuse(
 
     Parameters
     ----------
-    heights : Result or mapping
+    heights : Result, mapping, xarray.Dataset or path
         With ``height`` and ``height_sigma``, (H, W), mm; NaN where unknown. A map that is declared with the
         quantity "height" serves as well. Heights of components whose offset is unknown are not used.
-    normals : Result or mapping
+    normals : Result, mapping, xarray.Dataset or path
         With ``normals``, (H, W, 3), and ``normals_sigma``, (H, W), radians; NaN where unknown. If there is
         ``contact``, (H, W), normals where it is 0 are not used. If its process has a ``tilt``, radians, the
         normals are those of a precession, whose errors depend on the direction.
-    pixel_size : float or (float, float)
-        Millimetres along x and y.
+    pixel_size : float or (float, float), optional
+        Millimetres along x and y; by default that of the heights.
     mask : array_like, (H, W), optional
         Nonzero where heights are wanted; by default everywhere.
     robust : bool
@@ -107,7 +107,7 @@ def fuse(
     height = absolute_heights(height_maps)
     assert height is not None
     known = AbsoluteHeights.of(height, height_maps.height_sigma, wanted)
-    size = check_pixel_size(pixel_size)
+    size = pixel_size_of(height_maps, "heights", pixel_size)
     solver = FusionSolver(known, size, robust, open_device(device))
     surface = solver.filled(solver.surface(slopes))
     x, y = pixel_axes(wanted.shape, size)
@@ -116,12 +116,9 @@ def fuse(
     return Result(_maps_of_surface(surface), x=x, y=y, process=describe_integration([surface]))
 
 
-def _maps_of(name: str, maps: Mapping[str, Any], *needed: str) -> Result:
-    """Return a mapping as a result, if it has the maps that are needed."""
-    if not isinstance(maps, Mapping):
-        what = " and ".join(needed)
-        raise InputError(f"{name} is a {type(maps).__name__}: give a result, or a mapping with {what}")
-    result = result_from(maps)
+def _maps_of(name: str, maps: Maps, *needed: str) -> Result:
+    """Return maps as a result, if it has those that are needed."""
+    result = as_result(maps, name, quantity=needed[0])
     missing = [one for one in needed if result.name_of(one) is None]
     if missing:
         has = ", ".join(result) or "no maps"

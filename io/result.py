@@ -360,11 +360,6 @@ def _checked_map(name: str, values: NDArray[Any], declared: Map, shape: tuple[in
     return values.astype(declared.dtype, copy=False) if values.ndim else float(values)
 
 
-def result_from(maps: Mapping[str, Any]) -> Result:
-    """Return a result as it is, and any other mapping from names to maps as a result."""
-    return maps if isinstance(maps, Result) else Result(maps)
-
-
 def absolute_heights(result: Result) -> NDArray[np.float32] | None:
     """Return the heights of a result without the pieces whose offset is unknown, which are NaN."""
     height: NDArray[np.float32] | None = result.height

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.inputs import as_result
 from mirrorskin.engine.method import Method, Plan, Step
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.options import option
@@ -36,7 +37,7 @@ from mirrorskin.engine.streaming import feed
 from mirrorskin.io import Block, Calibrated, Header, InputError, Recording, Source, WallResponse, open_heights
 from mirrorskin.io.frames import FrameSequence
 from mirrorskin.io.positions import check_phase
-from mirrorskin.io.result import absolute_heights, result_from
+from mirrorskin.io.result import absolute_heights
 
 if TYPE_CHECKING:
     from mirrorskin.io.types import ProcessValue
@@ -243,7 +244,7 @@ def _heights_of(heights: Any, source: Source) -> ArrayLike | None:
         recording = source.source if isinstance(source, Calibrated) else source
         return open_heights(heights, recording if isinstance(recording, Recording) else None)
     if isinstance(heights, Mapping):
-        return absolute_heights(result_from(heights))
+        return absolute_heights(as_result(heights, "heights"))
     return cast("ArrayLike | None", heights)
 
 

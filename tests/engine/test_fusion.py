@@ -358,8 +358,24 @@ BAD = {
         {"normals": heights(plane()[0])},
         "normals has no map normals: it has height, height_sigma",
     ),
-    "no maps": ({"heights": plane()[0]}, "heights is a ndarray: give a result, or a mapping with height and"),
+    "an array": ({"heights": plane()[0]}, "heights has no map height_sigma: it has height"),
+    "None": ({"heights": None}, "heights is None: a Result, a mapping, a dataset, a path or an array is"),
 }
+
+
+@pytest.mark.parametrize("kind", ["dataset", "file"])
+def test_heights_and_normals_may_be_datasets_or_files(tmp_path, kind):
+    size = io.pixel_axes(SHAPE, (0.1, 0.1))
+    true, slopes = plane()
+    given = [heights(true).assign(x=size[0], y=size[1]), directions(slopes)]
+    expected = engine.fuse(*given, 0.1)
+    if kind == "dataset":
+        others = [one.to_xarray() for one in given]
+    else:
+        others = [tmp_path / "heights.h5", tmp_path / "normals.h5"]
+        for one, path in zip(given, others, strict=True):
+            io.save_result(one, path)
+    np.testing.assert_array_equal(engine.fuse(*others).height, expected.height)
 
 
 @pytest.mark.parametrize("case", BAD)
