@@ -7,7 +7,6 @@ from .fusion import fuse
 from .integration.camera import Camera
 from .integration.integration import Integrator, integrate
 from .integration.laplacian import invert_laplacian
-from .integration.surface import Surface
 from .method import Method, Step
 from .metrology.measures import Measures, measure
 from .operation import Operation
@@ -63,7 +62,6 @@ __all__ = [
     "Step",
     "Stitch",
     "Strokes",
-    "Surface",
     "correlate",
     "decode_gray",
     "estimate_frequency",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,73 +24,64 @@ from mirrorskin.engine.integration.multigrid import Multigrid, Solution
 from mirrorskin.engine.integration.rectangle import Rectangle, seems_full
 from mirrorskin.engine.integration.robust import solve_robust
 from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
-from mirrorskin.io import InputError
-from mirrorskin.io.result import Shown
+from mirrorskin.engine.operation import OnDevice
+from mirrorskin.engine.options import Option, option
+from mirrorskin.io import InputError, Result
+from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.links import DOWN, KNOWN, LOST, RIGHT, SLOPE
 
-IntegrationMethod = Literal["direct", "multigrid", "robust"]
+Method = Literal["direct", "multigrid", "robust"]
 
-_UNEVEN = 2.0  # weights of links to the right over those down, or back, that the multigrid may split
-_GOAL = 1e-4  # residual that is near enough where there is a deadline instead of a tolerance
-
-
-@dataclass(frozen=True, slots=True, repr=False)
-class Surface(Shown):
-    """Heights from slopes, known heights, or both.
-
-    Attributes
-    ----------
-    height : ndarray, (H, W) or (K, H, W), float32
-        Millimetres; with a camera the depth, in the unit of known ones. NaN where there is no answer. Of
-        several surfaces one after the other; all else is the same for all of them.
-    sigma : ndarray, (H, W), float32, or None
-        Expected standard deviation of the height, mm: about the mean of its component where that has no known
-        height. NaN where there is no answer, and where the noise of the slopes cannot be estimated.
-    component : ndarray, (H, W), int32
-        The connected component of a pixel, numbered in reading order of their first pixels; -1 where there is
-        no answer.
-    offset_unknown : ndarray, (components,), bool
-        Whether a component has no known height: its mean is 0, or the geometric mean of its depth 1.
-    filled : ndarray, (H, W), uint8
-        1 where a height was not measured but filled in.
-    edges : ndarray, (H, W), uint8, or None
-        1 on either side of a discontinuity that was found; None where none was looked for.
-    iterations : int
-        Of the solver, in all; of several surfaces the most.
-    residual : float
-        Norm of the error over that of the heights above the mean plane, both by the weights of the sum that
-        is minimised; 0 of the direct solver. Of several surfaces the greatest.
-    converged : bool
-        Whether the residual is within the tolerance; without one, whether it is below 0.3.
-    method : {"direct", "multigrid", "robust"}
-    invalid : int
-        Pixels within the mask whose slopes are no numbers.
-    """
-
-    height: NDArray[np.float32]
-    sigma: NDArray[np.float32] | None
-    component: NDArray[np.int32]
-    offset_unknown: NDArray[np.bool_]
-    filled: NDArray[np.uint8]
-    edges: NDArray[np.uint8] | None
-    iterations: int
-    residual: float
-    converged: bool
-    method: IntegrationMethod
-    invalid: int
+_UNEVEN = 2.0  # ratio of the weights of horizontal and vertical links above which they count as uneven
+_GOAL = 1e-4  # residual to stop at if there is a deadline, but no tolerance
 
 
-@dataclass(frozen=True, slots=True)
-class SolverOptions:
-    """How near a solver comes, and what else it returns."""
+class _Tolerance(Option):
+    """A number above 0, or None."""
 
-    tolerance: float | None = None  # of the residual; None: as near as two cycles get
-    deadline: float | None = None  # of ``time.perf_counter``; where there is one, no tolerance must be met
-    # k of the search for discontinuities; None where none are looked for.
-    sharpness: float | None = None
-    sigma: bool = False  # whether to estimate the heights' standard deviation
+    def check(self, value: Any) -> Any:
+        return None if value is None else super().check(value)
+
+
+_tolerance: Option = option(
+    default=1e-5,
+    above=0,
+    help="residual to stop at: norm of the error over that of the heights above the mean plane, both with the "
+    "weights of the sum that is minimised. None: do two cycles",
+)
+
+
+class IntegrationOptions(OnDevice):
+    """Options of `integrate`, the same in all cases. The budget starts when the object is created."""
+
+    robust: bool = option(
+        default=False,
+        help="whether to look for discontinuities in addition to ``edges``; for one surface only",
+    )
+    bilateral_sharpness: float = option(
+        default=2.0,
+        above=0,
+        help="sharpness k of discontinuities, 1/pixel^2: links that miss their slopes by more than "
+        "2.4 / sqrt(2 k) are cut",
+    )
+    sigma: bool = option(
+        default=True,
+        help="whether to estimate the heights' standard deviation, which takes about as long as the heights",
+    )
+    tolerance: float | None = cast(Any, _Tolerance(**vars(_tolerance)))
+    budget: float | None = option(
+        default=None,
+        above=0,
+        unit="s",
+        help="time limit, in place of the tolerance: after the first cycle, no cycle is started that would end "
+        "later. Preparation and ``sigma`` are not limited",
+    )
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.deadline = None if self.budget is None else time.perf_counter() + self.budget
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +90,7 @@ class _Relief:
 
     height: Array  # (H, W) or (K, H, W)
     planes: list[Plane]
-    method: IntegrationMethod
+    method: Method
     iterations: int
     residual: float
     converged: bool
@@ -138,10 +129,10 @@ class SurfaceSolver:
         self._last = self._plane = None
 
     def solve(
-        self, inputs: Inputs, options: SolverOptions, start: NDArray[np.floating] | None = None
-    ) -> Surface:
+        self, inputs: Inputs, options: IntegrationOptions, start: NDArray[np.floating] | None = None
+    ) -> Result:
         """Return the surface of a picture, from a start, (H, W), mm, or the last heights on."""
-        if options.sharpness is None and seems_full(inputs):
+        if not options.robust and seems_full(inputs):
             full = self._solve_full(inputs, options)
             if full is not None:
                 return full
@@ -167,7 +158,7 @@ class SurfaceSolver:
         self._finishing = time.perf_counter() - begun
         return surface
 
-    def _solve_full(self, inputs: Inputs, options: SolverOptions) -> Surface | None:
+    def _solve_full(self, inputs: Inputs, options: IntegrationOptions) -> Result | None:
         """Return the surface of a full rectangle with even weights; None where a slope is missing."""
         if self._rectangle is None or self._rectangle.shape != inputs.dz_dx.shape:
             size, area = inputs.pixel_size, math.prod(inputs.pixel_size)
@@ -175,28 +166,29 @@ class SurfaceSolver:
         found = self._rectangle.integrate(inputs, options.sigma)
         if found is None:
             return None
-        return Surface(
-            height=found[0],
-            sigma=found[1],
-            component=np.zeros(self._graph.shape, np.int32),
-            offset_unknown=np.array([inputs.known_heights is None]),
-            filled=np.zeros(self._graph.shape, np.uint8),
-            edges=None,
+        height, sigma = found
+        return _as_result(
+            height,
+            sigma,
+            np.zeros(self._graph.shape, np.int32),
+            np.array([inputs.known_heights is None]),
+            method="direct",
             iterations=1,
             residual=0.0,
             converged=True,
-            method="direct",
             invalid=0,
         )
 
-    def _find(self, inputs: Inputs, options: SolverOptions, start: NDArray[np.floating] | None) -> _Relief:
+    def _find(
+        self, inputs: Inputs, options: IntegrationOptions, start: NDArray[np.floating] | None
+    ) -> _Relief:
         """Choose a solver and run it."""
         if self._plane is None:
             self._plane = self._graph.mean_plane(inputs)
         plane, links = self._plane, self._graph.links(self._plane)
         first = None if start is None else self._above_plane(start, inputs, plane)
-        if options.sharpness is not None:
-            known = inputs, links, self._kept.flags, plane, options.sharpness
+        if options.robust:
+            known = inputs, links, self._kept.flags, plane, options.bilateral_sharpness
             near = options.tolerance or _GOAL
             one = solve_robust(*known, start=first, tolerance=near, deadline=options.deadline)
             numbers = one.iterations, one.residual, one.converged or options.tolerance is None
@@ -206,7 +198,7 @@ class SurfaceSolver:
         self._last = found.height
         return _relief(found, [plane])
 
-    def _find_several(self, inputs: Inputs, options: SolverOptions) -> _Relief:
+    def _find_several(self, inputs: Inputs, options: IntegrationOptions) -> _Relief:
         """Find several reliefs of one graph."""
         each = inputs.each()
         planes = [self._graph.mean_plane(one) for one in each]
@@ -227,7 +219,7 @@ class SurfaceSolver:
         self._kept.built = True
         return self._multigrid
 
-    def _goal(self, options: SolverOptions) -> dict[str, Any]:
+    def _goal(self, options: IntegrationOptions) -> dict[str, Any]:
         """Return how far the solver goes."""
         if options.deadline is None:
             return {"tolerance": options.tolerance}
@@ -244,21 +236,20 @@ class SurfaceSolver:
             datum = float(np.mean(above, where=known)) if known.any() else 0.0
         return np.where(known, above - datum, 0.0).astype(np.float32)
 
-    def _finish(self, inputs: Inputs, options: SolverOptions, relief: _Relief) -> Surface:
+    def _finish(self, inputs: Inputs, options: IntegrationOptions, relief: _Relief) -> Result:
         """Add plane and offsets to relief, and estimate its standard deviation."""
         components = self._find_components(inputs, relief)
         height = self._levelling.level(components, relief.height, relief.planes, inputs.datum)
-        return Surface(
-            height=height,
-            sigma=self._find_sigma(inputs, relief, components) if options.sigma else None,
-            component=components.labels,
-            offset_unknown=components.offset_unknown,
-            filled=np.zeros(self._graph.shape, np.uint8),
-            edges=relief.edges,
+        return _as_result(
+            height,
+            self._find_sigma(inputs, relief, components) if options.sigma else None,
+            components.labels,
+            components.offset_unknown,
+            relief.edges,
+            method=relief.method,
             iterations=relief.iterations,
             residual=relief.residual,
             converged=relief.converged,
-            method=relief.method,
             invalid=int(np.count_nonzero(self._kept.flags & LOST)),
         )
 
@@ -326,6 +317,29 @@ class SurfaceSolver:
 
 def _relief(found: Solution, planes: list[Plane]) -> _Relief:
     return _Relief(found.height, planes, "multigrid", found.iterations, found.residual, found.converged)
+
+
+def _as_result(
+    height: Floats,
+    sigma: Floats | None,
+    component: NDArray[np.int32],
+    offset_unknown: NDArray[np.bool_],
+    edges: Flags | None = None,
+    *,
+    method: Method,
+    **numbers: ProcessValue,
+) -> Result:
+    process: dict[str, ProcessValue] = {"integration": method}
+    process |= {f"integration_{name}": value for name, value in numbers.items()}
+    return Result(
+        height=height,
+        height_sigma=sigma,
+        component=component,
+        offset_unknown=offset_unknown.astype(np.uint8),
+        filled=np.zeros(component.shape, np.uint8),
+        edges=edges,
+        process=process,
+    )
 
 
 def explain(iterations: int, residual: float, tolerance: float | None) -> str:

@@ -90,11 +90,11 @@ def test_what_functions_return_shows_itself_in_a_few_lines():
     frames = np.zeros((5, 30, 40), np.uint8)
     frames[3:] = 255
     onset = engine.find_onset(frames, [0.0, 0.1, 0.2, 0.3, 0.4])
-    assert repr(onset).splitlines()[:2] == ["Onset", "  height        30 x 40         -0.25 to -0.25 mm"]
+    assert repr(onset).splitlines()[:2] == ["Result", "  height        30 x 40         -0.25 to -0.25 mm"]
     assert "<img" in onset._repr_html_()
     assert onset.plot().get_xlabel() == "column"
     surface = engine.integrate(np.zeros((8, 9)), np.zeros((8, 9)), 0.1)
-    assert repr(surface).startswith("Surface\n  height        8 x 9")
+    assert repr(surface).startswith("Result\n  height        8 x 9")
 
 
 def test_a_recording_shows_itself_in_a_line_and_a_picture(tmp_path):
