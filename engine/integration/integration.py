@@ -24,7 +24,7 @@ from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import checked
 from mirrorskin.kernels.device import Device, open_device
 
-# Pixels up to which the device keeps the memory of the last call, about 100 bytes a pixel: allocating it takes
+# Pixels up to which the device keeps the memory of the last call, about 100 bytes per pixel: allocation takes
 # as long as a solution (512 x 512 within a mask: 12 ms instead of 26).
 _LARGEST_CACHED = 2**23
 _OUTSIDE = {"height": np.nan, "height_sigma": np.nan, "component": -1, "filled": 0, "edges": 0}
@@ -74,9 +74,9 @@ def integrate(
         The pinhole camera that saw the normals; by default all lines of sight are along z. With a camera,
         ``height``, known and initial heights are *depths* Z > 0: distances from the pinhole along the optical
         axis, which increase away from the camera. The logarithm of Z is integrated: it rises by n_x / (n . v)
-        over the focal length from a pixel to the next one on the right, and by n_y / (n . v) to the one above,
-        where v = (x, y, 1) points along the line of sight to the camera. Normals do not determine the scale: a
-        component without a known depth has the geometric mean 1.
+        over the focal length from a pixel to the next one on the right, and by n_y / (n . v) to the one
+        above, where v = (x, y, 1) points along the line of sight to the camera. Normals do not determine the
+        scale: a component without a known depth has the geometric mean 1.
     mask : array_like, (H, W), optional
         0 where no height is wanted.
     slope_weights : array_like, scalar, (H, W) or (2, H, W), optional
@@ -91,7 +91,7 @@ def integrate(
     known_heights : array_like, (H, W), optional
         Known heights, mm, or depths in any unit; NaN elsewhere. These pixels need no slope.
     known_height_weights : array_like, scalar or (H, W), optional
-        Their inverse variances, 1/mm^2 (1 over the square of the depths' unit), 0 where unknown; by default 1.
+        Their inverse variances, 1/mm^2 (1 over the square of the depths' unit), 0 where unknown; default 1.
         Weights are clipped at 1e4 times a link's weight w.
     initial_heights : array_like, (H, W), optional
         Heights to start from, NaN where undefined.
@@ -102,8 +102,8 @@ def integrate(
     Returns
     -------
     Result
-        ``height``, (H, W) or (K, H, W), mm: with a camera the depth, in the unit of known ones. Pixels without
-        an answer are NaN. Other maps are (H, W), and shared by all surfaces.
+        ``height``, (H, W) or (K, H, W), mm: with a camera the depth, in the unit of known ones. NaN without an
+        answer. Other maps are (H, W), and shared by all surfaces.
 
         ``height_sigma``: expected standard deviation, about the mean of the component if it has no known
         height; NaN where the noise of the slopes cannot be estimated.
@@ -237,7 +237,7 @@ class Integrator(ThreadSafe):
         Parameters
         ----------
         budget : float, optional
-            Time limit, seconds: after the first, cycles are done while they end in time and improve the heights.
+            Time limit, seconds: after the first, cycles are done while they end in time and reduce the error.
         tolerance : float, optional
             Residual to stop at; with a budget it may be missed.
 

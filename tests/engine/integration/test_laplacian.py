@@ -86,7 +86,7 @@ BAD = {
     "links have shapes (3,) and": (np.ones(3), ONES[1]),
     "diagonal: shape (3, 3)": (*ONES, ONES[0]),
     "some are negative": (-ONES[0], ONES[1]),
-    "some are negative or no number": (*ONES, np.full((3, 4), np.nan)),
+    "some are negative or not finite": (*ONES, np.full((3, 4), np.nan)),
 }
 
 
