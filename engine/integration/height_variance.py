@@ -202,7 +202,7 @@ def _find_coarse(hierarchy: Hierarchy, number: int, mass: Floats) -> tuple[Ints,
     a, b = index[a], index[b]
     count = len(node)
     label = _connected(count, a, b)
-    diagonal = np.bincount(a, weight, count) + np.bincount(b, weight, count)
+    diagonal = np.asarray(np.bincount(a, weight, count) + np.bincount(b, weight, count), np.float64)
     free = np.bincount(label, pull, count) <= 0
     pixels = np.maximum(mass[node], 1).astype(np.float64)
     total, typical = np.bincount(label, pixels, count), np.bincount(label, diagonal, count)

@@ -77,8 +77,8 @@ class Hierarchy:
 
     ``graph`` has the nodes' links, and the weights of known heights as ``anchor`` (see
     ``kernels/multigrid.cl``); ``inverse`` is the inverse of the diagonal. ``to`` marks nodes that belong to
-    the aggregate of another block. ``moves`` counts, for each level, the aggregates that differ from blocks for
-    this reason, and ``changed`` lists them.
+    the aggregate of another block. ``moves`` counts, for each level, the aggregates that differ from blocks
+    for this reason, and ``changed`` lists them.
     """
 
     device: Device

@@ -102,8 +102,8 @@ def integrate(
     Returns
     -------
     Result
-        ``height``, (H, W) or (K, H, W), mm: with a camera the depth, in the unit of known ones. NaN without an
-        answer. Other maps are (H, W), and shared by all surfaces.
+        ``height``, (H, W) or (K, H, W), mm: with a camera the depth, in the unit of known ones. NaN where
+        undefined. Other maps are (H, W), and shared by all surfaces.
 
         ``height_sigma``: expected standard deviation, about the mean of the component if it has no known
         height; NaN where the noise of the slopes cannot be estimated.

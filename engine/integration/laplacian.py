@@ -60,8 +60,8 @@ def invert_laplacian(
     -------
     scipy.sparse.linalg.LinearOperator
         H W by H W, symmetric, for maps flattened in C order; for one thread at a time. The columns of a
-        matrix are solved together, several times as fast as one after the other. `NotConverged` is raised if weights
-        are too uneven to reach the tolerance.
+        matrix are solved together, several times as fast as one after the other. `NotConverged` is raised if
+        weights are too uneven to reach the tolerance.
 
     Raises
     ------

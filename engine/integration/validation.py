@@ -104,7 +104,7 @@ def check_inputs(
     """
     shape, slopes = _find_source(dz_dx, dz_dy, normals, camera, several)
     if camera is not None and pixel_size is not None:
-        raise InputError(f"pixel_size {pixel_size!r} is not needed with a camera: leave one of the two out")
+        raise InputError(f"pixel_size {pixel_size!r}: a camera determines it; leave one of the two out")
     size = check_pixel_size(pixel_size) if camera is None else camera.pixel_size
     weight, planes = _split_weights("slope_weights", slope_weights, shape)
     height_weight, height_planes = _split_weights("known_height_weights", known_height_weights, shape, 1)

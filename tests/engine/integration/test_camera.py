@@ -114,7 +114,7 @@ BAD = {
     "a camera needs normals": {"dz_dx": FLAT, "dz_dy": FLAT, "camera": CAMERA},
     "normals: shape (4, 5)": {"normals": FLAT, "camera": CAMERA},
     "normals: shape (0, 5, 3)": {"normals": NORMALS[:0], "camera": CAMERA},
-    "pixel_size 0.1: a camera": {"normals": NORMALS, "camera": CAMERA, "pixel_size": 0.1},
+    "pixel_size 0.1: a camera determines it": {"normals": NORMALS, "camera": CAMERA, "pixel_size": 0.1},
     "pixel_size is None": {"normals": NORMALS},
     "nothing to integrate": {"normals": -NORMALS, "camera": CAMERA},
     "known_heights: some are not above 0": {"normals": NORMALS, "camera": CAMERA, "known_heights": FLAT},

@@ -386,8 +386,8 @@ BAD = {
     "tolerance -0.1": {"tolerance": -0.1},
     "budget 0": {"budget": 0},
     "nothing to integrate": {"mask": MAP},
-    "nothing to integrate: no pixel": {"dz_dx": MAP * np.nan},
-    "nothing to integrate: no pixel that": {"slope_weights": 0},
+    "nothing to integrate: no wanted pixel": {"dz_dx": MAP * np.nan},
+    "nothing to integrate: no wanted pixel has": {"slope_weights": 0},
 }
 
 
