@@ -257,8 +257,8 @@ def covariance(gram: Doubles, parameters: int, count: int, claimed: float = 0.0)
 
     ``gram``, (k + m + 1, k + m + 1), contains the weighted sums over ``count`` residuals of all products of:
     the derivatives of a residual with respect to the parameters, m similarly smooth functions of its
-    position, and the residual. Weights are any multiple of the inverse variances. ``claimed`` is the weighted sum of
-    squares predicted by the standard deviations, 0 without these.
+    position, and the residual. Weights are any multiple of the inverse variances. ``claimed`` is the weighted
+    sum of squares predicted by the standard deviations, 0 without these.
     """
     scale = np.sqrt(np.diag(gram))
     lengths = np.where(scale > 0, scale, np.inf)

@@ -69,8 +69,8 @@ def section(
         Heights of one picture, mm, with their standard deviation, if available. An array is the height.
     start, end : (float, float), optional
         Millimetres from the picture's centre, x to the right and y up. By default the row of the highest
-        point, measured or filled, after a 3 x 3 median filter against spikes, from left to right. On a flat top, the
-        row in its middle.
+        point, measured or filled, after a 3 x 3 median filter against spikes, from left to right. On a flat
+        top, the row in its middle.
     pixel_size : float or (float, float), optional
         Millimetres along x and y; by default that of the result.
 

@@ -60,12 +60,12 @@ def roughness(
     """Return the roughness of a surface from its residual, (H, W) mm with NaN where undefined.
 
     ``pixel_size`` is along x and y, mm. ``cutoff``, mm, is the nesting index of the L-filter: longer waves
-    are removed, and pixels with more than a twentieth of the filter's weight on holes or outside the picture do
-    not count. ``sigma``, (H, W) mm, are the heights' standard deviations.
+    are removed, and pixels with more than a twentieth of the filter's weight on holes or outside the picture
+    do not count. ``sigma``, (H, W) mm, are the heights' standard deviations.
 
     Values include noise: Sq^2 is the sum of the squares of surface and noise if these are uncorrelated. In
-    any case noise changes Sq by at most its root mean square, and Sa by at most its mean magnitude: these are the
-    uncertainties. Noise increases Sz by at most the range of the noise; the errors of the highest and the
+    any case noise changes Sq by at most its root mean square, and Sa by at most its mean magnitude: these are
+    the uncertainties. Noise increases Sz by at most the range of the noise; the errors of the highest and the
     lowest pixel are added.
 
     Pixels that are far more uncertain than others (see `find_uncertain`) are excluded, because their errors
