@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.fusion_solver import AbsoluteHeights, FusionSolver
 from mirrorskin.engine.inputs import Maps, as_result, pixel_size_of
-from mirrorskin.engine.integration.surface import Surface
 from mirrorskin.engine.method import Context, Method, undistorted
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.press.press import Press
@@ -113,7 +112,7 @@ def fuse(
     x, y = pixel_axes(wanted.shape, size)
     if height_maps.x is not None and height_maps.y is not None:
         x, y = height_maps.x, height_maps.y
-    return Result(_maps_of_surface(surface), x=x, y=y, process=describe_integration([surface]))
+    return surface.assign(x=x, y=y, process=describe_integration([surface]))
 
 
 def _maps_of(name: str, maps: Maps, *needed: str) -> Result:
@@ -219,7 +218,7 @@ def fuse_recordings(
         if moved <= _STILL:
             break
         before = fill_with_nearest(surface.height)
-    if surface.sigma is None:
+    if surface.height_sigma is None:
         surface = solver.surface(slopes)
     surface = solver.filled(surface)
     if progress:
@@ -228,13 +227,10 @@ def fuse_recordings(
     process = _both(pressed.process, signed.process) | describe_integration([surface]) | {"heights": "none"}
     if register:
         process |= {"heights": "fused", "registrations": number + 1, "last_move_in_pixels": moved}
-    maps = _maps_of_surface(surface)
-    if maps["edges"] is None:
-        del maps["edges"]
-    else:
-        maps["edges"] = turned.edges | maps["edges"]
+    if surface.edges is not None:
+        surface = surface.assign(edges=turned.edges | surface.edges)
     result = turned.assign(
-        maps,
+        surface,
         status=pressed.status,
         x=pressed.x,
         y=pressed.y,
@@ -323,17 +319,6 @@ def _check_rotation(axial: Source, rotation: Rotation) -> None:
         raise InputError(f"{axial.name}: all turns make one surface: leave per_turn out")
     if rotation.heights is not None:
         raise InputError(f"{axial.name}: frames are registered with the heights of the press: give no others")
-
-
-def _maps_of_surface(surface: Surface) -> dict[str, Any]:
-    return {
-        "height": surface.height,
-        "height_sigma": surface.sigma,
-        "filled": surface.filled,
-        "component": surface.component,
-        "offset_unknown": surface.offset_unknown.astype(np.uint8),
-        "edges": surface.edges,
-    }
 
 
 def _moved(

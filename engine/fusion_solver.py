@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Self
 
 import cv2
@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.integration.integration import integrate
-from mirrorskin.engine.integration.surface import Surface
 from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.press.holes import fill_holes
 from mirrorskin.engine.press.intervals import estimate_interval_errors, fit_paraboloids, interval_evidence
 from mirrorskin.engine.rotation.normals_to_height import Slopes
-from mirrorskin.io import InputError
+from mirrorskin.io import InputError, Result
 from mirrorskin.kernels.device import Device
 
 Doubles = NDArray[np.float64]
@@ -76,9 +75,9 @@ class FusionSolver:
     def __init__(self, press: AbsoluteHeights, pixel_size: ArrayLike, robust: bool, device: Device) -> None:
         self._press, self._pixel_size = press, check_pixel_size(pixel_size)
         self._robust, self._device = robust, device
-        self._near: Surface | None = None
+        self._near: Result | None = None
 
-    def surface(self, slopes: Slopes, *, sigma: bool = True) -> Surface:
+    def surface(self, slopes: Slopes, *, sigma: bool = True) -> Result:
         """Return the surface of the heights and of slopes."""
         press, near = self._press, self._near
         if not (slopes.known | press.known).any():
@@ -93,14 +92,14 @@ class FusionSolver:
         height, weight = _use_intervals(near, press, slopes)
         found = self._solve(extended, height, weight, initial_heights=near.height, sigma=sigma)
         # Heights that are mistakes are left out of the surface, but may count next time.
-        self._near = replace(near, height=np.where(found.component < 0, near.height, found.height))
-        return found if found.sigma is None else _set_sigma_of_lone_pixels(found, weight)
+        self._near = near.assign(height=np.where(found.component < 0, near.height, found.height))
+        return found if found.height_sigma is None else _set_sigma_of_lone_pixels(found, weight)
 
-    def filled(self, surface: Surface) -> Surface:
+    def filled(self, surface: Result) -> Result:
         """Return a surface with its holes filled."""
         return _join(_fill(surface, self._pixel_size))
 
-    def _solve(self, slopes: Slopes, height: Doubles, weight: Doubles, **options: Any) -> Surface:
+    def _solve(self, slopes: Slopes, height: Doubles, weight: Doubles, **options: Any) -> Result:
         return integrate(
             slopes.dz_dx,
             slopes.dz_dy,
@@ -115,7 +114,7 @@ class FusionSolver:
         )
 
 
-def _correct_overstated(press: AbsoluteHeights, surface: Surface, slopes: Slopes) -> AbsoluteHeights:
+def _correct_overstated(press: AbsoluteHeights, surface: Result, slopes: Slopes) -> AbsoluteHeights:
     """Raise sigmas to the size of the errors, where slopes show that most are much too small."""
     both = press.known & slopes.known
     if not both.any():
@@ -129,7 +128,7 @@ def _correct_overstated(press: AbsoluteHeights, surface: Surface, slopes: Slopes
 
 
 def _extend(
-    slopes: Slopes, surface: Surface, press: AbsoluteHeights, pixel_size: tuple[float, float]
+    slopes: Slopes, surface: Result, press: AbsoluteHeights, pixel_size: tuple[float, float]
 ) -> Slopes:
     """Give pixels with a height but no normal, near those with one, the slopes of the heights around.
 
@@ -168,7 +167,7 @@ def _window(slopes: Slopes, sigma: float, pixel: float) -> float:
     return float(np.clip(terrace, _NARROWEST, _WIDEST))
 
 
-def _use_intervals(surface: Surface, press: AbsoluteHeights, slopes: Slopes) -> tuple[Doubles, Doubles]:
+def _use_intervals(surface: Result, press: AbsoluteHeights, slopes: Slopes) -> tuple[Doubles, Doubles]:
     """Return known heights and their weights by their intervals, around a surface that is about right.
 
     Heights far from it are mistakes, and get no weight. Nor do those without a normal of their own, which are
@@ -229,35 +228,35 @@ def _share_used(error: Doubles, half: Doubles, height: Doubles) -> float:
     return float(np.clip(used, _LEAST_USED, 1.0))
 
 
-def _sizes(surface: Surface) -> NDArray[np.intp]:
+def _sizes(surface: Result) -> NDArray[np.intp]:
     """Return how many pixels each component has."""
     return np.bincount(surface.component[surface.component >= 0], minlength=len(surface.offset_unknown))
 
 
-def _set_sigma_of_lone_pixels(surface: Surface, weight: Doubles) -> Surface:
+def _set_sigma_of_lone_pixels(surface: Result, weight: Doubles) -> Result:
     """Set the standard deviations of components of one pixel, which are known exactly."""
-    assert surface.sigma is not None
+    assert surface.height_sigma is not None
     lone = (surface.component >= 0) & (weight > 0) & (_sizes(surface)[surface.component] == 1)
-    sigma = surface.sigma.copy()
+    sigma = surface.height_sigma.copy()
     sigma[lone] = 1 / np.sqrt(weight[lone])
-    return replace(surface, sigma=sigma)
+    return surface.assign(height_sigma=sigma)
 
 
-def _fill(surface: Surface, pixel_size: ArrayLike) -> Surface:
+def _fill(surface: Result, pixel_size: ArrayLike) -> Result:
     """Fill holes from the absolute heights around them; what is relative stays as it is."""
-    assert surface.sigma is not None
+    assert surface.height_sigma is not None
     absolute = (surface.component >= 0) & ~_relative(surface)
-    height, filled = fill_holes(np.where(absolute, surface.height, np.nan), surface.sigma, pixel_size)
+    height, filled = fill_holes(np.where(absolute, surface.height, np.nan), surface.height_sigma, pixel_size)
     filled = np.where(surface.component < 0, filled, 0).astype(np.uint8)
-    return replace(surface, height=np.where(filled, height, surface.height), filled=filled)
+    return surface.assign(height=np.where(filled, height, surface.height), filled=filled)
 
 
-def _relative(surface: Surface) -> Mask:
+def _relative(surface: Result) -> Mask:
     """Return where heights are relative: pixels of components without a known one."""
-    return np.asarray(np.append(surface.offset_unknown, False)[surface.component])
+    return np.asarray(np.append(surface.offset_unknown, 0)[surface.component] != 0)
 
 
-def _join(surface: Surface) -> Surface:
+def _join(surface: Result) -> Result:
     """Make one component of neighbours whose heights are all absolute, though no slope leads across."""
     answered = (surface.component >= 0) | (surface.filled > 0)
     relative = _relative(surface)
@@ -267,6 +266,6 @@ def _join(surface: Surface) -> Surface:
     order = np.argsort(np.argsort(first))
     component = np.full(answered.shape, -1, np.int32)
     component[answered] = order[rank]
-    offset_unknown = np.zeros(len(first), bool)
-    offset_unknown[component[relative]] = True
-    return replace(surface, component=component, offset_unknown=offset_unknown)
+    offset_unknown = np.zeros(len(first), np.uint8)
+    offset_unknown[component[relative]] = 1
+    return surface.assign(component=component, offset_unknown=offset_unknown)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.cli.bench.records import Case, Target
 from mirrorskin.engine import Onset, estimate_normals, find_change_point, find_onset, fuse, integrate
-from mirrorskin.engine.integration import Surface
+from mirrorskin.io import Result
 from mirrorskin.kernels.device import Device
 from suite.harness import Cases, at_most, within
 from suite.scenes import STEPS, TILT
@@ -294,7 +294,7 @@ def _noisy(device: Device, quick: bool) -> list[Target]:
         given = known.dz_dx + noise[0], known.dz_dy + noise[1]
         found = integrate(*given, _PIXEL, slope_weights=1 / _SLOPE_NOISE**2, device=device)
         error = found.height - known.height
-        square.append(np.mean(((error - error.mean()) / found.sigma) ** 2))
+        square.append(np.mean(((error - error.mean()) / found.height_sigma) ** 2))
     low, high = (0.5, 1.5) if quick else (0.75, 1.25)
     return [within("noisy slopes: chi-square", float(np.mean(square)), low, high)]
 
@@ -349,7 +349,7 @@ def _ring(shape: tuple[int, int]) -> NDArray[np.uint8]:
     return ((away < 0.95) & (away > 0.02)).astype(np.uint8)
 
 
-def _range_error(found: Surface, known: Known) -> float:
+def _range_error(found: Result, known: Known) -> float:
     """Return the root mean square error about its mean, in ranges of the heights."""
     error = (found.height - known.height)[np.isfinite(found.height)]
     return float(np.std(error) / np.ptp(known.height[np.isfinite(found.height)]))

@@ -1,4 +1,4 @@
-"""A pinhole camera, and what surface normals that it sees say about the depth."""
+"""A pinhole camera, and the slopes of the logarithmic depth from the normals that it sees."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from mirrorskin.engine.integration.crop import Box
 from mirrorskin.io import InputError
 
 Slopes = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32] | None]
-"""Slopes along x and y, and their weight, (H, W); no weight where all have the same."""
+"""Slopes along x and y, and their weight, (H, W); None if all weights are equal."""
 
-_EDGE_ON = 1e-4  # squared share of a normal along the line of sight, up to which it tells no slope
+_EDGE_ON = 1e-4  # squared cosine of the angle between normal and line of sight, up to which there is no slope
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class Camera:
     Raises
     ------
     mirrorskin.io.InputError
-        Numbers that cannot be a camera's.
+        Focal length or principal point is not possible.
 
     Examples
     --------
@@ -74,7 +74,7 @@ class Camera:
         return width, height
 
     def sight(self, shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return x, (W,), and y, (H, 1), of vectors (x, y, 1) from what pixels show to the camera."""
+        """Return x, (W,), and y, (H, 1), of vectors (x, y, 1) from the object at each pixel to the camera."""
         rows, columns = shape
         column, row = self.principal_point or ((columns - 1) / 2, (rows - 1) / 2)
         width, height = self.pixel_size
@@ -83,13 +83,13 @@ class Camera:
 
 
 def find_slopes(normals: NDArray[Any], camera: Camera | None, box: Box) -> Slopes:
-    """Return slopes along x and y within a box, and their weights where normals are equally noisy.
+    """Return slopes along x and y within a box, and their weights for equally noisy normals.
 
-    Without a camera, which is then far away, they are the slopes of the height, -n_x / n_z and -n_y / n_z.
-    With one they are those of the logarithm of the depth, by the pixel size at depth 1: a step along x
-    changes the point Z r by Z (r d(ln Z) + dr), and n is perpendicular to that; so n_x / (n . v) and
-    n_y / (n . v), v = -r. The weight is (n . v)^2 of unit normals: a normal's errors are divided by n . v.
-    Where the surface faces away or is seen edge-on, or the normal is no number, the slopes are NaN.
+    Without a camera: the slopes of the height, -n_x / n_z and -n_y / n_z.
+    With one: the slopes of the logarithm of the depth, per pixel size at depth 1. A step along x changes the
+    point Z r by Z (r d(ln Z) + dr), to which n is perpendicular; so the slopes are n_x / (n . v) and
+    n_y / (n . v) with v = -r. The weight is (n . v)^2 of the unit normal, because its errors are divided by
+    n . v. Slopes are NaN where the surface faces away or is seen edge-on, and without a finite normal.
     """
     with np.errstate(all="ignore"):
         x, y, z = (np.asarray(normals[(*box, axis)], np.float32) for axis in range(3))
@@ -99,7 +99,7 @@ def find_slopes(normals: NDArray[Any], camera: Camera | None, box: Box) -> Slope
             facing += x * across[box[1]] + y * up[box[0]]
         square = x * x + y * y + z * z
         weight = np.square(facing) / square
-        bad = ~((facing > 0) & (weight > _EDGE_ON))
-        facing[bad], weight[bad] = np.nan, 1
-        over = np.reciprocal(facing if camera is not None else -facing)
-        return x * over, y * over, weight
+        undefined = ~((facing > 0) & (weight > _EDGE_ON))
+        facing[undefined], weight[undefined] = np.nan, 1
+        factor = np.reciprocal(facing if camera is not None else -facing)
+        return x * factor, y * factor, weight

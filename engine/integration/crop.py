@@ -14,9 +14,9 @@ Mask = NDArray[np.bool_]
 
 
 def find_box(shape: tuple[int, int], answered: Callable[[Box], Mask]) -> Box:
-    """Return the least box of all pixels with an answer, the whole picture where there is none.
+    """Return the smallest box that contains all pixels with an answer; the whole picture without any.
 
-    ``answered`` tells it of the pixels of a box; no more is asked than what is left out and a few lines.
+    ``answered`` returns a mask of the pixels of a box. It is only called for the margins and a few lines.
     """
     columns = slice(0, shape[1])
     rows = _find_ends(shape[0], lambda lines: np.any(answered((lines, columns)), axis=1))
@@ -24,7 +24,7 @@ def find_box(shape: tuple[int, int], answered: Callable[[Box], Mask]) -> Box:
 
 
 def _find_ends(count: int, answered: Callable[[slice], Mask]) -> slice:
-    """Return from the first to the last line with an answer, looking inwards from both ends."""
+    """Return the range from the first to the last line with an answer, searching from both ends."""
     begin, strip = 0, 1
     while not (some := answered(slice(begin, begin + strip))).any():
         begin, strip = begin + strip, 2 * strip

@@ -1,4 +1,4 @@
-"""A multigrid cycle over all levels of a hierarchy, for one right side or several at once."""
+"""A multigrid cycle over all levels of a hierarchy, for one or several right sides at once."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from mirrorskin.engine.integration.hierarchy import Hierarchy, Level, tile_colum
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Kernel
 
-_TWICE = 2  # the finest level that is gone through twice: all coarser ones are, or cycles may be indefinite
-_TAIL = 20480  # numbers of a level from which on down one group does all
-_LEAST = 1e-12  # of a component's links: anchors that are weaker leave its offset free
+_FIRST_W_LEVEL = 2  # finest level that is visited twice (W-cycle), as are all coarser ones
+_TAIL = 20480  # nodes times lanes of the finest level that one work-group processes with all coarser ones
+_WEAKEST_ANCHORS = 1e-12  # relative to a component's links, up to which its offset counts as free
 
 Doubles = NDArray[np.float64]
 
 
 def add_parts(parts: Array) -> Doubles:
-    """Return the sums of parts, (lanes,)."""
-    found = parts.download()
-    lanes: Doubles = np.ascontiguousarray(found.reshape(len(found), -1).T).sum(axis=1, dtype=np.float64)
-    return lanes
+    """Return the sums of partial sums, (lanes,)."""
+    values = parts.download()
+    sums: Doubles = np.ascontiguousarray(values.reshape(len(values), -1).T).sum(axis=1, dtype=np.float64)
+    return sums
 
 
 class Cycle:
-    """A cycle over a hierarchy, and memory for it: of all nodes ``b`` is the right side, ``x`` the answer.
+    """A cycle over a hierarchy, and its memory: ``b`` is the right side at all nodes, ``x`` the solution.
 
-    Of several right sides, ``lanes``, each node's numbers lie together.
+    With several right sides (``lanes``), the values of a node are adjacent in memory.
 
-    On each level three steps of Jacobi's method smooth on the way down, and on the way up in reverse. Half of
-    that is one pass, whose groups keep a tile of the level in local memory; all small levels are one.
+    The smoother is three Jacobi steps while descending, and the same in reverse while ascending. Each is one
+    kernel, whose work-groups keep a tile of the level in local memory. One kernel does all small levels.
     """
 
     b: Array
@@ -55,7 +55,7 @@ class Cycle:
         self._live = h.array("live", max(1, int(self._first_tile[-1])), dtype=np.uint8)
 
     def prepare(self) -> None:
-        """Make ready for what the hierarchy holds now."""
+        """Prepare for the current graph of the hierarchy."""
         h = self._h
         table = [[*one.place.values(), moves] for one, moves in zip(h.levels, h.moves, strict=True)]
         self._table = h.device.given("levels", np.array(table), np.int32)
@@ -63,20 +63,19 @@ class Cycle:
         self.find_tiles()
 
     def find_tiles(self) -> None:
-        """Find the tiles that have nodes; no cycle goes over the others."""
+        """Find the tiles that have nodes; cycles skip the others."""
         h = self._h
         for number, level in enumerate(h.levels[: self._tail]):
             kernel, items = self._kernel("find_live", level), self._tiles(level)
-            known = {"inverse": h.inverse, **self._live_of(number)}
-            kernel(items, **level.place, **known, moved=4 * level.nodes)
+            kernel(items, **level.place, inverse=h.inverse, **self._live_of(number), moved=4 * level.nodes)
 
     def _live_of(self, number: int) -> dict[str, Any]:
         return {"live": self._live, "first_tile": int(self._first_tile[number])}
 
     def factorise(self) -> bool:
-        """Solve the second level directly from now on, on the host; tell whether that is something new.
+        """Solve the second level directly on the host from now on; return whether that is a change.
 
-        Corridors that are narrower than a coarser level's aggregates are no longer apart there.
+        Coarser levels join corridors that are narrower than their aggregates, which slows convergence.
         """
         from scipy import sparse
         from scipy.sparse.linalg import splu
@@ -89,39 +88,39 @@ class Cycle:
         links = (links + links.T).tocsr()
         parts, label = sparse.csgraph.connected_components(links, directed=False)
         typical = np.asarray(links.sum(axis=1)).ravel()
-        held = np.bincount(label, pull, parts) <= _LEAST * np.bincount(label, typical, parts)
-        hold = np.zeros(count)
-        hold[np.unique(label, return_index=True)[1]] = np.where(held, 1.0, 0.0)  # one node of each free part
-        matrix = sparse.diags(typical + pull + hold) - links
+        free = np.bincount(label, pull, parts) <= _WEAKEST_ANCHORS * np.bincount(label, typical, parts)
+        fixed = np.zeros(count)  # one node of each free component
+        fixed[np.unique(label, return_index=True)[1]] = np.where(free, 1.0, 0.0)
+        matrix = sparse.diags(typical + pull + fixed) - links
         options = {"SymmetricMode": True}
         factors = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
         self._factors = factors.solve
         return True
 
     def _solve_directly(self) -> None:
-        """Answer the right side of the second level."""
+        """Solve the second level for its right side."""
         assert self._factors is not None
         level = self._h.levels[1]
         inside = slice(level.first, level.end - level.stride)
         b, x = self.b.download(), self.x.download()
-        with np.errstate(over="ignore"):  # of graphs that nearly come apart: cycles end there
+        with np.errstate(over="ignore"):  # nearly disconnected graphs: the iteration ends then
             x[inside] = self._factors(b[inside].astype(np.float64))
         self.b.upload()
         self.x.upload()
 
     def run(self) -> Doubles:
-        """Do a cycle from heights of zero: x answers b; return the product of both, (lanes,)."""
+        """Do a cycle from x = 0; return the product of b and x, (lanes,)."""
         self.launch()
         return self.product()
 
     def launch(self) -> None:
-        """Put a cycle on the queue, and the parts of its product."""
+        """Enqueue a cycle, and the partial sums of the product."""
         self._go(0, again=False)
         if self._tail == 0:
             self._h.over_parts("dot", self.parts, one=self.b, other=self.x, lanes=self._lanes)
 
     def _go(self, number: int, *, again: bool) -> None:
-        """Do a cycle from a level on, from heights of zero or ``again`` from those that it has."""
+        """Do a cycle over a level and all coarser ones, from x = 0 or, if ``again``, from the current x."""
         h = self._h
         if number == 1 and self._factors is not None:
             self._solve_directly()
@@ -141,23 +140,23 @@ class Cycle:
             coarse_b=self.b,
         )
         h.gather(number, self._rest, self.b, self._lanes)
-        for second in (False, True)[: 1 + (number + 1 >= _TWICE)]:
+        for second in (False, True)[: 1 + (number + 1 >= _FIRST_W_LEVEL)]:
             self._go(number + 1, again=second)
         arrays = {"e": self.x, "to": h.to, "t": self.spare, "x_new": self.x, "parts": self.parts}
         self._half("ascend", number, moved_nodes=h.moves[number], **arrays)
 
     def _run_tail(self, again: bool) -> None:
-        """Do all small levels."""
+        """Process all small levels."""
         h = self._h
         last = len(h.levels) - 1
         kernel, moved = self._kernel("tail", h.levels[last]), 200 * h.levels[self._tail].nodes
-        known: dict[str, Any] = {"levels": self._table, **h.graph, "inverse": h.inverse}
-        known |= {"to": h.to, "changed": h.changed, "b": self.b, "x": self.x, "t": self.spare}
-        known |= {"from": self._tail, "last": last, "again": again}
-        kernel(kernel.group, **known, moved=moved)
+        arguments: dict[str, Any] = {"levels": self._table, **h.graph, "inverse": h.inverse}
+        arguments |= {"to": h.to, "changed": h.changed, "b": self.b, "x": self.x, "t": self.spare}
+        arguments |= {"from": self._tail, "last": last, "again": again}
+        kernel(kernel.group, **arguments, moved=moved)
 
     def product(self) -> Doubles:
-        """Return the last cycle's product of right side and answer, (lanes,)."""
+        """Return the last cycle's product of right side and solution, (lanes,)."""
         return add_parts(self.parts)
 
     def _tiles(self, level: Level) -> int:
@@ -169,10 +168,10 @@ class Cycle:
         return self._h.kernel(name, self._h.links_of(level), self._lanes)
 
     def _half(self, name: str, number: int, **arguments: Any) -> None:
-        """Go down or up by one level."""
+        """Descend or ascend by one level."""
         h = self._h
         fine = h.levels[number]
         kernel = self._kernel(name, fine)
-        known = {**h.graph, "inverse": h.inverse, "b": self.b, **self._live_of(number)}
+        arguments |= {**h.graph, "inverse": h.inverse, "b": self.b, **self._live_of(number)}
         items = self._tiles(fine) * kernel.group
-        kernel(items, **h.places(number), **known, **arguments, moved=21 * fine.nodes)
+        kernel(items, **h.places(number), **arguments, moved=21 * fine.nodes)

@@ -1,4 +1,4 @@
-"""The graph that heights live on: pixels, links between neighbours, and its connected components."""
+"""The graph of an integration: pixels, links between neighbours, and connected components."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ Plane = tuple[float, float, float]
 
 LEVEL: Plane = (0.0, 0.0, 0.0)
 _CHUNK, _STRIP = 256, 16  # columns and rows of a work-item that is a core's loop; see links.cl, components.cl
-_SAMPLES = 64  # pixels along each side of the picture that the mean slope is taken from
-_PARTIAL_SUMS = 64  # of each component
-_MOST_SUMS = 1 << 22  # of all components
+_SAMPLES = 64  # pixels along each side of the picture of which the mean slope is computed
+_PARTIAL_SUMS = 64  # largest number of partial sums of a component
+_MOST_SUMS = 1 << 22  # largest number of partial sums of all components
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,23 +34,21 @@ class Links:
 
     device: Device
     shape: tuple[int, int]  # rows and columns
-    # (H, W), float32: weight w of the link to the pixel on the right, and to the one below; 0 where there is
-    # none.
+    # (H, W), float32: weight w of the link to the next pixel on the right, and to the one below; 0 if none.
     right: Array
     down: Array
-    # (H, W), float32: weight a of a known height; 0 where there is none. None without any.
-    anchor: Array | None
-    # (H, W), float32: right side b: of each pixel the sum of -w d over links that leave it and w d over those
-    # that end in it, and a k.
+    anchor: Array | None  # (H, W), float32: weight a of a known height, 0 if none; None if there are none
+    # (H, W), float32: right side b: at each pixel the sum of -w d over links that start there, of w d over
+    # links that end there, and of a k.
     source: Array
 
 
 class PixelGraph:
-    """A picture's maps on a device and the links that they make; memory is kept for the next picture.
+    """A picture's maps and links on a device; memory is reused for the next picture.
 
-    ``flags`` say what the pixels are (see ``mirrorskin.kernels.links``), ``known_heights`` are maps of
-    heights above the inputs' datum and of their weights, or empty. Weights are multiplied by ``scale``, to be
-    about 1.
+    ``flags`` contain the state of each pixel (see ``mirrorskin.kernels.links``), ``known_heights`` the maps
+    of heights above the inputs' datum and of their weights, if any. Weights are multiplied by ``scale``, so
+    that they are about 1.
     """
 
     device: Device
@@ -62,17 +60,17 @@ class PixelGraph:
         self._arrays: dict[str, Array] = {}
 
     def upload(self, inputs: Inputs) -> Flags:
-        """Bring maps to the device; return what the pixels are, in memory that the next call overwrites."""
-        slopes = self._see(dz_dx=inputs.dz_dx, dz_dy=inputs.dz_dy)
-        weights = self._see(map_x=inputs.weight_x, map_y=inputs.weight_y)
-        heights = self._see(heights=inputs.known_heights, height_weights=inputs.known_height_weights)
-        mask, edges = self._see(mask=inputs.mask), self._see(edges=inputs.edges)
+        """Copy maps to the device; return the flags, in memory that the next call overwrites."""
+        slopes = self._share(dz_dx=inputs.dz_dx, dz_dy=inputs.dz_dy)
+        weights = self._share(map_x=inputs.weight_x, map_y=inputs.weight_y)
+        heights = self._share(heights=inputs.known_heights, height_weights=inputs.known_height_weights)
+        mask, edges = self._share(mask=inputs.mask), self._share(edges=inputs.edges)
         self._use(inputs, slopes, weights, heights, mask, edges)
         flags: Flags = self.flags.download()
         return flags
 
     def use_device_maps(self, inputs: Inputs) -> None:
-        """Take slopes and weights that are in this graph's arrays already; the inputs' maps are not read."""
+        """Use the slopes and weights in this graph's arrays; the inputs' maps are not read."""
         slopes = {name: self.array(name) for name in ("dz_dx", "dz_dy")}
         self._use(inputs, slopes, {name: self.array(name) for name in ("map_x", "map_y")})
 
@@ -95,48 +93,49 @@ class PixelGraph:
         if edges:
             self._run("links_cut", {"MASK": int(bool(mask))}, **slopes, **edges, flags=uncut, cut=self.flags)
 
-    def take_slopes(self, inputs: Inputs) -> None:
-        """Have other slopes where all else, and what the pixels are, stays as it was."""
-        self._inputs, self._slopes = inputs, self._see(dz_dx=inputs.dz_dx, dz_dy=inputs.dz_dy)
+    def set_slopes(self, inputs: Inputs) -> None:
+        """Replace the slopes; weights and flags stay."""
+        self._inputs, self._slopes = inputs, self._share(dz_dx=inputs.dz_dx, dz_dy=inputs.dz_dy)
 
     def mean_plane(self, inputs: Inputs) -> Plane:
-        """Return a plane of the mean slopes, 0 in the middle: above it, heights have more digits."""
-        some = tuple(slice(step // 2, None, step) for step in (-(-size // _SAMPLES) for size in self.shape))
-        valid = self.flags.host[some] & SLOPE != 0
+        """Return the plane of the mean slopes, 0 in the middle; heights above it have more digits."""
+        subset = tuple(slice(step // 2, None, step) for step in (-(-size // _SAMPLES) for size in self.shape))
+        valid = self.flags.host[subset] & SLOPE != 0
         if not valid.any():
             return LEVEL
-        x, y = (float(slope[some][valid].mean()) for slope in (inputs.dz_dx, inputs.dz_dy))
+        x, y = (float(slope[subset][valid].mean()) for slope in (inputs.dz_dx, inputs.dz_dy))
         along_x, along_y, _ = self.steps((x, y, 0.0))
         return x, y, -(along_x * (self.shape[1] - 1) + along_y * (self.shape[0] - 1)) / 2
 
     def steps(self, plane: Plane) -> Plane:
-        """Return how much a plane rises from column to column and row to row, and where it begins, mm."""
+        """Return the rise of a plane per column and per row, and its height at the first pixel, mm."""
         width, height = self._inputs.pixel_size
         return plane[0] * width, -plane[1] * height, plane[2]
 
     def links(self, plane: Plane = LEVEL) -> Links:
         """Return the normal equations of heights above a plane."""
-        kept = {name: self.array(name) for name in ("right", "down", "source")}
+        maps = {name: self.array(name) for name in ("right", "down", "source")}
         if self.known_heights:
-            kept["anchor"] = self.array("anchor")
-        self._run("links_join", {"KEEP": 1}, **self._problem(plane, None), **kept, place=0)
-        return Links(self.device, self.shape, kept["right"], kept["down"], kept.get("anchor"), kept["source"])
+            maps["anchor"] = self.array("anchor")
+        self._run("links_join", {"KEEP": 1}, **self._problem(plane, None), **maps, place=0)
+        return Links(self.device, self.shape, maps["right"], maps["down"], maps.get("anchor"), maps["source"])
 
-    def put_source(self, plane: Plane, sources: Array, place: int) -> None:
-        """Write the right side alone to a place of some, (K, H, W)."""
-        self._run("links_join", {}, **self._problem(plane, None), source=sources, place=place)
+    def put_source(self, plane: Plane, sources: Array, number: int) -> None:
+        """Write only the right side, to ``sources``, (K, H, W), at a number."""
+        self._run("links_join", {}, **self._problem(plane, None), source=sources, place=number)
 
     def misfit(
-        self, reliefs: Array, plane: Plane = LEVEL, links: Links | None = None, place: int = 0
+        self, reliefs: Array, plane: Plane = LEVEL, links: Links | None = None, number: int = 0
     ) -> float:
-        """Return the least-squares sum, without unit, at heights above a plane, in a place of some."""
+        """Return the least-squares sum, without unit, of heights above a plane, ``reliefs`` at a number."""
         sums = self.array("sums", shape=(self._items("links_misfit"),))
+        macros = {} if links is None else {"WEIGHTS": 3}
         problem = self._problem(plane, links)
-        self._run("links_misfit", _weighted(links), **problem, reliefs=reliefs, place=place, sums=sums)
+        self._run("links_misfit", macros, **problem, reliefs=reliefs, place=number, sums=sums)
         return float(sums.download().sum(dtype=np.float64)) / self.scale
 
     def _problem(self, plane: Plane, links: Links | None) -> dict[str, Any]:
-        """Return the arguments of the passes over links."""
+        """Return the arguments of the kernels for links."""
         inputs = self._inputs
         width, height = inputs.pixel_size
         weights, maps = [self.scale * inputs.weight / size**2 for size in (width, height)], self._weights
@@ -148,18 +147,21 @@ class PixelGraph:
         return {**self._slopes, "flags": self.flags, **maps, **self.known_heights, **numbers}
 
     def put(self, name: str, values: NDArray[Any]) -> Array:
-        """Return an array on the device that holds values, (H, W)."""
+        """Return one of the graph's arrays, with values, (H, W)."""
         array = self.array(name, values.dtype)
         array.claim()
         array.host[...] = values
         array.upload()
         return array
 
-    def _see(self, **maps: NDArray[Any] | None) -> dict[str, Operand]:
-        """Return maps where they lie if the device can read them there, else in the graph's own arrays."""
-        given = {name: values for name, values in maps.items() if values is not None}
+    def _share(self, **maps: NDArray[Any] | None) -> dict[str, Operand]:
+        """Return maps for the device: in place if it shares the host's memory, else in the graph's arrays."""
         borrow = self.device.borrow if self.device.info.shares_memory else lambda name, values: None
-        return {name: borrow(name, values) or self.put(name, values) for name, values in given.items()}
+        return {
+            name: borrow(name, values) or self.put(name, values)
+            for name, values in maps.items()
+            if values is not None
+        }
 
     def array(self, name: str, dtype: DTypeLike = np.float32, shape: tuple[int, ...] | None = None) -> Array:
         """Return one of the graph's arrays, (H, W) by default."""
@@ -169,7 +171,7 @@ class PixelGraph:
         return self._arrays[name]
 
     def _items(self, name: str) -> int:
-        """Return how many work-items a kernel takes; see there."""
+        """Return the number of work-items of a kernel; see ``kernels/links.cl``."""
         (rows, columns), tile = self.shape, self.device.layout.tile
         strip = _STRIP if tile >= _CHUNK and name in ("links_flags", "links_join", "links_misfit") else 1
         return -(-rows // strip) * -(-columns // min(tile, _CHUNK))
@@ -182,26 +184,21 @@ class PixelGraph:
         kernel(self._items(name), rows=rows, columns=columns, **arguments, moved=moved)
 
 
-def _weighted(links: Links | None) -> dict[str, int]:
-    return {} if links is None else {"WEIGHTS": 3}
-
-
 @dataclass(frozen=True, slots=True)
 class Components:
     """The connected components of a surface."""
 
-    # (H, W), int32: numbered in reading order of their first pixels; -1 where there is no answer.
-    labels: Labels
-    offset_unknown: NDArray[np.bool_]  # (components,), bool: whether a component has no known height
+    labels: Labels  # (H, W), int32: numbered in reading order of the first pixels; -1 without an answer
+    offset_unknown: NDArray[np.bool_]  # (components,): whether a component has no known height
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """Number of components."""
         return len(self.offset_unknown)
 
 
 def find_components(flags: Flags, cut: bool) -> Components:
-    """Label the pixels that links connect; ``cut``: some neighbours with an answer may have no link."""
+    """Label connected pixels. ``cut``: neighbours with an answer may have no link."""
     answered = flags & (SLOPE | KNOWN) != 0
     right, down = answered[:, :-1] & answered[:, 1:], answered[:-1] & answered[1:]
     if cut:
@@ -209,26 +206,28 @@ def find_components(flags: Flags, cut: bool) -> Components:
     labels, count = _label(answered, right, down)
     unknown = np.ones(count, bool)
     unknown[labels[flags & KNOWN != 0]] = False
-    for shared in (labels, unknown):  # by the surfaces of several frames
-        shared.flags.writeable = False
+    for array in (labels, unknown):  # shared by the surfaces of several frames
+        array.flags.writeable = False
     return Components(labels, unknown)
 
 
 def _label(answered: Mask, right: Mask, down: Mask) -> tuple[Labels, int]:
-    """Label what links to the right and down connect: runs of pixels in a row, then runs that touch."""
+    """Label pixels that are linked to the right and down: first runs within a row, then connected runs."""
     starts = answered.copy()
     starts[:, 1:] &= ~right
-    begin = np.flatnonzero(starts)  # of each run
+    first_pixel = np.flatnonzero(starts)  # of each run
     changes = down.copy()  # one link of each pair of runs
     changes[:, 1:] &= ~(down[:, :-1] & right[:-1] & right[1:])
-    place = np.flatnonzero(changes)
-    upper, lower = (np.searchsorted(begin, end, "right") - 1 for end in (place, place + answered.shape[1]))
-    label = np.arange(begin.size, dtype=np.int32)
+    pixel = np.flatnonzero(changes)
+    upper, lower = (
+        np.searchsorted(first_pixel, end, "right") - 1 for end in (pixel, pixel + answered.shape[1])
+    )
+    label = np.arange(first_pixel.size, dtype=np.int32)
     while upper.size:
-        one, other = label[upper], label[lower]
-        apart = one != other
-        upper, lower, one, other = upper[apart], lower[apart], one[apart], other[apart]
-        np.minimum.at(label, np.maximum(one, other), np.minimum(one, other))
+        a, b = label[upper], label[lower]
+        apart = a != b
+        upper, lower, a, b = upper[apart], lower[apart], a[apart], b[apart]
+        np.minimum.at(label, np.maximum(a, b), np.minimum(a, b))
         while not np.array_equal(label, shorter := label[label]):
             label = shorter
     first = label == np.arange(label.size)
@@ -236,16 +235,16 @@ def _label(answered: Mask, right: Mask, down: Mask) -> tuple[Labels, int]:
     if count < 2:
         return answered.astype(np.int32) - 1, count
     number = (np.cumsum(first, dtype=np.int32) - 1)[label]
-    ends = np.append(begin[1:], answered.size)
-    whole = np.concatenate([np.zeros(begin[0], np.int32), np.repeat(number, ends - begin)])
-    return np.where(answered, whole.reshape(answered.shape), np.int32(-1)), count
+    ends = np.append(first_pixel[1:], answered.size)
+    labels = np.concatenate([np.zeros(first_pixel[0], np.int32), np.repeat(number, ends - first_pixel)])
+    return np.where(answered, labels.reshape(answered.shape), np.int32(-1)), count
 
 
 class Levelling:
-    """Adds to heights above a plane that plane, and to each component the offset that it has.
+    """Adds the plane to heights above it, and to each component its offset.
 
-    The mean of a component without a known height is 0. The others are where their known heights want them:
-    where these weigh little, a solver is done long before it is there.
+    The mean of a component without a known height becomes 0. For other components, the weighted mean
+    difference from the known heights becomes 0: a solver converges slowly in it if these weights are small.
     """
 
     def __init__(self, graph: PixelGraph) -> None:
@@ -256,7 +255,7 @@ class Levelling:
     def level(
         self, components: Components, reliefs: Array, planes: Sequence[Plane], datum: float = 0.0
     ) -> Floats:
-        """Return heights, mm, of one relief or several; known heights are above ``datum``."""
+        """Return heights, mm, of one or several reliefs; known heights are relative to ``datum``."""
         graph, unknown = self._graph, components.offset_unknown
         if components is not self._components and components.count > 1:
             graph.put("labels", components.labels)
@@ -268,26 +267,27 @@ class Levelling:
         items = rows * -(-columns // min(self._device.layout.tile, _CHUNK))
         parts: list[tuple[NDArray[np.bool_], Mapping[str, Operand], float]]
         parts = [(unknown, {}, 0.0), (~unknown, graph.known_heights, datum)]
-        for place, plane in enumerate(planes):
+        for number, plane in enumerate(planes):
             steps = dict(zip(("plane_x", "plane_y", "plane_z"), graph.steps(plane), strict=True))
-            relief: dict[str, Any] = {"reliefs": reliefs, "place": place, **steps}
+            relief: dict[str, Any] = {"reliefs": reliefs, "place": number, **steps}
             offsets.claim()
-            for some, maps, mean in parts:
-                if some.any():
-                    offsets.host[some] = mean - self._means(relief, maps)[some]
+            for selected, maps, mean in parts:
+                if selected.any():
+                    offsets.host[selected] = mean - self._means(relief, maps)[selected]
             offsets.upload()
             self._run("components_add_offsets", items, relief, offsets=offsets, heights=heights)
         levelled: Floats = heights.detach()
         return levelled
 
     def _means(self, relief: dict[str, Any], maps: Mapping[str, Operand]) -> NDArray[np.float64]:
-        """Return the mean heights of components, or those above their known ones, (components,), mm."""
+        """Return mean heights of components, or mean differences from known ones, (components,), mm."""
         rows, count = self._graph.shape[0], self._count
         strip = max(-(-rows // _PARTIAL_SUMS), -(-rows * count // _MOST_SUMS))
         strips = -(-rows // strip)
         sums, totals = (self._array(name, (strips, count)) for name in ("sums", "totals"))
-        known = {"heights": None, "height_weights": None, **maps, "strip": strip, "components": count}
-        self._run("components_sum", strips, relief, **known, sums=sums, totals=totals)
+        known = {"heights": None, "height_weights": None, **maps}
+        sizes = {"strip": strip, "components": count}
+        self._run("components_sum", strips, relief, **known, **sizes, sums=sums, totals=totals)
         sum_, total = (part.download().sum(axis=0, dtype=np.float64) for part in (sums, totals))
         return np.asarray(np.divide(sum_, total, out=np.zeros(count), where=total > 0))
 
@@ -302,9 +302,9 @@ class Levelling:
         return self._arrays[name]
 
     def _run(self, name: str, items: int, relief: dict[str, Any], **arguments: Any) -> None:
-        one = self._count == 1
-        labels = self._graph.flags if one else self._graph.array("labels", np.int32)
+        single = self._count == 1
+        labels = self._graph.flags if single else self._graph.array("labels", np.int32)
         rows, columns = self._graph.shape
-        kernel = self._device.kernel("components", name, ONE=int(one))
+        kernel = self._device.kernel("components", name, ONE=int(single))
         arguments |= {"flags": self._graph.flags, "labels": labels, **relief}
         kernel(items, rows=rows, columns=columns, **arguments, moved=8 * rows * columns)

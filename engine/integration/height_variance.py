@@ -1,41 +1,40 @@
-r"""The standard deviation of heights: the diagonal of an inverse, from coarse to fine, in closed form.
+r"""The standard deviation of heights: the diagonal of an inverse, approximated from coarse to fine.
 
-Heights of least squares whose weights are inverse variances have the covariance of the normal equations'
-inverse, A^-1, but for what the averages along links take out of the slopes' noise. On a plane the variance
-grows with the logarithm of the distance, by ln 2 / (2 pi w) from a grid of links of weight w to one with half
-its spacing. So it is found
+The covariance of weighted least-squares heights is the inverse of the normal equations' matrix, A^-1, reduced
+by the averaging of the slopes' noise along links. On a plane the variance grows with the logarithm of the
+distance: by ln 2 / (2 pi w) from a grid of links of weight w to one with half its spacing. It is computed
 
-- on the first of the multigrid's levels that has at most `COARSE` nodes a side, exactly: the diagonal of the
-  inverse of a block tridiagonal matrix, line by line (the recursive Green's function). What hangs together
-  without a known height has its mean weight 0.
-- from there on down, level by level, as what coarse nodes have, prolonged, and a local part. With w the
-  weights of a node's links, scaled so that those along x weigh as much on average as those along y, d one
-  over their sum and that of a known height, j the links' other ends, r = d sum w^2 d_j the probability that a
-  walk along links is back after two steps, and o how uneven the axes were, that is ::
+- exactly on the finest of the multigrid's levels that has at most `COARSE` nodes per side: the diagonal of
+  the inverse of a block tridiagonal matrix, line by line (recursive Green's function). The weighted mean of
+  a connected component without a known height is 0.
+- on finer levels, from the prolonged variance of the next coarser level, plus a local part. With the weights
+  w of a node's links, scaled so that both axes have the same mean, d the inverse of the sum of these and of
+  the known height's weight, j the other ends of the links, r = d sum w^2 d_j the probability that a random
+  walk returns after two steps, and o the anisotropy before scaling, it is ::
 
       d (c0 + c1 r + c2 d sum w r_j + c5 o) + d sum w d_j (c3 + c4 r_j).
 
-  The numbers c are fitted to exact covariances; c0 is such that a plane has what it must. On the finest level
-  they hold what the averages along links take out.
+  The coefficients c are fitted to exact covariances; c0 is determined by the exact result for a plane. On the
+  finest level they include the averaging along links.
 
-Levels for uneven weights join links that are too weak for a solver's: weights differ along x and y as a rule,
-and that breaks no surface.
+Levels for uneven weights also aggregate along links that a solver would not: weights usually differ between x
+and y, which is no discontinuity.
 
-A full rectangle with even weights has cosine modes k, l that know nothing of each other: with m = 4 sin^2(pi
-k / 2n) along each axis, and t the average of a link's slope as it acts on a mode ::
+On a full rectangle with uniform weights, cosine modes k, l are independent. With m = 4 sin^2(pi k / 2n)
+along each axis, and t the response of the averaging along links ::
 
     var(row, column) = sum of (w_x m_x t_x^2 + w_y m_y t_y^2 + a) / (w_x m_x + w_y m_y + a)^2 (u_k v_l)^2,
 
-u and v the modes of unit norm; of (u_k v_l)^2 the sum is a cosine transform again.
+where u and v are the modes of unit norm. The sum over (u_k v_l)^2 is a cosine transform again.
 
-Where weights are relative, all slopes are as noisy as they fit worse than noise of variance 1 would: that
-leaves a share of each loop of links (`expected_misfit`).
+If weights are relative, the noise is estimated from the misfit, relative to that of noise of variance 1
+(`expected_misfit`).
 
-Exact variances over these, of pictures of 64 x 64 pixels, are 0.98 to 1.00 in the mean, and within 1.0 +- 0.1
-for all of a rectangle's pixels, and all but 1 % of a disc's, 3 % of an annulus', 3 % around cuts, 2 % where
-heights are known on one side. Where a fifth of the pixels are missing at random, the mean is 0.92, 35 % are
-off by more than a tenth and 4 % by more than a fifth. The documentation has the table, in "Heights from
-slopes".
+The ratio of exact variances to these, for pictures of 64 x 64 pixels, has a mean of 0.98 to 1.00. It is
+within 1.0 +- 0.1 for all pixels of a rectangle, and for all but 1 % of a disc, 3 % of an annulus, 3 % around
+cuts, and 2 % with known heights on one side. If a fifth of the pixels are missing at random, the mean is
+0.92; 35 % differ by more than 0.1, and 4 % by more than 0.2. The documentation has the table, in "Heights
+from slopes".
 """
 
 from __future__ import annotations
@@ -51,42 +50,36 @@ from mirrorskin.kernels.array import Array
 
 Ints = NDArray[np.int64]
 Doubles = NDArray[np.float64]
-Rooms = tuple[Array, Array, Array, Array, Array]
 
 COARSE = 64
-"""Nodes along a side of the level whose variance is found exactly, at most."""
+"""Largest number of nodes per side of the level whose variance is computed exactly."""
 LEAST = 0.12
-"""Of one over the diagonal, which no variance is below."""
+"""Lower bound of variances, relative to the inverse of the diagonal."""
 
 JOINED = 3e-3
-"""Strength of links that make one coarse node of two: below, a surface is nearly broken."""
+"""Strength from which links aggregate two nodes; weaker ones are nearly discontinuities."""
 
-# The six numbers of the local part on the finest level, and on the others; c0 is such that on a plane, where
-# r is 1/4, it is as it must be.
+# Coefficients c of the local part on the finest level, and on coarser ones; see `local_part` for c0.
 _FINEST = 0.0, 4.7682, -2.5894, -0.9665, -2.4153, 0.255
 _COARSER = 0.0, -0.2621, -0.1186, -0.6233, 0.0, 0.0
-_MODES = 64  # along each axis of the sums over all modes of a plane
-_LOOSE = 1e-7  # of a node's links, which holds what has no known height
-_BORDER = 0.12  # less of a loop is left for each that pixels have not, at the ends of the surface
+_MODES = 64  # along each axis, for integrals over all modes of a plane
+_LOOSE = 1e-7  # regularisation of components without a known height, relative to their links
+_BORDER = 0.12  # reduction of the misfit per loop, for each loop that a pixel lacks at the border
 
 
-def find_graph_variance(hierarchy: Hierarchy, answered: NDArray[np.bool_], rooms: Rooms) -> None:
-    """Write the heights' variance to the finest level of the first of ``rooms``; the others are scratch.
+def find_graph_variance(
+    hierarchy: Hierarchy, answered: NDArray[np.bool_], arrays: tuple[Array, Array, Array, Array, Array]
+) -> None:
+    """Write the heights' variance to the finest level of the first array; the others are scratch memory.
 
     ``answered``, (H, W), are the pixels that have heights.
     """
-    number = min(
-        (k for k, one in enumerate(hierarchy.levels) if k > 0 and max(one.rows, one.columns) <= COARSE),
-        default=0,
-    )
-    nodes, variance = _find_coarse(hierarchy, number, _masses(hierarchy, number, answered))
-    _spread(hierarchy, nodes, variance, number, rooms)
-
-
-def _spread(hierarchy: Hierarchy, nodes: Ints, coarse: Doubles, number: int, rooms: Rooms) -> None:
-    """Bring the variance of a level's nodes to the finest, with what each level adds."""
     h = hierarchy
-    variance, evened, returns, part, brought = rooms
+    number = next(
+        (k for k, level in enumerate(h.levels) if k > 0 and max(level.rows, level.columns) <= COARSE), 0
+    )
+    nodes, coarse = _find_coarse(h, number, _masses(h, number, answered))
+    variance, evened, returns, part, prolonged = arrays
     variance.claim()
     variance.host[...] = 0
     variance.host[nodes] = coarse
@@ -98,30 +91,29 @@ def _spread(hierarchy: Hierarchy, nodes: Ints, coarse: Doubles, number: int, roo
         h.over("returns", level, **links, evened=evened, returns=returns)
         numbers = h.device.given("local", local_part(fine == 0))
         h.over("local", level, **links, evened=evened, returns=returns, c=numbers, local_part=part)
-        h.over("inject", level, **places, e=variance, moved_nodes=h.moves[fine], to=h.to, t=brought)
-        h.over("spread", level, **h.graph, inverse=h.inverse, t=brought, part=part, x=variance)
+        h.over("inject", level, **places, e=variance, moved_nodes=h.moves[fine], to=h.to, t=prolonged)
+        h.over("spread", level, **h.graph, inverse=h.inverse, t=prolonged, part=part, x=variance)
 
 
 def local_part(finest: bool) -> Floats:
-    """Return the six numbers of the local part."""
-    numbers = np.array(_FINEST if finest else _COARSER)
-    wanted = math.log(2) / (2 * math.pi)
+    """Return the coefficients of the local part; c0 makes it exact on a plane, where r = 1/4."""
+    coefficients = np.array(_FINEST if finest else _COARSER)
+    exact = math.log(2) / (2 * math.pi)
     if finest:
         (m_x, t_x), (m_y, t_y) = _plane(1.0, 1), _plane(1.0, 0)
-        wanted -= float(np.mean((m_x * (1 - t_x) + m_y * (1 - t_y)) / (m_x + m_y) ** 2))
-    numbers[0] = 4 * wanted - numbers[1:5] @ [1 / 4, 1 / 4, 1, 1 / 4]
-    return numbers.astype(np.float32)
+        exact -= float(np.mean((m_x * (1 - t_x) + m_y * (1 - t_y)) / (m_x + m_y) ** 2))
+    coefficients[0] = 4 * exact - coefficients[1:5] @ [1 / 4, 1 / 4, 1, 1 / 4]
+    return coefficients.astype(np.float32)
 
 
 def find_rectangle_variance(shape: tuple[int, int], weights: tuple[float, float], screening: float) -> Floats:
-    """Return the heights' variance, (H, W), where all pixels and links are alike."""
+    """Return the heights' variance, (H, W), for uniform weights, with ``screening`` on the diagonal."""
     rows, columns = shape
     (m_y, t_y), (m_x, t_x) = _modes(rows), _modes(columns)
-    across, along = (np.float32(one) for one in weights)
-    held = np.float32(screening)
-    m_x, m_y = across * m_x, (along * m_y)[:, np.newaxis]
-    power = m_x * t_x + m_y * t_y[:, np.newaxis] + held
-    diagonal = m_x + m_y + held
+    w_x, w_y, a = (np.float32(number) for number in (*weights, screening))
+    m_x, m_y = w_x * m_x, (w_y * m_y)[:, np.newaxis]
+    power = m_x * t_x + m_y * t_y[:, np.newaxis] + a
+    diagonal = m_x + m_y + a
     if not screening:
         diagonal[0, 0] = 1
     power /= diagonal * diagonal
@@ -131,10 +123,10 @@ def find_rectangle_variance(shape: tuple[int, int], weights: tuple[float, float]
 
 
 def _modes(length: int) -> tuple[Floats, Floats]:
-    """Return what differences make of the squares of modes, and averages along links of those of noise."""
+    """Return for each mode the squared responses m of differences, and t^2 of averages along links."""
     half = np.pi * np.arange(length) / (2 * length)
     pairs, fours = np.cos(half) ** 2, ((13 * np.cos(half) - np.cos(3 * half)) / 12) ** 2
-    share = max(0, length - 3) / max(1, length - 1)  # of links with two more pixels in line
+    share = max(0, length - 3) / max(1, length - 1)  # share of links with two more pixels in line
     return (
         (4 * np.sin(half) ** 2).astype(np.float32),
         (pairs + share * (fours - pairs)).astype(np.float32),
@@ -142,38 +134,38 @@ def _modes(length: int) -> tuple[Floats, Floats]:
 
 
 def _sum_squares(power: Floats) -> Floats:
-    """Return sums of the squares of cosine modes times their power, (n, m), in the first half of n points."""
+    """Return sums over modes of their squares times their power, (n, m), at the first half of n points."""
     length = len(power)
     half = (length + 1) // 2
     waves = np.zeros((length // 2 + 1, power.shape[1]), np.complex64)
     waves[0] = power.sum(axis=0)
-    # The square of mode k is 1 and mode 2 k, which is less mode 2 (length - k).
+    # The square of mode k is 1 plus mode 2 k, which equals minus mode 2 (length - k).
     turns = np.exp(1j * np.pi / length * np.arange(1, half)).astype(np.complex64) / 2
     waves[1:half] = turns[:, np.newaxis] * (power[1:half] - power[:-half:-1])
     return np.asarray(np.fft.irfft(waves, length, axis=0)[:half], np.float32)
 
 
 def _plane(weight: float, axis: int) -> tuple[Doubles, Doubles]:
-    """Return what `_modes` does for a plane with links of a weight, along an axis."""
+    """Return the responses of `_modes` for an infinite plane with links of a weight, along an axis."""
     half = np.pi * (np.arange(_MODES) + 0.5) / (2 * _MODES)
     fours = ((13 * np.cos(half) - np.cos(3 * half)) / 12) ** 2
     return np.expand_dims(4 * weight * np.sin(half) ** 2, 1 - axis), np.expand_dims(fours, 1 - axis)
 
 
 def expected_misfit(links: int, pixels: int, known: int, free: int, weights: tuple[float, float]) -> float:
-    """Return the sum that heights make least, as it is on average for noise of variance 1.
+    """Return the expected least-squares sum for noise of variance 1.
 
-    Of ``pixels`` some are ``known``, and ``free`` components have none that is.
+    ``known`` of the ``pixels`` have a known height, and ``free`` components have none.
     """
     (m_x, t_x), (m_y, t_y) = _plane(weights[0], 1), _plane(weights[1], 0)
-    square = (2 * 13**2 + 2) / 24**2  # of the average along a link
+    square = (2 * 13**2 + 2) / 24**2  # variance of the average along a link
     left = 2 * square - float(np.mean((m_x * t_x + m_y * t_y) / (m_x + m_y)))
     loops = max(0, links - pixels + free)
     return (loops + known) * (left - _BORDER * max(0.0, 1 - loops / pixels))
 
 
 def _masses(hierarchy: Hierarchy, number: int, answered: NDArray[np.bool_]) -> Floats:
-    """Return how many pixels each node of a level stands for, by node."""
+    """Return the number of pixels in each node of a level, (nodes,)."""
     mass, moved = np.zeros(hierarchy.nodes, np.float32), hierarchy.to.download()
     picture = answered.view(np.uint8).astype(np.float32)
     levels = zip(hierarchy.levels[:number], hierarchy.levels[1:], hierarchy.moves, strict=False)
@@ -196,7 +188,7 @@ def _masses(hierarchy: Hierarchy, number: int, answered: NDArray[np.bool_]) -> F
 
 
 def _find_coarse(hierarchy: Hierarchy, number: int, mass: Floats) -> tuple[Ints, Doubles]:
-    """Return a level's nodes, and the diagonal of the inverse of its matrix."""
+    """Return a level's nodes, and the diagonal of the (pseudo)inverse of its matrix."""
     level = hierarchy.levels[number]
     node, a, b, weight, pull = hierarchy.equations(number)
     row, column = np.divmod(node - level.first, level.stride)
@@ -209,60 +201,56 @@ def _find_coarse(hierarchy: Hierarchy, number: int, mass: Floats) -> tuple[Ints,
     index[node] = np.arange(len(node))
     a, b = index[a], index[b]
     count = len(node)
-    parts, label = count, first_connected(count, a, b)
-    diagonal = _add_up(a, weight, count) + _add_up(b, weight, count)
-    free = np.bincount(label, pull, parts) <= 0
-    share = np.maximum(mass[node], 1).astype(np.float64)
-    whole, typical = np.bincount(label, share, parts), np.bincount(label, diagonal, parts)
-    held = _LOOSE * typical / np.maximum(whole, 1)
-    diagonal += pull + (held * free)[label] * share
-    offset = np.where(free, 1 / np.where(held > 0, held * whole, 1), 0)
-    return node, invert_diagonal(line, diagonal, a, b, weight) - offset[label]
+    label = _connected(count, a, b)
+    diagonal = np.asarray(np.bincount(a, weight, count) + np.bincount(b, weight, count), np.float64)
+    free = np.bincount(label, pull, count) <= 0
+    pixels = np.maximum(mass[node], 1).astype(np.float64)
+    total, typical = np.bincount(label, pixels, count), np.bincount(label, diagonal, count)
+    extra = _LOOSE * typical / np.maximum(total, 1)
+    diagonal += pull + (extra * free)[label] * pixels
+    offset = np.where(free, 1 / np.where(extra > 0, extra * total, 1), 0)
+    return node, _invert_diagonal(line, diagonal, a, b, weight) - offset[label]
 
 
-def _add_up(at: Ints, values: Doubles, count: int) -> Doubles:
-    return np.asarray(np.bincount(at, values, count), np.float64)
+def _invert_diagonal(line: Ints, diagonal: Doubles, a: Ints, b: Ints, weight: Doubles) -> Doubles:
+    """Return the diagonal of the inverse of a block tridiagonal matrix: links within and between lines.
 
-
-def invert_diagonal(line: Ints, diagonal: Doubles, a: Ints, b: Ints, weight: Doubles) -> Doubles:
-    """Return the diagonal of the inverse of a matrix whose nodes have links within and between lines.
-
-    The inverses of all lines so far make that of the next one; on the way back the rest is added.
+    A forward pass inverts each block given the previous ones; a backward pass adds the effect of later ones.
     """
     order = np.argsort(line, kind="stable")
     sizes = np.bincount(line, minlength=1)
-    begins = np.cumsum(sizes) - sizes
+    starts = np.cumsum(sizes) - sizes
     place = np.empty(len(line), np.int64)
-    place[order] = np.arange(len(line)) - begins[line[order]]
-    most = int(sizes.max(initial=1))
-    own, link = (np.zeros((len(sizes), most, most)) for _ in range(2))
-    own[:, np.arange(most), np.arange(most)] = 1
-    own[line, place, place] = diagonal
+    place[order] = np.arange(len(line)) - starts[line[order]]
+    width = int(sizes.max(initial=1))
+    block, link = (np.zeros((len(sizes), width, width)) for _ in range(2))
+    block[:, np.arange(width), np.arange(width)] = 1
+    block[line, place, place] = diagonal
     within = line[a] == line[b]
     for first, second in ((a, b), (b, a)):
-        own[line[first[within]], place[first[within]], place[second[within]]] = -weight[within]
+        block[line[first[within]], place[first[within]], place[second[within]]] = -weight[within]
     first, second = (np.where(line[a] > line[b], *ends)[~within] for ends in ((a, b), (b, a)))
     link[line[first], place[first], place[second]] = weight[~within]
-    moved = np.empty_like(own)
-    own[0] = np.linalg.inv(own[0])
+    product = np.empty_like(block)
+    block[0] = np.linalg.inv(block[0])
     for k in range(1, len(sizes)):
-        np.matmul(link[k], own[k - 1], out=moved[k])
-        own[k] = np.linalg.inv(own[k] - moved[k] @ link[k].T)
+        np.matmul(link[k], block[k - 1], out=product[k])
+        block[k] = np.linalg.inv(block[k] - product[k] @ link[k].T)
     for k in range(len(sizes) - 1, 0, -1):
-        own[k - 1] += moved[k].T @ own[k] @ moved[k]
-    found: Doubles = own[line, place, place]
-    return found
+        block[k - 1] += product[k].T @ block[k] @ product[k]
+    variance: Doubles = block[line, place, place]
+    return variance
 
 
-def first_connected(count: int, a: Ints, b: Ints) -> Ints:
-    """Return of each node the first that it is connected with; quickly where chains of links are short."""
+def _connected(count: int, a: Ints, b: Ints) -> Ints:
+    """Return for each node the first node of its connected component; without the import of SciPy."""
     label = np.arange(count)
     while True:
         lower = np.minimum(label[a], label[b])
-        found = label.copy()
-        np.minimum.at(found, a, lower)
-        np.minimum.at(found, b, lower)
-        found = found[found]
-        if np.array_equal(found, label):
+        merged = label.copy()
+        np.minimum.at(merged, a, lower)
+        np.minimum.at(merged, b, lower)
+        merged = merged[merged]
+        if np.array_equal(merged, label):
             return label
-        label = found
+        label = merged

@@ -1,4 +1,4 @@
-"""The levels of a multigrid on a device: grids of nodes with links, each half as fine as the one before."""
+"""The levels of a multigrid on a device: grids of nodes with links, each half as fine as the previous one."""
 
 from __future__ import annotations
 
@@ -16,50 +16,50 @@ Ints = NDArray[np.int64]
 Doubles = NDArray[np.float64]
 
 STRENGTH = 0.25
-"""Of links that join nodes in one aggregate; see ``multigrid_parts``."""
+"""Relative weight from which a link joins its nodes in one aggregate; see ``multigrid_parts``."""
 
 LANES = 16, 8, 4
-"""Right sides that are solved for at once, if there are several."""
+"""Numbers of right sides that are solved at once, if there are several."""
 
-_ROUNDS = 4  # an even number, in which parts of blocks find another aggregate
-_VECTOR = 16  # nodes that a row is padded to: two of a kernel's vectors
-_BEFORE = _VECTOR  # nodes before the first level, which vectors to the left of its margin read
-_ROOM_OF_WIDE_TILES = 45056  # bytes of a group's memory; OpenCL grants no more than 32768
-_BEYOND = 64  # nodes behind the last level, which vectors may read
+_ROUNDS = 4  # rounds in which parts of blocks move to another aggregate; an even number
+_VECTOR = 16  # nodes to a multiple of which a row is padded: two of a kernel's vectors
+_BEFORE = _VECTOR  # nodes before the first level, which vectors left of its margin read
+_WIDE_TILE_MEMORY = 45056  # bytes of local memory needed; OpenCL guarantees only 32768
+_BEYOND = 64  # nodes after the last level, which vectors may read
 
 
 @dataclass(frozen=True, slots=True)
 class Level:
     """A grid of nodes among others in one array; see ``kernels/multigrid.cl``."""
 
-    base: int  # where it begins
+    base: int  # index of its start
     rows: int
     columns: int
     stride: int  # nodes from one row to the next
 
     @classmethod
     def at(cls, base: int, rows: int, columns: int) -> Level:
-        """Return a level that begins there."""
+        """Return a level that starts at an index."""
         return cls(base, rows, columns, -(-columns // _VECTOR) * _VECTOR)
 
     @property
     def nodes(self) -> int:
-        """Of its rows, margins included."""
+        """Number of nodes in its rows, including the margins on their right."""
         return self.rows * self.stride
 
     @property
     def first(self) -> int:
-        """Its first node."""
+        """Index of its first node."""
         return self.base + self.stride
 
     @property
     def end(self) -> int:
-        """Where it ends."""
+        """Index of its end."""
         return self.base + (self.rows + 2) * self.stride
 
     @property
     def place(self) -> dict[str, int]:
-        """Arguments of the passes over it."""
+        """Arguments of kernels for the level."""
         return {"base": self.base, "rows": self.rows, "stride": self.stride}
 
 
@@ -75,9 +75,10 @@ def cut_levels(shape: tuple[int, int]) -> list[Level]:
 class Hierarchy:
     """All levels of a graph.
 
-    ``graph`` has the nodes' links, and the weights of known heights as anchor (see ``kernels/multigrid.cl``);
-    ``inverse`` is one over the diagonal. ``to`` says which nodes belong to aggregates of other blocks than
-    theirs, ``moves`` how many aggregates of each level are therefore no blocks, and ``changed`` which.
+    ``graph`` has the nodes' links, and the weights of known heights as ``anchor`` (see
+    ``kernels/multigrid.cl``); ``inverse`` is the inverse of the diagonal. ``to`` marks nodes that belong to
+    the aggregate of another block. ``moves`` counts, for each level, the aggregates that differ from blocks
+    for this reason, and ``changed`` lists them.
     """
 
     device: Device
@@ -106,35 +107,36 @@ class Hierarchy:
     def array(
         self, name: str, size: int | None = None, *, dtype: DTypeLike = np.float32, lanes: int = 1
     ) -> Array:
-        """Return an array on the device, of all nodes unless it has another size, with as many lanes."""
+        """Return an array on the device, by default of all nodes, (size,) or (size, lanes)."""
         shape = (size or self.nodes,) if lanes == 1 else (size or self.nodes, lanes)
         array = self.device.array(name, shape, dtype)
         array.upload()
         return array
 
     def build(self, links: Links, *, plain: bool = False, strength: float = STRENGTH) -> None:
-        """Take a graph of this shape; in a plain one all that a block of pixels has is one aggregate.
+        """Build the levels of a graph of this shape.
 
-        Else a block's nodes are one aggregate where links of at least that ``strength`` join them, a share of
-        the geometric mean of their nodes' greatest ones along the same axis.
+        ``plain``: each block of 2 x 2 nodes is an aggregate. Otherwise, nodes of a block share an aggregate
+        if they are connected by links of at least ``strength``, relative to the geometric mean of the largest
+        weights of both nodes along the same axis.
         """
         self._admit_graph(links)
         for numbers in (self._splits, self._counts, self._changes):
             numbers.claim()
             numbers.host[...] = 0
             numbers.upload()
-        known: dict[str, Any] = {"strength": strength, **self.graph}
-        known |= {"parts": self._parts, "touched": self._touched}
+        arguments: dict[str, Any] = {"strength": strength, **self.graph}
+        arguments |= {"parts": self._parts, "touched": self._touched}
         for number in range(len(self.levels) - 1):
             if not plain:
-                self.between("parts", number, **known, level=number, splits=self._splits)
+                self.between("parts", number, **arguments, level=number, splits=self._splits)
                 splits = self._splits.download()[number]
                 self._splits.upload()
                 for turn in range(_ROUNDS if splits else 0):
                     old, new = (self._wanted, self.to)[:: 1 if turn % 2 else -1]
                     ends = {"clear": turn < 2, "first_round": turn == 0, "last_round": turn == _ROUNDS - 1}
                     counts: dict[str, Any] = {"level": number, "moves": self._counts}
-                    self.between("move", number, **known, **ends, to=old, places=new, **counts)
+                    self.between("move", number, **arguments, **ends, to=old, places=new, **counts)
             self._coarsen(number)
         self.moves[...] = self._changes.download()
         self._changes.upload()
@@ -142,9 +144,9 @@ class Hierarchy:
             self.over("invert", level, **self.graph, inverse=self.inverse)
 
     def follow(self, links: Links, *, deep: bool) -> None:
-        """Take a graph that is nearly the one before, a plain one; nothing goes to the host.
+        """Update a plain hierarchy for a similar graph, without copies to the host.
 
-        Unless ``deep``, all levels but the finest stay as they are.
+        Unless ``deep``, only the finest level is updated.
         """
         self._admit_graph(links)
         for number, level in enumerate(self.levels if deep else self.levels[:1]):
@@ -153,7 +155,7 @@ class Hierarchy:
             self.over("invert", level, **self.graph, inverse=self.inverse)
 
     def equations(self, number: int) -> tuple[Ints, Ints, Ints, Doubles, Doubles]:
-        """Return a level's nodes, of its links both ends and weights, and of each node the anchor."""
+        """Return a level's nodes, both ends and weights of its links, and the anchor of each node."""
         level = self.levels[number]
         node = np.arange(level.first, level.end - level.stride)
         steps = {"right": 1, "down": level.stride}
@@ -161,10 +163,10 @@ class Hierarchy:
             steps |= {"falling": level.stride + 1, "rising": level.stride - 1}
         ends, weights = [], []
         for name, step in steps.items():
-            found = self.graph[name].download()[node]
+            weight = self.graph[name].download()[node]
             self.graph[name].upload()
-            ends.append(node[found > 0] + np.array([[0], [step]]))
-            weights.append(found[found > 0].astype(np.float64))
+            ends.append(node[weight > 0] + np.array([[0], [step]]))
+            weights.append(weight[weight > 0].astype(np.float64))
         pull = np.zeros(len(node))
         if self.anchored:
             pull[...] = self.graph["anchor"].download()[node]
@@ -173,52 +175,51 @@ class Hierarchy:
         return node, a, b, np.concatenate(weights), pull
 
     def kernel(self, name: str, links: int, lanes: int = 1) -> Kernel:
-        """Return a pass over nodes with so many links, for as many right sides as there are lanes."""
+        """Return a kernel for nodes with a number of links, and for a number of right sides."""
         width = 8 if self.device.layout.tile > 1 and lanes == 1 else 1
-        given = {"ANCHORED": int(self.anchored), "LINKS": links, "PART": part_of(self.device), "WIDTH": width}
-        given |= {"ROWS": tile_rows(self.device, lanes), "COLUMNS": tile_columns(self.device, lanes)}
-        given["LANES"] = lanes
-        return self.device.kernel("multigrid", f"multigrid_{name}", **given)
+        macros = {"ANCHORED": int(self.anchored), "LINKS": links, "PART": part_of(self.device)}
+        macros |= {"ROWS": tile_rows(self.device, lanes), "COLUMNS": tile_columns(self.device, lanes)}
+        return self.device.kernel("multigrid", f"multigrid_{name}", **macros, WIDTH=width, LANES=lanes)
 
     def places(self, number: int) -> dict[str, int]:
-        """Return arguments of the passes between a level and the next."""
+        """Return arguments of kernels between a level and the next coarser one."""
         fine, coarse = self.levels[number : number + 2]
         return {**fine.place, **place_of_coarse(coarse)}
 
     def links_of(self, level: Level) -> int:
-        """Return how many links a level's nodes may have."""
+        """Return the number of links that a level's nodes may have."""
         return 8 if level is not self.levels[0] and self.moves.any() else 4
 
     def over(self, name: str, level: Level, *, lanes: int = 1, **arguments: Any) -> None:
-        """Run a pass over the nodes of a level."""
+        """Run a kernel for the nodes of a level."""
         items = -(-level.nodes // self.device.layout.tile)
         kernel = self.kernel(name, self.links_of(level), lanes)
         kernel(items, **level.place, **arguments, moved=_bytes(level, arguments))
 
     def between(self, name: str, number: int, **arguments: Any) -> None:
-        """Run a pass over the aggregates of a level, which are the next one's nodes."""
+        """Run a kernel for the aggregates of a level, which are the nodes of the next one."""
         fine, coarse = self.levels[number : number + 2]
         items = coarse.rows * -(-fine.stride // 2 // self.device.layout.tile)
         kernel = self.kernel(name, 8 if number else 4)
         kernel(items, **self.places(number), **arguments, moved=_bytes(fine, arguments))
 
     def gather(self, number: int, residual: Array, b: Array, lanes: int) -> None:
-        """Add up the residual over the aggregates of a level that are no blocks."""
+        """Sum the residual over the aggregates of a level that differ from blocks."""
         if count := int(self.moves[number]):
             items = -(-count // max(1, self.device.layout.tile // 16))
-            known: dict[str, Any] = {"to": self.to, "changed": self.changed, "count": count}
-            known |= {"residual": residual, "coarse_b": b}
-            self.kernel("gather", 4, lanes)(items, **self.places(number), **known, moved=80 * count)
+            arguments: dict[str, Any] = {"to": self.to, "changed": self.changed, "count": count}
+            arguments |= {"residual": residual, "coarse_b": b}
+            self.kernel("gather", 4, lanes)(items, **self.places(number), **arguments, moved=80 * count)
 
     def over_parts(self, name: str, parts: Array, *, lanes: int = 1, **arguments: Any) -> None:
-        """Run a pass over the finest level that adds up; ``parts`` gets partial sums."""
+        """Run a reduction over the finest level; ``parts`` receives the partial sums."""
         level = self.levels[0]
         count = -(-level.nodes // part_of(self.device))
         kernel = self.kernel(name, 4, lanes)
         kernel(count, **level.place, **arguments, parts=parts, moved=_bytes(level, arguments))
 
     def copy_picture(self, name: str, level: Array, map_: Array, *, lanes: int = 1, **arguments: Any) -> None:
-        """Copy a map of pixels to ("admit") the finest level, or back ("release")."""
+        """Copy a map of pixels to the finest level ("admit"), or back ("release")."""
         finest = self.levels[0]
         sizes = {**finest.place, "columns": finest.columns}
         items = finest.rows * -(-finest.columns // self.device.layout.tile)
@@ -232,51 +233,50 @@ class Hierarchy:
 
     def _coarsen(self, number: int) -> None:
         coarse = {f"coarse_{name}": array for name, array in self.graph.items()}
-        known = {"to": self.to, "touched": self._touched, "level": number, "moves": self._counts}
-        known |= {"changed": self.changed, "changes": self._changes}
-        self.between("coarsen", number, **self.graph, **known, **coarse)
+        moves = {"to": self.to, "touched": self._touched, "level": number, "moves": self._counts}
+        moves |= {"changed": self.changed, "changes": self._changes}
+        self.between("coarsen", number, **self.graph, **moves, **coarse)
 
 
 def place_of_coarse(coarse: Level) -> dict[str, int]:
-    """Return arguments of the passes between a level and the next, coarse one."""
+    """Return the arguments of kernels that describe the coarser level."""
     return {f"coarse_{name}": number for name, number in coarse.place.items()}
 
 
 def tile_columns(device: Device, lanes: int) -> int:
-    """Return the columns of the tiles that a group takes in half a cycle."""
+    """Return the number of columns of a work-group's tile in half a cycle."""
     if device.layout.tile == 1:
         return 32
-    room = device.context.devices[0].local_mem_size
-    return 128 if lanes == 1 and room >= _ROOM_OF_WIDE_TILES else 64
+    return 128 if lanes == 1 and device.context.devices[0].local_mem_size >= _WIDE_TILE_MEMORY else 64
 
 
 def tile_rows(device: Device, lanes: int) -> int:
-    """Return the rows of these tiles."""
+    """Return the number of rows of a work-group's tile."""
     return 16 if device.layout.tile == 1 and lanes > 1 else 32
 
 
 def choose_lanes(device: Device, sides: int) -> int:
-    """Return how many of some right sides to solve for at once: as many as a group's memory has room for."""
+    """Return the number of right sides to solve at once: as many as the local memory allows."""
     if sides == 1:
         return 1
-    room = device.context.devices[0].local_mem_size
+    local_memory = device.context.devices[0].local_mem_size
     return next(
         lanes
         for lanes in LANES
         if lanes == LANES[-1]
         or (
             lanes < 2 * sides
-            and 8 * lanes * (tile_rows(device, lanes) + 7) * (tile_columns(device, lanes) + 7) <= room
+            and 8 * lanes * (tile_rows(device, lanes) + 7) * (tile_columns(device, lanes) + 7) <= local_memory
         )
     )
 
 
 def part_of(device: Device) -> int:
-    """Return how many nodes a partial sum has."""
+    """Return the number of nodes of a partial sum."""
     return 4096 if device.layout.tile > 1 else 64
 
 
 def _bytes(level: Level, arguments: dict[str, Any]) -> int:
     """Return the bytes of a level in all arrays."""
-    arrays = [one for one in arguments.values() if isinstance(one, Array)]
-    return sum(min(one.host.nbytes, 4 * level.nodes) for one in arrays)
+    arrays = [value for value in arguments.values() if isinstance(value, Array)]
+    return sum(min(array.host.nbytes, 4 * level.nodes) for array in arrays)

@@ -3,33 +3,31 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mirrorskin.engine.integration.camera import Camera
-from mirrorskin.engine.integration.surface import SolverOptions, Surface, SurfaceSolver
+from mirrorskin.engine.integration.surface import IntegrationOptions, SurfaceSolver
 from mirrorskin.engine.integration.validation import (
     Inputs,
-    check_above_zero,
     check_inputs,
     check_map,
     check_pixel_size,
     logarithm,
 )
 from mirrorskin.engine.thread_safe import ThreadSafe
-from mirrorskin.io import InputError
+from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import checked
 from mirrorskin.kernels.device import Device, open_device
 
-# The memory of the last call, some 100 bytes a pixel, stays with the device for the next one: making it takes
-# as long as a solution (512 x 512 within a mask: 12 ms instead of 26). Not above so many pixels.
-_KEPT = 2**23
+# Pixels up to which the device keeps the memory of the last call, about 100 bytes per pixel: allocation takes
+# as long as a solution (512 x 512 within a mask: 12 ms instead of 26).
+_LARGEST_CACHED = 2**23
+_OUTSIDE = {"height": np.nan, "height_sigma": np.nan, "component": -1, "filled": 0, "edges": 0}
 
 
 @checked
@@ -45,89 +43,92 @@ def integrate(
     edges: ArrayLike | None = None,
     known_heights: ArrayLike | None = None,
     known_height_weights: ArrayLike | None = None,
-    robust: bool = False,
-    bilateral_sharpness: float = 2.0,
-    sigma: bool = True,
     initial_heights: ArrayLike | None = None,
-    tolerance: float | None = 1e-5,
-    budget: float | None = None,
-    device: str | Device | None = None,
-) -> Surface:
-    """Find the heights that fit slopes, and heights where they are known, best.
+    **options: Any,
+) -> Result:
+    """Integrate slopes to the heights that fit them, and known heights, best.
 
-    Neighbours i and j with slopes are linked. The heights u are those of the least ::
+    Neighbouring pixels i and j with slopes are linked. The heights u minimise ::
 
         sum of w (u_j - u_i - d)^2  +  sum of a (u_i - k_i)^2
 
-    over all links and known heights k; d is the pixel size times the slope of the link, which is
-    (-s[-1] + 13 s[0] + 13 s[1] - s[2]) / 24 of four pixels in line where links lead through all of them, else
-    the mean of two. w is the harmonic mean of both pixels' weights over the pixel size squared, a the weight
-    of the known height. The border is free (natural boundary). A full rectangle with even weights is solved
-    directly, all else by conjugate gradients with multigrid.
+    over all links and known heights k. d is the pixel size times the slope of the link: the fourth-order
+    formula (-s[-1] + 13 s[0] + 13 s[1] - s[2]) / 24 of four pixels in line if links connect all of them,
+    otherwise the mean of two. w is the harmonic mean of both pixels' weights over the pixel size squared, a
+    the weight of the known height. The boundary is free (Neumann condition). A full rectangle with uniform
+    weights is solved directly, everything else by conjugate gradients with multigrid.
 
     Parameters
     ----------
     dz_dx, dz_dy : array_like, (H, W) or (K, H, W), optional
-        Slopes along x (to the right) and along y, which runs up the picture. Not finite where there is none.
-        Of K surfaces with all else the same: they are solved together, several times as fast as one by one. A
-        pixel has slopes where all surfaces have; the first one says to which neighbour ``edges`` are linked.
+        Slopes along x (to the right) and along y (up the picture); not finite where undefined. K surfaces
+        with the same other arguments are solved together, several times as fast as one after the other. A
+        pixel has slopes if all surfaces have them; the first surface determines the links of ``edges``.
     pixel_size : array_like, optional
-        Millimetres, one number or (x, y). Left out with a camera.
+        Millimetres, one number or (x, y). Not allowed with a camera.
     normals : array_like, (H, W, 3), optional
-        Surface normals in place of slopes: along x, y and z, which runs towards the camera; of any length.
-        Not finite or 0 where there is none; where the surface faces away, or is seen within 0.6 degrees of
-        edge-on, they count as none.
+        Surface normals instead of slopes: components along x, y and z, which points to the camera; of any
+        length. Not finite or 0 where undefined. Normals of surfaces that face away, or within 0.6 degrees of
+        edge-on, are ignored.
     camera : mirrorskin.engine.integration.Camera, optional
-        What saw the normals; by default one so far away that all lines of sight are along z. With a camera,
+        The pinhole camera that saw the normals; by default all lines of sight are along z. With a camera,
         ``height``, known and initial heights are *depths* Z > 0: distances from the pinhole along the optical
-        axis, which grow away from the camera. The logarithm of Z is integrated: a pixel to the right it rises
-        by n_x / (n . v) over the focal length, a pixel up by n_y / (n . v), v = (x, y, 1) along the line of
-        sight to the camera. No normal says how large things are: a component without a known depth has the
-        geometric mean 1.
+        axis, which increase away from the camera. The logarithm of Z is integrated: it rises by n_x / (n . v)
+        over the focal length from a pixel to the next one on the right, and by n_y / (n . v) to the one
+        above, where v = (x, y, 1) points along the line of sight to the camera. Normals do not determine the
+        scale: a component without a known depth has the geometric mean 1.
     mask : array_like, (H, W), optional
-        0 where no answer is wanted.
+        0 where no height is wanted.
     slope_weights : array_like, scalar, (H, W) or (2, H, W), optional
-        Inverse variances of the slopes, or of dz_dx and of dz_dy; with ``normals`` those of unit normals,
-        1/rad^2, and a slope's is (n . v)^2 of it, v = (0, 0, 1) without a camera. 0 where there is none. By
-        default all are equally noisy, and ``sigma`` is estimated from how well they fit together. What is
-        below 1e-4 or above 1e3 of the slopes' median counts as that; what is 0 in float32, as 0.
+        Inverse variances of the slopes, or of dz_dx and of dz_dy; 0 where undefined. With ``normals``, those
+        of unit normals, 1/rad^2, from which a slope gets the weight times (n . v)^2, with v = (0, 0, 1)
+        without a camera. By default all slopes have the same noise, which is estimated from the misfit for
+        ``height_sigma``. Weights are clipped to 1e-4 to 1e3 times the median; values that are 0 in float32
+        count as 0.
     edges : array_like, (H, W), optional
-        Not 0 on pixels where the surface breaks: they keep but one link, to that neighbour off the edge whose
-        slopes are the most similar, and so never join two sides.
+        Not 0 at pixels where the surface is discontinuous. Such a pixel keeps only one link: to the neighbour
+        off the edge with the most similar slopes. So it never connects two sides.
     known_heights : array_like, (H, W), optional
-        Known heights, mm, or depths in any unit; NaN elsewhere. They need no slope.
+        Known heights, mm, or depths in any unit; NaN elsewhere. These pixels need no slope.
     known_height_weights : array_like, scalar or (H, W), optional
-        Their inverse variances, 1/mm^2 (1 over the square of the depths' unit); 0 where nothing is known. 1
-        by default. What is above 1e4 of a link's weight w counts as that.
-    robust : bool
-        Whether to look for discontinuities beyond ``edges``.
-    bilateral_sharpness : float
-        How sharply, 1/pixel^2: links that miss their slopes by more than 2.4 over the root of 2 k are cut.
-    sigma : bool
-        Whether to find the standard deviation of the heights, in about the time of the heights themselves.
+        Their inverse variances, 1/mm^2 (1 over the square of the depths' unit), 0 where unknown; default 1.
+        Weights are clipped at 1e4 times a link's weight w.
     initial_heights : array_like, (H, W), optional
-        Heights to begin with, NaN where there is none.
-    tolerance : float or None
-        Of the residual, which is `Surface.residual`; parts of small weight may be less near. None takes what
-        two cycles give.
-    budget : float, optional
-        Seconds, in place of the tolerance: after the first, no cycle is begun that would end later. Neither
-        the set-up nor ``sigma`` is cut.
-    device : str or Device, optional
-        See ``mirrorskin.kernels.device.open_device``.
+        Heights to start from, NaN where undefined.
+    **options
+        ``robust``, ``bilateral_sharpness``, ``sigma``, ``tolerance``, ``budget`` and ``device``; see
+        `mirrorskin.engine.integration.surface.IntegrationOptions`.
 
     Returns
     -------
-    Surface
+    Result
+        ``height``, (H, W) or (K, H, W), mm: with a camera the depth, in the unit of known ones. NaN where
+        undefined. Other maps are (H, W), and shared by all surfaces.
+
+        ``height_sigma``: expected standard deviation, about the mean of the component if it has no known
+        height; NaN where the noise of the slopes cannot be estimated.
+
+        ``component``: connected component of each pixel, numbered in reading order of the first pixels; -1
+        without an answer. ``offset_unknown``, (components,): 1 for a component without a known height, whose
+        mean is 0, or whose depth has the geometric mean 1.
+
+        ``filled``: all 0. ``edges``: 1 on both sides of a discontinuity, if ``robust``.
+
+        ``x`` and ``y``: pixel centres, without a camera.
+
+        ``process``: the method ("direct", "multigrid" or "robust") as ``integration``; the solver's
+        ``integration_iterations`` and final ``integration_residual``, each the largest of several surfaces;
+        ``integration_converged``: whether the residual is within the tolerance, or, without one, below 0.3;
+        ``integration_invalid``: number of wanted pixels whose slopes are not finite.
 
     Raises
     ------
     mirrorskin.io.InputError
-        Maps that do not fit each other, or of which nothing can be used; numbers out of range.
+        Maps of different sizes, or without anything to integrate; numbers outside of their limits.
     NotConverged
-        The tolerance was not met.
+        The tolerance was not reached.
     mirrorskin.kernels.errors.DeviceError
-        No device, or one without room for the maps.
+        No device, or too little memory for the maps.
 
     Examples
     --------
@@ -137,61 +138,56 @@ def integrate(
     >>> round(float(surface.height[0, 2]), 6)
     0.5
     """
-    began = time.perf_counter()
+    chosen = IntegrationOptions(**options)
     inputs = check_inputs(
         *(dz_dx, dz_dy, pixel_size, mask, slope_weights, edges, known_heights, known_height_weights),
         normals=normals,
         camera=camera,
-        robust=robust,
+        robust=chosen.robust,
         crop=True,
-        several=not robust and initial_heights is None,
+        several=not chosen.robust and initial_heights is None,
     )
-    check_above_zero(bilateral_sharpness=bilateral_sharpness, tolerance=tolerance, budget=budget)
     start = None
     if initial_heights is not None:
         start = check_map("initial_heights", initial_heights, inputs.picture)[inputs.box]
         start = start.astype(np.float64) if camera is None else logarithm("initial_heights", start)
-    options = SolverOptions(
-        tolerance=tolerance,
-        deadline=None if budget is None else began + budget,
-        sharpness=bilateral_sharpness if robust else None,
-        sigma=sigma,
-    )
-    with _borrowed_solver(open_device(device), inputs) as solver:
-        surface = solver.solve(inputs, options, start)
+    with _cached_solver(chosen.device, inputs) as solver:
+        result = solver.solve(inputs, chosen, start)
     if camera is not None:
-        depth = np.exp(surface.height)
-        deviation = None if surface.sigma is None else depth * surface.sigma
-        surface = replace(surface, height=depth, sigma=deviation)
-    return surface if inputs.shape == inputs.picture else _put_back(surface, inputs)
+        depth = np.exp(result.height)
+        sigma = None if result.height_sigma is None else depth * result.height_sigma
+        result = result.assign(height=depth, height_sigma=sigma)
+    else:
+        x, y = pixel_axes(inputs.picture, inputs.pixel_size)
+        result = result.assign(x=x, y=y)
+    return result if inputs.shape == inputs.picture else _uncropped(result, inputs)
 
 
-def _put_back(surface: Surface, inputs: Inputs) -> Surface:
-    """Return the surface of the picture that a box was cut out of."""
-    maps: dict[str, Any] = {}
-    for name, rest in {"height": np.nan, "sigma": np.nan, "component": -1, "filled": 0, "edges": 0}.items():
-        part = getattr(surface, name)
-        if part is not None:
-            maps[name] = np.full((*part.shape[:-2], *inputs.picture), rest, part.dtype)
-            maps[name][(..., *inputs.box)] = part
-    return replace(surface, **maps, invalid=surface.invalid + inputs.lost)
+def _uncropped(result: Result, inputs: Inputs) -> Result:
+    """Return the maps of the whole picture."""
+    maps = {}
+    for name, part in result.maps().items():
+        maps[name] = np.full((*part.shape[:-2], *inputs.picture), _OUTSIDE[name], part.dtype)
+        maps[name][(..., *inputs.box)] = part
+    invalid = int(result.process["integration_invalid"]) + inputs.lost
+    return result.assign(maps, process={**result.process, "integration_invalid": invalid})
 
 
 @contextmanager
-def _borrowed_solver(device: Device, inputs: Inputs) -> Iterator[SurfaceSolver]:
-    """Take the last call's solver if it fits, and give it back."""
+def _cached_solver(device: Device, inputs: Inputs) -> Iterator[SurfaceSolver]:
+    """Use the solver of the last call again if it fits, and keep it for the next call."""
     key = inputs.shape, inputs.pixel_size
-    kept, solver = device.spare.pop("integration", (None, None))  # at once, so that no two threads have it
-    if kept != key:
+    cached_key, solver = device.spare.pop("integration", (None, None))  # atomic: one thread gets it
+    if cached_key != key:
         solver = SurfaceSolver(device, inputs.shape)
-    yield solver  # one that failed is not kept
+    yield solver  # after an exception it is not kept
     solver.reset()
-    if math.prod(inputs.shape) <= _KEPT:
+    if math.prod(inputs.shape) <= _LARGEST_CACHED:
         device.spare["integration"] = key, solver
 
 
 class Integrator(ThreadSafe):
-    """Integrate slopes frame after frame: memory is kept, and heights start from the last ones.
+    """Integrate slopes frame after frame: memory is reused, and each frame starts from the last heights.
 
     Parameters
     ----------
@@ -218,7 +214,7 @@ class Integrator(ThreadSafe):
     ) -> None:
         self._shape, self._pixel_size = tuple(shape), check_pixel_size(pixel_size)
         self._solver = SurfaceSolver(open_device(device), shape)
-        self._surface: Surface | None = None
+        self._result: Result | None = None
 
     def push(
         self,
@@ -233,50 +229,48 @@ class Integrator(ThreadSafe):
         budget: float | None = None,
         tolerance: float | None = None,
     ) -> None:
-        """Integrate the slopes of one frame, without the heights' sigma.
+        """Integrate the slopes of one frame, without ``height_sigma``.
 
-        The maps are those of `mirrorskin.engine.integrate`. By default two cycles are done, from the last
-        frame's heights on.
+        The maps are those of `mirrorskin.engine.integrate`. By default two cycles are done, starting from the
+        heights of the last frame.
 
         Parameters
         ----------
         budget : float, optional
-            Seconds; after the first, cycles are done as long as they end in time, and until they are of no
-            more use.
+            Time limit, seconds: after the first, cycles are done while they end in time and reduce the error.
         tolerance : float, optional
-            Of the residual; with a budget it may be missed.
+            Residual to stop at; with a budget it may be missed.
 
         Raises
         ------
         mirrorskin.io.InputError
             Maps that cannot be used, or of another shape than the integrator's.
         NotConverged
-            The tolerance was not met, without a budget.
+            The tolerance was not reached, without a budget.
         """
-        began = time.perf_counter()
+        options = IntegrationOptions(tolerance=tolerance, budget=budget, sigma=False)
         inputs = check_inputs(
             dz_dx, dz_dy, self._pixel_size, mask, slope_weights, edges, known_heights, known_height_weights
         )
         if inputs.shape != self._shape:
             raise InputError(f"slopes have shape {inputs.shape}, not {self._shape}: make another Integrator")
-        check_above_zero(tolerance=tolerance, budget=budget)
-        self._surface = None
-        deadline = None if budget is None else began + budget
-        self._surface = self._solver.solve(inputs, SolverOptions(tolerance=tolerance, deadline=deadline))
+        self._result = None
+        x, y = pixel_axes(inputs.shape, inputs.pixel_size)
+        self._result = self._solver.solve(inputs, options).assign(x=x, y=y)
 
-    def result(self) -> Surface:
-        """Return the surface of the last frame.
+    def result(self) -> Result:
+        """Return the surface of the last frame; see `mirrorskin.engine.integrate`.
 
         Raises
         ------
         mirrorskin.io.InputError
-            There was none, or it had none.
+            No frame has been pushed, or the last one could not be integrated.
         """
-        if self._surface is None:
+        if self._result is None:
             raise InputError("there is no surface yet: push the slopes of a frame first")
-        return self._surface
+        return self._result
 
     def reset(self) -> None:
-        """Forget the last frame's heights: the next frame has nothing to do with it."""
-        self._surface = None
+        """Forget the last heights: the next frame starts from zero."""
+        self._result = None
         self._solver.reset()

@@ -1,4 +1,4 @@
-"""The solver of `integrate` for anyone's graph Laplacian on a picture."""
+"""The multigrid solver of `integrate` for any graph Laplacian on a picture."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.integration.graph import Links, find_components
 from mirrorskin.engine.integration.multigrid import Multigrid
-from mirrorskin.engine.integration.validation import check_above_zero
+from mirrorskin.engine.integration.surface import IntegrationOptions
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked
 from mirrorskin.kernels.array import Array
-from mirrorskin.kernels.device import Device, open_device
+from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.links import DOWN, KNOWN, RIGHT, SLOPE
 
 if TYPE_CHECKING:
@@ -32,41 +32,41 @@ def invert_laplacian(
     tolerance: float | None = 1e-5,
     device: str | Device | None = None,
 ) -> LinearOperator:
-    """Return the inverse of a graph Laplacian of a picture's pixels, as an operator of SciPy.
+    """Return the inverse of a graph Laplacian of a picture's pixels, as a SciPy operator.
 
-    The matrix A has for a map u, with neighbours j of pixel i, ::
+    For a map u, and neighbours j of pixel i, the matrix A gives ::
 
         (A u)_i = sum of w_ij (u_i - u_j)  +  a_i u_i
 
     The operator solves A u = b by conjugate gradients with multigrid in float32. As the preconditioner of a
-    solver in float64 it makes each of its steps gain the digits of the tolerance.
+    float64 solver, it reduces the error of each of its steps to the tolerance.
 
     Parameters
     ----------
     right : array_like, (H, W - 1)
-        Weights w of the links from pixels to those on the right, of any unit; 0 where there is none.
+        Weights w of the links from pixels to the next ones on the right, in any unit; 0 without a link.
     down : array_like, (H - 1, W)
         Weights w of the links to the pixels below.
     diagonal : array_like, (H, W), optional
-        What is added on the diagonal, a; 0 by default. Where no pixel of a connected component has any, A is
-        singular: of b the part with the mean 0 there is taken, and the mean of u is 0.
+        Values a added to the diagonal; 0 by default. A is singular if all are 0 in a connected component:
+        then the mean of b over the component is subtracted, and the mean of u is 0.
     tolerance : float or None
-        Energy norm of the error over that of u, of a solution. None does one multigrid cycle, which is a
-        preconditioner: the same for every b, and positive definite.
+        Energy norm of the error over that of u. None does one multigrid cycle, which is a preconditioner:
+        linear and positive definite.
     device : str or Device, optional
         See ``mirrorskin.kernels.device.open_device``.
 
     Returns
     -------
     scipy.sparse.linalg.LinearOperator
-        H W by H W, symmetric, for maps that are flattened in C order; for one thread at a time. Of a matrix
-        its columns are solved for together, several times as fast as one by one. It raises `NotConverged`
-        where weights are too uneven to meet the tolerance.
+        H W by H W, symmetric, for maps flattened in C order; for one thread at a time. The columns of a
+        matrix are solved together, several times as fast as one after the other. `NotConverged` is raised if
+        weights are too uneven to reach the tolerance.
 
     Raises
     ------
     mirrorskin.io.InputError
-        Maps that do not fit each other, or weights that are negative or no numbers.
+        Maps of different sizes, or weights that are negative or not finite.
 
     Examples
     --------
@@ -85,8 +85,8 @@ def invert_laplacian(
     """
     from scipy.sparse.linalg import LinearOperator
 
-    maps = [np.asarray(one, np.float64) for one in (right, down)]
-    shape = (len(maps[0]), maps[1].shape[-1]) if all(one.ndim == 2 for one in maps) else (0, 0)
+    maps = [np.asarray(weights, np.float64) for weights in (right, down)]
+    shape = (len(maps[0]), maps[1].shape[-1]) if all(weights.ndim == 2 for weights in maps) else (0, 0)
     if 0 in shape or maps[0].shape[1] != shape[1] - 1 or maps[1].shape[0] != shape[0] - 1:
         raise InputError(
             f"links have shapes {maps[0].shape} and {maps[1].shape}: (H, W - 1) to the right and (H - 1, W)"
@@ -95,17 +95,17 @@ def invert_laplacian(
     maps.append(np.zeros(shape) if diagonal is None else np.asarray(diagonal, np.float64))
     if maps[2].shape != shape:
         raise InputError(f"diagonal: shape {maps[2].shape}, but links are of {shape}; give maps of one size")
-    if not all(np.all((one >= 0) & (one < np.inf)) for one in maps):
-        raise InputError("links or diagonal: some are negative or no number; give 0 where there is none")
-    check_above_zero(tolerance=tolerance)
-    solve = _Solver(open_device(device), maps, tolerance)
+    if not all(np.all((weights >= 0) & (weights < np.inf)) for weights in maps):
+        raise InputError("links or diagonal: some are negative or not finite; give 0 where there is none")
+    options = IntegrationOptions(tolerance=tolerance, device=device)
+    solve = _Solver(options.device, maps, options.tolerance)
     size = shape[0] * shape[1]
-    known = {"matvec": solve, "rmatvec": solve, "matmat": solve, "rmatmat": solve}
-    return LinearOperator((size, size), **known, dtype=np.float64)
+    products = dict.fromkeys(("matvec", "rmatvec", "matmat", "rmatmat"), solve)
+    return LinearOperator((size, size), **products, dtype=np.float64)
 
 
 class _Solver:
-    """What multiplies by the inverse."""
+    """Multiplies by the inverse."""
 
     def __init__(self, device: Device, maps: list[Doubles], tolerance: float | None) -> None:
         self._tolerance = tolerance
@@ -130,15 +130,15 @@ class _Solver:
         exact = self._centred(np.asarray(sources, np.float64).reshape(len(sources), -1).T)
         sizes = np.abs(exact).max(axis=1, initial=0)
         if not (sizes < np.inf).all():
-            raise InputError("the right side of the Laplacian has values that are no numbers: leave them out")
+            raise InputError("the right side of the Laplacian has values that are not finite: leave them out")
         if not sizes.any():
             return exact.T.reshape(np.shape(sources))
         scales = np.where(sizes > 0, sizes, 1)[:, np.newaxis]
-        given = (exact / scales).reshape(-1, *self._links.shape)
-        maps = self._links.device.given("sources", given)
+        scaled = (exact / scales).reshape(-1, *self._links.shape)
+        maps = self._links.device.given("sources", scaled)
         height = self._multigrid.precondition(maps) if self._tolerance is None else self._solve(maps)
-        found = self._centred(height.download().reshape(exact.shape) * (scales / self._unit))
-        return found.T.reshape(np.shape(sources))
+        solution = self._centred(height.download().reshape(exact.shape) * (scales / self._unit))
+        return solution.T.reshape(np.shape(sources))
 
     def _solve(self, maps: Array) -> Array:
         found = self._multigrid.solve_many(maps, tolerance=self._tolerance)
@@ -150,6 +150,6 @@ class _Solver:
         return found.height
 
     def _centred(self, values: Doubles) -> Doubles:
-        """Return values, (K, N), less the mean of each component whose offset is free."""
+        """Return values, (K, N), minus the mean of each component whose offset is free."""
         means = [np.bincount(self._labels, one) / self._pixels for one in values]
         return values - np.where(self._free, means, 0.0)[:, self._labels]

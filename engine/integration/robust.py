@@ -1,4 +1,4 @@
-"""Heights of a surface that breaks where nobody says: links are trusted by what normals tell, and let go."""
+"""Integration of a discontinuous surface: links get a confidence from the normals, and are cut at misfits."""
 
 from __future__ import annotations
 
@@ -17,35 +17,36 @@ from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.breaks import DOWN, RIGHT
 
 _BROKEN = 6.0
-"""Of k r^2 (see ``mirrorskin.kernels.breaks``) above which a link leads across a discontinuity."""
+"""k r^2 (see ``mirrorskin.kernels.breaks``) above which a link crosses a discontinuity."""
 
-_SCALES = 32.0, 16.0, 8.0, 4.0, 2.0, 1.0  # over the root of 2 k: by what a link may miss its slope
-_MOST, _REST = 4, 0.02  # steps at a scale, and by what part of the broken links they must lower these
-_LOOSE = 0.001  # residual of a step's equations
-_CYCLES = 10  # of a step, at most
-_GONE = (
-    1e4  # of k r^2, above which a link is cut for a step: what hangs by links of no weight cannot be solved
-)
-_AGAIN = 3  # more solutions in the end, at most
-_NOISE = 0.03  # of slopes, at least
-_CLEAR = 3.0  # standard deviations of the curl's noise that do not tell of a tear
-_SLACK = 0.25  # of the difference of slopes, by which a link may miss for nothing: a crease may lie anywhere
-_LEAST = 1e-5  # of a link's weight, that trust leaves it
-_SAMPLES = 1 << 16  # of the curl, that tell of its noise
-_LOCAL, _WIDE = (1, 0.5, 2.0), (5, 0.1, 2.0)  # of two searches: reach of the curl's sums; bend, tear
+_SCALES = 32.0, 16.0, 8.0, 4.0, 2.0, 1.0  # times 1 / sqrt(2 k): misfit of a link that is tolerated
+_MOST, _REST = 4, 0.02  # largest number of steps at a scale; relative decrease of broken links to go on
+_LOOSE = 0.001  # residual of a step's solution
+_CYCLES = 10  # largest number of cycles of a step
+_GONE = 1e4  # k r^2 above which a link is cut for a step, because tiny weights cannot be solved
+_AGAIN = 3  # largest number of additional solutions at the end
+_NOISE = 0.03  # smallest standard deviation of slopes
+_CLEAR = 3.0  # standard deviations of the curl's noise up to which there is no contradiction
+_SLACK = 0.25  # share of the difference of slopes that is no misfit: a crease may be anywhere between pixels
+_LEAST = 1e-5  # smallest confidence, relative to a link's weight
+_SAMPLES = 1 << 16  # pixels from which the curl's noise is estimated
+_LOCAL, _WIDE = (
+    (1, 0.5, 2.0),
+    (5, 0.1, 2.0),
+)  # two searches: reach of the curl's sums, factors of bend and tear
 
 
 @dataclass(frozen=True, slots=True)
 class Robust:
-    """Heights of a surface that may break, and where it does."""
+    """Heights of a surface, and its discontinuities."""
 
-    relief: Array  # (H, W), float32: heights above the plane, mm; meaningless where there is no pixel
-    links: Links  # the graph that they solve, with the final weights
-    flags: Flags  # (H, W), uint8: those given, without links that are broken
-    edges: Flags  # (H, W), uint8: 1 on either side of a discontinuity
-    iterations: int  # solutions in all
-    residual: float  # of the last one
-    converged: bool  # whether all steps were done, and the last one within the tolerance
+    relief: Array  # (H, W), float32: heights above the plane, mm; arbitrary without an answer
+    links: Links  # the graph with the final weights
+    flags: Flags  # (H, W), uint8: the flags without broken links
+    edges: Flags  # (H, W), uint8: 1 on both sides of a discontinuity
+    iterations: int  # number of solutions
+    residual: float  # of the last solution
+    converged: bool  # whether all steps were done, and the last residual is within the tolerance
 
 
 def solve_robust(
@@ -61,43 +62,42 @@ def solve_robust(
 ) -> Robust:
     """Find heights that fit slopes and known heights, and the discontinuities between them.
 
-    A link is trusted less where the surface is seen from aside, where it bends, and where slopes contradict
-    each other (see ``mirrorskin.kernels.breaks``). Least squares of the links so weighted come first; then
-    links that miss their slopes lose weight, step by step by smaller misses. At last those are cut that miss
-    theirs by more than 2.4 over the root of 2 k, and the rest is solved to the tolerance. There are two
-    searches, with contradictions counted where they are and over 11 x 11 corners; the heights that
-    break fewer links are taken.
+    The initial confidence of a link is lower where the surface is seen obliquely, where it bends, and where
+    slopes contradict each other (curl; see ``mirrorskin.kernels.breaks``). The first heights are weighted
+    least squares. Then links with a misfit lose weight, at smaller and smaller scales. Finally links with a
+    misfit above 2.4 / sqrt(2 k) are cut, and the rest is solved to the tolerance. There are two searches,
+    with contradictions counted locally and over 11 x 11 corners; the heights that break fewer links win.
 
-    - What is cut off all round keeps its shape, and is a component with an unknown offset unless a height in
-      it is known. As long as no slope contradicts, it is not cut off at all: a ball on a plane stays on it.
-    - The place of a break is determined where its height changes along it; elsewhere it takes the way of the
-      normals that differ most.
-    - A step lower than about one pixel (at k = 2) is taken for a bend.
+    - A region that is cut off on all sides keeps its shape, and is a component with an unknown offset unless
+      it has a known height. Without contradictions it is not cut off: a ball on a plane stays connected.
+    - The position of a discontinuity is determined where its height changes along it; elsewhere it follows
+      the largest differences between normals.
+    - A step lower than about one pixel (at k = 2) counts as a bend.
 
-    ``links`` are of heights above the plane; only these can be cut. ``sharpness`` is k, 1/pixel^2. From a
-    ``start``, heights above the plane, only the last scale is used. After the ``deadline``, of
-    ``time.perf_counter``, no step is begun but the last solution's first cycle.
+    Only ``links``, of heights above the plane, can be cut. ``sharpness`` is k, 1/pixel^2. With a ``start``,
+    heights above the plane, only the last scales are used. After the ``deadline``, a ``time.perf_counter``,
+    only the first cycle of the last solution is started.
     """
     search = _Search(inputs, links, flags, plane, sharpness, deadline)
     search.trust(*_LOCAL)
     if start is not None:
-        given = np.where(np.isfinite(start), start, 0.0)
-        return search.conclude(search.descend(links.device.given("start", given)), flags, tolerance)
+        first = links.device.given("start", np.where(np.isfinite(start), start, 0.0))
+        return search.conclude(search.descend(first), flags, tolerance)
     best = search.descend()
     if search.contradicted and not search.late():
-        known, broken = np.array(best.download()), search.link(best)
+        local, broken = np.array(best.download()), search.link(best)
         best.upload()
         search.trust(*_WIDE)
         best = search.descend()
         search.trust(*_LOCAL)
         best = search.descend(best)
         if search.link(best) >= broken:
-            best = links.device.given("first", known)
+            best = links.device.given("first", local)
     return search.conclude(best, flags, tolerance)
 
 
 class _Search:
-    """Steps towards heights that break few links, on the links' device."""
+    """Steps towards heights that break few links."""
 
     def __init__(
         self,
@@ -114,7 +114,7 @@ class _Search:
         rows, columns = links.shape
         self._items = rows * -(-columns // min(links.device.layout.tile, 256))
         names = "tears", "weight_x", "weight_y", "rise_x", "rise_y", "right", "down", "source"
-        self._room = {name: self._array(name, links.shape) for name in names}
+        self._maps = {name: self._array(name, links.shape) for name in names}
         self._sums = self._array("sums", (self._items,))
         self._slopes, self._facing = self._find_slopes(inputs, plane)
         self._held = self._find_held(inputs, plane)
@@ -122,27 +122,27 @@ class _Search:
         self._solver: Multigrid | None = None
 
     def late(self) -> bool:
-        """Tell whether the deadline is over."""
+        """Return whether the deadline has passed."""
         return self._deadline is not None and time.perf_counter() > self._deadline
 
     def trust(self, reach: int, bend: float, tear: float) -> None:
-        """Weigh links by what is known of them before any heights."""
-        room, noise = self._room, max(_NOISE, self._noise / math.sqrt(2))
+        """Compute the initial confidence of the links, which does not depend on heights."""
+        maps, noise = self._maps, max(_NOISE, self._noise / math.sqrt(2))
         sums = self._curl
         for downwards, name in enumerate(("rise_x", "rise_y")):
-            self._run("sum", values=sums, reach=reach, downwards=downwards, sums=room[name])
-            sums = room[name]
-        known = {"reach": reach, "noise": _CLEAR * self._noise, "wide": int(reach > 1)}
-        self._run("spread", curl=self._curl, sums=sums, **known, tears=room["tears"])
-        found = {name: room[name] for name in ("tears", "weight_x", "weight_y", "rise_x", "rise_y")}
+            self._run("sum", values=sums, reach=reach, downwards=downwards, sums=maps[name])
+            sums = maps[name]
+        limits = {"reach": reach, "noise": _CLEAR * self._noise, "wide": int(reach > 1)}
+        self._run("spread", curl=self._curl, sums=sums, **limits, tears=maps["tears"])
+        outputs = {name: maps[name] for name in ("tears", "weight_x", "weight_y", "rise_x", "rise_y")}
         numbers = {"noise": noise**2, "bend": bend, "tear": tear, "least": _LEAST}
         links = {"right": self._links.right, "down": self._links.down, **self._slopes}
-        self._run("trust", **links, facing=self._facing, **numbers, **found)
+        self._run("trust", **links, facing=self._facing, **numbers, **outputs)
 
     def descend(self, heights: Array | None = None) -> Array:
-        """Solve for heights again and again, by the links that the last ones keep at each scale.
+        """Return heights from iteratively reweighted least squares at decreasing scales.
 
-        From given heights on, it begins with the last scales.
+        From given heights, only the last scales are used.
         """
         scales: tuple[float, ...] = _SCALES[3:]
         if heights is None:
@@ -159,11 +159,11 @@ class _Search:
         return heights
 
     def link(self, heights: Array, scale: float = 1.0, most: float = math.inf) -> float:
-        """Make the links that heights keep; return how many are broken."""
+        """Compute the weights of links from the misfit of heights; return the number of broken links."""
         names = "weight_x", "weight_y", "rise_x", "rise_y", "right", "down", "source"
-        room = {name: self._room[name] for name in names}
         numbers = {"sharpness": self._sharpness / scale**2, "most": min(most, _GONE), "slack": _SLACK}
-        maps = {**room, **self._slopes, "held": self._held, "heights": heights, "sums": self._sums}
+        maps = {**{name: self._maps[name] for name in names}, **self._slopes}
+        maps |= {"held": self._held, "heights": heights, "sums": self._sums}
         self._run("links", **maps, **self._size, **numbers)
         broken = float(self._sums.download().sum(dtype=np.float64))
         self._sums.upload()
@@ -171,7 +171,7 @@ class _Search:
 
     def _solve(self, heights: Array, tolerance: float, scale: float, most: float = math.inf) -> Solution:
         self.link(heights, scale, most)
-        right, down, source = (self._room[name] for name in ("right", "down", "source"))
+        right, down, source = (self._maps[name] for name in ("right", "down", "source"))
         links = Links(self._links.device, self._shape, right, down, self._links.anchor, source)
         if self._solver is None:
             self._solver = Multigrid(links)
@@ -184,12 +184,10 @@ class _Search:
         return self._solver.solve(start, tolerance=tolerance, limit=limit, deadline=self._deadline)
 
     def conclude(self, heights: Array, flags: Flags, tolerance: float) -> Robust:
-        """Cut what is broken, solve the rest to the tolerance, and return what was found."""
+        """Cut broken links, solve the rest to the tolerance, and return the surface."""
         done = not self.late()
         last = self._solve(heights, tolerance, 1.0, _BROKEN)
-        for _ in range(
-            _AGAIN
-        ):  # from new residuals on, where rounding of steps ends the descent of weak links
+        for _ in range(_AGAIN):  # a restart recomputes the residual, whose rounding errors stop the iteration
             if last.converged or self.late():
                 break
             assert self._solver is not None
@@ -213,15 +211,15 @@ class _Search:
     def _find_slopes(self, inputs: Inputs, plane: Plane) -> tuple[dict[str, Array], Array]:
         """Return slopes relative to the plane, to the right and down, and the normals' cosines."""
         x, y = inputs.dz_dx, inputs.dz_dy
-        good = np.isfinite(x) & np.isfinite(y)
-        x, y = np.where(good, x, np.float32(0)), np.where(good, y, np.float32(0))
+        defined = np.isfinite(x) & np.isfinite(y)
+        x, y = np.where(defined, x, np.float32(0)), np.where(defined, y, np.float32(0))
         steep = 1 / (1 + x * x + y * y) if inputs.steep is None else inputs.steep
         slopes = {"slope_x": x - np.float32(plane[0]), "slope_y": np.float32(plane[1]) - y}
-        maps = {name: self._given(name, one) for name, one in slopes.items()}
+        maps = {name: self._given(name, slope) for name, slope in slopes.items()}
         return maps, self._given("cosine", np.sqrt(steep))
 
     def _find_held(self, inputs: Inputs, plane: Plane) -> Array:
-        """Return the right side of known heights: weights times their heights above the plane."""
+        """Return the right side of known heights: weight times height above the plane."""
         anchor = self._links.anchor
         if inputs.known_heights is None or anchor is None:
             return self._given("held", np.zeros(self._shape))
@@ -236,13 +234,13 @@ class _Search:
     def _find_curl(self, flags: Flags) -> tuple[Array, float]:
         """Return the curl of the slopes, and the standard deviation of its noise."""
         curl, mean = self._array("curl", self._shape), math.sqrt(math.prod(self._size.values()))
-        size = {name: one / mean for name, one in self._size.items()}
+        size = {name: length / mean for name, length in self._size.items()}
         self._run("curl", flags=self._given("flags", flags, np.uint8), **self._slopes, **size, curl=curl)
         sizes = np.abs(curl.download())
         curl.upload()
         most, step = float(sizes.max()), max(1, sizes.size // _SAMPLES)
-        some = sizes.ravel()[::step][(flags & (RIGHT | DOWN) == RIGHT | DOWN).ravel()[::step]]
-        noise = float(np.median(some)) / 0.6745 if some.size else 0.0  # of a normal distribution
+        samples = sizes.ravel()[::step][(flags & (RIGHT | DOWN) == RIGHT | DOWN).ravel()[::step]]
+        noise = float(np.median(samples)) / 0.6745 if samples.size else 0.0  # of a normal distribution
         self.contradicted = most > _CLEAR * noise
         return curl, noise
 
@@ -253,6 +251,6 @@ class _Search:
 
     def _run(self, name: str, **arguments: Any) -> None:
         rows, columns = self._shape
-        moved = sum(one.host.nbytes for one in arguments.values() if isinstance(one, Array))
+        moved = sum(value.host.nbytes for value in arguments.values() if isinstance(value, Array))
         kernel = self._links.device.kernel("breaks", f"breaks_{name}")
         kernel(self._items, rows=rows, columns=columns, **arguments, moved=moved)

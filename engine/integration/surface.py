@@ -1,11 +1,11 @@
-"""A surface, and the choice of the solver that finds it."""
+"""The choice of the solver of an integration, and its result."""
 
 from __future__ import annotations
 
 import math
 import time
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,82 +24,73 @@ from mirrorskin.engine.integration.multigrid import Multigrid, Solution
 from mirrorskin.engine.integration.rectangle import Rectangle, seems_full
 from mirrorskin.engine.integration.robust import solve_robust
 from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
-from mirrorskin.io import InputError
-from mirrorskin.io.result import Shown
+from mirrorskin.engine.operation import OnDevice
+from mirrorskin.engine.options import Option, option
+from mirrorskin.io import InputError, Result
+from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.links import DOWN, KNOWN, LOST, RIGHT, SLOPE
 
-IntegrationMethod = Literal["direct", "multigrid", "robust"]
+Method = Literal["direct", "multigrid", "robust"]
 
-_UNEVEN = 2.0  # weights of links to the right over those down, or back, that the multigrid may split
-_GOAL = 1e-4  # residual that is near enough where there is a deadline instead of a tolerance
-
-
-@dataclass(frozen=True, slots=True, repr=False)
-class Surface(Shown):
-    """Heights from slopes, known heights, or both.
-
-    Attributes
-    ----------
-    height : ndarray, (H, W) or (K, H, W), float32
-        Millimetres; with a camera the depth, in the unit of known ones. NaN where there is no answer. Of
-        several surfaces one after the other; all else is the same for all of them.
-    sigma : ndarray, (H, W), float32, or None
-        Expected standard deviation of the height, mm: about the mean of its component where that has no known
-        height. NaN where there is no answer, and where the noise of the slopes cannot be estimated.
-    component : ndarray, (H, W), int32
-        The connected component of a pixel, numbered in reading order of their first pixels; -1 where there is
-        no answer.
-    offset_unknown : ndarray, (components,), bool
-        Whether a component has no known height: its mean is 0, or the geometric mean of its depth 1.
-    filled : ndarray, (H, W), uint8
-        1 where a height was not measured but filled in.
-    edges : ndarray, (H, W), uint8, or None
-        1 on either side of a discontinuity that was found; None where none was looked for.
-    iterations : int
-        Of the solver, in all; of several surfaces the most.
-    residual : float
-        Norm of the error over that of the heights above the mean plane, both by the weights of the sum that
-        is minimised; 0 of the direct solver. Of several surfaces the greatest.
-    converged : bool
-        Whether the residual is within the tolerance; without one, whether it is below 0.3.
-    method : {"direct", "multigrid", "robust"}
-    invalid : int
-        Pixels within the mask whose slopes are no numbers.
-    """
-
-    height: NDArray[np.float32]
-    sigma: NDArray[np.float32] | None
-    component: NDArray[np.int32]
-    offset_unknown: NDArray[np.bool_]
-    filled: NDArray[np.uint8]
-    edges: NDArray[np.uint8] | None
-    iterations: int
-    residual: float
-    converged: bool
-    method: IntegrationMethod
-    invalid: int
+_UNEVEN = 2.0  # ratio of the weights of horizontal and vertical links above which they count as uneven
+_GOAL = 1e-4  # residual to stop at if there is a deadline, but no tolerance
 
 
-@dataclass(frozen=True, slots=True)
-class SolverOptions:
-    """How near a solver comes, and what else it returns."""
+class _Tolerance(Option):
+    """A number above 0, or None."""
 
-    tolerance: float | None = None  # of the residual; None: as near as two cycles get
-    deadline: float | None = None  # of ``time.perf_counter``; where there is one, no tolerance must be met
-    # k of the search for discontinuities; None where none are looked for.
-    sharpness: float | None = None
-    sigma: bool = False  # whether to estimate the heights' standard deviation
+    def check(self, value: Any) -> Any:
+        return None if value is None else super().check(value)
+
+
+_tolerance = option(
+    default=1e-5,
+    above=0,
+    help="residual to stop at: norm of the error over that of the heights above the mean plane, both with "
+    "the weights of the sum that is minimised. None: do two cycles",
+)
+
+
+class IntegrationOptions(OnDevice):
+    """Options of `integrate`, the same in all cases. The budget starts when the object is created."""
+
+    robust: bool = option(
+        default=False,
+        help="whether to look for discontinuities in addition to ``edges``; one surface only",
+    )
+    bilateral_sharpness: float = option(
+        default=2.0,
+        above=0,
+        help="sharpness k of discontinuities, 1/pixel^2: links that miss their slopes by more than "
+        "2.4 / sqrt(2 k) are cut",
+    )
+    sigma: bool = option(
+        default=True,
+        help="whether to estimate the heights' standard deviation, which takes about as long as the heights",
+    )
+    tolerance: float | None = cast(Any, _Tolerance(**vars(_tolerance)))
+    budget: float | None = option(
+        default=None,
+        above=0,
+        unit="s",
+        help="time limit, in place of the tolerance: after the first cycle, no cycle is started that would "
+        "end later. Preparation and ``sigma`` are not limited",
+    )
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.deadline = None if self.budget is None else time.perf_counter() + self.budget
 
 
 @dataclass(frozen=True, slots=True)
 class _Relief:
-    """Heights above planes as a solver leaves them, on the device."""
+    """Heights above planes on the device, as computed by a solver."""
 
     height: Array  # (H, W) or (K, H, W)
     planes: list[Plane]
-    method: IntegrationMethod
+    method: Method
     iterations: int
     residual: float
     converged: bool
@@ -109,18 +100,18 @@ class _Relief:
 
 
 @dataclass(slots=True)
-class _Kept:
-    """What was found of a picture's graph, for the next picture that has the same."""
+class _GraphCache:
+    """Properties of the last picture's graph, reused if the next picture has the same graph."""
 
-    numbers: tuple[object, ...] | None  # all that says what links weigh; None where it takes maps
+    numbers: tuple[object, ...] | None  # determine the links' weights together with the flags; None: maps do
     flags: Flags
-    built: bool = False  # whether the multigrid is that of this graph
+    built: bool = False  # whether the multigrid has the levels of this graph
     components: Components | None = None
-    deviation: Floats | None = None  # of heights, for slopes of variance 1
+    sigma: Floats | None = None  # of heights, for slopes of variance 1
 
 
 class SurfaceSolver:
-    """Solvers for pictures of one shape and pixel size; what they allocated and found is used again."""
+    """Solvers for pictures of one shape and pixel size; memory and properties of equal graphs are reused."""
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
         self._device = device
@@ -128,31 +119,33 @@ class SurfaceSolver:
         self._levelling = Levelling(self._graph)
         self._rectangle: Rectangle | None = None
         self._multigrid: Multigrid | None = None
-        self._kept = _Kept(None, np.zeros(shape, np.uint8))
+        self._cache = _GraphCache(None, np.zeros(shape, np.uint8))
         self._plane: Plane | None = None
         self._last: Array | None = None
-        self._finishing = 0.0  # seconds that the last picture took after its solution
+        self._finishing = 0.0  # seconds from the last solution to the result
 
     def reset(self) -> None:
-        """Forget the last picture's heights; a next one with the same pixels still has its levels."""
+        """Forget the last picture's heights; a next picture with the same graph still uses its levels."""
         self._last = self._plane = None
 
     def solve(
-        self, inputs: Inputs, options: SolverOptions, start: NDArray[np.floating] | None = None
-    ) -> Surface:
-        """Return the surface of a picture, from a start, (H, W), mm, or the last heights on."""
-        if options.sharpness is None and seems_full(inputs):
-            full = self._solve_full(inputs, options)
-            if full is not None:
-                return full
+        self, inputs: Inputs, options: IntegrationOptions, start: NDArray[np.floating] | None = None
+    ) -> Result:
+        """Return the surface of a picture. The solver starts from ``start``, (H, W) mm, or the last ones."""
+        if (
+            not options.robust
+            and seems_full(inputs)
+            and (result := self._solve_full(inputs, options)) is not None
+        ):
+            return result
         flags = self._graph.upload(inputs.each()[0])
         if not np.bitwise_or.reduce(flags, axis=None) & (SLOPE | KNOWN):
-            raise InputError("nothing to integrate: no pixel that is wanted has slopes or a known height")
+            raise InputError("nothing to integrate: no wanted pixel has slopes or a known height")
         numbers = None
         if inputs.weight_x is None and inputs.known_height_weights is None:
             numbers = inputs.weight, inputs.known_height_weight, inputs.known_heights is None
-        if numbers is None or numbers != self._kept.numbers or not np.array_equal(flags, self._kept.flags):
-            self._kept = _Kept(numbers, flags.copy())
+        if numbers is None or numbers != self._cache.numbers or not np.array_equal(flags, self._cache.flags):
+            self._cache = _GraphCache(numbers, flags.copy())
         relief = (
             self._find(inputs, options, start)
             if inputs.dz_dx.ndim == 2
@@ -163,78 +156,79 @@ class SurfaceSolver:
         if not relief.converged and options.deadline is None:
             raise NotConverged(explain(relief.iterations, relief.residual, options.tolerance))
         begun = time.perf_counter()
-        surface = self._finish(inputs, options, relief)
+        result = self._finish(inputs, options, relief)
         self._finishing = time.perf_counter() - begun
-        return surface
+        return result
 
-    def _solve_full(self, inputs: Inputs, options: SolverOptions) -> Surface | None:
-        """Return the surface of a full rectangle with even weights; None where a slope is missing."""
+    def _solve_full(self, inputs: Inputs, options: IntegrationOptions) -> Result | None:
+        """Return the surface of a full rectangle with uniform weights; None if a slope is missing."""
         if self._rectangle is None or self._rectangle.shape != inputs.dz_dx.shape:
             size, area = inputs.pixel_size, math.prod(inputs.pixel_size)
             self._rectangle = Rectangle(inputs.dz_dx.shape, size, self._device, area)
-        found = self._rectangle.integrate(inputs, options.sigma)
-        if found is None:
+        maps = self._rectangle.integrate(inputs, options.sigma)
+        if maps is None:
             return None
-        return Surface(
-            height=found[0],
-            sigma=found[1],
-            component=np.zeros(self._graph.shape, np.int32),
-            offset_unknown=np.array([inputs.known_heights is None]),
-            filled=np.zeros(self._graph.shape, np.uint8),
-            edges=None,
+        return _as_result(
+            *maps,
+            np.zeros(self._graph.shape, np.int32),
+            np.array([inputs.known_heights is None]),
+            method="direct",
             iterations=1,
             residual=0.0,
             converged=True,
-            method="direct",
             invalid=0,
         )
 
-    def _find(self, inputs: Inputs, options: SolverOptions, start: NDArray[np.floating] | None) -> _Relief:
+    def _find(
+        self, inputs: Inputs, options: IntegrationOptions, start: NDArray[np.floating] | None
+    ) -> _Relief:
         """Choose a solver and run it."""
         if self._plane is None:
             self._plane = self._graph.mean_plane(inputs)
         plane, links = self._plane, self._graph.links(self._plane)
         first = None if start is None else self._above_plane(start, inputs, plane)
-        if options.sharpness is not None:
-            known = inputs, links, self._kept.flags, plane, options.sharpness
-            near = options.tolerance or _GOAL
-            one = solve_robust(*known, start=first, tolerance=near, deadline=options.deadline)
-            numbers = one.iterations, one.residual, one.converged or options.tolerance is None
-            return _Relief(one.relief, [plane], "robust", *numbers, one.links, one.flags, one.edges)
-        begin = self._last if first is None else self._graph.put("start", first)
-        found = self._build(links).solve(begin, **self._goal(options))
-        self._last = found.height
-        return _relief(found, [plane])
+        if options.robust:
+            problem = inputs, links, self._cache.flags, plane, options.bilateral_sharpness
+            goal = options.tolerance or _GOAL
+            robust = solve_robust(*problem, start=first, tolerance=goal, deadline=options.deadline)
+            numbers = robust.iterations, robust.residual, robust.converged or options.tolerance is None
+            return _Relief(
+                robust.relief, [plane], "robust", *numbers, robust.links, robust.flags, robust.edges
+            )
+        first_heights = self._last if first is None else self._graph.put("start", first)
+        solution = self._build(links).solve(first_heights, **self._goal(options))
+        self._last = solution.height
+        return _relief(solution, [plane])
 
-    def _find_several(self, inputs: Inputs, options: SolverOptions) -> _Relief:
-        """Find several reliefs of one graph."""
+    def _find_several(self, inputs: Inputs, options: IntegrationOptions) -> _Relief:
+        """Solve for several surfaces with one graph."""
         each = inputs.each()
-        planes = [self._graph.mean_plane(one) for one in each]
+        planes = [self._graph.mean_plane(surface) for surface in each]
         solver = self._build(self._graph.links(planes[0]))
         sources = self._device.array("sources", inputs.dz_dx.shape, np.float32, zeroed=False)
         sources.upload()
-        for place, (one, plane) in enumerate(zip(each, planes, strict=True)):
-            self._graph.take_slopes(one)
-            self._graph.put_source(plane, sources, place)
+        for number, (surface, plane) in enumerate(zip(each, planes, strict=True)):
+            self._graph.set_slopes(surface)
+            self._graph.put_source(plane, sources, number)
         return _relief(solver.solve_many(sources, **self._goal(options)), planes)
 
     def _build(self, links: Links) -> Multigrid:
-        """Return the solver of a graph."""
+        """Return the solver, with the levels of the graph."""
         if self._multigrid is None:
             self._multigrid = Multigrid(links)
-        elif not self._kept.built:
+        elif not self._cache.built:
             self._multigrid.rebuild(links)
-        self._kept.built = True
+        self._cache.built = True
         return self._multigrid
 
-    def _goal(self, options: SolverOptions) -> dict[str, Any]:
-        """Return how far the solver goes."""
+    def _goal(self, options: IntegrationOptions) -> dict[str, Any]:
+        """Return when the solver stops."""
         if options.deadline is None:
             return {"tolerance": options.tolerance}
         return {"tolerance": options.tolerance or _GOAL, "deadline": options.deadline - self._finishing}
 
     def _above_plane(self, start: NDArray[np.floating], inputs: Inputs, plane: Plane) -> Floats:
-        """Return heights to begin with above the plane, about 0 where nothing is known of them."""
+        """Return first heights above the plane, 0 where they are unknown."""
         known = np.isfinite(start)
         along_x, along_y, begin = self._graph.steps(plane)
         row, column = np.ogrid[: start.shape[0], : start.shape[1]]
@@ -244,93 +238,115 @@ class SurfaceSolver:
             datum = float(np.mean(above, where=known)) if known.any() else 0.0
         return np.where(known, above - datum, 0.0).astype(np.float32)
 
-    def _finish(self, inputs: Inputs, options: SolverOptions, relief: _Relief) -> Surface:
-        """Add plane and offsets to relief, and estimate its standard deviation."""
+    def _finish(self, inputs: Inputs, options: IntegrationOptions, relief: _Relief) -> Result:
+        """Add plane and offsets to the relief, and estimate the standard deviation."""
         components = self._find_components(inputs, relief)
         height = self._levelling.level(components, relief.height, relief.planes, inputs.datum)
-        return Surface(
-            height=height,
-            sigma=self._find_sigma(inputs, relief, components) if options.sigma else None,
-            component=components.labels,
-            offset_unknown=components.offset_unknown,
-            filled=np.zeros(self._graph.shape, np.uint8),
-            edges=relief.edges,
+        return _as_result(
+            height,
+            self._find_sigma(inputs, relief, components) if options.sigma else None,
+            components.labels,
+            components.offset_unknown,
+            relief.edges,
+            method=relief.method,
             iterations=relief.iterations,
             residual=relief.residual,
             converged=relief.converged,
-            method=relief.method,
-            invalid=int(np.count_nonzero(self._kept.flags & LOST)),
+            invalid=int(np.count_nonzero(self._cache.flags & LOST)),
         )
 
     def _find_components(self, inputs: Inputs, relief: _Relief) -> Components:
         if relief.flags is not None:
             return find_components(relief.flags, True)
-        if self._kept.components is None:
-            flags = self._kept.flags
+        if self._cache.components is None:
+            flags = self._cache.flags
             alone = (flags & (SLOPE | KNOWN)) == KNOWN
             cut = inputs.edges is not None or inputs.weight_y is not None or bool(alone.any())
-            self._kept.components = find_components(flags, cut)
-        return self._kept.components
+            self._cache.components = find_components(flags, cut)
+        return self._cache.components
 
     def _find_sigma(self, inputs: Inputs, relief: _Relief, components: Components) -> Floats:
         factor = self._graph.scale
         if not inputs.weights_given:
             factor *= self._excess(inputs, relief, components)
-        if relief.flags is not None:  # links are as sure as their pixels' weights, or broken
-            graph = self._graph
-            graph.put("flags", relief.flags)
-            deviation = self._find_deviation(Multigrid(graph.links()), inputs, components)
+        if relief.flags is not None:  # a link is cut, or has the weight of its pixels
+            self._graph.put("flags", relief.flags)
+            sigma = self._unit_sigma(Multigrid(self._graph.links()), inputs, components)
         else:
             assert self._multigrid is not None
-            if self._kept.deviation is None:
-                self._kept.deviation = self._find_deviation(self._multigrid, inputs, components)
-            deviation = self._kept.deviation
-        return deviation * np.float32(factor**0.5)
+            if self._cache.sigma is None:
+                self._cache.sigma = self._unit_sigma(self._multigrid, inputs, components)
+            sigma = self._cache.sigma
+        return sigma * np.float32(factor**0.5)
 
-    def _find_deviation(self, solver: Multigrid, inputs: Inputs, components: Components) -> Floats:
+    def _unit_sigma(self, solver: Multigrid, inputs: Inputs, components: Components) -> Floats:
         ends = self._link_weights(inputs)
         uneven = inputs.weight_x is not None or max(ends) > _UNEVEN * min(ends)
         if uneven:
-            self._kept.built = False  # its levels are no solver's
+            self._cache.built = False  # other levels are built
         return solver.deviation(components.labels >= 0, self._graph.flags, uneven)
 
     def _excess(self, inputs: Inputs, relief: _Relief, components: Components) -> float:
-        """Return how much worse slopes fit than noise of variance 1 would; NaN where nothing tells."""
-        flags = self._kept.flags if relief.flags is None else relief.flags
+        """Return the misfit over that expected for noise of variance 1; NaN without loops of links."""
+        flags = self._cache.flags if relief.flags is None else relief.flags
         ends = self._link_weights(inputs)
         count = {bit: int(np.count_nonzero(flags & bit)) for bit in (RIGHT, DOWN, KNOWN, SLOPE | KNOWN)}
         links, share = count[RIGHT] + count[DOWN], 1.0
-        if relief.links is not None:  # which have that share of their full weight
+        if relief.links is not None:  # the mean weight is this share of the full weight
             maps = relief.links.right, relief.links.down
-            whole = sum(
-                float(one.download().sum(dtype=np.float64)) / w for one, w in zip(maps, ends, strict=True)
+            total = sum(
+                float(link.download().sum(dtype=np.float64)) / w for link, w in zip(maps, ends, strict=True)
             )
-            share = whole / max(1, links)
-            for one in maps:
-                one.upload()
+            share = total / max(1, links)
+            for link in maps:
+                link.upload()
         free = int(np.count_nonzero(components.offset_unknown))
         unit = share * expected_misfit(links, count[SLOPE | KNOWN], count[KNOWN], free, ends)
         misfit = 0.0
         each = inputs.each()
-        for place, (surface, plane) in enumerate(zip(each, relief.planes, strict=True)):
+        for number, (surface, plane) in enumerate(zip(each, relief.planes, strict=True)):
             if len(each) > 1:
-                self._graph.take_slopes(surface)
-            misfit += self._graph.misfit(relief.height, plane, relief.links, place)
+                self._graph.set_slopes(surface)
+            misfit += self._graph.misfit(relief.height, plane, relief.links, number)
         return misfit / len(each) / unit if unit > 0 else math.nan
 
     def _link_weights(self, inputs: Inputs) -> tuple[float, float]:
-        """Return the weights of links to the right and down whose pixels weigh 1."""
+        """Return the weights of links to the right and down between pixels of weight 1."""
         width, height = inputs.pixel_size
         return self._graph.scale / width**2, self._graph.scale / height**2
 
 
-def _relief(found: Solution, planes: list[Plane]) -> _Relief:
-    return _Relief(found.height, planes, "multigrid", found.iterations, found.residual, found.converged)
+def _relief(solution: Solution, planes: list[Plane]) -> _Relief:
+    numbers = solution.iterations, solution.residual, solution.converged
+    return _Relief(solution.height, planes, "multigrid", *numbers)
+
+
+def _as_result(
+    height: Floats,
+    sigma: Floats | None,
+    component: NDArray[np.int32],
+    offset_unknown: NDArray[np.bool_],
+    edges: Flags | None = None,
+    *,
+    method: Method,
+    **numbers: ProcessValue,
+) -> Result:
+    process: dict[str, ProcessValue] = {"integration": method}
+    process |= {f"integration_{name}": value for name, value in numbers.items()}
+    return Result(
+        height=height,
+        height_sigma=sigma,
+        component=component,
+        offset_unknown=offset_unknown.astype(np.uint8),
+        filled=np.zeros(component.shape, np.uint8),
+        edges=edges,
+        process=process,
+    )
 
 
 def explain(iterations: int, residual: float, tolerance: float | None) -> str:
-    """Say that and why there is no surface, in one line."""
-    wanted = "" if tolerance is None else f", more than {tolerance:.2g}"
-    reached = f"{iterations} iterations left a residual of {residual:.2g}{wanted}"
-    remedy = "give engine.integrate a larger tolerance, or None to take it as it is"
+    """Return the message of an integration that did not converge."""
+    limit = "" if tolerance is None else f", more than {tolerance:.2g}"
+    reached = f"{iterations} iterations left a residual of {residual:.2g}{limit}"
+    remedy = "give engine.integrate a larger tolerance, or None to accept any residual"
     return f"the surface did not converge: {reached}; {remedy}"

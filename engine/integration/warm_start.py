@@ -1,4 +1,4 @@
-"""Heights that follow slopes on the device frame after frame, one step of the solver each."""
+"""Integration of slopes on the device frame after frame, one step of the solver for each frame."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 
 MAPS = {"dz_dx": "dz_dx", "dz_dy": "dz_dy", "weight_x": "map_x", "weight_y": "map_y"}
-"""Slopes, NaN where there is none, and their inverse variances, 0 there; with the graph's names of them."""
+"""Slopes, NaN where undefined, and their inverse variances, 0 there; with the names of the graph's arrays."""
 
-_DEEP = 8  # frames after which all levels are built anew
-_BEGIN, _MOST = 1e-3, 30  # residual, or cycles, to begin with
-_FAR = 0.3  # gap from which on heights are found from scratch
-_LOOK = 8  # frames after which the gap is looked at: that waits for the device
+_REBUILD_INTERVAL = 8  # frames between which all levels of the multigrid are rebuilt
+_FIRST_RESIDUAL, _FIRST_CYCLES = 1e-3, 30  # tolerance and limit of the first solution
+_LARGEST_GAP = 0.3  # relative error above which the next frame is solved from scratch
+_CHECK_INTERVAL = 8  # frames between checks of the gap, which wait for the device
 
 
 class WarmStartIntegrator(ThreadSafe):
-    """Integrate slopes that kernels leave on the device: heights are those of `Integrator`, a step behind.
+    """Integrate slopes on the device frame after frame; heights follow those of `Integrator` by a step.
 
     Attributes
     ----------
     maps : dict of Array, (H, W), float32
-        To be written to before each frame; see `MAPS`.
+        Written by kernels before each frame; see `MAPS`.
     gap : float
-        How far heights were from the solution before the last step that was looked at; NaN before the first.
+        Relative error of the heights before the last step that was checked; NaN before the first check.
     """
 
     gap: float
@@ -51,7 +51,7 @@ class WarmStartIntegrator(ThreadSafe):
         self._steps, self.gap = 0, math.nan
 
     def push(self, typical_weight: float) -> None:
-        """Put on the device's queue what brings heights a step towards the maps, without waiting for it."""
+        """Enqueue one step of the heights towards the solution for the maps, without waiting for it."""
         maps: dict[str, Any] = {name: array.host for name, array in self.maps.items()}
         inputs = Inputs(**maps, pixel_size=self._pixel_size, typical_weight=typical_weight)
         self._graph.use_device_maps(inputs)
@@ -59,17 +59,17 @@ class WarmStartIntegrator(ThreadSafe):
         self._links = self._graph.links()
         self._relief: Array | None = None
         if self._multigrid is not None and self._steps:
-            self._relief = self._multigrid.follow(self._links, deep=self._steps % _DEEP == 0)
+            self._relief = self._multigrid.follow(self._links, deep=self._steps % _REBUILD_INTERVAL == 0)
         self._device.flush()
         self._height = None
 
     def result(self) -> Floats:
-        """Return the heights of the last maps, (H, W), mm, NaN where there is none."""
+        """Return the heights of the last maps, (H, W), mm, NaN where undefined."""
         if self._height is None:
-            self._height = self._finish()
+            self._height = self._level()
         return self._height
 
-    def _finish(self) -> Floats:
+    def _level(self) -> Floats:
         components = find_components(self._graph.flags.snapshot(self._flagged), cut=False)
         if components.count == 0:
             self._steps = 0
@@ -77,7 +77,11 @@ class WarmStartIntegrator(ThreadSafe):
         relief = self._from_scratch() if self._relief is None else self._relief
         height = self._levelling.level(components, relief, [LEVEL])
         self._steps += 1
-        self._look()
+        if self._steps > 1 and self._steps % _CHECK_INTERVAL == 0:
+            assert self._multigrid is not None
+            self.gap = self._multigrid.gap()
+            if not self.gap < _LARGEST_GAP:
+                self._steps = 0
         return height
 
     def _from_scratch(self) -> Array:
@@ -85,12 +89,4 @@ class WarmStartIntegrator(ThreadSafe):
             self._multigrid = Multigrid(self._links, plain=True)
         else:
             self._multigrid.rebuild(self._links, plain=True)
-        return self._multigrid.solve(tolerance=_BEGIN, limit=_MOST).height
-
-    def _look(self) -> None:
-        """See now and then whether heights still follow; begin anew with the next frame if not."""
-        if self._steps > 1 and self._steps % _LOOK == 0:
-            assert self._multigrid is not None
-            self.gap = self._multigrid.gap()
-            if not self.gap < _FAR:
-                self._steps = 0
+        return self._multigrid.solve(tolerance=_FIRST_RESIDUAL, limit=_FIRST_CYCLES).height

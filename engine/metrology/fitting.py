@@ -1,14 +1,14 @@
 """Forms fitted to points by least squares of their distances, and the covariance of their parameters.
 
-Errors of heights that were integrated from slopes are correlated over many pixels, and a fit is then far less
-certain than so many independent pixels would make it. So residuals are projected on a few smooth shapes that
-the fit leaves free. Errors with the form's own shape cannot be seen, but they are as large as those of the
-other smooth shapes, if errors have no reason to look like the form: the mean square of the projections is the
-variance of what the fit took in. This is the long-run variance by orthonormal series of Y. Sun, "A
-heteroskedasticity and autocorrelation robust F test using an orthonormal series variance estimator", The
-Econometrics Journal 16 (2013). It covers white errors, correlated ones and a form that does not fit. Where
-errors are so smooth that the form takes most of them in, residuals are smaller than the heights' standard
-deviations claim; the variance that is missing is counted as taken in.
+Errors of heights that were integrated from slopes are correlated over many pixels, so a fit is far less
+certain than with independent errors. Therefore residuals are projected onto a few smooth shapes that are not
+part of the form. Errors with the shape of the form cannot be observed. They are assumed to be as large as
+errors with other smooth shapes: the mean square of the projections is the variance absorbed by the fit. This
+is the orthonormal series estimator of the long-run variance of Y. Sun, "A heteroskedasticity and
+autocorrelation robust F test using an orthonormal series variance estimator", The Econometrics Journal 16
+(2013). It covers white errors, correlated errors, and a form that does not fit. If errors are so smooth that
+the form absorbs most of them, the residuals are smaller than the heights' standard deviations predict; the
+missing variance is counted as absorbed.
 """
 
 from __future__ import annotations
@@ -26,51 +26,50 @@ Mask = NDArray[np.bool_]
 _Frame = tuple[Doubles, Doubles]
 
 _STEPS, _HALVINGS = 50, 10
-_CONVERGED = 1e-6  # of the residuals, by which a step may still change them
-_SINGULAR = 1e-14  # least eigenvalue of normal equations, of columns of length 1
-_MEDIAN = 0.6745  # of the magnitude of a normal variate
-_FAR = 5.0  # standard deviations, estimated by the median of the distances, beyond which points are outliers
-_FEW = 0.15  # of the points: if more are that far, or that uncertain, they belong to the surface
-_PASSES = 5  # over the outliers
-_ENOUGH = 65536  # points to begin with
+_CONVERGED = 1e-6  # largest relative change of the residuals by the last step
+_SINGULAR = 1e-14  # smallest eigenvalue of normal equations with columns of length 1
+_MEDIAN = 0.6745  # median magnitude of a normal variate
+_FAR = 5.0  # standard deviations, estimated from the median distance, beyond which points are outliers
+_FEW = 0.15  # largest share of outliers or uncertain points; if there are more, they belong to the surface
+_PASSES = 5  # largest number of updates of the outliers
+_ENOUGH = 65536  # points for the first fit
 _CHUNK = 16384  # points at a time: their derivatives stay in the processor's cache
-_NOTHING = 1e-300
-_ROUNDING = 1e-9  # of the points' extent: distances below it are none; of a shape's squared length likewise
-_UNCERTAIN = 5.0  # times the median standard deviation, beyond which a height shows its error alone
-_OVERSTATED = 0.1  # of the claimed variance, that may be missing because claims are not exact
+_NOTHING = 1e-300  # avoids a division by 0
+_ROUNDING = 1e-9  # relative to the points' extent: smaller distances count as 0; also for squared lengths
+_UNCERTAIN = 5.0  # times the median standard deviation, above which a height counts as uncertain
+_OVERSTATED = 0.1  # share of the predicted variance that may be missing because predictions are not exact
 
 
 class Form(Protocol):
     """A surface with k parameters that can be fitted."""
 
     lift: int
-    """Number of the parameter that moves it along z: distances go with that as with heights."""
+    """Index of the parameter that moves it along z."""
 
     def start(self) -> Doubles:
-        """Return parameters, (k,), to begin with."""
+        """Return first parameters, (k,)."""
 
     def distance(self, points: Doubles, parameters: Doubles) -> Doubles:
         """Return the distances, (n,), of points, (3, n), positive on the camera's side."""
 
     def jacobian(self, points: Doubles, parameters: Doubles) -> Doubles:
-        """Return their derivatives by the parameters, (k, n)."""
+        """Return the derivatives of the distances with respect to the parameters, (k, n)."""
 
 
 class Fit(NamedTuple):
-    """A form that fits, and how well."""
+    """A fitted form."""
 
     parameters: Doubles  # (k,), float64
-    covariance: Doubles  # (k, k), float64: naN where points are too few
-    kept: Mask  # (n,), bool: false of outliers
-    # Birge's ratio: root mean square of the weighted residuals over that by the standard deviations; much
-    # more than 1 if the surface is not of this form. NaN where these are unknown.
+    covariance: Doubles  # (k, k), float64: NaN if there are too few points
+    kept: Mask  # (n,), bool: False for outliers
+    # Birge's ratio: root mean square of the weighted residuals over that expected from standard deviations;
+    # much larger than 1 if the surface does not have this form. NaN without standard deviations.
     birge: float
 
     def sigma(self, *direction: float) -> float:
         """Return the standard deviation of a linear combination of parameters."""
         along = np.asarray(direction)
-        # Of parameters that nearly cancel, rounding may leave less than nothing.
-        return float(np.sqrt(np.maximum(along @ self.covariance @ along, 0)))
+        return float(np.sqrt(np.maximum(along @ self.covariance @ along, 0)))  # rounding may make it negative
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +82,7 @@ class PointCloud:
 
     @classmethod
     def of(cls, height: ArrayLike, x: ArrayLike, y: ArrayLike, sigma: ArrayLike | None) -> PointCloud:
-        """Take a height map, with NaN where there is none, and where its pixels are; see `fit_plane`."""
+        """Return the points of a height map, which is NaN where undefined; see `fit_plane`."""
         z = np.asarray(height, np.float64)
         where = np.isfinite(z)
         if sigma is not None:
@@ -95,7 +94,7 @@ class PointCloud:
 
     @property
     def common_sigma(self) -> float:
-        """Mean standard deviation, mm: by so much heights may be wrong together; 0 where it is not known."""
+        """Mean standard deviation, mm, as the size of a common error of all heights; 0 if unknown."""
         return float(np.nan_to_num(np.mean(self.sigma)))
 
     def residual(self, distance: Doubles) -> tuple[Doubles, Quantity]:
@@ -106,22 +105,21 @@ class PointCloud:
         return residual, micrometres(float(np.sqrt(np.mean(distance**2))), float(noise))
 
     def fit(self, form: Form) -> Fit | None:
-        """Fit a form; None where none of its kind fits.
+        """Fit a form; None if the points do not determine it.
 
-        Distances are weighted by their inverse variances; no weight is above that of the median. Outliers
-        are left out: points beyond five standard deviations, estimated by the median of the weighted
-        distances, if they are at most 15 %. If more are that far, they are part of the surface and all count.
+        Distances have inverse-variance weights, capped at the median weight. Outliers are ignored: points
+        beyond five standard deviations, estimated from the median of the weighted distances, if they are at
+        most 15 %. If there are more, they belong to the surface, and all points count.
         """
         points, sigma = self.points, self.sigma
         weight = _weights(sigma)
         rounding = _ROUNDING * float(np.ptp(points, axis=1).max())
-        # Nearly all steps are taken with few points, and the last ones with all.
-        every = max(1, weight.size // _ENOUGH)
-        near = _fit_robustly(form, points[:, ::every], weight[::every], form.start(), rounding)
-        found = None if near is None else _leave_outliers_out(form, points, weight, near, rounding)
-        if found is None:
+        step = max(1, weight.size // _ENOUGH)  # the first fit takes most steps, with a subset of the points
+        first = _fit_robustly(form, points[:, ::step], weight[::step], form.start(), rounding)
+        final = None if first is None else _fit_without_outliers(form, points, weight, first, rounding)
+        if final is None:
             return None
-        parameters, kept = found
+        parameters, kept = final
         if not kept.all():
             points, weight, sigma = points[:, kept], weight[kept], sigma[kept]
         gram = _gram(form, points, weight, parameters, _frame(points))
@@ -134,9 +132,9 @@ class PointCloud:
 
 
 def find_uncertain(sigma: Doubles, known: Mask) -> Mask:
-    """Return the known pixels, (H, W), of more than five times the median sigma, if at most 15 % are.
+    """Return the known pixels, (H, W), with more than five times the median sigma, if at most 15 % are.
 
-    The highest and the lowest of all would be their errors. If more are that uncertain, all count.
+    The errors of these would determine the highest and the lowest point. If there are more, all pixels count.
     """
     uncertain = known & (sigma > _UNCERTAIN * np.median(sigma[known]))
     return np.asarray(uncertain & (np.count_nonzero(uncertain) <= _FEW * np.count_nonzero(known)))
@@ -145,22 +143,22 @@ def find_uncertain(sigma: Doubles, known: Mask) -> Mask:
 def _fit_robustly(
     form: Form, points: Doubles, weight: Doubles, parameters: Doubles, rounding: float
 ) -> Doubles | None:
-    """Fit so that far points pull no more than near ones (Huber 1964): some to one side do not spoil it."""
+    """Fit with Huber weights (Huber 1964), so that outliers on one side have a limited effect."""
     share = np.ones_like(weight)
     for _ in range(_PASSES):
-        found = _minimise(form, points, weight * share, parameters, rounding)
-        if found is None:
+        minimum = _minimise(form, points, weight * share, parameters, rounding)
+        if minimum is None:
             return None
-        parameters = found
+        parameters = minimum
         misfit = abs(form.distance(points, parameters)) * np.sqrt(weight)
         share = 1 / np.maximum(misfit / (_typical(misfit) + rounding), 1)
     return parameters
 
 
-def _leave_outliers_out(
+def _fit_without_outliers(
     form: Form, points: Doubles, weight: Doubles, parameters: Doubles, rounding: float
 ) -> tuple[Doubles, Mask] | None:
-    """Leave out what is far, and fit, until the same points are left out."""
+    """Fit without outliers until these no longer change; return the parameters and the points used."""
     kept = np.zeros(weight.size, bool)
     for _ in range(_PASSES):
         misfit = abs(form.distance(points, parameters)) * np.sqrt(weight)
@@ -171,20 +169,20 @@ def _leave_outliers_out(
             break
         kept = near
         part = (points, weight) if kept.all() else (points[:, kept], weight[kept])
-        found = _minimise(form, *part, parameters, rounding)
-        if found is None:
+        minimum = _minimise(form, *part, parameters, rounding)
+        if minimum is None:
             return None
-        parameters = found
+        parameters = minimum
     return parameters, kept
 
 
 def _typical(misfit: Doubles) -> float:
-    """Return the standard deviation of normal variates with that median of magnitudes."""
+    """Return the standard deviation, estimated from the median magnitude."""
     return float(np.median(misfit)) / _MEDIAN
 
 
 def _weights(sigma: Doubles) -> Doubles:
-    """Return inverse variances, (n,), as shares of a typical one; ones where there are none."""
+    """Return inverse variances, (n,), relative to the median and capped there; 1 without variances."""
     typical = float(np.median(sigma))
     if not typical > 0:
         return np.ones_like(sigma)
@@ -194,14 +192,14 @@ def _weights(sigma: Doubles) -> Doubles:
 def _minimise(
     form: Form, points: Doubles, weight: Doubles, parameters: Doubles, rounding: float
 ) -> Doubles | None:
-    """Find the parameters of the least sum of squares by Gauss-Newton steps."""
+    """Minimise the sum of squares by Gauss-Newton steps with step halving."""
     gram = _gram(form, points, weight, parameters)
     least = rounding**2 * weight.size
     for _ in range(_STEPS):
-        found = _step(gram)
-        if found is None:
+        step_and_gain = _step(gram)
+        if step_and_gain is None:
             return None
-        step, gain = found
+        step, gain = step_and_gain
         before = gram[-1, -1]
         for _ in range(_HALVINGS):
             gram = _gram(form, points, weight, parameters + step)
@@ -215,7 +213,7 @@ def _minimise(
 
 
 def _step(gram: Doubles) -> tuple[Doubles, float] | None:
-    """Return the step that is best where distances are linear, and the sum of squares that it takes away."""
+    """Return the Gauss-Newton step, and the expected decrease of the sum of squares."""
     scale = np.sqrt(np.diag(gram)[:-1])
     if not np.all(scale > 0):
         return None
@@ -229,7 +227,7 @@ def _step(gram: Doubles) -> tuple[Doubles, float] | None:
 def _gram(
     form: Form, points: Doubles, weight: Doubles, parameters: Doubles, frame: _Frame | None = None
 ) -> Doubles:
-    """Return the weighted sums that steps and `covariance` need, the latter with smooth shapes in a frame."""
+    """Return the weighted sums of products for steps; with a frame of smooth shapes, for `covariance`."""
     total: Doubles | float = 0.0
     for start in range(0, weight.size, _CHUNK):
         part = points[:, start : start + _CHUNK]
@@ -241,13 +239,13 @@ def _gram(
 
 
 def _frame(points: Doubles) -> _Frame:
-    """Return the middle of the points along x and y, and how far they reach from it."""
+    """Return the middle of the points along x and y, and half their extent."""
     low, high = points[:2].min(axis=1), points[:2].max(axis=1)
     return (low + high) / 2, np.maximum((high - low) / 2, _NOTHING)
 
 
 def _shapes(points: Doubles, frame: _Frame) -> list[Doubles]:
-    """Return the products of two and of three of x and y, (n,) each, within -1 and 1."""
+    """Return the quadratic and cubic monomials of x and y, (n,) each, scaled to -1 to 1."""
     (x_middle, y_middle), (x_reach, y_reach) = frame
     x, y = (points[0] - x_middle) / x_reach, (points[1] - y_middle) / y_reach
     xx, xy, yy = x * x, x * y, y * y
@@ -255,35 +253,35 @@ def _shapes(points: Doubles, frame: _Frame) -> list[Doubles]:
 
 
 def covariance(gram: Doubles, parameters: int, count: int, claimed: float = 0.0) -> Doubles:
-    """Estimate the covariance, (k, k), of k least-squares parameters; NaN where residuals are too few.
+    """Estimate the covariance, (k, k), of k least-squares parameters; NaN if there are too few residuals.
 
-    ``gram``, (k + m + 1, k + m + 1), is the weighted sums over ``count`` residuals of the products of: the
-    derivatives of a residual by the parameters, m functions of its place, about as smooth, and the residual
-    itself. Weights are any multiple of the inverse variances; ``claimed`` is the expected weighted sum of
-    squares by standard deviations, 0 without these.
+    ``gram``, (k + m + 1, k + m + 1), contains the weighted sums over ``count`` residuals of all products of:
+    the derivatives of a residual with respect to the parameters, m similarly smooth functions of its
+    position, and the residual. Weights are any multiple of the inverse variances. ``claimed`` is the weighted
+    sum of squares predicted by the standard deviations, 0 without these.
     """
     scale = np.sqrt(np.diag(gram))
     lengths = np.where(scale > 0, scale, np.inf)
     gram = gram / np.multiply.outer(lengths, lengths)
     inverse = _inverse(gram[:parameters, :parameters])
     across = gram[:parameters, parameters:]
-    rest = gram[parameters:, parameters:] - across.T @ inverse @ across  # of shapes and residuals
+    rest = gram[parameters:, parameters:] - across.T @ inverse @ across  # shapes and residuals
     variance = scale[-1] ** 2 * _variance(rest, count - parameters)
-    # Not by all: errors that are so smooth go more into one parameter than into another.
-    taken_in = max((1 - _OVERSTATED) * claimed - scale[-1] ** 2, 0.0) / max(parameters - 1, 1)
-    own = lengths[:parameters]
-    return np.asarray((variance + taken_in) * inverse / np.multiply.outer(own, own))
+    # Divided by fewer than all parameters, because very smooth errors are not shared equally among them.
+    absorbed = max((1 - _OVERSTATED) * claimed - scale[-1] ** 2, 0.0) / max(parameters - 1, 1)
+    lengths = lengths[:parameters]
+    return np.asarray((variance + absorbed) * inverse / np.multiply.outer(lengths, lengths))
 
 
 def _inverse(normal: Doubles) -> Doubles:
-    """Invert normal equations, of columns of length 1; undetermined directions are left out."""
+    """Return the pseudoinverse of normal equations with columns of length 1."""
     lengths, directions = np.linalg.eigh(normal)
     real = directions[:, lengths > _SINGULAR] / np.sqrt(lengths[lengths > _SINGULAR])
     return np.asarray(real @ real.T)
 
 
 def _variance(rest: Doubles, freedom: int) -> float:
-    """Return the variance of a smooth shape's amplitude, or of a pixel's error if that is larger."""
+    """Return the variance of the amplitudes of smooth shapes, or of a pixel's error if that is larger."""
     lengths, directions = np.linalg.eigh(rest[:-1, :-1])
     real = lengths > _ROUNDING
     white = max(float(rest[-1, -1]), 0.0)
@@ -291,6 +289,6 @@ def _variance(rest: Doubles, freedom: int) -> float:
     if free < 3:
         return np.nan if freedom < 1 else white / freedom
     power = (directions[:, real].T @ rest[:-1, -1]) ** 2 / lengths[real]
-    # Of so few amplitudes the mean square is uncertain itself: the variance of Student's t.
+    # The variance of Student's t, because the mean square of few amplitudes is uncertain.
     smooth = float(np.sum(power)) / (free - 2)
     return max(smooth, white / freedom)

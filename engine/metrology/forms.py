@@ -14,9 +14,9 @@ from mirrorskin.io import InputError
 
 Doubles = NDArray[np.float64]
 
-_LEVEL = 1e-12  # slope
-_ANY_ANGLE = math.pi / math.sqrt(3)  # standard deviation of an angle that may be any, radians
-_FLATTEST = 1e-9  # sagitta over extent, below which a surface has no radius
+_LEVEL = 1e-12  # slope below which a plane counts as level
+_ANY_ANGLE = math.pi / math.sqrt(3)  # standard deviation of a uniformly distributed angle, radians
+_FLATTEST = 1e-9  # sagitta over extent, below which a surface counts as flat
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,17 +28,17 @@ class Plane:
     tilt : Quantity
         Between its normal and z, degrees.
     azimuth : Quantity
-        Of the direction in which it falls, counter-clockwise from x, degrees.
+        Direction of descent, counter-clockwise from x, degrees.
     offset : Quantity
-        Its height at x = y = 0, mm.
+        Height at x = y = 0, mm.
     rms : Quantity
         Root mean square of the residual, outliers included, µm.
     residual : ndarray, (H, W), float64
-        Distances from it, mm, positive on the camera's side; NaN where there is no height.
+        Distances from the plane, mm, positive on the camera's side; NaN without a height.
     outliers : int
-        Pixels that did not count.
+        Number of ignored pixels.
     birge : float
-        Residual over that by the standard deviations; see `Fit`.
+        Residual over that predicted by the standard deviations; see `Fit`.
     """
 
     tilt: Quantity
@@ -60,11 +60,11 @@ class Plane:
 
 
 def fit_plane(height: ArrayLike, x: ArrayLike, y: ArrayLike, sigma: ArrayLike | None = None) -> Plane:
-    """Fit a plane to a height map, (H, W) mm with NaN where there is none, by least squares.
+    """Fit a plane to a height map, (H, W) mm with NaN where undefined, by least squares.
 
     Pixel centres are at ``x``, (W,), and ``y``, (H,), mm. ``sigma``, (H, W) mm, are the heights' standard
-    deviations; `PointCloud.fit` says how they weight. Uncertainties are those of `covariance`, that of the
-    height joined by the mean standard deviation of the heights, which may have an error in common.
+    deviations, which determine weights as in `PointCloud.fit`. Uncertainties are from `covariance`. The mean
+    standard deviation is added to that of the height, because heights may have a common error.
 
     Examples
     --------
@@ -72,34 +72,30 @@ def fit_plane(height: ArrayLike, x: ArrayLike, y: ArrayLike, sigma: ArrayLike | 
     45.0
     """
     cloud, form = PointCloud.of(height, x, y, sigma), _PlaneForm()
-    found = cloud.fit(form) if cloud.sigma.size >= 3 else None
-    if found is None:
+    fit = cloud.fit(form) if cloud.sigma.size >= 3 else None
+    if fit is None:
         raise InputError("no plane fits: at least three pixels that are not in one line are needed")
-    offset, p, q = found.parameters
+    offset, p, q = fit.parameters
     slope = math.hypot(p, q)
     level = slope < _LEVEL
     cos, sin = (1.0, 0.0) if level else (p / slope, q / slope)
-    along, across = found.sigma(0, cos, sin), found.sigma(0, -sin, cos)
-    # A level plane falls nowhere: its azimuth is anything within half a turn.
-    turn = _ANY_ANGLE if level else min(across / slope, _ANY_ANGLE)
-    distance = form.distance(cloud.points, found.parameters) / math.sqrt(1 + slope**2)
+    along, across = fit.sigma(0, cos, sin), fit.sigma(0, -sin, cos)
+    azimuth_sigma = _ANY_ANGLE if level else min(across / slope, _ANY_ANGLE)
+    distance = form.distance(cloud.points, fit.parameters) / math.sqrt(1 + slope**2)
     residual, rms = cloud.residual(distance)
     return Plane(
         tilt=degrees(math.atan(slope), along / (1 + slope**2)),
-        azimuth=degrees(0.0 if level else math.atan2(-q, -p), turn),
-        offset=Quantity(float(offset), math.hypot(found.sigma(1, 0, 0), cloud.common_sigma), "mm"),
+        azimuth=degrees(0.0 if level else math.atan2(-q, -p), azimuth_sigma),
+        offset=Quantity(float(offset), math.hypot(fit.sigma(1, 0, 0), cloud.common_sigma), "mm"),
         rms=rms,
         residual=residual,
-        outliers=int(np.count_nonzero(~found.kept)),
-        birge=found.birge,
+        outliers=int(np.count_nonzero(~fit.kept)),
+        birge=fit.birge,
     )
 
 
 class _PlaneForm:
-    """Planes by offset and slopes along x and y; distances are along z, as errors are.
-
-    All are the same multiple of the orthogonal ones.
-    """
+    """Planes with the parameters offset and slopes along x and y; distances are along z, as errors are."""
 
     lift = 0
 
@@ -118,18 +114,18 @@ class _PlaneForm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sphere:
-    """The sphere that fits a height map: a ball, or where its centre lies towards the camera a hollow.
+    """The sphere that fits a height map: a ball, or a hollow, whose centre is on the camera's side.
 
     Attributes
     ----------
     radius : Quantity
         Millimetres.
     x, y, z : Quantity
-        Its centre, mm.
+        Centre, mm.
     top : Quantity
-        Height of its point that is nearest to the camera, of a hollow farthest from it, mm.
+        Height of the point nearest to the camera, or of a hollow's farthest point, mm.
     rms, residual, outliers, birge
-        As of a `Plane`.
+        See `Plane`.
     hollow : bool
     """
 
@@ -157,7 +153,7 @@ class Sphere:
 
 
 def fit_sphere(height: ArrayLike, x: ArrayLike, y: ArrayLike, sigma: ArrayLike | None = None) -> Sphere:
-    """Fit a sphere to a height map by least squares of the distances from it; arguments as for `fit_plane`.
+    """Fit a sphere to a height map by least squares of the distances from it; see `fit_plane`.
 
     Examples
     --------
@@ -168,13 +164,13 @@ def fit_sphere(height: ArrayLike, x: ArrayLike, y: ArrayLike, sigma: ArrayLike |
     """
     cloud = PointCloud.of(height, x, y, sigma)
     form = _SphereForm.of(cloud.points)
-    found = None if form is None else cloud.fit(form)
-    if form is None or found is None:
+    fit = None if form is None else cloud.fit(form)
+    if form is None or fit is None:
         raise InputError("no sphere fits: a curved surface of at least four pixels is needed")
-    x_centre, y_centre, z_centre, radius = map(float, found.parameters)
-    sigmas = np.sqrt(np.diag(found.covariance))
-    residual, rms = cloud.residual(form.distance(cloud.points, found.parameters))
-    top_sigma = math.hypot(found.sigma(0, 0, 1, form.side), cloud.common_sigma)
+    x_centre, y_centre, z_centre, radius = map(float, fit.parameters)
+    sigmas = np.sqrt(np.diag(fit.covariance))
+    residual, rms = cloud.residual(form.distance(cloud.points, fit.parameters))
+    top_sigma = math.hypot(fit.sigma(0, 0, 1, form.side), cloud.common_sigma)
     return Sphere(
         radius=Quantity(radius, float(sigmas[3]), "mm"),
         x=Quantity(x_centre, float(sigmas[0]), "mm"),
@@ -183,15 +179,15 @@ def fit_sphere(height: ArrayLike, x: ArrayLike, y: ArrayLike, sigma: ArrayLike |
         top=Quantity(z_centre + form.side * radius, top_sigma, "mm"),
         rms=rms,
         residual=residual,
-        outliers=int(np.count_nonzero(~found.kept)),
+        outliers=int(np.count_nonzero(~fit.kept)),
         hollow=form.side < 0,
-        birge=found.birge,
+        birge=fit.birge,
     )
 
 
 @dataclass(slots=True)
 class _SphereForm:
-    """Spheres by centre and radius; the side is 1 of a ball's top, -1 of a hollow."""
+    """Spheres with the parameters centre and radius; the side is 1 for a ball, -1 for a hollow."""
 
     side: int
     first: Doubles
@@ -199,7 +195,7 @@ class _SphereForm:
 
     @classmethod
     def of(cls, points: Doubles) -> _SphereForm | None:
-        """Begin with the paraboloid that fits, of which a sphere's cap is nearly one."""
+        """Start from a fitted paraboloid, which approximates a sphere's cap."""
         if points.shape[1] < 4:
             return None
         x, y, z = points

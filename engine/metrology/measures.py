@@ -1,4 +1,4 @@
-"""All that can be measured of a result."""
+"""Measures of a result: heights, areas, volumes, forms, roughness and sections."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from mirrorskin.io.arguments import checked
 
 FormName = Literal["plane", "sphere", "none"]
 
-_MUCH_BETTER = 0.5  # share of a plane's residual, below which a sphere is taken for the form
-_CLEAR = 2.0  # standard uncertainties that a step must have to be reported
-# The power of the pixel size that a quantity is proportional to, by its unit or its name. The radius of a
-# shallow cap goes with the square of its width, and its centre lies a radius away from its top.
+_MUCH_BETTER = 0.5  # ratio of the residuals of sphere and plane below which the sphere is chosen
+_CLEAR = 2.0  # smallest step that is reported, in standard uncertainties
+# Power of the pixel size that a quantity is proportional to, by unit or name. The radius of a shallow cap is
+# proportional to the square of its width, and its centre is a radius away from its top.
 _POWERS = {"mm2": 2, "mm3": 2, "sphere radius": 2}
 _POWERS |= dict.fromkeys(("sphere centre x", "sphere centre y", "section length", "distance in space"), 1)
 _POWERS |= dict.fromkeys(("step at", "plane tilt", "slope", "slope beside step"), 1)
-_RATIO = 2.0  # Birge's, above which a surface is not of a form
+_RATIO = 2.0  # Birge's ratio above which a surface does not have the form
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Measures:
     quantities : dict of str to Quantity
         By name, in reading order.
     notes : list of str
-        What was left out, and what was assumed.
+        What is omitted, and what is assumed.
     """
 
     quantities: dict[str, Quantity]
@@ -68,25 +68,24 @@ def measure(
     pixel_size : float or (float, float), optional
         Millimetres along x and y; by default that of the result.
     region : Region, optional
-        In its pixels; by default all of it.
+        Part of the picture to measure, in its pixels; by default all of it.
     form : {"plane", "sphere", "none"}, optional
-        What is fitted, and what roughness is measured from; by default the sphere where its residual is
-        less than half of the plane's, else the plane. Without a form, roughness is that of the heights.
+        Form that is fitted, and from which roughness is measured; by default the sphere if its residual is
+        less than half of the plane's, otherwise the plane. Without a form, roughness is that of the heights.
     cutoff : float, optional
-        Longest waves that count as roughness, mm.
+        Longest wavelength that counts as roughness, mm.
     section : ((float, float), (float, float)), optional
-        Both ends of a section to be measured, mm from the picture's centre.
+        Both ends of a section to measure, mm from the picture's centre.
 
     Returns
     -------
     Measures
         Heights, areas, volumes, the form, roughness, and the section, each with its standard uncertainty.
-        See the functions for how that is found.
 
     Raises
     ------
     InputError
-        Nothing can be measured, or not with these options.
+        Nothing can be measured with these options.
 
     Examples
     --------
@@ -109,14 +108,14 @@ def measure(
 
 
 def _volumes(patch: Patch, base: Quantity | None) -> dict[str, Quantity]:
-    """Return volumes above the rim, and below the sheet's rest plane where heights are absolute."""
-    found: dict[str, Quantity] = {}
+    """Return the volume above the rim, and below the sheet's rest plane if heights are absolute."""
+    volumes: dict[str, Quantity] = {}
     if base is not None:
-        found |= volume(patch, base.value, base.sigma, "volume above rim")
+        volumes |= volume(patch, base.value, base.sigma, "volume above rim")
     if patch.absolute:
         for name, above in volume(patch, 0.0, 0.0, "volume below rest plane").items():
-            found[name] = Quantity(-above.value, above.sigma, above.unit)
-    return found
+            volumes[name] = replace(above, value=-above.value)
+    return volumes
 
 
 def _forms(
@@ -125,11 +124,19 @@ def _forms(
     """Return the form that fits the surface, and its roughness."""
     fitted = _fit(patch, form)
     about, residual = "their mean", patch.height
-    found: dict[str, Quantity] = {}
+    quantities: dict[str, Quantity] = {}
     if fitted is not None:
         kind = "plane" if isinstance(fitted, Plane) else "sphere"
-        about, residual, found = f"the {kind}", fitted.residual, fitted.quantities()
-        notes.extend(_fit_notes(fitted, kind))
+        about, residual, quantities = f"the {kind}", fitted.residual, fitted.quantities()
+        if fitted.outliers:
+            notes.append(
+                f"outliers left out of the fit of the {kind}, but not of its residual: {fitted.outliers}"
+            )
+        if fitted.birge > _RATIO:
+            notes.append(
+                f"the surface is no {kind} within its errors:"
+                f" what the fit leaves is {fitted.birge:.0f} times as large"
+            )
     rough = roughness(residual, patch.pixel_size, cutoff=cutoff, sigma=patch.sigma)
     waves = "" if cutoff is None else f", of waves up to {cutoff:g} mm"
     notes.append(f"roughness by ISO 25178-2 from {about}{waves}, over {rough.pixels} pixels, noise included")
@@ -141,26 +148,11 @@ def _forms(
         notes.append(
             f"pixels left out of roughness and lowest point, far less certain than others: {rough.uncertain}"
         )
-    return found | rough.quantities()
-
-
-def _fit_notes(fitted: Plane | Sphere, kind: str) -> list[str]:
-    """Say how well a form fits."""
-    notes = []
-    if fitted.outliers:
-        notes.append(
-            f"outliers left out of the fit of the {kind}, but not of its residual: {fitted.outliers}"
-        )
-    if fitted.birge > _RATIO:
-        notes.append(
-            f"the surface is no {kind} within its errors:"
-            f" what the fit leaves is {fitted.birge:.0f} times as large"
-        )
-    return notes
+    return quantities | rough.quantities()
 
 
 def _fit(patch: Patch, form: FormName | None) -> Plane | Sphere | None:
-    """Fit the given form; by default the one of little residual, or none where none fits."""
+    """Fit a form; by default the sphere if its residual is much smaller, otherwise the plane, if any fits."""
     cloud = patch.height, patch.x, patch.y, patch.sigma
     if form == "plane":
         return fit_plane(*cloud)
@@ -168,19 +160,19 @@ def _fit(patch: Patch, form: FormName | None) -> Plane | Sphere | None:
         return fit_sphere(*cloud)
     if form == "none":
         return None
-    found: Plane | Sphere | None = None
+    plane: Plane | None = None
     with suppress(InputError):
-        found = plane = fit_plane(*cloud)
+        plane = fit_plane(*cloud)
         sphere = fit_sphere(*cloud)
         if sphere.rms.value < _MUCH_BETTER * plane.rms.value:
-            found = sphere
-    return found
+            return sphere
+    return plane
 
 
 def _section(result: Result, ends: tuple[Point, Point], notes: list[str]) -> dict[str, Quantity]:
-    """Return the quantities of a section, and of a step where there is one."""
+    """Return the quantities of a section, and of a step if there is one."""
     profile = cut(result, *ends)
-    found = along(profile)
+    quantities = along(profile)
     ends_known = np.isfinite(profile.height[[0, -1]]) & ~profile.filled[[0, -1]]
     if not ends_known.all():
         notes.append(
@@ -189,17 +181,17 @@ def _section(result: Result, ends: tuple[Point, Point], notes: list[str]) -> dic
     with suppress(InputError):
         step = step_height(profile)
         if abs(step.height.value) > _CLEAR * step.height.sigma:
-            return found | {
+            return quantities | {
                 "step height": step.height,
                 "step at": step.place,
                 "slope beside step": step.slope,
             }
     notes.append("no step along the section: no two levels that differ clearly")
-    return found
+    return quantities
 
 
 def _scaled(quantities: dict[str, Quantity], scale: float) -> dict[str, Quantity]:
-    """Add the uncertainty of the pixel size, given as a share of it."""
+    """Add the relative uncertainty of the pixel size, ``scale``, to the quantities."""
     scaled: dict[str, Quantity] = {}
     for name, quantity in quantities.items():
         if name == "sphere centre z":
@@ -211,7 +203,7 @@ def _scaled(quantities: dict[str, Quantity], scale: float) -> dict[str, Quantity
 
 
 def _assumed(patch: Patch, scale: float) -> list[str]:
-    """Return notes on what values and their uncertainties assume."""
+    """Return notes on the assumptions behind values and uncertainties."""
     size = f"known within {100 * scale:.2g} %" if scale else "taken as exact"
     notes = [f"± is the standard uncertainty (k = 1); the pixel size is {size}"]
     filled = int(np.count_nonzero(np.isfinite(patch.filled)))

@@ -1,4 +1,4 @@
-"""The part of a result that is measured: checked, cut out, and separated from what was filled."""
+"""The part of a result to measure: checked, cut out, and without filled heights."""
 
 from __future__ import annotations
 
@@ -19,27 +19,22 @@ Mask = NDArray[np.bool_]
 class Patch:
     """Heights to measure, in a rectangle of the picture."""
 
-    # (H, W), float64: millimetres where heights were measured, or where they were filled, else NaN.
-    height: Doubles
-    filled: Doubles
+    height: Doubles  # (H, W), float64: measured heights, mm, NaN elsewhere
+    filled: Doubles  # (H, W), float64: filled heights, mm, NaN elsewhere
     sigma: Doubles | None  # (H, W), float64: standard deviations of the measured heights, mm
-    # (H, W), bool: where the object was touched: as the result has it (``contact_given``), else where there
-    # is a height, filled ones too.
-    contact: Mask
+    contact: Mask  # (H, W), bool: the contact of the result (``contact_given``), or pixels with any height
     contact_given: bool
-    # (H, W), float64: surface for each area of the picture, from the normals; NaN where they are unknown.
-    secant: Doubles | None
+    secant: Doubles | None  # (H, W), float64: surface area over projected area, from the normals, or NaN
     normals_sigma: Doubles | None  # (H, W), float64: standard deviations of the normals, radians
-    # (W,) and (H,), float64: millimetres of the pixel centres.
-    x: Doubles
-    y: Doubles
+    x: Doubles  # (W,), float64: pixel centres, mm
+    y: Doubles  # (H,), float64
     pixel_size: tuple[float, float]  # millimetres along x and y
-    absolute: bool  # whether heights are above the sheet's rest plane; else above the mean of their component
-    notes: tuple[str, ...]  # what was left out
+    absolute: bool  # whether heights are relative to the sheet's rest plane, not to the mean of a component
+    notes: tuple[str, ...]  # what is omitted
 
     @property
     def measured(self) -> Mask:
-        """Where heights were measured, (H, W)."""
+        """Pixels with a measured height, (H, W)."""
         return np.isfinite(self.height)
 
     @property
@@ -49,13 +44,13 @@ class Patch:
         return width * height
 
     def sigmas(self) -> Doubles:
-        """Return the standard deviations of the measured heights, (n,), mm; NaN where there are none."""
-        where = self.measured
-        return np.full(np.count_nonzero(where), np.nan) if self.sigma is None else self.sigma[where]
+        """Return the standard deviations of the measured heights, (n,), mm; NaN if unknown."""
+        measured = self.measured
+        return np.full(np.count_nonzero(measured), np.nan) if self.sigma is None else self.sigma[measured]
 
 
 def heights_of(result: Result) -> NDArray[np.float32]:
-    """Return the heights of one picture, (H, W); InputError where there are none, or a map for each turn."""
+    """Return the heights of one picture, (H, W); InputError without heights, or if each turn has a map."""
     height: NDArray[np.float32] | None = select_turn(result, None).height
     if height is None:
         raise InputError("the result has no heights: take one of a press or of 'mirrorskin fuse'")
@@ -63,11 +58,10 @@ def heights_of(result: Result) -> NDArray[np.float32]:
 
 
 def patch_of(result: Result, region: Region | None = None) -> tuple[Patch, Result]:
-    """Cut out a region, and return the result without the heights that cannot be compared with its own.
+    """Cut out a region; also return the result without the heights that cannot be compared with those in it.
 
-    Only heights that were measured and whose standard deviation is finite count. Of several components, those
-    whose height is relative cannot be compared with others: they are left out where others are absolute, and
-    all but the largest where none is.
+    Only measured heights with a finite standard deviation count. Components with relative heights cannot be
+    compared with others: they are omitted if others are absolute; if none is, only the largest is used.
     """
     height = heights_of(result)
     if result.height_sigma is not None and not np.isfinite(result.height_sigma).any():
@@ -103,7 +97,7 @@ def patch_of(result: Result, region: Region | None = None) -> tuple[Patch, Resul
 
 
 def _known(result: Result, height: NDArray[np.float32], filled: Mask) -> tuple[Mask, list[str]]:
-    """Return which heights count, and notes on that."""
+    """Return which heights count, and notes."""
     known, notes = np.isfinite(height), []
     if result.height_sigma is not None:
         undefined = known & ~np.isfinite(result.height_sigma) & ~filled
@@ -116,11 +110,11 @@ def _known(result: Result, height: NDArray[np.float32], filled: Mask) -> tuple[M
 
 
 def _comparable(result: Result, known: Mask, part: tuple[slice, slice]) -> tuple[Mask, bool, list[str]]:
-    """Return which heights can be compared, whether they are absolute, and notes on that."""
+    """Return which heights can be compared, whether they are absolute, and notes."""
     component, unknown = result.component, result.offset_unknown
     if component is None or unknown is None or not np.any(unknown):
         return known, True, []
-    # Numbers from -1 on: what belongs to no component comes first, and counts as absolute.
+    # Component -1, which is none, counts as absolute.
     relative = np.concatenate([[False], unknown != 0])[component + 1]
     inside = np.zeros(known.shape, bool)
     inside[part] = known[part]
@@ -137,6 +131,6 @@ def _comparable(result: Result, known: Mask, part: tuple[slice, slice]) -> tuple
 
 
 def _secant(normals: NDArray[np.float32]) -> Doubles:
-    """Return one over their z; NaN of normals that do not face the camera."""
+    """Return 1 / z of normals; NaN if they do not face the camera."""
     z = normals[..., 2].astype(np.float64)
     return 1 / np.where(z > 0, z, np.nan)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-_ROUNDING = 1e-12  # of a value: an uncertainty below it is that of the arithmetic
+_ROUNDING = 1e-12  # relative uncertainty that is explained by rounding
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,9 +15,9 @@ class Quantity:
     Attributes
     ----------
     value : float
-        NaN where there is no answer.
+        NaN if undefined.
     sigma : float
-        Standard uncertainty (k = 1), in the same unit; NaN where it is not known.
+        Standard uncertainty (k = 1), in the same unit; NaN if unknown.
     unit : str
         As in ``mm``, ``mm2``, ``deg``.
 
@@ -35,7 +35,7 @@ class Quantity:
         return f"{self._number()} {self.unit}".strip()
 
     def _number(self) -> str:
-        """Round to two digits of the uncertainty, or where there is none to five of the value."""
+        """Round to two digits of the uncertainty; without one, to five digits of the value."""
         if not math.isfinite(self.value):
             return "unknown"
         if not (math.isfinite(self.sigma) and self.sigma > _ROUNDING * abs(self.value)):
@@ -48,10 +48,10 @@ class Quantity:
 
 
 def micrometres(value: float, sigma: float) -> Quantity:
-    """Return a quantity in micrometres of numbers in millimetres."""
+    """Return a quantity in micrometres from millimetres."""
     return Quantity(1e3 * value, 1e3 * sigma, "µm")
 
 
 def degrees(value: float, sigma: float) -> Quantity:
-    """Return a quantity in degrees of numbers in radians."""
+    """Return a quantity in degrees from radians."""
     return Quantity(math.degrees(value), math.degrees(sigma), "deg")

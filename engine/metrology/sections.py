@@ -19,11 +19,11 @@ Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Point = tuple[float, float]
 
-_ROUNDING = 1e-6  # of a pixel
-_LEVEL = 0.01  # of the range of heights: what is as high as the highest point
-_WINDOW = 3  # pixels a side of the median that removes spikes
-_LEAST = 4  # samples on either side of a step
-_LEFT_OUT = 1 / 3  # of either side, next to the step: it may be rounded or a ramp
+_ROUNDING = 1e-6  # share of a pixel that is neglected
+_LEVEL = 0.01  # share of the range of heights within which points are as high as the highest one
+_WINDOW = 3  # pixels per side of the median filter that removes spikes
+_LEAST = 4  # smallest number of samples on either side of a step
+_LEFT_OUT = 1 / 3  # share of either side that is ignored next to the step, which may be rounded or a ramp
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,16 +33,16 @@ class Section:
     Attributes
     ----------
     distance : ndarray, (n,), float64
-        From its start, in ``unit``; samples are one pixel apart.
+        Distance from the start, in ``unit``; samples are one pixel apart.
     x, y : ndarray, (n,), float64
-        Where it runs, from the picture's centre, in ``unit``.
+        Position relative to the picture's centre, in ``unit``.
     height, sigma : ndarray, (n,), float64
-        Millimetres: heights between four pixels, NaN next to a hole and between components; and their
-        standard deviations, NaN where they are unknown or a height was filled.
+        Millimetres: heights interpolated between four pixels, NaN next to a hole and between components; and
+        their standard deviations, NaN if unknown or if the height was filled.
     filled : ndarray, (n,), bool
-        Where a height was filled, not measured.
+        Whether the height was filled, not measured.
     unit : {"mm", "px"}
-        Millimetres, or pixels where their size is not known.
+        Millimetres, or pixels if their size is unknown.
     """
 
     distance: Doubles
@@ -68,22 +68,22 @@ def section(
     result : Result, mapping, xarray.Dataset, path or array_like, (H, W)
         Heights of one picture, mm, with their standard deviation, if available. An array is the height.
     start, end : (float, float), optional
-        Millimetres from the picture's centre, x to the right and y up. Without them, the row of the highest
-        point is taken, from the picture's left to its right; the highest after a median over 3 x 3
-        pixels, which leaves spikes out, measured or filled. Of a flat top it is the row in its middle.
+        Millimetres from the picture's centre, x to the right and y up. By default the row of the highest
+        point, measured or filled, after a 3 x 3 median filter against spikes, from left to right. On a flat
+        top, the row in its middle.
     pixel_size : float or (float, float), optional
         Millimetres along x and y; by default that of the result.
 
     Returns
     -------
     Section
-        NaN as well where the line runs outside of the outermost pixel centres.
+        Also NaN outside of the outermost pixel centres.
 
     Raises
     ------
     InputError
-        No heights, one map for each turn, only one end, both ends in one point, ends where the pixel size
-        is not known, or one further outside of the picture than that is large.
+        No heights, one map for each turn, only one end, equal ends, ends without a pixel size, or an end
+        further outside of the picture than its size.
 
     Examples
     --------
@@ -118,9 +118,9 @@ def section(
 
 
 def apex(height: NDArray[np.floating]) -> tuple[int, int]:
-    """Return row and column of the highest point, after a median that leaves spikes out.
+    """Return row and column of the highest point after a median filter against spikes.
 
-    The median treats NaN as lower than everything. InputError if there is no height.
+    NaN counts as the lowest height. InputError without any height.
     """
     import cv2
 
@@ -131,28 +131,28 @@ def apex(height: NDArray[np.floating]) -> tuple[int, int]:
     below = np.nextafter(np.float32(lowest), np.float32(-np.inf)) - np.float32(1)
     smooth = cv2.medianBlur(np.where(known, height, below).astype(np.float32), _WINDOW)
     smooth[~known] = below
-    # Where all that is known is thinner than the window, the median is undefined.
+    # The median is undefined everywhere if all areas are narrower than the window.
     chosen = smooth if np.any(smooth > below) else np.where(known, height, below)
     row, column = np.unravel_index(int(np.argmax(chosen)), height.shape)
     return int(row), int(column)
 
 
 def _top_row(height: NDArray[np.float32]) -> int:
-    """Return the row of the highest point, or the one nearest to the middle of all that is as high."""
+    """Return the row of the highest point; of a flat top, the row nearest to its middle."""
     top = height[apex(height)]
     rows, _ = np.nonzero((height <= top) & (height >= top - _LEVEL * (top - np.nanmin(height))))
     return int(rows[np.argmin(abs(rows - rows.mean()))])
 
 
 def _check_near(ends: tuple[Point, Point], x: Doubles, y: Doubles, size: tuple[float, float]) -> None:
-    """Raise InputError if an end is further outside of the picture than that is large."""
+    """Raise InputError if an end is further outside of the picture than its size."""
     reach = size[0] * len(x), size[1] * len(y)
     if np.any(abs(np.subtract(ends, (x.mean(), y.mean()))) > reach):
         raise InputError("the section ends far outside of the picture: give mm from its centre")
 
 
 def _samples(start: Point, end: Point, size: tuple[float, float]) -> tuple[Doubles, Doubles]:
-    """Return evenly spaced points from end to end, (2, n), about a pixel apart, and their distances, (n,)."""
+    """Return points between both ends, (2, n), about a pixel apart, and their distances, (n,)."""
     step = np.subtract(end, start)
     length = math.hypot(*step)
     pixels = math.hypot(step[0] / size[0], step[1] / size[1])
@@ -163,7 +163,7 @@ def _samples(start: Point, end: Point, size: tuple[float, float]) -> tuple[Doubl
 def _between(
     result: Result, height: NDArray[np.float32], points: SamplePoints
 ) -> tuple[Doubles, Doubles, Mask]:
-    """Return heights, their standard deviations and whether they were filled, (n,), at places."""
+    """Return heights, their standard deviations and whether they were filled, (n,), at points."""
     counts = points.shares > _ROUNDING
     inside = points.all_inside
     if result.component is not None:
@@ -174,16 +174,16 @@ def _between(
         filled = np.any((result.filled.ravel()[points.pixels] != 0) & counts, axis=0)
     sigma = np.full(values.shape, np.nan)
     if result.height_sigma is not None:
-        # Errors of neighbours are correlated, so those of a mean are no smaller.
+        # Errors of neighbours are correlated, so the mean is as uncertain as they are.
         sigma = _mean(result.height_sigma, points, counts)
-    there = inside & np.isfinite(values)
-    return np.where(there, values, np.nan), np.where(there & ~filled, sigma, np.nan), filled & there
+    valid = inside & np.isfinite(values)
+    return np.where(valid, values, np.nan), np.where(valid & ~filled, sigma, np.nan), filled & valid
 
 
 def _mean(values: NDArray[np.float32], points: SamplePoints, counts: Mask) -> Doubles:
-    """Return weighted means of four pixels, NaN where one that counts is."""
-    around = np.where(counts, values.ravel()[points.pixels], 0).astype(np.float64)
-    return np.asarray(np.sum(np.where(counts, points.shares, 0) * around, axis=0))
+    """Return weighted means of four pixels; NaN if one that counts is."""
+    neighbours = np.where(counts, values.ravel()[points.pixels], 0).astype(np.float64)
+    return np.asarray(np.sum(np.where(counts, points.shares, 0) * neighbours, axis=0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,9 +193,9 @@ class Step:
     Attributes
     ----------
     height : Quantity
-        Distance of the two parallel lines, mm; positive where the section goes up.
+        Distance of the two parallel lines, mm; positive for a step upwards.
     place : Quantity
-        Distance of the step from the section's start, mm; it lies within one sample.
+        Distance of the step from the section's start, mm; known within one sample.
     slope : Quantity
         Of both lines, degrees; positive upwards.
     """
@@ -208,10 +208,9 @@ class Step:
 def step_height(section: Section) -> Step:
     """Measure the step along a section in millimetres.
 
-    The step is where two parallel lines fit the measured samples before and after it best. Then the third of
-    either side that lies nearest to it is left out, and the lines are fitted once more: the step's
-    height is their distance, at right angles to them. Uncertainties are those of `covariance`, with curves of
-    either side as smooth shapes.
+    The step is where two parallel lines fit the measured samples before and after it best. Then the nearest
+    third of either side is ignored, and the lines are fitted again: the height of the step is their
+    orthogonal distance. Uncertainties are from `covariance`, with curves of either side as smooth shapes.
 
     Examples
     --------
@@ -229,11 +228,16 @@ def step_height(section: Section) -> Step:
     split = _split(distance, height)
     place = (distance[split - 1] + distance[split]) / 2
     half = (distance[split] - distance[split - 1]) / 2
-    kept = _away(distance, split)
-    found, spread, rest = _lines(distance[kept] - place, height[kept])
-    if _curve(distance[kept] - place, height[kept]) < rest:
+    before = distance[split - 1] - _LEFT_OUT * (distance[split - 1] - distance[0])
+    after = distance[split] + _LEFT_OUT * (distance[-1] - distance[split])
+    kept = (distance <= before) | (distance >= after)
+    x, z = distance[kept] - place, height[kept]
+    parameters, spread, rest = _lines(x, z)
+    cubic = np.vander(x / np.abs(x).max(), 4)
+    coefficients, *_ = np.linalg.lstsq(cubic, z, rcond=None)
+    if np.sum((z - coefficients @ cubic.T) ** 2) < rest:
         raise InputError("there is no step along the section: a smooth curve fits it better than two levels")
-    slope, rise = float(found[1]), float(found[2])
+    slope, rise = float(parameters[1]), float(parameters[2])
     across = math.sqrt(1 + slope**2)
     return Step(
         Quantity(rise / across, math.sqrt(spread[2, 2]) / across, "mm"),
@@ -243,7 +247,7 @@ def step_height(section: Section) -> Step:
 
 
 def _measured(section: Section) -> Mask:
-    """Return which samples of a section in millimetres were measured."""
+    """Return the measured samples of a section in millimetres."""
     if section.unit != "mm":
         raise InputError("the result has no pixel size: reconstruct it again with --pixel-size")
     return np.isfinite(section.height) & ~section.filled
@@ -255,21 +259,13 @@ def _split(distance: Doubles, height: Doubles) -> int:
     x /= np.linalg.norm(x)
     residual = height - np.mean(height)
     residual = residual - x * (x @ residual)
-    # Of a step before each sample, what a line does not take in: its length, and its share in the residual.
+    # The part of a step before each sample that a line does not fit: its squared length, and its projection.
     count = height.size
     after = count - np.arange(count)
     share = np.cumsum(x[::-1])[::-1]
     length = after * (count - after) / count - share**2
     gain = np.cumsum(residual[::-1])[::-1] ** 2 / np.where(length > 0, length, np.inf)
     return _LEAST + int(np.argmax(gain[_LEAST : count - _LEAST + 1]))
-
-
-def _away(distance: Doubles, split: int) -> Mask:
-    """Return the samples that are not in the third of their side that lies next to the step."""
-    start, end = distance[0], distance[-1]
-    before = distance[split - 1] - _LEFT_OUT * (distance[split - 1] - start)
-    after = distance[split] + _LEFT_OUT * (end - distance[split])
-    return np.asarray((distance <= before) | (distance >= after))
 
 
 def _lines(x: Doubles, z: Doubles) -> tuple[Doubles, Doubles, float]:
@@ -279,25 +275,18 @@ def _lines(x: Doubles, z: Doubles) -> tuple[Doubles, Doubles, float]:
     """
     up = (x > 0).astype(np.float64)
     rows = np.stack([np.ones_like(x), x, up])
-    found, *_ = np.linalg.lstsq(rows.T, z, rcond=None)
-    own = x / np.abs(x).max()
-    shapes = np.stack([up * own, own**2, up * own**2, own**3, up * own**3])
-    every = np.concatenate([rows, shapes, [z - found @ rows]])
-    gram = every @ every.T
-    return np.asarray(found), covariance(gram, len(rows), z.size), float(gram[-1, -1])
-
-
-def _curve(x: Doubles, z: Doubles) -> float:
-    """Return the sum of squares of a cubic's residual."""
-    rows = np.vander(x / np.abs(x).max(), 4).T
-    found, *_ = np.linalg.lstsq(rows.T, z, rcond=None)
-    return float(np.sum((z - found @ rows) ** 2))
+    parameters, *_ = np.linalg.lstsq(rows.T, z, rcond=None)
+    t = x / np.abs(x).max()
+    shapes = np.stack([up * t, t**2, up * t**2, t**3, up * t**3])
+    columns = np.concatenate([rows, shapes, [z - parameters @ rows]])
+    gram = columns @ columns.T
+    return np.asarray(parameters), covariance(gram, len(rows), z.size), float(gram[-1, -1])
 
 
 def along(section: Section) -> dict[str, Quantity]:
     """Return the length of a section, and difference, distance and slope between its outermost heights.
 
-    Errors of the two heights are taken to be independent. InputError where fewer than two were measured.
+    Errors of both heights are assumed to be independent. InputError if fewer than two were measured.
     """
     known = np.flatnonzero(_measured(section))
     if known.size < 2:

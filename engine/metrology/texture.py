@@ -14,9 +14,9 @@ from mirrorskin.io import InputError
 
 Doubles = NDArray[np.float64]
 
-_ALPHA = math.sqrt(math.log(2) / math.pi)  # of the Gaussian filter: it halves waves as long as the cutoff
-_COVERED = 0.95  # of the filter's weight that must lie on known pixels
-_TAIL = 4.0  # standard deviations to which the filter's weights reach
+_ALPHA = math.sqrt(math.log(2) / math.pi)  # constant of the Gaussian filter, which halves waves at the cutoff
+_COVERED = 0.95  # smallest share of the filter's weight on known pixels
+_TAIL = 4.0  # half-width of the filter, in standard deviations
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,12 +28,12 @@ class Roughness:
     sa, sq : Quantity
         Arithmetical mean and root mean square of the heights, µm.
     sz : Quantity
-        Highest peak and deepest pit together, µm.
+        Sum of highest peak and deepest pit, µm.
     noise : Quantity
-        What Sq would be of a perfect surface: the root mean square of the standard deviations, µm.
+        Sq of a perfect surface: the root mean square of the standard deviations, µm.
     pixels, left_out, uncertain : int
-        Known pixels that count, that lie too near to an end or a hole for the filter, and whose standard
-        deviation is so much larger than others' that they count as not measured.
+        Numbers of known pixels that count, that are too near to an end or a hole for the filter, and that are
+        ignored because their standard deviation is much larger than that of others.
     """
 
     sa: Quantity
@@ -46,8 +46,8 @@ class Roughness:
 
     def quantities(self) -> dict[str, Quantity]:
         """Return its quantities by name."""
-        found = {"Sa": self.sa, "Sq": self.sq, "Sz": self.sz}
-        return found | {"Sq of noise": self.noise} if math.isfinite(self.noise.value) else found
+        quantities = {"Sa": self.sa, "Sq": self.sq, "Sz": self.sz}
+        return quantities | {"Sq of noise": self.noise} if math.isfinite(self.noise.value) else quantities
 
 
 def roughness(
@@ -57,19 +57,19 @@ def roughness(
     cutoff: float | None = None,
     sigma: ArrayLike | None = None,
 ) -> Roughness:
-    """Return the roughness of a surface from its residual, (H, W) mm with NaN where there is none.
+    """Return the roughness of a surface from its residual, (H, W) mm with NaN where undefined.
 
-    ``pixel_size`` is that along x and y, mm. ``cutoff``, mm, is the nesting index of the L-filter: longer
-    waves are taken out, and pixels with more than a twentieth of the filter's weight on holes or outside the
-    picture do not count. ``sigma``, (H, W) mm, are the heights' standard deviations.
+    ``pixel_size`` is along x and y, mm. ``cutoff``, mm, is the nesting index of the L-filter: longer waves
+    are removed, and pixels with more than a twentieth of the filter's weight on holes or outside the picture
+    do not count. ``sigma``, (H, W) mm, are the heights' standard deviations.
 
-    Values include the noise: the square of Sq is the sum of that of the surface and that of the noise, where
-    these are uncorrelated. In any case noise changes Sq by no more than its own root mean square, and Sa by
-    no more than its mean magnitude: these are the uncertainties. Noise makes Sz larger by something between
-    nothing and all that noise spans; the errors of the highest and of the lowest pixel add to that.
+    Values include noise: Sq^2 is the sum of the squares of surface and noise if these are uncorrelated. In
+    any case noise changes Sq by at most its root mean square, and Sa by at most its mean magnitude: these are
+    the uncertainties. Noise increases Sz by at most the range of the noise; the errors of the highest and the
+    lowest pixel are added.
 
-    Pixels that are far more uncertain than others (see `find_uncertain`) are not part of the definition area:
-    Sz would be their error. What a form's fit left out as outliers is: it may be the texture.
+    Pixels that are far more uncertain than others (see `find_uncertain`) are excluded, because their errors
+    would determine Sz. Outliers of a form's fit are included, because they may be texture.
 
     Examples
     --------
@@ -104,9 +104,9 @@ def roughness(
 
 
 def long_waves(height: Doubles, pixel_size: tuple[float, float], cutoff: float) -> Doubles:
-    """Smooth a height map by the areal Gaussian filter of ISO 16610-61, which halves waves of the cutoff, mm.
+    """Smooth a height map by the areal Gaussian filter of ISO 16610-61, which halves waves at the cutoff, mm.
 
-    Return weighted means over known pixels; NaN where more than a twentieth of the weight lies elsewhere.
+    Values are weighted means over known pixels; NaN if these have less than 95 % of the weight.
     """
     if not cutoff >= 2 * max(pixel_size):
         raise InputError(f"a cutoff of {cutoff:g} mm is shorter than two pixels: choose a longer one")
@@ -114,7 +114,7 @@ def long_waves(height: Doubles, pixel_size: tuple[float, float], cutoff: float) 
     spread = _ALPHA * cutoff / math.sqrt(2 * math.pi)
     known = np.isfinite(height)
     if min(count * size for count, size in zip(height.shape[::-1], pixel_size, strict=True)) < 2 * spread:
-        return np.full(height.shape, np.nan)  # nowhere would enough weight lie on pixels
+        return np.full(height.shape, np.nan)  # too little weight everywhere
     weight = _blur(known.astype(np.float64), spread, pixel_size)
     blurred = _blur(np.where(known, height, 0.0), spread, pixel_size)
     covered = known & (weight >= _COVERED)
@@ -122,24 +122,14 @@ def long_waves(height: Doubles, pixel_size: tuple[float, float], cutoff: float) 
 
 
 def _blur(values: Doubles, spread: float, pixel_size: tuple[float, float]) -> Doubles:
-    """Convolve with a normal distribution, in the standard deviation of millimetres; nothing lies outside."""
-    for axis, size in zip((1, 0), pixel_size, strict=True):
-        values = _convolve(values, _bell(spread / size), axis)
-    return values
-
-
-def _convolve(values: Doubles, weights: Doubles, axis: int) -> Doubles:
-    """Convolve along an axis with weights whose middle is where the result goes; zeros lie outside."""
+    """Convolve with a normal distribution of a standard deviation in mm; values outside are 0."""
     from scipy import fft
 
-    count, reach = values.shape[axis], weights.size // 2
-    length = fft.next_fast_len(count + 2 * reach, real=True)
-    wave = fft.rfft(values, length, axis=axis) * np.expand_dims(fft.rfft(weights, length), 1 - axis)
-    return np.asarray(fft.irfft(wave, length, axis=axis).take(range(reach, reach + count), axis))
-
-
-def _bell(spread: float) -> Doubles:
-    """Return the weights of a normal distribution, its standard deviation in pixels."""
-    reach = math.ceil(_TAIL * spread)
-    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / spread) ** 2)
-    return np.asarray(weights / weights.sum())
+    for axis, size in zip((1, 0), pixel_size, strict=True):
+        reach, count = math.ceil(_TAIL * (spread / size)), values.shape[axis]
+        weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (spread / size)) ** 2)
+        weights /= weights.sum()
+        length = fft.next_fast_len(count + 2 * reach, real=True)
+        wave = fft.rfft(values, length, axis=axis) * np.expand_dims(fft.rfft(weights, length), 1 - axis)
+        values = np.asarray(fft.irfft(wave, length, axis=axis).take(range(reach, reach + count), axis))
+    return values

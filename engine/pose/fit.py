@@ -19,17 +19,18 @@ from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.pose import BLOCK, PARTS, SUMS
 
 _UPPER = np.triu_indices(6)
-_FLOOR = 1e-5  # of the mean information: what rounding and the pixel size leave where there is none
-_LIKELY = 0.5, 0.02  # times the spurious information that a step's direction needs, near and away
-_AWAY = 3.0  # chi square of a motion that is away
-_FEWEST = 20  # pixels that two maps must share
+_FLOOR = 1e-5  # share of the mean information that is added to all directions, for rounding errors
+_LIKELY = 0.5, 0.02  # noise that `Equations.free` assumes during steps, near the solution and far from it
+_AWAY = 3.0  # chi square above which a motion is far from the solution
+_FEWEST = 20  # smallest number of pixels that two maps must share
 _COARSEST = 24  # pixels along the shorter side of the coarsest maps
-_STEPS, _STILL = 40, 1e-2  # steps at most, and the step in standard deviations that ends them
-_BLOCKS = 100  # whose scatter is as informative about the covariance's form as independence
-_POOR = 2.0  # typical chi square from which on other starts are tried
-_ANGLES, _SHIFTS, _REACH, _SHARED, _TRIED = 24, 13, 0.8, 0.2, 6  # of the search
+_STEPS, _STILL = 40, 1e-2  # largest number of steps; step, in standard deviations, that ends them
+_BLOCKS = 100  # weight, in blocks, of the covariance of independent errors
+_POOR = 2.0  # typical chi square above which other starts are tried
+_ANGLES, _SHIFTS, _TRIED = 24, 13, 6  # starts of the search: turns, shifts per axis, and those refined
+_REACH, _SHARED = 0.8, 0.2  # largest shift relative to the map's extent; smallest share of common pixels
 _NONE = np.zeros((6, 0))
-_LONGEST = 0.35  # of the object's size: the longest step
+_LONGEST = 0.35  # longest step, relative to the object's size
 
 
 class Equations:
@@ -54,10 +55,10 @@ class Equations:
     def __init__(self, sums: NDArray[np.float32], size: float, unbiased: bool) -> None:
         scale = _scale_of(size)
         parts = np.split(sums.astype(np.float64), PARTS[1:-1], axis=1)
-        upper, scores, chi, expected, self.heights, self.normals, whole = parts
+        upper, scores, chi, expected, self.heights, self.normals, products = parts
         self.normal_matrix: NDArray[Any] = _symmetric(upper.sum(axis=0), scale)
-        own = whole.sum(axis=0).reshape(6, 6) * np.outer(scale, scale)
-        self.unbiased: NDArray[Any] = own if unbiased else self.normal_matrix
+        full = products.sum(axis=0).reshape(6, 6) * np.outer(scale, scale)
+        self.unbiased: NDArray[Any] = full if unbiased else self.normal_matrix
         self.scores: NDArray[np.float64] = scores * scale
         self.right: NDArray[Any] = self.scores.sum(axis=0)
         self.pixels: float = max(float(self.normals.sum()), float(self.heights.sum()))
@@ -86,13 +87,11 @@ class Equations:
         independent errors.
         """
         directions = complement(free)
-        count, alone = (
-            int(np.count_nonzero(self.normals + self.heights)),
-            directions.T @ self.normal_matrix @ directions,
-        )
+        count = int(np.count_nonzero(self.normals + self.heights))
+        independent = directions.T @ self.normal_matrix @ directions
         scatter = directions.T @ self.scores.T @ self.scores @ directions * count / max(count - 6, 1)
-        size = np.trace(np.linalg.solve(alone, scatter)) / len(alone)
-        middle = (count * scatter + _BLOCKS * size * alone) / (count + _BLOCKS)
+        size = np.trace(np.linalg.solve(independent, scatter)) / len(independent)
+        middle = (count * scatter + _BLOCKS * size * independent) / (count + _BLOCKS)
         inverse = np.linalg.inv(directions.T @ self.unbiased @ directions)
         return np.asarray(directions @ inverse @ middle @ inverse.T @ directions.T)
 
@@ -110,7 +109,7 @@ def _symmetric(upper: Doubles, scale: Doubles) -> Doubles:
 
 
 def complement(free: Doubles) -> Doubles:
-    """Return orthonormal directions, (6, 6 - k), at right angles to others."""
+    """Return orthonormal directions, (6, 6 - k), orthogonal to the given ones."""
     return np.asarray(np.linalg.svd(free, full_matrices=True)[0][:, free.shape[1] :])
 
 
@@ -135,7 +134,8 @@ class PairFit:
         side = BLOCK * step
         blocks = -(-rows // side) * -(-columns // side)
         maps = *second.middle, *first.grid, *second.grid, first.least, second.least
-        poses = self.device.given("poses", [[*one.turn.ravel(), *one.shift, *maps] for one in motions])
+        rows_of_poses = [[*motion.turn.ravel(), *motion.shift, *maps] for motion in motions]
+        poses = self.device.given("poses", rows_of_poses)
         sums = self.device.array("sums", (len(motions), blocks, SUMS), np.float32, zeroed=False)
         self.device.kernel("pose", "pose_equations", BESIDE=int(unbiased))(
             len(motions) * blocks,
@@ -154,33 +154,32 @@ class PairFit:
         return sums.download()
 
     def solve(self, start: Motion | None = None, near: bool = False) -> tuple[Motion, Equations, Doubles]:
-        """Return the motion, its equations, and the directions that they leave free.
+        """Return the motion, its equations, and the directions that they do not determine.
 
-        Without a start, no motion and many others are tried. A start that is ``near`` needs no coarse maps.
+        Without a start, the identity and a grid of motions are tried. A ``near`` start needs no coarse maps.
         """
         levels = [self] if near else self._levels()
-        found, typical = self._descend(levels, start or STILL)
+        motion, typical = self._descend(levels, start or STILL)
         if start is None and not typical < _POOR:
-            other = self._descend(levels, levels[-1].search())
-            found, typical = min((found, typical), other, key=lambda one: one[1])
-            start = other[0] if found is other[0] else None
-        if found is None:
+            other, other_typical = self._descend(levels, levels[-1].search())
+            if other_typical < typical:
+                motion = start = other
+        if motion is None:
             raise InputError("the two maps share too few pixels: give a start, or results that overlap")
-        now = self.equations(found, unbiased=True)
+        now = self.equations(motion, unbiased=True)
         free = now.free()
         if free.shape[1] == 6:
             raise InputError("the maps determine no motion: the surface is too plain for its noise")
         if free.shape[1]:
-            again = self._descend(levels, start or STILL, free)[0]
-            found = found if again is None else again
-            now = self.equations(found, unbiased=True)
-        return found, now, free
+            motion = self._descend(levels, start or STILL, free)[0] or motion
+            now = self.equations(motion, unbiased=True)
+        return motion, now, free
 
     def _levels(self) -> list[PairFit]:
         """Return the maps from fine to coarse."""
         levels = [self]
         while min(levels[-1].first.records.shape[:2]) >= 2 * _COARSEST:
-            first, second = (one.halved(self.device) for one in (levels[-1].first, levels[-1].second))
+            first, second = (map_.halved(self.device) for map_ in (levels[-1].first, levels[-1].second))
             if min(len(first.points), len(second.points)) < _FEWEST:
                 break
             levels.append(PairFit(first, second, self.device))
@@ -189,7 +188,7 @@ class PairFit:
     def _descend(
         self, levels: list[PairFit], start: Motion | None, free: Doubles = _NONE
     ) -> tuple[Motion | None, float]:
-        """Return the motion that is found from a start, and its typical chi square."""
+        """Refine a start from coarse to fine maps; return the motion and its typical chi square."""
         motion = start
         for level in reversed(levels):
             if motion is not None:
@@ -197,21 +196,21 @@ class PairFit:
         return motion, math.inf if motion is None else self.equations(motion).typical
 
     def search(self) -> Motion | None:
-        """Return the best of the motions that are found from turns about z and shifts of all sizes."""
-        found: list[tuple[float, Motion]] = []
+        """Return the best motion from a grid of rotations about z and shifts."""
+        candidates: list[tuple[float, Motion]] = []
         scale = _scale_of(self.second.size)
         for starts in self._starts():
             sums = self._sums(starts).sum(axis=1, dtype=np.float64)
             upper, right, chi, compared, heights, normals, _ = np.split(sums, PARTS[1:-1], axis=1)
-            some = np.maximum(heights, normals)[:, 0] > _SHARED * len(self.first.points)
-            matrix, slope = _symmetric(upper[some], scale), right[some] * scale
+            overlap = np.maximum(heights, normals)[:, 0] > _SHARED * len(self.first.points)
+            matrix, slope = _symmetric(upper[overlap], scale), right[overlap] * scale
             matrix += _FLOOR * np.trace(matrix, axis1=1, axis2=2)[:, np.newaxis, np.newaxis] / 6 * np.eye(6)
             gain = np.vecdot(slope, np.linalg.solve(matrix, slope[..., np.newaxis])[..., 0])
-            merit = (chi[some, 0] - gain) / np.maximum(compared[some, 0], 1e-9)
-            found += zip(merit, itertools.compress(starts, some), strict=True)
-        found.sort(key=lambda one: one[0])
+            merit = (chi[overlap, 0] - gain) / np.maximum(compared[overlap, 0], 1e-9)
+            candidates += zip(merit, itertools.compress(starts, overlap), strict=True)
+        candidates.sort(key=lambda candidate: candidate[0])
         best, least = None, math.inf
-        for _, start in found[:_TRIED]:
+        for _, start in candidates[:_TRIED]:
             motion = self.refine(start)
             if motion is not None:
                 now = self.equations(motion)
@@ -220,7 +219,7 @@ class PairFit:
         return best
 
     def _starts(self) -> Iterator[list[Motion]]:
-        """Return motions of one turn after the other."""
+        """Yield the motions with each rotation."""
         extent, shifts = np.ptp(self.first.points, axis=0), np.linspace(-_REACH, _REACH, _SHIFTS)
         for angle in np.linspace(0, 2 * math.pi, _ANGLES, endpoint=False):
             turn = Rotation.from_rotvec([0, 0, angle]).as_matrix()
@@ -230,7 +229,7 @@ class PairFit:
             ]
 
     def refine(self, motion: Motion, free: Doubles = _NONE) -> Motion | None:
-        """Return the motion at which no step outside of the free directions remains; None without overlap."""
+        """Refine a motion until steps outside of the free directions are small; None without overlap."""
         for _ in range(_STEPS):
             now = self.equations(motion, unbiased=not free.size)
             if now.pixels < _FEWEST:
@@ -244,7 +243,7 @@ class PairFit:
         return motion
 
     def step(self, motion: Motion, now: Equations, directions: Doubles) -> tuple[Motion, float]:
-        """Return where the Gauss-Newton step in some directions leads, and its length in sigmas."""
+        """Return the motion after a Gauss-Newton step in given directions, and its length in sigmas."""
         matrix = directions.T @ now.normal_matrix @ directions
         matrix += _FLOOR / 10 * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
         step = -directions @ np.linalg.solve(matrix, directions.T @ now.right)

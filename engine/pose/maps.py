@@ -1,4 +1,4 @@
-"""Maps as a motion is found from: records of heights and normals with their variances, on a device."""
+"""Maps from which motions are estimated: heights and normals with their variances, on a device."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from mirrorskin.kernels.pose import FAR
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-_STEEPEST = 0.17  # cosine of the zenith beyond which slopes are not used
-_NOT_COMPARED = 1e6  # radians^2, of normals that are not compared
-_BORDER = np.ones((5, 5), np.uint8)  # pixels round edges and the border of contact that are left out
+_STEEPEST = 0.17  # cosine of the largest zenith at which slopes are used
+_NOT_COMPARED = 1e6  # variance of normals that are not compared, radians^2
+_BORDER = np.ones((5, 5), np.uint8)  # pixels around edges and the border of contact that are ignored
 
 
 @dataclass(frozen=True, eq=False)
 class PoseMap:
-    """Records of a map, (H, W, 8), as `mirrorskin.kernels.pose` has them, and where they are.
+    """Records of a map, (H, W, 8), as `mirrorskin.kernels.pose` defines them, and their positions.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class PoseMap:
 
     @classmethod
     def of(cls, result: Result, pixel_size: ArrayLike | None, device: Device, curved: bool = True) -> PoseMap:
-        """Take a result's maps; without ``curved`` its second derivatives remain unknown, 0."""
+        """Return the map of a result; without ``curved`` the second derivatives are 0."""
         grid = _grid(result, pixel_size)
         height, variance = _heights(result)
         normals, square = _normals(result, height, grid, device)
@@ -69,7 +69,7 @@ class PoseMap:
         return cls(records, grid, _least(result), device.given("records", records))
 
     def halved(self, device: Device) -> PoseMap:
-        """Return the map of half as many pixels each way: means of two by two, where all four are known."""
+        """Return the map at half the resolution: means of 2 x 2 pixels, if all four are known."""
         rows, columns = (size // 2 for size in self.records.shape[:2])
         fours = self.records[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2, 8)
         records = fours.mean(axis=(1, 3), dtype=np.float32)
@@ -80,7 +80,7 @@ class PoseMap:
 
     @cached_property
     def points(self) -> NDArray[np.float64]:
-        """The points of the surface that can be used, (n, 3), mm."""
+        """Usable points of the surface, (n, 3), mm."""
         row, column = np.nonzero(np.isfinite(self.records[..., 0]))
         x, y, step_x, step_y = self.grid
         height = self.records[row, column, 3].astype(np.float64)
@@ -88,12 +88,12 @@ class PoseMap:
 
     @cached_property
     def middle(self) -> NDArray[np.float64]:
-        """Their mean."""
+        """Mean of the points."""
         return np.asarray(self.points.mean(axis=0))
 
     @cached_property
     def size(self) -> float:
-        """Their root mean square distance from it."""
+        """Root mean square distance of the points from their mean."""
         return float(np.sqrt(np.mean(np.sum((self.points - self.middle) ** 2, axis=1))))
 
 
@@ -110,7 +110,7 @@ def _grid(result: Result, pixel_size: ArrayLike | None) -> tuple[float, float, f
 
 
 def _heights(result: Result) -> tuple[Floats, Floats]:
-    """Return heights and their variances; `FAR` where they add nothing to the normals."""
+    """Return heights and their variances; `FAR` where they contain no more than the normals."""
     height = np.asarray(result.height, np.float32)
     if result.height_sigma is None:
         return height, np.full(height.shape, FAR, np.float32)
@@ -124,7 +124,7 @@ def _heights(result: Result) -> tuple[Floats, Floats]:
 def _normals(
     result: Result, height: Floats, grid: tuple[float, float, float, float], device: Device
 ) -> tuple[Floats, Floats]:
-    """Return normals and their mean square errors; without normals, the heights' own, not compared."""
+    """Return normals and their mean square errors; without normals, those of the heights, not compared."""
     if result.normals is None:
         slopes = _gradient(height, grid, device)
         normals = np.dstack([-slopes, np.ones_like(height)])
@@ -140,13 +140,13 @@ def _normals(
 def _same(values: Any, shape: tuple[int, ...], name: str) -> Any:
     if np.shape(values) != shape:
         raise InputError(
-            f"{name} is {np.shape(values)}, but the height asks for {shape}: give maps of one size"
+            f"{name} has shape {np.shape(values)}, but the height needs {shape}: give maps of one size"
         )
     return values
 
 
 def _doubtful(result: Result) -> Mask:
-    """Return where a result is unreliable: filled, or close to edges and to the border of contact."""
+    """Return the unreliable pixels: filled, or close to edges or to the border of contact."""
     assert result.height is not None
     border = np.zeros(result.height.shape, np.uint8)
     for lines in (result.edges, None if result.contact is None else result.contact == 0):
@@ -181,7 +181,7 @@ def _gradient(values: Floats, grid: tuple[float, float, float, float], device: D
 def _curvature(
     normals: Floats, usable: Mask, grid: tuple[float, float, float, float], device: Device
 ) -> Floats:
-    """Return the second derivatives xx, xy and yy of the height, from the slopes around."""
+    """Return the second derivatives xx, xy and yy of the height, from adjacent slopes."""
     across, up = (
         _gradient(np.where(usable, -normals[..., axis] / normals[..., 2], np.float32(np.nan)), grid, device)
         for axis in (0, 1)

@@ -1,4 +1,4 @@
-"""Rigid motions: to apply one, to join two, and what errors of one become after another."""
+"""Rigid motions: application, composition, and propagation of errors."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ class Motion:
         return Motion(other.turn @ self.turn, other.apply(self.shift))
 
     def inverse(self) -> Motion:
-        """Return the motion back."""
+        """Return the inverse motion."""
         return Motion(self.turn.T, -self.shift @ self.turn)
 
     def small_step(self, step: Doubles, centre: Doubles) -> Motion:
         """Return this motion followed by a small rotation about a point and a translation, (6,)."""
         turn = np.asarray(Rotation.from_rotvec(step[:3]).as_matrix())
         moved = self.then(Motion(turn, centre - turn @ centre + step[3:]))
-        # Rounding would grow from motion to motion, as the transpose is taken for the inverse.
+        # Rounding errors would grow from motion to motion, because the transpose is used as the inverse.
         return Motion(np.asarray(Rotation.from_matrix(moved.turn).as_matrix()), moved.shift)
 
     def adjoint(self) -> Doubles:
-        """Return the matrix, (6, 6), that makes small motions before this one such after it."""
-        both = np.zeros((6, 6))
-        both[:3, :3] = both[3:, 3:] = self.turn
-        both[3:, :3] = cross_matrix(self.shift) @ self.turn
-        return both
+        """Return the matrix, (6, 6), that converts small motions before this one to ones after it."""
+        matrix = np.zeros((6, 6))
+        matrix[:3, :3] = matrix[3:, 3:] = self.turn
+        matrix[3:, :3] = cross_matrix(self.shift) @ self.turn
+        return matrix
 
 
 STILL = Motion(np.eye(3), np.zeros(3))
 
 
 def cross_matrix(vector: Doubles) -> Doubles:
-    """Return the matrix, (3, 3), of the cross product with a vector on its left."""
+    """Return the matrix, (3, 3), of the cross product with a vector on the left."""
     x, y, z = vector
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

@@ -15,8 +15,8 @@ from mirrorskin.engine.pose.motion import Doubles, Motion
 from mirrorskin.io.arguments import checked
 from mirrorskin.kernels.device import Device, open_device
 
-_SHARE = 1e-3  # of a parameter in an undetermined direction, from which on it is undetermined itself
-_ALIKE = 0.01  # directions are the same that differ by less
+_SHARE = 1e-3  # component of an undetermined direction above which the parameter is undetermined
+_ALIKE = 0.01  # directions that differ by less are equal
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,13 +80,17 @@ class Pose:
         return other._changed(self.motion.then(other.motion), covariance, free)
 
     def _changed(self, motion: Motion, covariance: Doubles, free: Doubles) -> Pose:
-        """Return a motion with its errors; its undetermined directions are orthonormalised."""
+        """Return another motion with its errors, and orthonormal undetermined directions."""
         directions, sizes, _ = np.linalg.svd(free.T, full_matrices=False)
         vector = np.asarray(Rotation.from_matrix(motion.turn).as_rotvec(), np.float64)
         kept = directions[:, sizes > _ALIKE].T
         return replace(
             self, rotation=vector, translation=motion.shift, covariance=covariance, undetermined=kept
         )
+
+
+IDENTITY = Pose(np.zeros(3), np.zeros(3), np.zeros((6, 6)), 1.0, 0, np.zeros((0, 6)))
+"""No motion, without errors."""
 
 
 @checked
@@ -100,15 +104,15 @@ def estimate_pose(
 ) -> Pose:
     """Find the rigid motion of an object from one result to the next, with its covariance.
 
-    Each usable pixel of the first result is moved, and compared with the second result where it comes to lie:
+    Each usable pixel of the first result is moved, and compared with the second result at its new position:
     its normal with the normal there, and its height with the height there, along the second surface's normal
     (Chen and Medioni, Image and Vision Computing 10, 1992). Gauss-Newton steps minimise the squares over the
-    variances of both maps, from coarse maps to fine ones. Where no fit is found from no motion, turns about z
-    and shifts of all sizes are tried.
+    variances of both maps, from coarse to fine maps. If there is no good fit from the identity, a grid of
+    rotations about z and shifts is tried.
 
-    Filled pixels are left out, and those within two pixels of `edges` and of the border of `contact`. Heights
+    Filled pixels are ignored, and those within two pixels of `edges` and of the border of `contact`. Heights
     of unknown offset were integrated from the normals and contain no more information: they only determine
-    where points are. The pose is then between the two results' own coordinates, and its z is undetermined.
+    the positions of points. The pose is then between the coordinates of both results, with an undetermined z.
 
     The covariance is estimated from the scatter of the equations over blocks of 8 x 8 pixels, so errors of
     adjacent pixels may be correlated, and larger than their standard deviations.
@@ -119,7 +123,7 @@ def estimate_pose(
         ``height``, (H, W), mm, with ``height_sigma``, or ``normals``, (H, W, 3), with ``normals_sigma``, or
         both. The sizes may differ.
     pixel_size : float or (float, float), optional
-        mm; by default as the results say.
+        Millimetres along x and y; by default that of the results.
     start : Pose, optional
         A motion to start from.
     device : str or Device, optional
@@ -142,10 +146,10 @@ def estimate_pose(
     ...     x, y = np.meshgrid(np.arange(-20, 21) * 0.1, np.arange(20, -21, -1) * 0.1)
     ...     z = np.sqrt(25 - (x - at) ** 2 - y**2)
     ...     normals = np.dstack([(x - at) / 5, y / 5, z / 5])
-    ...     sure = np.full(x.shape, 0.01)
-    ...     return io.Result(height=z - 5, height_sigma=0.1 * sure, normals=normals, normals_sigma=sure)
+    ...     sigma = np.full(x.shape, 0.01)
+    ...     return io.Result(height=z - 5, height_sigma=0.1 * sigma, normals=normals, normals_sigma=sigma)
     >>> pose = engine.pose.estimate_pose(ball(0.0), ball(0.2), pixel_size=0.1)
-    >>> pose.apply([0, 0, -5]).round(3).tolist()  # the ball's centre; about its spin nothing is known
+    >>> pose.apply([0, 0, -5]).round(3).tolist()  # the ball's centre; its spin is undetermined
     [0.2, 0.0, -5.0]
     >>> len(pose.undetermined)
     3
@@ -158,8 +162,8 @@ def estimate_pose(
 
 
 def pose_of(fit: PairFit, motion: Motion, now: Equations, free: Doubles) -> Pose:
-    """Return a fit's motion about the picture's centre, with its covariance."""
-    moved = fit.at_origin()
-    covariance = moved @ now.covariance(free) @ moved.T
-    fitted = Pose(np.zeros(3), np.zeros(3), covariance, now.chi_square, int(now.pixels), np.zeros((0, 6)))
-    return fitted._changed(motion, covariance, (moved @ free).T)
+    """Return the pose of a fitted motion, about the picture's centre."""
+    change = fit.at_origin()
+    covariance = change @ now.covariance(free) @ change.T
+    pose = replace(IDENTITY, chi_square=now.chi_square, pixels=int(now.pixels))
+    return pose._changed(motion, covariance, (change @ free).T)

@@ -1,4 +1,4 @@
-"""Results of several touches become one larger surface."""
+"""Stitching: the results of several touches are merged into one larger surface."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mirrorskin.engine.inputs import Maps, as_result
 from mirrorskin.engine.pose.fit import PairFit
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import STILL, Doubles, Motion
-from mirrorskin.engine.pose.pose import Pose, pose_of
+from mirrorskin.engine.pose.pose import IDENTITY, Pose, pose_of
 from mirrorskin.engine.provenance import signature
 from mirrorskin.engine.resample import SamplePoints
 from mirrorskin.io import InputError, Result, select_turn
@@ -23,13 +23,13 @@ from mirrorskin.io.maps import StitchStatus, status_of
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.device import Device, open_device
 
-_SHARED = 0.2  # of the smaller map's pixels, from which on two touches are compared
-_ALIKE = 4.0  # of chi square, that two touches which are compared may have for a link
-_ROUNDS, _NEWTON = 5, 8  # steps of the poses, and of a height along z
-_LEVELLINGS = 3  # of a touch of unknown offset, whose height determines where its pixels are
-_APART = 4.0  # sigmas between a touch and the mean, from which on they disagree
-_LARGEST = 1 << 28  # pixels of the whole
-_UNFIT = 1e-9  # of the largest information, below which a direction has none
+_SHARED = 0.2  # smallest share of the smaller map's pixels that two touches must have in common
+_ALIKE = 4.0  # largest chi square of a link between two touches
+_ROUNDS, _NEWTON = 5, 8  # steps for the poses, and for a height along z
+_LEVELLINGS = 3  # iterations for a touch of unknown offset, whose height determines where its pixels are
+_APART = 4.0  # sigmas between a touch and the mean above which they disagree
+_LARGEST = 1 << 28  # largest number of pixels of the stitched surface
+_UNFIT = 1e-9  # smallest information of a direction, relative to the largest
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,20 +60,21 @@ def stitch(
     names: Sequence[str] | None = None,
     device: str | Device | None = None,
 ) -> Stitch:
-    """Put the maps of several touches of one object together into one larger surface.
+    """Merge the maps of several touches of one object into one larger surface.
 
-    The motion from each touch to the next is found as by `mirrorskin.engine.pose.estimate_pose`, then those
-    between all others that share a fifth of their pixels. A least-squares fit of all motions, weighted by
-    their covariances, makes the poses (a pose graph: Lu and Milios, Autonomous Robots 4, 1997). Heights of
-    all touches are then brought to the pixels of the first, and merged by their inverse variances.
+    The motion from each touch to the next is estimated by `mirrorskin.engine.pose.estimate_pose`, then
+    those
+    between all others that share a fifth of their pixels. The poses are a least-squares fit of all motions,
+    weighted by their covariances (a pose graph: Lu and Milios, Autonomous Robots 4, 1997). Heights of all
+    touches are then resampled to the pixels of the first, and merged by inverse-variance weighting.
 
     Parameters
     ----------
     results : sequence of Result, mapping, xarray.Dataset or path
-        Two or more, each with heights and what `estimate_pose` needs, and sharing a part with one before it.
-        Of touches whose height's offset is unknown, it is made to agree with those before.
+        Two or more, each with heights, the maps for `estimate_pose`, and an overlap with an earlier one.
+        An unknown offset of heights is determined from the overlap.
     pixel_size : float or (float, float), optional
-        mm; by default as the results say.
+        Millimetres along x and y; by default that of the results.
     names : sequence of str, optional
         Names of the results in messages, by default their paths or numbers.
     device : str or Device, optional
@@ -82,7 +83,7 @@ def stitch(
     Raises
     ------
     mirrorskin.io.InputError
-        Fewer than two results, one that shares nothing with those before it, or what `estimate_pose` refuses.
+        Fewer than two results, one that does not overlap earlier ones, or maps that `estimate_pose` refuses.
 
     Examples
     --------
@@ -91,9 +92,9 @@ def stitch(
     ...     x, y = np.meshgrid(np.arange(-30, 31) * 0.1, np.arange(20, -21, -1) * 0.1)
     ...     p, q = 0.2 * np.cos(x - at) * np.cos(y), -0.2 * np.sin(x - at) * np.sin(y)
     ...     normals = np.dstack([-p, -q, np.ones_like(p)]) / np.sqrt(1 + p * p + q * q)[..., None]
-    ...     sure = np.full(x.shape, 0.01)
+    ...     sigma = np.full(x.shape, 0.01)
     ...     height = 0.2 * np.sin(x - at) * np.cos(y)
-    ...     return io.Result(height=height, height_sigma=0.1 * sure, normals=normals, normals_sigma=sure)
+    ...     return io.Result(height=height, height_sigma=0.1 * sigma, normals=normals, normals_sigma=sigma)
     >>> whole = engine.pose.stitch([waves(0.0), waves(-1.0)], pixel_size=0.1)
     >>> whole.result.height.shape, whole.poses[1].translation.round(2).tolist()
     ((41, 71), [-1.0, 0.0, 0.0])
@@ -102,7 +103,11 @@ def stitch(
         raise InputError(f"the touches are a {type(results).__name__}: give a list of results")
     if len(results) < 2:
         raise InputError(f"{len(results)} results make no larger surface: give two or more")
-    names = [_name_of(result, number) for number, result in enumerate(results)] if names is None else names
+    if names is None:
+        names = [
+            os.fspath(result) if isinstance(result, str | os.PathLike) else f"result {number}"
+            for number, result in enumerate(results)
+        ]
     touches = [
         select_turn(as_result(result, name), None) for result, name in zip(results, names, strict=True)
     ]
@@ -122,12 +127,8 @@ def stitch(
     return Stitch(_merged(touches, maps, poses, names), tuple(poses), len(graph.links))
 
 
-def _name_of(result: Maps, number: int) -> str:
-    return os.fspath(result) if isinstance(result, str | os.PathLike) else f"result {number}"
-
-
 class _Graph:
-    """Touches, and the motions that were found between pairs of them."""
+    """A pose graph: touches, and the motions between pairs of them."""
 
     def __init__(self, maps: Sequence[PoseMap], names: Sequence[str], device: Device) -> None:
         self._maps, self._device = maps, device
@@ -141,7 +142,7 @@ class _Graph:
                     self._compare(first, second)
 
     def _join(self, new: int, names: Sequence[str]) -> None:
-        """Link a touch to the one before it, or to the latest that it shares enough with."""
+        """Link a touch to the latest earlier one with enough overlap."""
         for old in range(new - 1, -1, -1):
             fit = PairFit(self._maps[old], self._maps[new], self._device)
             try:
@@ -155,7 +156,7 @@ class _Graph:
         raise InputError(f"{names[new]} shares too little with those before it: give results that overlap")
 
     def _compare(self, first: int, second: int) -> None:
-        """Link two touches that overlap, as far as is known, if they agree there."""
+        """Link two touches if they overlap at their current poses, and agree there."""
         start = self._motions[first].inverse().then(self._motions[second])
         fit = PairFit(self._maps[first], self._maps[second], self._device)
         if fit.equations(start).pixels < _SHARED * self._smaller(first, second):
@@ -180,32 +181,29 @@ class _Graph:
             normal, right = np.zeros((count, count)), np.zeros(count)
             for (first, second), link in self.links.items():
                 between = motions[first].inverse().then(motions[second])
-                rest = _small(link.motion.inverse().then(between))
+                error = link.motion.inverse().then(between)
+                rest = np.concatenate([Rotation.from_matrix(error.turn).as_rotvec(), error.shift])
                 weight = _information(link)
                 parts = {first: -between.adjoint(), second: np.eye(6)}
-                for one, left in parts.items():
-                    for other, right_part in parts.items():
-                        if one and other:
-                            normal[_part(one), _part(other)] += left.T @ weight @ right_part
-                    if one:
-                        right[_part(one)] -= left.T @ weight @ rest
+                for i, left in parts.items():
+                    for k, jacobian in parts.items():
+                        if i and k:
+                            normal[_part(i), _part(k)] += left.T @ weight @ jacobian
+                    if i:
+                        right[_part(i)] -= left.T @ weight @ rest
             covariance = np.linalg.pinv(normal, _UNFIT, hermitian=True)
             step = (covariance @ right).reshape(-1, 6)
-            motions = [
-                STILL,
-                *(one.small_step(d, np.zeros(3)) for one, d in zip(motions[1:], step, strict=True)),
-            ]
-        nothing = Pose(np.zeros(3), np.zeros(3), np.zeros((6, 6)), 1.0, 0, np.zeros((0, 6)))
-        poses = [nothing]
+            steps = zip(motions[1:], step, strict=True)
+            motions = [STILL, *(motion.small_step(d, np.zeros(3)) for motion, d in steps)]
+        poses = [IDENTITY]
         for number, motion in enumerate(motions[1:], 1):
-            own = np.asarray(covariance[_part(number), _part(number)], np.float64)
             link = next(pose for (_, second), pose in self.links.items() if second == number)
             poses.append(
                 replace(
                     link,
                     rotation=np.asarray(Rotation.from_matrix(motion.turn).as_rotvec()),
                     translation=motion.shift,
-                    covariance=own,
+                    covariance=np.asarray(covariance[_part(number), _part(number)], np.float64),
                 )
             )
         return poses
@@ -216,22 +214,17 @@ def _part(number: int) -> slice:
 
 
 def _information(pose: Pose) -> Doubles:
-    """Return the inverse of a pose's covariance, 0 along what is undetermined."""
+    """Return the inverse of a pose's covariance, 0 along undetermined directions."""
     variance = np.diag(pose.covariance)
     lengths = np.sqrt(np.where(variance > _UNFIT**2 * variance.max(), variance, 1.0))
     scaled = pose.covariance / np.outer(lengths, lengths)
     return np.asarray(np.linalg.pinv(scaled, _UNFIT, hermitian=True) / np.outer(lengths, lengths))
 
 
-def _small(motion: Motion) -> Doubles:
-    """Return a small motion as a rotation vector and a translation, (6,)."""
-    return np.concatenate([Rotation.from_matrix(motion.turn).as_rotvec(), motion.shift])
-
-
 def _merged(
     touches: Sequence[Result], maps: Sequence[PoseMap], poses: Sequence[Pose], names: Sequence[str]
 ) -> Result:
-    """Bring all touches to the pixels of the first, and merge them by their inverse variances."""
+    """Resample all touches to the pixels of the first, and merge them by inverse-variance weighting."""
     x, y = _axes(maps, poses)
     shape = len(y), len(x)
     if shape[0] * shape[1] > _LARGEST:
@@ -252,11 +245,9 @@ def _merged(
 def _axes(maps: Sequence[PoseMap], poses: Sequence[Pose]) -> tuple[Doubles, Doubles]:
     """Return x and y, mm, of pixels on the first map's grid that contain all maps."""
     x, y, step_x, step_y = maps[0].grid
-    corners = []
-    for one, pose in zip(maps, poses, strict=True):
-        corners.append(pose.inverse().apply(one.points)[:, :2])
-    every = np.concatenate(corners)
-    (left, low), (right, high) = every.min(axis=0), every.max(axis=0)
+    moved = [pose.inverse().apply(map_.points)[:, :2] for map_, pose in zip(maps, poses, strict=True)]
+    points = np.concatenate(moved)
+    (left, low), (right, high) = points.min(axis=0), points.max(axis=0)
     columns = np.arange(np.round((left - x) / step_x), np.round((right - x) / step_x) + 1)
     rows = np.arange(np.round((y - high) / step_y), np.round((y - low) / step_y) + 1)
     return x + columns * step_x, y - rows * step_y
@@ -264,11 +255,11 @@ def _axes(maps: Sequence[PoseMap], poses: Sequence[Pose]) -> tuple[Doubles, Doub
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Moved:
-    """A touch at the pixels of the first one: (H, W), NaN where it has no height."""
+    """A touch at the pixels of the first one: (H, W), NaN without a height."""
 
     height: Doubles
-    variance: Doubles  # with the pose's and, where it was levelled, the offset's
-    common: Doubles  # the part of it that all pixels share: the pose's and the offset's
+    variance: Doubles  # including that of the pose and of a determined offset
+    common: Doubles  # variance of errors that all pixels share: those of the pose and the offset
     contact: NDArray[np.bool_]
     normals: Doubles | None
     normal_variance: Doubles | None
@@ -284,7 +275,7 @@ class _Moved:
         with_normals: bool,
         before: _Sums | None,
     ) -> _Moved:
-        """Move a touch; one of unknown offset goes to the height of those before."""
+        """Move a touch; an unknown offset is determined from those before."""
         assert touch.height is not None
         left, top, step_x, step_y = known.grid
         height = np.asarray(touch.height, np.float32).copy()
@@ -306,9 +297,9 @@ class _Moved:
                 found = points.interpolate(height).astype(np.float64)
                 here = np.nan_to_num(found - place[:, 2])
                 above = above + here / motion.turn[2, 2]
-            p, q = (np.nan_to_num(points.interpolate(np.asarray(one, np.float32))) for one in slopes)
+            p, q = (np.nan_to_num(points.interpolate(np.asarray(slope, np.float32))) for slope in slopes)
             upright = np.stack([-p, -q, np.ones_like(p)], axis=-1)
-            steep = upright @ motion.turn[:, 2]  # how much faster the surface comes nearer than z
+            steep = upright @ motion.turn[:, 2]  # change of the surface's distance per change of z
             lever = np.concatenate([np.cross(place, upright), upright], axis=-1) / steep[:, np.newaxis]
             own = points.interpolate(_variance_of(touch).astype(np.float32)).astype(np.float64) / steep**2
             if before is not None:
@@ -316,7 +307,7 @@ class _Moved:
                 level, middle, of_level = before.level(heights, own, lever)
             if not np.isfinite(level):
                 break
-        lever -= middle  # what the pose's error does there is levelled out
+        lever -= middle  # levelling removes the mean effect of the pose's error
         common = np.einsum("ni,ij,nj->n", lever, pose.covariance, lever) + of_level
         above, variance = above + level, own + common
         answered = np.isfinite(found) & np.isfinite(variance)
@@ -340,7 +331,7 @@ class _Moved:
 
 
 def _variance_of(touch: Result) -> Doubles:
-    """Return the variance of a touch's heights, (H, W); NaN where it is not known."""
+    """Return the variance of a touch's heights, (H, W); NaN if unknown."""
     sigma = np.asarray(touch.height_sigma, np.float64)
     return np.where(sigma > 0, sigma, np.nan) ** 2
 
@@ -361,8 +352,8 @@ class _Sums:
         self._common += weight * np.nan_to_num(moved.common)
         self._contact |= moved.contact
         if moved.normals is not None and moved.normal_variance is not None:
-            told = np.isfinite(moved.normals).all(axis=-1) & (moved.normal_variance > 0)
-            weight = np.where(told, 1 / np.where(told, moved.normal_variance, 1.0), 0.0)
+            defined = np.isfinite(moved.normals).all(axis=-1) & (moved.normal_variance > 0)
+            weight = np.where(defined, 1 / np.where(defined, moved.normal_variance, 1.0), 0.0)
             self._normal_weight += weight
             self._normals += weight[..., np.newaxis] * np.nan_to_num(moved.normals)
 
@@ -371,10 +362,10 @@ class _Sums:
             return np.asarray(self._height / self._weight)
 
     def level(self, height: Doubles, variance: Doubles, lever: Doubles) -> tuple[float, Doubles, float]:
-        """Return the offset of heights, (n,), to those so far, its mean lever, and its variance.
+        """Return the offset of heights, (n,), to earlier ones, its mean lever, and its variance.
 
-        The pixels' own errors are independent. Errors that pixels share by their poses do not average out;
-        for several touches their weighted mean is an upper bound. All is NaN if no pixel is shared.
+        Errors of pixels are independent. Errors that pixels share by their poses do not average out; with
+        several touches, their weighted mean is an upper bound. All values are NaN without common pixels.
         """
         off = self.mean().ravel() - height
         shared = np.isfinite(off) & np.isfinite(variance)
@@ -418,9 +409,8 @@ class _Sums:
             with np.errstate(invalid="ignore", divide="ignore"):
                 normals = self._normals / np.linalg.norm(self._normals, axis=-1, keepdims=True)
                 spread = 1 / np.sqrt(self._normal_weight)
-            told = self._normal_weight > 0
             maps["normals"] = normals.astype(np.float32)
-            maps["normals_sigma"] = np.where(told, spread, np.nan).astype(np.float32)
+            maps["normals_sigma"] = np.where(self._normal_weight > 0, spread, np.nan).astype(np.float32)
         if unknown:
             maps["component"] = np.where(known, 0, -1).astype(np.int32)
             maps["offset_unknown"] = np.ones(1, np.uint8)

@@ -9,30 +9,29 @@ from mirrorskin.engine.inputs import Maps, as_result
 from mirrorskin.engine.pose.fit import PairFit, complement
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import STILL, Doubles, Motion
-from mirrorskin.engine.pose.pose import Pose, pose_of
+from mirrorskin.engine.pose.pose import IDENTITY, Pose, pose_of
 from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import Result
 from mirrorskin.kernels.device import Device, open_device
 
-_SHARED = 0.6  # of the key's pixels: with fewer in common the next result becomes the key
-_COARSE, _STEPS, _STILL = 4, 8, 0.3  # every how many-th pixel at first; steps, and how many sigmas end them
-_FEWEST = 20  # pixels of a coarse comparison
-_LOST = 3.0  # times the key's first chi square, from which on the motion is looked for anew
+_SHARED = 0.6  # share of the key's pixels below which the next result becomes the key
+_COARSE, _STEPS, _STILL = 4, 8, 0.3  # pixel step of the coarse fit; number of steps, and sigmas that end them
+_FEWEST = 20  # smallest number of pixels of a coarse comparison
+_LOST = 3.0  # times the key's first chi square, above which the motion is searched again
 
 
 class PoseTracker(ThreadSafe):
     """Estimates the motion of an object from the first of a stream of results to each of them.
 
-    Each result is compared with a key: the first one, and later the last before too few pixels were shared.
-    Errors therefore grow with the number of keys, not with that of results. The start is the motion
-    extrapolated from the last two results; steps on every fourth row and column follow, and a last one uses
-    all pixels. Directions that the key does not determine are found with the first result after it, and are
-    held constant.
+    Each result is compared with a key: the first result, or a later one when too few pixels were shared with
+    the previous key. So errors increase with the number of keys, not of results. The start is extrapolated
+    from the last two results. It is refined on every fourth row and column, then on all pixels. Directions
+    that the key does not determine are found with the first result after it, and are kept fixed.
 
     Parameters
     ----------
     pixel_size : float or (float, float), optional
-        mm; by default as the results say.
+        Millimetres along x and y; by default that of the results.
     device : str or Device, optional
         See ``mirrorskin.kernels.device.open_device``.
 
@@ -49,9 +48,9 @@ class PoseTracker(ThreadSafe):
     ...     x, y = np.meshgrid(np.arange(-30, 31) * 0.1, np.arange(20, -21, -1) * 0.1)
     ...     p, q = 0.2 * np.cos(x - at) * np.cos(y), -0.2 * np.sin(x - at) * np.sin(y)
     ...     normals = np.dstack([-p, -q, np.ones_like(p)]) / np.sqrt(1 + p * p + q * q)[..., None]
-    ...     sure = np.full(x.shape, 0.01)
+    ...     sigma = np.full(x.shape, 0.01)
     ...     height = 0.2 * np.sin(x - at) * np.cos(y)
-    ...     return io.Result(height=height, height_sigma=0.1 * sure, normals=normals, normals_sigma=sure)
+    ...     return io.Result(height=height, height_sigma=0.1 * sigma, normals=normals, normals_sigma=sigma)
     >>> tracker = engine.pose.PoseTracker(pixel_size=0.1)
     >>> [float(tracker.push(waves(0.05 * number)).translation[0].round(2)) for number in range(3)]
     [0.0, 0.05, 0.1]
@@ -61,19 +60,19 @@ class PoseTracker(ThreadSafe):
         self.keys: int = 0
         self._pixel_size, self._device = pixel_size, open_device(device)
         self._key: PoseMap | None = None
-        self._key_pose = Pose(np.zeros(3), np.zeros(3), np.zeros((6, 6)), 1.0, 0, np.zeros((0, 6)))
+        self._key_pose = IDENTITY
         self._free: Doubles | None = None
         self._fewest, self._worst = 0.0, np.inf  # pixels, and chi square
         self._back, self._last = STILL, STILL  # from the last result to the key, and to the one before
 
     def push(self, maps: Maps) -> Pose:
-        """Take the next result, or maps as for `estimate_pose`, and return the motion from the first to it.
+        """Return the motion from the first result to the next one, a result or maps as for `estimate_pose`.
 
         Raises
         ------
         mirrorskin.io.InputError
-            What `estimate_pose` refuses, or the result shares too few pixels with earlier ones. It is left
-            out.
+            Maps that `estimate_pose` refuses, or too few pixels shared with earlier results. The result is
+            ignored.
         """
         result = as_result(maps, "result")
         if self._key is None:
@@ -87,37 +86,37 @@ class PoseTracker(ThreadSafe):
             for _ in range(_STEPS):
                 now = fit.equations(motion, step=step)
                 if now.pixels < _FEWEST:
-                    return self._look_for(result)
+                    return self._search(result)
                 motion, moved = fit.step(motion, now, directions)
                 if moved < _STILL:
                     break
         if now.chi_square > self._worst:
-            return self._look_for(result)
+            return self._search(result)
         pose = self._moved_to(motion, pose_of(fit, motion, now, self._free))
         if now.pixels < self._fewest:
             self._take_key(result, pose)
         return pose
 
     def _first_after_key(self, result: Result) -> Pose:
-        """Return the pose of the first result after a key, and find the directions that are undetermined."""
+        """Return the pose of the first result after a key, and determine the undetermined directions."""
         assert self._key is not None
         fit = PairFit(self._map(result), self._key, self._device)
         motion, now, self._free = fit.solve(self._last.then(self._back), near=True)
         self._fewest, self._worst = _SHARED * now.pixels, _LOST * max(now.chi_square, 1.0)
         return self._moved_to(motion, pose_of(fit, motion, now, self._free))
 
-    def _look_for(self, result: Result) -> Pose:
-        """Return the pose of a result that is not where it was expected."""
+    def _search(self, result: Result) -> Pose:
+        """Return the pose of a result that is far from the expected pose."""
         assert self._key is not None
         fit = PairFit(self._map(result), self._key, self._device)
         motion, now, free = fit.solve()
         return self._moved_to(motion, pose_of(fit, motion, now, free))
 
-    def _moved_to(self, motion: Motion, found: Pose) -> Pose:
+    def _moved_to(self, motion: Motion, to_key: Pose) -> Pose:
         """Store the motion back to the key, and return the pose."""
         self._last = motion.then(self._back.inverse())
         self._back = motion
-        return self._key_pose.then(found.inverse())
+        return self._key_pose.then(to_key.inverse())
 
     def _take_key(self, result: Result, pose: Pose) -> None:
         self._key, self._key_pose, self._free = self._map(result), pose, None

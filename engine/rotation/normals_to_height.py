@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.frames import SAMPLES
 from mirrorskin.engine.integration.integration import integrate
-from mirrorskin.engine.integration.surface import Surface, explain
+from mirrorskin.engine.integration.surface import explain
 from mirrorskin.engine.integration.validation import LEAST, MOST
 from mirrorskin.io import Result
 from mirrorskin.io.types import ProcessValue
@@ -203,31 +203,29 @@ def integrate_normals(
         np.where(one.component >= 0, one.component + np.int32(shift), np.int32(-1))
         for one, shift in zip(surfaces, before, strict=False)
     ]
-    stacked = [
-        _stack([getattr(one, name) for one in surfaces], per_turn) for name in ("height", "sigma", "edges")
-    ]
+    names = ("height", "height_sigma", "edges")
+    stacked = {name: _stack([getattr(one, name) for one in surfaces], per_turn) for name in names}
     return Result(
-        height=stacked[0],
-        height_sigma=stacked[1],
+        stacked,
         component=_stack(components, per_turn),
         offset_unknown=np.ones(before[-1], np.uint8),
-        edges=stacked[2],
         process=describe_integration(surfaces),
     )
 
 
-def describe_integration(surfaces: Sequence[Surface]) -> dict[str, ProcessValue]:
+def describe_integration(surfaces: Sequence[Result]) -> dict[str, ProcessValue]:
     """Return how surfaces were found, for a result's process."""
     if not surfaces:
         return {}
+    processes = [surface.process for surface in surfaces]
     return {
-        "integration": surfaces[0].method,
-        "integration_iterations": max(surface.iterations for surface in surfaces),
-        "integration_residual": max(surface.residual for surface in surfaces),
+        "integration": processes[0]["integration"],
+        "integration_iterations": max(process["integration_iterations"] for process in processes),
+        "integration_residual": max(process["integration_residual"] for process in processes),
     }
 
 
-def _integrate(slopes: Slopes, pixel_size: tuple[float, float], robust: bool, device: Device) -> Surface:
+def _integrate(slopes: Slopes, pixel_size: tuple[float, float], robust: bool, device: Device) -> Result:
     """Return the surface of one picture; one of no pixels, where there is no normal to begin with."""
     if not slopes.known.any():
         return _empty_surface(slopes.known.shape)
@@ -241,25 +239,20 @@ def _integrate(slopes: Slopes, pixel_size: tuple[float, float], robust: bool, de
         budget=_NO_LIMIT,
         device=device,
     )
-    if not (surface.converged or surface.residual <= _TOLERANCE):
-        raise NotConverged(explain(surface.iterations, surface.residual, _TOLERANCE))
+    residual = float(surface.process["integration_residual"])
+    if not (surface.process["integration_converged"] or residual <= _TOLERANCE):
+        raise NotConverged(explain(int(surface.process["integration_iterations"]), residual, _TOLERANCE))
     return surface
 
 
-def _empty_surface(shape: tuple[int, ...]) -> Surface:
+def _empty_surface(shape: tuple[int, ...]) -> Result:
     unknown = np.full(shape, np.nan, np.float32)
-    return Surface(
+    return Result(
         height=unknown,
-        sigma=unknown.copy(),
+        height_sigma=unknown.copy(),
         component=np.full(shape, -1, np.int32),
-        offset_unknown=np.zeros(0, bool),
-        filled=np.zeros(shape, np.uint8),
-        edges=None,
-        iterations=0,
-        residual=0.0,
-        converged=True,
-        method="multigrid",
-        invalid=0,
+        offset_unknown=np.zeros(0, np.uint8),
+        process={"integration": "multigrid", "integration_iterations": 0, "integration_residual": 0.0},
     )
 
 

@@ -85,18 +85,18 @@ def normal_maps(found: io.Result) -> Answer:
     }
 
 
-def surface_maps(found: engine.integration.Surface) -> Answer:
-    """Return what an integration tells; how many rounds it took is its own affair."""
+def surface_maps(found: io.Result) -> Answer:
+    """Return the maps of an integration, without the number of iterations."""
     return {
         "height": found.height,
-        "sigma": found.sigma,
+        "sigma": found.height_sigma,
         "component": found.component,
-        "offset_unknown": found.offset_unknown,
+        "offset_unknown": found.offset_unknown.astype(bool),
         "filled": found.filled,
         "edges": found.edges,
-        "converged": found.converged,
-        "method": found.method,
-        "invalid": found.invalid,
+        "converged": found.process["integration_converged"],
+        "method": found.process["integration"],
+        "invalid": found.process["integration_invalid"],
     }
 
 

@@ -94,7 +94,7 @@ def test_what_functions_return_shows_itself_in_a_few_lines():
     assert "<img" in onset._repr_html_()
     assert onset.plot().get_xlabel() == "column"
     surface = engine.integrate(np.zeros((8, 9)), np.zeros((8, 9)), 0.1)
-    assert repr(surface).startswith("Surface\n  height        8 x 9")
+    assert repr(surface).startswith("Result\n  height        8 x 9")
 
 
 def test_a_recording_shows_itself_in_a_line_and_a_picture(tmp_path):

@@ -50,7 +50,7 @@ def test_planes_are_exact_at_oblique_rays(device, normal):
     found = engine.integrate(normals=normals, camera=camera, device=device)
     assert apart(found.height, depth, np.ones(shape, bool)) < 2e-6
     assert np.mean(np.log(found.height)) == pytest.approx(0, abs=1e-6)
-    assert found.offset_unknown.tolist() == [True]
+    assert found.offset_unknown.tolist() == [1]
 
 
 def test_a_sphere_seen_from_near_converges_with_the_second_order():
@@ -73,7 +73,7 @@ def test_known_depths_tell_the_scale_of_what_they_are_in(device, robust):
     asked = {"normals": normals, "camera": camera, "mask": mask, "device": device, "robust": robust}
     found = engine.integrate(**asked, known_heights=known, known_height_weights=np.where(upper, 9.0, 0.0))
     np.testing.assert_allclose(found.height[upper], depth[upper], rtol=2e-4)
-    assert found.offset_unknown.tolist() == [False, True]
+    assert found.offset_unknown.tolist() == [0, 1]
     lower = mask & ~upper
     assert apart(found.height, depth, lower) < 1e-3
     assert np.mean(np.log(found.height[lower])) == pytest.approx(0, abs=1e-5)
@@ -86,7 +86,7 @@ def test_sigma_is_that_of_the_depth(device):
     asked = {"normals": normals, "camera": camera, "mask": mask, "device": device, "slope_weights": 1e6}
     found = [engine.integrate(**asked, known_heights=one, known_height_weights=4.0) for one in noisy]
     spread = np.std([one.height[mask] for one in found], axis=0)
-    np.testing.assert_allclose(np.sqrt(np.mean(spread**2)), np.nanmean(found[0].sigma), rtol=0.3)
+    np.testing.assert_allclose(np.sqrt(np.mean(spread**2)), np.nanmean(found[0].height_sigma), rtol=0.3)
 
 
 @pytest.mark.filterwarnings("error")
@@ -101,9 +101,9 @@ def test_without_a_camera_lines_of_sight_are_parallel(device):
     weights = 1 / (1 + np.nan_to_num(x**2 + y**2))  # n_z^2: normals are as noisy, not slopes
     expected = engine.integrate(x, y, (0.3, 0.5), slope_weights=weights, device=device)
     np.testing.assert_allclose(found.height, expected.height, atol=1e-5)
-    shares = found.sigma / expected.sigma
+    shares = found.height_sigma / expected.height_sigma
     np.testing.assert_allclose(shares[np.isfinite(x)], np.nanmedian(shares), rtol=1e-3)
-    assert found.invalid == expected.invalid == 9 * SHAPE[1] + 4
+    assert found.process["integration_invalid"] == expected.process["integration_invalid"] == 9 * SHAPE[1] + 4
 
 
 NORMALS, FLAT = np.broadcast_to([0.0, 0, 1], (4, 5, 3)), np.zeros((4, 5))
@@ -114,7 +114,7 @@ BAD = {
     "a camera needs normals": {"dz_dx": FLAT, "dz_dy": FLAT, "camera": CAMERA},
     "normals: shape (4, 5)": {"normals": FLAT, "camera": CAMERA},
     "normals: shape (0, 5, 3)": {"normals": NORMALS[:0], "camera": CAMERA},
-    "pixel_size 0.1: a camera": {"normals": NORMALS, "camera": CAMERA, "pixel_size": 0.1},
+    "pixel_size 0.1: a camera determines it": {"normals": NORMALS, "camera": CAMERA, "pixel_size": 0.1},
     "pixel_size is None": {"normals": NORMALS},
     "nothing to integrate": {"normals": -NORMALS, "camera": CAMERA},
     "known_heights: some are not above 0": {"normals": NORMALS, "camera": CAMERA, "known_heights": FLAT},

@@ -61,7 +61,7 @@ SCENES = {
 @pytest.mark.parametrize(("options", "size", "mean", "doubtful"), SCENES.values(), ids=SCENES)
 def test_sigma_is_that_of_the_noise(options, size, mean, doubtful):
     problem = Problem(FLAT, FLAT, size, **options)
-    sigma = engine.integrate(FLAT, FLAT, size, **{"slope_weights": 1.0, **options}).sigma
+    sigma = engine.integrate(FLAT, FLAT, size, **{"slope_weights": 1.0, **options}).height_sigma
     exact = exact_variance(problem)
     np.testing.assert_array_equal(np.isnan(sigma), np.isnan(exact))
     some = exact > 1e-12  # a pixel alone has no error
@@ -75,9 +75,9 @@ def test_noise_without_weights_is_estimated_from_the_misfit():
     slopes = np.random.default_rng(2).normal(0, 0.07, (2, *SHAPE))
     given = engine.integrate(*slopes, 1.0, mask=DISTANCE < 15, slope_weights=1 / 0.07**2)
     found = engine.integrate(*slopes, 1.0, mask=DISTANCE < 15)
-    np.testing.assert_array_equal(np.isnan(given.sigma), DISTANCE >= 15)
-    np.testing.assert_array_equal(np.isnan(found.sigma), DISTANCE >= 15)
-    ratio = found.sigma / given.sigma
+    np.testing.assert_array_equal(np.isnan(given.height_sigma), DISTANCE >= 15)
+    np.testing.assert_array_equal(np.isnan(found.height_sigma), DISTANCE >= 15)
+    ratio = found.height_sigma / given.height_sigma
     assert np.nanmedian(ratio) == pytest.approx(1, abs=0.05)
     assert np.nanstd(ratio) < 1e-4
 
@@ -85,20 +85,20 @@ def test_noise_without_weights_is_estimated_from_the_misfit():
 def test_sigma_is_the_same_each_time():
     slopes = np.random.default_rng(2).normal(0, 0.07, (2, 9, 11))
     slopes[:, 3, 4] = np.nan
-    first, second = (engine.integrate(*slopes, 1.0).sigma for _ in range(2))
+    first, second = (engine.integrate(*slopes, 1.0).height_sigma for _ in range(2))
     assert np.nanmin(first) > 0
     np.testing.assert_array_equal(first, second)
 
 
 def test_sigma_goes_with_pixel_size_and_noise():
     flat = np.zeros((9, 11))
-    first = engine.integrate(flat, flat, 0.5, slope_weights=1.0).sigma
-    second = engine.integrate(flat, flat, 0.05, slope_weights=4e6).sigma
+    first = engine.integrate(flat, flat, 0.5, slope_weights=1.0).height_sigma
+    second = engine.integrate(flat, flat, 0.05, slope_weights=4e6).height_sigma
     np.testing.assert_allclose(second, first / 10 / 2000, rtol=1e-4)
-    assert engine.integrate(flat, flat, 0.5, sigma=False).sigma is None
+    assert engine.integrate(flat, flat, 0.5, sigma=False).height_sigma is None
     line = np.ones((1, 9))
-    assert np.isnan(engine.integrate(line, line, 1.0).sigma).all()  # no loop, so no misfit
-    assert np.isfinite(engine.integrate(line, line, 1.0, slope_weights=4.0).sigma).all()
+    assert np.isnan(engine.integrate(line, line, 1.0).height_sigma).all()  # no loop, so no misfit
+    assert np.isfinite(engine.integrate(line, line, 1.0, slope_weights=4.0).height_sigma).all()
 
 
 def test_sigma_is_that_of_the_picture_not_of_the_one_before():
@@ -115,7 +115,7 @@ def test_sigma_is_that_of_the_picture_not_of_the_one_before():
     alone = []
     for case in cases:
         engine.integrate(*slopes[:, 1:], 1.0)  # of another shape: nothing is kept
-        alone.append(engine.integrate(*slopes, 1.0, **case).sigma)
+        alone.append(engine.integrate(*slopes, 1.0, **case).height_sigma)
     for case, expected in zip(2 * cases, 2 * alone, strict=True):
-        np.testing.assert_array_equal(engine.integrate(*slopes, 1.0, **case).sigma, expected)
-    np.testing.assert_array_equal(engine.integrate(*slopes, 1.0, **cases[-1]).sigma, alone[-1])
+        np.testing.assert_array_equal(engine.integrate(*slopes, 1.0, **case).height_sigma, expected)
+    np.testing.assert_array_equal(engine.integrate(*slopes, 1.0, **cases[-1]).height_sigma, alone[-1])

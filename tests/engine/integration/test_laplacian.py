@@ -86,7 +86,7 @@ BAD = {
     "links have shapes (3,) and": (np.ones(3), ONES[1]),
     "diagonal: shape (3, 3)": (*ONES, ONES[0]),
     "some are negative": (-ONES[0], ONES[1]),
-    "some are negative or no number": (*ONES, np.full((3, 4), np.nan)),
+    "some are negative or not finite": (*ONES, np.full((3, 4), np.nan)),
 }
 
 
@@ -96,5 +96,5 @@ def test_bad_input_is_refused_in_one_line(message):
         engine.integration.invert_laplacian(*BAD[message])
     assert message in str(error.value)
     assert "\n" not in str(error.value)
-    with pytest.raises(io.InputError, match="no numbers"):
+    with pytest.raises(io.InputError, match="not finite"):
         engine.integration.invert_laplacian(*ONES) @ np.full(12, np.nan)

@@ -88,7 +88,7 @@ def test_what_is_cut_all_round_is_a_component_of_its_own(device):
     surface = engine.integrate(
         *noisy(slopes, 0.01), 1.0, robust=True, initial_heights=truth, sigma=False, device=device
     )
-    assert surface.offset_unknown.tolist() == [True, True]
+    assert surface.offset_unknown.tolist() == [1, 1]
     np.testing.assert_array_equal(surface.component, on)
     for part in (on, ~on):
         off = (surface.height - truth)[part]
@@ -104,7 +104,7 @@ def test_links_that_are_not_there_stay_away():
     surface = engine.integrate(*slopes, 1.0, mask=mask, edges=edges, robust=True, sigma=False)
     good = mask & np.isfinite(slopes[0])
     np.testing.assert_array_equal(np.isfinite(surface.height), good)
-    assert surface.invalid == 12
+    assert surface.process["integration_invalid"] == 12
     assert surface.component[0, 0] != surface.component[0, 47]
     # Edges that are given cut links, and no others are found.
     assert not surface.edges.any()
@@ -123,8 +123,8 @@ def test_the_smallest_pictures_have_heights(device, shape):
 def test_a_search_that_must_stop_says_so():
     slopes = noisy(ramps()[1], 0.02)
     surface = engine.integrate(*slopes, 1.0, robust=True, sigma=False, budget=1e-6)
-    assert not surface.converged
-    assert surface.iterations == 2
+    assert not surface.process["integration_converged"]
+    assert surface.process["integration_iterations"] == 2
 
 
 K, NOISE = 2.0, np.radians(1.0)

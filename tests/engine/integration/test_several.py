@@ -42,18 +42,18 @@ def test_each_surface_is_that_found_alone(device, graph, count):
     given, known = slopes(count), {**GRAPHS[graph], "tolerance": 1e-6, "device": device}
     found = engine.integrate(*given, 0.5, **known)
     assert found.height.shape == (count, *SHAPE)
-    assert found.sigma.shape == found.component.shape == SHAPE
+    assert found.height_sigma.shape == found.component.shape == SHAPE
     for pair, height in zip(np.moveaxis(given, 1, 0), found.height, strict=True):
         alone = engine.integrate(*pair, 0.5, sigma=False, **known)
         np.testing.assert_allclose(height, alone.height, atol=1e-5 * max(1.0, np.nanmax(alone.height)))
-        assert alone.method == found.method
+        assert alone.process["integration"] == found.process["integration"]
         np.testing.assert_array_equal(alone.component, found.component)
 
 
 def test_the_noise_is_that_of_all_surfaces():
     given = np.random.default_rng(1).normal(0, [[[[0.01]], [[0.03]]]], (2, 2, *SHAPE))
-    both = engine.integrate(*given, 1.0, mask=DISC).sigma
-    one, other = (engine.integrate(*given[:, k], 1.0, mask=DISC).sigma for k in (0, 1))
+    both = engine.integrate(*given, 1.0, mask=DISC).height_sigma
+    one, other = (engine.integrate(*given[:, k], 1.0, mask=DISC).height_sigma for k in (0, 1))
     np.testing.assert_allclose(both[DISC], np.sqrt((one**2 + other**2) / 2)[DISC], rtol=1e-3)
 
 
@@ -65,7 +65,7 @@ def test_a_pixel_without_a_slope_of_one_surface_is_left_out_of_all(mask):
     found = engine.integrate(*given, 0.5, mask=mask)
     agreed = engine.integrate(*np.where(lost, np.nan, given), 0.5, mask=mask)
     assert np.isnan(found.height[:, lost]).all()
-    assert found.invalid == agreed.invalid == lost.sum()
+    assert found.process["integration_invalid"] == agreed.process["integration_invalid"] == lost.sum()
     np.testing.assert_array_equal(found.height, agreed.height)
 
 

@@ -235,7 +235,8 @@ def test_heights_that_do_not_converge_are_refused(monkeypatch, robust, residual,
     def miss(*slopes, **options):
         assert options.pop("robust") == robust
         found = engine.integrate(*slopes, **options)
-        return replace(found, converged=False, residual=residual, edges=broken if robust else None)
+        process = {**found.process, "integration_converged": False, "integration_residual": residual}
+        return found.assign(process=process, edges=broken if robust else None)
 
     monkeypatch.setattr("mirrorskin.engine.rotation.normals_to_height.integrate", miss)
     if accepted:
