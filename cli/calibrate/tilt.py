@@ -103,7 +103,7 @@ def _brightness(
 
     import numpy as np
 
-    from mirrorskin.engine.calibration.ball import pixel_size_of
+    from mirrorskin.engine.calibration.sources import pixel_size_of
     from mirrorskin.engine.calibration.brightness import LinearBrightness, WallBrightness
     from mirrorskin.io import InputError
     from mirrorskin.io.calibration.source import check_sizes

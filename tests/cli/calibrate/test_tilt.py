@@ -76,7 +76,7 @@ def test_a_flat_and_a_ball_become_a_precession_in_a_file():
     )
     assert line is not None, ended.out
     assert [float(number) for number in line.groups()] == pytest.approx([2.53, 2.865, 12], abs=0.1)
-    assert ended.said.startswith("note: the phase offset is taken to be within 90 deg of 0")
+    assert ended.said.startswith("note: the phase offset is assumed to be within 90 deg of 0")
     known = io.open_calibration("cal.h5")
     assert known.camera.name == "left"
     assert known.camera.shape == SHAPE
