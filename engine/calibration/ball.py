@@ -51,20 +51,8 @@ def see_ball(
 
     The ball's centre C in the mean pose (pressed, upright) is at ``pivot + R (C - pivot)`` in a pose with the
     rotation R. A line of sight meets the ball's upper side; the sheet touches the ball where that point is
-    above the rest plane, z > 0.
-
-    Parameters
-    ----------
-    sight : ndarray, (4, n)
-        Lines of sight: x and y on the rest plane, mm, and their displacement along x and y per mm of z.
-    centre : array_like, (3,)
-        Centre of the ball in the mean pose, mm.
-    radius : float
-        Radius of the ball, mm.
-    lean : array_like, (T, 2)
-        Lean of the body in each pose, radians; see `rotations`.
-    pivot : array_like, (3,)
-        Centre of the body's rotation, mm.
+    above the rest plane, z > 0. ``sight`` are the lines of sight, (4, n): x and y on the rest plane, mm, and
+    their displacement along x and y per mm of z.
     """
     x, y, slope_x, slope_y = sight
     middle = moved(centre, lean, pivot)
@@ -128,12 +116,8 @@ def follow_ball(frames: NDArray[Any], pixel_size: tuple[float, float], radius: f
     located on rays from the centre.
 
     A circle of radius a implies a centre at sqrt(radius^2 - a^2) below the rest plane. If the light ends
-    before the contact does, the true centre is lower.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        A ball is visible in less than half of the frames.
+    before the contact does, the true centre is lower. InputError if a ball is visible in less than half of
+    the frames.
     """
     centres, sigma = np.full((2, len(frames), 3), np.nan)
     for number, frame in enumerate(frames):

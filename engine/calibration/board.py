@@ -126,12 +126,7 @@ def paint_board(board: Board, dots_per_inch: float) -> NDArray[np.uint8]:
     """Paint a board for printing, black on white, with a margin as wide as a square or the pitch.
 
     Edges are within half a pixel of their position. Markers are of the family 4X4; the diameter of dots is
-    half the pitch.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        The resolution is too low for the details of the board, or the picture would be too large.
+    half the pitch. InputError if the resolution is too low for the details, or the picture too large.
 
     Examples
     --------
@@ -198,12 +193,8 @@ def _cells(
 def mean_of_still(source: Source) -> NDArray[Any]:
     """Return the mean frame of a recording in which nothing moves, (H, W), uint16 or float32.
 
-    The mean of 8-bit frames is scaled to 16 bits, which keeps fractions of a count.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        There are no frames, or the picture changes.
+    The mean of 8-bit frames is scaled to 16 bits, which keeps fractions of a count. InputError if there are no
+    frames, or the picture changes.
     """
     total, count, steps = np.zeros(source.shape[1:]), 0, 0.0
     first = last = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,27 +18,6 @@ Pixels = NDArray[np.intp]
 
 _ZENITH_PER_DEPTH = 0.01  # radians per mm: typical apparent change of the zenith with a mirror's height
 _END = 0.06  # share of the range, at both ends, where scatter makes the linear pattern nonlinear
-
-
-class Brightness(Protocol):
-    """Brightness of a mirror for each pixel of a picture; pixels are numbered row by row."""
-
-    @property
-    def depth_sigma(self) -> float:
-        """Common standard deviation of all depths that are determined from light, mm."""
-
-    def sight(self, pixels: Pixels) -> Doubles:
-        """Return the displacement of lines of sight of pixels, (n,), along x and y per mm of z, (2, n)."""
-
-    def of_counts(self, counts: NDArray[Any], pixels: Pixels) -> Doubles:
-        """Return the brightness of counts of pixels, (..., n); NaN if clipped or unknown."""
-
-    def of_normals(self, normals: Doubles, z: Doubles, pixels: Pixels) -> tuple[Doubles, Mask]:
-        """Return the brightness of mirrors, (N, n), and whether it is within the valid range.
-
-        ``normals`` are unit vectors in the body's frame, (N, n, 3); ``z`` is the mirrors' height above the
-        rest plane, (N, n), mm.
-        """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,18 +43,19 @@ class LinearBrightness:
             ends = [(_per_pixel(level, shape) - offset) / gain for level in (header.dark, header.bright)]
         return cls(offset, gain, np.fmin(*ends), np.fmax(*ends))
 
-    depth_sigma: ClassVar[float] = 0.0  # depths are not determined from light
+    depth_sigma: ClassVar[float] = 0.0
+    """Common standard deviation of all depths determined from light, mm: none are."""
 
     def sight(self, pixels: Pixels) -> Doubles:
         """Return zeros: pixels look straight down."""
         return np.zeros((2, len(pixels)))
 
     def of_counts(self, counts: NDArray[Any], pixels: Pixels) -> Doubles:
-        """Return zeniths, radians."""
+        """Return the zeniths of counts of pixels, (..., n), radians; NaN if clipped or unknown."""
         return (_unclipped(counts) - self.offset[pixels]) / self.gain[pixels]
 
     def of_normals(self, normals: Doubles, z: Doubles, pixels: Pixels) -> tuple[Doubles, Mask]:
-        """Return the zeniths of normals; the range is that in which the pattern is linear."""
+        """Return the zeniths of normals, (N, n, 3), and whether the pattern is linear there."""
         zenith = np.arctan2(np.hypot(normals[..., 0], normals[..., 1]), normals[..., 2])
         low, high = self.low[pixels], self.high[pixels]
         with np.errstate(invalid="ignore"):
@@ -124,19 +104,23 @@ class WallBrightness:
         return float(np.median(sigma)) / _ZENITH_PER_DEPTH if sigma.size else 0.0
 
     def sight(self, pixels: Pixels) -> Doubles:
-        """Return the slopes of the lines of sight."""
+        """Return the displacement of lines of sight along x and y per mm of z, (2, n)."""
         return self.wall.sight_slopes(self.place[:, pixels])
 
     def of_counts(self, counts: NDArray[Any], pixels: Pixels) -> Doubles:
-        """Return shares of full light."""
+        """Return the light of counts of pixels, (..., n), as a share; NaN if clipped or unknown."""
         return (_unclipped(counts) - self.dark[pixels]) / self.span[pixels]
 
     def of_normals(self, normals: Doubles, z: Doubles, pixels: Pixels) -> tuple[Doubles, Mask]:
-        """Return the light of normals."""
+        """Return the light of normals, (N, n, 3), at heights z, (N, n), mm, and whether it is valid."""
         wall = self.wall
         place = np.stack(np.broadcast_arrays(*self.place[:, pixels], z, *self.sight(pixels)))
         geometry = wall.radius, wall.rim, wall.scatter
         return wall_light(place, normals, geometry, wall.lamps, wall.curve, wall.reach)
+
+
+Brightness = LinearBrightness | WallBrightness
+"""Brightness of a mirror for each pixel of a picture; pixels are numbered row by row."""
 
 
 def _per_pixel(values: ArrayLike, shape: tuple[int, int]) -> Doubles:

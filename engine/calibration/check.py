@@ -96,9 +96,8 @@ class Check:
 
     def notes(self) -> list[str]:
         """Return the reasons for missing numbers in the table."""
-        maps = {
-            name: [when[name] for when in (self.before, self.after) if name in when] for name in self.after
-        }
+        both = self.before, self.after
+        maps = {name: [when[name] for when in both if name in when] for name in self.after}
         unknown = [name for name, each in maps.items() if all(math.isnan(one.expected) for one in each)]
         few = [name for name, each in maps.items() if any(np.isnan(one.cells.rms).all() for one in each)]
         notes = []
@@ -175,7 +174,7 @@ def _check_rotation(
         sound = np.isfinite(gain)
         gain, offset = (np.where(sound, values, np.median(values[sound])) for values in (gain, offset))
         plain = replace(calibration, zenith=None, gel=None)
-        scale = {"zenith_gain": gain, "zenith_offset": offset - rim * gain}
+        scale: dict[str, Any] = {"zenith_gain": gain, "zenith_offset": offset - rim * gain}
         source.rewind()
         before = _normal_errors(reconstruct(source, plain, device=device, **scale), truth, cells)
     after = _normal_errors(result, truth, cells)

@@ -52,13 +52,7 @@ def stretch_contrast(picture: NDArray[Any], name: str) -> Doubles:
 
 
 def find_marks(picture: NDArray[Any], board: Board, name: str) -> Marks:
-    """Find the corners of a ChArUco board's markers (four each, marker by marker), or dots, approximately.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        The board is not in the picture.
-    """
+    """Find the corners of a ChArUco board's markers (four each, marker by marker), or dots, approximately."""
     grey = np.clip(np.rint(stretch_contrast(picture, name)), 0, 255).astype(np.uint8)
     if isinstance(board, Dots):
         positions = _find_dots(grey, board)
@@ -178,20 +172,9 @@ def centre_marks(picture: NDArray[Any], starts: Doubles, radius: float) -> tuple
     found by Gauss-Newton steps with the weights (1 - d^2 / radius^2)^2. The picture is interpolated by cubic
     splines after a slight blur, because splines oscillate next to a sharp edge.
 
-    Parameters
-    ----------
-    picture : ndarray, (H, W)
-        With a contrast of about 255.
-    starts : ndarray, (n, 2)
-        Columns and rows.
-    radius : float
-        Radius of the circle, pixels.
-
-    Returns
-    -------
-    places : ndarray, (n, 2)
-    found : ndarray, (n,), bool
-        Whether there is such a centre near the start, with the whole circle in the picture.
+    ``picture`` has a contrast of about 255, ``starts`` are columns and rows, (n, 2), and ``radius`` is that of
+    the circle, pixels. Returned are the places, and whether there is such a centre near the start, with the
+    whole circle in the picture.
     """
     from scipy import ndimage
 
