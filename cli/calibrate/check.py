@@ -1,4 +1,4 @@
-"""``mirrorskin calibrate check``: what errors are left on a ball that the calibration has not seen."""
+"""``mirrorskin calibrate check``: errors that remain on a ball that was not used for the calibration."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from mirrorskin.cli.groups import Argument, Option
 
 def command(
     recording: Annotated[
-        Path, Argument(metavar="REC.h5", help="A ball pressed, or rotated about, that was not used.")
+        Path, Argument(metavar="REC.h5", help="A press or rotation of a ball that was not used.")
     ],
     calibration: Annotated[Path, Option(metavar="CAL.h5", help="Calibration to check.")],
     ball: Annotated[str, Option(metavar="LENGTH", help="Diameter of the ball: 6mm.")],
-    cells: Annotated[int, Option(metavar="N", help="Cells a side into which the field is cut.")] = 8,
+    cells: Annotated[int, Option(metavar="N", help="Number of cells along each side of the field.")] = 8,
     picture: Annotated[
-        Path | None, Option("--output", "-o", metavar="PNG", help="Picture of the errors to write.")
+        Path | None, Option("--output", "-o", metavar="PNG", help="Picture of the errors.")
     ] = None,
     device: options.Device = None,
     as_json: options.Json = False,
@@ -35,16 +35,15 @@ def command(
     if picture is not None:
         check_drawing()
         io.check_output(picture, recording, calibration)
-    known = io.open_calibration(calibration)
     with io.open_recording(recording) as source:
-        found = check_ball(source, known, length(ball, "--ball"), cells=cells, device=device)
+        parts = io.open_calibration(calibration), length(ball, "--ball")
+        errors = check_ball(source, *parts, cells=cells, device=device)
     if picture is not None:
-        check_figure(found, f"{recording.name}: a ball of {ball}", picture)
+        check_figure(errors, f"{recording.name}: a ball of {ball}", picture)
     if as_json:
-        print_json(found.numbers())
+        print_json(errors.numbers())
         return
-    head = ("what", "when", "rms", "bias", "worst cell's rms", "expected", "pixels")
-    print_table(head, found.table())
-    for note in found.notes():
+    print_table(("what", "when", "rms", "bias", "worst cell's rms", "expected", "pixels"), errors.table())
+    for note in errors.notes():
         click.echo(note)
-    click.echo(f"ball of {found.ball:g} mm found at {found.place[0]:.3f}, {found.place[1]:.3f} mm")
+    click.echo(f"ball of {errors.ball:g} mm found at {errors.place[0]:.3f}, {errors.place[1]:.3f} mm")

@@ -1,4 +1,4 @@
-"""``mirrorskin calibrate elastic``: how the gel gives way, from a ball of known size."""
+"""``mirrorskin calibrate elastic``: the gel's compliance, from a ball of calibration size."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from mirrorskin.engine.calibration.gel import BallOnset, GelFit
     from mirrorskin.io import Calibration, Source
 
-_STEP, _PRESS = 0.03, "1.2mm"  # mm of a step
+_STEP, _PRESS = 0.03, "1.2mm"  # defaults with --rig: step, mm, and travel
 
 
 def command(
@@ -29,7 +29,7 @@ def command(
         Argument(metavar="REC.h5...", help="Vertical recordings of the ball, at one place or more."),
     ] = None,
     sheet: Annotated[
-        str, Option(metavar="LENGTH", help="Thickness of what lies between mirror and ball.")
+        str, Option(metavar="LENGTH", help="Thickness of the material between mirror and ball.")
     ] = "0.05mm",
     rig: inputs.OptionalRig = None,
     places: inputs.Places = 1,
@@ -38,9 +38,9 @@ def command(
     overwrite: inputs.Overwrite = False,
     device: options.Device = None,
     as_json: options.Json = False,
-    **given: Annotated[Any, STACK.only("travel_step", "travel_start", "pixel_size")],
+    **stack: Annotated[Any, STACK.only("travel_step", "travel_start", "pixel_size")],
 ) -> None:
-    """Learn when the sheet turns light and how far the stage gives way, from presses of a ball."""
+    """Learn the slope at which the sheet turns bright, and the stage's compliance, from presses of a ball."""
     from mirrorskin import io
     from mirrorskin.cli.quantity import length
     from mirrorskin.engine.calibration.gel import fit_gel
@@ -48,35 +48,34 @@ def command(
     paths = list(presses or [])
     radius, thickness = length(ball, "--ball") / 2, length(sheet, "--sheet")
     if thickness < 0:
-        raise io.InputError(f"--sheet {sheet} cannot be: give a thickness of 0 or more")
-    known = inputs.check_call(output, paths, rig, press=press, settle=settle, overwrite=overwrite)
+        raise io.InputError(f"--sheet {sheet}: a thickness must not be negative")
+    calibration = inputs.check_call(output, paths, rig, press=press, settle=settle, overwrite=overwrite)
     if rig is not None:
         from mirrorskin.hw.rig.plans import VerticalPlan
 
         plan = VerticalPlan(
-            given.pop("travel_start", 0.0),
+            stack.pop("travel_start", 0.0),
             length(press or _PRESS, "--press"),
-            step=given.pop("travel_step", _STEP),
+            step=stack.pop("travel_step", _STEP),
         )
         prompt = "put the ball at place {} of {}, near the middle of the field"
         balls = inputs.at_each("elastic", prompt, places, plan)
         paths = inputs.take(rig, output, balls, settle, overwrite)
-    stack = stack_options(given)
-    with inputs.open_all(paths, stack, known, output) as (sources, camera):
-        fit = fit_gel([_onset(source, known, radius, device) for source in sources], sheet=thickness)
+    with inputs.open_all(paths, stack_options(stack), calibration, output) as (sources, camera):
+        fit = fit_gel([_onset(source, calibration, radius, device) for source in sources], sheet=thickness)
         process = inputs.process_of(
             sources[0],
-            sources=inputs.names_of(paths),
+            sources=paths,
             ball=ball,
             sheet=sheet,
-            untold=", ".join(fit.undetermined) or "nothing",
+            undetermined=", ".join(fit.undetermined) or "nothing",
         )
     io.update_calibration(output, fit.gel, camera, process)
     _report(output, fit, as_json)
 
 
-def _onset(source: Source, known: Calibration | None, radius: float, device: str | None) -> BallOnset:
-    """Find when the ball turned pixels light, by the references that are known so far."""
+def _onset(source: Source, calibration: Calibration | None, radius: float, device: str | None) -> BallOnset:
+    """Return the onsets of light in a ball's press, with the references of the calibration."""
     from mirrorskin import io
     from mirrorskin.cli.output import progress
     from mirrorskin.engine.calibration.gel import ball_onset
@@ -85,7 +84,7 @@ def _onset(source: Source, known: Calibration | None, radius: float, device: str
 
     if source.motion != "vertical":
         raise io.InputError(f"{source.name} is of {source.motion} motion: give presses of a ball")
-    plain = source if known is None else io.Calibrated(source, replace(known, gel=None))
+    plain = source if calibration is None else io.Calibrated(source, replace(calibration, gel=None))
     with progress("pressing", source.shape[0]) as show:
         press = Press(threshold=LEARNED_AT, fill=False, device=device)
         result = press.run(plain, show, undistort=False)
@@ -97,22 +96,22 @@ def _report(output: Path, fit: GelFit, as_json: bool) -> None:
 
     gel = fit.gel
     if as_json:
-        print_json({"output": str(output), "gel": gel, "balls": fit.places, "untold": fit.undetermined})
+        print_json({"output": str(output), "gel": gel, "balls": fit.places, "undetermined": fit.undetermined})
         return
     sigma = gel.sigma
     parts = [
-        f"light from {math.degrees(gel.threshold):.2f} +- {math.degrees(sigma['threshold']):.2f} deg",
+        f"bright from {math.degrees(gel.threshold):.2f} ± {math.degrees(sigma['threshold']):.2f} deg",
         *(
-            f"{name} {getattr(gel, name):.3f} +- {sigma[name]:.3f} /mm"
+            f"{name} {getattr(gel, name):.3f} ± {sigma[name]:.3f} /mm"
             for name in ("compliance", "curvature")
             if name not in fit.undetermined
         ),
-        f"met at a travel of {gel.travel_zero:.3f} +- {sigma['travel_zero']:.3f} mm",
-        f"{gel.error:.3f} mm left",
+        f"contact at a travel of {gel.travel_zero:.3f} ± {sigma['travel_zero']:.3f} mm",
+        f"residual {gel.error:.3f} mm",
     ]
     click.echo(f"{output}: {', '.join(parts)}")
     for name in fit.undetermined:
         click.echo(
-            f"{name}: not determined by the presses, 0 is kept; press deeper, at more places or larger balls",
+            f"{name}: not determined by the presses, left at 0; press deeper, at more places or larger balls",
             err=True,
         )

@@ -1,4 +1,4 @@
-"""What a part of a calibration is found from: recordings that are named, or taken on a rig."""
+"""Recordings for a part of a calibration: named ones, or ones that are captured on a rig."""
 
 from __future__ import annotations
 
@@ -16,14 +16,13 @@ from mirrorskin.cli.groups import Option
 if TYPE_CHECKING:
     from mirrorskin.cli.stack import StackOptions
     from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
-    from mirrorskin.hw.rig.rig import Rig
     from mirrorskin.io import Calibration, CameraId, Source
     from mirrorskin.io.types import ProcessValue
 
 TILT, _PHASE_STEP = "2.5deg", "45deg"
 BALL = "put the ball at place {} of {}, all over the field"
 _BLOCK = 16  # frames that are read at a time, at most
-_STILL = 0.05  # mm that the body moves in a recording of it at rest: a press has two steps at least
+_STILL = 0.05  # mm: movement of the body "at rest", because a press has at least two steps
 
 OptionalRig = Annotated[
     Path | None,
@@ -36,11 +35,11 @@ Settle = Annotated[
     str | None,
     Option(metavar="TIME", help="With --rig: time from rest to the first exposure.", show_default="100ms"),
 ]
-Places = Annotated[int, Option(min=1, help="With --rig: of the ball.")]
+Places = Annotated[int, Option(min=1, help="With --rig: number of places of the ball.")]
 
 
 def press_option(example: str) -> Any:
-    """Return the option of how deep a rig presses."""
+    """Return the option for the travel of a press on a rig."""
     return Option(metavar="LENGTH", help=f"With --rig: how far the body is lowered: {example}.")
 
 
@@ -51,14 +50,14 @@ def check_call(
     plates: Sequence[Path] = (),
     **options: str | bool | None,
 ) -> Calibration | None:
-    """Check where recordings come from and where the calibration goes; return the one that is added to.
+    """Check inputs and output, and return the calibration to which a part is added.
 
-    Recordings of presses are named or taken on a rig, not both; ``options`` need a rig.
+    Presses are either named or captured on a rig; ``options`` need a rig.
     """
     from mirrorskin import io
 
     if rig is None and not (presses or plates):
-        raise io.InputError("no recordings: name those of a ball, or take them with --rig RIG.toml")
+        raise io.InputError("no recordings: name those of a ball, or capture them with --rig RIG.toml")
     if rig is not None and presses:
         raise io.InputError("recordings and --rig both give the presses: leave one of them out")
     for name, value in options.items():
@@ -70,38 +69,38 @@ def check_call(
 
 @contextmanager
 def open_all(
-    paths: Sequence[Path], options: StackOptions, known: Calibration | None, output: Path
+    paths: Sequence[Path], options: StackOptions, calibration: Calibration | None, output: Path
 ) -> Iterator[tuple[list[Source], CameraId]]:
-    """Open recordings with the pixel size of the known scale, and find which camera all are of."""
+    """Open recordings with the pixel size of the calibration's scale, and return them and their camera."""
     from mirrorskin import io
     from mirrorskin.io.calibration.source import differ
 
-    if known is not None and known.lens is not None:
-        size = known.lens.pixel_size
-        given = options.get("pixel_size", size)
-        if differ(given, size):
+    if calibration is not None and calibration.lens is not None:
+        size = calibration.lens.pixel_size
+        option = options.get("pixel_size", size)
+        if differ(option, size):
             raise io.InputError(
-                f"--pixel-size says {given[0]:.5g} mm, the scale of {known.name} {size[0]:.5g} mm:"
-                " leave it out"
+                f"--pixel-size {option[0]:.5g} mm: the scale of {calibration.name} is {size[0]:.5g} mm;"
+                " remove the option"
             )
         options = options | {"pixel_size": size}
     with ExitStack() as opening:
         sources = [opening.enter_context(io.open_recording(path, **options)) for path in paths]
-        yield [*sources], _one_camera(sources, known, output)
+        yield [*sources], _one_camera(sources, calibration, output)
 
 
 def camera_name(names: Sequence[str]) -> str:
-    """Return the one camera that recordings are of; empty names are unknown."""
+    """Return the name of the only camera of recordings; an empty name is unknown."""
     from mirrorskin.io import InputError
 
-    known = set(names) - {""}
-    if len(known) > 1:
-        raise InputError(f"the recordings are of {' and '.join(sorted(known))}: take all with one camera")
-    return "".join(known)
+    cameras = set(names) - {""}
+    if len(cameras) > 1:
+        raise InputError(f"the recordings are of {' and '.join(sorted(cameras))}: take all with one camera")
+    return "".join(cameras)
 
 
-def _one_camera(sources: Sequence[Source], known: Calibration | None, output: Path) -> CameraId:
-    """Return the camera of all recordings, which is that of the known calibration."""
+def _one_camera(sources: Sequence[Source], calibration: Calibration | None, output: Path) -> CameraId:
+    """Return the camera of all recordings, which is that of the calibration."""
     from mirrorskin import io
     from mirrorskin.io.calibration.source import check_camera
 
@@ -114,34 +113,33 @@ def _one_camera(sources: Sequence[Source], known: Calibration | None, output: Pa
                 f"{source.name} is of {camera}, {sources[0].name} of {first}: take all with one camera"
             )
     camera = io.CameraId(name, first.shape, first.dtype)
-    if known is not None:
-        check_camera(known, camera, sources[0].name, f"name another file than {output} with -o")
+    if calibration is not None:
+        check_camera(calibration, camera, sources[0].name, f"name another file than {output} with -o")
     return camera
 
 
-def process_of(source: Source | None = None, **facts: ProcessValue) -> dict[str, ProcessValue]:
-    """Return how a part came about: program, date, facts, and the pixel size of a source."""
+def process_of(source: Source | None = None, **facts: ProcessValue | list[Path]) -> dict[str, ProcessValue]:
+    """Return the provenance of a part: program, date, facts, and the pixel size of a source."""
     from mirrorskin.engine.provenance import signature
     from mirrorskin.io.calibration.source import size_facts
 
     size = None if source is None else source.header.pixel_size
-    return {**signature(), **facts, **({} if size is None else size_facts(size))}
-
-
-def names_of(paths: Sequence[Path]) -> str:
-    """Return paths as a process keeps them."""
-    return ", ".join(map(str, paths))
+    texts = {
+        name: ", ".join(map(str, value)) if isinstance(value, list) else value
+        for name, value in facts.items()
+    }
+    return {**signature(), **texts, **({} if size is None else size_facts(size))}
 
 
 # --- on a rig -----------------------------------------------------------------------------------------------
 
 
 class Place(NamedTuple):
-    """A recording that is to be taken."""
+    """A recording that is captured."""
 
-    name: str  # what its file is named by: "dark", "ball-1"
-    prompt: str  # what the user is to do before: "put the ball at place 1 of 9"
-    plan: Plan  # what the body does then
+    name: str  # part of the file's name: "dark", "ball-1"
+    prompt: str  # instruction for the user: "put the ball at place 1 of 9"
+    plan: Plan  # movement of the body
     frames: int = 1  # at each step of a plan in steps
 
 
@@ -152,12 +150,15 @@ def take(
     settle: str | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Take recordings, and keep them next to the calibration: CAL-dark.h5 for CAL.h5 and a place "dark".
+    """Capture recordings into files next to the calibration: CAL-dark.h5 for CAL.h5 and a place "dark".
 
-    The body is lifted, then the user is asked to make each place ready and to press Enter. Plans and files
-    are checked before anything moves.
+    For each place the body is lifted, and the user is asked to follow the prompt and to press Enter. Plans
+    and files are checked before any movement.
     """
+    import numpy as np
+
     from mirrorskin import io
+    from mirrorskin.cli.output import progress
     from mirrorskin.cli.quantity import duration
     from mirrorskin.hw.rig.plans import check_plan
     from mirrorskin.hw.rig.rig import open_rig
@@ -166,25 +167,34 @@ def take(
     settings = load_rig(rig_file)
     seconds = None if settle is None else duration(settle, "--settle")
     if seconds is not None and seconds < 0:
-        raise io.InputError(f"--settle {settle}: a time of at least 0 is needed")
+        raise io.InputError(f"--settle {settle}: a time must not be negative")
     paths = [calibration.with_name(f"{calibration.stem}-{place.name}.h5") for place in places]
     for place, path in zip(places, paths, strict=True):
         check_plan(place.plan, settings.stage, settings.name)
         io.check_output(path, rig_file, replaces="anything" if overwrite else "nothing")
     with open_rig(settings) as rig:
         for place, path in zip(places, paths, strict=True):
-            _take_one(rig, place, path, seconds, overwrite)
+            scan = scans.make_scan(rig, place.plan, seconds, place.frames)
+            scan.lift()
+            click.echo(f"{place.prompt}, then press Enter", err=True)
+            if not sys.stdin.readline():  # end of input
+                raise click.Abort
+            recorder = io.StreamRecorder(scan, path, overwrite=overwrite)
+            with scans.kept(recorder), recorder, progress(place.name, recorder.shape[0]) as show:
+                buffer = np.empty((_BLOCK, *recorder.shape[1:]), recorder.dtype)
+                while recorder.read(buffer) is not None:
+                    show(recorder.count)
     return paths
 
 
 def at_each(part: str, prompt: str, count: int, plan: Plan, frames: int = 1) -> list[Place]:
-    """Return the same plan at several places; the prompt has room for their number and count."""
+    """Return one plan at several places; the prompt is a format for the number and the count of places."""
     numbers = range(1, count + 1)
     return [Place(f"{part}-{n}", prompt.format(n, count), plan, frames) for n in numbers]
 
 
 def turn_plan(press: str | None, tilt: float | None, phase_step: float | None, example: str) -> AxialPlan:
-    """Return the plan of a turn on a ball: eight steps and a tilt of 2.5 degrees unless given."""
+    """Return the plan of a rotation on a ball, by default of eight steps and a tilt of 2.5 degrees."""
     from mirrorskin.cli.quantity import angle, length
     from mirrorskin.hw.rig.plans import AxialPlan
     from mirrorskin.io import InputError
@@ -201,27 +211,9 @@ def turn_plan(press: str | None, tilt: float | None, phase_step: float | None, e
 
 
 def still_plan(rig_file: Path, travel: float | None = None) -> VerticalPlan:
-    """Return a plan in which the body all but stands still, lifted or at a travel, mm."""
+    """Return a plan in which the body hardly moves, lifted or at a travel, mm."""
     from mirrorskin.hw.rig.plans import VerticalPlan
     from mirrorskin.hw.rig_file import load_rig
 
     start = load_rig(rig_file).stage.limits.travel[0] if travel is None else travel - _STILL
     return VerticalPlan(start, start + _STILL, step=_STILL)
-
-
-def _take_one(rig: Rig, place: Place, path: Path, settle: float | None, overwrite: bool) -> None:
-    import numpy as np
-
-    from mirrorskin import io
-    from mirrorskin.cli.output import progress
-
-    scan = scans.make_scan(rig, place.plan, settle, place.frames)
-    scan.lift()
-    click.echo(f"{place.prompt}, then press Enter", err=True)
-    if not sys.stdin.readline():  # nobody is there
-        raise click.Abort
-    recorder = io.StreamRecorder(scan, path, overwrite=overwrite)
-    with scans.kept(recorder), recorder, progress(place.name, recorder.shape[0]) as show:
-        room = np.empty((_BLOCK, *recorder.shape[1:]), recorder.dtype)
-        while recorder.read(room) is not None:
-            show(recorder.count)

@@ -1,4 +1,4 @@
-"""``mirrorskin calibrate references``: what each pixel counts without and with full light."""
+"""``mirrorskin calibrate references``: the counts of each pixel without light and in full light."""
 
 from __future__ import annotations
 
@@ -18,9 +18,7 @@ if TYPE_CHECKING:
     from mirrorskin.engine.calibration.references import Measured
     from mirrorskin.io import CameraId, Source
 
-_FRAMES = 64
-_PLACES = 9
-_ROUNDS = 4  # of taking what is still missing on a rig
+_ROUNDS = 4  # of captures on a rig, at most, until a stated noise is reached
 
 _PROMPTS = {
     "dark": "take everything off the sheet, with the lamps as they are in a press",
@@ -33,7 +31,7 @@ def command(
     output: options.LearnedCalibration,
     dark: Annotated[
         list[Path] | None,
-        Option(metavar="REC.h5", help="Recording or folder of pictures of a sheet that touches nothing."),
+        Option(metavar="REC.h5", help="Recording, or folder of pictures, of a sheet that touches nothing."),
     ] = None,
     bright: Annotated[
         list[Path] | None,
@@ -41,24 +39,24 @@ def command(
     ] = None,
     rolled: Annotated[
         bool,
-        Option("--rolled", help="Bright: a ball rolled about, so that all are in full light sometimes."),
+        Option("--rolled", help="Bright frames are of a rolled ball: full light in some frames only."),
     ] = False,
     noise: Annotated[
         float | None, Option(metavar="COUNTS", help="Greatest standard error of a reference: 0.1.")
     ] = None,
     rig: inputs.OptionalRig = None,
     frames: Annotated[
-        int, Option(min=2, help="With --rig: of each level, or of the ball at each place.")
-    ] = _FRAMES,
-    places: Annotated[int, Option(min=1, help="With --rig and --rolled: of the ball.")] = _PLACES,
+        int, Option(min=2, help="With --rig: frames of each level, or of the ball at each place.")
+    ] = 64,
+    places: Annotated[int, Option(min=1, help="With --rig and --rolled: places of the ball.")] = 9,
     press: Annotated[
         str | None,
-        Option(metavar="LENGTH", help="With --rig and --rolled: how far the body is lowered: 2mm."),
+        Option(metavar="LENGTH", help="With --rig and --rolled: travel of the body: 2mm."),
     ] = None,
     overwrite: inputs.Overwrite = False,
     as_json: options.Json = False,
 ) -> None:
-    """Average dark and bright references to a stated noise, and find hot, dead and saturated pixels."""
+    """Measure dark and bright references, and find hot, dead and saturated pixels."""
     from mirrorskin import io
 
     darks, brights = list(dark or []), list(bright or [])
@@ -73,16 +71,17 @@ def command(
         missing = _missing(measured, noise, rig is None or rolled)
         if rig is None or not missing:
             break
-        more = {name: _still(name, rig, count, number) for name, count in missing.items()}
-        for name, place in more.items():
+        for name, count in missing.items():
+            place = _still(name, rig, count, number)
             paths = inputs.take(rig, output, [place], overwrite=overwrite)
             (darks if name == "dark" else brights).extend(paths)
         measured, camera = _measure(darks, brights, rolled)
     _missing(measured, noise, True)
-    process = inputs.process_of(bright_light="of a ball rolled about" if rolled else "of a flat field")
-    for name, level, paths in (("dark", measured.dark, darks), ("bright", measured.bright, brights)):
-        process[f"{name}_sources"] = inputs.names_of(paths)
-        process |= {f"{name}_{key}": value for key, value in asdict(level).items()}
+    process = inputs.process_of(
+        bright_light="of a ball rolled about" if rolled else "of a flat field",
+        **{f"dark_{key}": value for key, value in {"sources": darks, **asdict(measured.dark)}.items()},
+        **{f"bright_{key}": value for key, value in {"sources": brights, **asdict(measured.bright)}.items()},
+    )
     io.update_calibration(output, measured.references, camera, process)
     _report(output, measured, as_json)
 
@@ -98,13 +97,13 @@ def _check_call(
 ) -> None:
     from mirrorskin.io import InputError
 
-    missing = [option for option, given in (("--dark", darks), ("--bright", brights)) if not given]
+    missing = [option for option, paths in (("--dark", darks), ("--bright", brights)) if not paths]
     if missing and rig is None:
         raise InputError(
-            f"{' and '.join(missing)} missing: name recordings, or take them with --rig RIG.toml"
+            f"{' and '.join(missing)} missing: name recordings, or capture them with --rig RIG.toml"
         )
     if noise is not None and not noise > 0:
-        raise InputError(f"--noise {noise:g}: no number of frames is enough for that: give some counts")
+        raise InputError(f"--noise {noise:g}: no number of frames reaches that: give a number above 0")
     if overwrite and rig is None:
         raise InputError("--overwrite is for recordings taken with --rig: remove it")
     if press is not None and (rig is None or not rolled):
@@ -116,7 +115,7 @@ def _check_call(
 
 
 def _still(name: str, rig: Path, frames: int, number: int = 1) -> inputs.Place:
-    """Return how a level is taken: half of the frames at each of two places that nearly coincide."""
+    """Return the capture of a level: half of the frames at each of two positions that nearly coincide."""
     file = name if number == 1 else f"{name}-{number}"
     return inputs.Place(file, _PROMPTS[name], inputs.still_plan(rig), max(1, -(-frames // 2)))
 
@@ -143,7 +142,7 @@ def _measure(darks: Sequence[Path], brights: Sequence[Path], rolled: bool) -> tu
 
 
 def _open(path: Path) -> Source:
-    """Open frames; where the body was in those of a folder does not matter."""
+    """Open a recording or a folder of pictures; the positions of the body are irrelevant."""
     from mirrorskin import io
     from mirrorskin.io.pictures import PICTURE_SUFFIXES
 
@@ -153,21 +152,21 @@ def _open(path: Path) -> Source:
 
 
 def _missing(measured: Measured, noise: float | None, refuse: bool) -> dict[str, int]:
-    """Count the frames that a stated noise still needs, by level, or refuse to go on with too few."""
+    """Return the number of frames that a stated noise still needs, by level, or raise InputError."""
     from mirrorskin.io import InputError
 
     missing: dict[str, int] = {}
     for name, level in (("dark", measured.dark), ("bright", measured.bright)):
         count = 0 if noise is None else level.missing(noise)
-        known = f"{name}: the standard error is {level.sigma:.3g} counts"
+        error = f"{name}: the standard error is {level.sigma:.3g} counts"
         if count is None:
             raise InputError(
-                f"{known}, of which rounding leaves {level.rounding:.2g} with any number of frames:"
-                f" give a --noise above that"
+                f"{error}; {level.rounding:.2g} of it is due to rounding with any number of frames: give a"
+                " --noise above that"
             )
         if count and refuse:
             raise InputError(
-                f"{known}: {count} more frames than {level.frames} are needed for --noise {noise:g}"
+                f"{error}: {count} more frames than {level.frames} are needed for --noise {noise:g}"
             )
         if count:
             missing[name] = count
@@ -190,7 +189,7 @@ def _report(output: Path, measured: Measured, as_json: bool) -> None:
         for name, level in levels.items():
             drift = f", drift {level.drift:+.2g}" if np.isfinite(level.drift) else ""
             parts.append(
-                f"{name} {float(np.nanmedian(getattr(references, name))):.2f} +- {level.sigma:.2g} counts"
+                f"{name} {float(np.nanmedian(getattr(references, name))):.2f} ± {level.sigma:.2g} counts"
                 f" ({level.frames} frames of noise {level.noise:.3g}{drift})"
             )
         counts = ", ".join(f"{count} {name}" for name, count in defects.items())
@@ -200,7 +199,7 @@ def _report(output: Path, measured: Measured, as_json: bool) -> None:
             click.echo(f"{name} drifts by {level.drift:+.2g} counts: let camera and lamps warm up", err=True)
         if level.clipped:
             click.echo(
-                f"{name}: samples of {level.clipped} pixels lie on the end of the scale; their mean was"
-                f" corrected for it; better {_REMEDIES[name]}",
+                f"{name}: {level.clipped} pixels have samples at the end of the scale; their means were"
+                f" corrected; better {_REMEDIES[name]}",
                 err=True,
             )

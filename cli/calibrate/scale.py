@@ -1,4 +1,4 @@
-"""``mirrorskin calibrate board`` and ``scale``: a board to print, and where on the sheet the pixels look."""
+"""``mirrorskin calibrate board`` and ``scale``: a board to print, and positions of pixels on the sheet."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from mirrorskin.engine.calibration.lens import LensFit
     from mirrorskin.io import CameraId
 
-_PLACES = 5
-_SHOTS = 8
+_SHOTS = 8  # frames at each of two positions that nearly coincide
 
 BoardText = Annotated[
     str,
@@ -45,25 +44,25 @@ def board_of(text: str) -> Board:
     if size is None or count is None or len(numbers) != 1 + count:
         raise InputError(f"--board {text}: write e.g. charuco:7x5:2mm:1.5mm, or dots:11x9:1mm")
     columns, rows = int(size[1]), int(size[2])
-    lengths = [length(one, "--board") for one in numbers[1:]]
+    lengths = [length(number, "--board") for number in numbers[1:]]
     return Charuco(columns, rows, *lengths) if count == 2 else Dots(columns, rows, *lengths)
 
 
 def board_command(
     output: Annotated[Path, Option("--output", "-o", metavar="BOARD.png", help="Picture to write.")],
     board: BoardText,
-    dpi: Annotated[float, Option(help="Pixels per inch, to be printed at that.")] = 2540.0,
+    dpi: Annotated[float, Option(help="Resolution of the printer, pixels per inch.")] = 2540.0,
 ) -> None:
-    """Paint a board for printing, in its true size."""
+    """Paint a board for printing in its true size."""
     from mirrorskin.engine.calibration.board import paint_board
     from mirrorskin.io import InputError, check_output
     from mirrorskin.io.pictures import save_print
 
     kind = board_of(board)
     if output.suffix.lower() != ".png":
-        raise InputError(f"{output}: a board is written as PNG, which keeps its size: name it board.png")
+        raise InputError(f"{output}: a board is written as PNG, which stores its size: name it board.png")
     if not 1 <= dpi <= 100_000:
-        raise InputError(f"--dpi {dpi:g}: pixels per inch of a printer are needed, such as 2540")
+        raise InputError(f"--dpi {dpi:g}: give the pixels per inch of a printer, such as 2540")
     check_output(output)
     picture = paint_board(kind, dpi)
     save_print(picture, output, dpi)
@@ -82,17 +81,17 @@ def command(
         list[Path] | None,
         Argument(
             metavar="PICTURE-OR-RECORDING...",
-            help="Of the board, flat on the sheet, at several places and turned.",
+            help="Of the board, flat on the sheet, at several positions and orientations.",
         ),
     ] = None,
     rig: inputs.OptionalRig = None,
-    places: Annotated[int, Option(min=1, help="With --rig: of the board.")] = _PLACES,
+    places: Annotated[int, Option(min=1, help="With --rig: places of the board.")] = 5,
     overwrite: inputs.Overwrite = False,
     as_json: options.Json = False,
 ) -> None:
-    """Find millimetres per pixel, perspective and distortion from a board on the sheet.
+    """Determine millimetres per pixel, perspective and distortion from a board on the sheet.
 
-    One picture is enough where the board fills it; with several, the board need not.
+    One picture is enough if the board fills it; otherwise take several.
     """
     from mirrorskin import io
     from mirrorskin.engine.calibration.lens import calibrate_lens
@@ -101,23 +100,19 @@ def command(
 
     kind, paths = board_of(board), list(pictures or [])
     if not paths and rig is None:
-        raise io.InputError("no picture of a board is given: name some, or take them with --rig RIG.toml")
+        raise io.InputError("no picture of a board is given: name some, or capture them with --rig RIG.toml")
     if overwrite and rig is None:
         raise io.InputError("--overwrite is for recordings taken with --rig: remove it")
     io.check_output(output, *paths, rig, replaces="calibration")
     if rig is not None:
-        prompt = (
-            "lay the board flat on the sheet, place {} of {}, turned and moved from the others, up to the"
-            " corners"
-        )
-        plan = inputs.still_plan(rig)
-        boards = inputs.at_each("board", prompt, places, plan, _SHOTS)
+        prompt = "lay the board flat on the sheet, place {} of {}, turned and moved, also to the corners"
+        boards = inputs.at_each("board", prompt, places, inputs.still_plan(rig), _SHOTS)
         paths += inputs.take(rig, output, boards, overwrite=overwrite)
     read, camera = _read(paths, output)
     fit = calibrate_lens(read, kind)
     process = inputs.process_of(
         board=str(kind),
-        sources=inputs.names_of(paths),
+        sources=paths,
         marks=sum(fit.marks),
         worst=fit.worst,
         corner_sigma=fit.corner_sigma,
@@ -130,7 +125,7 @@ def command(
 
 
 def _read(paths: Sequence[Path], output: Path) -> tuple[list[tuple[str, NDArray[Any]]], CameraId]:
-    """Return all pictures, the means of recordings, and their camera."""
+    """Return pictures and the means of recordings with their names, and the camera."""
     from mirrorskin import io
     from mirrorskin.engine.calibration.board import mean_of_still
     from mirrorskin.io.pictures import PICTURE_SUFFIXES, read_picture
@@ -148,7 +143,7 @@ def _read(paths: Sequence[Path], output: Path) -> tuple[list[tuple[str, NDArray[
             pictures.append(mean_of_still(recording))
             names.append(recording.header.camera)
             dtypes.append(recording.dtype)
-    # A picture need not be saved in the camera's type of sample: that of a recording or the file is right.
+    # The type of a picture may differ from the camera's: that of a recording or of the file is preferred.
     if not dtypes and output.exists():
         dtypes = [io.open_calibration(output).camera.dtype]
     first = pictures[0]
@@ -171,8 +166,8 @@ def _report(output: Path, fit: LensFit, paths: Sequence[Path], as_json: bool) ->
         print_json({"output": str(output), **sizes, **errors, **rest})
         return
     click.echo(
-        f"{output}: {1000 * size:.4f} +- {1000 * size * lens.scale_sigma:.2g} um a pixel"
-        f" ({lens.scale_sigma:.2%}); {sum(fit.marks)} marks in {len(paths)} pictures are off by"
-        f" {lens.error:.3f} pixels RMS, {fit.worst:.2f} at most; near its corners the map is known to"
-        f" {fit.corner_sigma:.2g} pixels"
+        f"{output}: {1000 * size:.4f} ± {1000 * size * lens.scale_sigma:.2g} µm a pixel"
+        f" ({lens.scale_sigma:.2%}); residual of {sum(fit.marks)} marks in {len(paths)}"
+        f" picture{'s' if len(paths) > 1 else ''} {lens.error:.3f} pixels RMS, {fit.worst:.2f} at most;"
+        f" standard error of the map near its corners {fit.corner_sigma:.2g} pixels"
     )

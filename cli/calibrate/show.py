@@ -25,11 +25,11 @@ def command(
     ],
     output: Annotated[
         Path | None,
-        Option("--output", "-o", metavar="DIR", help="Folder to draw pictures of all maps into."),
+        Option("--output", "-o", metavar="DIR", help="Folder for pictures of all maps."),
     ] = None,
     as_json: options.Json = False,
 ) -> None:
-    """Print a calibration's numbers with their errors, and draw its maps."""
+    """Print a calibration's numbers with their standard errors, and draw its maps."""
     from mirrorskin import io
     from mirrorskin.cli.output import print_json
     from mirrorskin.view import check_drawing
@@ -38,15 +38,15 @@ def command(
 
     if output is not None:
         check_drawing()
-    known = io.open_calibration(calibration)
-    rows = calibration_table(known)
-    pictures = [] if output is None else calibration_figures(known, output)
+    parts = io.open_calibration(calibration)
+    rows = calibration_table(parts)
+    pictures = [] if output is None else calibration_figures(parts, output)
     if as_json:
         print_json(
             {
                 "calibration": str(calibration),
                 "numbers": [row._asdict() for row in rows],
-                "process": dict(known.process),
+                "process": dict(parts.process),
                 "pictures": list(map(str, pictures)),
             }
         )

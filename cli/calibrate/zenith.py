@@ -1,4 +1,4 @@
-"""``mirrorskin calibrate zenith``: what brightness means at each place, from a ball of known size."""
+"""``mirrorskin calibrate zenith``: brightness by position and normal, from a ball of known size."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from mirrorskin.io import Calibration, Precession, Source, WallResponse
 
 _PRINTED = "radius", "rim", "axis_x", "axis_y", "sight_0", "lamp_x", "lamp_y", "scatter"
-_DOUBTFUL = 0.1  # degrees: error of the zenith at the median pixel above which a warning is printed
+_DOUBTFUL = 0.1  # degrees: median standard deviation of the zenith above which a warning is printed
 
 
 class PatternName(StrEnum):
-    """What is printed on the wall."""
+    """Print on the wall."""
 
     graded = "graded"
     uniform = "uniform"
@@ -41,20 +41,20 @@ def command(
         PatternName, Option(help="Whether the wall's brightness changes with its height.")
     ] = PatternName.graded,
     body_radius: Annotated[
-        str, Option(metavar="LENGTH", help="Nominal radius of the body, right within a tenth.")
+        str, Option(metavar="LENGTH", help="Nominal radius of the body, within 10 %.")
     ] = "17.5mm",
     body_height: Annotated[
-        str, Option(metavar="LENGTH", help="Nominal height of the wall, right within a tenth.")
+        str, Option(metavar="LENGTH", help="Nominal height of the wall, within 10 %.")
     ] = "40mm",
     rig: inputs.OptionalRig = None,
-    places: Annotated[int, Option(min=5, help="With --rig: of the ball.")] = 9,
+    places: Annotated[int, Option(min=5, help="With --rig: number of places of the ball.")] = 9,
     press: Annotated[str | None, inputs.press_option("0.4mm for 4 mm")] = None,
     settle: inputs.Settle = None,
     overwrite: inputs.Overwrite = False,
     as_json: options.Json = False,
-    **given: Annotated[Any, STACK.only("tilt", "phase_step", "pixel_size")],
+    **stack: Annotated[Any, STACK.only("tilt", "phase_step", "pixel_size")],
 ) -> None:
-    """Learn what brightness means at each place, from a ball of known size pressed all over the field."""
+    """Learn brightness as a function of position and normal, from a ball pressed all over the field."""
     from mirrorskin import io
     from mirrorskin.cli.output import progress
     from mirrorskin.cli.quantity import length
@@ -63,47 +63,47 @@ def command(
     paths = list(presses or [])
     radius = length(ball, "--ball") / 2
     body = length(body_radius, "--body-radius"), length(body_height, "--body-height")
-    known = inputs.check_call(output, paths, rig, press=press, settle=settle, overwrite=overwrite)
+    calibration = inputs.check_call(output, paths, rig, press=press, settle=settle, overwrite=overwrite)
     if rig is not None:
-        turn = given.pop("tilt", None), given.pop("phase_step", None)
+        turn = stack.pop("tilt", None), stack.pop("phase_step", None)
         plan = inputs.turn_plan(press, *turn, "0.4mm for 4 mm")
         balls = inputs.at_each("zenith", inputs.BALL, places, plan)
         paths = inputs.take(rig, output, balls, settle, overwrite)
-    stack = stack_options(given)
-    with inputs.open_all(paths, stack, known, output) as (sources, camera):
+    with inputs.open_all(paths, stack_options(stack), calibration, output) as (sources, camera):
         with progress("fitting", len(sources)) as show:
             response = fit_zenith(
                 sources,
                 radius,
-                references=None if known is None else known.references,
-                precession=None if known is None else _precession(known, sources[0]),
+                references=None if calibration is None else calibration.references,
+                precession=None if calibration is None else _precession(calibration, sources[0]),
                 pattern=pattern.value,
                 body=body,
                 progress=show,
             )
-        names, (radius, height) = inputs.names_of(paths), body
-        process = inputs.process_of(
-            sources[0], sources=names, ball=ball, body_radius=radius, body_height=height
-        )
+        sizes = {"body_radius": body[0], "body_height": body[1]}
+        process = inputs.process_of(sources[0], sources=paths, ball=ball, **sizes)
     io.update_calibration(output, response, camera, process)
     _report(output, response, as_json)
 
 
-def _precession(known: Calibration, source: Source) -> Precession | None:
-    """Return the precession that is known, unless its pivot was measured with another pixel size."""
+def _precession(calibration: Calibration, source: Source) -> Precession | None:
+    """Return the calibration's precession, unless its pivot was measured with another pixel size."""
     from mirrorskin.io.calibration.source import outdated
 
     size = source.header.pixel_size
-    if known.precession is None or size is None or not list(outdated(known, size, ["precession"])):
-        return known.precession
+    if (
+        calibration.precession is None
+        or size is None
+        or not list(outdated(calibration, size, ["precession"]))
+    ):
+        return calibration.precession
     click.echo(
-        "the calibrated tilt is left out: it was made with another pixel size; learn it again", err=True
+        "the calibrated tilt is ignored: it was made with another pixel size; learn it again", err=True
     )
     return None
 
 
 def _report(output: Path, response: WallResponse, as_json: bool) -> None:
-    """Print what was found, with its errors."""
     import numpy as np
 
     from mirrorskin.cli.output import print_json
@@ -114,8 +114,8 @@ def _report(output: Path, response: WallResponse, as_json: bool) -> None:
     most = float(np.degrees(response.error))
     if middle > _DOUBTFUL:
         click.echo(
-            f"depth not determined, zenith known within {middle:.2g} deg only: press less, so that the touch"
-            " ends within what the wall shows",
+            f"depth not determined, standard deviation of zenith {middle:.2g} deg: press less, so that the"
+            " contact ends within the part that shows the wall",
             err=True,
         )
     if as_json:
@@ -123,12 +123,12 @@ def _report(output: Path, response: WallResponse, as_json: bool) -> None:
         values = response.radius, response.rim, *place, response.scatter
         each = zip(_PRINTED, values, strict=True)
         found = {name: {"value": value, "sigma": errors[name]} for name, value in each}
-        degrees = {"zenith_sigma_median": middle, "zenith_sigma_worst": worst, "left_on_balls": most}
+        degrees = {"zenith_sigma_median": middle, "zenith_sigma_worst": worst, "residual_on_balls": most}
         print_json({"output": str(output), "pattern": response.pattern, "found": found, "degrees": degrees})
         return
     click.echo(
-        f"{output}: wall {response.radius:.2f} +- {errors['radius']:.2g} mm from the axis and"
-        f" {response.rim:.1f} +- {errors['rim']:.2g} mm high (noise alone), axis at {response.axis[0]:.2f},"
-        f" {response.axis[1]:.2f} mm; zenith known within"
-        f" {middle:.2g} deg ({worst:.2g} at worst), at most {most:.2g} deg left on the balls"
+        f"{output}: wall {response.radius:.2f} ± {errors['radius']:.2g} mm from the axis and"
+        f" {response.rim:.1f} ± {errors['rim']:.2g} mm high (noise alone), axis at {response.axis[0]:.2f},"
+        f" {response.axis[1]:.2f} mm; standard deviation of zenith {middle:.2g} deg ({worst:.2g} at most),"
+        f" residual on the balls at most {most:.2g} deg"
     )

@@ -1,4 +1,4 @@
-"""Boards that show a camera's scale: what they are, how they are painted, and the mean of a recording."""
+"""Boards that show a camera's scale: their marks, their picture for printing, and the mean of a recording."""
 
 from __future__ import annotations
 
@@ -9,48 +9,53 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.calibration.sources import read_blocks
 from mirrorskin.io import InputError, Source
 
 Doubles = NDArray[np.float64]
 
 FEWEST = 12
-"""Marks that a fit needs of each picture."""
+"""Marks of each picture that a fit needs."""
 
 _FAMILIES = (
     *(f"{kind}X{kind}_{count}" for kind in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
     "APRILTAG_36h11",
-)
-_INCH = 25.4
+)  # of markers in OpenCV, each with its numbers of markers in ascending order
+_INCH = 25.4  # mm
 _DOT = 0.5  # diameter of a printed dot as a share of the pitch
-_MOVED = 1.5  # times as much change between the first and the last frame as between neighbours
-_BLOCK = 16  # frames
+_MOVED = 1.5  # change from first to last frame, relative to that of neighbours, of a moving scene
 
 
 @dataclass(frozen=True, slots=True)
 class Charuco:
-    """A ChArUco board: a chessboard, black in its upper left corner, with markers in its white squares."""
+    """A ChArUco board: a chessboard with a black upper left corner and markers in its white squares."""
 
     columns: int  # squares
     rows: int
-    square: float  # mm along an edge
-    marker: float  # mm
+    square: float  # side of a square, mm
+    marker: float  # side of a marker, mm
 
     def __post_init__(self) -> None:
         _check(self, min(self.square, self.marker), (self.columns - 1) * (self.rows - 1), "corners")
         if self.marker >= self.square:
             raise InputError(
-                f"{self}: a marker lies within its square: give the square first,"
+                f"{self}: a marker is smaller than its square: give the square first,"
                 " such as charuco:7x5:2mm:1.5mm"
             )
-        if self.columns * self.rows // 2 > 1000:
-            raise InputError(f"{self}: no family has so many markers: take fewer squares")
+        if self.markers > 1000:
+            raise InputError(f"{self}: the largest family has 1000 markers: take fewer squares")
 
     def __str__(self) -> str:
         return f"charuco:{self.columns}x{self.rows}:{self.square:g}mm:{self.marker:g}mm"
 
     @property
+    def markers(self) -> int:
+        """Number of markers."""
+        return self.columns * self.rows // 2
+
+    @property
     def pitch(self) -> float:
-        """Millimetres from mark to mark."""
+        """Distance of neighbouring marks, mm."""
         return self.square
 
     @property
@@ -59,24 +64,24 @@ class Charuco:
         return self.columns * self.square, self.rows * self.square
 
     def marks(self) -> Doubles:
-        """Return where its inner corners are, (n, 2), mm from its middle, y up; row by row from the top."""
+        """Return its inner corners, (n, 2), mm from its middle, y up; row by row from the top."""
         return _grid(self.columns - 1, self.rows - 1, self.square)
 
     def dictionaries(self) -> list[Any]:
-        """Return OpenCV's smallest dictionary of each family that has as many markers as the board."""
+        """Return OpenCV's smallest dictionary with enough markers for the board, of each family."""
         import cv2
 
-        found: dict[str, Any] = {}
+        smallest: dict[str, Any] = {}
         for name in _FAMILIES:
             dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
-            if len(dictionary.bytesList) >= self.columns * self.rows // 2:
-                found.setdefault(name.rpartition("_")[0], dictionary)
-        return list(found.values())
+            if len(dictionary.bytesList) >= self.markers:
+                smallest.setdefault(name.rpartition("_")[0], dictionary)
+        return list(smallest.values())
 
 
 @dataclass(frozen=True, slots=True)
 class Dots:
-    """Round dots in a square grid; ``pitch`` is in mm from centre to centre."""
+    """Round dots in a square grid; ``pitch`` is the distance of their centres, mm."""
 
     columns: int
     rows: int
@@ -94,7 +99,7 @@ class Dots:
         return self.columns * self.pitch, self.rows * self.pitch
 
     def marks(self) -> Doubles:
-        """Return where the dots are, (n, 2), mm from the board's middle, y up; row by row from the top."""
+        """Return the centres of its dots, (n, 2), mm from its middle, y up; row by row from the top."""
         return _grid(self.columns, self.rows, self.pitch)
 
 
@@ -103,9 +108,9 @@ Board = Charuco | Dots
 
 def _check(board: Board, length: float, marks: int, noun: str) -> None:
     if not 0 < length < math.inf:
-        raise InputError(f"{board}: lengths are above zero")
+        raise InputError(f"{board}: lengths must be above zero")
     if min(board.columns, board.rows) < 3 or marks < FEWEST:
-        raise InputError(f"{board} has too few {noun}: 3 each way and {FEWEST} in all are needed")
+        raise InputError(f"{board} has too few {noun}: at least 3 each way and {FEWEST} in all are needed")
 
 
 def _grid(columns: int, rows: int, pitch: float) -> Doubles:
@@ -114,14 +119,14 @@ def _grid(columns: int, rows: int, pitch: float) -> Doubles:
     return np.stack([np.tile(x, rows), np.repeat(y, columns)], axis=1)
 
 
-# --- painting -----------------------------------------------------------------------------------------------
+# --- printing -----------------------------------------------------------------------------------------------
 
 
 def paint_board(board: Board, dots_per_inch: float) -> NDArray[np.uint8]:
     """Paint a board for printing, black on white, with a margin as wide as a square or the pitch.
 
-    Edges lie where they belong to half a pixel; InputError where details are finer than that. Markers are of
-    the family 4X4; dots are half as wide as the pitch.
+    Edges are within half a pixel of their position. Markers are of the family 4X4; the diameter of dots is
+    half the pitch. InputError if the resolution is too low for the details, or the picture too large.
 
     Examples
     --------
@@ -129,10 +134,10 @@ def paint_board(board: Board, dots_per_inch: float) -> NDArray[np.uint8]:
     (50, 60)
     """
     per_mm = dots_per_inch / _INCH
-    fine = board.marker / 6 if isinstance(board, Charuco) else board.pitch * _DOT / 2
-    if not per_mm * fine >= 2:
-        needed = math.ceil(2 / fine * _INCH)
-        raise InputError(f"{board} has details of {fine:g} mm: {needed} dots per inch or more are needed")
+    detail = board.marker / 6 if isinstance(board, Charuco) else board.pitch * _DOT / 2
+    if not per_mm * detail >= 2:
+        needed = math.ceil(2 / detail * _INCH)
+        raise InputError(f"{board} has details of {detail:g} mm: {needed} dots per inch or more are needed")
     width, height = (side + 2 * board.pitch for side in board.size)
     columns, rows = round(width * per_mm), round(height * per_mm)
     if columns * rows > 1 << 28:
@@ -141,42 +146,44 @@ def paint_board(board: Board, dots_per_inch: float) -> NDArray[np.uint8]:
     y = height / 2 - (np.arange(rows, dtype=np.float64) + 0.5) / per_mm
     if isinstance(board, Charuco):
         return _paint_charuco(board, x, y)
-    across, down = (
-        np.min(abs(axis[:, np.newaxis] - np.unique(places)), axis=1)
-        for axis, places in zip((x, y), board.marks().T, strict=True)
+    off_x, off_y = (
+        np.min(abs(axis[:, np.newaxis] - np.unique(centres)), axis=1)
+        for axis, centres in zip((x, y), board.marks().T, strict=True)
     )
-    dot = across**2 + down[:, np.newaxis] ** 2 <= (board.pitch * _DOT / 2) ** 2
+    dot = off_x**2 + off_y[:, np.newaxis] ** 2 <= (board.pitch * _DOT / 2) ** 2
     return np.where(dot, 0, 255).astype(np.uint8)
 
 
 def _paint_charuco(board: Charuco, x: Doubles, y: Doubles) -> NDArray[np.uint8]:
-    """Look up each pixel's square, and in a white square its marker's cell."""
+    """Look up each pixel's square, and in a white square the cell of its marker."""
     import cv2
 
     dictionary = board.dictionaries()[0]
     cells = dictionary.markerSize + 2
-    (column, across), (row, down) = (
-        _cells(along / board.square, board.marker / board.square, cells, count)
-        for along, count in ((x + board.size[0] / 2, board.columns), (board.size[1] / 2 - y, board.rows))
+    (column, cell_x), (row, cell_y) = (
+        _cells(position / board.square, board.marker / board.square, cells, count)
+        for position, count in ((x + board.size[0] / 2, board.columns), (board.size[1] / 2 - y, board.rows))
     )
     painted = np.full((y.size, x.size), 255, np.uint8)
     number = 0
     for i in range(board.rows):
         for j in range(board.columns):
-            place = np.ix_(np.flatnonzero(row == i), np.flatnonzero(column == j))
+            pixels = np.ix_(np.flatnonzero(row == i), np.flatnonzero(column == j))
             if (i + j) % 2 == 0:
-                painted[place] = 0
+                painted[pixels] = 0
                 continue
             marker = np.pad(cv2.aruco.generateImageMarker(dictionary, number, cells), 1, constant_values=255)
-            painted[place] = marker[np.ix_(down[row == i], across[column == j])]
+            painted[pixels] = marker[np.ix_(cell_y[row == i], cell_x[column == j])]
             number += 1
     return painted
 
 
-def _cells(along: Doubles, share: float, cells: int, count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the square of each place, -1 outside, and the cell of its marker, 0 and cells + 1 beside it."""
-    square = np.floor(along).astype(np.intp)
-    cell = np.floor(((along - square - 0.5) / share + 0.5) * cells).astype(np.intp) + 1
+def _cells(
+    position: Doubles, share: float, cells: int, count: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return squares, -1 outside the board, and cells of a marker, 0 and cells + 1 outside the marker."""
+    square = np.floor(position).astype(np.intp)
+    cell = np.floor(((position - square - 0.5) / share + 0.5) * cells).astype(np.intp) + 1
     return np.where((square >= 0) & (square < count), square, -1), np.clip(cell, 0, cells + 1)
 
 
@@ -186,34 +193,31 @@ def _cells(along: Doubles, share: float, cells: int, count: int) -> tuple[NDArra
 def mean_of_still(source: Source) -> NDArray[Any]:
     """Return the mean frame of a recording in which nothing moves, (H, W), uint16 or float32.
 
-    What was of 8 bits has 16, and so fractions of a count.
+    The mean of 8-bit frames is scaled to 16 bits, which keeps fractions of a count. InputError if there are
+    no frames, or the picture changes.
     """
-    if source.rewindable:
-        source.rewind()
-    count, *shape = source.shape
-    buffer = np.empty((max(1, min(count, _BLOCK)), *shape), source.dtype)
-    total, number, steps = np.zeros(shape), 0, 0.0
+    total, count, steps = np.zeros(source.shape[1:]), 0, 0.0
     first = last = None
-    while (block := source.read(buffer)) is not None:
+    for block in read_blocks(source):
         for frame in block.frames.astype(np.float64):
             steps += 0.0 if last is None else _change(last, frame)
             first, last = frame if first is None else first, frame
             total += frame
-            number += 1
+            count += 1
     if first is None or last is None:
         raise InputError(f"{source.name} has no frames: record the board again")
-    if number > 2 and _change(first, last) > _MOVED * steps / (number - 1) + 1e-9 * np.abs(total).max():
+    if count > 2 and _change(first, last) > _MOVED * steps / (count - 1) + 1e-9 * np.abs(total).max():
         raise InputError(
             f"{source.name} is a sequence in which the picture changes: record the board while nothing moves"
         )
-    mean = total / number
+    mean = total / count
     if source.dtype.kind == "f":
         return np.asarray(mean, np.float32)
     return np.rint(mean * (257 if source.dtype.itemsize == 1 else 1)).astype(np.uint16)
 
 
 def _change(one: Doubles, other: Doubles) -> float:
-    """Return by how much two frames differ, but for an offset and a factor of the light, counts RMS."""
+    """Return the RMS difference of two frames, counts, after an offset and a gain of the light are fitted."""
     first, second = one - one.mean(), other - other.mean()
     factor = np.sum(first * second) / max(np.sum(first * first), 1e-300)
     return float(np.sqrt(np.mean((second - factor * first) ** 2)))

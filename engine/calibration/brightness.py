@@ -1,9 +1,9 @@
-"""What counts say of normals: the response of a sensor, linear in the zenith or of a calibrated wall."""
+"""Brightness as a function of the normal: linear in the zenith, or by a calibrated wall."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,31 +16,8 @@ Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Pixels = NDArray[np.intp]
 
-_ZENITH_PER_DEPTH = (
-    0.01  # radians by which the zenith seems to change for each mm of a mirror's height, about
-)
-_END = 0.06  # share of the range, at both of its ends, within which scatter bends the linear pattern's line
-
-
-class Brightness(Protocol):
-    """How bright a mirror looks to each pixel of a picture; pixels are numbered row by row."""
-
-    @property
-    def depth_sigma(self) -> float:
-        """Common standard deviation of all depths that light gives, mm."""
-
-    def sight(self, pixels: Pixels) -> Doubles:
-        """Return by how much the sight lines of pixels, (n,), move along x and y a mm of z, (2, n)."""
-
-    def of_counts(self, counts: NDArray[Any], pixels: Pixels) -> Doubles:
-        """Return how bright counts of pixels, (..., n), are; NaN where a sample is clipped or unknown."""
-
-    def of_normals(self, normals: Doubles, z: Doubles, pixels: Pixels) -> tuple[Doubles, Mask]:
-        """Return how bright mirrors are, (N, n), and whether that is within the range that shows them.
-
-        ``normals`` are unit vectors in the body's frame, (N, n, 3); ``z`` is the mirrors' height above the
-        rest plane, (N, n), mm.
-        """
+_ZENITH_PER_DEPTH = 0.01  # radians per mm: typical apparent change of the zenith with a mirror's height
+_END = 0.06  # share of the range, at both ends, where scatter makes the linear pattern nonlinear
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +31,7 @@ class LinearBrightness:
 
     @classmethod
     def of_header(cls, header: Header, shape: tuple[int, int]) -> LinearBrightness:
-        """Take the scale of a recording; without references the whole line is taken for straight."""
+        """Use the zenith gain and offset of a recording; without references they are valid everywhere."""
         if header.zenith_gain is None or header.zenith_offset is None:
             raise InputError(
                 "the recording has no zenith gain and offset: calibrate the zenith first, or give both"
@@ -66,18 +43,19 @@ class LinearBrightness:
             ends = [(_per_pixel(level, shape) - offset) / gain for level in (header.dark, header.bright)]
         return cls(offset, gain, np.fmin(*ends), np.fmax(*ends))
 
-    depth_sigma: ClassVar[float] = 0.0  # light shows no depths here
+    depth_sigma: ClassVar[float] = 0.0
+    """Common standard deviation of all depths determined from light, mm: none are."""
 
     def sight(self, pixels: Pixels) -> Doubles:
-        """Look straight down."""
+        """Return zeros: pixels look straight down."""
         return np.zeros((2, len(pixels)))
 
     def of_counts(self, counts: NDArray[Any], pixels: Pixels) -> Doubles:
-        """Return zeniths, radians."""
+        """Return the zeniths of counts of pixels, (..., n), radians; NaN if clipped or unknown."""
         return (_unclipped(counts) - self.offset[pixels]) / self.gain[pixels]
 
     def of_normals(self, normals: Doubles, z: Doubles, pixels: Pixels) -> tuple[Doubles, Mask]:
-        """Return the zeniths of normals; within range is where the line is straight."""
+        """Return the zeniths of normals, (N, n, 3), and whether the pattern is linear there."""
         zenith = np.arctan2(np.hypot(normals[..., 0], normals[..., 1]), normals[..., 2])
         low, high = self.low[pixels], self.high[pixels]
         with np.errstate(invalid="ignore"):
@@ -87,12 +65,12 @@ class LinearBrightness:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WallBrightness:
-    """Brightness as a calibrated cylindrical wall gives it, as a share of full light."""
+    """Brightness under a calibrated cylindrical wall, as a share of full light."""
 
     wall: WallResponse
     place: Doubles  # (2, H * W): of the pixels, mm from the wall's axis
     dark: Doubles  # (H * W,): counts without light
-    span: Doubles  # (H * W,): how many more counts there are in full light
+    span: Doubles  # (H * W,): difference of the counts in full light; NaN if unknown
 
     @classmethod
     def of_pixels(
@@ -110,7 +88,7 @@ class WallBrightness:
                 " 'mirrorskin calibrate references'"
             )
         if wall.pattern != "graded":
-            raise InputError("the response is of a uniform pattern, which shows no zenith: go without it")
+            raise InputError("the response is of a uniform pattern, without zeniths: leave it out")
         x, y = (axis.ravel() for axis in np.meshgrid(*pixel_axes(shape, pixel_size)))
         place = np.stack([x - wall.axis[0], y - wall.axis[1]])
         level = _per_pixel(dark, shape)
@@ -121,24 +99,28 @@ class WallBrightness:
 
     @property
     def depth_sigma(self) -> float:
-        """What the response's error of zenith makes of depths, mm."""
-        known = self.wall.zenith_sigma[np.isfinite(self.wall.zenith_sigma)]
-        return float(np.median(known)) / _ZENITH_PER_DEPTH if known.size else 0.0
+        """Standard deviation of depths due to the error of the response's zenith, mm."""
+        sigma = self.wall.zenith_sigma[np.isfinite(self.wall.zenith_sigma)]
+        return float(np.median(sigma)) / _ZENITH_PER_DEPTH if sigma.size else 0.0
 
     def sight(self, pixels: Pixels) -> Doubles:
-        """Return the slopes of the lines of sight."""
+        """Return the displacement of lines of sight along x and y per mm of z, (2, n)."""
         return self.wall.sight_slopes(self.place[:, pixels])
 
     def of_counts(self, counts: NDArray[Any], pixels: Pixels) -> Doubles:
-        """Return light, as a share."""
+        """Return the light of counts of pixels, (..., n), as a share; NaN if clipped or unknown."""
         return (_unclipped(counts) - self.dark[pixels]) / self.span[pixels]
 
     def of_normals(self, normals: Doubles, z: Doubles, pixels: Pixels) -> tuple[Doubles, Mask]:
-        """Return the light of normals."""
+        """Return the light of normals, (N, n, 3), at heights z, (N, n), mm, and whether it is valid."""
         wall = self.wall
         place = np.stack(np.broadcast_arrays(*self.place[:, pixels], z, *self.sight(pixels)))
         geometry = wall.radius, wall.rim, wall.scatter
         return wall_light(place, normals, geometry, wall.lamps, wall.curve, wall.reach)
+
+
+Brightness = LinearBrightness | WallBrightness
+"""Brightness of a mirror for each pixel of a picture; pixels are numbered row by row."""
 
 
 def _per_pixel(values: ArrayLike, shape: tuple[int, int]) -> Doubles:
@@ -146,7 +128,7 @@ def _per_pixel(values: ArrayLike, shape: tuple[int, int]) -> Doubles:
 
 
 def _unclipped(counts: NDArray[Any]) -> Doubles:
-    """Return counts as float64, NaN where they are at an end of an integer type."""
+    """Return counts as float64, NaN at the ends of an integer type."""
     values = np.asarray(counts, np.float64)
     if counts.dtype.kind != "u":
         return values

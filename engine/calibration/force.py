@@ -1,4 +1,4 @@
-"""The elastomer's modulus, from presses whose force is known by a scale or a weight."""
+"""The elastomer's modulus, from presses whose force is measured by a scale or a weight."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.calibration.sources import pixel_size_of
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.force.normal import press_within
 from mirrorskin.engine.press.elastic import LEARNED_AT, fit_press
@@ -22,34 +23,34 @@ if TYPE_CHECKING:
 
 Doubles = NDArray[np.float64]
 
-_PRIOR = 6.0  # standard errors of the gel's numbers that they may well be off
-_MODEL_ERROR = 0.003  # of a load, by splines and cells: measured on the twin with balls and cones
-_EXACT = 1e-12  # share of a force to which nothing is known better
+_PRIOR = 6.0  # prior standard deviation of the gel's parameters, in their standard errors
+_MODEL_ERROR = 0.003  # relative error of a load by splines and cells: measured on the twin, balls and cones
+_EXACT = 1e-12  # least relative standard deviation of a force
 
 
 class KnownPress(NamedTuple):
-    """A press whose force is known."""
+    """A press with a measured force."""
 
-    load: float  # force over Young's modulus, mm^2, as the heights have it
-    load_sigma: float  # by the noise of the heights, mm^2
-    by_gel: Doubles  # (3,): what a standard error of each of the gel's numbers changes, mm^2
-    force: float  # by the scale, N
-    force_sigma: float  # of the scale, N
+    load: float  # force divided by Young's modulus, from the heights, mm^2
+    load_sigma: float  # standard deviation due to the noise of the heights, mm^2
+    by_gel: Doubles  # (3,): change of the load per standard error of each of the gel's parameters, mm^2
+    force: float  # reading of the scale, N
+    force_sigma: float  # standard deviation of the reading, N
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StiffnessFit:
-    """What presses of known force show.
+    """A modulus and its residuals.
 
     Attributes
     ----------
     stiffness : Stiffness
     residual : ndarray, (presses,), float64
-        Forces by the modulus less those of the scale, N.
+        Forces by the modulus minus those of the scale, N.
     held_out : ndarray, (presses,), float64
-        The same, each by the modulus of the other presses; NaN of a single press.
+        The same, each by the modulus of the other presses; NaN for a single press.
     sigma : ndarray, (presses,), float64
-        Standard deviations that are expected of the residuals, N.
+        Expected standard deviations of the residuals, N.
     """
 
     stiffness: Stiffness
@@ -67,21 +68,34 @@ def known_press(
     device: str | Device | None = None,
     progress: Progress | None = None,
 ) -> KnownPress:
-    """Return the load that a press shows by a calibration with a gel, beside the force that a scale read, N.
+    """Return the load of a press by a calibration with a gel, together with the force that a scale measured.
 
-    InputError where it is no press, has no pixel size or a force that cannot be, or where the contact is not
-    found, or lies beyond the picture.
+    Parameters
+    ----------
+    source : Source
+        The press.
+    calibration : Calibration
+    force, force_sigma : float
+        Force at the end of the press and its standard deviation, N.
+    device : str or Device, optional
+    progress : callable, optional
+        Called with the number of frames so far.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        The source is not a press or has no pixel size, the force is not above 0, or the contact is not found
+        or not completely in the picture.
     """
     if source.motion != "vertical":
         raise InputError(f"{source.name} is of {source.motion} motion: give presses of known force")
     if not (math.isfinite(force) and force > 0 and math.isfinite(force_sigma) and force_sigma >= 0):
-        raise InputError(f"a force of {force:g} +- {force_sigma:g} N cannot be: give newtons above 0")
+        raise InputError(f"force {force:g} ± {force_sigma:g} N: give newtons above 0")
     gel = Calibrated(source, calibration).calibration.gel
     if gel is None:
         raise InputError(f"{calibration.name or 'the calibration'} has no gel: calibrate elastic first")
     plain = Calibrated(source, replace(calibration, gel=None, stiffness=None))
-    if plain.header.pixel_size is None:
-        raise InputError(f"{source.name} has no pixel size: calibrate the scale first, or give --pixel-size")
+    pixel_size = pixel_size_of(plain)
     press = Press(threshold=LEARNED_AT, fill=False, device=device)
     result = press.run(plain, progress, undistort=False)
     assert result.height is not None
@@ -89,81 +103,78 @@ def known_press(
     assert result.status is not None
     maps = result.height, result.height_sigma, result.status
     try:
-        fit = fit_press(*maps, plain.header.pixel_size, gel, deepest=float(np.max(plain.travel)))
+        fit = fit_press(*maps, pixel_size, gel, deepest=float(np.max(plain.travel)))
         pressed = press_within(fit)
     except NotConverged as error:
-        raise InputError(
-            f"{source.name} shows no force: {error}; press otherwise, or leave it out"
-        ) from error
+        message = f"{source.name} shows no force: {error}; press otherwise, or leave it out"
+        raise InputError(message) from error
     return KnownPress(pressed.load, *fit.load_errors(pressed), force, force_sigma)
 
 
 def fit_stiffness(presses: Sequence[KnownPress], gel: Gel) -> StiffnessFit:
-    """Find Young's modulus of the elastomer from presses of known force.
+    """Fit Young's modulus of the elastomer to presses of measured force.
 
-    A force is the modulus times the load. Loads are wrong by what the gel's numbers are wrong by, in a way of
-    its own at each press: so three shifts of these are found as well, with a standard deviation of six of
-    their standard errors beforehand (those are of one or two balls, and not much is known of their errors).
-    It is linear least squares, weighted by the errors of load and scale and by a scatter in proportion to the
-    force, at least 0.3 % and as large as makes chi^2 its degrees of freedom (Paule and Mandel, J. Res. NBS
-    87, 1982, 377-385).
+    A force is the modulus times the load. Errors of the gel's parameters change each load differently, so
+    three shifts of these parameters are fitted as well, with a prior standard deviation of six of their
+    standard errors (which come from one or two balls, and are themselves uncertain). The linear least squares
+    are weighted by the errors of load and scale and by a relative scatter of the force: at least 0.3 %, and
+    large enough that chi^2 equals its degrees of freedom (Paule and Mandel, J. Res. NBS 87, 1982, 377-385).
 
-    InputError without presses, or where the loads are not above 0.
+    Raises
+    ------
+    mirrorskin.io.InputError
+        There are no presses, or a load is not above 0.
     """
     if not presses:
-        raise InputError("a modulus is learned from presses of known force: give at least one")
+        raise InputError("a modulus is learned from presses of measured force: give at least one")
     table = _Presses(
-        np.array([[one.load, *one.by_gel] for one in presses], np.float64),
-        *np.array([[one.load_sigma, one.force, one.force_sigma] for one in presses], np.float64).T,
+        np.array([[press.load, *press.by_gel] for press in presses], np.float64),
+        *np.array([[press.load_sigma, press.force, press.force_sigma] for press in presses], np.float64).T,
     )
     if not (table.terms[:, 0] > 0).all():
         raise InputError("a press without load shows no modulus: press deeper")
     scatter = max(table.scatter(), _MODEL_ERROR)
-    found, covariance, _ = table.solve(scatter)
+    solution, covariance, _ = table.solve(scatter)
     held_out = np.full(len(presses), np.nan)
     for number in range(len(presses) if len(presses) > 1 else 0):
-        others = table.but(number).solve(scatter)[0]
+        others = _Presses(*(np.delete(part, number, axis=0) for part in table)).solve(scatter)[0]
         held_out[number] = table.terms[number] @ others - table.force[number]
-    modulus = float(found[0])
-    shift = tuple((found[1:] / modulus).tolist())
+    modulus = float(solution[0])
+    shift = tuple((solution[1:] / modulus).tolist())
     error = float(np.sqrt(np.mean((held_out / table.force) ** 2)))
-    known = Stiffness(modulus, shift, covariance, scatter, gel.threshold, error, len(presses))
-    residual = table.terms @ found - table.force
-    return StiffnessFit(known, residual, held_out, table.sigma(scatter, modulus))
+    stiffness = Stiffness(modulus, shift, covariance, scatter, gel.threshold, error, len(presses))
+    residual = table.terms @ solution - table.force
+    return StiffnessFit(stiffness, residual, held_out, table.sigma(scatter, modulus))
 
 
 class _Presses(NamedTuple):
-    """Presses as rows: loads and their changes by the gel, (n, 4), mm^2; the rest (n,)."""
+    """The presses of a fit."""
 
-    terms: Doubles
-    load_sigma: Doubles
-    force: Doubles
-    reading: Doubles
-
-    def but(self, number: int) -> _Presses:
-        """Return all presses but one."""
-        return _Presses(*(np.delete(part, number, axis=0) for part in self))
+    terms: Doubles  # (n, 4): loads and their changes by the gel, mm^2
+    load_sigma: Doubles  # (n,): mm^2
+    force: Doubles  # (n,): N
+    force_sigma: Doubles  # (n,): N
 
     def sigma(self, scatter: float, modulus: float) -> Doubles:
-        """Return the standard deviations that are expected of the residuals, N."""
-        own = self.reading**2 + (modulus * self.load_sigma) ** 2
-        return np.asarray(np.sqrt(own + (scatter * modulus * self.terms[:, 0]) ** 2))
+        """Return the expected standard deviations of the residuals, N."""
+        variance = self.force_sigma**2 + (modulus * self.load_sigma) ** 2
+        return np.asarray(np.sqrt(variance + (scatter * modulus * self.terms[:, 0]) ** 2))
 
     def solve(self, scatter: float) -> tuple[Doubles, Doubles, float]:
-        """Return the modulus and its products with the gel's shifts, their covariance, and chi^2."""
+        """Return the modulus and its products with the shifts, (4,), their covariance, and chi^2."""
         usual = float(np.median(self.force / self.terms[:, 0]))
         sigma = np.maximum(self.sigma(scatter, usual), _EXACT * self.force)
-        before = np.hstack([np.zeros((3, 1)), np.eye(3) / (_PRIOR * usual)])
-        rows = np.vstack([self.terms / sigma[:, np.newaxis], before])
+        prior = np.hstack([np.zeros((3, 1)), np.eye(3) / (_PRIOR * usual)])
+        rows = np.vstack([self.terms / sigma[:, np.newaxis], prior])
         values = np.append(self.force / sigma, np.zeros(3))
-        # Loads and their changes differ by orders of magnitude.
+        # Columns are scaled, because loads and their changes differ by orders of magnitude.
         scale = np.linalg.norm(rows, axis=0)
         inverse = np.linalg.pinv(rows / scale) / scale[:, np.newaxis]
-        found = inverse @ values
-        return found, inverse @ inverse.T, float(np.sum((rows @ found - values) ** 2))
+        solution = inverse @ values
+        return solution, inverse @ inverse.T, float(np.sum((rows @ solution - values) ** 2))
 
     def scatter(self) -> float:
-        """Return the scatter at which chi^2 is the degrees of freedom, or 0."""
+        """Return the scatter at which chi^2 equals the degrees of freedom, or 0."""
         from scipy.optimize import brentq
 
         def excess(scatter: float) -> float:

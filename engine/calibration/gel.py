@@ -1,51 +1,52 @@
-"""The elastomer's compliance and the threshold of light, found from presses of a ball of known size."""
+"""The elastomer's compliance and the threshold of light, from presses of a ball of known size."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.integration.validation import check_pixel_size
+from mirrorskin.engine.calibration.levels import mad_sigma
+from mirrorskin.engine.calibration.sources import check_ball_radius, pixel_size_of
 from mirrorskin.engine.press.elastic import threshold_at
 from mirrorskin.io import Gel, InputError, Result, Source, pixel_axes
 from mirrorskin.io.maps import PressStatus
 
 Doubles = NDArray[np.float64]
 
-_NODES = 24
-_THINNEST = 1e-3  # radii of the ball: the depth of a mirror on the very surface
+_NODES = 24  # of the Gauss-Legendre quadrature over punches
+_THINNEST = 1e-3  # radii of the ball: least depth of the mirror below the surface
 
-_RIM = 0.1  # square of a rim pixel's error, by its circumference
-_MOST = 600  # pixels of a press that are used
-_FEWEST = 50
+_RIM = 0.1  # variance of the dark top's radius in pixels, times its radius in pixels
+_MOST = 600  # pixels of a press that are used, at most
+_FEWEST = 50  # pixels of a press that turned bright, at least
 
-_SHARED = ("threshold", "compliance", "curvature")  # numbers that all presses have in common:
+_SHARED = ("threshold", "compliance", "curvature")  # parameters that all presses have in common:
 _START = (0.2, 0.005, 0.03)
 _BOUNDS = ((0.02, 0.0, 0.0), (0.78, 2.0, 0.2))
 _WORST = (0.01, 0.02, 0.02)  # standard errors above which they are not determined
-_LATER = np.linspace(-0.1, 0.2, 13)  # radii of the ball by which it may be met later than it seems
-_INDEPENDENT = 200  # pixels of a press with independent errors
-_AROUND = 24  # directions in which a dark top's rim is looked at
-_STEPS = 40
-_TABLE = 400  # entries of a table of travels
-_WIDEST = 0.999  # radii of the ball that the touch can be wide
-_SLOPE_ERROR = 0.003  # of the sheet, that the theory may be wrong by
-_TRAVEL_ERROR = 0.004  # mm, of onsets between two frames, at least
-_DELAY = 1e-3  # mm of travel, of differences
-_LEAST_RATE = 0.05  # 1/mm: below it the sheet touches already, and turns light by chance
-_DIGITS = 8  # of 1/mm: what lies next to the bound at 0 is 0
+_LATER = np.linspace(-0.1, 0.2, 13)  # radii of the ball: delays of the contact that are tried for the start
+_INDEPENDENT = 200  # number of pixels of a press with independent errors
+_AROUND = 24  # points on a dark top's rim
+_STEPS = 40  # function evaluations of a fit, at most
+_TABLE = 400  # entries of the table from travel to contact radius
+_WIDEST = 0.999  # radii of the ball: largest contact radius
+_SLOPE_ERROR = 0.003  # standard deviation of the sheet's slope by the theory
+_TRAVEL_ERROR = 0.004  # mm: least standard deviation of onsets, which are between two frames
+_DELAY = 1e-3  # mm of travel: step of numerical derivatives
+_LEAST_RATE = 0.05  # 1/mm: below this rate the sheet is already in contact, and the onset is random
+_DIGITS = 8  # decimals of compliance and curvature, so that a value next to the bound 0 becomes 0
 
 
 def sphere_travel(touch: ArrayLike, radius: float, compliance: float = 0.0) -> Doubles:
-    """Return how far a ball of a radius R must be pressed for a touch of radius a < R, mm.
+    """Return the travel at which a ball of radius R has a contact of radius a < R, mm.
 
-    The depth is ``a artanh(a / R)``, and the force over Young's modulus ``4/3 ((a^2 + R^2) artanh(a / R) -
-    a R)``, by which the stage gives way as well, its compliance times that (Sneddon, Int. J. Eng. Sci. 3,
-    1965, 47-57, at Poisson ratio 0.5).
+    The depth is ``a artanh(a / R)``, and the force divided by Young's modulus is
+    ``4/3 ((a^2 + R^2) artanh(a / R) - a R)`` (Sneddon, Int. J. Eng. Sci. 3, 1965, 47-57, at Poisson ratio
+    0.5). The stage gives way by ``compliance`` times the latter.
 
     Examples
     --------
@@ -58,11 +59,10 @@ def sphere_travel(touch: ArrayLike, radius: float, compliance: float = 0.0) -> D
 
 
 def sphere_slope(distance: ArrayLike, touch: ArrayLike, radius: float, sheet: float = 0.0) -> Doubles:
-    """Return how steep the mirror is under a ball and around it.
+    """Return the slope of the mirror at a distance from a ball's centre, for a contact radius.
 
-    A ball's press is one of flat punches of growing radius x, each pressed on by g'(x) dx, g(x) = x
-    artanh(x / R). Of a punch pressed by 1 the harmonic continuation of the surface's displacement to the
-    depth z is ::
+    A press of a ball is a sum of presses of flat punches of radius x by g'(x) dx, g(x) = x artanh(x / R). The
+    surface's displacement under a punch pressed by 1 continues harmonically to the depth z as ::
 
         U = 2 / pi arcsin(2 x / (sqrt((r - x)^2 + z^2) + sqrt((r + x)^2 + z^2)))
 
@@ -73,14 +73,14 @@ def sphere_slope(distance: ArrayLike, touch: ArrayLike, radius: float, sheet: fl
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     share, weights = (nodes + 1) / 2, weights / 2
     near, rest = np.minimum(r, a)[..., np.newaxis], np.maximum(a - r, 0.0)[..., np.newaxis]
-    # Punches about as wide as the place is far make its slope: nodes crowd there.
+    # Punches with x close to r have the largest slope, so nodes are denser there.
     x = np.concatenate([near - near * share**2, near + rest * share**2], axis=-1)
     width = np.concatenate([2 * near * share * weights, 2 * rest * share * weights], axis=-1)
-    part = x / radius
-    pressed = width * (np.arctanh(part) + part / (1 - part**2))
-    delay = depth / 2
-    below, here, above = (_punch_slope(r[..., np.newaxis], x, depth + step) for step in (delay, 0.0, -delay))
-    return np.asarray(np.sum(pressed * (here - depth * (below - above) / (2 * delay)), axis=-1))
+    ratio = x / radius
+    pressed = width * (np.arctanh(ratio) + ratio / (1 - ratio**2))
+    step = depth / 2
+    below, here, above = (_punch_slope(r[..., np.newaxis], x, depth + h) for h in (step, 0.0, -step))
+    return np.asarray(np.sum(pressed * (here - depth * (below - above) / (2 * step)), axis=-1))
 
 
 def _punch_slope(r: Doubles, x: Doubles, z: float) -> Doubles:
@@ -93,67 +93,76 @@ def _punch_slope(r: Doubles, x: Doubles, z: float) -> Doubles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BallOnset:
-    """When a ball pressed into the sheet turned n pixels light; all in mm."""
+    """Onset of light at n pixels while a ball was pressed into the sheet; all in mm."""
 
     travel: Doubles  # (n,): at the onset
     sigma: Doubles  # (n,): its standard deviation
     x: Doubles  # (n,)
     y: Doubles  # (n,)
     radius: float  # of the ball
-    inner: float = math.nan  # radius of the ball's dark top; NaN where it was not seen whole
+    inner: float = math.nan  # radius of the ball's dark top; NaN if it was not completely visible
     inner_sigma: float = math.nan
 
 
 def ball_onset(result: Result, source: Source, radius: float) -> BallOnset:
-    """Return when pixels turned light in the uncorrected reconstruction of a ball's press; radius in mm.
+    """Return the onsets of a ball's press.
 
-    InputError where it is no press, has no pixel size, or less than 50 pixels turned light.
+    Parameters
+    ----------
+    result : Result
+        The press without correction for the elastomer and without filling, at the threshold 0.5.
+    source : Source
+        The recording, with a pixel size.
+    radius : float
+        Radius of the ball, mm.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        The result is not a press, there is no pixel size, or fewer than 50 pixels turned bright.
     """
     from scipy import ndimage
 
     height, sigma, status = result.height, result.height_sigma, result.status
     if status is None or height is None or sigma is None:
-        raise InputError(f"{source.name} is no press: give a vertical recording of a ball")
-    if source.header.pixel_size is None:
-        raise InputError(f"{source.name} has no pixel size: calibrate the scale first, or give --pixel-size")
-    if not (math.isfinite(radius) and radius > 0):
-        raise InputError(f"a ball of radius {radius:g} mm cannot be: give one above 0")
+        raise InputError(f"{source.name} is not a press: give a vertical recording of a ball")
+    size = pixel_size_of(source)
+    check_ball_radius(radius)
     lit = np.flatnonzero((status == PressStatus.ONSET) & np.isfinite(height))
     if len(lit) < _FEWEST:
         raise InputError(
-            f"{source.name}: {len(lit)} pixels turned light, too few to learn from: press the ball deeper"
+            f"{source.name}: {len(lit)} pixels turned bright, and {_FEWEST} are needed: press the ball deeper"
         )
     some = lit[:: math.ceil(len(lit) / _MOST)]
-    size = check_pixel_size(source.header.pixel_size)
     x, y = np.meshgrid(*pixel_axes((height.shape[0], height.shape[1]), size))
-    travel, error, across, up = (part.ravel()[some].astype(np.float64) for part in (-height, sigma, x, y))
-    # The dark top is the largest dark patch that light surrounds.
+    maps = [values.ravel()[some].astype(np.float64) for values in (-height, sigma, x, y)]
+    onset = BallOnset(maps[0], maps[1], maps[2], maps[3], radius)
+    # The dark top is the largest dark patch that is surrounded by light.
     closed = ndimage.binary_closing(np.pad(status == PressStatus.ONSET, 1), np.ones((3, 3), bool))[1:-1, 1:-1]
     patches, count = ndimage.label(ndimage.binary_fill_holes(closed) & ~closed)
     if count == 0:
-        return BallOnset(travel, error, across, up, radius)
+        return onset
     largest = patches == 1 + np.argmax(np.bincount(patches.ravel())[1:])
     area = float(np.count_nonzero(largest & (status == PressStatus.NEVER_LIGHT))) * size[0] * size[1]
     inner = math.sqrt(area / math.pi)
-    # The rim falls at random within a pixel, in as many places as it has pixels.
+    # The rim crosses each of its pixels at a random position.
     pixel = max(size)
-    inner_sigma = pixel * math.sqrt(_RIM * pixel / max(inner, pixel))
-    return BallOnset(travel, error, across, up, radius, inner, inner_sigma)
+    return replace(onset, inner=inner, inner_sigma=pixel * math.sqrt(_RIM * pixel / max(inner, pixel)))
 
 
 @dataclass(frozen=True, slots=True)
 class BallPlace:
-    """Where a ball was found, mm."""
+    """Fitted position of a ball, mm."""
 
     x: float
     y: float
     travel_zero: float  # travel at which the sheet met its top
-    pixels: int  # that were used
+    pixels: int  # number of pixels that were used
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GelFit:
-    """What balls show of a gel; ``undetermined`` names the numbers that were left at 0."""
+    """A gel and the balls' positions; ``undetermined`` names the parameters that were left at 0."""
 
     gel: Gel
     places: tuple[BallPlace, ...]
@@ -163,15 +172,27 @@ class GelFit:
 def fit_gel(
     presses: Sequence[BallOnset], axis: tuple[float, float] = (0.0, 0.0), sheet: float = 0.05
 ) -> GelFit:
-    """Find the gel that turns light as balls of known radius showed.
+    """Fit a gel to the onsets of light in presses of balls of known radius.
 
-    At a pixel's onset the sheet is as steep there as the threshold (see `threshold_at`). How steep it is, is
-    known in closed form of a ball (`sphere_slope`). Found are the threshold on the wall's axis, the wall's
-    curvature, the stage's compliance, and of each press the ball's place and the travel at which it was met,
-    by robust least squares over all pixels. Compliance and curvature that are not determined are 0. The
-    ball's height over the stage's zero and that zero are one number. ``axis`` is the wall's in the picture,
-    and ``sheet`` the thickness of what lies between mirror and ball, mm. More presses, of different balls or
-    places, determine more; InputError where they do not determine the threshold.
+    At a pixel's onset the slope of the sheet there equals the threshold (see `threshold_at` of
+    `mirrorskin.engine.press.elastic`); the slope next to a ball has a closed form (`sphere_slope`). Fitted by
+    robust least squares over all pixels are the threshold on the wall's axis, the wall's curvature, the
+    stage's compliance, and for each press the ball's position and the travel of first contact. Compliance and
+    curvature are 0 if they are not determined. The ball's height above the stage's zero and this zero cannot
+    be separated. More presses, of different balls or at other positions, determine more.
+
+    Parameters
+    ----------
+    presses : sequence of BallOnset
+    axis : (float, float)
+        Position of the wall's axis in the picture, mm.
+    sheet : float
+        Thickness of the material between mirror and ball, mm.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        The presses do not determine the threshold.
     """
     if not presses:
         raise InputError("a gel is learned from a ball: give at least one press")
@@ -182,7 +203,7 @@ def fit_gel(
         ratio = {
             name: errors[name] / worst for name, worst in zip(_SHARED, _WORST, strict=True) if name in free
         }
-        name = max(ratio, key=lambda one: (ratio[one], one))
+        name = max(ratio, key=lambda parameter: (ratio[parameter], parameter))
         if ratio[name] <= 1:
             break
         if free == ["threshold"]:
@@ -195,20 +216,19 @@ def fit_gel(
         BallPlace(float(place[0]), float(place[1]), float(place[2]), len(press.travel))
         for place, press in zip(fit.places, presses, strict=True)
     )
-    found = Gel(
-        threshold=gel.threshold,
+    gel = replace(
+        gel,
         compliance=round(gel.compliance, _DIGITS),
         curvature=round(gel.curvature, _DIGITS),
-        axis=axis,
         travel_zero=places[0].travel_zero,
         error=fit.height_error(),
         sigma=errors,
     )
-    return GelFit(found, places, tuple(name for name in _SHARED if name not in free))
+    return GelFit(gel, places, tuple(name for name in _SHARED if name not in free))
 
 
 class _Fit:
-    """The search for a gel's free numbers, the others being 0, and x, y and travel zero of each ball."""
+    """A fit of the free parameters, with the others at 0, and of x, y and travel zero of each ball."""
 
     def __init__(
         self, presses: Sequence[BallOnset], axis: tuple[float, float], sheet: float, free: tuple[str, ...]
@@ -216,13 +236,13 @@ class _Fit:
         self._presses, self._axis, self._sheet, self._free = presses, axis, sheet, free
         self._low, self._high, start = self._bounds()
         self._solution = self._latest_contact(start)
-        self._rates = self._rising()
+        self._rates = self._rates_of_slopes()
 
     def solve(self) -> tuple[Gel, dict[str, float]]:
-        """Return the shared numbers and their standard errors."""
+        """Return the shared parameters and their standard errors."""
         from scipy.optimize import least_squares
 
-        for _ in range(2):  # how fast slopes rise is known better from what was found
+        for _ in range(2):  # the rates of slopes are more accurate in the second fit
             found = least_squares(
                 self._residuals,
                 self._solution,
@@ -233,68 +253,65 @@ class _Fit:
                 max_nfev=_STEPS,
             )
             self._solution = np.clip(found.x, self._low + 1e-9, self._high - 1e-9)
-            self._rates = self._rising()
+            self._rates = self._rates_of_slopes()
         count = sum(len(press.travel) for press in self._presses)
-        share = max(1.0, count / (_INDEPENDENT * len(self._presses)))
+        dependent = max(1.0, count / (_INDEPENDENT * len(self._presses)))
         excess = max(1.0, 2 * found.cost / count)
-        errors = np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac)) * excess * share)
+        errors = np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac)) * excess * dependent)
         sigma = dict(zip(self._free, errors.tolist(), strict=False))
         sigma["travel_zero"] = float(errors[len(self._free) + 2])
         return self._gel(self._solution), sigma
 
     @property
     def places(self) -> Doubles:
-        """Where the balls are, (presses, 3)."""
+        """Positions of the balls, (presses, 3)."""
         return self._places(self._solution)
 
     def height_error(self) -> float:
-        """Return the usual error of a height that is left, mm."""
-        off = np.concatenate(
-            [
-                self._steeper(self._solution, number)[rate > _LEAST_RATE] / rate[rate > _LEAST_RATE]
-                for number, rate in enumerate(self._rates)
-            ]
-        )
-        return 1.4826 * float(np.median(np.abs(off))) if off.size else 0.0
+        """Return the robust standard deviation of the residual heights, mm."""
+        residuals = [self._excess(self._solution, number) for number in range(len(self._presses))]
+        residual, rate = np.concatenate(residuals), np.concatenate(self._rates)
+        heights = residual[rate > _LEAST_RATE] / rate[rate > _LEAST_RATE]
+        return mad_sigma(heights) if heights.size else 0.0
 
     def _bounds(self) -> tuple[Doubles, Doubles, Doubles]:
-        """Return lower and upper bounds, and where to begin."""
+        """Return lower and upper bounds, and the start."""
         chosen = [_SHARED.index(name) for name in self._free]
         start, low, high = ([row[index] for index in chosen] for row in (_START, *_BOUNDS))
         for number, press in enumerate(self._presses):
             x, y = float(np.median(press.x)), float(np.median(press.y))
             r = np.hypot(press.x - x, press.y - y)
-            seen = press.inner if math.isfinite(press.inner) else float(np.quantile(r, 0.05))
-            inner = min(seen, 0.7 * press.radius)
+            inner = press.inner if math.isfinite(press.inner) else float(np.quantile(r, 0.05))
+            inner = min(inner, 0.7 * press.radius)
             first = float(np.median(press.travel[r <= np.quantile(r, 0.1)]))
             place = [x, y, first - float(sphere_travel(inner, press.radius))]
             start += place
-            low += [one - press.radius for one in place]
-            high += [one + press.radius for one in place]
+            low += [coordinate - press.radius for coordinate in place]
+            high += [coordinate + press.radius for coordinate in place]
             if number == 0:
                 start[0] = float(np.clip(math.asin(inner / press.radius), low[0] * 1.1, high[0] * 0.9))
         return np.array(low), np.array(high), np.array(start)
 
     def _latest_contact(self, start: Doubles) -> Doubles:
-        """Return the start with each ball met when the slopes at onsets fit best.
+        """Return the start with the travel of first contact at which slopes fit best, for each ball.
 
-        Met too soon, the sheet would touch everywhere at the onsets, and nothing would lead out of that.
+        If the first contact is too early, the sheet touches the ball at all onsets, which is a local minimum.
         """
         best = start.copy()
         for number, press in enumerate(self._presses):
             place = len(self._free) + 3 * number + 2
             costs = []
             for later in _LATER * press.radius:
-                tried = start.copy()
-                tried[place] += later
-                costs.append(float(np.mean(np.abs(self._steeper(tried, number)))))
+                trial = start.copy()
+                trial[place] += later
+                costs.append(float(np.mean(np.abs(self._excess(trial, number)))))
             best[place] += _LATER[int(np.argmin(costs))] * press.radius
         return best
 
     def _gel(self, parameters: Doubles) -> Gel:
-        known = dict.fromkeys(_SHARED, 0.0)
-        known |= dict(zip(self._free, parameters[: len(self._free)].tolist(), strict=True))
-        return Gel(known["threshold"], known["compliance"], known["curvature"], self._axis)
+        shared = dict.fromkeys(_SHARED, 0.0)
+        shared |= dict(zip(self._free, parameters[: len(self._free)].tolist(), strict=True))
+        return Gel(shared["threshold"], shared["compliance"], shared["curvature"], self._axis)
 
     def _places(self, parameters: Doubles) -> Doubles:
         return parameters[len(self._free) :].reshape(-1, 3)
@@ -303,40 +320,42 @@ class _Fit:
         parts = []
         for number, (press, rate) in enumerate(zip(self._presses, self._rates, strict=True)):
             error = np.hypot(_SLOPE_ERROR, rate * np.maximum(press.sigma, _TRAVEL_ERROR))
-            parts.append(self._steeper(parameters, number) / error)
+            parts.append(self._excess(parameters, number) / error)
             if math.isfinite(press.inner):
-                # As few pixels are independent, the dark top counts as many of them.
+                # Pixels are correlated, so the dark top has the weight of several of them.
                 weight = max(1.0, len(press.travel) / _INDEPENDENT)
                 parts.append(np.array([self._rim(parameters, number)]) * math.sqrt(weight))
         return np.concatenate(parts)
 
-    def _steeper(self, parameters: Doubles, number: int, later: float = 0.0) -> Doubles:
-        """Return by how much the sheet is steeper at onsets, or a little later, than the threshold."""
+    def _excess(self, parameters: Doubles, number: int, later: float = 0.0) -> Doubles:
+        """Return the slope of the sheet minus the threshold at the onsets, or ``later`` mm after them."""
         press, gel = self._presses[number], self._gel(parameters)
         x, y, zero = self._places(parameters)[number]
-        across, up = press.x - x, press.y - y
+        from_x, from_y = press.x - x, press.y - y
         touches = np.linspace(0.0, _WIDEST * press.radius, _TABLE)
         travels = sphere_travel(touches, press.radius, gel.compliance)
         touch = np.interp(press.travel + later - zero, travels, touches)
-        zenith = threshold_at(gel, press.x, press.y, np.arctan2(up, across))
-        steep = sphere_slope(np.hypot(across, up), touch, press.radius, self._sheet)
-        return np.asarray(steep - np.tan(np.where(np.isfinite(zenith), zenith, gel.threshold)))
+        zenith = threshold_at(gel, press.x, press.y, np.arctan2(from_y, from_x))
+        slope = sphere_slope(np.hypot(from_x, from_y), touch, press.radius, self._sheet)
+        return np.asarray(slope - np.tan(np.where(np.isfinite(zenith), zenith, gel.threshold)))
 
     def _rim(self, parameters: Doubles, number: int) -> float:
-        """Return by how many standard errors the ball's slope at its dark top's rim misses the threshold.
+        """Return the ball's slope at the rim of its dark top minus the threshold, in standard errors.
 
-        The sheet lies on the ball there, and how it gives way does not matter.
+        The sheet touches the ball there, so the residual does not depend on the elastomer.
         """
         press = self._presses[number]
         azimuth = np.linspace(0, 2 * math.pi, _AROUND, endpoint=False)
         x, y, _ = self._places(parameters)[number]
-        at = x + press.inner * np.cos(azimuth), y + press.inner * np.sin(azimuth)
+        rim = x + press.inner * np.cos(azimuth), y + press.inner * np.sin(azimuth)
         zenith = math.asin(min(press.inner / press.radius, _WIDEST))
         error = math.hypot(_SLOPE_ERROR, press.inner_sigma / press.radius)
-        return float(np.nanmean(zenith - threshold_at(self._gel(parameters), *at, azimuth))) / error
+        return float(np.nanmean(zenith - threshold_at(self._gel(parameters), *rim, azimuth))) / error
 
-    def _rising(self) -> list[Doubles]:
-        """Return how fast slopes rise at the onsets of each press, 1/mm."""
-        each = range(len(self._presses))
-        changes = (self._steeper(self._solution, k, _DELAY) - self._steeper(self._solution, k) for k in each)
-        return [np.maximum(change / _DELAY, 0.0) for change in changes]
+    def _rates_of_slopes(self) -> list[Doubles]:
+        """Return the rates at which slopes increase with travel at the onsets of each press, 1/mm."""
+        rates = []
+        for number in range(len(self._presses)):
+            change = self._excess(self._solution, number, _DELAY) - self._excess(self._solution, number)
+            rates.append(np.maximum(change / _DELAY, 0.0))
+        return rates

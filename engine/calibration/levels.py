@@ -1,4 +1,4 @@
-"""The level behind a pixel's noisy, rounded and clipped samples, and how well it is known."""
+"""The level of a pixel from noisy, rounded and clipped samples, and its standard error."""
 
 from __future__ import annotations
 
@@ -15,23 +15,28 @@ from mirrorskin.io.types import Floats
 Mask = NDArray[np.bool_]
 
 ROUNDING = 1 / 12
-"""Variance that rounding to integers adds, counts^2."""
+"""Variance of rounding to integers, counts^2: that of a uniform distribution of width 1."""
 
 FEWEST = 5
 """Samples in full light that a level under a rolled ball needs."""
 
-_BIN, _BINS = 2048, 32  # fewest pixels that a noise is estimated from, and most levels for which it is
+_BIN, _BINS = 2048, 32  # pixels in a bin of equal levels, at least; number of bins, at most
 _RARE = 6.0  # standard deviations beyond which a variance is an outlier
 _UNCLIPPED = 0.05  # least share of unclipped samples for a level to be estimated
-_FAR = 6.0  # standard deviations from the end of the scale beyond which clipping does not matter
-_STEPS = 4  # iterations; they converge at once
-_TINY = 1e-30  # counts^2
+_FAR = 6.0  # standard deviations from the end of the scale beyond which clipping is negligible
+_STEPS = 4  # iterations, which converge in fewer
+_TINY = 1e-30  # counts^2: avoids division by 0
+
+
+def mad_sigma(residuals: Floats) -> float:
+    """Return a robust standard deviation of residuals about 0: 1.4826 times their median magnitude."""
+    return 1.4826 * float(np.median(np.abs(residuals)))
 
 
 class Moments:
-    """Running count, mean, variance and extremes of each pixel; samples that are not finite are left out.
+    """Running count, mean, variance and extremes of each pixel; samples that are not finite are ignored.
 
-    Sums are of differences from the first frame, in float64: for integers they are exact.
+    Differences from the first frame are summed in float64, which is exact for integers.
     """
 
     lowest: NDArray[Any]
@@ -62,19 +67,19 @@ class Moments:
         return np.asarray(np.where(self.count > 1, squares / np.maximum(self.count - 1, 1), np.nan))
 
     def push(self, frames: NDArray[Any]) -> None:
-        """Take in frames, (n, H, W)."""
+        """Add frames, (n, H, W)."""
         for frame in frames:
-            known = np.isfinite(frame)
-            counts = np.where(known, frame, 0).astype(np.float64)
+            valid = np.isfinite(frame)
+            counts = np.where(valid, frame, 0).astype(np.float64)
             if self._first is None:
                 self._first = counts
-            difference = np.where(known, counts - self._first, 0.0)
+            difference = np.where(valid, counts - self._first, 0.0)
             self.sum += difference
             self._squares += difference * difference
-            self.count += known
-            low, high = np.where(known, counts, np.inf), np.where(known, counts, -np.inf)
-            self.at_lowest = self.at_lowest * (self.lowest <= low) + known * (low <= self.lowest)
-            self.at_highest = self.at_highest * (self.highest >= high) + known * (high >= self.highest)
+            self.count += valid
+            low, high = np.where(valid, counts, np.inf), np.where(valid, counts, -np.inf)
+            self.at_lowest = self.at_lowest * (self.lowest <= low) + valid * (low <= self.lowest)
+            self.at_highest = self.at_highest * (self.highest >= high) + valid * (high >= self.highest)
             np.minimum(self.lowest, low, out=self.lowest)
             np.maximum(self.highest, high, out=self.highest)
         self.frames += len(frames)
@@ -83,27 +88,26 @@ class Moments:
 class Level(NamedTuple):
     """A level of each pixel; all (H, W), float64."""
 
-    value: Floats  # counts; NaN without an answer
+    value: Floats  # counts; NaN if unknown
     sigma: Floats  # standard error of the value, counts
-    noise: Floats  # usual standard deviation of a sample at this level, before clipping, counts
-    excess: Floats  # the pixel's own variance in units of the usual one at its level
+    noise: Floats  # mean standard deviation of a sample at this level, before clipping, counts
+    excess: Floats  # ratio of the pixel's variance to the mean variance at its level
     clipped: Floats  # share of the samples at the end of the scale
 
 
 def level_above(moments: Moments, floor: float | None) -> Level:
     """Estimate the level of samples that are clipped at a floor (counts), if there is one.
 
-    The standard error is that of the mean, with the variance that pixels of about this level share (a pixel's
-    own counts by how much pixels differ: Buehlmann's credibility), plus what rounding leaves. Where samples
-    lie on the floor their mean is too high: the level is that of the normal distribution which, clipped
-    there, has this mean. Where 95 % of the samples or more lie on the floor only an upper bound is known, and
-    the error is one sample's noise.
+    The standard error is that of the mean, with a variance between the pixel's own and the mean one of pixels
+    of this level (Buehlmann's credibility), plus the error of rounding. Clipping raises the mean of samples:
+    the level is that of the normal distribution which has this mean when clipped. If 95 % of the samples or
+    more are at the floor, the level is an upper bound, and its error is the noise of one sample.
     """
     return _level(moments, moments.mean, moments.lowest, moments.at_lowest, floor)
 
 
 def level_below(moments: Moments, top: float | None) -> Level:
-    """Estimate the level of samples that are clipped at a top, if there is one; see `level_above`."""
+    """Estimate the level of samples that are clipped at a top, counts, if there is one: see `level_above`."""
     end = None if top is None else -top
     level = _level(moments, -moments.mean, -moments.highest, moments.at_highest, end)
     return level._replace(value=-level.value)
@@ -112,7 +116,7 @@ def level_below(moments: Moments, top: float | None) -> Level:
 def _level(
     moments: Moments, mean: Floats, least: Floats, at_least: NDArray[np.int32], floor: float | None
 ) -> Level:
-    """Estimate the level of samples, or of their negatives, of this mean and with these extremes."""
+    """Estimate the level of samples, or of their negatives, from their mean and least value."""
     variance = moments.variance
     clipped = np.zeros(mean.shape)
     if floor is not None:
@@ -120,7 +124,7 @@ def _level(
         unclipped = _unclipped_variance(mean - floor, variance, moments.integer)
         variance = np.where(clipped < 1 - _UNCLIPPED, unclipped, np.nan)
     usual, shrunk = pool_variance(mean, variance, moments.count - 1)
-    shrunk = np.where(clipped > 0, usual, shrunk)  # what clipping leaves of a pixel's own says little
+    shrunk = np.where(clipped > 0, usual, shrunk)  # a clipped variance has no weight
     value, error = mean, shrunk / np.maximum(moments.count, 1)
     if floor is not None:
         value, error = _unclipped_mean(mean - floor, shrunk, error, moments.integer)
@@ -132,36 +136,35 @@ def _level(
 
 
 def rounding_error(variance: Floats) -> Floats:
-    """Return the variance that rounding leaves in a mean of samples of a variance, counts^2.
+    """Return the variance due to rounding of a mean of samples with a variance, counts^2.
 
-    It does not average out: without noise a level lies anywhere within half a count of what is seen.
+    It does not average out: without noise, the level can be anywhere within half a count of the mean.
     """
-    sigma, left, observed = _rounding_tables()
-    return np.asarray(np.interp(np.interp(variance, observed, sigma), sigma, left))
+    sigma, bias, observed = _rounding_tables()
+    return np.asarray(np.interp(np.interp(variance, observed, sigma), sigma, bias))
 
 
 def pool_variance(level: Floats, variance: Floats, freedom: NDArray[np.int32]) -> tuple[Floats, Floats]:
-    """Estimate the noise of pixels from all that have about the same level.
+    """Estimate the noise of pixels from all pixels of about the same level.
 
-    Returned are the mean variance of pixels at that level without outliers, and the best linear guess of the
-    pixel's own (Buehlmann): between its variance and the usual one by how much pixels differ beyond chance;
-    its own where that is an outlier. ``freedom`` are the degrees of freedom of the variances.
+    Returned are the mean variance at that level without outliers, and the best linear estimate of the pixel's
+    own variance (Buehlmann): between both, depending on how much pixels differ beyond chance; outliers keep
+    their variance. ``freedom`` are the degrees of freedom of the variances.
     """
-    known = np.isfinite(level) & np.isfinite(variance)
-    if not known.any():
-        nothing = np.where(np.isfinite(level), 0.0, np.nan)
-        return nothing, nothing
-    degrees = float(np.median(freedom[known]))
+    valid = np.isfinite(level) & np.isfinite(variance)
+    if not valid.any():
+        zeros = np.where(np.isfinite(level), 0.0, np.nan)
+        return zeros, zeros
+    degrees = float(np.median(freedom[valid]))
     limit = rare_ratio(degrees)
-    usual = np.where(
-        np.isfinite(level), np.interp(level, *_binned_variance(level[known], variance[known], limit)), np.nan
-    )
+    curve = _binned_variance(level[valid], variance[valid], limit)
+    usual = np.where(np.isfinite(level), np.interp(level, *curve), np.nan)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(variance > 0, variance / usual, 0.0)
-    common = ratio[known & (ratio <= limit)]
+    common = ratio[valid & (ratio <= limit)]
     spread = float(np.var(common)) if common.size else 0.0
-    own = max(0.0, (spread - 2 / degrees) / (1 + 2 / degrees)) / max(spread, 1e-30)
-    best = np.where(ratio > limit, variance, usual * (1 - own) + own * variance)
+    credibility = max(0.0, (spread - 2 / degrees) / (1 + 2 / degrees)) / max(spread, 1e-30)
+    best = np.where(ratio > limit, variance, usual * (1 - credibility) + credibility * variance)
     return usual, np.where(np.isfinite(best), best, usual)
 
 
@@ -177,10 +180,8 @@ def _binned_variance(level: Floats, variance: Floats, limit: float) -> tuple[Flo
     edges = np.unique(np.quantile(level, np.linspace(0, 1, bins + 1)[1:-1]))
     number = np.searchsorted(edges, level, side="right")
     present = np.flatnonzero(np.bincount(number))
-    return (
-        np.array([level[number == one].mean() for one in present]),
-        np.array([_mean_without_outliers(variance[number == one], limit) for one in present]),
-    )
+    means = [_mean_without_outliers(variance[number == k], limit) for k in present]
+    return np.array([level[number == k].mean() for k in present]), np.array(means)
 
 
 def _mean_without_outliers(variance: Floats, limit: float) -> float:
@@ -213,9 +214,9 @@ def _clipped_normal() -> _ClippedNormal:
 
 @functools.cache
 def _rounding_tables() -> tuple[Floats, Floats, Floats]:
-    """Return standard deviations s, the mean square bias of rounded samples' mean, and their variance.
+    """Return standard deviations, and for each the mean square bias and the variance of rounded samples.
 
-    By Fourier's series of the sawtooth; the bias is averaged over all levels.
+    From the Fourier series of the sawtooth; the bias is averaged over all levels.
     """
     sigma, order = np.linspace(0.0, 2.0, 1001), np.arange(1, 61)[:, np.newaxis]
     bias = np.sum(np.exp(-((math.tau * order * sigma) ** 2)) / (2 * (math.pi * order) ** 2), axis=0)
@@ -224,7 +225,7 @@ def _rounding_tables() -> tuple[Floats, Floats, Floats]:
 
 
 def _unclipped_variance(distance: Floats, variance: Floats, integer: bool) -> Floats:
-    """Return the variance that samples would have, were they not clipped at a distance below their mean."""
+    """Return the variance of samples before they were clipped at a distance below their mean."""
     from scipy.special import ndtr
 
     table = _clipped_normal()
@@ -247,7 +248,7 @@ def _unclipped_variance(distance: Floats, variance: Floats, integer: bool) -> Fl
 def _unclipped_mean(
     distance: Floats, variance: Floats, error: Floats, integer: bool
 ) -> tuple[Floats, Floats]:
-    """Return the mean that samples would have, and its squared standard error."""
+    """Return the mean of samples before clipping, and its squared standard error."""
     table = _clipped_normal()
     noise = np.sqrt(np.maximum(variance - (ROUNDING if integer else 0.0), _TINY))
     near = distance < _FAR * noise
@@ -257,31 +258,31 @@ def _unclipped_mean(
         u = np.interp((mean + _lost_by_rounding(u, scale)) / scale, table.mean, table.u)
     value, error = distance.copy(), error.copy()
     value[near] = u * scale
-    known = error[near] * np.interp(u, table.u, table.variance / table.share**2)
-    error[near] = np.where(u > table.u[0], known, variance[near])
+    estimated = error[near] * np.interp(u, table.u, table.variance / table.share**2)
+    error[near] = np.where(u > table.u[0], estimated, variance[near])
     return value, error
 
 
 def _lost_by_rounding(u: Floats, noise: Floats) -> Floats:
-    """Return by how much rounding lowers the mean of samples clipped at 0 (Euler-Maclaurin)."""
-    least = math.sqrt(ROUNDING)  # below that the formula fails; rounding_error covers it
+    """Return the decrease of the mean of samples clipped at 0 by rounding (Euler-Maclaurin)."""
+    least = math.sqrt(ROUNDING)  # the formula fails below it; `rounding_error` covers that
     return np.asarray(np.exp(-(u**2) / 2) / (math.sqrt(math.tau) * 24 * np.maximum(noise, least)))
 
 
 # --- full light under a rolled ball -------------------------------------------------------------------------
 
-_BRIGHTEST = 3  # the sample, by brightness, that gives a first level: no single glint
-_LIT = 0.75  # of that light, for samples among which full light is looked for
-_WIDTH = 3.0  # standard deviations to either side that belong to full light
-_BELOW = 6.0  # standard deviations down to which samples show how many in half light there are
-_ROUNDS = 30
-_CONVERGED = 1e-3  # standard deviations
-_PLATEAU_BIN, _PLATEAU_BINS = 256, 16
+_BRIGHTEST = 3  # rank, by brightness, of the sample that is the first level: ignores glints
+_LIT = 0.75  # share of that light above which samples may be in full light
+_WIDTH = 3.0  # standard deviations to either side that count as full light
+_BELOW = 6.0  # standard deviations below full light from which the number in half light is estimated
+_ROUNDS = 30  # iterations, at most
+_CONVERGED = 1e-3  # standard deviations: change of the level in the last iteration
+_PLATEAU_BIN, _PLATEAU_BINS = 256, 16  # as _BIN and _BINS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plateau:
-    """The upper plateau of pixels' samples, (P,): NaN where it has fewer than five samples."""
+    """The upper plateau of pixels' samples, (P,), counts; NaN if it has fewer than five samples."""
 
     value: Floats
     sigma: Floats
@@ -290,15 +291,17 @@ class Plateau:
 
 
 def find_plateau(samples: Floats, dark: Floats, integer: bool) -> Plateau:
-    """Find the mean of the samples in full light, (T, P), among those in half light and in none.
+    """Find the mean of the samples in full light, (T, P), when others are in half light or dark.
 
-    The plateau is where a mean of samples is in the middle of the window of three standard deviations to
-    either side that it was taken from: the window cuts off as much above as below, so the mean has no bias,
-    as the mean of the brightest samples has. The standard deviation comes from the samples above the mean, of
-    all pixels of about that level, as none of these is in half light. How many in half light lie in the
-    window is estimated from those just below it, and their share of the mean is subtracted.
+    The plateau is the mean that is in the middle of its own window, three standard deviations to either side.
+    The window cuts off as much above as below, so this mean has no bias, unlike that of the brightest
+    samples. The standard deviation is estimated from the samples above the mean, of all pixels of about that
+    level, because none of these is in half light. The number of samples in half light within the window is
+    estimated from those just below it, and their contribution to the mean is subtracted.
     """
-    lit = samples >= dark + _LIT * (_third_brightest(samples) - dark)
+    rank = max(len(samples) - _BRIGHTEST, 0)
+    rough = np.partition(np.where(np.isfinite(samples), samples, -np.inf), rank, axis=0)[rank]
+    lit = samples >= dark + _LIT * (np.where(np.isfinite(rough), rough, np.nan) - dark)
     value = _masked_mean(samples, lit)
     noise = _noise_above(samples, value, np.full(value.shape, np.inf))
     for _ in range(_ROUNDS):
@@ -310,15 +313,8 @@ def find_plateau(samples: Floats, dark: Floats, integer: bool) -> Plateau:
     count = np.count_nonzero(np.abs(samples - value) <= _WIDTH * noise, axis=0)
     value, error = _without_half_light(samples, value, noise, count)
     error += rounding_error(noise**2) if integer else 0.0
-    known = count >= FEWEST
-    return Plateau(np.where(known, value, np.nan), np.where(known, np.sqrt(error), np.nan), noise, count)
-
-
-def _third_brightest(samples: Floats) -> Floats:
-    known = np.where(np.isfinite(samples), samples, -np.inf)
-    place = max(len(samples) - _BRIGHTEST, 0)
-    rough = np.partition(known, place, axis=0)[place]
-    return np.asarray(np.where(np.isfinite(rough), rough, np.nan))
+    enough = count >= FEWEST
+    return Plateau(np.where(enough, value, np.nan), np.where(enough, np.sqrt(error), np.nan), noise, count)
 
 
 def _masked_mean(samples: Floats, mask: Mask) -> Floats:
@@ -327,34 +323,34 @@ def _masked_mean(samples: Floats, mask: Mask) -> Floats:
 
 
 def _noise_above(samples: Floats, value: Floats, reach: Floats) -> Floats:
-    """Estimate the standard deviation from what lies above the level, of all pixels of about that level."""
+    """Estimate the standard deviation from samples above the level, of all pixels of about that level."""
     with np.errstate(invalid="ignore"):
         above = (samples > value) & (samples <= value + reach)
     count = above.sum(axis=0)
     squares = np.where(above, (samples - value) ** 2, 0.0).sum(axis=0)
-    own = np.maximum(1 - 1 / np.maximum(2 * count, 1), 0.5)  # the level is a mean of these, too
-    known = np.flatnonzero(count > 0)
-    if not known.size:
+    freedom = np.maximum(1 - 1 / np.maximum(2 * count, 1), 0.5)  # the level is a mean of these samples, too
+    occupied = np.flatnonzero(count > 0)
+    if not occupied.size:
         return np.where(np.isfinite(value), 0.0, np.nan)
-    order = known[np.argsort(value[known], kind="stable")]
+    order = occupied[np.argsort(value[occupied], kind="stable")]
     parts = np.array_split(order, min(max(order.size // _PLATEAU_BIN, 1), _PLATEAU_BINS))
     level = [value[part].mean() for part in parts]
-    pooled = [math.sqrt(squares[part].sum() / (count[part] * own[part]).sum()) for part in parts]
+    pooled = [math.sqrt(squares[part].sum() / (count[part] * freedom[part]).sum()) for part in parts]
     return np.where(np.isfinite(value), np.interp(value, level, pooled), np.nan)
 
 
 def _without_half_light(
     samples: Floats, value: Floats, noise: Floats, count: NDArray[np.int64]
 ) -> tuple[Floats, Floats]:
-    """Subtract what samples in half light add to the mean; return it and its squared standard error."""
+    """Subtract the contribution of samples in half light; return the mean and its squared standard error."""
     below = value - samples
     half = ((below > _WIDTH * noise) & (below <= _BELOW * noise)).sum(axis=0)
-    half = half * _WIDTH / (_BELOW - _WIDTH)  # as many lie in the window's lower half
+    half = half * _WIDTH / (_BELOW - _WIDTH)  # their density continues into the window's lower half
     lever = _WIDTH * noise / 2
     full = np.maximum(count - half, 1)
-    # A mean over a symmetric window about itself scatters more than one of all samples.
+    # The mean over a window about itself scatters more than the mean of all samples.
     inside = math.erf(_WIDTH / math.sqrt(2))
     kept = inside - 2 * _WIDTH * math.exp(-(_WIDTH**2) / 2) / math.sqrt(math.tau)
-    # Neither how many in half light there are nor where they lie in their half of the window is known.
+    # Both the number in half light and their position in the lower half are uncertain.
     error = inside / kept * noise**2 / full + half * (lever**2 + (_WIDTH * noise) ** 2 / 3) / full**2
     return value + half * lever / full, error

@@ -1,4 +1,4 @@
-"""What a turn shows of the body's lean: where a ball is in each frame, or how a plate is inclined."""
+"""The lean of the body in a rotation: the position of a ball in each frame, or the zenith of a plate."""
 
 from __future__ import annotations
 
@@ -8,48 +8,50 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.calibration.ball import follow_ball, pixel_size_of, read_turn, see_ball
+from mirrorskin.engine.calibration.ball import follow_ball, see_ball
 from mirrorskin.engine.calibration.brightness import Brightness, LinearBrightness
+from mirrorskin.engine.calibration.levels import mad_sigma
+from mirrorskin.engine.calibration.sources import check_ball_radius, pixel_size_of, read_turn
+from mirrorskin.engine.provenance import naming
 from mirrorskin.engine.rotation.design_matrix import check_phases
 from mirrorskin.io import InputError, Source, pixel_axes
 
 Doubles = NDArray[np.float64]
 
-_MOST_BYTES = 2_000_000_000  # of frames that are held
-_PHASES = 4  # that an ellipse and its mean need, at least
+_MOST_BYTES = 2_000_000_000  # of frames in memory
+_PHASES = 4  # phases that an ellipse and its mean need
 _SAME_PHASE = 1e-6  # radians
-_MARGIN = 2.0  # pixels from the outline within which a sample may be of the rest sheet
-_MOST = 20_000  # samples of a frame that are fitted
-_FEWEST = 30
-_ROUNDS = 8
-_STEP = 1e-3  # mm, of differences
-_CONVERGED = 1e-6  # mm
-_MEDIAN = 1.4826  # standard deviations of a normal variate, of its median magnitude
-_OUTLIER = 4.0  # standard deviations from which on a sample counts little
-_FAR = 0.25  # radii by which light may correct an outline
-_DEEP = 0.5  # mm by which an outline may mistake the depth where it is not that of the contact
-_RIM = 0.85  # share of the outline's radius from which on the rim is looked at
-_MOSTLY = 0.8  # share of the rim that must show the ball
-_SHALLOWER = 0.1  # share of the press by which the depth may differ from it
-_RIM_ERROR = 0.01  # radians that the mean residual of a sound rim may have
-_FAINT = 0.01  # share of the range that a plate must show
+_MARGIN = 2.0  # pixels from the outline within which a sample may show the free sheet
+_MOST = 20_000  # samples of a frame that are fitted, at most
+_FEWEST = 30  # samples of a frame, at least
+_ROUNDS = 8  # Gauss-Newton steps, at most
+_STEP = 1e-3  # mm: step of numerical derivatives
+_CONVERGED = 1e-6  # mm: size of the last step
+_OUTLIER = 4.0  # standard deviations: scale of the robust weights
+_FAR = 0.25  # radii: greatest distance of the fitted centre from that of the outline
+_DEEP = 0.5  # mm: standard deviation of the depth if the outline is not that of the contact
+_RIM = 0.85  # share of the outline's radius at which the rim begins
+_MOSTLY = 0.8  # least share of the rim that shows the ball
+_SHALLOWER = 0.1  # greatest relative difference of the depth from the recorded press
+_RIM_ERROR = 0.01  # radians: greatest mean residual of a valid rim
+_FAINT = 0.01  # share of the range by which a plate must be inside it
 
 
 class BallTrack(NamedTuple):
-    """A ball's centre in the frames of a turn; NaN where it is not seen."""
+    """A ball's centre in the frames of a rotation; NaN where no ball is visible."""
 
-    phase: Doubles  # (T,): radians, as the recording has them
+    phase: Doubles  # (T,): radians, as in the recording
     centres: Doubles  # (T, 3): mm, in the body's frame of that pose
     sigma: Doubles  # (T, 3): standard errors, mm
 
 
 class PlateTrack(NamedTuple):
-    """The zenith that a plate shows in the frames of a turn; (T,), radians."""
+    """The zenith of a plate in the frames of a rotation; (T,), radians."""
 
     phase: Doubles
     zenith: Doubles
     sigma: Doubles
-    level: bool  # else it is a wedge, inclined anyhow
+    level: bool  # whether the plate is level; otherwise it is a wedge of unknown inclination
 
 
 class _BallTurn(NamedTuple):
@@ -62,20 +64,24 @@ class _BallTurn(NamedTuple):
 def track_ball(source: Source, radius: float, light: Brightness) -> BallTrack:
     """Find a ball's centre in each frame of an axial recording.
 
-    Its outline gives it roughly (see `follow_ball`). Then what the ball shows is fitted to the light inside
-    by Gauss-Newton steps. Light that is linear in the zenith does not depend on how deep the ball lies: the
-    depth then comes from the outline alone, if that is where the contact ends. It is not, and the depth all
-    but unknown, where what lies within does not show the ball up to the rim (the wall ends before the contact
-    does), and where the stage's press is another (the gel gives way, or the stage's zero is wrong).
+    The outline gives an approximate centre (see `follow_ball`); the light inside it is then fitted by
+    Gauss-Newton steps. Light that is linear in the zenith does not depend on the ball's depth, which then
+    follows from the outline alone, provided that it is the outline of the contact. Otherwise the depth is
+    nearly unknown: if the rim does not show the ball (the wall ends before the contact does), or if the depth
+    differs from the recorded press (the elastomer gives way, or the stage's zero is wrong).
+
+    Parameters
+    ----------
+    source : Source
+    radius : float
+        Radius of the ball, mm.
+    light : LinearBrightness or WallBrightness
     """
     pixel_size = pixel_size_of(source)
-    if not radius > 0:
-        raise InputError(f"a ball of {2 * radius:g} mm cannot be: give its diameter")
+    check_ball_radius(radius)
     frames, phase = _read_turn(source)
-    try:
+    with naming(source):
         centres, sigma = follow_ball(frames, pixel_size, radius)
-    except InputError as error:
-        raise InputError(f"{source.name}: {error}") from None
     turn = _BallTurn(frames, pixel_size, radius, light)
     for number in np.flatnonzero(np.isfinite(centres[:, 0])):
         _fit_centre(turn, frames[number], centres[number], sigma[number])
@@ -88,9 +94,16 @@ def track_ball(source: Source, radius: float, light: Brightness) -> BallTrack:
 
 
 def track_plate(source: Source, level: bool, light: Brightness) -> PlateTrack:
-    """Find how far a plate leans in each frame of an axial recording, by the mean of the pixels that show it.
+    """Find the zenith of a plate in each frame of an axial recording, as the mean of the pixels that show it.
 
-    A level plate is dark unless the wall reaches up to the camera; a wedge is then needed.
+    A level plate is dark unless the wall reaches up to the camera; then a wedge is needed.
+
+    Parameters
+    ----------
+    source : Source
+    level : bool
+        Whether the plate is level.
+    light : LinearBrightness
     """
     if not isinstance(light, LinearBrightness):
         raise InputError(
@@ -101,18 +114,17 @@ def track_plate(source: Source, level: bool, light: Brightness) -> PlateTrack:
     zenith = light.of_counts(frames.reshape(len(frames), -1), np.arange(frames[0].size))
     mean = zenith.mean(axis=0)
     with np.errstate(invalid="ignore"):
-        faint = np.where(np.isfinite(light.high - light.low), _FAINT * (light.high - light.low), 0.0)
-        seen = (mean > light.low + faint) & (mean < light.high - faint)
-    zenith = zenith[:, seen]
-    for _ in range(2):  # without the plate's edge, where frames do not vary as those of the others
+        margin = np.where(np.isfinite(light.high - light.low), _FAINT * (light.high - light.low), 0.0)
+        zenith = zenith[:, (mean > light.low + margin) & (mean < light.high - margin)]
+    for _ in range(2):  # without the plate's edge, where brightness varies differently
         if zenith.shape[1] < _FEWEST:
             raise InputError(
                 f"{source.name}: no flat plate is seen: with this pattern it is dark unless it is inclined"
                 " more; take a wedge of 25 degrees, say"
             )
         middle = np.median(zenith, axis=1, keepdims=True)
-        away = np.sqrt(np.mean((zenith - middle) ** 2, axis=0))
-        zenith = zenith[:, away < _OUTLIER * np.median(away) + 1e-12]
+        residual = np.sqrt(np.mean((zenith - middle) ** 2, axis=0))
+        zenith = zenith[:, residual < _OUTLIER * np.median(residual) + 1e-12]
     sigma = (zenith.std(axis=1) + 1e-9) / math.sqrt(zenith.shape[1])
     return PlateTrack(phase, zenith.mean(axis=1), sigma, level)
 
@@ -123,15 +135,15 @@ def _read_turn(source: Source) -> tuple[NDArray[Any], Doubles]:
     if size > _MOST_BYTES:
         raise InputError(f"{source.name}: {size / 1e9:.1f} GB of frames are too much: take a turn or two")
     frames, phase = read_turn(source)
-    known = check_phases(phase)
-    different = len(np.unique(np.round(np.mod(known, math.tau) / _SAME_PHASE)))
+    phase = check_phases(phase)
+    different = len(np.unique(np.round(np.mod(phase, math.tau) / _SAME_PHASE)))
     if different < _PHASES:
         raise InputError(f"{source.name}: {different} different phases, at least {_PHASES} are needed")
-    return frames, known
+    return frames, phase
 
 
 def _fit_centre(turn: _BallTurn, frame: NDArray[Any], centre: Doubles, sigma: Doubles) -> None:
-    """Bring a centre of one frame, and its standard errors, (3,), to what the light says, in place."""
+    """Fit the centre in one frame, (3,), and its standard errors to the light, in place."""
     x, y = np.meshgrid(*pixel_axes((frame.shape[0], frame.shape[1]), turn.pixel_size))
     outline = math.sqrt(max(turn.radius**2 - float(centre[2]) ** 2, 0.0)) - _MARGIN * max(turn.pixel_size)
     pixels = np.flatnonzero(np.hypot(x - centre[0], y - centre[1]) < outline)
@@ -141,42 +153,42 @@ def _fit_centre(turn: _BallTurn, frame: NDArray[Any], centre: Doubles, sigma: Do
     sight = np.stack([x, y, *turn.light.sight(pixels)])
     linear = isinstance(turn.light, LinearBrightness)
     prior, outline_sigma = float(sigma[2]) if linear else _DEEP, sigma[2]
-    sigma[2] = _DEEP  # until it is seen that the outline is that of the contact
+    sigma[2] = _DEEP  # unless the outline proves to be that of the contact
     place = centre.copy()
     for _ in range(_ROUNDS):
         expected, within = _expected(turn, sight, pixels, place)
-        beside = [_expected(turn, sight, pixels, place + step)[0] for step in _STEP * np.eye(3)]
-        slopes, residual = (np.stack(beside, axis=1) - expected[:, np.newaxis]) / _STEP, light - expected
+        moved = [_expected(turn, sight, pixels, place + step)[0] for step in _STEP * np.eye(3)]
+        slopes, residual = (np.stack(moved, axis=1) - expected[:, np.newaxis]) / _STEP, light - expected
         used = within & np.isfinite(residual) & np.isfinite(slopes).all(axis=1)
         if np.count_nonzero(used) < _FEWEST:
             return
         slopes, residual = slopes[used], residual[used]
-        spread = _MEDIAN * float(np.median(np.abs(residual))) + 1e-9
-        weighted = slopes / ((1 + (residual / (_OUTLIER * spread)) ** 2) * spread)[:, np.newaxis] ** 2
-        square, pull = weighted.T @ slopes, weighted.T @ residual
-        square[2, 2] += prior**-2
+        noise = mad_sigma(residual) + 1e-9
+        weighted = slopes / ((1 + (residual / (_OUTLIER * noise)) ** 2) * noise)[:, np.newaxis] ** 2
+        curvature, pull = weighted.T @ slopes, weighted.T @ residual
+        curvature[2, 2] += prior**-2
         pull[2] += (centre[2] - place[2]) / prior**2
-        step = np.linalg.solve(square, pull)
+        step = np.linalg.solve(curvature, pull)
         place = place + np.clip(step, -1, 1) * min(1.0, float(turn.radius))
         if np.max(np.abs(step)) < _CONVERGED:
             break
     if np.linalg.norm((place - centre)[:2]) > _FAR * turn.radius:
         return
-    centre[:], sigma[:] = place, np.sqrt(np.diag(np.linalg.inv(square)))
+    centre[:], sigma[:] = place, np.sqrt(np.diag(np.linalg.inv(curvature)))
     if linear:
         away = np.hypot(x - place[0], y - place[1])
         rim = away > _RIM * away.max()
         off = residual[rim[used]]
-        shown = off.size >= max(1, _MOSTLY * np.count_nonzero(rim)) and (
-            abs(float(np.mean(off))) < _RIM_ERROR + _OUTLIER * spread / math.sqrt(off.size)
+        visible = off.size >= max(1, _MOSTLY * np.count_nonzero(rim)) and (
+            abs(float(np.mean(off))) < _RIM_ERROR + _OUTLIER * noise / math.sqrt(off.size)
         )
-        sigma[2] = outline_sigma if shown else _DEEP
+        sigma[2] = outline_sigma if visible else _DEEP
 
 
 def _expected(
     turn: _BallTurn, sight: Doubles, pixels: NDArray[np.intp], centre: Doubles
 ) -> tuple[Doubles, NDArray[np.bool_]]:
-    """Return what pixels, (n,), show of a ball upright at a place, and whether that is within range."""
+    """Return the brightness of pixels, (n,), for a ball at a position, and whether it is within range."""
     seen = see_ball(sight, centre, turn.radius, np.zeros((1, 2)), (0.0, 0.0, 0.0))
     with np.errstate(invalid="ignore"):
         light, within = turn.light.of_normals(seen.normal, seen.z, pixels)

@@ -1,9 +1,9 @@
-"""What pixels see of balls under the lit wall, and how that changes with the parameters that are fitted.
+"""The light of balls under the lit wall, and its derivatives by the parameters of a fit.
 
-A printed pattern is a monotone curve of light, which scatter blurs: here a ray is spread evenly over the
-angles that the sheet's flakes turn it by, and what passes over the rim or below the rest plane is dark.
-Otherwise the formula is that of `mirrorskin.kernels.response`. The place on the wall is given by a share u:
-0 at the rim and 1 at the rest plane, evenly in the elevation at which the sheet's centre sees it.
+A printed pattern is a monotone curve of light, blurred by scatter: a ray is spread evenly over the angles by
+which the sheet's flakes turn it, and rays over the rim or below the rest plane are dark. Otherwise the
+formula is that of `mirrorskin.kernels.response`. The position on the wall is a share u: 0 at the rim and 1 at
+the rest plane, linear in the elevation seen from the sheet's centre.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from mirrorskin.kernels.response import reflect, way_to_wall
 
 Doubles = NDArray[np.float64]
 
-_PIECES = 8  # a gamma of 2.2 is met within 2e-4 of full light
-_CUBIC = 3
+_PIECES = 8  # of the curve: enough for a gamma of 2.2 within 2e-4 of full light
+_CUBIC = 3  # degree of the curve
 CURVE_COEFFICIENTS = _PIECES + _CUBIC
-"""Of a curve, which is a cubic spline with evenly spaced knots on 0 to 1, and 0 beyond."""
+"""Number of coefficients of the curve, a cubic spline with evenly spaced knots on 0 to 1, and 0 outside."""
 
 _KNOTS = np.pad(np.linspace(0, 1, _PIECES + 1), _CUBIC, "edge")
 
@@ -38,10 +38,10 @@ def curve_values(coefficients: ArrayLike, share: ArrayLike) -> Doubles:
 
 
 def curve_means(low: ArrayLike, high: ArrayLike) -> Doubles:
-    """Return the matrix that makes of coefficients the curve's means over intervals, (n, CURVE_COEFFICIENTS).
+    """Return the matrix from coefficients to the curve's means over intervals, (n, CURVE_COEFFICIENTS).
 
-    With G, the antiderivative, they are ``(G(high) - G(low)) / (high - low)``: what a mirror shows that
-    spreads each ray evenly over the interval.
+    With the antiderivative G it is ``(G(high) - G(low)) / (high - low)``: the light of a mirror that spreads
+    each ray evenly over the interval.
     """
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
     grown = _antiderivatives(np.clip(high, 0, 1)) - _antiderivatives(np.clip(low, 0, 1))
@@ -49,10 +49,10 @@ def curve_means(low: ArrayLike, high: ArrayLike) -> Doubles:
 
 
 def curve_from_steps(rising: bool) -> Doubles:
-    """Return the square matrix that makes coefficients of steps.
+    """Return the square matrix from steps to coefficients.
 
-    The first step is the lower end of the curve; if the others are at least 0, the coefficients never turn
-    back, and so neither does the curve.
+    The first step is the lower end of the curve. If the others are not negative, the coefficients are
+    monotone, and so is the curve.
     """
     matrix = np.tril(np.ones((CURVE_COEFFICIENTS, CURVE_COEFFICIENTS)))
     return matrix if rising else matrix[::-1]
@@ -66,8 +66,8 @@ def curve_roughness() -> Doubles:
 def _antiderivatives(share: Doubles) -> Doubles:
     """Return the antiderivative of each basis function, (n, CURVE_COEFFICIENTS).
 
-    That of a cubic spline of coefficients c is a spline of fourth degree, whose coefficients are the running
-    sums of c_i (t[i+4] - t[i]) / 4 (de Boor, A Practical Guide to Splines, chapter X).
+    The antiderivative of a cubic spline with coefficients c is a spline of fourth degree with the cumulative
+    sums of c_i (t[i+4] - t[i]) / 4 as coefficients (de Boor, A Practical Guide to Splines, chapter X).
     """
     from scipy.interpolate import BSpline
 
@@ -83,25 +83,25 @@ SENSOR = (
     *("pivot_x", "pivot_y", "pivot_z", "phase_offset"),
     *("lamp_x", "lamp_y", "shade_0", "shade_1", "shade_2", "shade_3", "shade_4"),
 )
-"""Parameters of the sensor, in their order in a fit; the curve's steps and the balls' centres follow."""
+"""Names of the sensor's parameters in the order of a fit; the curve's steps and the balls' centres follow."""
 
 STEPS = slice(len(SENSOR), len(SENSOR) + CURVE_COEFFICIENTS)
-"""Where the curve's steps are among the parameters; the balls' centres, x, y and z each, follow."""
+"""The curve's steps among the parameters; the balls' centres, x, y and z each, follow."""
 
-_BENT = len(SENSOR) - 7  # parameters that change which way a ray goes, and not only its light
-_OF_THE_WALL = ("radius", "rim", "scatter")  # that do not change where a pixel looks
-_STEEPEST = np.radians(89.0)  # elevation up to which a ray is followed to the wall
-_SMALL = 1e-5  # step of the differences, as a share of a parameter's scale
+_GEOMETRIC = len(SENSOR) - 7  # number of parameters that change the path of rays; others change their light
+_OF_THE_WALL = ("radius", "rim", "scatter")  # parameters without influence on where rays are reflected
+_STEEPEST = np.radians(89.0)  # greatest elevation of a ray that is followed to the wall
+_SMALL = 1e-5  # step of numerical derivatives, relative to a parameter's scale
 SCALES = dict(zip(SENSOR, (1, 1, 1, 1, 1e-3, 1e-6, 1e-2, 1, 1, 1, 1e-2, *[0.1] * 7), strict=True))
-"""How far each parameter of the sensor may be expected to be off, about."""
+"""Order of magnitude of the error of each parameter of the sensor."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightSamples:
     """The light of N pixels that see balls in axial rotations."""
 
-    light: Doubles  # (N,): share of the pixel's own full light
-    place: Doubles  # (2, N): x and y at which the pixel looks on the rest plane, mm
+    light: Doubles  # (N,): share of the pixel's full light
+    place: Doubles  # (2, N): x and y of the pixel on the rest plane, mm
     pose: NDArray[np.intp]  # (N,): number of the frame, counted through all presses
     press: NDArray[np.intp]  # (poses,): press that each frame belongs to
     lean: Doubles  # (poses, 2): of the body in each frame, radians; see `rotations`
@@ -114,7 +114,7 @@ class LightSamples:
 
 
 class SheetPoints(NamedTuple):
-    """Where lines of sight meet the sheet: from the body's axis, mm; sight and normal are unit vectors."""
+    """Points of the sheet on lines of sight, mm from the body's axis; sight and normal are unit vectors."""
 
     x: Doubles
     y: Doubles
@@ -124,67 +124,72 @@ class SheetPoints(NamedTuple):
 
 
 class WallHit(NamedTuple):
-    """What mirrored rays see of the wall."""
+    """The part of the wall that reflected rays see."""
 
-    low: Doubles  # (N,): share from which a ray is spread
-    high: Doubles  # (N,): and up to which
+    low: Doubles  # (N,): first share that a ray is spread over
+    high: Doubles  # (N,): last share
     azimuth: Doubles  # (2, N): direction of the wall's point, a unit vector
 
 
 def meet_balls(samples: LightSamples, named: Mapping[str, float], centres: Doubles) -> SheetPoints:
-    """Return where pixels see the balls, whose centres in the mean pose are (presses, 3), mm.
+    """Return the points that pixels see on balls with these centres in the mean pose, (presses, 3), mm.
 
-    A line of sight that misses its ball is taken to where it is nearest.
+    A line of sight that misses its ball is followed to the point closest to it.
     """
-    middle = _centres(samples, named, centres)[samples.pose].T
-    (x, y), (across, up) = look(samples.place, named)
+    pivot = np.array([named["pivot_x"], named["pivot_y"], named["pivot_z"]])
+    cos, sin = np.cos(named["phase_offset"]), np.sin(named["phase_offset"])
+    turns = rotations(samples.lean @ np.array([[cos, sin], [-sin, cos]]))
+    in_frames = np.asarray(pivot + np.einsum("pij,pj->pi", turns, centres[samples.press] - pivot))
+    middle = in_frames[samples.pose].T
+    (x, y), (slope_x, slope_y) = look(samples.place, named)
     start_x, start_y, start_z = samples.place[0] - middle[0], samples.place[1] - middle[1], -middle[2]
-    square = across * across + up * up + 1
-    linear = start_x * across + start_y * up + start_z
-    room = linear**2 - square * (start_x**2 + start_y**2 + start_z**2 - samples.ball**2)
-    z = (np.sqrt(np.maximum(room, 0)) - linear) / square
-    normal = np.stack([start_x + z * across, start_y + z * up, start_z + z]) / samples.ball
-    return SheetPoints(x + z * across, y + z * up, z, down(np.stack([across, up])), normal)
+    square = slope_x * slope_x + slope_y * slope_y + 1
+    linear = start_x * slope_x + start_y * slope_y + start_z
+    discriminant = linear**2 - square * (start_x**2 + start_y**2 + start_z**2 - samples.ball**2)
+    z = (np.sqrt(np.maximum(discriminant, 0)) - linear) / square
+    normal = np.stack([start_x + z * slope_x, start_y + z * slope_y, start_z + z]) / samples.ball
+    return SheetPoints(x + z * slope_x, y + z * slope_y, z, down(np.stack([slope_x, slope_y])), normal)
 
 
-def down(lean: Doubles) -> Doubles:
-    """Return the unit vectors along which pixels look, (3, N), whose lines of sight lean so, (2, N)."""
-    return np.asarray(-np.stack([*lean, np.ones(lean.shape[1])]) / np.sqrt((lean**2).sum(axis=0) + 1))
+def down(slope: Doubles) -> Doubles:
+    """Return unit vectors along lines of sight, (3, N), from their slopes along x and y, (2, N)."""
+    return np.asarray(-np.stack([*slope, np.ones(slope.shape[1])]) / np.sqrt((slope**2).sum(axis=0) + 1))
 
 
 def look(place: Doubles, named: Mapping[str, float]) -> tuple[Doubles, Doubles]:
-    """Return where pixels at places, (2, N), look on the rest plane from the axis, mm, and how they lean.
+    """Return positions relative to the axis, mm, and slopes of lines of sight, of places on the rest plane.
 
-    Both are (2, N): the lines pass ``place + z lean``.
+    All are (2, N): the lines pass ``position + z slope``.
     """
     from_axis = place - np.array([[named["axis_x"]], [named["axis_y"]]])
     return from_axis, -(named["sight_0"] + named["sight_2"] * (from_axis**2).sum(axis=0)) * from_axis
 
 
 def reach_wall(met: SheetPoints, named: Mapping[str, float]) -> WallHit:
-    """Return where the mirrored rays meet the wall, spread along the direction in which that matters most.
+    """Return where reflected rays meet the wall, spread along the direction that changes the height most.
 
-    A turn of the ray by da moves its height there by up to ``way da sqrt(c^2 + rz^2) / c`` with c the cosine
-    to the wall's normal; straight up and down it is ``way da / (rx^2 + ry^2)`` across the axis.
+    A rotation of the ray by da changes its height on the wall by up to ``d da sqrt(c^2 + rz^2) / c``, with
+    the distance d and the cosine c to the wall's normal; a vertical rotation changes it by
+    ``d da / (rx^2 + ry^2)``.
     """
     radius = named["radius"]
     ray = reflect(met.sight, met.normal)
-    # A ray that goes straight up, and a place that a trial of the fit puts outside, have an answer, too.
+    # Vertical rays, and points that an iteration of the fit puts outside the wall, must not cause errors.
     out = np.sqrt(ray[0] ** 2 + ray[1] ** 2) + 1e-12
     room = np.maximum(radius**2 - met.x**2 - met.y**2, 1e-6)
-    way, cosine = way_to_wall(met.x * ray[0] + met.y * ray[1], out**2, room)
+    distance, cosine = way_to_wall(met.x * ray[0] + met.y * ray[1], out**2, room)
     elevation = np.arctan2(ray[2], out)
-    turn = named["scatter"] * np.sqrt(out**2 + (ray[2] * radius * out / cosine) ** 2)
+    spread = named["scatter"] * np.sqrt(out**2 + (ray[2] * radius * out / cosine) ** 2)
     whole = np.arctan2(named["rim"], radius)
     high, low = (
-        1 - np.arctan2(met.z + way * out * np.tan(np.clip(angle, -_STEEPEST, _STEEPEST)), radius) / whole
-        for angle in (elevation - turn, elevation + turn)
+        1 - np.arctan2(met.z + distance * out * np.tan(np.clip(angle, -_STEEPEST, _STEEPEST)), radius) / whole
+        for angle in (elevation - spread, elevation + spread)
     )
-    return WallHit(low, high, np.stack([met.x + way * ray[0], met.y + way * ray[1]]) / radius)
+    return WallHit(low, high, np.stack([met.x + distance * ray[0], met.y + distance * ray[1]]) / radius)
 
 
 def shade_terms(met: SheetPoints, radius: float) -> Doubles:
-    """Return the five functions of the pixels' place on the rest plane that the shade is made of, (5, N)."""
+    """Return the five functions of the position on the rest plane that shading is composed of, (5, N)."""
     back = met.z / met.sight[2]
     x, y = (met.x - back * met.sight[0]) / radius, (met.y - back * met.sight[1]) / radius
     return np.stack([x, y, x * x, x * y, y * y])
@@ -197,23 +202,22 @@ def split(parameters: Doubles) -> tuple[dict[str, float], Doubles, Doubles]:
 
 
 def light_of(met: SheetPoints, named: Mapping[str, float], coefficients: Doubles) -> Doubles:
-    """Return the light of mirrors, (N,): shares of each pixel's own full light."""
+    """Return the light of mirrors, (N,): shares of each pixel's full light."""
     wall = reach_wall(met, named)
-    return np.asarray(
-        _factor(met, wall, named) * (np.einsum("nk,k->n", curve_means(wall.low, wall.high), coefficients))
-    )
+    level = np.einsum("nk,k->n", curve_means(wall.low, wall.high), coefficients)
+    return np.asarray(_factor(met, wall, named) * level)
 
 
 def predict(samples: LightSamples, parameters: Doubles, rising: bool) -> Doubles:
-    """Return the light that samples should have, (N,)."""
+    """Return the light of samples by the model, (N,)."""
     named, steps, centres = split(parameters)
     return light_of(meet_balls(samples, named, centres), named, curve_from_steps(rising) @ steps)
 
 
 def linearise(samples: LightSamples, parameters: Doubles, rising: bool) -> tuple[Doubles, Doubles]:
-    """Return the light that samples should have, (N,), and how it changes with the parameters, (N, P).
+    """Return the light of samples by the model, (N,), and its derivatives by the parameters, (N, P).
 
-    The geometry is differenced, and everything else differentiated.
+    Derivatives of the geometry are numerical, all others analytical.
     """
     named, steps, centres = split(parameters)
     met = meet_balls(samples, named, centres)
@@ -224,39 +228,30 @@ def linearise(samples: LightSamples, parameters: Doubles, rising: bool) -> tuple
     by_high = per_width * (curve_values(coefficients, wall.high) - level)
     by_low = per_width * (level - curve_values(coefficients, wall.low))
 
-    def change(step: float, bent: Mapping[str, float], there: SheetPoints) -> Doubles:
-        other = reach_wall(there, bent)
+    def change(step: float, changed: Mapping[str, float], points: SheetPoints) -> Doubles:
+        other = reach_wall(points, changed)
         by_ends = by_high * (other.high - wall.high) + by_low * (other.low - wall.low)
-        return np.asarray((by_ends + level * (_factor(there, other, bent) - factor)) / step)
+        return np.asarray((by_ends + level * (_factor(points, other, changed) - factor)) / step)
 
     slopes = np.zeros((len(level), len(parameters)))
-    for number, name in enumerate(SENSOR[:_BENT]):
+    for number, name in enumerate(SENSOR[:_GEOMETRIC]):
         step = _SMALL * SCALES[name]
-        bent = {**named, name: named[name] + step}
-        slopes[:, number] = change(
-            step, bent, met if name in _OF_THE_WALL else meet_balls(samples, bent, centres)
-        )
+        changed = {**named, name: named[name] + step}
+        points = met if name in _OF_THE_WALL else meet_balls(samples, changed, centres)
+        slopes[:, number] = change(step, changed, points)
     lamp = 1 + named["lamp_x"] * wall.azimuth[0] + named["lamp_y"] * wall.azimuth[1]
-    slopes[:, _BENT : _BENT + 2] = (factor * level / lamp * wall.azimuth).T
-    slopes[:, _BENT + 2 : STEPS.start] = (lamp * level * shade_terms(met, named["radius"])).T
+    slopes[:, _GEOMETRIC : _GEOMETRIC + 2] = (factor * level / lamp * wall.azimuth).T
+    slopes[:, _GEOMETRIC + 2 : STEPS.start] = (lamp * level * shade_terms(met, named["radius"])).T
     slopes[:, STEPS] = factor[:, np.newaxis] * np.einsum("nk,ks->ns", basis, curve_from_steps(rising))
-    own = STEPS.stop + 3 * samples.press[samples.pose]
-    for axis, moved in enumerate(_SMALL * np.eye(3)):
-        there = meet_balls(samples, named, centres + moved)
-        slopes[np.arange(len(level)), own + axis] = change(_SMALL, named, there)
+    centre = STEPS.stop + 3 * samples.press[samples.pose]
+    for axis, shift in enumerate(_SMALL * np.eye(3)):
+        points = meet_balls(samples, named, centres + shift)
+        slopes[np.arange(len(level)), centre + axis] = change(_SMALL, named, points)
     return factor * level, slopes
 
 
-def _centres(samples: LightSamples, named: Mapping[str, float], centres: Doubles) -> Doubles:
-    """Return where the balls' centres are in each frame, (poses, 3), mm."""
-    pivot = np.array([named["pivot_x"], named["pivot_y"], named["pivot_z"]])
-    cos, sin = np.cos(named["phase_offset"]), np.sin(named["phase_offset"])
-    turned = rotations(samples.lean @ np.array([[cos, sin], [-sin, cos]]))
-    return np.asarray(pivot + np.einsum("pij,pj->pi", turned, centres[samples.press] - pivot))
-
-
 def _factor(met: SheetPoints, wall: WallHit, named: Mapping[str, float]) -> Doubles:
-    """Return what lamps and shade make of the light."""
+    """Return the factor of lamps and shading."""
     lamp = 1 + named["lamp_x"] * wall.azimuth[0] + named["lamp_y"] * wall.azimuth[1]
     shade = np.array([named[f"shade_{number}"] for number in range(5)])
     return np.asarray(lamp * (1 + shade @ shade_terms(met, named["radius"])))

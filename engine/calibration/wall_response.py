@@ -1,4 +1,4 @@
-"""What a fit of the wall says of every pixel, how sure that is, and from which zenith mirrors are light."""
+"""The response of all pixels from a fit of the wall, its errors, and the zenith of first light."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.calibration.ball import pixel_size_of, rotations
+from mirrorskin.engine.calibration.ball import rotations
+from mirrorskin.engine.calibration.sources import pixel_size_of
 from mirrorskin.engine.calibration.wall_fit import WallFit
 from mirrorskin.engine.calibration.wall_model import (
     CURVE_COEFFICIENTS,
@@ -32,27 +33,27 @@ from mirrorskin.kernels.response import reflect, way_to_wall
 
 Doubles = NDArray[np.float64]
 
-_ZENITHS = 16  # at which the first light is looked for
-_HALVINGS = 16
-_STEEPEST = math.radians(89.0)  # elevation up to which rays are followed
+_ZENITHS = 16  # at which the first light is searched for
+_HALVINGS = 16  # of the interval of the first light
+_STEEPEST = math.radians(89.0)  # greatest elevation of a ray that is followed to the wall
 
-_MARGIN = 1.05  # of the scatter: its edges are not sharp, and off the centre it is a little wider
-_EXACT = 1e-4  # of full light by which the polynomial may miss the curve
-_TERMS = 12
-_PLACES = 400  # of the curve, at which the polynomial is fitted
-_HALF = 0.5  # of the light of a uniform wall
-_GRADED = 0.2  # of its greatest light by which a graded wall's changes at least
-_FLAT = 0.02  # of its middle's steepness that a curve must have to be read
-_FEW = 2e-3  # of the samples that may lie beyond the reach at either end
+_MARGIN = 1.05  # factor of the scatter, whose edges are not sharp; off the centre it is slightly wider
+_EXACT = 1e-4  # of full light: greatest error of the polynomial
+_TERMS = 12  # of the polynomial, at most
+_PLACES = 400  # points of the curve to which the polynomial is fitted
+_HALF = 0.5  # of full light: threshold of a uniform wall
+_GRADED = 0.2  # of its greatest light: least variation of a graded wall
+_FLAT = 0.02  # least slope of the curve relative to that in its middle
+_FEW = 2e-3  # share of the samples outside the reach, at either end
 
 _SIDE = 5  # places along a side at which errors are computed
-_TURN = 8  # azimuths there
-_LEAN = math.radians(2.5)  # of a usual rotation; errors of the normals hardly depend on it
-_FRAMES = 8
-_STEP = 1e-4  # radians, of differences
-_SMALL = 1e-3  # step of a parameter, as a share of its scale
+_TURN = 8  # azimuths at each place
+_LEAN = math.radians(2.5)  # of a typical rotation; errors of the normals hardly depend on it
+_FRAMES = 8  # of that rotation
+_STEP = 1e-4  # radians: step of numerical derivatives by angles
+_SMALL = 1e-3  # step of numerical derivatives by a parameter, relative to its scale
 _OUTLIER = 3.0  # times the noise at which residuals are clipped
-_RINGS, _OCTANTS = 6, 8  # cells of a press, whose mean residual is compared with noise
+_RINGS, _OCTANTS = 6, 8  # cells of a press, in which residuals are averaged
 
 
 def threshold_zenith(
@@ -64,13 +65,22 @@ def threshold_zenith(
     *,
     z: ArrayLike = 0.0,
 ) -> Doubles:
-    """Return the least zenith at which pixels get so much light, radians; NaN where none up to 45 deg does.
+    """Return the smallest zenith at which mirrors are bright, radians; NaN if there is none up to 45 degrees.
 
-    Pixels look at ``x`` and ``y`` on the rest plane, mm, at mirrors of this height ``z``, mm, whose normals
-    have this ``azimuth``; ``threshold`` is a share of their own full light. All arguments broadcast.
+    Parameters
+    ----------
+    response : WallResponse
+    x, y : array_like
+        Positions of pixels on the rest plane, mm. These, ``azimuth`` and ``z`` broadcast.
+    azimuth : array_like
+        Azimuth of the mirrors' normals, radians.
+    threshold : float
+        Share of the pixels' full light.
+    z : array_like
+        Height of the mirrors, mm.
     """
-    given = np.broadcast_arrays(*(np.asarray(value, np.float64) for value in (x, y, z, azimuth)))
-    *place, turn = (value.ravel() for value in given)
+    arrays = np.broadcast_arrays(*(np.asarray(value, np.float64) for value in (x, y, z, azimuth)))
+    *place, turn = (value.ravel() for value in arrays)
     places = np.stack(place)
     dark, light = np.zeros(turn.shape), np.full(turn.shape, np.nan)
     for zenith in np.linspace(0, math.pi / 4, _ZENITHS + 1)[1:]:
@@ -81,33 +91,33 @@ def threshold_zenith(
         middle = (dark + light) / 2
         lit = full_light(response, places, middle, turn) >= threshold
         dark, light = np.where(lit, dark, middle), np.where(lit, middle, light)
-    return np.asarray(((dark + light) / 2).reshape(given[0].shape))
+    return np.asarray(((dark + light) / 2).reshape(arrays[0].shape))
 
 
 def full_light(response: WallResponse, places: Doubles, zenith: Doubles, azimuth: Doubles) -> Doubles:
-    """Return shares of the pixels' own full light, (n,), also where part of a ray misses the wall.
+    """Return shares of the pixels' full light, (n,), also where part of a scattered ray misses the wall.
 
     ``places`` are x and y on the rest plane and the mirror's height, (3, n), mm; zenith and azimuth are those
-    of its normal. Beyond what is known of the wall it is as bright as at the end of that.
+    of its normal. Outside its reach the wall is as bright as at the end of the reach.
     """
     z, radius = places[2], response.radius
     from_axis = places[:2] - np.reshape(response.axis, (2, 1))
-    lean = response.sight_slopes(from_axis)
-    ray = reflect(down(lean), _normals(zenith, azimuth))
-    at = from_axis + z * lean
+    slope = response.sight_slopes(from_axis)
+    ray = reflect(down(slope), _normals(zenith, azimuth))
+    mirror = from_axis + z * slope
     out = np.sqrt(ray[0] ** 2 + ray[1] ** 2) + 1e-12
     with np.errstate(invalid="ignore"):
-        room = radius**2 - (at**2).sum(axis=0)
+        room = radius**2 - (mirror**2).sum(axis=0)
         room = np.where(room > 0, room, np.nan)
-        way, _ = way_to_wall((at * ray[:2]).sum(axis=0), out**2, room)
-        # The share of the ray, spread evenly over its scatter, that meets the wall.
+        distance, _ = way_to_wall((mirror * ray[:2]).sum(axis=0), out**2, room)
+        # Share of the ray, spread evenly over the scatter, that meets the wall.
         elevation, spread = np.arctan2(ray[2], out), max(response.scatter, 1e-9)
-        top = np.minimum(np.arctan2(response.rim - z, way * out), _STEEPEST)
-        bottom = np.arctan2(-z, way * out)
+        top = np.minimum(np.arctan2(response.rim - z, distance * out), _STEEPEST)
+        bottom = np.arctan2(-z, distance * out)
         lit = np.minimum(elevation + spread, top) - np.maximum(elevation - spread, bottom)
-        height = z + way * ray[2]
+        height = z + distance * ray[2]
         q = np.clip(height / (radius + np.hypot(height, radius)), *response.reach)
-        lamp = 1 + np.array(response.lamps) @ (at + way * ray[:2]) / radius
+        lamp = 1 + np.array(response.lamps) @ (mirror + distance * ray[:2]) / radius
     u, v = from_axis / radius
     shade = 1 + response.shade @ np.stack([u, v, u * u, u * v, v * v])
     level = np.polynomial.polynomial.polyval(q, response.curve)
@@ -122,9 +132,9 @@ def _normals(zenith: Doubles, azimuth: Doubles) -> Doubles:
 def make_response(
     fit: WallFit, samples: LightSamples, noise: Doubles, pattern: str, source: Source
 ) -> WallResponse:
-    """Return a fit, to samples of so much noise, as a response for the pixels of a source.
+    """Return a fit to samples with some noise as a response for the pixels of a source.
 
-    Its scatter is 5 % above the fitted one, so that what is within its range is so safely.
+    Its scatter is 5 % larger than the fitted one, so that its range is on the safe side.
     """
     named, steps, centres = split(fit.parameters)
     residual, most = error_left(samples, fit, noise)
@@ -159,20 +169,20 @@ def make_response(
 
 def _reach(named: Mapping[str, float], shares: tuple[float, float] = (0.0, 1.0)) -> tuple[float, float]:
     """Return the q between which the whole scattered ray meets the wall, and there are samples."""
-    whole, turn = math.atan2(named["rim"], named["radius"]), _MARGIN * named["scatter"]
-    low = max(turn, (1 - shares[1]) * whole)
-    high = min(whole - turn, (1 - shares[0]) * whole)
+    whole, spread = math.atan2(named["rim"], named["radius"]), _MARGIN * named["scatter"]
+    low = max(spread, (1 - shares[1]) * whole)
+    high = min(whole - spread, (1 - shares[0]) * whole)
     return math.tan(low / 2), math.tan(high / 2)
 
 
 def _polynomial(
     named: Mapping[str, float], coefficients: Doubles, ends: tuple[float, float]
 ) -> tuple[Doubles, tuple[float, float]]:
-    """Return the scattered curve at the centre as a polynomial in q, of few terms, and where it is valid."""
+    """Return the blurred curve at the centre as a polynomial in q with few terms, and its valid range."""
     q = np.linspace(*ends, _PLACES)
     whole = math.atan2(named["rim"], named["radius"])
-    elevation, turn = 2 * np.arctan(q), named["scatter"]
-    light = curve_means(1 - (elevation + turn) / whole, 1 - (elevation - turn) / whole) @ coefficients
+    elevation, spread = 2 * np.arctan(q), named["scatter"]
+    light = curve_means(1 - (elevation + spread) / whole, 1 - (elevation - spread) / whole) @ coefficients
     for terms in range(2, _TERMS + 1):
         fit = np.polynomial.Polynomial.fit(q, light, terms - 1)
         if np.max(np.abs(fit(q) - light)) <= _EXACT:
@@ -181,9 +191,9 @@ def _polynomial(
         raise InputError(
             "the wall is equally bright at all heights: give --pattern uniform, or check that the print is in"
         )
-    steepness = fit.deriv()(q)
+    slope = fit.deriv()(q)
     middle = _PLACES // 2
-    flat = np.flatnonzero(steepness * np.sign(steepness[middle]) < _FLAT * np.median(np.abs(steepness)))
+    flat = np.flatnonzero(slope * np.sign(slope[middle]) < _FLAT * np.median(np.abs(slope)))
     first = flat[flat < middle].max(initial=-1) + 1
     last = flat[flat > middle].min(initial=_PLACES) - 1
     return np.asarray(fit.convert().coef), (float(q[first]), float(q[last]))
@@ -194,9 +204,9 @@ def _error_maps(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the standard deviations of zenith, and of azimuth times the zenith's sine, (H, W), radians.
 
-    What a fit says of the light of 8 frames is off by its slopes times the parameters' errors, and the normal
-    of least squares by what comes of that. Root mean square over azimuths, in the middle of the reach, or
-    where light begins under a uniform wall; NaN where no azimuth shows the wall.
+    The covariance of the parameters is propagated to the light of 8 frames, and from there to the normal by
+    least squares. RMS over azimuths, in the middle of the reach, or at the threshold for a uniform wall; NaN
+    where the wall is visible at no azimuth.
     """
     from scipy.ndimage import map_coordinates
 
@@ -210,18 +220,18 @@ def _error_maps(
         middle = math.pi / 4 - math.atan(sum(response.reach) / 2)
         outside = np.hypot(places[0] - response.axis[0], places[1] - response.axis[1]) >= response.radius
         zenith = np.where(outside, np.nan, middle)
-    seen = np.isfinite(zenith)
+    valid = np.isfinite(zenith)
     slopes = np.full((2, len(zenith), STEPS.stop), np.nan)
-    slopes[:, seen] = _normal_slopes(fit, places[:, seen], azimuth[seen], zenith[seen])
+    slopes[:, valid] = _normal_slopes(fit, places[:, valid], azimuth[valid], zenith[valid])
     covariance = fit.covariance[: STEPS.stop, : STEPS.stop]
     variance = np.einsum("inp,pq,inq->in", slopes, covariance, slopes).reshape(2, -1, _TURN)
-    known = np.isfinite(variance)
-    count = np.where(known.any(axis=-1), known.sum(axis=-1), np.nan)
-    coarse = np.sqrt(np.where(known, variance, 0).sum(axis=-1) / count).reshape(2, _SIDE, _SIDE)
-    # Rows go down the picture as the coarse ones do: both follow the pixels' axes.
-    where = np.meshgrid(*(np.linspace(0, _SIDE - 1, size) for size in shape), indexing="ij")
+    valid = np.isfinite(variance)
+    count = np.where(valid.any(axis=-1), valid.sum(axis=-1), np.nan)
+    coarse = np.sqrt(np.where(valid, variance, 0).sum(axis=-1) / count).reshape(2, _SIDE, _SIDE)
+    # The rows of the coarse maps are in the order of the picture's: both follow the pixels' axes.
+    positions = np.meshgrid(*(np.linspace(0, _SIDE - 1, size) for size in shape), indexing="ij")
     zenith_sigma, azimuth_sigma = (
-        map_coordinates(one, where, order=1, mode="nearest").astype(np.float32) for one in coarse
+        map_coordinates(sigma, positions, order=1, mode="nearest").astype(np.float32) for sigma in coarse
     )
     if response.pattern == "uniform":
         azimuth_sigma[:] = np.nan
@@ -229,11 +239,11 @@ def _error_maps(
 
 
 def error_left(samples: LightSamples, fit: WallFit, noise: Doubles) -> tuple[float, float]:
-    """Return the RMS error of the zenith that the fit leaves on the balls, and its upper bound, radians.
+    """Return the RMS error of the zenith that remains on the balls, and its upper bound, radians.
 
-    Estimated by the mean residuals of cells, octants of some rings of each ball, whose noise averages out.
-    The first is what is left beyond noise, 0 where that is none; the upper bound is one standard error of its
-    square more, which noise never lets be 0.
+    The error is estimated from the mean residuals of cells, octants of rings of each ball, in which noise is
+    averaged. It is what exceeds the noise, or 0. The bound adds one standard error of its square, and so is
+    never 0.
     """
     named, steps, centres = split(fit.parameters)
     met = meet_balls(samples, named, centres)
@@ -249,20 +259,20 @@ def error_left(samples: LightSamples, fit: WallFit, noise: Doubles) -> tuple[flo
     ring = np.minimum((flat / flat.max() * _RINGS).astype(np.intp), _RINGS - 1)
     cell = (samples.press[samples.pose] * _RINGS + ring) * _OCTANTS + octant
     residual = np.clip(samples.light - light, -_OUTLIER * noise, _OUTLIER * noise)
-    summed = np.ones_like(light), residual, noise**2, slope**2
-    count, total, expected, steep = (np.bincount(cell, values) for values in summed)
-    # A mean's square less what noise makes of it, summed over samples.
-    known = count > 0
-    share = expected[known] / count[known]
-    excess = max(0.0, float(np.sum(total[known] ** 2 / count[known] - share)))
-    # The square of a normal number of variance v has variance 2 v^2.
+    terms = np.ones_like(light), residual, noise**2, slope**2
+    count, total, expected, steep = (np.bincount(cell, values) for values in terms)
+    # Square of each cell's mean minus its expectation from noise, summed over samples.
+    filled = count > 0
+    share = expected[filled] / count[filled]
+    excess = max(0.0, float(np.sum(total[filled] ** 2 / count[filled] - share)))
+    # The square of a normal variate of variance v has the variance 2 v^2.
     chance = math.sqrt(2 * float(np.sum(share**2)))
     over = max(float(np.sum(steep)), 1e-12)
     return math.sqrt(excess / over), math.sqrt((excess + chance) / over)
 
 
 def _normal_slopes(fit: WallFit, places: Doubles, azimuth: Doubles, zenith: Doubles) -> Doubles:
-    """Return how zenith, and azimuth times its sine, change with the parameters, (2, n, STEPS.stop)."""
+    """Return the derivatives of zenith, and azimuth times its sine, by the parameters, (2, n, STEPS.stop)."""
     parameters = fit.parameters[: STEPS.stop]
 
     def light(values: Doubles, theta: Doubles, phi: Doubles) -> Doubles:
@@ -279,9 +289,9 @@ def _normal_slopes(fit: WallFit, places: Doubles, azimuth: Doubles, zenith: Doub
     by_parameter = np.zeros((*design.shape[:2], len(parameters)))
     scales = [*(SCALES[name] for name in SENSOR), *([1.0] * (STEPS.stop - STEPS.start))]
     for number, step in enumerate(_SMALL * np.array(scales)):
-        moved = np.repeat(parameters[np.newaxis], 2, axis=0)
-        moved[:, number] += step, -step
-        change = light(moved[0], zenith, azimuth) - light(moved[1], zenith, azimuth)
+        changed = np.repeat(parameters[np.newaxis], 2, axis=0)
+        changed[:, number] += step, -step
+        change = light(changed[0], zenith, azimuth) - light(changed[1], zenith, azimuth)
         by_parameter[..., number] = change / (2 * step)
     return np.asarray(np.moveaxis(-np.linalg.pinv(design, rcond=1e-6) @ by_parameter, 1, 0), np.float64)
 
@@ -294,6 +304,6 @@ def _light_of_turn(
     phase = np.arange(_FRAMES) * 2 * np.pi / _FRAMES
     turns = rotations(_LEAN * np.stack([np.cos(phase), np.sin(phase)], axis=1))
     normal = np.moveaxis(turns @ _normals(zenith, azimuth), 0, -1).reshape(3, -1)
-    from_axis, lean = look(np.repeat(places, _FRAMES, axis=1), named)
-    met = SheetPoints(from_axis[0], from_axis[1], np.zeros(from_axis.shape[1]), down(lean), normal)
+    from_axis, slope = look(np.repeat(places, _FRAMES, axis=1), named)
+    met = SheetPoints(from_axis[0], from_axis[1], np.zeros(from_axis.shape[1]), down(slope), normal)
     return light_of(met, named, curve_from_steps(rising) @ steps).reshape(-1, _FRAMES)

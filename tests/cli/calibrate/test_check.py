@@ -58,7 +58,7 @@ def test_a_picture_is_drawn(folder, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--ball", "0mm"), "cannot be"),
+        (("--ball", "0mm"), "diameter is 0 mm: give a length above 0"),
         (("--ball", "10mm", "--cells", "0"), "cells"),
     ],
 )

@@ -60,7 +60,7 @@ def quick(monkeypatch):
 def test_a_ball_becomes_a_gel_in_the_file_and_is_told_in_a_line():
     ended = run("calibrate", "elastic", "ball.h5", "--ball", "4mm", "-o", "cal.h5")
     assert ended.code == 0, ended.said
-    assert ended.out.startswith("cal.h5: light from ")
+    assert ended.out.startswith("cal.h5: bright from ")
     assert len(ended.out.splitlines()) == 1
     assert "curvature: not determined by the presses" in ended.said
     calibration = io.open_calibration("cal.h5")
@@ -83,7 +83,7 @@ def test_a_ball_becomes_a_gel_in_the_file_and_is_told_in_a_line():
         ([], "no recordings"),
         (["ball.h5", "--rig", "rig.toml"], "leave one of them out"),
         (["ball.h5", "--press", "1mm"], "--press applies to presses on a rig"),
-        (["ball.h5", "--sheet", "-1mm"], "--sheet -1mm cannot be"),
+        (["ball.h5", "--sheet", "-1mm"], "--sheet -1mm: a thickness must not be negative"),
         (["turn.h5"], "axial motion"),
         (["none.h5"], "none.h5"),
     ],

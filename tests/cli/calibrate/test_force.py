@@ -84,14 +84,14 @@ def test_a_modulus_can_be_given(folder):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ([], "either as --force, one a recording, or as --readings"),
+        ([], "either as --force, one per recording, or as --readings"),
         (["--force", "1N", "--readings", "scale.csv"], "either as --force"),
         (["--force", "1N", "--force", "2N"], "1 recordings and 2 times --force"),
         (["--force", "1mm"], "force"),
         (["--force", "-1N"], "a force above 0 is needed; write e.g. 1.5N"),
         (["--readings", "none.csv"], "none.csv: no such file"),
-        (["--readings", "other.csv"], "other.csv has no line of press-0.h5"),
-        (["--readings", "bad.csv"], "is no press: write REC.h5,newtons"),
+        (["--readings", "other.csv"], "other.csv has no line for press-0.h5"),
+        (["--readings", "bad.csv"], "is not a force: write REC.h5,newtons"),
         (["--force", "1N", "-o", "new.h5"], "new.h5 has no gel"),
     ],
 )

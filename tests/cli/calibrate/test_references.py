@@ -87,7 +87,7 @@ def test_a_camera_whose_dark_level_is_cut_off_is_told(scene, tmp_path):
     [
         (("--dark", "dark.h5"), "--bright missing"),
         ((), "--dark and --bright missing"),
-        (("--dark", "dark.h5", "--bright", "bright.h5", "--noise", "0"), "give some counts"),
+        (("--dark", "dark.h5", "--bright", "bright.h5", "--noise", "0"), "give a number above 0"),
         (("--dark", "dark.h5", "--bright", "bright.h5", "--press", "1mm"), "--rolled"),
         (("--dark", "bright.h5", "--bright", "dark.h5"), "exchanged"),
         (("--dark", "dark.h5", "--bright", "ball.h5"), "--rolled"),

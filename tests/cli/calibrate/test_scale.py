@@ -45,7 +45,7 @@ def test_a_picture_becomes_a_lens_in_a_file():
     assert ended.code == 0, ended.said
     assert ended.said == ""
     assert ended.out.startswith("cal.h5: 71.4")
-    assert "24 marks in 1 pictures" in ended.out
+    assert "24 marks in 1 picture " in ended.out
     known = io.open_calibration("cal.h5")
     assert known.camera.shape == known.lens.shape == SHOWN.shape
     assert known.camera.dtype == np.uint8

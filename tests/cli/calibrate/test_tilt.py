@@ -70,13 +70,13 @@ def test_a_flat_and_a_ball_become_a_precession_in_a_file():
 
     assert ended.code == 0, ended.said
     line = re.fullmatch(
-        r"cal.h5: half-angle (\S+) \+- \S+ deg, clockwise from (\S+) \+- \S+ deg, ellipticity \S+ \+- \S+,"
-        r" pivot at x \S+ \+- \S+ mm, y \S+ \+- \S+ mm, z (\S+) \+- \S+ mm\n",
+        r"cal.h5: half-angle (\S+) ± \S+ deg, clockwise from (\S+) ± \S+ deg, ellipticity \S+ ± \S+,"
+        r" pivot at x \S+ ± \S+ mm, y \S+ ± \S+ mm, z (\S+) ± \S+ mm\n",
         ended.out,
     )
     assert line is not None, ended.out
     assert [float(number) for number in line.groups()] == pytest.approx([2.53, 2.865, 12], abs=0.1)
-    assert ended.said.startswith("note: the phase offset is taken to be within 90 deg of 0")
+    assert ended.said.startswith("note: the phase offset is assumed to be within 90 deg of 0")
     known = io.open_calibration("cal.h5")
     assert known.camera.name == "left"
     assert known.camera.shape == SHAPE
@@ -89,8 +89,8 @@ def test_a_flat_and_a_ball_become_a_precession_in_a_file():
     assert known.process["tilt.flats"] == "flat.h5"
     assert known.process["tilt.ball"] == "4mm"
     assert (known.process["tilt.pixel_size_x"], known.process["tilt.pixel_size_y"]) == (0.1, 0.1)
-    assert known.process["tilt.left_place"] < 0.005
-    assert "within 90 deg" in known.process["tilt.taken_for_granted"]
+    assert known.process["tilt.residual_place"] < 0.005
+    assert "within 90 deg" in known.process["tilt.assumptions"]
 
 
 def test_what_the_file_knew_before_is_kept_and_what_the_user_says_of_the_scale_is_believed():

@@ -63,8 +63,8 @@ def test_a_response_is_added_to_a_calibration(folder, fitted):
     io.save_calibration(io.Calibration(camera, references=references, precession=precession), "cal.h5")
     ended = calibrate("--body-radius", "18mm", "--body-height", "41mm")
     assert ended.code == 0, ended.said
-    assert ended.out.startswith("cal.h5: wall 17.50 +- 1 mm from the axis and 40.0 +- 2 mm high")
-    assert "zenith known within" in ended.out
+    assert ended.out.startswith("cal.h5: wall 17.50 ± 1 mm from the axis and 40.0 ± 2 mm high")
+    assert "standard deviation of zenith" in ended.out
     assert fitted["ball"] == pytest.approx(2.0)
     assert fitted["body"] == (18.0, 41.0)
     assert fitted["pattern"] == "graded"
@@ -84,7 +84,7 @@ def test_without_a_calibration_one_is_made_and_told_as_json(folder, fitted):
     told = json.loads(ended.out)
     assert told["output"] == "cal.h5"
     assert told["found"]["rim"] == {"value": 40.0, "sigma": 2.0}
-    assert told["degrees"]["left_on_balls"] == pytest.approx(np.degrees(0.003))
+    assert told["degrees"]["residual_on_balls"] == pytest.approx(np.degrees(0.003))
     assert fitted["references"] is None
     assert fitted["precession"] is None
     assert fitted["pattern"] == "uniform"
@@ -137,7 +137,7 @@ def test_a_pixel_size_that_the_scale_denies_is_refused(folder, fitted):
     io.save_calibration(known(lens=a_lens()), "cal.h5")
     ended = calibrate("--pixel-size", "0.1mm")
     assert ended.code == 2
-    assert "--pixel-size says 0.1 mm, the scale of cal.h5 0.5 mm: leave it out" in ended.said
+    assert "--pixel-size 0.1 mm: the scale of cal.h5 is 0.5 mm; remove the option" in ended.said
     assert not fitted
 
 
@@ -146,13 +146,13 @@ def test_a_pivot_measured_with_other_pixels_is_left_out(folder, fitted):
     io.save_calibration(known(precession=a_precession(tilt=TILT), process=process), "cal.h5")
     ended = calibrate()
     assert ended.code == 0, ended.said
-    assert "the calibrated tilt is left out" in ended.said
+    assert "the calibrated tilt is ignored" in ended.said
     assert fitted["precession"] is None
 
 
 def test_presses_that_leave_the_zenith_uncertain_are_told(folder, fitted):
     ended = calibrate()
-    assert "depth not determined, zenith known within 0.27 deg only" in ended.said
+    assert "depth not determined, standard deviation of zenith 0.27 deg" in ended.said
     assert "press less" in ended.said
     assert "at most 0.17 deg left on the balls" in ended.out
 

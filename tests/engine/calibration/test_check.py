@@ -73,7 +73,7 @@ def test_what_the_table_has_no_number_for_is_explained(press):
     bare = replace(height, expected=math.nan)
     maps = {"zenith": bare, "azimuth": bare, "normal": height}
     found = replace(fine, after=maps, before=maps | {"normal": bare})
-    assert found.notes()[0] == "expected: a result tells no errors of zenith and azimuth alone"
+    assert found.notes()[0] == "expected: results contain no standard deviation of zenith or azimuth alone"
     assert "of zenith and azimuth and normal that" in found.notes()[1]
 
 
@@ -89,9 +89,12 @@ def test_what_cannot_be_checked_is_refused(press, change, message):
         check_ball(source, calibration(), 10.0)
 
 
-@pytest.mark.parametrize(("ball_size", "cells"), [(-1.0, 8), (math.nan, 8), (4.0, 0)])
-def test_numbers_that_cannot_be_are_refused(press, ball_size, cells):
-    with pytest.raises(io.InputError, match="cannot be"):
+@pytest.mark.parametrize(
+    ("ball_size", "cells", "message"),
+    [(-1.0, 8, "diameter is -1 mm"), (math.nan, 8, "diameter is nan mm"), (4.0, 0, "0 cells a side: give 1")],
+)
+def test_numbers_out_of_range_are_refused(press, ball_size, cells, message):
+    with pytest.raises(io.InputError, match=message):
         check_ball(press, calibration(), ball_size, cells=cells)
 
 

@@ -144,12 +144,12 @@ def test_presses_that_say_nothing_are_refused():
     source = type("Source", (), {"name": "turn.h5", "header": io.Header("axial")})()
     lit = np.zeros((9, 9), np.float32)
     press = Result(height=lit, height_sigma=lit, status=np.full((9, 9), 2, np.uint8))
-    with pytest.raises(InputError, match=r"turn\.h5 is no press"):
+    with pytest.raises(InputError, match=r"turn\.h5 is not a press"):
         ball_onset(Result(), source, 2.0)
     with pytest.raises(InputError, match=r"turn\.h5 has no pixel size"):
         ball_onset(press, source, 2.0)
     source.header = io.Header("vertical", pixel_size=(0.1, 0.1))
-    with pytest.raises(InputError, match=r"turn\.h5: 0 pixels turned light"):
+    with pytest.raises(InputError, match=r"turn\.h5: 0 pixels turned bright"):
         ball_onset(press, source, 2.0)
-    with pytest.raises(InputError, match="radius -1"):
+    with pytest.raises(InputError, match="diameter is -2 mm"):
         ball_onset(press, source, -1.0)

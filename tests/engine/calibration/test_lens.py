@@ -172,7 +172,7 @@ def test_a_painted_board_has_its_true_size(board):
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: Charuco(7, 5, 1.5, 2.0), "lies within its square"),
+        (lambda: Charuco(7, 5, 1.5, 2.0), "is smaller than its square"),
         (lambda: Charuco(4, 4, 2.0, 1.5), "too few corners"),
         (lambda: Dots(2, 20, 1.0), "too few dots"),
         (lambda: Dots(11, 9, 0.0), "above zero"),
@@ -193,9 +193,9 @@ def painted(board, pixels_per_mm=14):
     ("shown", "said"),
     [
         (np.full((99, 99), 255, np.uint8), "100% of its pixels are saturated: expose it less"),
-        (np.zeros((99, 99), np.uint8), "all of one brightness"),
-        (np.zeros((1, 1), np.uint8), "all of one brightness"),
-        (np.full((50, 50), np.nan, np.float32), "no numbers"),
+        (np.zeros((99, 99), np.uint8), "brightness is the same everywhere"),
+        (np.zeros((1, 1), np.uint8), "brightness is the same everywhere"),
+        (np.full((50, 50), np.nan, np.float32), "samples that are not finite"),
         (np.random.default_rng(0).integers(0, 99, (40, 41)).astype(np.uint16), "shows no board charuco:7x5"),
         (np.clip(painted(CHARUCO) * 9.0, 0, 255).astype(np.uint8), "are saturated: expose it less"),
         (painted(CHARUCO)[:, ::-1], "in a mirror"),

@@ -130,7 +130,7 @@ def test_balls_at_three_places_determine_all_but_the_mean_lean_even_a_lean_to_th
     fit = fit_precession([track_ball(turn, RADIUS, scale_of(None, shape)) for turn in turns])
     assert abs(off(fit.precession, truth)["tilt"]) < 0.1 * DEGREE
     assert_within_errors(fit.precession, truth, "tilt", "phase_offset", "pivot_x", "pivot_y", "pivot_z")
-    assert fit.notes == ("the mean pose is taken for upright: a level plate would tell the mean lean",)
+    assert fit.notes == ("the mean pose is assumed to be upright: a level plate would show the mean lean",)
 
 
 def test_with_one_ball_the_side_of_the_pivot_is_an_assumption():
@@ -260,8 +260,8 @@ def test_turns_that_cannot_be_used_are_refused():
     vertical = Frames("turn", dark, Header("vertical", pixel_size=PIXEL), travel=EIGHTHS)
     for source, radius, said in (
         (vertical, 2.0, "turn is of vertical motion"),
-        (recording("turn", dark, pixel_size=None), 2.0, "turn: its pixel size is not known"),
-        (recording("turn", dark), 0.0, "a ball of 0 mm cannot be"),
+        (recording("turn", dark, pixel_size=None), 2.0, "turn has no pixel size: calibrate the scale first"),
+        (recording("turn", dark), 0.0, "the ball.s diameter is 0 mm"),
         (long, 2.0, r"turn: 5\.0 GB of frames are too much"),
         (no_phase, 2.0, "turn has no phases"),
         (recording("turn", dark[:3], EIGHTHS[:3]), 2.0, "turn: 3 different phases, at least 4 are needed"),
@@ -279,7 +279,7 @@ def test_turns_that_cannot_be_used_are_refused():
 def test_a_wall_needs_references_and_a_graded_pattern_and_has_an_error_of_depth():
     with pytest.raises(InputError, match="no dark and bright references"):
         WallBrightness.of_pixels(wall(SHAPE), None, None, SHAPE, PIXEL)
-    with pytest.raises(InputError, match="uniform pattern"):
+    with pytest.raises(InputError, match="of a uniform pattern, without zeniths"):
         WallBrightness.of_pixels(replace(wall(SHAPE), pattern="uniform"), 16.0, 224.0, SHAPE, PIXEL)
     vague = replace(wall(SHAPE), zenith_sigma=np.full(SHAPE, 5e-4, np.float32))
     assert WallBrightness.of_pixels(vague, 16.0, 224.0, SHAPE, PIXEL).depth_sigma == pytest.approx(0.05)

@@ -158,9 +158,9 @@ def test_a_press_without_a_ball_is_named(presses):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"ball": 0.0}, "radius 0.0 mm cannot be"),
+        ({"ball": 0.0}, "diameter is 0 mm: give a length above 0"),
         ({"pattern": "striped"}, "take graded or uniform"),
-        ({"body": (0.0, 40.0)}, "cannot be: give more"),
+        ({"body": (0.0, 40.0)}, "0.0 mm radius and 40.0 mm height: both must be above 0"),
     ],
 )
 def test_what_cannot_be_is_refused(presses, options, said):
@@ -172,7 +172,7 @@ def test_what_cannot_be_is_refused(presses, options, said):
     ("fields", "said"),
     [
         ({"pixel_size": None}, "differ in pixels or their size"),
-        ({"tilt": None}, "place-2: the tilt of its rotation is not known"),
+        ({"tilt": None}, "place-2 has no tilt: give it"),
         ({"dark": None}, "place-2: there are no dark and bright references"),
     ],
 )
