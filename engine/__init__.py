@@ -1,6 +1,6 @@
-"""The estimators: what turns frames into maps, and maps into numbers.
+"""Operations, methods and steps, which compute maps from frames, and functions that compute with maps.
 
-The public names stand in ``__init__.pyi``; each is imported from its module when it is first used.
+The public names are listed in ``__init__.pyi``; each is imported from its module when it is first used.
 """
 
 import lazy_loader

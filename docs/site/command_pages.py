@@ -35,15 +35,15 @@ def pages() -> dict[str, str]:
     rows = [f"| [`{_PROGRAM} {name}`]({name}.md) | {_first(command)} |" for name, command in commands.items()]
     index = [
         "# Commands\n",
-        f"What `--help` says; `{_PROGRAM} --debug` before a command shows tracebacks, and what is logged.\n",
+        f"The output of `--help`. `{_PROGRAM} --debug` before a command shows tracebacks and log messages.\n",
         "| command | |\n|---|---|",
         *rows,
     ]
-    told = {
+    by_name = {
         f"commands/{name}.md": "\n".join(_page(command, context, name, 1))
         for name, command in commands.items()
     }
-    return {"commands/index.md": "\n".join(index), **told}
+    return {"commands/index.md": "\n".join(index), **by_name}
 
 
 def uris() -> list[str]:
@@ -79,16 +79,16 @@ def _options(command: Any, context: Any) -> Iterator[str]:
     yield f"```text\n{' '.join([context.command_path, *command.collect_usage_pieces(context)])}\n```\n"
     yield "| | |\n|---|---|"
     for parameter in command.get_params(context):
-        told = parameter.get_help_record(context)
-        if told is not None:
-            names, meaning = told
+        record = parameter.get_help_record(context)
+        if record is not None:
+            names, meaning = record
             yield f"| <code>{_cell(names).replace('&#124;', '&#124;<wbr>')}</code> | {_cell(meaning)} |"
     yield ""
 
 
 def _cell(text: str) -> str:
-    """Return text in which nothing is taken for Markdown or HTML."""
-    told = html.escape(" ".join(text.split()))
+    """Return text with the special characters of Markdown and HTML escaped."""
+    escaped = html.escape(" ".join(text.split()))
     for sign in "|*_[`\\":
-        told = told.replace(sign, f"&#{ord(sign)};")
-    return told
+        escaped = escaped.replace(sign, f"&#{ord(sign)};")
+    return escaped

@@ -1,4 +1,4 @@
-"""The pages of the gallery: scripts that run while the site is built, with what they print and draw."""
+"""The pages of the gallery: scripts that run while the site is built, with their output and figures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _ORDER = [
     "slip",
     "moving_object",
 ]
-_WITHOUT_FIGURE = {"steepest_rise"}  # described in docs/estimators.md
+_WITHOUT_FIGURE = {"steepest_rise"}  # described in docs/operations.md
 _LONGEST = 300  # seconds
 
 
@@ -88,7 +88,7 @@ def _index(texts: list[str], pictures: list[str]) -> str:
     for name, text, picture in zip(_ORDER, texts, pictures, strict=True):
         title = _parts(text)[0]
         cards.append(f"- [![{title}]({picture})]({name}.md)\n\n    [{title}]({name}.md)")
-    about = "The scripts in `examples/`: each runs whenever this site is built. Their figures:"
+    about = "The figures of the scripts in `examples/`, which run each time this site is built."
     listed = "\n\n".join(cards)
     return f"# Gallery\n\n{about}\n\n<div class='gallery' markdown>\n\n{listed}\n\n</div>\n"
 
@@ -103,5 +103,5 @@ def _page(name: str, text: str, printed: str, pictures: list[str]) -> str:
 
 
 def _what(picture: str) -> str:
-    """Return in a word what a picture shows."""
+    """Return the subject of a picture in one word."""
     return Path(picture).stem.rpartition("-")[2]

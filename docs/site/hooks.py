@@ -31,29 +31,48 @@ _AS_MEMBER = """\
       show_root_toc_entry: true
 """
 _PACKAGES = {
-    "engine": "The estimators: from frames to maps, and from maps to numbers.",
-    "engine.live": "The same while the body moves.",
-    "io": "Shared types, recordings, results, frames of other programs, exports.",
-    "hw": "Stage, camera, rig.",
-    "hw.twin": "The digital twin: objects, body, camera, movements.",
-    "view": "Figures of results compared with the truth.",
-    "view.result": "Figures of one result.",
-    "view.report": "A result as one page for a browser.",
-    "kernels.device": "The OpenCL devices, and what runs on them.",
+    "Reconstruct recordings, run operations": {
+        "engine": "`reconstruct`, `run`, `fuse`, `measure`; base classes and the most used operations",
+        "engine.live": "the same operations while the body moves",
+    },
+    "Single computations": {
+        "engine.press": "heights from a press or a release",
+        "engine.rotation": "normals, contact and edges from a rotation",
+        "engine.slip": "displacement and slip of the skin",
+        "engine.integration": "heights from slopes or normals",
+        "engine.fusion": "one surface from heights and normals",
+        "engine.pose": "motion of an object between results; stitching of results",
+        "engine.force": "pressure, traction and forces from heights or displacements",
+        "engine.metrology": "planes, spheres, sections, steps and roughness, with uncertainties",
+        "engine.fringes": "phase of fringes, and its unwrapping",
+        "engine.photometric": "normals and albedo from several lamps",
+        "engine.focus": "heights from a focus stack",
+    },
+    "Calibration": {"engine.calibration": "references, lens, zenith, tilt, gel and modulus of a sensor"},
+    "Files, pictures, hardware": {
+        "io": "shared types; recordings, results, calibrations, frames of other programs, exports",
+        "view": "figures of results compared with the truth",
+        "view.result": "figures of one result",
+        "view.report": "a result as one page for a browser",
+        "hw": "stage, camera, and both as a rig",
+        "hw.twin": "the digital twin: objects, body, camera, movements",
+        "kernels.device": "OpenCL devices, their arrays and kernels",
+    },
 }
+"""Documented packages by task, each with its contents."""
 
 
 def on_config(config: MkDocsConfig) -> None:
-    """Put pages into the navigation where a folder's name stands."""
+    """Replace names of folders in the navigation by their pages."""
     config.nav = _expanded(config.nav)
 
 
 def on_files(files: Files, config: MkDocsConfig) -> None:
-    """Add the pages that do not lie in the folder of the documentation."""
-    made: dict[str, str | bytes] = {**command_pages.pages(), **gallery_pages.pages(), **_api_pages()}
-    made |= notebook_page.pages()
-    made["decisions/index.md"] = _index_of_decisions()
-    for uri, content in made.items():
+    """Add generated pages, and those outside the folder of the documentation."""
+    generated: dict[str, str | bytes] = {**command_pages.pages(), **gallery_pages.pages(), **_api_pages()}
+    generated |= notebook_page.pages()
+    generated["decisions/index.md"] = _index_of_decisions()
+    for uri, content in generated.items():
         files.append(File.generated(config, uri, content=content))
     pages = [
         repository.path_of(file.src_uri) for file in files.documentation_pages() if not file.generated_by
@@ -65,39 +84,42 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Let links lead to where the pages lie in the site."""
+    """Replace links between files of the repository by links between pages."""
     return repository.relink(markdown, page.file.src_uri)
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Make MathML of formulas."""
+    """Convert formulas to MathML."""
     return mathml.with_formulas(html, page.file.src_uri)
 
 
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
-    """Refuse a page that would ask for something from elsewhere when it is read."""
-    asked = _FROM_ELSEWHERE.search(output)
-    if asked:
-        raise PluginError(f"{page.file.src_uri} asks for something from elsewhere: {asked[0]}")
+    """Raise PluginError if a page loads anything from another address."""
+    external = _FROM_ELSEWHERE.search(output)
+    if external:
+        raise PluginError(f"{page.file.src_uri} loads a file from another address: {external[0]}")
     return output
 
 
 @functools.cache
 def _api_pages() -> dict[str, str]:
     """Return the pages from which mkdocstrings makes the Python reference."""
-    rows = "".join(f"| [`mirrorskin.{name}`]({name}.md) | {what} |\n" for name, what in _PACKAGES.items())
-    index = f"# Python\n\nThe contents of each package.\n\n| package | contents |\n|---|---|\n{rows}"
-    pages = {f"api/{name}.md": _api_page(f"mirrorskin.{name}") for name in _PACKAGES}
+    index = "# Python\n\nMost programs need `engine` and `io` only.\n"
+    pages = {}
+    for task, packages in _PACKAGES.items():
+        rows = "".join(f"| [`mirrorskin.{name}`]({name}.md) | {what} |\n" for name, what in packages.items())
+        index += f"\n## {task}\n\n| package | contents |\n|---|---|\n{rows}"
+        pages |= {f"api/{name}.md": _api_page(f"mirrorskin.{name}") for name in packages}
     return {"api/index.md": index, **pages}
 
 
 def _api_page(package: str) -> str:
     """Return the page of a package; members with the name of their module are requested explicitly."""
-    found = importlib.import_module(package)
-    named = [getattr(found, name) for name in getattr(found, "__all__", []) if _is_module(package, name)]
+    module = importlib.import_module(package)
+    named = [getattr(module, name) for name in getattr(module, "__all__", []) if _is_module(package, name)]
     members = [one for one in named if not isinstance(one, ModuleType)]
-    asked = "".join(f"\n::: {one.__module__}.{one.__name__}\n{_AS_MEMBER}" for one in members)
-    return f"# {package}\n\n::: {package}\n{asked}"
+    sections = "".join(f"\n::: {one.__module__}.{one.__name__}\n{_AS_MEMBER}" for one in members)
+    return f"# {package}\n\n::: {package}\n{sections}"
 
 
 def _is_module(package: str, name: str) -> bool:
@@ -109,8 +131,8 @@ def _index_of_decisions() -> str:
     titles = {
         path: path.read_text(encoding="utf-8").partition("\n")[0] for path in sorted(folder.glob("*.md"))
     }
-    told = "".join(f"- [{title.removeprefix('# ')}]({path.name})\n" for path, title in titles.items())
-    return f"# Decisions\n\nWhy things are as they are.\n\n{told}"
+    entries = "".join(f"- [{title.removeprefix('# ')}]({path.name})\n" for path, title in titles.items())
+    return f"# Decisions\n\nReasons for the design, one decision per page.\n\n{entries}"
 
 
 def _expanded(entry: Any) -> Any:

@@ -1,1 +1,1 @@
-"""Many recordings: what to do with each, which are done already, and who does the rest."""
+"""Reconstruction of many recordings, on several devices or machines."""

@@ -1,1 +1,8 @@
-"""From recordings of known things to what the sensor is: references, lens, zenith, precession, gel."""
+"""Calibration of a sensor from recordings of known objects: references, lens, zenith, tilt, gel and force.
+
+The public names are listed in ``__init__.pyi``; each is imported from its module when it is first used.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,4 +1,4 @@
-"""Forces and stresses between sensor and object, from how the elastomer is deformed."""
+"""Pressure, traction and forces between sensor and object, computed from the deformation of the elastomer."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Heights from slopes: weighted least squares on the graph of the pixels."""
+"""Heights from slopes, by weighted least squares on the graph of the pixels."""
 
 import lazy_loader
 

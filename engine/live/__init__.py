@@ -1,4 +1,4 @@
-"""Operations and methods while the body moves, within a bounded time."""
+"""Operations and methods that run while the body moves, with a limited delay."""
 
 import lazy_loader
 

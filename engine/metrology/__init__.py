@@ -1,4 +1,4 @@
-"""Numbers with uncertainties from height maps: forms, areas and volumes, sections, steps, roughness."""
+"""Measurements on height maps, with uncertainties: forms, areas, volumes, sections, steps and roughness."""
 
 from mirrorskin.engine.metrology.forms import Plane, Sphere, fit_plane, fit_sphere
 from mirrorskin.engine.metrology.measures import FormName, Measures, measure

@@ -1,4 +1,4 @@
-"""Where and how an object moved from one result to the next, and one surface of several results."""
+"""Motion of an object between results, and joining of several results into one surface."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""A press or its release: heights from the frame in which a pixel turns light or dark."""
+"""Heights from a press or a release: the travel at which each pixel turns light or dark."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""An axial rotation: normals, contact and edges from a pixel's wave."""
+"""Normals, contact and edges from the brightness of each pixel during an axial rotation."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""The texture of the skin on the move: how far it has gone, and where it slips on the object."""
+"""Displacement of the skin in a slide or a twist, and where and when it slips on the object."""
 
 import lazy_loader
 

@@ -1,0 +1,46 @@
+from .board import Charuco, Dots, mean_of_still, paint_board
+from .brightness import LinearBrightness, WallBrightness
+from .check import Check, Errors, Summary, check_ball
+from .force import KnownPress, StiffnessFit, fit_stiffness, known_press
+from .gel import BallOnset, BallPlace, GelFit, ball_onset, fit_gel
+from .lens import LensFit, calibrate_lens
+from .references import LevelReport, Measured, measure_references
+from .tilt import PrecessionFit, fit_precession
+from .tilt_tracks import BallTrack, PlateTrack, track_ball, track_plate
+from .wall import fit_zenith
+from .wall_response import threshold_zenith
+
+__all__ = [
+    "BallOnset",
+    "BallPlace",
+    "BallTrack",
+    "Charuco",
+    "Check",
+    "Dots",
+    "Errors",
+    "GelFit",
+    "KnownPress",
+    "LensFit",
+    "LevelReport",
+    "LinearBrightness",
+    "Measured",
+    "PlateTrack",
+    "PrecessionFit",
+    "StiffnessFit",
+    "Summary",
+    "WallBrightness",
+    "ball_onset",
+    "calibrate_lens",
+    "check_ball",
+    "fit_gel",
+    "fit_precession",
+    "fit_stiffness",
+    "fit_zenith",
+    "known_press",
+    "mean_of_still",
+    "measure_references",
+    "paint_board",
+    "threshold_zenith",
+    "track_ball",
+    "track_plate",
+]
