@@ -232,7 +232,7 @@ def test_bad_input_is_one_line():
         operation.push(frames, displacement=places, twist=np.arange(20.0))
     with pytest.raises(InputError, match=r"displacement has shape \(20,\) for 20 frames: two numbers"):
         operation.push(frames, displacement=places[:, 0])
-    with pytest.raises(InputError, match="Slip needs at least 3 frames; none pushed so far"):
+    with pytest.raises(InputError, match="Slip needs at least 3 frames; none have been pushed so far"):
         operation.result()
     operation.push(frames[:4], displacement=0 * places[:4])
     with pytest.raises(InputError, match="the body does not move"):
