@@ -129,8 +129,8 @@ find_focus = travel_function(
     """Find the travel at which each pixel's surroundings are sharpest (shape from focus).
 
     Sharpness S is the sum of squares of a window's samples about their mean, N - 1 times their variance,
-    minus the contribution (N - 1) noise^2 of noise. A Gaussian is fitted to the peak and its neighbours, which is a
-    parabola through log S (Nayar and Nakagawa 1994), weighted by the inverse of the variance of log S,
+    minus the contribution (N - 1) noise^2 of noise. A Gaussian is fitted to the peak and its neighbours, that
+    is, a parabola through log S (Nayar and Nakagawa 1994), weighted by the inverse of the variance of log S,
     noise^2 (2 (N - 1) noise^2 + 4 S) / S^2 (a non-central chi-square). The standard error follows from these
     and, if reach is 2 or more, from the median misfit of such curves in the picture.
 

@@ -233,7 +233,7 @@ def _sizes(surface: Result) -> NDArray[np.intp]:
 
 
 def _set_sigma_of_lone_pixels(surface: Result, weight: Doubles) -> Result:
-    """Set the standard deviations of components of one pixel, which are those of their heights."""
+    """Set the standard deviations of components of one pixel to those of their heights."""
     lone = (surface.component >= 0) & (weight > 0) & (_sizes(surface)[surface.component] == 1)
     sigma = surface.height_sigma.copy()
     sigma[lone] = 1 / np.sqrt(weight[lone])

@@ -167,8 +167,8 @@ class Band:
 
         If the device shares the host's memory, frames are used in place if their layout allows it. On a
         device with its own memory, they are copied while kernels process the previous piece. Afterwards the
-        memory of the frames may be overwritten, except if it is ``lent`` (never overwritten while referenced): then
-        kernels may still read it. ``whole``: yield at most ``length`` frames in one piece.
+        memory of the frames may be overwritten, except if it is ``lent`` (never overwritten while
+        referenced): then kernels may still read it. ``whole``: yield at most ``length`` frames in one piece.
         """
         frames = frames[:, self.rows]
         start = 0

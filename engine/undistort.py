@@ -73,7 +73,7 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
     Each map is sampled as its declaration says; see `mirrorskin.io.Map`. Numbers are interpolated between
     four pixels. A pixel has no answer where the nearest one has none. Of the other three, those are left out
     that have no answer or another label: heights are not interpolated between components, nor other maps
-    across the border of contact. Integers, such as codes and components, are those of the nearest pixel.
+    across the border of contact. Integers, such as codes and components, are taken from the nearest pixel.
     Pixels that the camera did not see are undefined. Where a position is that of a pixel to a millionth, its
     value is copied.
 
