@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from mirrorskin.cli.bench.records import Case, Target
 from mirrorskin.engine import (
-    Onset,
     estimate_normals,
     find_change_point,
     find_onset,
@@ -57,7 +56,7 @@ def _sudden(kind: str, shape: tuple[int, int], device: Device, slack: float) -> 
     found = find_onset(frames, **known, noise=_press_noise(kind), device=device)
     first = np.ceil(place)
     error = _frame_error(found, place) * np.sqrt(12)
-    sigma = float(np.mean(found.sigma)) / _STEP * np.sqrt(12)
+    sigma = float(np.mean(found.height_sigma)) / _STEP * np.sqrt(12)
     return [
         at_most(f"{kind}, sudden: onsets in another frame", float(np.mean(found.frame != first)), 0),
         within(f"{kind}, sudden: RMS error of 1/sqrt(12) frame", _rms(error), 1 - slack, 1 + slack),
@@ -104,13 +103,13 @@ def _press_noise(kind: str) -> float:
     return light if kind == "float32" else float(np.hypot(light, 1 / np.sqrt(12)))
 
 
-def _frame_error(found: Onset, place: Doubles) -> Doubles:
+def _frame_error(found: Result, place: Doubles) -> Doubles:
     """Return the error of the height in frames; NaN without an answer."""
     return np.asarray(-found.height.astype(np.float64) / _STEP - place)
 
 
-def _chi_square(found: Onset, error: Doubles) -> float:
-    return float(np.mean((error * _STEP / found.sigma) ** 2))
+def _chi_square(found: Result, error: Doubles) -> float:
+    return float(np.mean((error * _STEP / found.height_sigma) ** 2))
 
 
 def _rms(error: Doubles) -> float:
@@ -140,7 +139,7 @@ class Sensor:
     @property
     def known(self) -> dict[str, Any]:
         """The options of the estimator."""
-        return {"tilt": TILT, "gain": self.gain, "offset": self.offset, "noise": self.spread}
+        return {"tilt": TILT, "zenith_gain": self.gain, "zenith_offset": self.offset, "noise": self.spread}
 
 
 _SENSORS = (
@@ -182,11 +181,16 @@ def run_normals(device: Device, quick: bool) -> Case:
 def _score_normals(truth: Doubles, sensor: Sensor, device: Device, slack: float) -> list[Target]:
     frames = expose(truth, sensor, 6)
     found = estimate_normals(frames, _PHASES, **sensor.known, device=device)
-    across = np.linalg.norm(np.cross(found.vectors.astype(np.float64), truth), axis=-1)
+    across = np.linalg.norm(np.cross(found.normals.astype(np.float64), truth), axis=-1)
     square = np.arcsin(np.minimum(across, 1)) ** 2
     targets = []
     for bin_, mine, sigma, lost, least in zip(
-        _BINS, square, found.sigma.astype(np.float64), found.contact == 0, _bound(truth, sensor), strict=True
+        _BINS,
+        square,
+        found.normals_sigma.astype(np.float64),
+        found.contact == 0,
+        _bound(truth, sensor),
+        strict=True,
     ):
         where = f"{sensor.kind}, zenith {bin_[0]} to {bin_[1]} degrees"
         ratio = float(np.sqrt(mine.mean() / least.mean()))
@@ -315,12 +319,12 @@ def run_fusion(device: Device, quick: bool) -> Case:
     height, sigma = (
         np.where(lit, values, np.nan).astype(np.float32) for values in (middle, _PRESS_STEP / np.sqrt(12))
     )
-    press = Onset(height, sigma, lit.astype(np.uint8), np.zeros(lit.shape, np.int32), 0.0)
+    press = Result(height=height, height_sigma=sigma)
     sensor = _SENSORS[1]
     normals = toward(np.where(there, zenith, 0.0), np.arctan2(y, x))
     frames = expose(normals, sensor, 10)
     turned = estimate_normals(frames, _PHASES, **sensor.known, device=device)
-    turn = replace(turned, contact=(turned.contact * there).astype(np.uint8))
+    turn = turned.assign(contact=(turned.contact * there).astype(np.uint8))
     found = fuse(press, turn, _PIXEL * 201 / size, mask=there, device=device)
     inner = zenith <= _LIT[1]
     error = (found.height - truth)[inner]
