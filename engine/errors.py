@@ -1,7 +1,7 @@
-"""What can go wrong in the engine besides input that cannot be used."""
+"""Errors of the engine, in addition to `mirrorskin.io.InputError`."""
 
 
 class NotConverged(Exception):  # noqa: N818  # its name is a promise to users
-    """A solver did not reach its tolerance; the message is one line: how near it came, and what to do."""
+    """A solver did not reach its tolerance; the message is one line with the residual and a remedy."""
 
     exit_code = 1

@@ -17,8 +17,8 @@ from mirrorskin.kernels.device import C_TYPES
 
 Doubles = NDArray[np.float64]
 
-_LEAST_CONTRAST = 5.0  # standard errors by which the contrast of a peak exceeds that of noise
-_LEAST_CURVATURE = 3.0  # standard errors by which the curvature of a peak differs from 0
+_LEAST_CONTRAST = 5.0  # smallest contrast of a peak above that of noise, in standard errors
+_LEAST_CURVATURE = 3.0  # smallest curvature of a peak, in standard errors
 
 
 class Focus(Operation):
@@ -128,17 +128,17 @@ find_focus = travel_function(
     "find_focus",
     """Find the travel at which each pixel's surroundings are sharpest (shape from focus).
 
-    Sharpness S is the sum of squares of a window's samples less their mean, N - 1 times their variance, less
-    (N - 1) noise^2, which noise adds. A Gaussian is fitted through the peak and its neighbours, a parabola
-    through log S (Nayar and Nakagawa 1994), with weights one over the variance of log S, which is
-    noise^2 (2 (N - 1) noise^2 + 4 S) / S^2 (a non-central chi-square). The standard error follows from them
-    and, if reach is 2 or more, from the picture's median misfit of such a curve.
+    Sharpness S is the sum of squares of a window's samples about their mean, N - 1 times their variance,
+    minus the contribution (N - 1) noise^2 of noise. A Gaussian is fitted to the peak and its neighbours, that
+    is, a parabola through log S (Nayar and Nakagawa 1994), weighted by the inverse of the variance of log S,
+    noise^2 (2 (N - 1) noise^2 + 4 S) / S^2 (a non-central chi-square). The standard error follows from these
+    and, if reach is 2 or more, from the median misfit of such curves in the picture.
 
     Returns
     -------
     Result
         ``height`` and ``height_sigma`` are undefined where ``status`` is not 1. ``sharpness`` is the standard
-        deviation of the window's samples in the sharpest frame, less the noise.
+        deviation of the window's samples in the sharpest frame, corrected for noise.
 
     Raises
     ------
@@ -156,12 +156,12 @@ find_focus = travel_function(
     >>> round(float(focus.height[10, 10]), 2), round(float(focus.height_sigma[10, 10]), 4)
     (-3.7, 0.0023)
     """,
-    "Millimetres by which the camera or its plane of focus was lowered, in steps of any size.",
+    "Distance that the camera or its plane of focus was lowered, mm, in steps of any size.",
 )
 
 
 def _window(length: int, radius: int) -> Doubles:
-    """Return how many pixels of a row or column are in the window around each."""
+    """Return the number of pixels of a row or column in the window around each."""
     place = np.arange(length)
     return np.minimum(place + radius, length - 1.0) - np.maximum(place - radius, 0) + 1
 
@@ -171,10 +171,10 @@ class _Peak(NamedTuple):
 
     vertex: Doubles
     variance: Doubles
-    gain: Doubles  # the variance of the vertex where all values had the variance 1
-    bent: Doubles  # the square of the curvature by its standard error, 0 of a curve that is bent up
-    residual: Doubles  # the sum of weight * residual^2
-    free: Doubles  # the mean of that sum where all values had the variance 1
+    gain: Doubles  # variance of the vertex if all values had the variance 1
+    bent: Doubles  # (curvature / its standard error)^2; 0 if the curve has a minimum
+    residual: Doubles  # sum of weight * residual^2
+    free: Doubles  # expectation of that sum if all values had the variance 1
 
 
 def _fit(place: Doubles, value: Doubles, weight: Doubles) -> _Peak:
@@ -198,14 +198,14 @@ def _fit(place: Doubles, value: Doubles, weight: Doubles) -> _Peak:
 
 
 def _misfit(peak: _Peak, points: NDArray[np.intp], in_focus: NDArray[np.bool_], variance: float) -> float:
-    """Return the variance by which logarithms of the sharpness differ from a parabola beyond the noise's.
+    """Return the variance of the logarithm of sharpness about the parabola, in excess of noise.
 
-    It is the median over pixels with four points or more. Their residuals are distributed as chi-square with
-    n degrees of freedom, whose median is (1 - 2 / 9n)^3 n (Wilson and Hilferty 1931). 0 if there is none.
+    It is the median over pixels with four points or more, or 0. Their residuals have a chi-square
+    distribution with n degrees of freedom, whose median is (1 - 2 / 9n)^3 n (Wilson and Hilferty 1931).
     """
-    some = in_focus & (points > 3) & (peak.free > 0)
-    if not some.any():
+    tested = in_focus & (points > 3) & (peak.free > 0)
+    if not tested.any():
         return 0.0
-    freedom = points[some] - 3
-    residual = peak.residual[some] / (1 - 2 / (9 * freedom)) ** 3
-    return max(0.0, float(np.median((residual - freedom * variance) / peak.free[some])))
+    freedom = points[tested] - 3
+    residual = peak.residual[tested] / (1 - 2 / (9 * freedom)) ** 3
+    return max(0.0, float(np.median((residual - freedom * variance) / peak.free[tested])))

@@ -1,4 +1,4 @@
-"""What is checked and estimated of frames before any are used: type, size, noise, dark and bright levels."""
+"""Checks of frames, and estimates from the first frames: type, size, noise, dark and bright levels."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from mirrorskin.io import InputError
 from mirrorskin.io.types import FRAME_DTYPES
 
 SAMPLES = 65536
-"""Pixels of a frame that its noise is estimated from, at least, if it has as many."""
+"""Smallest number of pixels from which the noise of a larger frame is estimated."""
 QUANTUM = 1 / math.sqrt(12)
-"""The least noise of integer counts: that of their rounding."""
+"""Standard deviation of the rounding of integer counts."""
 
-_AT_ONCE = 65536  # pixels
-_CLIP = 4.0  # sigma
-_MEDIAN = 0.6745  # of the magnitude of a normal variate
+_AT_ONCE = 65536  # pixels processed at once
+_CLIP = 4.0  # standard deviations beyond which differences are clipped
+_MEDIAN = 0.6745  # median magnitude of a normal variate
 
 
 def check_dtype(dtype: DTypeLike) -> np.dtype[Any]:
-    """Return the type of samples if kernels take it, else raise InputError."""
-    found = np.dtype(dtype)
-    if found not in FRAME_DTYPES:
-        raise InputError(f"frames of type {found}: uint8, uint16 or float32 are needed")
-    return found
+    """Return the type of samples; raise InputError if kernels do not accept it."""
+    sample_type = np.dtype(dtype)
+    if sample_type not in FRAME_DTYPES:
+        raise InputError(f"frames of type {sample_type}: uint8, uint16 or float32 are needed")
+    return sample_type
 
 
 def check_frames(frames: NDArray[Any], dtype: np.dtype[Any], shape: tuple[int, int]) -> None:
@@ -36,9 +36,9 @@ def check_frames(frames: NDArray[Any], dtype: np.dtype[Any], shape: tuple[int, i
 
 
 class Noise:
-    """The standard deviation of a sample: given, or estimated from the first two frames that are seen.
+    """The standard deviation of a sample, counts: given, or estimated from the first two frames.
 
-    ``given`` is in counts; ``integer`` says whether counts are.
+    ``integer``: samples are integers.
     """
 
     def __init__(self, given: float | None, integer: bool) -> None:
@@ -48,34 +48,34 @@ class Noise:
         self.reset()
 
     def reset(self, known: float | None = None) -> None:
-        """Forget the frames so far, but for what is known from others."""
-        self._seen: list[NDArray[np.float64]] = []
+        """Forget the frames so far; the noise may be known from other frames."""
+        self._samples: list[NDArray[np.float64]] = []
         self.value = self._given if known is None else known
 
     def look(self, frames: NDArray[Any]) -> None:
-        """See the next frames, (n, H, W); only the first two of all are used."""
+        """Use the next frames, (n, H, W), if they are among the first two."""
         if self.value is not None:
             return
-        self._seen += [thin_out(frame) for frame in frames[: 2 - len(self._seen)]]
-        if len(self._seen) == 2:
-            self.value = estimate_noise(self._seen[0], self._seen[1], self._integer)
+        self._samples += [thin_out(frame) for frame in frames[: 2 - len(self._samples)]]
+        if len(self._samples) == 2:
+            self.value = estimate_noise(self._samples[0], self._samples[1], self._integer)
 
 
 def thinning(shape: tuple[int, ...]) -> int:
-    """Return n such that every n-th pixel of a frame makes enough evenly spread samples."""
+    """Return n such that every n-th pixel of a frame gives enough samples."""
     return max(1, math.prod(shape) // SAMPLES)
 
 
 def thin_out(frame: NDArray[Any]) -> NDArray[np.float64]:
-    """Take evenly spread samples of a frame, enough to know its noise within half a per cent."""
+    """Return evenly spaced samples of a frame, enough to estimate its noise within 0.5 %."""
     return frame.reshape(-1)[:: thinning(frame.shape)].astype(np.float64)
 
 
 def estimate_noise(first: NDArray[np.float64], second: NDArray[np.float64], integer: bool) -> float:
-    """Estimate the standard deviation of a sample, counts, from two looks at the same pixels, (n,) each.
+    """Estimate the standard deviation of a sample, counts, from two samples of each pixel, (n,) each.
 
-    Clipping at four sigma, until nothing changes, leaves out the pixels that changed in between, as long as
-    they are fewer than half. Integer counts have at least the noise of their rounding.
+    Iterative clipping at four sigma excludes pixels that changed in between, if they are fewer than half.
+    Integer counts have at least the noise of their rounding.
     """
     usable = np.isfinite(first) & np.isfinite(second)
     difference = second[usable] - first[usable]
@@ -91,10 +91,10 @@ def estimate_noise(first: NDArray[np.float64], second: NDArray[np.float64], inte
 
 
 def noise_of_residual(residual: NDArray[Any], freedom: ArrayLike) -> float:
-    """Return the standard deviation of a sample by the residuals of fits; NaN where there is none.
+    """Return the standard deviation of a sample from residuals of fits; NaN without any.
 
-    Of samples' residuals with some degrees of freedom n each, scalar or a map, the median is that of
-    sqrt(chi^2 / n), by Wilson and Hilferty (PNAS 17, 1931).
+    The residuals have n degrees of freedom each, scalar or a map. Their median is that of sqrt(chi^2 / n), in
+    the approximation of Wilson and Hilferty (PNAS 17, 1931).
     """
     degrees = np.broadcast_to(np.asarray(freedom, np.float64), residual.shape)
     known = (degrees > 0) & np.isfinite(residual)
@@ -105,11 +105,11 @@ def noise_of_residual(residual: NDArray[Any], freedom: ArrayLike) -> float:
 def reference_maps(
     dark: ArrayLike | None, bright: ArrayLike | None, shape: tuple[int, int], dtype: np.dtype[Any]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Check the references and fill in what is missing from the range of the frames' type.
+    """Check the references; missing ones are replaced by the range of the frames' type.
 
-    Dark and bright are counts without and with full light, scalar or (H, W); shape is a frame's. InputError
-    if a shape does not fit, float frames have no references, or bright is not above dark at half or more of
-    the pixels where both are known, or none is known.
+    Dark and bright are counts without and with full light, scalar or (H, W). InputError if a shape differs
+    from that of frames, float frames have no references, no pixel has both, or bright is not above dark at
+    half or more of the pixels that have both.
     """
     if dtype.kind == "f" and (dark is None or bright is None):
         raise InputError("float frames have no natural range: give dark and bright, as counts or as maps")
@@ -118,7 +118,7 @@ def reference_maps(
     high = _as_map("bright", top if bright is None else bright, shape)
     known, usable = _count_usable(low, high)
     if known == 0:
-        raise InputError("no pixel has a dark and a bright that are numbers: take the references again")
+        raise InputError("no pixel has a finite dark and bright: take the references again")
     if 2 * usable <= known:
         share = 100 * (1 - usable / known)
         raise InputError(f"bright is not above dark at {share:.3g} % of the pixels: are they swapped?")
@@ -128,9 +128,9 @@ def reference_maps(
 def reference_pair(
     dark: ArrayLike | None, bright: ArrayLike | None, shape: tuple[int, int], dtype: np.dtype[Any]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Do as `reference_maps`, and return maps (H, W), float64, for all pixels.
+    """Return the references of `reference_maps` as maps (H, W), float64.
 
-    Both are NaN where bright is not above dark: such a pixel, dead or hot, can answer nothing.
+    Both are NaN where bright is not above dark, as in dead or hot pixels.
     """
     low, high = reference_maps(dark, bright, shape, dtype)
     usable = _usable(low, high)
@@ -141,7 +141,7 @@ def reference_pair(
 
 
 def _count_usable(dark: NDArray[np.float32], bright: NDArray[np.float32]) -> tuple[int, int]:
-    """Return at how many pixels both are numbers, and bright is above dark as well."""
+    """Return the number of pixels where both are finite, and where bright is also above dark."""
     known = usable = 0
     if dark.ndim == bright.ndim == 0:
         dark, bright = np.atleast_1d(dark, bright)

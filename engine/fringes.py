@@ -169,11 +169,11 @@ fit_fringes = phase_function(
 
 @checked
 def unwrap_frequencies(fringes: Sequence[Maps], frequency: ArrayLike, *, start: float = 0.0) -> Result:
-    """Unwrap fringes of several frequencies, each with the help of the one before.
+    """Unwrap fringes of several frequencies, each from the next coarser one.
 
-    The phase before, times the ratio of the frequencies, predicts the next, and the order is that which comes
-    nearest. With d the difference that is left and s its standard error, the neighbouring order is the right
-    one with probability 1 / (1 + exp(2 pi (pi - abs(d)) / s^2)); such risks of all steps are added.
+    The coarser phase, times the ratio of the frequencies, predicts the next one, which determines the order.
+    With d the remaining difference and s its standard error, the adjacent order is the right one with
+    probability 1 / (1 + exp(2 pi (pi - abs(d)) / s^2)); such risks of all steps are added.
 
     Parameters
     ----------
@@ -225,7 +225,7 @@ def unwrap_frequencies(fringes: Sequence[Maps], frequency: ArrayLike, *, start: 
     if not (np.all(np.isfinite(rate)) and rate[0] > 0 and np.all(np.diff(rate) > 0)):
         raise InputError(f"frequencies {rate.tolist()}: positive ones from coarse to fine are needed")
     whole = start + np.mod(phases[0] - start, _TURN)
-    border = np.minimum(whole - start, start + _TURN - whole)  # beyond it, the field's other end
+    border = np.minimum(whole - start, start + _TURN - whole)  # distance to the field's ends
     risk = ndtr(-border / np.maximum(sigmas[0], 1e-12))
     for finer, ratio in enumerate(rate[1:] / rate[:-1], 1):
         guess, whole = ratio * whole, _nearest(phases[finer], ratio * whole)
@@ -283,7 +283,7 @@ def decode_gray(frames: NDArray[Any], threshold: ArrayLike, *, noise: ArrayLike)
     contrast = np.sqrt(np.maximum(np.mean(above**2, axis=0) - variance, 0))
     risk = np.zeros(shape)
     for left, distance in zip(range(len(frames), 0, -1), np.abs(above), strict=True):
-        other = stripe ^ (1 << left) - 1  # if this bit is wrong, so are all after it
+        other = stripe ^ (1 << left) - 1  # if this bit is wrong, all later ones are
         risk += expit(-2 * contrast * distance / variance) * (np.abs(other - stripe) > 1)
     return Result(stripe=stripe, risk=_probability(risk), declarations=_STRIPES)
 
@@ -292,8 +292,8 @@ def decode_gray(frames: NDArray[Any], threshold: ArrayLike, *, noise: ArrayLike)
 def unwrap_gray(fringes: Maps, stripes: Maps, *, width: float = np.pi, start: float = 0.0) -> Result:
     """Unwrap fringes by the numbers of stripes that are narrower than a fringe.
 
-    The order is that by which the phase comes nearest to the middle of the stripe. With stripes of half a
-    fringe, a number that is off by one on the border of two stripes does no harm.
+    The order brings the phase nearest to the middle of the stripe. With stripes of half a fringe, a number
+    that is wrong by one at the border of two stripes does not matter.
 
     Parameters
     ----------
@@ -309,8 +309,8 @@ def unwrap_gray(fringes: Maps, stripes: Maps, *, width: float = np.pi, start: fl
     Returns
     -------
     Result
-        Maps as those of `unwrap_frequencies`. The risk is the sum of that of the stripe and that of a phase
-        whose error leads to the adjacent order.
+        The maps of `unwrap_frequencies`. The risk is the sum of that of the stripe and of the probability
+        that the error of the phase leads to the adjacent order.
 
     Raises
     ------
@@ -360,7 +360,7 @@ def _maps_of(maps: Maps, name: str, *quantities: str) -> tuple[Doubles, Doubles]
 
 
 def _nearest(phase: Doubles, guess: Doubles) -> Doubles:
-    """Return a phase plus the turns that bring it nearest to a guess."""
+    """Return a phase plus the turns that bring it nearest to a prediction."""
     return np.asarray(phase + _TURN * np.rint((guess - phase) / _TURN))
 
 

@@ -126,7 +126,7 @@ def _maps_of(name: str, maps: Maps, *needed: str) -> Result:
 
 
 def _check_shapes(heights: Result, normals: Result, mask: ArrayLike | None) -> Mask:
-    """Return where heights are wanted, if all maps are of one size."""
+    """Return the mask of wanted heights; raise InputError unless all maps have one size."""
     shapes = {
         "height": np.shape(heights.height),
         "height_sigma": np.shape(heights.height_sigma),
@@ -212,7 +212,7 @@ def fuse_recordings(
         method = turn.with_options(heights=before) if register else turn
         done = vertical.shape[0] + number * axial.shape[0]
         turned, slopes = _rotate(method, axial, _after(progress, done))
-        # The first of several surfaces is hardly ever the last.
+        # The first of several surfaces is rarely the last one, so its sigma is not needed.
         surface = solver.surface(slopes, sigma=number > 0 or passes == 1)
         moved = _moved(before, surface.height, float(turned.process["tilt"]), pixel_size)
         if moved <= _STILL:
@@ -242,7 +242,7 @@ def fuse_recordings(
 
 
 def frames_to_read(vertical: Source, axial: Source, register: bool = True) -> int:
-    """Return how many frames `fuse_recordings` reads at most."""
+    """Return the largest number of frames that `fuse_recordings` reads."""
     return vertical.shape[0] + _passes(axial, register) * axial.shape[0]
 
 
@@ -251,7 +251,7 @@ def _passes(axial: Source, register: bool) -> int:
 
 
 def _options_of(method: Method | Mapping[str, Any] | None) -> Mapping[str, Any]:
-    """Return the options of a method, or those that are given as a mapping."""
+    """Return the options of a method, or a mapping of options."""
     return method.chosen() if isinstance(method, Method) else method or {}
 
 
@@ -324,18 +324,18 @@ def _check_rotation(axial: Source, rotation: Rotation) -> None:
 def _moved(
     before: NDArray[np.float32], after: NDArray[np.float32], tilt: float, pixel_size: tuple[float, float]
 ) -> float:
-    """Return the shift, pixels, that 99 % of the points do not exceed when their heights change."""
+    """Return the 99th percentile of the shift of points, pixels, by a change of their heights."""
     change = np.abs(before - after)[np.isfinite(after)]
     return float(np.percentile(change, 99) * np.sin(tilt) / min(pixel_size)) if change.size else 0.0
 
 
 def _after(progress: Progress | None, done: int) -> Progress | None:
-    """Return a progress that begins to count at a number of frames."""
+    """Return a progress that starts at a number of frames."""
     return None if progress is None else lambda count: progress(done + count)
 
 
 def _both(vertical: Mapping[str, ProcessValue], axial: Mapping[str, ProcessValue]) -> dict[str, ProcessValue]:
-    """Join two processes: shared values once, others with the name of the motion in front."""
+    """Merge two processes: common values once, others prefixed with the motion."""
     shared = {name: axial[name] for name in ("program", "version", "date", "device", "driver")}
     process = shared | {"source": f"{vertical['source']}, {axial['source']}", "method": "fusion"}
     for motion, values in ("vertical", vertical), ("axial", axial):

@@ -1,4 +1,4 @@
-"""A surface from absolute heights and slopes, weighted by inverse variance."""
+"""A surface from absolute heights and slopes, with inverse-variance weights."""
 
 from __future__ import annotations
 
@@ -21,41 +21,40 @@ Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _UNIFORM = np.sqrt(3.0)  # half the width of a uniform distribution, in its standard deviations
-_SHARPEST = 1e-5  # mm: no height is known better than this
-_NARROWEST, _WIDEST = 2.0, 8.0  # standard deviation of a window that slopes are taken from, pixels
-_NEAR = 3.0  # such windows, beyond which pixels are too far from any normal
-_LEVEL = 0.05  # slope below which a surface has no terraces to speak of
-_FIRM = 30.0  # standard deviation of a press' height over that of one with normals around
-_OFF = 4.0  # standard deviations from those around, beyond which a height is a mistake
-_ROUGH = 3.0  # mean squared error in standard deviations of what is no smooth surface
-_OVERSTATED = 2.0  # times that errors of heights may exceed their sigmas, and these still be believed
-_SEVERAL = 6.0  # half intervals that heights go over, for their errors to be spread evenly
-_NEARLY_ALL = 0.9  # of all heights: the quantile that shows how much of their intervals errors use
-_LEAST_USED = 0.5
-_ITERATIONS = 5  # of where the intervals lift a component
-_SETTLED = 1e-3  # of half an interval, that it may still move
+_SHARPEST = 1e-5  # smallest standard deviation of a height, mm
+_NARROWEST, _WIDEST = 2.0, 8.0  # range of the standard deviation of windows for slopes of heights, pixels
+_NEAR = 3.0  # largest distance from a normal at which slopes of heights are used, in windows
+_LEVEL = 0.05  # smallest slope from which the width of terraces is computed
+_FIRM = 30.0  # standard deviation of a press' height over that of the surface near normals
+_OFF = 4.0  # standard deviations from the heights around, above which a height is an outlier
+_ROUGH = 3.0  # mean squared misfit, in standard deviations, above which a surface is not smooth
+_OVERSTATED = 2.0  # ratio of errors of heights to their sigmas up to which the sigmas are not changed
+_SEVERAL = 6.0  # smallest range of heights, in half intervals, for uniformly distributed errors
+_NEARLY_ALL = 0.9  # quantile of the errors from which the used share of the intervals is estimated
+_LEAST_USED = 0.5  # smallest used share of the intervals
+_ITERATIONS = 5  # largest number of updates of the components' offsets
+_SETTLED = 1e-3  # change of an offset, in half intervals, that ends them
 
 
 @dataclass(frozen=True, slots=True)
 class AbsoluteHeights:
     """Heights with standard deviations, such as those of a press."""
 
-    # (H, W), float64: millimetres, and their standard deviations; NaN where unknown.
-    height: Doubles
-    sigma: Doubles
+    height: Doubles  # (H, W), float64: millimetres; NaN where unknown
+    sigma: Doubles  # (H, W), float64: standard deviations, mm; NaN where unknown
 
     @classmethod
     def of(cls, height: NDArray[np.floating], sigma: NDArray[np.floating], mask: Mask | bool = True) -> Self:
-        """Take the finite ones of a map, where they are wanted."""
+        """Return the finite heights of a map within a mask; sigmas are raised to at least the median."""
         height, sigma = np.asarray(height, np.float64), np.asarray(sigma, np.float64)
         known = mask & np.isfinite(height) & (sigma >= 0) & (sigma < np.inf)
-        # The few that claim a far smaller sigma than the others are mostly those whose light rose oddly.
+        # Most pixels with a far smaller sigma than others have an unusual rise of the light.
         least = max(float(np.median(sigma[known])), _SHARPEST) if known.any() else _SHARPEST
         return cls(np.where(known, height, np.nan), np.where(known, np.maximum(sigma, least), np.nan))
 
     @property
     def known(self) -> Mask:
-        """Where heights are known, (H, W)."""
+        """Pixels with a known height, (H, W)."""
         return np.isfinite(self.height)
 
     @property
@@ -65,11 +64,11 @@ class AbsoluteHeights:
 
 
 class FusionSolver:
-    """Integrates heights and slopes in three passes: as given, with the slopes of heights, with intervals.
+    """Integrates heights and slopes in three passes: as given, with slopes from heights, and with intervals.
 
-    Slopes that are nearly those before, of frames that were registered anew, are integrated in one: the last
-    surface takes the place of the first two. `surface` raises InputError where there is neither a height nor
-    a slope, or the pixel size cannot be; NotConverged where a surface was not found.
+    Later slopes, of the same frames after another registration, are integrated in one pass: the last surface
+    replaces the first two. `surface` raises InputError without any height or slope, and NotConverged if the
+    integration does not converge.
     """
 
     def __init__(self, press: AbsoluteHeights, pixel_size: ArrayLike, robust: bool, device: Device) -> None:
@@ -78,7 +77,7 @@ class FusionSolver:
         self._near: Result | None = None
 
     def surface(self, slopes: Slopes, *, sigma: bool = True) -> Result:
-        """Return the surface of the heights and of slopes."""
+        """Return the surface of the heights and given slopes."""
         press, near = self._press, self._near
         if not (slopes.known | press.known).any():
             raise InputError("there is nothing to fuse: no pixel has a height or a normal")
@@ -90,10 +89,10 @@ class FusionSolver:
             start = near.height
             near = self._solve(extended, press.height, press.weight, initial_heights=start, sigma=False)
         height, weight = _use_intervals(near, press, slopes)
-        found = self._solve(extended, height, weight, initial_heights=near.height, sigma=sigma)
-        # Heights that are mistakes are left out of the surface, but may count next time.
-        self._near = near.assign(height=np.where(found.component < 0, near.height, found.height))
-        return found if found.height_sigma is None else _set_sigma_of_lone_pixels(found, weight)
+        surface = self._solve(extended, height, weight, initial_heights=near.height, sigma=sigma)
+        # Outliers are not part of the surface, but may count in the next call.
+        self._near = near.assign(height=np.where(surface.component < 0, near.height, surface.height))
+        return surface if surface.height_sigma is None else _set_sigma_of_lone_pixels(surface, weight)
 
     def filled(self, surface: Result) -> Result:
         """Return a surface with its holes filled."""
@@ -115,12 +114,12 @@ class FusionSolver:
 
 
 def _correct_overstated(press: AbsoluteHeights, surface: Result, slopes: Slopes) -> AbsoluteHeights:
-    """Raise sigmas to the size of the errors, where slopes show that most are much too small."""
+    """Raise sigmas to the size of the errors, if the slopes show that most are much too small."""
     both = press.known & slopes.known
     if not both.any():
         return press
     off = press.height[both] - surface.height[both]
-    # Half are beyond half of an interval.
+    # The median of a uniform distribution's magnitude is half of its half-width.
     usual = float(np.median(np.abs(off - np.median(off)))) * 2 / _UNIFORM
     if usual < _OVERSTATED * float(np.median(press.sigma[both])):
         return press
@@ -130,10 +129,10 @@ def _correct_overstated(press: AbsoluteHeights, surface: Result, slopes: Slopes)
 def _extend(
     slopes: Slopes, surface: Result, press: AbsoluteHeights, pixel_size: tuple[float, float]
 ) -> Slopes:
-    """Give pixels with a height but no normal, near those with one, the slopes of the heights around.
+    """Add slopes, fitted to heights in a window, at pixels near normals that have a height but no normal.
 
-    The window spans a terrace or more. Neighbours share data, so each slope counts only for its part of a
-    window. Where heights do not fit a smooth surface, there are no slopes.
+    The window spans at least a terrace. Windows overlap, so each slope counts only for its share of a window.
+    No slopes are added where heights do not fit a smooth surface.
     """
     gaps = press.known & ~slopes.known
     if not gaps.any() or not slopes.known.any():
@@ -147,7 +146,7 @@ def _extend(
     weight = np.where(firm, (_FIRM / sigma) ** 2, np.where(gaps, 1 / press.sigma**2, 0.0))
     trend = fit_paraboloids(height, weight, gaps, width)
     off = np.abs(height[gaps] - trend.height) > _OFF * press.sigma[gaps]
-    if off.any():  # mistakes count only once
+    if off.any():  # fit again without outliers
         weight[gaps] = np.where(off, 0.0, weight[gaps])
         trend = fit_paraboloids(height, weight, gaps, width)
     smooth = trend.misfit < _ROUGH
@@ -161,18 +160,18 @@ def _extend(
 
 
 def _window(slopes: Slopes, sigma: float, pixel: float) -> float:
-    """Return the width of windows, in pixels, that span the terraces where slopes are as usual."""
+    """Return the width of windows, in pixels, that span a terrace at the median slope."""
     steepness = np.hypot(slopes.dz_dx[slopes.known], slopes.dz_dy[slopes.known])
     terrace = 2 * _UNIFORM * sigma / (pixel * max(float(np.median(steepness)), _LEVEL))
     return float(np.clip(terrace, _NARROWEST, _WIDEST))
 
 
 def _use_intervals(surface: Result, press: AbsoluteHeights, slopes: Slopes) -> tuple[Doubles, Doubles]:
-    """Return known heights and their weights by their intervals, around a surface that is about right.
+    """Return known heights and their weights from their intervals, given an approximate surface.
 
-    Heights far from it are mistakes, and get no weight. Nor do those without a normal of their own, which are
-    at rims and often late, in a component that has others. A component of which no height is near an end of
-    its interval lies on one terrace: then all of its heights together count as one.
+    Heights far from the surface are outliers, with weight 0. So are heights without a normal, which are at
+    rims and often late, if their component has others. If no height of a component is near an end of its
+    interval, the component is on one terrace, and all of its heights together count as one.
     """
     size = _sizes(surface)
     joined = press.known & (size[surface.component] > 1)
@@ -184,7 +183,7 @@ def _use_intervals(surface: Result, press: AbsoluteHeights, slopes: Slopes) -> t
         return height, weight
     label, half = surface.component[joined], _UNIFORM * press.sigma[joined]
     middle, shape = press.height[joined], surface.height[joined].astype(np.float64)
-    # The mean that a solver finds is moved by mistakes, the median is not.
+    # The offset of the solver is a mean, which outliers affect; the median is robust.
     lift = _medians(middle - shape, label, size.size)
     half *= _share_used(middle - shape - lift[label], half, shape)
     for _ in range(_ITERATIONS):
@@ -208,7 +207,7 @@ def _use_intervals(surface: Result, press: AbsoluteHeights, slopes: Slopes) -> t
 
 
 def _medians(values: Doubles, label: NDArray[np.integer], count: int) -> Doubles:
-    """Return the median of each label's values, 0 where there is none."""
+    """Return the median of each label's values, 0 without any."""
     ordered = np.append(values[np.lexsort((values, label))], 0.0)
     members = np.bincount(label, minlength=count)
     first = np.cumsum(members) - members
@@ -217,10 +216,10 @@ def _medians(values: Doubles, label: NDArray[np.integer], count: int) -> Doubles
 
 
 def _share_used(error: Doubles, half: Doubles, height: Doubles) -> float:
-    """Return the share of their intervals that errors use, if heights go over several of them.
+    """Return the share of the intervals within which errors are, if heights span several intervals.
 
-    Samples may place the onset better than within an interval. Ends that no error reaches leave a surface
-    free to follow the few that are beyond.
+    Samples may determine the onset better than within an interval. With intervals that are too long, the few
+    errors outside of them would determine the surface.
     """
     if np.ptp(height) < _SEVERAL * float(np.median(half)):
         return 1.0
@@ -229,13 +228,12 @@ def _share_used(error: Doubles, half: Doubles, height: Doubles) -> float:
 
 
 def _sizes(surface: Result) -> NDArray[np.intp]:
-    """Return how many pixels each component has."""
+    """Return the number of pixels of each component."""
     return np.bincount(surface.component[surface.component >= 0], minlength=len(surface.offset_unknown))
 
 
 def _set_sigma_of_lone_pixels(surface: Result, weight: Doubles) -> Result:
-    """Set the standard deviations of components of one pixel, which are known exactly."""
-    assert surface.height_sigma is not None
+    """Set the standard deviations of components of one pixel to those of their heights."""
     lone = (surface.component >= 0) & (weight > 0) & (_sizes(surface)[surface.component] == 1)
     sigma = surface.height_sigma.copy()
     sigma[lone] = 1 / np.sqrt(weight[lone])
@@ -243,8 +241,7 @@ def _set_sigma_of_lone_pixels(surface: Result, weight: Doubles) -> Result:
 
 
 def _fill(surface: Result, pixel_size: ArrayLike) -> Result:
-    """Fill holes from the absolute heights around them; what is relative stays as it is."""
-    assert surface.height_sigma is not None
+    """Fill holes from the absolute heights around them; relative heights do not change."""
     absolute = (surface.component >= 0) & ~_relative(surface)
     height, filled = fill_holes(np.where(absolute, surface.height, np.nan), surface.height_sigma, pixel_size)
     filled = np.where(surface.component < 0, filled, 0).astype(np.uint8)
@@ -252,12 +249,12 @@ def _fill(surface: Result, pixel_size: ArrayLike) -> Result:
 
 
 def _relative(surface: Result) -> Mask:
-    """Return where heights are relative: pixels of components without a known one."""
+    """Return the pixels with a relative height, of components without a known one."""
     return np.asarray(np.append(surface.offset_unknown, 0)[surface.component] != 0)
 
 
 def _join(surface: Result) -> Result:
-    """Make one component of neighbours whose heights are all absolute, though no slope leads across."""
+    """Merge adjacent components with absolute heights, although no slope connects them."""
     answered = (surface.component >= 0) | (surface.filled > 0)
     relative = _relative(surface)
     count, labels = cv2.connectedComponents((answered & ~relative).view(np.uint8), connectivity=4)

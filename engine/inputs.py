@@ -1,4 +1,4 @@
-"""Maps as arguments: a result, a mapping, a dataset of xarray, a file, or an array."""
+"""Conversion of arguments to results: mappings, xarray datasets, files and arrays."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 Maps: TypeAlias = Union[
     Result, Mapping[str, Any], "xarray.Dataset", "xarray.DataArray", str, os.PathLike[str], ArrayLike
 ]
-"""What functions of maps accept; see `as_result`."""
+"""Arguments that functions of maps accept; see `as_result`."""
 
 
 def as_result(
     maps: Maps, name: str = "maps", *, quantity: str = "height", pixel_size: ArrayLike | None = None
 ) -> Result:
-    """Return maps as a result, wherever they come from.
+    """Return maps of any supported kind as a result.
 
     Parameters
     ----------
@@ -57,14 +57,14 @@ def as_result(
     if pixel_size is None:
         return result
     pixels, size = check_pixel_size(pixel_size), map_shape(result)[-2:]
-    if len(size) < 2:  # whoever needs a map refuses this
+    if len(size) < 2:  # the caller reports a missing map
         return result
     x, y = pixel_axes((size[0], size[1]), pixels)
     return result.assign(x=x, y=y)
 
 
 def pixel_size_of(result: Result, name: str, pixel_size: ArrayLike | None = None) -> tuple[float, float]:
-    """Return millimetres along x and y of a pixel, as specified, or as the result has it.
+    """Return millimetres along x and y of a pixel, as specified, or those of the result.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def spacing(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, floa
 
 
 def _converted(maps: Any, name: str, quantity: str) -> Result:
-    """Return what is not a result as one."""
+    """Return maps of another kind as a result."""
     if isinstance(maps, str | os.PathLike):
         return open_result(os.fspath(maps))
     if type(maps).__module__.partition(".")[0] == "xarray":
@@ -127,7 +127,7 @@ def _of_mapping(maps: Mapping[Any, Any], name: str) -> Result:
 
 
 def _of_one_size(result: Result, name: str) -> Result:
-    """Return a result if its maps are of one size."""
+    """Return a result; raise InputError unless its maps have one size."""
     size = map_shape(result)[-2:]
     if len(size) < 2:
         raise InputError(f"the maps of {name} are not of size (H, W)")

@@ -1,4 +1,4 @@
-"""Maps without gaps: each pixel without a number takes that of about the nearest one with it."""
+"""Filling of undefined pixels with the value of the nearest defined one."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 def fill_with_nearest(values: NDArray[Any]) -> NDArray[Any]:
-    """Return a map, (H, W), whose NaN are replaced by the nearest number, but for 2 % of distance."""
+    """Return a map, (H, W), whose NaN are replaced by the nearest number, within 2 % of the distance."""
     import cv2
 
     known = np.isfinite(values)

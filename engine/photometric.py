@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Doubles = NDArray[np.float64]
 
-_LEAST_PIVOT = 1e-3  # of the lamps' directions, as a share of their size: below it, they are coplanar
+_LEAST_PIVOT = 1e-3  # relative pivot of the lamps' directions below which they count as coplanar
 
 
 class PhotometricStereo(Operation):

@@ -1,4 +1,4 @@
-"""What a result says of how it came about."""
+"""Provenance: the values in a result's process."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ _ASSUMED, _ESTIMATED = "range of the type", "estimated from the frames"  # of le
 
 @functools.cache
 def program_version() -> str:
-    """Return the version of the installed package; to look it up takes a millisecond, so only once."""
+    """Return the version of the installed package; cached, because the look-up takes a millisecond."""
     return version("mirrorskin")
 
 
 def signature() -> dict[str, str]:
-    """Return what every file that is written says of its maker: program, version and date."""
+    """Return program, version and date, which all written files contain."""
     date = datetime.now(UTC).isoformat(timespec="seconds")
     return {"program": "mirrorskin", "version": program_version(), "date": date}
 
@@ -40,7 +40,7 @@ def signature() -> dict[str, str]:
 def attach_provenance(
     result: Result, source: Source, device: Device | None, process: dict[str, ProcessValue]
 ) -> Result:
-    """Return a result with the pixels' places, how its maps came about, and the calibration if any."""
+    """Return a result with coordinates, provenance, and the calibration if any."""
     own = source.source if isinstance(source, io.Calibrated) else source
     known: dict[str, ProcessValue] = {**signature(), "source": source.name}
     if device is not None:
@@ -67,7 +67,7 @@ def attach_provenance(
 
 
 def describe(configured: Configured, source: Source | None = None) -> dict[str, ProcessValue]:
-    """Return the name of an operation, step or method, and its options as a process lists them."""
+    """Return the name of an operation, step or method, and its options, for ``process``."""
     found: dict[str, ProcessValue] = {"operation": type(configured).__name__}
     for name, value in configured.chosen().items():
         if name in ("device", "memory_limit") or value is None:
@@ -89,19 +89,19 @@ def describe(configured: Configured, source: Source | None = None) -> dict[str, 
 def level_origin(
     source: Source, name: Literal["dark", "bright"], given: ArrayLike | None = None
 ) -> ProcessValue:
-    """Return where the level of dark or bright pixels came from; see `parameter_origin`."""
+    """Return the origin of the level of dark or bright pixels; see `parameter_origin`."""
     references = source.calibration.references if isinstance(source, io.Calibrated) else None
     whose = "recording" if references is None else "calibration"
     return parameter_origin(given, getattr(source.header, name), _ASSUMED, whose)
 
 
 def estimated_level(counts: float) -> str:
-    """Return what a process says of a level that was estimated."""
+    """Return the text for an estimated level in ``process``."""
     return f"{counts:.4g}, {_ESTIMATED}"
 
 
 def missing_levels(process: Mapping[str, object]) -> str:
-    """Tell which levels nobody gave, and what was taken, from a process; nothing if all were given.
+    """Return which levels in a process were not given, and their replacements; empty if all were given.
 
     Examples
     --------
@@ -110,11 +110,11 @@ def missing_levels(process: Mapping[str, object]) -> str:
     """
     if "tilt_from" in process:  # of a rotation: dark and bright are only limits
         return ""
-    taken = {one: str(process.get(one, "")) for one in ("dark", "bright")}
-    missing = [one for one, said in taken.items() if said == _ASSUMED or said.endswith(_ESTIMATED)]
+    origins = {name: str(process.get(name, "")) for name in ("dark", "bright")}
+    missing = [name for name, text in origins.items() if text == _ASSUMED or text.endswith(_ESTIMATED)]
     if not missing:
         return ""
-    counts = [taken[one].partition(",")[0] for one in missing]
+    counts = [origins[name].partition(",")[0] for name in missing]
     what = f"estimated as {' and '.join(counts)} counts"
     if _ASSUMED in counts:
         what = "the range of the frames' type is taken, and heights may be wrong by more than height_sigma"
@@ -124,7 +124,7 @@ def missing_levels(process: Mapping[str, object]) -> str:
 def parameter_origin(
     given: ArrayLike | None, own: ArrayLike | None, otherwise: str, whose: str = "recording"
 ) -> ProcessValue:
-    """Return a parameter's value, or in a word where it came from: given, the source's own, or a default."""
+    """Return a parameter's value, or its origin in words: given, of the source, or a default."""
     if given is not None:
         return float(given) if np.ndim(given) == 0 else "map given"  # type: ignore[arg-type]
     if own is None:
@@ -134,7 +134,7 @@ def parameter_origin(
 
 @contextmanager
 def naming(source: Source) -> Iterator[None]:
-    """Name the source in errors about what it holds."""
+    """Prefix the messages of errors with the source's name."""
     try:
         yield
     except io.InputError as error:

@@ -1,4 +1,4 @@
-"""Values between the pixels of a map, where some pixels have none or belong to something else."""
+"""Interpolation between the pixels of a map, some of which are undefined or have another label."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-_ROUNDING = 1e-6  # of a pixel: places nearer than that are the pixel's own
+_ROUNDING = 1e-6  # distance from a pixel's centre, in pixels, below which a point is the pixel itself
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SamplePoints:
-    """Places in a picture, and the four pixels around each."""
+    """Points in a picture, and the four pixels around each."""
 
-    pixels: NDArray[np.intp]  # (4, n), intp: numbers of the pixels, row by row; any where the share is 0
-    shares: Doubles  # (4, n), float64: bilinear weights; 0 of pixels outside the picture
-    nearest: NDArray[np.intp]  # (n,), intp: number of the nearest pixel; any where it is outside
-    closest: NDArray[np.intp]  # (n,), intp: which of the four that is
+    pixels: NDArray[np.intp]  # (4, n): flat indices of the pixels; arbitrary if the share is 0
+    shares: Doubles  # (4, n), float64: bilinear weights; 0 for pixels outside the picture
+    nearest: NDArray[np.intp]  # (n,): flat index of the nearest pixel; arbitrary if it is outside
+    closest: NDArray[np.intp]  # (n,): index of the nearest pixel among the four
     inside: Mask  # (n,), bool: whether the nearest pixel is in the picture
     all_inside: Mask  # (n,), bool: whether all four are
 
     @classmethod
     def at(cls, column: ArrayLike, row: ArrayLike, shape: tuple[int, int]) -> SamplePoints:
-        """Take places, (n,), in pixels from the first one's centre, NaN where there is none."""
+        """Return points, (n,), at distances in pixels from the first pixel's centre; NaN for none."""
         (rows, low, i), (columns, left, j) = _pair(row, shape[0]), _pair(column, shape[1])
         pixels = np.stack([y * shape[1] + x for y in rows for x in columns])
         shares = np.stack([v * w for v in low for w in left])
@@ -40,11 +40,11 @@ class SamplePoints:
 
     @property
     def on_pixel(self) -> Mask:
-        """Where a place is a pixel's own, (n,)."""
+        """Whether a point is at a pixel's centre, (n,)."""
         return np.asarray(self.shares.max(axis=0) == 1)
 
     def same_label(self, labels: NDArray[Any]) -> Mask:
-        """Tell which of the four pixels have the nearest one's label, (4, n), in a map (H, W)."""
+        """Return which of the four pixels have the nearest one's label, (4, n), in a map (H, W)."""
         flat = labels.ravel()
         return np.asarray(flat[self.pixels] == flat[self.nearest])
 
@@ -76,27 +76,26 @@ class SamplePoints:
         return np.where(self.on_pixel, self.nearest_values(values, np.nan), mean)
 
     def _mean(self, around: list[Floats], count: Mask | None) -> list[Doubles]:
-        """Return weighted means, (n,) each, of values around, (4, n), that are known or unknown together."""
-        means = [np.einsum("kn,kn->n", self.shares, one) for one in around]
-        own = np.where(
-            self.inside, np.take_along_axis(around[0], self.closest[np.newaxis], axis=0)[0], np.nan
-        )
-        easy = np.isfinite(means[0]) & self.all_inside
+        """Return weighted means, (n,) each, of values, (4, n), which are all undefined at the same pixels."""
+        means = [np.einsum("kn,kn->n", self.shares, values) for values in around]
+        nearest = np.take_along_axis(around[0], self.closest[np.newaxis], axis=0)[0]
+        nearest = np.where(self.inside, nearest, np.nan)
+        complete = np.isfinite(means[0]) & self.all_inside
         if count is not None:
-            easy &= count.all(axis=0)
-        few = np.flatnonzero(~easy & np.isfinite(own))
-        shares = np.where(np.isfinite(around[0][:, few]), self.shares[:, few], 0.0)
+            complete &= count.all(axis=0)
+        partial = np.flatnonzero(~complete & np.isfinite(nearest))
+        shares = np.where(np.isfinite(around[0][:, partial]), self.shares[:, partial], 0.0)
         if count is not None:
-            shares = np.where(count[:, few], shares, 0.0)
+            shares = np.where(count[:, partial], shares, 0.0)
         shares /= shares.sum(axis=0)
-        for mean, one in zip(means, around, strict=True):
-            mean[few] = np.sum(np.where(shares > 0, shares * one[:, few], 0), axis=0)
-            mean[np.isnan(own)] = np.nan
+        for mean, values in zip(means, around, strict=True):
+            mean[partial] = np.sum(np.where(shares > 0, shares * values[:, partial], 0), axis=0)
+            mean[np.isnan(nearest)] = np.nan
         return means
 
 
 def _pair(place: ArrayLike, size: int) -> tuple[list[NDArray[np.intp]], list[Doubles], Mask]:
-    """Return, along one axis, the pixels beside places, their shares, and whether the nearest is there."""
+    """Return, along one axis, both adjacent pixels, their shares, and whether the nearest one exists."""
     place = np.asarray(place, np.float64)
     inside = (place >= -0.5) & (place <= size - 0.5)
     place = np.where(inside, place, 0.0)

@@ -1,4 +1,4 @@
-"""How far a result is from the truth."""
+"""Comparison of results with the truth."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ from mirrorskin.io.types import UNDISTORTED
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_JUMP = np.radians(10.0)  # between neighbours, from which on a change of the normal is an edge
+_JUMP = np.radians(10.0)  # smallest angle between normals of neighbours that is an edge
 
 
 @dataclass(frozen=True, slots=True)
 class AngleScore:
-    """Angular errors of normals, or of azimuths alone, where the sheet was in contact in every frame.
+    """Angular errors of normals, or of azimuths, where the sheet was in contact in every frame.
 
     Attributes
     ----------
     answered : int
-        Pixels with an answer whose truth is known: of angles those in contact, both in truth and by the
-        result; a level one has no azimuth.
+        Pixels with an answer and a known truth; for angles, those in contact in the truth and in the result.
+        Level pixels have no azimuth.
     touched : int
         Pixels in contact.
     coverage : float
-        Share of the touched pixels that were answered.
+        Share of the touched pixels that are answered.
     rms, median, p99, largest : float
-        Of the angle between answer and truth, degrees, or of the magnitude of the height error, mm; NaN
-        without answers.
+        Statistics of the angle between answer and truth, degrees, or of the size of the height error, mm;
+        NaN without answers.
     chi_square : float
-        Mean of (error / sigma)^2: 1 where the standard deviations are honest; NaN without them.
+        Mean of (error / sigma)^2: 1 if the standard deviations are correct; NaN without them.
     """
 
     answered: int
@@ -72,16 +72,16 @@ class AngleScore:
 
 @dataclass(frozen=True, slots=True)
 class HeightScore(AngleScore):
-    """Errors of a height map, as of an `AngleScore`.
+    """Errors of a height map; see `AngleScore`.
 
-    Of components whose heights are relative, the mean difference from the truth is taken off first.
+    The mean difference from the truth is subtracted from components with relative heights.
 
     Attributes
     ----------
     mean : float
-        Of the height error, mm.
+        Mean height error, mm.
     relative : int
-        Components whose mean difference was taken off.
+        Number of components with relative heights.
     """
 
     mean: float
@@ -97,16 +97,16 @@ class HeightScore(AngleScore):
 
 @dataclass(frozen=True, slots=True)
 class ContactScore:
-    """How well contact in every frame was found.
+    """Errors of the contact in every frame.
 
     Attributes
     ----------
     recall, precision : float
-        Share of the pixels in contact that were found, and of those found that are in contact.
+        Share of the pixels in contact that were found, and share of the found pixels that are in contact.
     lost : int
-        Pixels with an answer that were out of contact in some frame.
+        Pixels with an answer that lost contact in some frame.
     lost_flagged, wrongly_flagged : float
-        Share of these, and of the pixels with an answer and in contact, that the result has out of contact.
+        Shares of these, and of the other pixels with an answer, that are out of contact in the result.
     """
 
     recall: float
@@ -127,14 +127,14 @@ class ContactScore:
 
 @dataclass(frozen=True, slots=True)
 class EdgeScore:
-    """How well edges were found: the borders of contact, and jumps of the normal by more than 10 degrees.
+    """Errors of edges: borders of contact, and jumps of the normal by more than 10 degrees.
 
     Attributes
     ----------
     true, found : int
-        Pixels on either side of a true edge, and of a found one.
+        Pixels on both sides of true edges, and of found ones.
     recall, precision : float
-        Share of the true ones with a found one within a pixel, and of the found ones with a true one.
+        Share of the true pixels with a found one within a pixel, and of the found pixels with a true one.
     """
 
     true: int
@@ -152,27 +152,26 @@ class EdgeScore:
 
 @dataclass(frozen=True, slots=True)
 class SlipScore:
-    """How well displacement and slip were found in a slide or a twist.
+    """Errors of displacement and slip in a slide or a twist.
 
     Attributes
     ----------
     answered, touched : int
         Pixels in contact with the status slipped or sticks, and all pixels in contact.
     coverage : float
-        Share of these that were answered.
+        Share of these that are answered.
     recall, precision : float
-        Share of the slipped pixels that were found, and of those found that slipped; pixels next to a border
-        of contact or slip are left out.
+        Share of the slipped pixels that were found, and share of the found pixels that slipped; pixels
+        next to a border of contact or slip are ignored.
     stick_radius, true_stick_radius : float
-        At the end, as shares of the contact's radius: square roots of the share of the answered pixels that
-        stick, found and true.
+        At the end, relative to the contact's radius: square root of the share of the answered pixels that
+        stick.
     unit : str
-        Of onsets.
+        Unit of onsets.
     onset_rms, onset_chi_square : float
-        Of the onset's error where both found and truth slipped: its root mean square, and the mean of
-        (error / sigma)^2.
+        Root mean square error of the onset, and mean of (error / sigma)^2, where result and truth slipped.
     displacement_rms, displacement_chi_square : float
-        Of the displacement in the last frame, mm, and along either axis.
+        The same of the displacement in the last frame, mm, with a chi square along each axis.
     """
 
     answered: int
@@ -210,25 +209,24 @@ class SlipScore:
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """A result's errors; None of a map that it does not have.
+    """A result's errors; None for missing maps.
 
     Attributes
     ----------
     height : HeightScore or None
-        Of the measured heights.
+        Measured heights.
     filled : HeightScore or None
-        Of heights that were filled, where a result has any.
+        Filled heights.
     normal : AngleScore or None
     azimuth : AngleScore or None
-        Of a result that has azimuths but no normals.
+        Azimuths of a result without normals.
     contact : ContactScore or None
     edges : EdgeScore or None
-        None of frames that were registered: what follows the object has another contact than what stays with
-        the picture.
+        None for registered frames, whose contact is that of the object's points, not of the picture's pixels.
     slip : SlipScore or None
-        Of a slide or a twist from its first frame on.
+        Slip of a slide or a twist that starts with the first frame.
     slip_left_out : str or None
-        Why slip that the result has is not scored.
+        Reason why the result's slip is not scored.
     """
 
     height: HeightScore | None = None
@@ -241,7 +239,7 @@ class Score:
     slip_left_out: str | None = None
 
     def parts(self) -> dict[str, Any]:
-        """Return the scores that there are, by name."""
+        """Return the available scores, by name."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         del values["slip_left_out"]
         return {name: value for name, value in values.items() if value is not None}
@@ -262,10 +260,10 @@ def score(result: Maps, truth: Truth) -> Score:
     Parameters
     ----------
     result : Result, mapping, xarray.Dataset, path or array_like, (H, W)
-        With at least one of ``height``, ``normals``, ``azimuth``, ``contact``, ``edges``, ``slip_onset`` and
-        ``displacement``; of a result for each turn, all turns are compared.
+        Maps with at least one of ``height``, ``normals``, ``azimuth``, ``contact``, ``edges``, ``slip_onset``
+        and ``displacement``; if there are maps for each turn, all turns are compared.
     truth : Truth
-        Of the same size.
+        True maps of the same size.
 
     Returns
     -------
@@ -294,7 +292,7 @@ def score(result: Maps, truth: Truth) -> Score:
         raise InputError(f"the result is {size} pixels, the truth {truth.height.shape}: not of one stack")
     touched = truth.contact.astype(bool)
     azimuth = result.azimuth if result.normals is None else None
-    # Maps of registered frames are those of the object's points, the truth is that of the picture's pixels.
+    # Maps of registered frames belong to the object's points, but the truth to the picture's pixels.
     follows = bool(result.process.get("registered", result.process.get("heights", "none") != "none"))
     contact, edges = (None, None) if follows else (result.contact, result.edges)
     height, filled = _score_heights(result, truth.height, touched)
@@ -320,7 +318,7 @@ _SLIP_MAPS = ("displacement", "slip_onset", "status")
 
 
 def _why_slip_is_left_out(result: Result, truth: Truth) -> str | None:
-    """Return why slip that a result has cannot be compared with the truth; None if it can, or has none."""
+    """Return why a result's slip cannot be compared with the truth; None if it can, or without slip."""
     if result.slip_onset is None and result.displacement is None:
         return None
     missing = [name for name in _SLIP_MAPS if name not in result]
@@ -342,7 +340,7 @@ def _why_slip_is_left_out(result: Result, truth: Truth) -> str | None:
 
 
 def _distance(result: Result) -> Doubles | None:
-    """Return how far the body has slid or turned in each frame, mm or radians."""
+    """Return the distance or angle of the body in each frame, mm or radians."""
     distance: Doubles | None = result.slide_distance if result.twist_angle is None else result.twist_angle
     return distance
 
@@ -398,7 +396,7 @@ def _score_heights(
 
 
 def _mean_differences(result: Result, error: Doubles) -> tuple[Doubles | float, int]:
-    """Return the mean error of each pixel's component, if that is relative, and how many are."""
+    """Return the mean error of each pixel's component, if that is relative, and the number of these."""
     unknown, component = result.offset_unknown, result.component
     if unknown is None or component is None or not unknown.any():
         return 0.0, 0
@@ -406,7 +404,7 @@ def _mean_differences(result: Result, error: Doubles) -> tuple[Doubles | float, 
     count = np.bincount(component[known], minlength=unknown.size)
     total = np.bincount(component[known], error[known], unknown.size)
     mean = np.where(unknown, total / np.maximum(count, 1), 0.0)
-    # The last one is for pixels that are in no component.
+    # The last element is for pixels without a component.
     return np.append(mean, 0.0)[component], int(np.count_nonzero(count[unknown.astype(bool)]))
 
 
@@ -475,25 +473,25 @@ def _score_edges(edges: NDArray[np.uint8], truth: Mask) -> EdgeScore:
 
 
 def _turned(azimuth: NDArray[np.float32], truth: NDArray[np.float32]) -> Doubles:
-    """Return the angles between directions, radians, the shorter way round."""
+    """Return the smaller angles between directions, radians."""
     error = azimuth.astype(np.float64) - truth
     return np.abs(np.arctan2(np.sin(error), np.cos(error)))
 
 
 def _edges_of(truth: Truth) -> Mask:
-    """Mark the pixels on either side of an edge."""
+    """Return the pixels on both sides of edges."""
     normals, touched = true_normals(truth), truth.contact.astype(bool)
     edges = np.zeros_like(touched)
-    for one, other in (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]):
-        jump = touched[one] & touched[other] & (angle_between(normals[one], normals[other]) > _JUMP)
-        border = jump | (touched[one] != touched[other])
-        edges[one] |= border
-        edges[other] |= border
+    for a, b in (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]):
+        jump = touched[a] & touched[b] & (angle_between(normals[a], normals[b]) > _JUMP)
+        border = jump | (touched[a] != touched[b])
+        edges[a] |= border
+        edges[b] |= border
     return edges
 
 
 def _around(marked: Mask) -> Mask:
-    """Mark the eight neighbours of what is marked, too."""
+    """Return a mask that includes the eight neighbours of its pixels."""
     border = [(0, 0)] * (marked.ndim - 2) + [(1, 1), (1, 1)]
     squares = sliding_window_view(np.pad(marked, border), (3, 3), axis=(-2, -1))
     return np.asarray(squares.any(axis=(-2, -1)))
@@ -504,7 +502,7 @@ def _share(part: Mask, whole: Mask) -> float:
 
 
 def _spread(size: Doubles) -> dict[str, float]:
-    """Return how large errors are, from their magnitudes."""
+    """Return statistics of errors from their magnitudes."""
     if not size.size:
         return dict.fromkeys(("rms", "median", "p99", "largest"), np.nan)
     return {
@@ -523,9 +521,9 @@ def _chi_square(error: Doubles, sigma: NDArray[np.float32] | None, answered: Mas
 
 
 def true_normals(truth: Truth) -> NDArray[np.float64]:
-    """Return the normals that a simulation knows, (H, W, 3) float64; NaN where there is no object."""
+    """Return the true normals, (H, W, 3) float64; NaN without an object."""
     zenith = truth.zenith.astype(np.float64)
-    azimuth = np.where(zenith == 0, 0.0, truth.azimuth.astype(np.float64))  # a level one has none
+    azimuth = np.where(zenith == 0, 0.0, truth.azimuth.astype(np.float64))  # undefined if level
     sine = np.sin(zenith)
     return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith)], axis=-1)
 

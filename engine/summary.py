@@ -1,4 +1,4 @@
-"""A result in one line."""
+"""Summary of a result in one line."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from mirrorskin.io.maps import SIGMA, is_builtin, is_deviation, place_of
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """How many pixels of a result have an answer; ``str()`` of it is one line.
+    """Number of pixels of a result with an answer, and their range; ``str()`` is one line.
 
     Attributes
     ----------
     what : str
-        The maps that are summarised, such as ``"height"`` or ``"normals"``.
+        Name of the summarised maps, such as ``"height"`` or ``"normals"``.
     pixels, answered : int
-        All pixels, and those with an answer; in all turns, if there are maps for each.
+        Number of pixels, and of those with an answer; of all turns, if there are maps for each.
     quantity, unit : str
-        The map that ``lowest`` and ``highest`` are the range of, and its unit.
+        Map whose range is ``lowest`` to ``highest``, and its unit.
     lowest, highest : float
         NaN without an answer.
     in_contact : int or None
@@ -34,7 +34,7 @@ class Summary:
     filled : int or None
         Pixels whose height was filled, if holes were searched for.
     relief : (float, float) or None
-        Lowest and highest of the heights that go with normals and are relative, mm.
+        Range of relative heights of a result with normals, mm.
     counts : dict of str to int
         Pixels of each code of the status, where the status matters most, as for slip.
     numbers : dict of str to (float, float or None, str)
@@ -91,8 +91,8 @@ class Summary:
 def summarise(result: Result) -> Summary:
     """Count the pixels of a result that have an answer, and find the range of the answers.
 
-    It is about the first map whose declaration has a text for the summary; heights that are all relative come
-    last. Without such a map it is about the first one that is not built-in, or the first of all.
+    The first map whose declaration has a text for the summary is used; heights that are all relative come
+    last. Without such a map, the first one that is not built-in is used, or the first of all.
     """
     relative = result.offset_unknown is not None and bool(np.all(result.offset_unknown))
     name, what = _leading(result, relative)

@@ -1,4 +1,4 @@
-"""One thread at a time inside an object: the base class of all estimators."""
+"""Base class of objects that run one thread at a time."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from typing import Any, Self
 class ThreadSafe:
     """Base of classes whose objects may be used by several threads at once.
 
-    One thread at a time runs an object's public methods and properties; others wait until it is done. So a
-    display may call ``result()`` while another thread pushes: it gets the maps of all pushes that were over
-    before, and of no half of one. A method may call others of the same object. A subclass adds nothing; its
-    public methods are wrapped when the class is made. Plain attributes are not guarded.
+    One thread at a time runs an object's public methods and properties; others wait. So a display may call
+    ``result()`` while another thread pushes: it gets the maps of all completed pushes. A method may call
+    others of the same object. Public methods of subclasses are wrapped when the class is created. Plain
+    attributes are not locked.
 
     Examples
     --------
@@ -39,10 +39,10 @@ class ThreadSafe:
     _thread_lock: AbstractContextManager[Any]
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Make an object with a lock of its own, whatever ``__init__`` does."""
-        made = super().__new__(cls)
-        made._thread_lock = threading.RLock()
-        return made
+        """Create an object with a lock, independently of ``__init__``."""
+        instance = super().__new__(cls)
+        instance._thread_lock = threading.RLock()
+        return instance
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -52,7 +52,7 @@ class ThreadSafe:
 
 
 def _guarded(member: Any) -> Any:
-    """Return a method or property that runs under the object's lock; anything else as it is."""
+    """Return a method or property that runs under the object's lock; anything else unchanged."""
     if isinstance(member, FunctionType):
         return _locked(member)
     if isinstance(member, property):

@@ -1,4 +1,4 @@
-"""A picture's maps and some frames on a device: in one piece if they fit, else in bands of rows."""
+"""A picture's maps and staged frames on a device: in one piece if they fit, otherwise in bands of rows."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from mirrorskin.kernels.device import free_memory as free_memory
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError
 
 MEMORY_LIMIT = 256_000_000
-"""Bytes of host memory for frames on the move, by default."""
+"""Default number of bytes of host memory for staged frames."""
 
-_MOST_PIXELS = 2**30  # kernels number those of two planes with an int
+_MOST_PIXELS = 2**30  # kernels index the pixels of two planes with an int
 _LINE = 64  # bytes of the longest word that a kernel loads at once
-_PIECE = 64_000_000  # bytes that a device of its own memory is sent at once: enough for its speed
+_PIECE = 64_000_000  # bytes that are copied to discrete memory at once: enough for the full transfer rate
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,13 +36,13 @@ class Planes:
 
 @dataclass(frozen=True, slots=True)
 class Staged:
-    """Frames that are on a device, or on their way there, for the next kernels.
+    """Frames on a device, or being copied there, for the next kernels.
 
     Attributes
     ----------
     array : Array or BorrowedBuffer, (n, rows, W)
     frames : slice
-        Which of the frames these are.
+        Positions among the pushed frames.
     """
 
     array: Operand
@@ -55,31 +55,31 @@ class Staged:
 
 
 class _Maps(dict[str, Array]):
-    """Arrays by name, each made anew when it is asked for after it was given away."""
+    """Arrays by name; one that was detached is created again when it is used."""
 
     def __init__(self, make: Callable[[str], Array], names: Iterable[str]) -> None:
         super().__init__((name, make(name)) for name in names)
         self._make = make
 
     def __missing__(self, name: str) -> Array:
-        made = self[name] = self._make(name)
-        return made
+        array = self[name] = self._make(name)
+        return array
 
 
 class Band:
-    """Some rows of a picture on a device: named maps, and room for some frames.
+    """A band of rows of a picture on a device: named maps, and memory for some frames.
 
     Attributes
     ----------
     rows : slice
-        The rows of the picture that it holds.
+        Rows of the picture.
     pixels : int
     stride : int
         Pixels from plane to plane.
     maps : dict of Array, (rows, W), or (count, stride) for `Planes`
-        They hold anything at first.
+        Uninitialised at first.
     length : int
-        Frames that there is room for.
+        Number of frames that fit in the memory.
     """
 
     rows: slice
@@ -105,27 +105,25 @@ class Band:
                 f"kernels number pixels to {_MOST_PIXELS}; {self.pixels} are too many at once"
             )
         self.maps: dict[str, Array] = _Maps(self._make, maps)
-        self._most = device.max_allocation // (
-            self.pixels * dtype.itemsize
-        )  # frames that kernels see at once
+        self._most = device.max_allocation // (self.pixels * dtype.itemsize)  # frames in one buffer
         if self._most < least:
             raise DeviceMemoryError(f"{device.info.title} has no room for {least} frames")
         self.length: int = min(length, self._most)
         self._places = [] if device.info.shares_memory else _places(device, self.length, least, shape, dtype)
         self._borrowed: BorrowedBuffer | None = None
-        self._only = True  # band of the picture
+        self._only = True  # whether the picture has no other bands
         self._resident = False
-        self._blank = set(maps)  # maps that nothing was written to
+        self._blank = set(maps)  # maps that are uninitialised
 
     @cached_property
     def room(self) -> NDArray[Any]:
-        """Where frames may be written, (length, rows, W)."""
+        """Staging buffer for frames, (length, rows, W)."""
         nbytes = self.length * self.pixels * self._dtype.itemsize
-        place = memory.take(nbytes + SLACK, zeroed=False)[:nbytes]
-        return place.view(self._dtype).reshape(self.length, *self._shape)
+        buffer = memory.take(nbytes + SLACK, zeroed=False)[:nbytes]
+        return buffer.view(self._dtype).reshape(self.length, *self._shape)
 
     def share_device(self) -> None:
-        """Leave the device to other bands whenever this one is not at work."""
+        """Free the device's memory for other bands while this one is not used."""
         self._only = False
         self._park()
 
@@ -146,12 +144,12 @@ class Band:
         return plane[: self.pixels].reshape(self._shape)
 
     def detach(self, name: str) -> NDArray[Any]:
-        """Give away what a map holds, (count, stride) or (rows, W), without a copy; it is blank then."""
+        """Return the contents of a map, (count, stride) or (rows, W), without a copy; it is then blank."""
         return self.maps.pop(name).detach()
 
     @contextmanager
     def resident(self) -> Iterator[None]:
-        """Have the maps on the device for a while."""
+        """Keep the maps on the device within a context."""
         if not self._resident:
             for name, array in self.maps.items():
                 if name in self._blank:
@@ -165,43 +163,42 @@ class Band:
             self._park()
 
     def stage(self, frames: NDArray[Any], lent: bool = False, whole: bool = False) -> Iterator[Staged]:
-        """Bring frames, (n, H, W), to the device, piece by piece; give each to its kernels before the next.
+        """Yield frames, (n, H, W), on the device in pieces; launch the kernels for each before the next.
 
-        Nothing is copied where the device shares the host's memory, as long as frames lie there as kernels
-        need them. A device of its own memory takes them beside the kernels on those before. When all are
-        through, the frames' memory may be written anew, unless it is lent (nobody writes to it as long as it
-        is referred to): then kernels may still be at work. ``whole`` frames, at most ``length`` of them, come
-        in one piece.
+        If the device shares the host's memory, frames are used in place if their layout allows it. On a
+        device with its own memory, they are copied while kernels process the previous piece. Afterwards the
+        memory of the frames may be overwritten, except if it is ``lent`` (never overwritten while
+        referenced): then kernels may still read it. ``whole``: yield at most ``length`` frames in one piece.
         """
         frames = frames[:, self.rows]
         start = 0
         while start < len(frames):
             rest = frames[start:]
             if self._places:
-                yield (staged := self._bring(rest, start))
+                yield (staged := self._copy(rest, start))
                 self._places[0].wait()
             else:
-                yield (staged := self._see(rest[: self._most], start, whole))
+                yield (staged := self._share(rest[: self._most], start, whole))
                 assert self._borrowed is not None
                 if not (lent and np.may_share_memory(self._borrowed.host, rest)):
                     self._borrowed.wait()
             start = staged.frames.stop
 
-    def _see(self, frames: NDArray[Any], start: int, whole: bool) -> Staged:
-        """Let the device see frames where they lie, or copies of some."""
+    def _share(self, frames: NDArray[Any], start: int, whole: bool) -> Staged:
+        """Share frames with the device in place, or copies of some."""
         borrowed = self._device.borrow("frames", frames)
         if borrowed is None and not whole and frames.flags.c_contiguous and len(frames) > 1:
-            borrowed = self._device.borrow("frames", frames[:-1])  # the memory may end behind the last
+            borrowed = self._device.borrow("frames", frames[:-1])  # the memory may end after the last frame
         if borrowed is None:
             room = self.room[: len(frames)]
             room[...] = frames[: len(room)]
             borrowed = BorrowedBuffer(self._device, "frames", room)
-        # The one before waits for its kernels: when more frames are read, only these here can be under way.
+        # Releasing the previous buffer waits for its kernels, so at most one piece is being processed.
         self._borrowed = borrowed
         return Staged(borrowed, slice(start, start + len(borrowed.host)))
 
-    def _bring(self, frames: NDArray[Any], start: int) -> Staged:
-        """Begin to copy frames to one of two places on the device, while kernels work on the other."""
+    def _copy(self, frames: NDArray[Any], start: int) -> Staged:
+        """Start to copy frames to one of two buffers on the device, while kernels process the other."""
         self._places.reverse()
         part = np.ascontiguousarray(frames[: self._places[0].shape[0]])
         self._places[0].upload_async(part)
@@ -232,11 +229,11 @@ def cut_into_bands(
     length: int,
     least: int = 1,
 ) -> list[Band]:
-    """Make room for a picture: one band where the device has the memory, else as few as it takes.
+    """Allocate the bands of a picture: one if the device has enough memory, otherwise as few as possible.
 
-    Shape is rows and columns of the picture, dtype a sample's, ``maps`` what is needed of each pixel. A band
-    holds ``length`` frames, fewer where they do not fit, but at least ``least``; DeviceError if not even one
-    row fits.
+    ``shape`` is rows and columns of the picture, ``dtype`` that of samples, ``maps`` the arrays of pixels.
+    A band has memory for ``length`` frames, or fewer if they do not fit, but at least ``least``. DeviceError
+    if a single row does not fit.
     """
 
     def cut(start: int, stop: int) -> list[Band]:
@@ -257,7 +254,7 @@ def cut_into_bands(
 
 
 def room_of(bands: Sequence[Band], length: int) -> NDArray[Any]:
-    """Return where frames may be written: a single band's room, or host memory for so many frames."""
+    """Return a staging buffer for frames: that of a single band, or host memory for ``length`` frames."""
     room = bands[0].room
     if len(bands) == 1:
         return room
@@ -265,14 +262,14 @@ def room_of(bands: Sequence[Band], length: int) -> NDArray[Any]:
 
 
 def join_rows(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Put a map together from those of the bands; that of a single one is taken as it is."""
+    """Return a map from those of the bands, without a copy for a single band."""
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _places(
     device: Device, length: int, least: int, shape: tuple[int, int], dtype: np.dtype[Any]
 ) -> list[Array]:
-    """Make two places on a device for as many frames as fit, up to a length; one, where two do not."""
+    """Allocate two buffers for frames on a device, up to a length; one if two do not fit."""
     length = max(least, min(length, _PIECE // (math.prod(shape) * dtype.itemsize)))
     places: list[Array] = []
     while len(places) < 2:

@@ -1,4 +1,4 @@
-"""Where on the picture a camera with a distorting lens sees the points of the sheet."""
+"""Undistortion: resampling of maps from a camera's pixels to equal pixels on the sheet."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ Doubles = NDArray[np.float64]
 
 
 def picture_places(lens: Lens, x: ArrayLike, y: ArrayLike) -> tuple[Doubles, Doubles]:
-    """Return the columns and rows of the picture, 0 in the first, at which points of the sheet are seen.
+    """Return the columns and rows of the picture, from 0, at which points of the sheet are seen.
 
-    Points are in mm from the middle of the undistorted map, y up; NaN where no line of sight leads there.
+    Points are in mm from the middle of the undistorted map, y up. NaN for points that the camera cannot see.
     """
     across, up = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
     rays = _rays(lens, np.stack([across.ravel(), up.ravel(), np.ones(across.size)]))
     seen = lens.matrix @ distorted(rays, lens.distortion)
-    # Not "at or above": a ray that is NaN stays so.
+    # Written such that a NaN ray remains NaN.
     seen[:, ~(rays[0] ** 2 + rays[1] ** 2 < _fold(lens.distortion))] = np.nan
     return seen[0].reshape(across.shape), seen[1].reshape(across.shape)
 
 
 def distorted(rays: Doubles, distortion: ArrayLike) -> Doubles:
-    """Bend rays as OpenCV's model does."""
+    """Return rays distorted by OpenCV's model."""
     k1, k2, p1, p2, k3 = np.moveaxis(np.asarray(distortion, np.float64), -1, 0)[..., np.newaxis]
     x, y = rays[..., 0, :], rays[..., 1, :]
     square = x * x + y * y
     radial = 1 + square * (k1 + square * (k2 + square * k3))
-    bent = np.ones_like(rays)
-    bent[..., 0, :] = x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x)
-    bent[..., 1, :] = y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y
-    return bent
+    result = np.ones_like(rays)
+    result[..., 0, :] = x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x)
+    result[..., 1, :] = y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y
+    return result
 
 
 def _fold(distortion: Doubles) -> float:
@@ -54,17 +54,17 @@ def _fold(distortion: Doubles) -> float:
 
 
 def _rays(lens: Lens, points: Doubles) -> Doubles:
-    """Return the rays, (3, n), by which points of the sheet are seen; NaN of those behind the camera."""
+    """Return the rays, (3, n), to points of the sheet; NaN for points behind the camera."""
     whole = lens.camera @ lens.matrix
     seen = np.linalg.solve(whole, points)
-    # In front is the side of the picture's centre.
+    # The picture's centre is in front of the camera.
     ahead = seen[2] * np.linalg.solve(whole, [0.0, 0.0, 1.0])[2] > 0
     return np.asarray(seen / np.where(ahead, seen[2], np.nan))
 
 
 Maps = dict[str, NDArray[Any]]
 
-_BAND = 1 << 14  # pixels that are worked on at once
+_BAND = 1 << 14  # pixels that are resampled at once
 
 
 def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None) -> Result:
@@ -73,7 +73,7 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
     Each map is sampled as its declaration says; see `mirrorskin.io.Map`. Numbers are interpolated between
     four pixels. A pixel has no answer where the nearest one has none. Of the other three, those are left out
     that have no answer or another label: heights are not interpolated between components, nor other maps
-    across the border of contact. Integers, such as codes and components, are those of the nearest pixel.
+    across the border of contact. Integers, such as codes and components, are taken from the nearest pixel.
     Pixels that the camera did not see are undefined. Where a position is that of a pixel to a millionth, its
     value is copied.
 
@@ -91,11 +91,11 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
     Parameters
     ----------
     result : Result
-        In the camera's pixels; of each turn, too.
+        Maps in the camera's pixels, also for each turn.
     lens : Lens
     origin : (int, int), optional
-        Row and column of the maps' first pixel in the full picture; by default those of the part that the
-        result says it is of. The same part of the undistorted map comes back.
+        Row and column of the maps' first pixel in the full picture; by default those of the region in the
+        result's process. The same region of the undistorted maps is returned.
 
     Raises
     ------
@@ -120,22 +120,22 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
         )
     across, up = pixel_axes(lens.shape, lens.pixel_size)
     x, y = across[column : column + columns], up[row : row + rows]
-    made = {name: np.empty_like(values) for name, values in maps.items()}
+    undistorted = {name: np.empty_like(values) for name, values in maps.items()}
     height = max(1, _BAND // columns)
     for band in (slice(first, min(first + height, rows)) for first in range(0, rows, height)):
         seen = picture_places(lens, *np.meshgrid(x, y[band]))
         points = SamplePoints.at(seen[0].ravel() - column, seen[1].ravel() - row, (rows, columns))
         turn: Any
         for turn in range(turns[0]) if turns else [...]:
-            found = _resampled({name: values[turn] for name, values in maps.items()}, declared, points)
-            for name, values in found.items():
-                room = made[name][turn][band]
-                room[...] = values.reshape(room.shape)
-    return result.assign(made, x=x, y=y, process={**result.process, UNDISTORTED: True})
+            resampled = _resampled({name: values[turn] for name, values in maps.items()}, declared, points)
+            for name, values in resampled.items():
+                target = undistorted[name][turn][band]
+                target[...] = values.reshape(target.shape)
+    return result.assign(undistorted, x=x, y=y, process={**result.process, UNDISTORTED: True})
 
 
 def _resampled(maps: Maps, declared: Mapping[str, Map], points: SamplePoints) -> Maps:
-    """Return all maps of one picture at some places, (n,) or (n, components)."""
+    """Return all maps of one picture at points, (n,) or (n, components)."""
     labels = {one.within for one in declared.values() if one.within in maps}
     same = {name: points.same_label(maps[name]) for name in labels}
     resampled = {name: _sample(values, declared[name], same, points) for name, values in maps.items()}
@@ -145,7 +145,7 @@ def _resampled(maps: Maps, declared: Mapping[str, Map], points: SamplePoints) ->
 def _sample(
     values: NDArray[Any], declared: Map, same: Mapping[str, NDArray[np.bool_]], points: SamplePoints
 ) -> NDArray[Any]:
-    """Return one map at some places, by its declaration; ``same`` are the neighbours with equal labels."""
+    """Return one map at points, by its declaration; ``same`` are the neighbours with equal labels."""
     count = same.get(declared.within)
     if values.dtype.kind != "f" or declared.sampling == "nearest":
         outside = declared.undefined_value if values.dtype.kind == "f" else int(declared.undefined or 0)
@@ -165,7 +165,7 @@ def _sample(
 
 
 def _directions(maps: Maps, resampled: Maps, points: SamplePoints) -> Maps:
-    """Return zenith and azimuth, if there are any, of the resampled normals; a pixel's own are kept."""
+    """Return zenith and azimuth, if available, of the resampled normals; those at pixels do not change."""
     if "normals" not in maps:
         return {}
     x, y, z = resampled["normals"].T

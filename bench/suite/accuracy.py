@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.cli.bench.records import Case, Target
-from mirrorskin.engine import Onset, estimate_normals, find_change_point, find_onset, fuse, integrate
+from mirrorskin.engine import (
+    estimate_normals,
+    find_change_point,
+    find_onset,
+    fuse,
+    integrate,
+)
 from mirrorskin.io import Result
 from mirrorskin.kernels.device import Device
 from suite.harness import Cases, at_most, within
@@ -97,12 +103,12 @@ def _press_noise(kind: str) -> float:
     return light if kind == "float32" else float(np.hypot(light, 1 / np.sqrt(12)))
 
 
-def _frame_error(found: Onset, place: Doubles) -> Doubles:
+def _frame_error(found: Result, place: Doubles) -> Doubles:
     """Return the error of the height in frames; NaN without an answer."""
     return np.asarray(-found.height.astype(np.float64) / _STEP - place)
 
 
-def _chi_square(found: Onset, error: Doubles) -> float:
+def _chi_square(found: Result, error: Doubles) -> float:
     return float(np.mean((error * _STEP / found.height_sigma) ** 2))
 
 
@@ -133,7 +139,7 @@ class Sensor:
     @property
     def known(self) -> dict[str, Any]:
         """The options of the estimator."""
-        return {"tilt": TILT, "gain": self.gain, "offset": self.offset, "noise": self.spread}
+        return {"tilt": TILT, "zenith_gain": self.gain, "zenith_offset": self.offset, "noise": self.spread}
 
 
 _SENSORS = (
@@ -313,12 +319,12 @@ def run_fusion(device: Device, quick: bool) -> Case:
     height, sigma = (
         np.where(lit, values, np.nan).astype(np.float32) for values in (middle, _PRESS_STEP / np.sqrt(12))
     )
-    press = Onset(height, sigma, lit.astype(np.uint8), np.zeros(lit.shape, np.int32), 0.0)
+    press = Result(height=height, height_sigma=sigma)
     sensor = _SENSORS[1]
     normals = toward(np.where(there, zenith, 0.0), np.arctan2(y, x))
     frames = expose(normals, sensor, 10)
     turned = estimate_normals(frames, _PHASES, **sensor.known, device=device)
-    turn = replace(turned, contact=(turned.contact * there).astype(np.uint8))
+    turn = turned.assign(contact=(turned.contact * there).astype(np.uint8))
     found = fuse(press, turn, _PIXEL * 201 / size, mask=there, device=device)
     inner = zenith <= _LIT[1]
     error = (found.height - truth)[inner]

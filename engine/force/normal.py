@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mirrorskin.engine.press.elastic import PressFit
     from mirrorskin.io import Stiffness
 
-_BEYOND = 0.01  # of the load that may lie beyond the picture
+_BEYOND = 0.01  # largest share of the load outside of the picture
 
 
 @checked
@@ -70,13 +70,13 @@ def find_force(
     Raises
     ------
     mirrorskin.io.InputError
-        A shape or a number that cannot be.
+        A shape or a number that is not possible.
     mirrorskin.engine.NotConverged
-        The contact was not found.
+        The search for the contact did not converge.
 
     Examples
     --------
-    A ball of 6 mm, 0.5 mm deep in silicone of 0.1 MPa; by Hertz, who takes it for a paraboloid, 0.109 N.
+    A ball of 6 mm, 0.5 mm deep in silicone of 0.1 MPa. Hertz's formula, for a paraboloid, gives 0.109 N.
 
     >>> import numpy as np
     >>> x = np.linspace(-2, 2, 41)
@@ -112,9 +112,10 @@ def find_force(
     independent = float(np.sqrt(np.sum(np.where(pressed.contact, errors * gradient, 0.0) ** 2)))
     spread = math.hypot(young * common, young * independent, young_sigma * pressed.load)
     pressure = (young * pressed.strain).astype(np.float32)
-    found = _force(pressure, pressed.contact, young * pressed.load, spread)
+    force = _force(pressure, pressed.contact, young * pressed.load, spread)
     x, y = pixel_axes((surface.shape[0], surface.shape[1]), size)
-    return found.assign(x=x, y=y, process={"travel": float(travel), "modulus": float(young)})
+    process = {"travel": float(travel), "modulus": float(young)}
+    return force.assign(x=x, y=y, process=process)
 
 
 def _force(pressure: NDArray[np.float32], contact: NDArray[np.bool_], force: float, sigma: float) -> Result:
@@ -132,7 +133,7 @@ def modulus_of(result: Result, modulus: float | None, modulus_sigma: float) -> t
 
 
 def check_modulus(modulus: float) -> float:
-    """Return Young's modulus, or raise InputError where it cannot be."""
+    """Return Young's modulus, or raise InputError if it is not possible."""
     if not 1e-9 < modulus < 1e9:
         raise InputError(
             f"a modulus of {modulus:g} MPa cannot be: give Young's modulus, above 0, as in 0.1 MPa"
@@ -150,9 +151,8 @@ def _check(**values: tuple[float, float]) -> None:
 def force_of_press(fit: PressFit, known: Stiffness | float) -> Result:
     """Return the force of a press whose surface was fitted to the onsets, at the greatest travel.
 
-    Presses of known force correct for the gel's errors, and tell what is left; with a modulus that is merely
-    given, these errors are propagated. NotConverged where much of the load lies beyond
-    the picture.
+    A stiffness calibrated by presses of known force corrects errors of the gel's shape; with a specified
+    modulus, these errors are propagated. NotConverged if much of the load is outside of the picture.
     """
     pressed = press_within(fit)
     own, by_gel = fit.load_errors(pressed)
@@ -171,7 +171,7 @@ def force_of_press(fit: PressFit, known: Stiffness | float) -> Result:
 
 
 def press_within(fit: PressFit) -> Pressed:
-    """Return the press at the greatest travel; NotConverged where its load is not all in the picture."""
+    """Return the press at the greatest travel; NotConverged if much of its load is outside of the picture."""
     pressed = fit.pressed()
     if not pressed.load > 0:
         raise NotConverged("nothing touches")

@@ -21,12 +21,12 @@ Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _SOFTNESS = 3 / (4 * math.pi)  # 1 / (4 pi G) at E = 1: G = E / 3
-_UP = np.array([1.0, -1.0]).reshape(2, 1, 1)  # y runs up, rows run down
-_TOLERANCE, _ROUGH = 1e-5, 1e-3  # of the greatest displacement; the second, of damped tractions
-_STEPS = 400  # of conjugate gradients
-_FARTHEST = 1e6  # mm
-_LEAST_KNOWN = 0.8  # of the contact that must have a displacement
-_DAMPING = 1e-4, 1e4  # of what a contact as a whole gives way by
+_UP = np.array([1.0, -1.0]).reshape(2, 1, 1)  # y points up, rows increase downwards
+_TOLERANCE, _ROUGH = 1e-5, 1e-3  # residual relative to the largest displacement; with damping, the second
+_STEPS = 400  # largest number of conjugate gradient steps
+_FARTHEST = 1e6  # largest displacement, mm
+_LEAST_KNOWN = 0.8  # smallest share of the contact with a displacement
+_DAMPING = 1e-4, 1e4  # range of the damping, relative to the compliance of the contact as a whole
 
 
 @checked
@@ -45,12 +45,12 @@ def find_tangential_force(
 
     The elastomer is an incompressible half-space, in which pressure displaces nothing along the surface. A
     force Q along x displaces it by 3 / (4 pi E) times Q (1 / r + x^2 / r^3) along x and Q x y / r^3 along y
-    (Cerruti; Johnson, Contact Mechanics, 1985, 3.6). Its inverse in the contact, where alone there is
-    traction, needs no law of friction: it holds where the skin sticks and where it slips.
+    (Cerruti; Johnson, Contact Mechanics, 1985, 3.6). This is inverted within the contact, outside of which
+    there is no traction. No law of friction is needed: the skin may stick or slip.
 
-    The operator is symmetric, so the force is a sum of the displacements, weighted with the traction under
-    which the contact would be displaced by 1 as a whole; its error follows from theirs. Tractions amplify
-    noise of short waves: they are damped, such that displacements are missed by their standard deviation
+    The operator is symmetric, so the force is a sum of the displacements, weighted by the traction that
+    displaces the whole contact by 1; its error follows from their errors. Tractions amplify noise of short
+    wavelengths, so they are damped such that the misfit of the displacements equals their standard deviation
     (Morozov's discrepancy principle).
 
     Parameters
@@ -84,13 +84,14 @@ def find_tangential_force(
     Raises
     ------
     mirrorskin.io.InputError
-        No contact, a shape or number that cannot be, or less than 80 % of the contact with a displacement.
+        No contact, a shape or number that is not possible, or less than 80 % of the contact with a
+        displacement.
     mirrorskin.engine.NotConverged
-        The traction was not found.
+        The traction was not found in the allowed number of steps.
 
     Examples
     --------
-    A disc of 2 mm that sticks and is displaced by 0.1 mm: by Mindlin 16/3 G a times that, 0.0178 N.
+    A sticking disc of 2 mm, displaced by 0.1 mm: Mindlin's formula, 16/3 G a times that, gives 0.0178 N.
 
     >>> import numpy as np
     >>> x = np.linspace(-1.5, 1.5, 61)
@@ -183,7 +184,7 @@ def _touches(contact: ArrayLike | None, pressure: ArrayLike | None, shape: tuple
 
 
 class _System:
-    """Tractions over Young's modulus, (2, H, W), on a contact, and how they displace it, along x and rows."""
+    """The linear map from tractions over Young's modulus, (2, H, W), to displacements, along x and rows."""
 
     def __init__(self, contact: Mask, pixel_size: tuple[float, float]) -> None:
         self._contact, shape = contact, contact.shape
@@ -204,12 +205,12 @@ class _System:
         self._inverse = up / determinant, along / determinant, -across / determinant
 
     def displaced(self, strain: Doubles) -> Doubles:
-        """Return by how much tractions displace the contact, mm."""
+        """Return the displacement of the contact by tractions, mm."""
         spectra = self._along, self._up, self._across
         return np.where(self._contact, _filtered(strain, spectra, self._padded), 0.0)
 
     def solve(self, target: Doubles, tolerance: float, damping: float = 0.0) -> Doubles:
-        """Return the traction that displaces the contact, by conjugate gradients."""
+        """Return the traction for a displacement of the contact, by preconditioned conjugate gradients."""
         goal = tolerance * float(np.abs(target).max())
         strain, residual = np.zeros_like(target), target
         direction, last = np.zeros_like(target), np.inf
@@ -227,7 +228,7 @@ class _System:
         raise NotConverged(f"the traction in contact was not found in {_STEPS} steps")
 
     def damped(self, target: Doubles, sigma: Doubles) -> Doubles:
-        """Return the traction that misses displacements by their standard deviation."""
+        """Return the damped traction whose misfit equals the standard deviation of the displacements."""
         noise = float(np.mean(sigma[:, self._contact] ** 2))
         if not noise:
             return self.solve(target, _TOLERANCE)
@@ -235,33 +236,32 @@ class _System:
 
         def excess(power: float) -> float:
             damping = softness * 10**power
-            missed = damping * self.solve(target, _ROUGH, damping)
-            return float(np.mean(missed[:, self._contact] ** 2)) / noise - 1
+            misfit = damping * self.solve(target, _ROUGH, damping)
+            return float(np.mean(misfit[:, self._contact] ** 2)) / noise - 1
 
         low, high = (math.log10(end) for end in _DAMPING)
         if excess(high) < 0:  # noise explains all displacements
             return np.zeros_like(target)
-        found = low if excess(low) > 0 else float(brentq(excess, low, high, xtol=0.05))
-        return self.solve(target, _ROUGH, softness * 10**found)
+        power = low if excess(low) > 0 else float(brentq(excess, low, high, xtol=0.05))
+        return self.solve(target, _ROUGH, softness * 10**power)
 
 
 def _filtered(values: Doubles, spectra: tuple[Doubles, Doubles, Doubles], shape: tuple[int, ...]) -> Doubles:
-    """Return a symmetric tensor, by its spectra xx, yy and xy, applied to vectors (2, H, W)."""
+    """Return the convolution of vectors, (2, H, W), with a symmetric tensor of spectra xx, yy and xy."""
     x, y = fft.rfft2(values, shape)
     xx, yy, xy = spectra
-    both = np.stack([xx * x + xy * y, xy * x + yy * y])
-    found: Doubles = fft.irfft2(both, shape)[:, : values.shape[1], : values.shape[2]]
-    return found
+    product = np.stack([xx * x + xy * y, xy * x + yy * y])
+    return np.asarray(fft.irfft2(product, shape)[:, : values.shape[1], : values.shape[2]])
 
 
 def _tensor(
     shape: tuple[int, ...] | list[int], pixel_size: tuple[float, float], reach: float
 ) -> tuple[Doubles, Doubles, Doubles]:
-    """Return the spectra xx, yy and xy of a point force's displacements, cut off at a reach, mm.
+    """Return the spectra xx, yy and xy of the displacements by a point force, cut off at a reach, mm.
 
-    At the wavenumber q towards phi they are 3 / (2 E q) times ``3/2 S0 - cos(2 phi) S2 / 2`` of xx, the same
-    with plus of yy, and ``- sin(2 phi) S2 / 2`` of xy; S0 and S2 are the integrals of the Bessel functions J0
-    and J2 from 0 to q times the reach, which go to 1.
+    At the wavenumber q in the direction phi, they are 3 / (2 E q) times ``3/2 S0 - cos(2 phi) S2 / 2`` for
+    xx, the same with plus for yy, and ``- sin(2 phi) S2 / 2`` for xy. S0 and S2 are the integrals of the
+    Bessel functions J0 and J2 from 0 to q times the reach, which converge to 1.
     """
     q_y = 2 * math.pi * fft.fftfreq(shape[0], pixel_size[1])[:, np.newaxis]
     q_x = 2 * math.pi * fft.rfftfreq(shape[1], pixel_size[0])[np.newaxis]

@@ -20,7 +20,7 @@ Plane = tuple[float, float, float]
 
 LEVEL: Plane = (0.0, 0.0, 0.0)
 _CHUNK, _STRIP = 256, 16  # columns and rows of a work-item that is a core's loop; see links.cl, components.cl
-_SAMPLES = 64  # pixels along each side of the picture of which the mean slope is computed
+_SAMPLES = 64  # samples along each side of the picture for the mean slope
 _PARTIAL_SUMS = 64  # largest number of partial sums of a component
 _MOST_SUMS = 1 << 22  # largest number of partial sums of all components
 

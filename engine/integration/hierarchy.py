@@ -22,7 +22,7 @@ LANES = 16, 8, 4
 """Numbers of right sides that are solved at once, if there are several."""
 
 _ROUNDS = 4  # rounds in which parts of blocks move to another aggregate; an even number
-_VECTOR = 16  # nodes to a multiple of which a row is padded: two of a kernel's vectors
+_VECTOR = 16  # the length of a row is a multiple of it: two of a kernel's vectors
 _BEFORE = _VECTOR  # nodes before the first level, which vectors left of its margin read
 _WIDE_TILE_MEMORY = 45056  # bytes of local memory needed; OpenCL guarantees only 32768
 _BEYOND = 64  # nodes after the last level, which vectors may read

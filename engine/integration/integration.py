@@ -231,7 +231,7 @@ class Integrator(ThreadSafe):
     ) -> None:
         """Integrate the slopes of one frame, without ``height_sigma``.
 
-        The maps are those of `mirrorskin.engine.integrate`. By default two cycles are done, starting from the
+        For the maps see `mirrorskin.engine.integrate`. By default two cycles are done, starting from the
         heights of the last frame.
 
         Parameters

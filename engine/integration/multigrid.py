@@ -18,10 +18,7 @@ from mirrorskin.kernels.links import KNOWN, SLOPE
 
 _USUAL = 40  # cycles after which coarse levels are replaced by a direct solver
 _CYCLES = 2  # cycles without a tolerance
-_PATIENCE, _PROGRESS = (
-    8,
-    0.7,
-)  # the residual must fall by this factor in so many iterations; float32 limits it
+_PATIENCE, _PROGRESS = 8, 0.7  # iterations in which the residual must decrease to this share of the best one
 _WORSE = 10  # times the smallest residual so far, above which rounding errors dominate
 _FAILED = 0.3  # residual above which two cycles count as failed
 _FACTORS = 8e-6  # seconds per node of the second level for a factorisation, at most
@@ -310,7 +307,7 @@ class _Gradients:
         return self._sum("advance", **graph, factor=factor, direction=self.before, b=cycle.b)
 
     def _last_step(self) -> dict[str, Any]:
-        """Return the arguments by which a kernel adds the last step to the heights."""
+        """Return the arguments with which a kernel adds the last step to the heights."""
         alpha, self._alpha = self._alpha, None
         step = 0 if alpha is None else 2 - self._fresh
         self._fresh = self._fresh and alpha is None

@@ -30,10 +30,7 @@ _CLEAR = 3.0  # standard deviations of the curl's noise up to which there is no 
 _SLACK = 0.25  # share of the difference of slopes that is no misfit: a crease may be anywhere between pixels
 _LEAST = 1e-5  # smallest confidence, relative to a link's weight
 _SAMPLES = 1 << 16  # pixels from which the curl's noise is estimated
-_LOCAL, _WIDE = (
-    (1, 0.5, 2.0),
-    (5, 0.1, 2.0),
-)  # two searches: reach of the curl's sums, factors of bend and tear
+_LOCAL, _WIDE = (1, 0.5, 2.0), (5, 0.1, 2.0)  # searches: reach of the curl's sums; factors of bend and tear
 
 
 @dataclass(frozen=True, slots=True)

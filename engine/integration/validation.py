@@ -22,7 +22,7 @@ LEAST, MOST = 1e-4, 1e3
 """Range of the weights of slopes, relative to the median, that can be solved in float32."""
 
 _LARGEST_HEIGHT_WEIGHT = 1e4  # relative to the weight of a link; larger weights are clipped
-_SAMPLES = 65536  # pixels of which the median weight is computed
+_SAMPLES = 65536  # pixels for the median weight
 
 
 @dataclass(frozen=True, slots=True)

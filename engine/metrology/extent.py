@@ -27,9 +27,9 @@ def heights(patch: Patch) -> dict[str, Quantity]:
     The *highest point* is the top of a paraboloid fitted to 7 x 7 pixels around the highest pixel after a
     median filter; the highest pixel itself would have the largest error. If the paraboloid has no top there,
     it is the mean of 3 x 3 pixels. The *lowest point* is the lowest level that two adjacent pixels reach,
-    because it is often at the rim, where nothing can be fitted. Pixels that are far more uncertain than the
-    others (see `find_uncertain`) do not count. Its uncertainty increases with the number of candidates. If a
-    filled point is higher than the highest point, values that depend on it are also returned "with filled".
+    because it is often at the rim, where nothing can be fitted. Pixels that are far more uncertain than most
+    (see `find_uncertain`) do not count. Its uncertainty increases with the number of candidates. If a filled
+    point is higher than the highest point, values that depend on it are also returned "with filled".
     """
     highest, lowest, base = _highest(patch), _lowest(patch), rim(patch)
     median = Quantity(float(np.median(patch.height[patch.measured])), float(np.median(patch.sigmas())), "mm")

@@ -30,12 +30,12 @@ MAPS = {
 }
 """Declarations of the maps of `find_displacement`: each component has a standard deviation of its own."""
 
-_RANK = np.array([1, 0, 2, 3], np.uint8)  # of a status among those of the nodes around a pixel
+_RANK = np.array([1, 0, 2, 3], np.uint8)  # rank of a status: a pixel has the highest of its nodes
 _CODES = np.argsort(_RANK).astype(np.uint8)
-_MOST_STEP = 64  # pixels from node to node
-_ALIKE = 4  # samples
-_LAPLACIAN_NOISE = 4 * 20 / 24**2  # of a variance: two standard deviations
-_LEAST_TEXTURED = 0.1  # of the windows; there are as many on a clear sheet where light and dark meet
+_MOST_STEP = 64  # largest distance of nodes, pixels
+_ALIKE = 4  # samples over which residuals are correlated
+_LAPLACIAN_NOISE = 4 * 20 / 24**2  # noise of the squared bias, two standard deviations, per variance
+_LEAST_TEXTURED = 0.1  # smallest share of windows with texture; edges of light give as many on a clear sheet
 
 
 @checked
@@ -130,7 +130,7 @@ class Texture:
     covariance : ndarray, (rows, columns, 2, 2), float64
         Covariance of a displacement, pixels^2, to the right and down.
     there : ndarray, (rows, columns), bool
-        Whether the texture's derivatives have at least the variance of those of noise, in every direction.
+        Whether the texture's derivatives exceed those of noise, in every direction.
     usable : ndarray, (rows, columns), bool
         Whether the window has enough samples.
     variance : ndarray, (rows, columns), float64
@@ -147,7 +147,7 @@ class Texture:
 
     @classmethod
     def of(cls, tracker: Tracker, variance: Doubles, noise: float | None) -> Texture:
-        """Evaluate a tracker's reference; ``variance``, (rows, columns), is that of a sample in the frames.
+        """Evaluate a tracker's reference, given the variance of a sample in the frames, (rows, columns).
 
         Both the reference and a frame have noise, so that the covariance is 2 variance / information.
         """
@@ -155,13 +155,13 @@ class Texture:
         known = variance[np.isfinite(variance)] if noise is None else np.array([noise**2])
         usual = float(np.median(known)) if known.size else np.nan
         variance = np.where(np.isfinite(variance) & (noise is None), variance, usual)
-        alone = (GRADIENT_NOISE * variance * level.measured)[..., None, None] * np.eye(2)
-        own = level.information - alone
-        usable = np.isfinite(own[..., 0, 0])
+        spurious = (GRADIENT_NOISE * variance * level.measured)[..., None, None] * np.eye(2)
+        information = level.information - spurious
+        usable = np.isfinite(information[..., 0, 0])
         least = np.full(level.grid, np.nan)
-        least[usable] = np.linalg.eigvalsh(own[usable])[:, 0]
-        there = least >= np.maximum(alone[..., 0, 0], np.finfo(float).tiny)
-        covariance = np.full(own.shape, np.nan)
+        least[usable] = np.linalg.eigvalsh(information[usable])[:, 0]
+        there = least >= np.maximum(spurious[..., 0, 0], np.finfo(float).tiny)
+        covariance = np.full(information.shape, np.nan)
         covariance[there] = 2 * variance[there][:, None, None] * np.linalg.inv(level.information[there])
         return cls(covariance, there, level.usable, variance, float(np.sqrt(usual)))
 
@@ -197,9 +197,9 @@ def _maps(
 
 
 def misfit(field: NodeField, texture: Texture, window: int) -> Doubles:
-    """Return the factor, (rows, columns, 1), by which a frame's misfit beyond noise raises sigma.
+    """Return the factor, (rows, columns, 1), of sigma for a frame's misfit beyond noise.
 
-    Residuals of brightness that changes are correlated over some samples, and are weighted by their number.
+    Residuals from changes of brightness are correlated over some samples, by whose number they count.
     """
     chance = 1 + 2 * math.sqrt(2) / window  # two standard deviations of a window's variance
     more = np.fmax(field.variance / texture.variance - chance, 0)

@@ -14,16 +14,16 @@ from scipy.sparse.linalg import splu
 
 Doubles = NDArray[np.float64]
 
-_CANDIDATES = 48  # onsets that a search begins with
-_EVIDENCE = 8.0  # of the log-likelihood over that of no departure, for a node's onset to begin with
-_ROUNDS = 20
-_SETTLED = 1e-3  # of the path, in a round
-_FARTHEST = 0.08  # of the path, the largest change of an onset in a round
-_LOCKING = 0.05  # pixels: sigma of the bias of displacements towards halves of a pixel
-_POWER_SIGMA = 0.1  # those of slides and twists differ by twice that
-_APART = 9  # nodes, beyond which errors of onsets are independent
-_NEVER = 1.5  # of the path: an onset that has not happened
-_FLOOR = 1e-6  # of an equation's weight, so that there is always a solution
+_CANDIDATES = 48  # onsets that are tried for the first map
+_EVIDENCE = 8.0  # smallest log-likelihood ratio of a departure, for a node's first onset
+_ROUNDS = 20  # largest number of Gauss-Newton steps
+_SETTLED = 1e-3  # change of an onset, relative to the path, that ends them
+_FARTHEST = 0.08  # largest change of an onset in a step, relative to the path
+_LOCKING = 0.05  # prior sigma of the bias of displacements towards halves of a pixel, pixels
+_POWER_SIGMA = 0.1  # standard deviation of the power; those of slides and twists differ by twice that
+_APART = 9  # distance of nodes above which errors of onsets are independent
+_NEVER = 1.5  # onset, relative to the path, of a node that has not slipped
+_FLOOR = 1e-6  # weight added to all equations, so that they have a solution
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,10 +35,9 @@ class Expected:
     power : float
         Exponent of the departure, accurate to ±0.1.
     onset_bend : float
-        Standard deviation of the third difference of onsets over the radius of the contact, as a share of
-        the path.
+        Standard deviation of the third difference of onsets over the contact's radius, relative to the path.
     growth_bend : float
-        That of the second difference of the growth's logarithm.
+        Standard deviation of the second difference of the growth's logarithm.
     """
 
     power: float
@@ -93,10 +92,10 @@ def fit_onsets(
     locks = _whitened(np.where(known, locking * scale, 0.0))
     second, third = (_bending(known.shape, order) for order in (2, 3))
     onset_stiff = third * (radius**3 / expected.onset_bend) ** 2
-    begin = _begin(data, scale, times, onset_stiff, power)
-    if begin is None:
+    first = _first_onsets(data, scale, times, onset_stiff, power)
+    if first is None:
         return OnsetMap(np.full(known.shape, _NEVER * length), np.full(known.shape, length))
-    onset, usual = begin
+    onset, usual = first
     stiff = sparse.block_diag([onset_stiff, second * (radius**2 / expected.growth_bend) ** 2], format="csc")
     floor = _FLOOR * sparse.identity(stiff.shape[0], format="csc")
     log_growth, lock = np.zeros_like(onset), np.zeros(2)
@@ -122,7 +121,7 @@ def fit_onsets(
 
 
 class _Normal:
-    """The normal equations of both maps, with those of the locking, which all nodes share, as a border."""
+    """The normal equations of both maps, bordered by those of the locking, which all nodes share."""
 
     def __init__(self, normal: Any, columns: Doubles, locks: Doubles) -> None:
         self._lu, self._columns, self._locks = splu(normal), columns, locks
@@ -134,23 +133,22 @@ class _Normal:
     def solve(
         self, left: Doubles, pull: Doubles | float = 0.0, lock_pull: Doubles | float = 0.0
     ) -> tuple[Doubles, Doubles]:
-        """Return the step of the maps, (2, rows, columns), and of the locking, by what data leave."""
+        """Return the step of the maps, (2, rows, columns), and of the locking, from residuals and priors."""
         step = self._lu.solve(np.sum(self._columns * left, axis=1).ravel() + pull)
         more = self._inner @ (np.einsum("ktyx,tyx->k", self._locks, left) + lock_pull - self._cross.T @ step)
         return np.asarray((step - self._freed @ more).reshape(2, *left.shape[1:])), more
 
     def variances(self) -> Doubles:
-        """Return those of the first map."""
+        """Return the variances of the first map."""
         shape = self._columns.shape[2:]
         shared = np.einsum("nk,kl,nl->n", self._freed, self._inner, self._freed)
-        found: Doubles = _variances(self._lu, shape) + shared.reshape(2, *shape)[0]
-        return found
+        return np.asarray(_variances(self._lu, shape) + shared.reshape(2, *shape)[0])
 
 
 def _whitened(values: Doubles) -> Doubles:
-    """Return values without what a common offset, as uncertain as a frame's own part, would explain.
+    """Whiten the errors of frames, whose covariance is (I + J) / 2, where all elements of J are 1.
 
-    Of frames whose errors have the covariance (I + J) / 2, J being all ones: those of the outcome have I.
+    J is the error of the reference, which is as large as that of a frame.
     """
     part = 1 - 1 / math.sqrt(values.shape[-3] + 1)
     whitened: Doubles = math.sqrt(2) * (values - part * values.mean(axis=-3, keepdims=True))
@@ -158,20 +156,17 @@ def _whitened(values: Doubles) -> Doubles:
 
 
 def _blurred(since: Doubles, half: Doubles | float, power: float) -> tuple[Doubles, Doubles]:
-    """Return the mean of ``since^power``, 0 before 0, over +- half, and its derivative."""
+    """Return the mean of ``max(since, 0)^power`` over an interval of ± half, and its derivative."""
     ahead, behind = np.maximum(since + half, 0.0), np.maximum(since - half, 0.0)
     ends = ahead**power, behind**power
     mean = (ahead * ends[0] - behind * ends[1]) / (2 * half * (power + 1))
     return mean, (ends[0] - ends[1]) / (2 * half)
 
 
-def _begin(
+def _first_onsets(
     data: Doubles, scale: Doubles, times: Doubles, stiff: Any, power: float
 ) -> tuple[Doubles, float] | None:
-    """Return a first map of onsets, by trial at each node and its neighbours, and the usual growth.
-
-    None if no node departs.
-    """
+    """Return a first map of onsets, by grid search at each node, and the growth; None without departure."""
     length = float(times[-1, 0, 0])
     best, onset = np.zeros_like(scale), np.full_like(scale, length)
     for trial in np.linspace(-0.3 * length, length, _CANDIDATES, endpoint=False):
@@ -192,7 +187,7 @@ def _begin(
 
 
 def _bending(shape: tuple[int, int], order: int) -> Any:
-    """Return the matrix of a smooth map's energy: squares of the differences of an order, summed."""
+    """Return the matrix of a map's bending energy: the sum of squared differences of an order."""
     rows, columns = (
         [sparse.csr_matrix(np.diff(np.eye(n), k, axis=0)) for k in range(order + 1)] for n in shape
     )
@@ -203,14 +198,14 @@ def _bending(shape: tuple[int, int], order: int) -> Any:
 
 
 def _variances(system: Any, shape: tuple[int, int]) -> Doubles:
-    """Return the diagonal of a system's inverse, of its first map, of nodes far apart at once."""
+    """Estimate the diagonal of a system's inverse for its first map, by probing distant nodes at once."""
     signs = np.random.default_rng(0).choice([-1.0, 1.0], shape)
-    found = np.empty(shape)
+    diagonal = np.empty(shape)
     for row in range(min(_APART, shape[0])):
         for column in range(min(_APART, shape[1])):
             here = np.s_[row::_APART, column::_APART]
             right = np.zeros((2, *shape))
             right[0][here] = signs[here]
             answer = system.solve(right.ravel()).reshape(2, *shape)[0]
-            found[here] = (answer * signs)[here]
-    return np.maximum(np.asarray(median_filter(found, 3), np.float64), 0.0)  # of a few neighbours, too
+            diagonal[here] = (answer * signs)[here]
+    return np.maximum(np.asarray(median_filter(diagonal, 3), np.float64), 0.0)  # less noise of the probing

@@ -1,4 +1,4 @@
-"""Where the skin follows the object, and where and when it slips: displacement of all frames together."""
+"""Displacement of the skin in all frames, where it sticks, and where and when it slips."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ _EXPECTED = {  # see docs/method/slip.md
 # An estimated contact is too wide: at its rim in a slide, windows contain free skin.
 _BEND_ESTIMATED = {"horizontal": 64.0, "twist": 24.0}
 _FOLLOWS = 0.5  # of the object's movement, above which skin is assumed to have been in contact with it
-_LEAST_STUCK = 4  # nodes from which the centre and the angle of a twist are computed
-_STILL = 1e-9  # of the body's path, below which it is at rest
-_BLOCK = 16  # frames that are read at once
+_LEAST_STUCK = 4  # smallest number of nodes for the centre and the angle of a twist
+_STILL = 1e-9  # motion, relative to the body's path, up to which it is at rest
+_BLOCK = 16  # frames read at once
 
 
 class Slip(Operation):
@@ -411,7 +411,7 @@ class _Course:
         self.reach: Doubles = np.hypot(*self._arms) if twist else np.ones(x.shape)
 
     def _object(self, frame: int) -> Doubles:
-        """Return how far the object has moved at the nodes, (rows, columns, 2), mm."""
+        """Return the displacement of the object at the nodes, (rows, columns, 2), mm."""
         moved = self._moved[frame]
         if len(moved) == 2:
             return np.broadcast_to(moved, (*self.x.shape, 2))
@@ -421,7 +421,7 @@ class _Course:
 
     @cached_property
     def _unit(self) -> Doubles:
-        """Unit vector of the object's displacement in the last frame, or 0 where it does not move."""
+        """Unit vector of the object's displacement in the last frame; 0 if it does not move."""
         last = self._object(self.forward - 1)
         length = np.sqrt(np.sum(last**2, axis=-1, keepdims=True))
         unit: Doubles = np.divide(last, length, out=np.zeros(last.shape), where=length > 0)
@@ -432,13 +432,13 @@ class _Course:
         return np.asarray(np.sum(moved * self._unit, axis=-1))
 
     def departures(self, moved: Doubles, covariance: Doubles) -> tuple[Doubles, Doubles]:
-        """Return by how much nodes lag behind the object, along its displacement, and the sigma."""
+        """Return the lag of nodes behind the object, along its displacement, and its sigma."""
         lags = [self.along(self._object(k) - part) for k, part in enumerate(moved)]
         variance = np.einsum("yxi,yxij,yxj->yx", self._unit, covariance, self._unit)
         return np.stack(lags), np.where(variance > 0, np.sqrt(np.maximum(variance, 0)), np.nan)
 
     def stick_ratio(self, onsets: NDArray[np.float32]) -> Doubles:
-        """Return the share of onsets that are still to come, frame by frame."""
+        """Return the share of onsets later than each frame."""
         ratio = np.full(len(self.distance) + 1, np.nan)
         if onsets.size:
             behind = (
@@ -449,7 +449,7 @@ class _Course:
 
 
 def _read_contact(contact: Maps | None, shape: tuple[int, int]) -> tuple[NDArray[np.bool_] | None, str]:
-    """Return where the skin touches, if that is specified, and what the process says of it."""
+    """Return the contact, if it is specified, and its origin for ``process``."""
     if contact is None:
         return None, "estimated"
     if isinstance(contact, str | os.PathLike):
@@ -474,7 +474,7 @@ def _contact_of(result: Result, shape: tuple[int, int]) -> tuple[NDArray[np.bool
 
 
 def _check_contact(contact: NDArray[Any], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return where a map is not 0; raise InputError unless it is so somewhere in frames of this shape."""
+    """Return the pixels where a map is not 0; raise InputError without any, or for another shape."""
     if contact.shape != shape:
         size = f"{shape[0]} x {shape[1]}"
         raise InputError(

@@ -1,4 +1,4 @@
-"""How far the texture of a reference has moved in each frame after it, at a grid of nodes."""
+"""Tracking of a reference's texture in later frames: displacements at a grid of nodes."""
 
 from __future__ import annotations
 
@@ -19,21 +19,19 @@ from mirrorskin.kernels.displacement import AFFINE, MARGIN, PARAMETERS, basis, i
 Doubles = NDArray[np.float64]
 
 ITERATIONS = 8
-"""Times that a frame is warped back at most; after a start from the frame before, 2 are needed."""
+"""Largest number of iterations; 2 are needed with a good start."""
 GRADIENT_NOISE = 1.3923
-"""Variance of a cubic spline's derivative at a sample, of samples with noise of variance 1."""
+"""Variance of a cubic spline's derivative at a sample, for samples with noise of variance 1."""
 
-_LEVELS = 4  # resolutions
-_ENOUGH = 0.5  # of the windows
-_LIKE = 0.5  # of the reference's contrast is in what is the same texture
-_MOST = 0.98  # of the nodes; windows with hardly any texture never settle
-_SETTLED = 0.03  # pixels: the linearisation is then wrong by less than a thousandth of one
-_FARTHEST = 1.5  # pixels in one iteration
-_KERNEL = (
-    np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
-)  # over nodes, for the field that frames are warped back with
-_HOLD = 0.01  # weight of the field before, of the median node's
-_TILE = 4096  # pixels of a core's item
+_LEVELS = 4  # largest number of resolutions
+_ENOUGH = 0.5  # share of the windows that must be found
+_LIKE = 0.5  # smallest contrast of the same texture, relative to the reference
+_MOST = 0.98  # share of the nodes that must settle; windows with little texture never do
+_SETTLED = 0.03  # change, pixels, that ends iterations: the linearisation error is then below 0.001 pixels
+_FARTHEST = 1.5  # largest change in one iteration, pixels
+_KERNEL = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16  # smoothing of the field over nodes
+_HOLD = 0.01  # weight of the previous field, relative to that of the median node
+_TILE = 4096  # pixels of a core's work-item
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +43,7 @@ class NodeField:
     moved : ndarray, (2, rows, columns), float64
         Pixels to the right and down; NaN where a window leaves the picture or has no texture at all.
     variance : ndarray, (rows, columns), float64
-        Of a sample, counts^2, as the residual in the window has it.
+        Variance of a sample, counts^2, from the residual in the window.
     found : ndarray, (rows, columns), bool
         Whether the frame was warped back to within half a pixel, and then has at least half of the
         reference's contrast.
@@ -64,11 +62,11 @@ class Tracker:
 
         R - W + g U = g a + brightness (1, x, y) + gain R
 
-    is solved for an affine displacement a, with which the next U is made: a Gauss-Newton step. As a is all of
-    the displacement, not what is added to U, a node's answer depends on its own window alone.
+    is solved for an affine displacement a, from which the next U is computed: a Gauss-Newton step. Because a
+    is the whole displacement, not an increment of U, the result of a node depends only on its window.
 
-    A frame is begun where the two before it lead to. If less than half of the windows are found from there,
-    it is begun again at coarser resolutions, and then where the correlation of the whole picture is largest.
+    The start of a frame is extrapolated from the last two. If less than half of the windows are found from
+    there, coarser resolutions are tried, and then the maximum of the correlation of the whole picture.
 
     Parameters
     ----------
@@ -97,7 +95,7 @@ class Tracker:
         return levels
 
     def follow(self, frame: NDArray[Any], stride: float = 1.0) -> NodeField:
-        """Return how far a frame has moved; ``stride`` is its step as a multiple of the step before."""
+        """Return the displacement of a frame; ``stride`` is its step as a multiple of the previous step."""
         last, before = self._fields
         begin = last + stride * (last - before)
         best, field = self.finest.follow(frame, begin)
@@ -120,7 +118,7 @@ class Tracker:
         return np.asarray(np.moveaxis(found, 0, -1).reshape(*level.shape, *values.shape[2:]))
 
     def positive_to_pixels(self, values: Doubles) -> NDArray[np.float32]:
-        """Return values above 0 at all pixels, by their logarithms: a cubic may fall below 0."""
+        """Return values above 0 at all pixels, interpolated as logarithms to remain above 0."""
         return np.asarray(np.exp(self.to_pixels(np.log(values))))
 
     def worst_at_pixels(self, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -145,7 +143,7 @@ class Tracker:
         return np.asarray(values[np.ix_(rows, columns)])
 
     def _places(self) -> list[Doubles]:
-        """Return where rows and columns of pixels lie among the nodes."""
+        """Return rows and columns of pixels in units of the nodes' spacing."""
         level = self.finest
         return [
             np.clip((np.arange(size) - level.start) / level.step, 0, nodes - 1)
@@ -165,15 +163,15 @@ class Tracker:
         return found, field
 
     def _correlated(self, frame: NDArray[Any]) -> Doubles:
-        """Return the field of the movement that fits the whole picture best (phase correlation)."""
-        one, other = (np.nan_to_num(counts.astype(np.float64)) for counts in (self._reference, frame))
+        """Return the field of a uniform displacement, by phase correlation of the whole picture."""
+        reference, moved = (np.nan_to_num(counts.astype(np.float64)) for counts in (self._reference, frame))
         taper = cv2.createHanningWindow(frame.shape[::-1], cv2.CV_64F)
-        (right, down), _ = cv2.phaseCorrelate(one, other, taper)
+        (right, down), _ = cv2.phaseCorrelate(reference, moved, taper)
         return np.asarray(self.finest.rest + np.array([right, down])[:, None, None])
 
 
 class _Level:
-    """The reference at one resolution, and what the device keeps of it."""
+    """The reference at one resolution, and its arrays on the device."""
 
     step: int
     measured: Doubles
@@ -205,7 +203,7 @@ class _Level:
         self._maps["planes"] = device.given("planes", planes)
         inverse, self.measured = self._invert_normals(planes)
         self._maps["inverse"] = device.given("inverse", inverse.transpose(1, 2, 0))
-        # Of the displacement alone, whatever the other parameters are.
+        # Information about the displacement, with all other parameters free.
         self.information: NDArray[Any] = np.linalg.inv(inverse[:, :2, :2]).reshape(*self.grid, 2, 2)
         self.usable: NDArray[np.bool_] = np.isfinite(self.information[..., 0, 0])
         trust = 1 / np.trace(inverse[:, :2, :2], axis1=1, axis2=2).reshape(self.grid)
@@ -231,7 +229,7 @@ class _Level:
         return np.stack([np.pad(counts, halo, constant_values=np.nan), *rest])
 
     def _invert_normals(self, planes: Doubles) -> tuple[Doubles, Doubles]:
-        """Return the inverse normal matrix of each node, and how many samples it is made of."""
+        """Return the inverse normal matrix of each node, and its number of samples."""
         rows, columns = self.grid
         first = self._halo + self._first
         normals = np.empty((rows, columns, PARAMETERS, PARAMETERS))
@@ -251,7 +249,7 @@ class _Level:
         return inverse, measured
 
     def _fit_spline(self, frame: NDArray[Any]) -> None:
-        """Have the device make the coefficients of a frame's spline."""
+        """Compute the coefficients of a frame's spline on the device."""
         maps, (rows, columns) = self._maps, self.shape
         _write(maps["frame"], frame)
         width = columns + 2 * MARGIN
@@ -264,7 +262,7 @@ class _Level:
             )
 
     def follow(self, frame: NDArray[Any], field: Doubles) -> tuple[NodeField, Doubles]:
-        """Return how far a frame has moved, from a field to begin with, and the field that fits it."""
+        """Return the displacement of a frame, starting from a field, and the final field."""
         self._fit_spline(frame)
         for _ in range(ITERATIONS):
             answer = self._solve(field)
@@ -274,26 +272,24 @@ class _Level:
         moved = answer[:2]
         gain, squares, variances = answer[AFFINE:]
         with np.errstate(invalid="ignore", divide="ignore"):
-            # Of the reference's noise, what remains is by the gain.
+            # The reference's noise is multiplied by the gain.
             variances += (gain**2 - 1) * self.measured
             variance = squares / (variances * (1 - PARAMETERS / self.measured))
             found = (np.abs(moved - last).max(axis=0) < 0.5) & (gain > _LIKE)
         return NodeField(moved, variance, found), field
 
     def _solve(self, field: Doubles) -> Doubles:
-        """Fetch the frame back by a field, and solve all windows."""
+        """Warp the frame back by a field, and solve all windows."""
         maps, (rows, columns), (node_rows, node_columns) = self._maps, self.shape, self.grid
         _write(maps["field"], field)
-        known = {"rows": rows, "columns": columns, "node_rows": node_rows, "node_columns": node_columns}
-        known |= {"step": self.step, "halo": self._halo}
+        sizes = {"rows": rows, "columns": columns, "node_rows": node_rows, "node_columns": node_columns}
+        sizes |= {"step": self.step, "halo": self._halo}
         shared = {name: maps[name] for name in ("planes", "field", "difference")}
         items = rows * math.ceil(columns / self._tile)
-        self._launch("warp", items, **known, **shared, start=self.start, coefficients=maps["coefficients"])
+        self._launch("warp", items, **sizes, **shared, start=self.start, coefficients=maps["coefficients"])
+        arrays = {"inverse": maps["inverse"], "answer": maps["answer"]}
         first = self._first + self._halo
-        self._launch(
-            "solve", node_rows * node_columns, **known, **shared, first=first,
-            inverse=maps["inverse"], answer=maps["answer"],
-        )  # fmt: skip
+        self._launch("solve", node_rows * node_columns, **sizes, **shared, first=first, **arrays)
         return maps["answer"].download().astype(np.float64)
 
     def _next_field(self, field: Doubles, affine: Doubles) -> Doubles:
