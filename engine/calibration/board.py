@@ -193,8 +193,8 @@ def _cells(
 def mean_of_still(source: Source) -> NDArray[Any]:
     """Return the mean frame of a recording in which nothing moves, (H, W), uint16 or float32.
 
-    The mean of 8-bit frames is scaled to 16 bits, which keeps fractions of a count. InputError if there are no
-    frames, or the picture changes.
+    The mean of 8-bit frames is scaled to 16 bits, which keeps fractions of a count. InputError if there are
+    no frames, or the picture changes.
     """
     total, count, steps = np.zeros(source.shape[1:]), 0, 0.0
     first = last = None
