@@ -204,14 +204,6 @@ def _axes(result: Result) -> tuple[Doubles, Doubles]:
 # --- a rotation ---------------------------------------------------------------------------------------------
 
 
-class _Truth(NamedTuple):
-    """True maps, (H, W); NaN where the ball is not visible."""
-
-    zenith: Doubles
-    azimuth: Doubles
-    height: Doubles
-
-
 def _sight_of(response: WallResponse, result: Result) -> Doubles:
     """Return the lines of sight of all pixels, (4, H, W), as in `see_ball`."""
     place = np.stack(np.meshgrid(*_axes(result)))
@@ -221,12 +213,10 @@ def _sight_of(response: WallResponse, result: Result) -> Doubles:
 
 def _centre_by_normals(result: Result, sight: Doubles, radius: float, press: float | None) -> Doubles:
     """Return the ball's centre, (3,), mm: one radius from each point, opposite to its normal."""
-    assert result.normals is not None
-    assert result.contact is not None
-    valid = (result.contact != 0) & np.isfinite(result.normals).all(axis=-1)
+    valid = (result["contact"] != 0) & np.isfinite(result["normals"]).all(axis=-1)
     _check_enough(np.count_nonzero(valid), "in contact have a normal")
     x, y, slope_x, slope_y = sight[:, valid]
-    normal_x, normal_y, normal_z = result.normals[valid].astype(np.float64).T
+    normal_x, normal_y, normal_z = result["normals"][valid].astype(np.float64).T
     centre = np.zeros(3)
     for _ in range(_ROUNDS):
         depth = press
@@ -239,25 +229,23 @@ def _centre_by_normals(result: Result, sight: Doubles, radius: float, press: flo
     return centre
 
 
-def _true_ball(sight: Doubles, centre: Doubles, radius: float, result: Result) -> _Truth:
-    """Return the true maps of the ball where it is in contact in every frame, without a margin."""
+def _true_ball(sight: Doubles, centre: Doubles, radius: float, result: Result) -> list[Doubles]:
+    """Return true zenith, azimuth and height where the ball is in contact in every frame; NaN elsewhere."""
     from scipy.ndimage import binary_erosion
 
     shape = sight.shape[1:]
     seen = see_ball(sight.reshape(4, -1), centre, radius, np.zeros((1, 2)), np.zeros(3))
     x, y, z = (part.reshape(shape) for part in np.moveaxis(seen.normal[0], -1, 0))
-    assert result.contact is not None
-    inside = binary_erosion(seen.contact[0].reshape(shape) & (result.contact != 0), iterations=_MARGIN)
+    inside = binary_erosion(seen.contact[0].reshape(shape) & (result["contact"] != 0), iterations=_MARGIN)
     maps = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x), seen.z[0].reshape(shape)
-    return _Truth(*(np.where(inside, values, np.nan) for values in maps))
+    return [np.where(inside, values, np.nan) for values in maps]
 
 
-def _normal_errors(result: Result, truth: _Truth, cells: int) -> dict[str, Errors]:
-    assert result.zenith is not None
-    assert result.azimuth is not None
-    difference = result.azimuth - truth.azimuth
-    lean, turn = result.zenith - truth.zenith, np.arctan2(np.sin(difference), np.cos(difference))
-    sine = np.sqrt(np.sin(result.zenith) * np.sin(truth.zenith))
+def _normal_errors(result: Result, truth: list[Doubles], cells: int) -> dict[str, Errors]:
+    zenith, azimuth, height = truth
+    difference = result["azimuth"] - azimuth
+    lean, turn = result["zenith"] - zenith, np.arctan2(np.sin(difference), np.cos(difference))
+    sine = np.sqrt(np.sin(result["zenith"]) * np.sin(zenith))
     angle = 2 * np.arcsin(np.sqrt(np.sin(lean / 2) ** 2 + (sine * np.sin(turn / 2)) ** 2))  # haversines
     sigma = None if result.normals_sigma is None else np.degrees(result.normals_sigma)
     errors = {
@@ -267,7 +255,7 @@ def _normal_errors(result: Result, truth: _Truth, cells: int) -> dict[str, Error
     }
     _check_enough(errors["zenith"].whole.pixels)
     if result.height is not None and result.component is not None:
-        error = result.height - truth.height
+        error = result.height - height
         for number in np.unique(result.component[np.isfinite(error)]):
             component = result.component == number
             error[component] -= np.nanmean(error[component])
@@ -287,8 +275,7 @@ def _check_enough(pixels: Any, what: str = "could be judged") -> None:
 
 def _measured(result: Result) -> NDArray[np.bool_]:
     """Return where a height was measured, not filled in."""
-    assert result.height is not None
-    measured: NDArray[np.bool_] = np.isfinite(result.height)
+    measured: NDArray[np.bool_] = np.isfinite(result["height"])
     return measured if result.filled is None else measured & (result.filled == 0)
 
 
@@ -298,9 +285,8 @@ def _top_by_heights(result: Result, radius: float) -> tuple[float, float]:
 
     measured = _measured(result)
     _check_enough(np.count_nonzero(measured), "turn light")
-    assert result.height is not None
     x, y = (values[measured] for values in np.meshgrid(*_axes(result)))
-    height = result.height[measured].astype(np.float64)
+    height = result["height"][measured].astype(np.float64)
 
     def residuals(top: Doubles) -> Doubles:
         square = np.minimum((x - top[0]) ** 2 + (y - top[1]) ** 2, 0.999 * radius**2)
@@ -315,11 +301,10 @@ def _height_errors(
     result: Result, place: tuple[float, float], radius: float, cells: int
 ) -> dict[str, Errors]:
     """Compare heights with a ball whose top is touched at travel 0."""
-    assert result.height is not None
     x, y = np.meshgrid(*_axes(result))
     square = radius**2 - (x - place[0]) ** 2 - (y - place[1]) ** 2
     true = np.sqrt(np.where(_measured(result) & (square > 0), square, np.nan)) - radius
-    errors = _errors(result.height - true, "mm", cells, result.height_sigma)
+    errors = _errors(result["height"] - true, "mm", cells, result.height_sigma)
     _check_enough(errors.whole.pixels)
     return {"height": errors}
 

@@ -98,12 +98,9 @@ def known_press(
     pixel_size = pixel_size_of(plain)
     press = Press(threshold=LEARNED_AT, fill=False, device=device)
     result = press.run(plain, progress, undistort=False)
-    assert result.height is not None
-    assert result.height_sigma is not None
-    assert result.status is not None
-    maps = result.height, result.height_sigma, result.status
+    maps = [result[name] for name in ("height", "height_sigma", "status")]
     try:
-        fit = fit_press(*maps, pixel_size, gel, deepest=float(np.max(plain.travel)))
+        fit = fit_press(maps[0], maps[1], maps[2], pixel_size, gel, deepest=float(np.max(plain.travel)))
         pressed = press_within(fit)
     except NotConverged as error:
         message = f"{source.name} shows no force: {error}; press otherwise, or leave it out"

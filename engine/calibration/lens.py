@@ -18,7 +18,7 @@ from mirrorskin.io import InputError, Lens
 
 Doubles = NDArray[np.float64]
 
-_ROUNDS = 8  # fits to the marks located so far, each of which predicts more marks
+_ROUNDS = 8  # fits, at most; each predicts further marks
 _ADJACENT = 1.5  # pitches: distance from located marks within which others are predicted
 _FEWEST_YET = 6  # marks that are needed before all are predicted
 _LEAST_REACH, _MOST_REACH = 2.5, 12.0  # pixels: radius around a corner in which it is centred
@@ -83,7 +83,7 @@ def fit_lens(pictures: Sequence[Marks]) -> LensFit:
     The axes on the sheet are rotated so that the map at the picture's centre has no rotation. Its pixels have
     the mean size of the picture's pixels at the centre.
     """
-    fit = CameraFit.of(pictures)
+    fit = CameraFit(pictures)
     errors = fit.errors()
     _check_plane(pictures, errors)
     scale_sigma, corner_sigma = fit.uncertainty()
@@ -102,7 +102,7 @@ def locate_marks(picture: NDArray[Any], board: Board, name: str) -> Marks:
     from scipy.spatial import KDTree
 
     rough = find_marks(picture, board, name)
-    fit = CameraFit.of([rough])
+    fit = CameraFit([rough])
     _check_kind(rough, board, fit)
     stretched, marks = stretch_contrast(picture, name), rough
     for _ in range(_ROUNDS):
@@ -110,7 +110,7 @@ def locate_marks(picture: NDArray[Any], board: Board, name: str) -> Marks:
         adjacent = KDTree(marks.board).query(board.marks())[0] < _ADJACENT * board.pitch
         marks = _centre_predicted(stretched, board, fit, board.marks()[adjacent], name)
         _check_number(marks, board, _FEWEST_YET)
-        fit = CameraFit.of([marks])
+        fit = CameraFit([marks])
         if len(marks.board) == count:
             break
     _check_number(marks, board, FEWEST)
@@ -194,26 +194,24 @@ def _check_number(marks: Marks, board: Board, fewest: int) -> None:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class CameraFit:
     """A camera fitted to marks; its parameters are scaled so that all are of the order of 1."""
 
-    pictures: Sequence[Marks]
-    parameters: Doubles
-    covariance: Doubles
-
-    @classmethod
-    def of(cls, pictures: Sequence[Marks]) -> CameraFit:
+    def __init__(self, pictures: Sequence[Marks]) -> None:
         """Fit twice; the second fit is weighted by the noise estimated from the first."""
         from scipy.optimize import least_squares
 
-        fit, noise = cls(pictures, np.empty(0), np.empty((0, 0))), _NOISE
-        fit = replace(fit, parameters=fit._start())
+        self.pictures = pictures
+        self._shape = pictures[0].shape
+        self._unit = float(max(np.abs(picture.board).max() for picture in pictures))  # of lengths, mm
+        self._middle = (np.array(self._shape[::-1]) - 1) / 2  # column and row of the picture's centre
+        self._focal = math.hypot(*self._shape) / 2  # half the picture's diagonal, pixels
+        self.parameters, noise = self._start(), _NOISE
         for tolerance in (1e-4, 1e-8):
             solution = least_squares(
-                fit._normalised_residuals,
-                fit.parameters,
-                fit._jacobian,
+                self._normalised_residuals,
+                self.parameters,
+                self._jacobian,
                 args=(noise,),
                 loss="soft_l1",
                 f_scale=_OUTLIER,
@@ -221,25 +219,10 @@ class CameraFit:
                 ftol=tolerance,
                 max_nfev=200,
             )
-            fit = replace(fit, parameters=solution.x)
-            noise = max(_LEAST_NOISE, mad_sigma(np.concatenate(fit.residuals())))
+            self.parameters = solution.x
+            noise = max(_LEAST_NOISE, mad_sigma(np.concatenate(self.residuals())))
         excess = max(1.0, 2 * solution.cost / max(1, solution.fun.size - solution.x.size))
-        return replace(fit, covariance=np.linalg.pinv(solution.jac.T @ solution.jac) * excess)
-
-    @property
-    def unit(self) -> float:
-        """Unit of lengths on the board, mm: the largest coordinate of a mark."""
-        return float(max(np.abs(picture.board).max() for picture in self.pictures))
-
-    @property
-    def middle(self) -> Doubles:
-        """Column and row of the picture's centre."""
-        return (np.array(self.pictures[0].shape[::-1]) - 1) / 2
-
-    @property
-    def focal(self) -> float:
-        """Half the picture's diagonal, pixels."""
-        return math.hypot(*self.pictures[0].shape) / 2
+        self.covariance = np.linalg.pinv(solution.jac.T @ solution.jac) * excess
 
     def places(self, number: int, board: Doubles) -> Doubles:
         """Return the places of points of a board, (..., 2), mm, in a picture."""
@@ -275,14 +258,14 @@ class CameraFit:
 
     def lens(self, parameters: Doubles) -> Lens:
         """Return the lens of some parameters, with the sheet's axes parallel to the picture's."""
-        shape = self.pictures[0].shape
-        matrix = np.array([[self.focal, 0, self.middle[0]], [0, self.focal, self.middle[1]], [0, 0, 1]])
+        shape = self._shape
+        matrix = np.array([[self._focal, 0, self._middle[0]], [0, self._focal, self._middle[1]], [0, 0, 1]])
         to_sheet = np.linalg.inv(matrix @ np.append(parameters[:_PLANE], 1.0).reshape(3, 3))
-        to_sheet = np.diag([self.unit, self.unit, 1.0]) @ to_sheet
+        to_sheet = np.diag([self._unit, self._unit, 1.0]) @ to_sheet
         # Displacements, mm, of one pixel to the right and one up at the centre; their rotation is removed.
         step = 1e-3
         offsets = np.array([[0, 0], [step, 0], [-step, 0], [0, -step], [0, step]])
-        ends = _mapped(to_sheet, self.middle + offsets)
+        ends = _mapped(to_sheet, self._middle + offsets)
         slopes = np.stack([ends[1] - ends[2], ends[3] - ends[4]], axis=1) / (2 * step)
         left, stretch, right = np.linalg.svd(slopes)
         rotation = (left @ right).T
@@ -298,7 +281,7 @@ class CameraFit:
         planes = [self._plane(picture) for picture in self.pictures]
         parameters = [planes[0].ravel()[:_PLANE], np.zeros(_LENS - _PLANE)]
         for plane, picture in zip(planes[1:], self.pictures[1:], strict=True):
-            board = picture.board / self.unit
+            board = picture.board / self._unit
             parameters.append(_rigid(board, _mapped(np.linalg.solve(planes[0], plane), board)))
         return np.concatenate(parameters)
 
@@ -306,8 +289,8 @@ class CameraFit:
         """Return the homography of one picture, from the board in units to rays."""
         import cv2
 
-        rays = (marks.places - self.middle) / self.focal
-        plane, _ = cv2.findHomography(marks.board / self.unit, rays, cv2.LMEDS)
+        rays = (marks.places - self._middle) / self._focal
+        plane, _ = cv2.findHomography(marks.board / self._unit, rays, cv2.LMEDS)
         if plane is None or not np.isfinite(plane).all():
             raise InputError(f"{marks.name}: the marks do not determine a plane: show more of the board")
         return np.asarray(plane / plane[2, 2])
@@ -348,9 +331,9 @@ class CameraFit:
         plane = plane.reshape(*parameters.shape[:-1], 3, 3)
         if number:
             plane = plane @ _pose(parameters[..., _LENS + 3 * (number - 1) :][..., :3])
-        rays = plane @ _homogeneous(board.reshape(-1, 2) / self.unit)
+        rays = plane @ _homogeneous(board.reshape(-1, 2) / self._unit)
         bent = distorted(rays / rays[..., 2:, :], parameters[..., _PLANE:_LENS])
-        places = np.swapaxes(bent[..., :2, :], -1, -2) * self.focal + self.middle
+        places = np.swapaxes(bent[..., :2, :], -1, -2) * self._focal + self._middle
         return np.asarray(places.reshape(*parameters.shape[:-1], *board.shape))
 
 

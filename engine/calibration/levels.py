@@ -39,18 +39,12 @@ class Moments:
     Differences from the first frame are summed in float64, which is exact for integers.
     """
 
-    lowest: NDArray[Any]
-    highest: NDArray[Any]
-    sum: NDArray[Any]
-    count: NDArray[Any]
-    at_lowest: NDArray[Any]
-    at_highest: NDArray[Any]
-
     def __init__(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         self.integer: bool = dtype.kind == "u"
         self.frames: int = 0
         self.count, self.at_lowest, self.at_highest = np.zeros((3, *shape), np.int32)
-        self.lowest, self.highest = np.full(shape, np.inf), np.full(shape, -np.inf)
+        self.lowest: Floats = np.full(shape, np.inf)
+        self.highest: Floats = np.full(shape, -np.inf)
         self.sum, self._squares = np.zeros((2, *shape))
         self._first: Floats | None = None
 

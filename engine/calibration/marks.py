@@ -172,9 +172,9 @@ def centre_marks(picture: NDArray[Any], starts: Doubles, radius: float) -> tuple
     found by Gauss-Newton steps with the weights (1 - d^2 / radius^2)^2. The picture is interpolated by cubic
     splines after a slight blur, because splines oscillate next to a sharp edge.
 
-    ``picture`` has a contrast of about 255, ``starts`` are columns and rows, (n, 2), and ``radius`` is that
-    of the circle, pixels. Returned are the places, and whether there is such a centre near the start, with
-    the whole circle in the picture.
+    ``picture`` has a contrast of about 255, ``starts`` are columns and rows, (n, 2), and ``radius`` is the
+    circle's, pixels. Returned are the places, and whether there is such a centre near the start, with the
+    whole circle in the picture.
     """
     from scipy import ndimage
 

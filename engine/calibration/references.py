@@ -47,7 +47,7 @@ _FULL = 0.1  # share of clipped samples of a saturated pixel
 
 @dataclass(frozen=True, slots=True)
 class LevelReport:
-    """Quality of a measured level, counts; noise and sigma are those of the median pixel."""
+    """Quality of a measured level, counts; noise and sigma are medians over pixels."""
 
     frames: int  # of all recordings together
     noise: float  # standard deviation of a sample

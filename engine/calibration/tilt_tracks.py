@@ -34,7 +34,7 @@ _RIM = 0.85  # share of the outline's radius at which the rim begins
 _MOSTLY = 0.8  # least share of the rim that shows the ball
 _SHALLOWER = 0.1  # greatest relative difference of the depth from the recorded press
 _RIM_ERROR = 0.01  # radians: greatest mean residual of a valid rim
-_FAINT = 0.01  # share of the range by which a plate must be inside it
+_FAINT = 0.01  # share of the range that a plate must not show, at both ends
 
 
 class BallTrack(NamedTuple):

@@ -9,29 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.calibration import wall_fit
+from mirrorskin.engine.calibration import wall_model as model
 from mirrorskin.engine.calibration.ball import moved
 from mirrorskin.engine.calibration.levels import mad_sigma
 from mirrorskin.engine.calibration.sources import check_ball_radius
-from mirrorskin.engine.calibration.wall_fit import (
-    BallPress,
-    Pivot,
-    Prior,
-    WallFit,
-    fit_wall,
-    join,
-    pivot_of,
-    read_press,
-    start_curve,
-)
-from mirrorskin.engine.calibration.wall_model import (
-    CURVE_COEFFICIENTS,
-    SENSOR,
-    STEPS,
-    LightSamples,
-    meet_balls,
-    predict,
-    split,
-)
 from mirrorskin.engine.calibration.wall_response import make_response
 from mirrorskin.io import InputError, Precession, References, Source, WallResponse
 from mirrorskin.io.calibration.types import PATTERNS
@@ -55,7 +37,7 @@ _LIKELY = {
     **dict.fromkeys(("lamp_x", "lamp_y"), (0.0, 0.2)),
     **dict.fromkeys((f"shade_{number}" for number in range(5)), (0.0, 0.02)),
 }
-"""Prior means and standard deviations of a sensor's parameters."""
+"""wall_fit.Prior means and standard deviations of a sensor's parameters."""
 
 _FEW, _MANY = 4_000, 30_000  # samples of the first fits, and of the last
 _TOLERANCES = {_FEW: 1e-4, _MANY: 3e-6}  # relative change of the sum of squares at which these fits end
@@ -118,26 +100,28 @@ def fit_zenith(
     _check(presses, ball, pattern, body)
     samples = []
     for number, source in enumerate(presses, 1):
-        samples.append(read_press(source, ball, references, precession, _SAMPLES // len(presses)))
+        samples.append(wall_fit.read_press(source, ball, references, precession, _SAMPLES // len(presses)))
         if progress:
             progress(number)
-    prior = _prior(samples, pivot_of(presses[0], precession), pattern, body)
-    touch = fit_touch(join(samples, ball), samples, prior)
+    prior = _prior(samples, wall_fit.pivot_of(presses[0], precession), pattern, body)
+    touch = fit_touch(wall_fit.join(samples, ball), samples, prior)
     return make_response(touch.fit, touch.samples, touch.noise, pattern, presses[0])
 
 
-def _prior(presses: Sequence[BallPress], pivot: Pivot, pattern: str, body: tuple[float, float]) -> Prior:
+def _prior(
+    presses: Sequence[wall_fit.BallPress], pivot: wall_fit.Pivot, pattern: str, body: tuple[float, float]
+) -> wall_fit.Prior:
     radius, rim = body
     sensor = dict(_LIKELY, radius=(radius, 0.1 * radius), rim=(rim, 0.1 * rim))
     for axis, place, sigma in zip("xyz", pivot.place, pivot.sigma, strict=True):
         sensor[f"pivot_{axis}"] = place, sigma
     sensor["phase_offset"] = (0.0, pivot.phase_sigma)
-    mean, sigma = np.array([sensor[name] for name in SENSOR], np.float64).T
+    mean, sigma = np.array([sensor[name] for name in model.SENSOR], np.float64).T
     centres = np.concatenate([press.centre for press in presses])
-    steps = np.zeros(CURVE_COEFFICIENTS), np.full(CURVE_COEFFICIENTS, np.inf)
+    steps = np.zeros(model.CURVE_COEFFICIENTS), np.full(model.CURVE_COEFFICIENTS, np.inf)
     if pattern == "uniform":
         steps[0][0], steps[1][1:] = 1.0, 0.0
-    return Prior(
+    return wall_fit.Prior(
         np.concatenate([mean, steps[0], centres]),
         np.concatenate([sigma, steps[1], *(press.centre_sigma for press in presses)]),
     )
@@ -165,12 +149,14 @@ def _check(presses: Sequence[Source], ball: float, pattern: str, body: tuple[flo
 class Touch:
     """A fit, the samples in contact that it is based on, and their noise, (n,), as shares of full light."""
 
-    fit: WallFit
-    samples: LightSamples
+    fit: wall_fit.WallFit
+    samples: model.LightSamples
     noise: Doubles
 
 
-def fit_touch(samples: LightSamples, presses: Sequence[BallPress], prior: Prior) -> Touch:
+def fit_touch(
+    samples: model.LightSamples, presses: Sequence[wall_fit.BallPress], prior: wall_fit.Prior
+) -> Touch:
     """Fit the wall to samples where the sheet touches the ball.
 
     From well within the light's outline, rings are added to each press as long as they fit as well as the
@@ -199,7 +185,7 @@ def fit_touch(samples: LightSamples, presses: Sequence[BallPress], prior: Prior)
 class _Rings:
     """The press of each sample, and its ring around the ball's centre."""
 
-    def __init__(self, samples: LightSamples, presses: Sequence[BallPress]) -> None:
+    def __init__(self, samples: model.LightSamples, presses: Sequence[wall_fit.BallPress]) -> None:
         middle = np.concatenate([moved(press.centre, press.lean, press.pivot) for press in presses])
         self.press: Numbers = samples.press[samples.pose]
         outline = np.array([press.outline for press in presses])[self.press]
@@ -211,26 +197,31 @@ class _Rings:
         return np.asarray(self.number < rings[self.press])
 
 
-def _first_fit(samples: LightSamples, prior: Prior) -> WallFit:
+def _first_fit(samples: model.LightSamples, prior: wall_fit.Prior) -> wall_fit.WallFit:
     """Return a first fit, starting at the nominal sensor and the curve that fits best to it."""
     start, rising = prior.mean, prior.rising
-    if prior.sigma[STEPS].all():
-        start, rising = start_curve(samples, start)
-    return fit_wall(samples, replace(prior, rising=rising), start, _COARSE, 1e-4)
+    if prior.sigma[model.STEPS].all():
+        start, rising = wall_fit.start_curve(samples, start)
+    return wall_fit.fit_wall(samples, replace(prior, rising=rising), start, _COARSE, 1e-4)
 
 
 def _refit(
-    samples: LightSamples, noise: Doubles, inside: Mask, prior: Prior, fit: WallFit, count: int
+    samples: model.LightSamples,
+    noise: Doubles,
+    inside: Mask,
+    prior: wall_fit.Prior,
+    fit: wall_fit.WallFit,
+    count: int,
 ) -> tuple[Touch, Doubles]:
     """Fit again, to at most ``count`` of the samples that are inside and in contact.
 
     Also returned are the residuals of all samples in standard deviations, NaN where there is no contact.
     """
-    named, _, centres = split(fit.parameters)
-    touched = meet_balls(samples, named, centres).z >= _TOUCHED
+    named, _, centres = model.split(fit.parameters)
+    touched = model.meet_balls(samples, named, centres).z >= _TOUCHED
     chosen = _evenly(inside & touched, count)
-    fit = fit_wall(samples[chosen], prior, fit.parameters, noise[chosen], _TOLERANCES[count])
-    off = (samples.light - predict(samples, fit.parameters, fit.rising)) / noise
+    fit = wall_fit.fit_wall(samples[chosen], prior, fit.parameters, noise[chosen], _TOLERANCES[count])
+    off = (samples.light - model.predict(samples, fit.parameters, fit.rising)) / noise
     return Touch(fit, samples[chosen], noise[chosen]), np.where(touched, off, np.nan)
 
 
@@ -252,12 +243,12 @@ def _grow(off: Doubles, ring: Numbers, taken: int) -> tuple[int, bool]:
     return taken + _AT_ONCE, True
 
 
-def _noise(samples: LightSamples, fit: WallFit, inside: Mask) -> Doubles:
+def _noise(samples: model.LightSamples, fit: wall_fit.WallFit, inside: Mask) -> Doubles:
     """Return the noise of all samples, (N,), from the residuals of those inside.
 
     Its square is linear in the light; it is estimated from the medians in bins of brightness.
     """
-    light = predict(samples, fit.parameters, fit.rising)
+    light = model.predict(samples, fit.parameters, fit.rising)
     residual = samples.light - light
     order = np.flatnonzero(inside)[np.argsort(light[inside])]
     bins = np.array_split(order, _BINS)
@@ -279,7 +270,7 @@ def _evenly(mask: Mask, count: int) -> Numbers:
 
 
 def _check_presses(
-    touch: Touch, off: Doubles, rings: _Rings, presses: Sequence[BallPress], prior: Prior
+    touch: Touch, off: Doubles, rings: _Rings, presses: Sequence[wall_fit.BallPress], prior: wall_fit.Prior
 ) -> None:
     """Raise InputError if a press does not fit the others.
 
@@ -302,17 +293,17 @@ def _check_presses(
         )
 
 
-def _without(touch: Touch, prior: Prior, press: int) -> WallFit:
+def _without(touch: Touch, prior: wall_fit.Prior, press: int) -> wall_fit.WallFit:
     """Return the fit without a press."""
     samples = touch.samples
     others = _evenly(samples.press[samples.pose] != press, _FEW)
     start = prior.mean.copy()
-    start[STEPS] = touch.fit.parameters[STEPS]
+    start[model.STEPS] = touch.fit.parameters[model.STEPS]
     noise = np.maximum(touch.noise[others], _MODEST)
-    return fit_wall(samples[others], prior, start, noise, _TOLERANCES[_FEW])
+    return wall_fit.fit_wall(samples[others], prior, start, noise, _TOLERANCES[_FEW])
 
 
-def _prior_misfit(fit: WallFit, prior: Prior) -> float:
+def _prior_misfit(fit: wall_fit.WallFit, prior: wall_fit.Prior) -> float:
     """Return the RMS deviation of a sensor from its prior, standard deviations."""
     off = (fit.parameters - prior.mean) / np.where(prior.sigma > 0, prior.sigma, np.inf)
-    return float(np.sqrt(np.mean(off[: STEPS.start] ** 2)))
+    return float(np.sqrt(np.mean(off[: model.STEPS.start] ** 2)))

@@ -176,8 +176,8 @@ def reach_wall(met: SheetPoints, named: Mapping[str, float]) -> WallHit:
     ray = reflect(met.sight, met.normal)
     # Vertical rays, and points that an iteration of the fit puts outside the wall, must not cause errors.
     out = np.sqrt(ray[0] ** 2 + ray[1] ** 2) + 1e-12
-    room = np.maximum(radius**2 - met.x**2 - met.y**2, 1e-6)
-    distance, cosine = way_to_wall(met.x * ray[0] + met.y * ray[1], out**2, room)
+    clearance = np.maximum(radius**2 - met.x**2 - met.y**2, 1e-6)
+    distance, cosine = way_to_wall(met.x * ray[0] + met.y * ray[1], out**2, clearance)
     elevation = np.arctan2(ray[2], out)
     spread = named["scatter"] * np.sqrt(out**2 + (ray[2] * radius * out / cosine) ** 2)
     whole = np.arctan2(named["rim"], radius)

@@ -9,25 +9,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.calibration import wall_model as model
 from mirrorskin.engine.calibration.ball import rotations
 from mirrorskin.engine.calibration.sources import pixel_size_of
 from mirrorskin.engine.calibration.wall_fit import WallFit
-from mirrorskin.engine.calibration.wall_model import (
-    CURVE_COEFFICIENTS,
-    SCALES,
-    SENSOR,
-    STEPS,
-    LightSamples,
-    SheetPoints,
-    curve_from_steps,
-    curve_means,
-    down,
-    light_of,
-    look,
-    meet_balls,
-    reach_wall,
-    split,
-)
 from mirrorskin.io import InputError, Source, WallResponse, pixel_axes
 from mirrorskin.kernels.response import reflect, way_to_wall
 
@@ -103,13 +88,13 @@ def full_light(response: WallResponse, places: Doubles, zenith: Doubles, azimuth
     z, radius = places[2], response.radius
     from_axis = places[:2] - np.reshape(response.axis, (2, 1))
     slope = response.sight_slopes(from_axis)
-    ray = reflect(down(slope), _normals(zenith, azimuth))
+    ray = reflect(model.down(slope), _normals(zenith, azimuth))
     mirror = from_axis + z * slope
     out = np.sqrt(ray[0] ** 2 + ray[1] ** 2) + 1e-12
     with np.errstate(invalid="ignore"):
-        room = radius**2 - (mirror**2).sum(axis=0)
-        room = np.where(room > 0, room, np.nan)
-        distance, _ = way_to_wall((mirror * ray[:2]).sum(axis=0), out**2, room)
+        clearance = radius**2 - (mirror**2).sum(axis=0)
+        clearance = np.where(clearance > 0, clearance, np.nan)
+        distance, _ = way_to_wall((mirror * ray[:2]).sum(axis=0), out**2, clearance)
         # Share of the ray, spread evenly over the scatter, that meets the wall.
         elevation, spread = np.arctan2(ray[2], out), max(response.scatter, 1e-9)
         top = np.minimum(np.arctan2(response.rim - z, distance * out), _STEEPEST)
@@ -130,19 +115,19 @@ def _normals(zenith: Doubles, azimuth: Doubles) -> Doubles:
 
 
 def make_response(
-    fit: WallFit, samples: LightSamples, noise: Doubles, pattern: str, source: Source
+    fit: WallFit, samples: model.LightSamples, noise: Doubles, pattern: str, source: Source
 ) -> WallResponse:
     """Return a fit to samples with some noise as a response for the pixels of a source.
 
     Its scatter is 5 % larger than the fitted one, so that its range is on the safe side.
     """
-    named, steps, centres = split(fit.parameters)
+    named, steps, centres = model.split(fit.parameters)
     residual, most = error_left(samples, fit, noise)
-    coefficients = curve_from_steps(fit.rising) @ steps
+    coefficients = model.curve_from_steps(fit.rising) @ steps
     if pattern == "uniform":
         powers, reach = coefficients[:1], _reach(named)
     else:
-        wall = reach_wall(meet_balls(samples, named, centres), named)
+        wall = model.reach_wall(model.meet_balls(samples, named, centres), named)
         low, high = np.quantile((wall.low + wall.high) / 2, [_FEW, 1 - _FEW])
         powers, reach = _polynomial(named, coefficients, _reach(named, (float(low), float(high))))
     response = WallResponse(
@@ -158,8 +143,8 @@ def make_response(
         pattern=pattern,
         zenith_sigma=np.full(source.shape[1:], np.nan, np.float32),
         azimuth_sigma=np.full(source.shape[1:], np.nan, np.float32),
-        parameters=(*SENSOR, *(f"step_{number}" for number in range(CURVE_COEFFICIENTS))),
-        covariance=fit.covariance[: STEPS.stop, : STEPS.stop],
+        parameters=(*model.SENSOR, *(f"step_{number}" for number in range(model.CURVE_COEFFICIENTS))),
+        covariance=fit.covariance[: model.STEPS.stop, : model.STEPS.stop],
         error=most,
     )
     zenith_sigma, azimuth_sigma = _error_maps(response, fit, source)
@@ -182,7 +167,8 @@ def _polynomial(
     q = np.linspace(*ends, _PLACES)
     whole = math.atan2(named["rim"], named["radius"])
     elevation, spread = 2 * np.arctan(q), named["scatter"]
-    light = curve_means(1 - (elevation + spread) / whole, 1 - (elevation - spread) / whole) @ coefficients
+    low, high = 1 - (elevation + spread) / whole, 1 - (elevation - spread) / whole
+    light = model.curve_means(low, high) @ coefficients
     for terms in range(2, _TERMS + 1):
         fit = np.polynomial.Polynomial.fit(q, light, terms - 1)
         if np.max(np.abs(fit(q) - light)) <= _EXACT:
@@ -221,9 +207,9 @@ def _error_maps(
         outside = np.hypot(places[0] - response.axis[0], places[1] - response.axis[1]) >= response.radius
         zenith = np.where(outside, np.nan, middle)
     valid = np.isfinite(zenith)
-    slopes = np.full((2, len(zenith), STEPS.stop), np.nan)
+    slopes = np.full((2, len(zenith), model.STEPS.stop), np.nan)
     slopes[:, valid] = _normal_slopes(fit, places[:, valid], azimuth[valid], zenith[valid])
-    covariance = fit.covariance[: STEPS.stop, : STEPS.stop]
+    covariance = fit.covariance[: model.STEPS.stop, : model.STEPS.stop]
     variance = np.einsum("inp,pq,inq->in", slopes, covariance, slopes).reshape(2, -1, _TURN)
     valid = np.isfinite(variance)
     count = np.where(valid.any(axis=-1), valid.sum(axis=-1), np.nan)
@@ -238,22 +224,22 @@ def _error_maps(
     return zenith_sigma, azimuth_sigma
 
 
-def error_left(samples: LightSamples, fit: WallFit, noise: Doubles) -> tuple[float, float]:
+def error_left(samples: model.LightSamples, fit: WallFit, noise: Doubles) -> tuple[float, float]:
     """Return the RMS error of the zenith that remains on the balls, and its upper bound, radians.
 
     The error is estimated from the mean residuals of cells, octants of rings of each ball, in which noise is
     averaged. It is what exceeds the noise, or 0. The bound adds one standard error of its square, and so is
     never 0.
     """
-    named, steps, centres = split(fit.parameters)
-    met = meet_balls(samples, named, centres)
-    coefficients = curve_from_steps(fit.rising) @ steps
+    named, steps, centres = model.split(fit.parameters)
+    met = model.meet_balls(samples, named, centres)
+    coefficients = model.curve_from_steps(fit.rising) @ steps
     flat = np.hypot(met.normal[0], met.normal[1])
     steeper = np.cos(_STEP) * met.normal + np.sin(_STEP) * np.stack(
         [*(met.normal[:2] * met.normal[2] / np.maximum(flat, _STEP)), -flat]
     )
-    light = light_of(met, named, coefficients)
-    slope = (light_of(met._replace(normal=steeper), named, coefficients) - light) / _STEP
+    light = model.light_of(met, named, coefficients)
+    slope = (model.light_of(met._replace(normal=steeper), named, coefficients) - light) / _STEP
     turn = np.arctan2(met.normal[1], met.normal[0]) / (2 * np.pi) + 0.5
     octant = np.minimum((turn * _OCTANTS).astype(np.intp), _OCTANTS - 1)
     ring = np.minimum((flat / flat.max() * _RINGS).astype(np.intp), _RINGS - 1)
@@ -272,8 +258,8 @@ def error_left(samples: LightSamples, fit: WallFit, noise: Doubles) -> tuple[flo
 
 
 def _normal_slopes(fit: WallFit, places: Doubles, azimuth: Doubles, zenith: Doubles) -> Doubles:
-    """Return the derivatives of zenith, and azimuth times its sine, by the parameters, (2, n, STEPS.stop)."""
-    parameters = fit.parameters[: STEPS.stop]
+    """Return the derivatives of zenith, and azimuth times its sine, by the parameters, (2, n, P)."""
+    parameters = fit.parameters[: model.STEPS.stop]
 
     def light(values: Doubles, theta: Doubles, phi: Doubles) -> Doubles:
         return _light_of_turn(values, fit.rising, places, theta, phi)
@@ -287,8 +273,8 @@ def _normal_slopes(fit: WallFit, places: Doubles, azimuth: Doubles, zenith: Doub
         axis=-1,
     ) / (2 * _STEP)
     by_parameter = np.zeros((*design.shape[:2], len(parameters)))
-    scales = [*(SCALES[name] for name in SENSOR), *([1.0] * (STEPS.stop - STEPS.start))]
-    for number, step in enumerate(_SMALL * np.array(scales)):
+    scales = np.append([model.SCALES[name] for name in model.SENSOR], np.ones(model.CURVE_COEFFICIENTS))
+    for number, step in enumerate(_SMALL * scales):
         changed = np.repeat(parameters[np.newaxis], 2, axis=0)
         changed[:, number] += step, -step
         change = light(changed[0], zenith, azimuth) - light(changed[1], zenith, azimuth)
@@ -300,10 +286,10 @@ def _light_of_turn(
     parameters: Doubles, rising: bool, places: Doubles, zenith: Doubles, azimuth: Doubles
 ) -> Doubles:
     """Return the light of normals at places on the rest plane in the frames of a rotation, (n, frames)."""
-    named, steps, _ = split(parameters)
+    named, steps, _ = model.split(parameters)
     phase = np.arange(_FRAMES) * 2 * np.pi / _FRAMES
     turns = rotations(_LEAN * np.stack([np.cos(phase), np.sin(phase)], axis=1))
     normal = np.moveaxis(turns @ _normals(zenith, azimuth), 0, -1).reshape(3, -1)
-    from_axis, slope = look(np.repeat(places, _FRAMES, axis=1), named)
-    met = SheetPoints(from_axis[0], from_axis[1], np.zeros(from_axis.shape[1]), down(slope), normal)
-    return light_of(met, named, curve_from_steps(rising) @ steps).reshape(-1, _FRAMES)
+    (x, y), slope = model.look(np.repeat(places, _FRAMES, axis=1), named)
+    met = model.SheetPoints(x, y, np.zeros_like(x), model.down(slope), normal)
+    return model.light_of(met, named, model.curve_from_steps(rising) @ steps).reshape(-1, _FRAMES)

@@ -152,9 +152,9 @@ def test_a_pivot_measured_with_other_pixels_is_left_out(folder, fitted):
 
 def test_presses_that_leave_the_zenith_uncertain_are_told(folder, fitted):
     ended = calibrate()
-    assert "depth not determined, standard deviation of zenith 0.27 deg" in ended.said
+    assert "depth not determined, standard deviation of zenith 0.27 deg: press less" in ended.said
     assert "press less" in ended.said
-    assert "at most 0.17 deg left on the balls" in ended.out
+    assert "residual on the balls at most 0.17 deg" in ended.out
 
 
 def test_recordings_of_two_kinds_of_samples_are_refused(folder, fitted):
