@@ -1,4 +1,4 @@
-"""A source that changes what another source reads, such as the phase of each frame."""
+"""A source that edits the blocks of another source, such as the phase of each frame."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mirrorskin.io.types import Closing
 
 
 class EditedSource(Closing):
-    """A source whose blocks are changed after they are read."""
+    """A source whose blocks are edited after they are read; it does not close the other source."""
 
     def __init__(self, source: Source, edit: Callable[[Block], Block]) -> None:
         self._source, self._edit = source, edit
