@@ -1,4 +1,4 @@
-"""The jobs of a batch (recordings and their results), and the plan by which they are reconstructed."""
+"""The jobs of a batch (recordings and their results), and the plan of their reconstruction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A batch on this machine: one thread per device, each of which takes the next job."""
+"""A batch on this machine, with one thread per device."""
 
 from __future__ import annotations
 

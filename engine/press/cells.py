@@ -22,24 +22,12 @@ _SMALL = 4  # cells: gaps up to this size belong to the surface
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
-    """Cells that cover the lit part of the picture, with a margin.
+    """Cells that cover the lit part of the picture, with a margin; pairs are rows and columns."""
 
-    Attributes
-    ----------
-    box : (slice, slice)
-        Rows and columns of the picture that are covered by cells.
-    block : (int, int)
-        Rows and columns of pixels in a cell.
-    before : (int, int)
-        Cells outside the picture, above and to the left of the box.
-    shape : (int, int)
-        Rows and columns of cells, including those outside the picture.
-    """
-
-    box: tuple[slice, slice]
-    block: tuple[int, int]
-    before: tuple[int, int]
-    shape: tuple[int, int]
+    box: tuple[slice, slice]  # pixels that are covered by cells
+    block: tuple[int, int]  # pixels per cell
+    before: tuple[int, int]  # cells outside the picture, above and to the left of the box
+    shape: tuple[int, int]  # number of cells, including those outside the picture
 
     def means(self, values: Doubles) -> Doubles:
         """Return the mean of each cell's finite pixels, NaN where less than half are finite."""

@@ -118,7 +118,7 @@ class EventMaps(NamedTuple):
 class Crossing:
     """Search for the crossing of one threshold on a device.
 
-    The options are those of ``operation``, except for the threshold.
+    It uses the options of ``operation``, except for the threshold.
     """
 
     def __init__(

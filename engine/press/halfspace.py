@@ -79,24 +79,12 @@ class HalfSpace:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pressed:
-    """A rigid surface and the half-space in equilibrium.
+    """A rigid surface and the half-space in equilibrium; maps are (H, W)."""
 
-    Attributes
-    ----------
-    strain : ndarray, (H, W), float64
-        Pressure over Young's modulus, 0 or more.
-    height : ndarray, (H, W), float64
-        Height of the half-space's surface above its rest plane, mm.
-    contact : ndarray, (H, W), bool
-        Where the two touch.
-    load : float
-        Force over Young's modulus, mm^2.
-    """
-
-    strain: Doubles
-    height: Doubles
+    strain: Doubles  # pressure over Young's modulus, 0 or more
+    height: Doubles  # of the half-space's surface above its rest plane, mm
     contact: Mask
-    load: float
+    load: float  # force over Young's modulus, mm^2
 
 
 def press(

@@ -53,7 +53,22 @@ class Levels(ThresholdOperation):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self._angles = _check_levels(self.thresholds, self.inclinations)
+        shares, angles = list(self.thresholds or ()), list(self.inclinations or ())
+        if not shares or any(high <= low for low, high in pairwise(shares)):
+            raise InputError(
+                f"thresholds {_listed(shares)}: give them from the lowest to the highest, such as 0.25, 0.75"
+            )
+        if len(angles) != len(shares):
+            raise InputError(
+                f"{len(shares)} thresholds and {len(angles)} inclinations: give the sheet's inclination at"
+                " which each threshold is passed, from the lowest on"
+            )
+        if not all(low < high for low, high in pairwise([0.0, *angles, math.pi / 2])):
+            degrees = _listed(map(math.degrees, angles))
+            raise InputError(
+                f"inclinations {degrees} deg: they must rise with the thresholds, between 0 and 90"
+            )
+        self._angles = angles
 
     def shares(self) -> Sequence[float]:
         """Return the thresholds."""
@@ -68,27 +83,6 @@ class Levels(ThresholdOperation):
         least = np.array([0, *self._angles, np.nan], np.float32)
         greatest = np.array([*self._angles, np.nan, np.nan], np.float32)
         return self.as_result(levels[0], slope_min=least[passed], slope_max=greatest[passed])
-
-
-def _check_levels(
-    thresholds: Sequence[float] | None, inclinations: Sequence[float] | None
-) -> Sequence[float]:
-    """Return the inclinations, or raise InputError unless they and the thresholds fit together."""
-    shares, angles = list(thresholds or ()), list(inclinations or ())
-    if not shares or any(high <= low for low, high in pairwise(shares)):
-        raise InputError(
-            f"thresholds {_listed(shares)}: give them from the lowest to the highest, such as 0.25, 0.75"
-        )
-    if len(angles) != len(shares):
-        raise InputError(
-            f"{len(shares)} thresholds and {len(angles)} inclinations: give the sheet's inclination at which"
-            " each threshold is passed, from the lowest on"
-        )
-    rising = all(low < high for low, high in zip([0.0, *angles], [*angles, math.pi / 2], strict=True))
-    if not rising:
-        degrees = _listed(map(math.degrees, angles))
-        raise InputError(f"inclinations {degrees} deg: they must rise with the thresholds, between 0 and 90")
-    return angles
 
 
 def _listed(numbers: Any) -> str:

@@ -33,7 +33,7 @@ def coarse_heights(
     Slopes are integrated; the highest point of each component is assumed to be at the depth of the press.
     Pixels without a normal get the nearest slope, as at a crease. Where the surface is too level to be
     visible, this slope decreases towards the middle, as on a ball. Outside, the nearest height is used.
-    Without any contact, all heights are those of the press.
+    Without any contact, all heights are equal to the press.
     """
     from scipy import ndimage
 

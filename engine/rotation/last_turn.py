@@ -75,7 +75,7 @@ class LastTurn(Normals):
     press: float | None = option(
         default=None,
         unit="mm",
-        help="distance by which the body is lowered, for a calibrated response",
+        help="depth to which the body is lowered, for a calibrated response",
         python_only=True,
     )
 

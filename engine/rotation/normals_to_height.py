@@ -33,19 +33,11 @@ _CHUNK, _STRIP = 256, 16  # columns and rows of a work-item on a CPU; see slopes
 
 @dataclass(frozen=True, slots=True)
 class Slopes:
-    """Slopes of the surface along x, and along y, which points up the picture.
+    """Slopes of the surface along x, and along y, which points up the picture."""
 
-    Attributes
-    ----------
-    dz_dx, dz_dy : ndarray, (H, W), float32
-        Dimensionless; NaN where undefined.
-    weights : ndarray, (2, H, W), float32
-        Inverse variances of both; 0 where undefined.
-    """
-
-    dz_dx: Floats
+    dz_dx: Floats  # (H, W); NaN where undefined
     dz_dy: Floats
-    weights: Floats
+    weights: Floats  # (2, H, W): inverse variances of both; 0 where undefined
 
     @property
     def known(self) -> NDArray[np.bool_]:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.frames import check_dtype
-from mirrorskin.io import Block, Header, InputError, Motion, Source, pixel_axes
+from mirrorskin.engine.rotation.edited import DerivedSource
+from mirrorskin.io import Block, Header, InputError, Source, pixel_axes
 from mirrorskin.io.positions import check_phase
 from mirrorskin.io.types import block_memory
 from mirrorskin.kernels.array import Array
@@ -19,7 +19,6 @@ from mirrorskin.kernels.device import C_TYPES, Device, open_device
 from mirrorskin.kernels.registration import BORDER
 
 _BLOCK = 16_000_000  # bytes of the source's frames that are read at once
-_FRAME: np.dtype[Any] = np.dtype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +29,7 @@ class Sight:
     axis: tuple[float, float]
 
 
-class Registered:
+class Registered(DerivedSource):
     """A source's frames, resampled as float32 so that each pixel shows one point of the object in all frames.
 
     This is the point that the pixel shows in the mean pose, pressed and upright: p = (x, y, height + press)
@@ -67,12 +66,6 @@ class Registered:
         The phases of the source, if it has them in advance.
     """
 
-    name: str
-    header: Header
-    shape: tuple[int, int, int]
-
-    dtype = _FRAME
-
     def __init__(
         self,
         source: Source,
@@ -82,16 +75,14 @@ class Registered:
         sight: Sight | None = None,
         device: str | Device | None = None,
     ) -> None:
+        super().__init__(source)
         check_dtype(source.dtype)
-        header = source.header if header is None else header
+        self.header, self.dtype = header or source.header, np.dtype(np.float32)
+        header = self.header
         self._geometry = _Geometry.of(source, header, sight)
         height = check_heights(heights, source.shape[1:])
-        self.name, self.header, self.shape = source.name, header, source.shape
-        self.motion: Motion = source.motion
-        self.rewindable: bool = source.rewindable
         self.phase: NDArray[np.float64] | None = getattr(source, "phase", None)
         self.device: Device = open_device(device)
-        self._source = source
         rows, columns = self.shape[1:]
         offset, gain = _levels(header, (rows, columns))
         integer = source.dtype.kind == "u"
@@ -171,15 +162,6 @@ class Registered:
             noise=self._noise,
             moved=7 * size,
         )
-
-    def __enter__(self) -> Self:
-        self._source.__enter__()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
-    ) -> None:
-        self._source.__exit__(kind, error, trace)
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,22 +28,14 @@ HALF_WAY = 0.5
 class Response:
     """Brightness of each pixel as a function of the normal; replaces a ``Scale``.
 
-    Attributes
-    ----------
-    planes : ndarray, (5, H, W), float32
-        Counts without light; light per count; x and y from the wall's axis, and height z of the object in the
-        mean pose above the rest plane, mm. NaN where a pixel has no response.
-    wall : Wall
-    sigma : ndarray, (H, W), float32
-        Standard error of normals due to the calibration, radians; NaN where unknown.
-    axis : (float, float)
-        Position of the wall's axis in the picture, mm from its centre.
+    The planes, (5, H, W), are counts without light; light per count; x and y from the wall's axis, and the
+    height z of the object in the mean pose above the rest plane, mm. They are NaN without a response.
     """
 
     planes: NDArray[np.float32]
     wall: Wall
-    sigma: NDArray[np.float32]
-    axis: tuple[float, float]
+    sigma: NDArray[np.float32]  # (H, W): standard error of normals due to the calibration, radians; or NaN
+    axis: tuple[float, float]  # position of the wall's axis, mm from the picture's centre
     per_pixel = True  # as of `Scale`
 
     @property

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.rotation.design_matrix import Doubles
-from mirrorskin.engine.rotation.tilt import one_wave
+from mirrorskin.engine.rotation.tilt import STEEP
 from mirrorskin.io import InputError
 
 
@@ -16,11 +16,8 @@ from mirrorskin.io import InputError
 class Scale:
     """Linear brightness E = offset + gain zenith, within limits of the zenith.
 
-    Attributes
-    ----------
-    planes : ndarray, (4,) or (4, H, W), float64
-        Counts at zenith 0; radians per count; the lowest and the highest zenith of the linear range. NaN
-        where a pixel has no scale.
+    The planes, (4,) or (4, H, W), are the counts at zenith 0, radians per count, and the lowest and the
+    highest zenith of the linear range. They are NaN without a scale.
     """
 
     planes: Doubles
@@ -35,8 +32,12 @@ class Scale:
         return self.planes.reshape(4, -1)[:, ::step] if self.per_pixel else self.planes
 
     def clear_pixels(self, wave: Doubles, step: int) -> NDArray[np.bool_]:
-        """Return which of every ``step``-th pixel are steep enough for one wave per turn; see `one_wave`."""
-        return one_wave(wave, self.thinned(step))
+        """Return which of every ``step``-th pixel are steep enough for one wave per turn to be a good fit.
+
+        ``wave``, (3, n), is the mean, cosine and sine of the samples, counts.
+        """
+        offset, per_count = np.broadcast_to(self.thinned(step).reshape(4, -1)[:2], (2, wave.shape[1]))
+        return np.asarray((wave[0] - offset) * per_count > STEEP * np.hypot(*wave[1:]) * np.abs(per_count))
 
 
 def make_scale(

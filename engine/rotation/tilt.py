@@ -12,8 +12,10 @@ from mirrorskin.engine.rotation.design_matrix import Doubles, TurnFit, basis
 from mirrorskin.engine.rotation.residual_noise import CountNoise, valid
 from mirrorskin.io import InputError
 
+STEEP = 4.0
+"""Ratio of zenith and tilt above which one wave per turn is a good approximation."""
+
 _STEEPEST = math.radians(30.0)  # largest tilt that the sheet can follow
-_STEEP = 4.0  # zenith over tilt above which one wave per turn is a good approximation
 _FEWEST = 30  # least number of pixels of an estimate
 _ROUNDS = 5  # iterations
 
@@ -37,12 +39,6 @@ def check_tilts(tilt: ArrayLike, count: int) -> Doubles:
         at = f" at frame {int(np.argmax(wrong))}" if values.ndim else ""
         raise InputError(f"tilt {math.degrees(values[wrong].flat[0]):g} deg{at}: 30 deg at most is needed")
     return np.broadcast_to(values, count)
-
-
-def one_wave(wave: Doubles, scale: Doubles) -> NDArray[np.bool_]:
-    """Return which pixels are steep enough for one wave per turn to be a good fit, (3, n) counts."""
-    offset, per_count = np.broadcast_to(scale.reshape(4, -1)[:2], (2, wave.shape[1]))
-    return np.asarray((wave[0] - offset) * per_count > _STEEP * np.hypot(*wave[1:]) * np.abs(per_count))
 
 
 def estimate_tilt(samples: NDArray[Any], fit: TurnFit, scale: Doubles, noise: CountNoise) -> float:
@@ -71,7 +67,7 @@ def estimate_tilt(samples: NDArray[Any], fit: TurnFit, scale: Doubles, noise: Co
 
     tilt = math.sqrt(max(0.0, float(np.median(square[clean])))) if clean.any() else 0.0
     for _ in range(_ROUNDS):
-        chosen = clean & (mean > max(_STEEP * tilt, 1e-3))
+        chosen = clean & (mean > max(STEEP * tilt, 1e-3))
         if np.count_nonzero(chosen) < _FEWEST or not tilt > 0:
             raise InputError(
                 "too few pixels are steep and clear enough to estimate the tilt: give it, such as 2.5deg"
