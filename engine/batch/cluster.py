@@ -186,7 +186,7 @@ class _Batch:
             raise self._lost("does not answer" if isinstance(error, TimeoutError) else "was lost") from error
 
     def _lost(self, problem: str) -> InputError:
-        remedy = "see that it runs and start the batch again, which goes on where it stopped"
+        remedy = "check that it runs and start the batch again, which continues where it stopped"
         return InputError(f"{self._name} {problem}: {remedy}")
 
 

@@ -155,9 +155,7 @@ class Crossing:
         """Return the state of each pixel on the device; see ``onset.cl``."""
         return {
             "levels": Planes(2, np.float32),  # counts at the threshold, and of the dark plateau
-            "marks": Planes(
-                3, self._dtype
-            ),  # smallest sample that is light, not clearly dark, near the level
+            "marks": Planes(3, self._dtype),  # least sample that is light, not clearly dark, near
             "left": Planes(1, f"u{self._dtype.itemsize}"),  # frames until the pixel is finished
             "times": Planes(3, np.int32),  # start of the run; last frames that were clearly dark, not near
             "answers": Planes(2, np.float32),  # height and sigma

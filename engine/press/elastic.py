@@ -109,7 +109,7 @@ def correct_press(
     except NotConverged as error:
         return result, f"none: {error}", None
     lost = np.count_nonzero((result["status"] == PressStatus.ONSET) & np.isnan(fit.height))
-    summary = f"corrected for the gel; {lost} pixels turned light too far from the touch"
+    summary = f"corrected for the gel; {lost} pixels turned light too far from the contact"
     return result.assign(height=fit.height, height_sigma=fit.sigma), summary, fit
 
 
@@ -172,7 +172,7 @@ def fit_press(
     factors, fit, form = _fit_surface(scene, _initial_surface(scene))
     here, everywhere = (int(np.sum(part)) for part in (scene.cells.inside(fit.contact), fit.contact))
     if everywhere - here > _BEYOND * everywhere:
-        raise NotConverged("much of what touches lies beyond the picture")
+        raise NotConverged("much of the contact is outside the picture")
     change = np.zeros(heights.shape)
     change[scene.cells.box] = scene.splines.at(factors - smooth, *scene.cells.places(heights.shape))
     variance = _on_pixels(scene, heights.shape, _variances(scene, fit, form))
@@ -250,7 +250,7 @@ def _scene_of(
     onsets = -means[np.isfinite(means)]
     if len(onsets) < _FEWEST:
         raise NotConverged(
-            f"light in {len(onsets)} places is too little to determine a surface: {_FEWEST} are needed"
+            f"{len(onsets)} cells of the picture turned light, too little for a surface: {_FEWEST} are needed"
         )
     dark = cells.share(status == PressStatus.NEVER_LIGHT) == 1
     hidden = cells.inside(cells.share(status == PressStatus.LIGHT_AT_START)) >= 0.5

@@ -61,7 +61,7 @@ class Levels(ThresholdOperation):
         if len(angles) != len(shares):
             raise InputError(
                 f"{len(shares)} thresholds and {len(angles)} inclinations: give the sheet's inclination at"
-                " which each threshold is passed, from the lowest on"
+                " which each threshold is passed, starting with the lowest"
             )
         if not all(low < high for low, high in pairwise([0.0, *angles, math.pi / 2])):
             degrees = _listed(map(math.degrees, angles))

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.method import Context, Method, Plan, Step
-from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.options import option
 from mirrorskin.engine.press.changepoint import ChangePoint
 from mirrorskin.engine.press.crossing import Event, PressOperation
@@ -141,10 +140,12 @@ class Press(Method, options_of=(Onset, Levels, Elastomer, HoleFilling)):
     def plan(self, source: Source) -> Plan:
         """Return the operation for a source, depending on its travel, the method and the available levels."""
         travel: NDArray[np.float64] | None = getattr(source, "travel", None)
-        oscillates = (
-            travel is not None and len(stroke_starts(travel, 1)) > 1
-        )  # more than a press and a release
-        frames = range(source.shape[0]) if oscillates else _frames_of(source, self.event)
+        # More than a press and its release.
+        oscillates = travel is not None and len(stroke_starts(travel, 1)) > 1
+        if travel is None or oscillates:
+            frames = range(source.shape[0])
+        else:
+            frames = _frames_of(source.name, travel, self.event)
         size = len(frames) * math.prod(source.shape[1:]) * source.dtype.itemsize
         limits = {"memory_limit": max(1, min(self.memory_limit, 2 * size))}
         kind = self._kind(source, oscillates)
@@ -180,7 +181,7 @@ class Press(Method, options_of=(Onset, Levels, Elastomer, HoleFilling)):
             return Strokes
         return Onset if self.method == "threshold" else ChangePoint
 
-    def _check_change_point(self, source: Source, operation: Operation) -> None:
+    def _check_change_point(self, source: Source, operation: PressOperation) -> None:
         if not self.subframe:
             raise InputError(
                 "a change-point lies between frames: equation 4 as printed needs method 'threshold'"
@@ -234,17 +235,14 @@ def _with_estimated_levels(
     return operation.with_options(**changes)
 
 
-def _frames_of(source: Source, event: Event) -> range:
-    """Return the frames of a press, or of a release; all frames if the source has no travel in advance."""
-    travel: NDArray[np.float64] | None = getattr(source, "travel", None)
-    if travel is None:
-        return range(source.shape[0])
+def _frames_of(name: str, travel: NDArray[np.float64], event: Event) -> range:
+    """Return the frames of a press up to the greatest travel, or of a release from there."""
     deepest = np.flatnonzero(travel == travel.max())
     rises, falls = travel[0] < travel[deepest[0]], travel[-1] < travel[deepest[0]]
     if event == "release":
         if rises and not falls:
-            raise InputError(f"{source.name}: travel only rises: that is a press; give event onset")
-        return range(int(deepest[0]), source.shape[0])
+            raise InputError(f"{name}: travel only rises: that is a press; give event onset")
+        return range(int(deepest[0]), len(travel))
     if falls and not rises:
-        raise InputError(f"{source.name}: travel only falls: that is a release; give event release")
+        raise InputError(f"{name}: travel only falls: that is a release; give event release")
     return range(int(deepest[-1]) + 1)

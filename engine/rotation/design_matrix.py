@@ -55,7 +55,9 @@ def check_phases(phase: ArrayLike, frame_weights: ArrayLike | None = None) -> Do
     weight = check_weights(frame_weights, len(alpha))
     used = alpha[weight > 0]
     if len(alpha) > 0 and len(used) == 0:
-        raise InputError(f"all {len(alpha)} frames have weight 0: nothing is left to be fitted")
+        raise InputError(
+            f"all {len(alpha)} frames have weight 0: at least 3 with a weight above 0 are needed"
+        )
     different = max(1, int(np.count_nonzero(_gaps(used) > _SAME))) if len(used) else 0
     if different < 3:
         problem = f"{len(used)} frames at {different} different phases do not determine a fit"

@@ -73,7 +73,7 @@ def estimate_frequency(samples: NDArray[Any], time: ArrayLike) -> Frequency:
     if counts.shape[1] == 0:
         raise InputError("every pixel has a missing sample: no frequency can be estimated")
     if (greatest := np.abs(counts).max()) > _GREATEST:
-        raise InputError(f"a sample is {greatest:.3g}: at most {_GREATEST:g} can be")
+        raise InputError(f"a sample is {greatest:.3g}: at most {_GREATEST:g} is supported")
     counts -= counts.mean(axis=0)
     if not counts.any():
         raise InputError("nothing oscillates: all samples of a pixel are the same")
@@ -94,7 +94,7 @@ def estimate_frequency(samples: NDArray[Any], time: ArrayLike) -> Frequency:
     explained = -unexplained(frequency) / max(variance, np.finfo(float).tiny)
     pixels = counts.shape[1]
     if not explained > 2 * pixels + _SIGNIFICANT * math.sqrt(4 * pixels) + 4 * math.log(len(counts)):
-        raise InputError("nothing oscillates beyond the noise: give the frequency")
+        raise InputError("no oscillation exceeds the noise: give the frequency")
     return Frequency(frequency, math.sqrt(variance / information))
 
 

@@ -142,7 +142,7 @@ def make_response(
             " calibrate again"
         )
     if dark is None or bright is None:
-        raise InputError("the calibration's response needs dark and bright references: calibrate them, too")
+        raise InputError("the calibrated response needs dark and bright references: calibrate them as well")
     shape = len(axes[1]), len(axes[0])
     x, y = np.meshgrid(axes[0] - wall.axis[0], axes[1] - wall.axis[1])
     base = np.broadcast_to(np.asarray(dark, np.float64), shape)
