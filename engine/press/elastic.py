@@ -109,7 +109,7 @@ def correct_press(
     except NotConverged as error:
         return result, f"none: {error}", None
     lost = np.count_nonzero((result["status"] == PressStatus.ONSET) & np.isnan(fit.height))
-    summary = f"corrected for the gel; {lost} pixels turned light too far from the contact"
+    summary = f"corrected for the gel; {lost} pixels turned light too far from the touch"
     return result.assign(height=fit.height, height_sigma=fit.sigma), summary, fit
 
 

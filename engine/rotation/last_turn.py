@@ -184,7 +184,7 @@ class LastTurn(Normals):
         swing = 1.0 if gain is None or tilt is None else gain * tilt
         offset = np.asarray(0.0 if self.zenith_offset is None else self.zenith_offset, np.float64)
         level = offset if self.zenith_offset is None else offset + (0.5 if gain is None else 0.5 * gain)
-        ends = [np.asarray(level, np.float64) for level in (self.dark, self.bright) if level is not None]
+        ends = [np.asarray(end, np.float64) for end in (self.dark, self.bright) if end is not None]
         if len(ends) == 2:
             level = np.mean(np.stack(np.broadcast_arrays(*ends)), axis=0)
         most = np.iinfo(self.dtype).max if self.dtype.kind == "u" else np.inf
