@@ -1,4 +1,4 @@
-"""A batch on the workers of a Dask cluster: one that runs already, or one of this machine's own."""
+"""A batch on the workers of a Dask cluster: a running one, or a local one for this batch."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from mirrorskin.io.atomic import remove_leftovers
 from mirrorskin.io.os_errors import as_input_error
 
 PATIENCE = 30.0
-"""Seconds after which a scheduler that was reached, or the last of its workers, is taken for lost."""
+"""Timeout, s, of a scheduler after the first contact, and of a cluster without workers."""
 
-_REACH = 10.0  # seconds, for a first answer
-_CHECK = 150.0  # seconds, for a worker to load everything from a slow disk and try its device
-_POLL = 1.0  # seconds between two looks at the workers
+_REACH = 10.0  # seconds: timeout of the first answer
+_CHECK = 150.0  # seconds: timeout of the check of a worker, which may load modules from a slow disk
+_POLL = 1.0  # seconds between queries of the workers
 
 _log = logging.getLogger("mirrorskin.engine.batch")
 
@@ -40,12 +40,12 @@ _log = logging.getLogger("mirrorskin.engine.batch")
 def run_cluster(
     jobs: Iterable[Job], plan: Plan, address: str | None = None, workers: int | None = None
 ) -> Iterator[Outcome]:
-    """Run a batch on a Dask cluster, each worker with a device of its own and one job at a time.
+    """Run a batch on a Dask cluster; each worker has its own device and runs one job at a time.
 
-    The cluster is that of a scheduler that runs already, at ``address``, such as ``"tcp://node1:8786"``, or
-    consists of so many ``workers``, processes of this machine that are started for this batch. All workers
-    must see the files under the same names. A job whose worker is lost goes to another one. Closing the
-    iterator ends the batch: jobs that run on workers of others are finished by them, all else is dropped.
+    The cluster is that of a running scheduler at ``address``, such as ``"tcp://node1:8786"``, or ``workers``
+    local processes that are started for this batch. All workers must see the files under the same names. A
+    job whose worker is lost is given to another one. Closing the iterator ends the batch: jobs that are
+    running on a remote cluster are finished there, all others are cancelled.
     """
     jobs = list(jobs)
     if not jobs:
@@ -57,7 +57,7 @@ def run_cluster(
 
 
 class _Batch:
-    """Jobs on their way through a cluster."""
+    """A batch in progress on a cluster."""
 
     def __init__(self, client: Any, name: str, plan: Plan) -> None:
         self._client, self._name, self._plan = client, name, plan
@@ -68,25 +68,25 @@ class _Batch:
 
     @contextmanager
     def enlisted(self, jobs: list[Job]) -> Iterator[None]:
-        """Let workers take part that can, also those that come later; at the end, drop what is not begun."""
+        """Enlist suitable workers, including those that join later; at the end, cancel the remaining jobs."""
         from mirrorskin.engine.batch.worker import RESOURCE, Enlist, check_worker
 
         sizes = _one_of_each_folder(job.source.absolute() for job in jobs)
-        name, own = f"mirrorskin-{uuid.uuid4()}", program_version()
+        name, program = f"mirrorskin-{uuid.uuid4()}", program_version()
         with _trace(_nearest_existing(jobs[0].target.absolute().parent)) as trace:
-            # A function of Python's own: one of ours could not be read by another version, or by none.
-            for worker, found in self._run(version, "mirrorskin").items():
-                if found != own:
-                    has = "not installed" if isinstance(found, PackageNotFoundError) else found
+            # A function of the standard library, since another version of mirrorskin may not have ours.
+            for worker, installed in self._run(version, "mirrorskin").items():
+                if installed != program:
+                    has = "not installed" if isinstance(installed, PackageNotFoundError) else installed
                     remedy = "install the same on both"
-                    self._refuse(worker, f"has mirrorskin {has}, and this machine {own}: {remedy}")
-            for worker, found in self._run(check_worker, sizes, trace).items():
-                if isinstance(found, Exception):
-                    self._refuse(worker, f"cannot take part ({type(found).__name__}: {found})")
-                if found is not None:
-                    self._refuse(worker, found)
+                    self._refuse(worker, f"has mirrorskin {has}, and this machine {program}: {remedy}")
+            for worker, problem in self._run(check_worker, sizes, trace).items():
+                if isinstance(problem, Exception):
+                    self._refuse(worker, f"cannot take part ({type(problem).__name__}: {problem})")
+                if problem is not None:
+                    self._refuse(worker, problem)
             self._client.subscribe_topic(RESOURCE, lambda event: _log.warning("%s", event[1]))
-            self._client.register_plugin(Enlist(own, sizes, trace), name=name)
+            self._client.register_plugin(Enlist(program, sizes, trace), name=name)
             try:
                 yield
             finally:
@@ -95,9 +95,9 @@ class _Batch:
                     self._ask(self._client.scheduler.unregister_worker_plugin, _REACH, name=name)
 
     def outcomes(self, jobs: list[Job]) -> Iterator[Outcome]:
-        """Give out jobs, one for each worker, and yield what becomes of them.
+        """Submit jobs, one per worker, and yield their outcomes.
 
-        Dask itself gives a job whose worker is lost to another, and gives it up with the fourth.
+        Dask gives a job whose worker is lost to another worker, at most three times.
         """
         waiting = deque(jobs)
         while waiting or self._running:
@@ -112,16 +112,16 @@ class _Batch:
     def _submit(self, job: Job) -> None:
         from mirrorskin.engine.batch.worker import RESOURCE, run_on_worker
 
-        there = Job(job.source.absolute(), job.target.absolute())
+        absolute = Job(job.source.absolute(), job.target.absolute())
         key = f"mirrorskin-{uuid.uuid4()}"
         future = self._client.submit(
-            run_on_worker, there, self._plan, key=key, resources={RESOURCE: 1}, pure=False
+            run_on_worker, absolute, self._plan, key=key, resources={RESOURCE: 1}, pure=False
         )
         self._running[key] = job, future
         future.add_done_callback(lambda future: self._ended.put(future.key))
 
     def _outcome(self, key: str) -> Outcome | None:
-        """Return what became of a job; None if its worker was lost with the answer, and it is done again."""
+        """Return the outcome of a job; None if it is repeated because the worker with the answer was lost."""
         import distributed
 
         job, future = self._running[key]
@@ -143,7 +143,7 @@ class _Batch:
         return outcome
 
     def _poll(self) -> None:
-        """See that there is a scheduler and workers, and clear away what lost workers had begun to write."""
+        """Check that there are a scheduler and workers, and remove partial files of lost workers."""
         now = time.monotonic()
         if now - self._polled < _POLL:
             return
@@ -168,27 +168,31 @@ class _Batch:
     def _run(self, function: Callable[..., Any], *values: Any) -> dict[str, Any]:
         """Call a function on each worker, and return what it returned or raised."""
         run = functools.partial(self._client.run, function, *values, on_error="return")
-        try:
-            found: dict[str, Any] = run(callback_timeout=_CHECK)
-        except (OSError, _closed()) as error:
-            raise self._lost("does not answer" if isinstance(error, TimeoutError) else "was lost") from error
-        return {worker: one for worker, one in found.items() if not isinstance(one, OSError)}  # it was lost
+        answers: dict[str, Any] = self._checked(run, _CHECK)
+        # An OSError means that the worker was lost.
+        return {worker: answer for worker, answer in answers.items() if not isinstance(answer, OSError)}
 
     def _ask(self, question: Callable[..., Any], timeout: float, **values: Any) -> Any:
-        """Ask the scheduler something."""
+        """Call a method of the scheduler."""
+        return self._checked(functools.partial(self._client.sync, question, **values), timeout)
+
+    def _checked(self, call: Callable[..., Any], timeout: float) -> Any:
+        """Call a function; InputError if the scheduler does not answer or is lost."""
+        from distributed.client import ClosedClientError
+
         try:
-            return self._client.sync(question, callback_timeout=timeout, **values)
-        except (OSError, _closed()) as error:
+            return call(callback_timeout=timeout)
+        except (OSError, ClosedClientError) as error:
             raise self._lost("does not answer" if isinstance(error, TimeoutError) else "was lost") from error
 
     def _lost(self, problem: str) -> InputError:
-        remedy = "see that it runs and start the batch again, which goes on where it stopped"
+        remedy = "check that it runs and start the batch again, which continues where it stopped"
         return InputError(f"{self._name} {problem}: {remedy}")
 
 
 @contextmanager
 def _connect(address: str | None, workers: int | None) -> Iterator[Any]:
-    """Connect to a scheduler, or to one of the batch's own for as long as it lasts."""
+    """Connect to a scheduler; without an address, start a local cluster for the batch."""
     try:
         import distributed
     except ImportError as error:
@@ -197,28 +201,28 @@ def _connect(address: str | None, workers: int | None) -> Iterator[Any]:
     with ExitStack() as stack:
         stack.enter_context(_quiet())
         if address is None:
-            address = stack.enter_context(_own_cluster(workers or 1)).scheduler_address
+            address = stack.enter_context(_local_cluster(workers or 1)).scheduler_address
         yield stack.enter_context(_reach(distributed, address))
 
 
 @contextmanager
-def _own_cluster(workers: int) -> Iterator[Any]:
-    """Start a scheduler, and worker processes that are started again when they are lost."""
+def _local_cluster(workers: int) -> Iterator[Any]:
+    """Start a scheduler, and worker processes that are restarted when they are lost."""
     import dask
     from distributed import LocalCluster
 
-    start: Any = LocalCluster  # which has no types
-    # Dask gives up those that need longer to come back: on a busy machine, that is most.
+    start: Any = LocalCluster  # not typed
+    # Dask's default timeout of a restart is too short for a busy machine.
     patient = dask.config.set({"distributed.deploy.lost-worker-timeout": "1 hour"})
     with (
         patient,
         start(
             n_workers=workers,
             threads_per_worker=1,
-            memory_limit=0,  # a plan has a limit of its own
+            memory_limit=0,  # the plan has its own limit
             preload=["mirrorskin.engine.batch.worker"],
             dashboard_address=None,
-            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # else it complains of a second one
+            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # avoids a warning if the port is in use
             silence_logs=logging.CRITICAL,
         ) as cluster,
     ):
@@ -227,7 +231,7 @@ def _own_cluster(workers: int) -> Iterator[Any]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep Dask's own messages off the terminal: outcomes and errors have what went wrong."""
+    """Suppress Dask's messages: outcomes and errors describe what went wrong."""
     names = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]
     loggers = [logging.getLogger(name) for name in names]
     levels = [logger.level for logger in loggers]
@@ -242,7 +246,7 @@ def _quiet() -> Iterator[None]:
 
 def _reach(distributed: ModuleType, address: str) -> Any:
     try:
-        with ThreadPoolExecutor(1) as thread:  # the caller's may have an event loop of its own
+        with ThreadPoolExecutor(1) as thread:  # the caller's thread may have an event loop
             thread.submit(asyncio.run, _greet(distributed, address)).result()
         return distributed.Client(address, timeout=_REACH, set_as_default=False)
     except (OSError, ValueError, OverflowError) as error:
@@ -252,34 +256,27 @@ def _reach(distributed: ModuleType, address: str) -> Any:
 
 
 async def _greet(distributed: ModuleType, address: str) -> None:
-    """Shake hands with a scheduler: a client waits for ever for one that only listens."""
-    known = distributed.Security().get_connection_args("client")
-    comm = await asyncio.wait_for(distributed.comm.connect(address, timeout=0.9 * _REACH, **known), _REACH)
+    """Connect once with a timeout: a client waits forever for a port that accepts but does not answer."""
+    security = distributed.Security().get_connection_args("client")
+    comm = await asyncio.wait_for(distributed.comm.connect(address, timeout=0.9 * _REACH, **security), _REACH)
     await comm.close()
-
-
-def _closed() -> type[Exception]:
-    from distributed.client import ClosedClientError
-
-    closed: type[Exception] = ClosedClientError
-    return closed
 
 
 @contextmanager
 def _trace(folder: Path) -> Iterator[Path]:
-    """Leave an empty file in a folder for a while: who sees it, sees the folder itself."""
+    """Create a temporary empty file in a folder: a worker that sees it sees the folder itself."""
     with ExitStack() as stack:
         with as_input_error(f"{folder} cannot be written to", "choose another folder with -o"):
             file = stack.enter_context(
                 tempfile.NamedTemporaryFile(prefix=".mirrorskin-", suffix=".part", dir=folder)
             )
-        with suppress(OSError):  # a file system without locks
-            fcntl.flock(file, fcntl.LOCK_EX)  # no leftover yet
+        with suppress(OSError):  # the file system may not support locks
+            fcntl.flock(file, fcntl.LOCK_EX)  # so that it is not removed as a leftover
         yield Path(file.name)
 
 
 def _one_of_each_folder(files: Iterable[Path]) -> dict[Path, int]:
-    """Return the sizes of some files: one of each folder, if it is there at all."""
+    """Return the size of one existing file of each folder."""
     first: dict[Path, Path] = {}
     for file in files:
         if file.parent not in first and file.is_file():
@@ -288,5 +285,5 @@ def _one_of_each_folder(files: Iterable[Path]) -> dict[Path, int]:
 
 
 def _nearest_existing(folder: Path) -> Path:
-    """Return a folder, or the nearest above it that is there."""
-    return next(one for one in [folder, *folder.parents] if one.is_dir())
+    """Return a folder, or its nearest existing parent."""
+    return next(parent for parent in [folder, *folder.parents] if parent.is_dir())

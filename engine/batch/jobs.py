@@ -1,4 +1,4 @@
-"""What a batch does: which recording becomes which result, and how each is reconstructed."""
+"""The jobs of a batch (recordings and their results), and the plan of their reconstruction."""
 
 from __future__ import annotations
 
@@ -27,41 +27,49 @@ from mirrorskin.io.url import Url
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A recording, and the result to make of it."""
+    """A recording, and the file of its result."""
 
     source: Path
     target: Path
 
 
 def make_jobs(paths: Iterable[Path], folder: Path) -> list[Job]:
-    """Name a result in a folder for each recording.
+    """Choose the name of each recording's result in a folder.
 
-    ``NAME.h5`` becomes ``NAME-result.h5``. Recordings of one name keep their folders below the one that they
-    have in common, and their endings where only those differ.
+    The result of ``NAME.h5`` is ``NAME-result.h5``. Results of recordings with the same name are in
+    subfolders, relative to their common folder; recordings that differ in the ending only keep it.
 
     Examples
     --------
     >>> make_jobs([Path("a.h5")], Path("out"))[0].target
     PosixPath('out/a-result.h5')
     """
-    once: dict[Path, Path] = {}
+    by_location: dict[Path, Path] = {}
     for path in paths:
-        once.setdefault(_absolute(path), path)
-    sources = list(once.values())
+        by_location.setdefault(_absolute(path), path)
+    sources = list(by_location.values())
     names: dict[str, list[Path]] = defaultdict(list)
     for source in sources:
         names[source.stem].append(source)
     targets = {
         source: folder / name
-        for alike in names.values()
-        for source, name in zip(alike, _distinct_names(alike), strict=True)
+        for same_name in names.values()
+        for source, name in zip(same_name, _distinct_names(same_name), strict=True)
     }
-    _check(sources, targets.values())
+    inputs = {os.path.realpath(source) for source in sources}
+    outputs: set[str] = set()
+    for target in targets.values():
+        real = os.path.realpath(target)
+        if real in inputs:
+            raise InputError(f"{target} is one of the recordings: choose another folder for results with -o")
+        if real in outputs:
+            raise InputError(f"{target} would be the result of two recordings: rename one of them")
+        outputs.add(real)
     return [Job(source, targets[source]) for source in sources]
 
 
 def _distinct_names(sources: Sequence[Path]) -> list[str]:
-    """Name the results of recordings of one name, below the results' folder."""
+    """Return the names of the results of recordings with the same name, relative to the results' folder."""
     if len(sources) == 1:
         return [f"{sources[0].stem}-result.h5"]
     folders = [_absolute(source).parent for source in sources]
@@ -75,41 +83,26 @@ def _distinct_names(sources: Sequence[Path]) -> list[str]:
 
 
 def _absolute(path: Path) -> Path:
-    """Return the whole path, without '..', but with the links that lead there."""
+    """Return the absolute path without '..'; links are not resolved."""
     return Path(os.path.normpath(f"/{path}" if isinstance(path, Url) else path.absolute()))
 
 
-def _check(sources: Sequence[Path], targets: Iterable[Path]) -> None:
-    """Refuse results that would overwrite a recording, or each other."""
-    inputs = {os.path.realpath(source) for source in sources}
-    taken: set[str] = set()
-    for target in targets:
-        real = os.path.realpath(target)
-        if real in inputs:
-            raise InputError(f"{target} is one of the recordings: choose another folder for results with -o")
-        if real in taken:
-            raise InputError(f"{target} would be the result of two recordings: rename one of them")
-        taken.add(real)
-
-
-# These change how a result is computed, not what is in it.
-_NO_MATTER = {"source", "memory_limit", "device", "threads"}
-# Parameters of a stack that only one motion uses.
-_OF_MOTION = {"travel": "vertical", "phase": "axial", "tilt": "axial"}
+_IRRELEVANT = {"source", "memory_limit", "device", "threads"}  # options that do not change results
+_OF_MOTION = {"travel": "vertical", "phase": "axial", "tilt": "axial"}  # parameters of one motion only
 TABLES: Mapping[Motion, str] = {
     "vertical": "press", "axial": "rotation", "horizontal": "slip", "twist": "slip"
 }  # fmt: skip
-"""Names of the options of each motion's method."""
+"""Attribute of a plan with the options of each motion's method."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is done with every recording of a batch. It can be pickled."""
+    """What is done with every recording of a batch; can be pickled."""
 
     opening: Mapping[str, Any] = field(default_factory=dict)  # keywords of `io.open_recording`
     press: Mapping[str, Any] = field(default_factory=dict)  # options of `engine.Press`
     rotation: Mapping[str, Any] = field(default_factory=dict)  # of `engine.Rotation`
-    memory_limit: int = MEMORY_LIMIT  # bytes of host memory for frames that are read ahead, of each device
+    memory_limit: int = MEMORY_LIMIT  # bytes of host memory for frames that are read ahead, per device
     slip: Mapping[str, Any] = field(default_factory=dict)  # of `engine.Sliding`
     operation: str = ""  # MODULE:CLASS of an operation that is run instead of all methods
     operation_options: Mapping[str, Any] = field(default_factory=dict)
@@ -124,18 +117,19 @@ class Plan:
         return {**chosen, "memory_limit": self.memory_limit}
 
     def key(self, motion: Motion) -> str:
-        """Return everything of the plan that changes a motion's results, as a text.
+        """Return everything in the plan that affects the results of a motion, as text.
 
-        Defaults are included: an option that is given with its default value changes nothing.
+        Defaults are included, so giving an option its default value does not change the key.
         """
         opening = {
             name: value
             for name, value in self.opening.items()
-            if value is not None and name not in _NO_MATTER and _OF_MOTION.get(name, motion) == motion
+            if value is not None and name not in _IRRELEVANT and _OF_MOTION.get(name, motion) == motion
         }
         kind = self.kind(motion)
-        values = {name: one.default for name, one in kind.options.items()} | dict(self.options(motion))
-        used = {name: value for name, value in values.items() if name not in _NO_MATTER}
+        defaults = {name: declared.default for name, declared in kind.options.items()}
+        values = defaults | dict(self.options(motion))
+        used = {name: value for name, value in values.items() if name not in _IRRELEVANT}
         table = {"operation": self.operation, "code": _code(kind)} if self.operation else {}
         name = "options" if self.operation else TABLES[motion]
         parts = {"version": program_version(), "opening": opening, name: used, **table}
@@ -147,7 +141,7 @@ class Plan:
 
 
 def _code(kind: type) -> str:
-    """Return the SHA-256 of the file with a class: another version of it may return other results."""
+    """Return the SHA-256 of the file that contains a class, since its results may change with the code."""
     path = getattr(sys.modules[kind.__module__], "__file__", None)
     return "" if path is None else hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
@@ -155,7 +149,7 @@ def _code(kind: type) -> str:
 def _as_json(value: Any) -> Any:
     """Convert a value to what JSON can hold."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {one.name: _as_json(getattr(value, one.name)) for one in dataclasses.fields(value)}
+        fields = {entry.name: _as_json(getattr(value, entry.name)) for entry in dataclasses.fields(value)}
         return {type(value).__name__: fields}
     if isinstance(value, Mapping):
         return {str(name): _as_json(item) for name, item in value.items()}

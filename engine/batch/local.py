@@ -1,4 +1,4 @@
-"""A batch on this machine: a thread a device, and each takes the next job."""
+"""A batch on this machine, with one thread per device."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from mirrorskin.kernels.device import Device, list_devices, open_device
 
 Watch = Callable[[Job, int], None]
 
-_INSISTS = 3  # times that Ctrl-C is pressed while a thread hangs, in a network disk perhaps
-_INTERRUPTED = 130  # what shells say of a program that Ctrl-C ended
+_INTERRUPTS = 3  # number of Ctrl-C that end the process at once, while a thread waits for a network disk
+_INTERRUPTED = 130  # exit status of programs that Ctrl-C ended
 
 
-class _Stopped(BaseException):  # no Exception: nobody may take it for a recording's failure
-    """The batch was ended; a job under way is given up."""
+class _Stopped(BaseException):  # not an Exception, which would be reported as a failure of the recording
+    """The batch was ended; the running job is abandoned."""
 
 
 def default_devices() -> list[Device]:
-    """Open the devices that a batch uses unasked: the default one, or all GPUs if that is one."""
+    """Open the devices that a batch uses by default: the default device, or all GPUs if it is a GPU."""
     first = open_device()
     if first.info.kind != "gpu" or "PYOPENCL_CTX" in os.environ:
         return [first]
@@ -34,12 +34,12 @@ def default_devices() -> list[Device]:
 def run_local(
     jobs: Sequence[Job], plan: Plan, devices: Sequence[Device], watch: Watch | None = None
 ) -> Iterator[Outcome]:
-    """Do jobs on devices of this machine, one at a time on each; yield what became of each, as it is done.
+    """Run jobs on devices of this machine, one at a time on each, and yield the outcomes as they are ready.
 
-    ``watch`` is called by the devices' threads with the job under way and how many frames of it were read.
+    ``watch`` is called in the devices' threads with the running job and the number of its frames read so far.
 
-    Leaving the iterator early, by an exception as well, ends the batch: each device gives up its job at the
-    next block of frames, or finishes it where all frames are read. Nothing half-written stays behind.
+    Closing the iterator, or an exception, ends the batch: each device abandons its job at the next block of
+    frames, or finishes it if all frames have been read. No incomplete files are left.
 
     Examples
     --------
@@ -69,7 +69,10 @@ def run_local(
 
     threads: list[Thread] = []
     try:
-        threads.extend(_started(work, device) for device in devices)
+        for device in devices:
+            thread = Thread(target=work, args=(device,))
+            thread.start()
+            threads.append(thread)
         for _ in jobs:
             outcome = outcomes.get()
             if isinstance(outcome, BaseException):
@@ -80,14 +83,8 @@ def run_local(
         _finish(threads, ended)
 
 
-def _started(work: Callable[[Device], None], device: Device) -> Thread:
-    thread = Thread(target=work, args=(device,))
-    thread.start()
-    return thread
-
-
 def _finish(threads: Sequence[Thread], ended: Semaphore) -> None:
-    """Wait for all threads; each releases once at its end."""
+    """Wait for all threads; each releases the semaphore once at its end."""
     for _ in threads:
         _wait(ended)
     for thread in threads:
@@ -95,11 +92,12 @@ def _finish(threads: Sequence[Thread], ended: Semaphore) -> None:
 
 
 def _wait(ended: Semaphore) -> None:
-    """Wait for a thread, as OpenCL aborts a program that leaves it at work; who insists ends it at once.
+    """Wait for the end of a thread, since OpenCL aborts a program that exits earlier.
 
-    A thread's own join must not be interrupted: some Pythons then take the thread for ended.
+    Repeated interrupts end the program at once. `Thread.join` must not be interrupted: some versions of
+    Python then consider the thread as ended.
     """
-    for _ in range(_INSISTS):
+    for _ in range(_INTERRUPTS):
         with suppress(KeyboardInterrupt, SystemExit):
             ended.acquire()
             return
@@ -107,7 +105,7 @@ def _wait(ended: Semaphore) -> None:
 
 
 def _reporter(job: Job, watch: Watch | None, stop: Event) -> Callable[[int], None]:
-    """Report that a job begins; return what reports its frames, and gives the job up when the batch ends."""
+    """Report the start of a job; return a function that reports its frames and stops it with the batch."""
 
     def report(frames: int) -> None:
         if stop.is_set():

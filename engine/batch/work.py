@@ -1,4 +1,4 @@
-"""One recording of a batch, from file to file: what every scheduler calls."""
+"""One job of a batch, from file to file, as run by every scheduler."""
 
 from __future__ import annotations
 
@@ -31,52 +31,49 @@ _KEPT = "there already"
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of a job. It can be pickled.
+    """The outcome of a job; can be pickled.
 
-    It is kept if the result was there already, made of the same recording with the same parameters.
+    A result is kept if it was computed from the same recording with the same parameters.
     """
 
     job: Job
     state: State
-    message: str  # one line: what the result holds, or what is wrong and the remedy
+    message: str  # one line: a summary of the result, or the problem and the remedy
     seconds: float
-    bytes: int = 0  # of frames, unpacked, that were reconstructed
-    device: str = ""  # its title
-    motion: str = ""  # of the recording, if it could be opened
+    bytes: int = 0  # size of the reconstructed frames, uncompressed
+    device: str = ""  # title of the device
+    motion: str = ""  # motion of the recording, if it could be opened
 
 
 def find_settled(job: Job, plan: Plan) -> Outcome | None:
-    """Return what became of a job with which there is nothing to do, for which no device is needed.
-
-    Its result is there already, or its recording is not.
-    """
-    there = isinstance(job.source, Url) or os.path.exists(job.source)  # noqa: PTH110  # which never raises
-    if there and not os.path.exists(job.target):  # noqa: PTH110
+    """Return the outcome of a job that needs no device: the result exists, or the recording does not."""
+    exists = isinstance(job.source, Url) or os.path.exists(job.source)  # noqa: PTH110  # which never raises
+    if exists and not os.path.exists(job.target):  # noqa: PTH110
         return None
     start = time.perf_counter()
     try:
         with io.open_recording(job.source, memory_limit=plan.memory_limit, **plan.opening) as source:
-            made, motion = _is_made(job, source, plan.digest(source.motion)), source.motion
+            valid, motion = _has_result(job, source, plan.digest(source.motion)), source.motion
     except InputError as error:
         return Outcome(job, "failed", str(error), time.perf_counter() - start)
     except Exception:
-        return None  # who does the job says what is wrong
-    return Outcome(job, "kept", _KEPT, time.perf_counter() - start, motion=motion) if made else None
+        return None  # `run_job` reports the error
+    return Outcome(job, "kept", _KEPT, time.perf_counter() - start, motion=motion) if valid else None
 
 
 def run_job(
     job: Job, plan: Plan, device: str | Device | None = None, progress: Progress | None = None
 ) -> Outcome:
-    """Make a job's result, unless it is there already.
+    """Compute and save a job's result, unless it exists.
 
-    Whatever goes wrong with one recording is in the outcome, not raised, so that the others go on.
+    Errors are returned in the outcome, not raised, so that the batch continues.
     """
     start = time.perf_counter()
     outcome = Outcome(job, "failed", "", 0.0)
     try:
         with io.open_recording(job.source, memory_limit=plan.memory_limit, **plan.opening) as source:
             outcome = replace(outcome, motion=source.motion)
-            outcome = _done(outcome, source, plan, device, progress)
+            outcome = _compute(outcome, source, plan, device, progress)
     except (InputError, NotConverged, DeviceError) as error:
         outcome = replace(outcome, message=str(error))
     except MemoryError as error:
@@ -88,23 +85,23 @@ def run_job(
     return replace(outcome, seconds=time.perf_counter() - start)
 
 
-def _done(
+def _compute(
     outcome: Outcome, source: Recording, plan: Plan, device: str | Device | None, progress: Progress | None
 ) -> Outcome:
-    """Make the result of an open recording, or find it made."""
+    """Compute and save the result of an open recording, unless it exists."""
     target, digest = outcome.job.target, plan.digest(source.motion)
-    if _is_made(outcome.job, source, digest):
+    if _has_result(outcome.job, source, digest):
         return replace(outcome, state="kept", message=_KEPT)
     with as_input_error(f"{target.parent} cannot be made", "choose another folder for results"):
         target.parent.mkdir(parents=True, exist_ok=True)
     io.check_output(target, outcome.job.source)
     opened = open_device(device)
-    with naming(source):  # raises if the file was written to meanwhile
+    with naming(source):  # raises if the file has been modified
         result = run_class(
             plan.kind(source.motion), source, progress, device=opened, **plan.options(source.motion)
         )
-    signed: dict[str, ProcessValue] = {**result.process, "batch_parameters": digest}
-    io.save_result(result.assign(process=signed), target)
+    process: dict[str, ProcessValue] = {**result.process, "batch_parameters": digest}
+    io.save_result(result.assign(process=process), target)
     return replace(
         outcome,
         state="done",
@@ -114,35 +111,34 @@ def _done(
     )
 
 
-def _is_made(job: Job, source: Recording, digest: str) -> bool:
-    """Tell whether a job's result is there, whole, and of this recording and these parameters."""
+def _has_result(job: Job, source: Recording, digest: str) -> bool:
+    """Return whether a job has a valid result, of this recording and these parameters."""
     if not job.target.exists():
         return False
-    wanted = {
+    signature = {
         "batch_parameters": digest,
         "source_fingerprint": source.fingerprint(),
         "source_modified": source.modified,
     }
     try:
-        return open_process(job.target, *wanted) == wanted
+        return open_process(job.target, *signature) == signature
     except InputError:
-        return False  # damaged, or something else: it is made anew
+        return False  # damaged, or another file: it is replaced
 
 
-# Of malloc.h of the GNU C library.
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
-_LARGE = 8 << 20  # room for frames is larger, and often not touched: that costs nothing only if it is new
-_SPARE = 256 << 20
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # parameters of mallopt, from malloc.h of the GNU C library
+_LARGE = 8 << 20  # bytes: larger blocks, such as those of frames, are returned to the system
+_CACHE = 256 << 20  # bytes of freed memory that the process keeps
 
 
 def keep_memory() -> None:
-    """Let this process keep pieces of memory up to 8 MiB that are freed, 256 MiB in all, for the next file.
+    """Let this process keep freed blocks of up to 8 MiB, 256 MiB in total, for the next file.
 
-    The GNU C library gives a map's memory back to the system when the map is gone, and gets it again, page by
-    page and full of zeros, for the next one. That took a third of the time of small recordings: 4100 pages of
-    each of 32 x 640 x 480. With another C library nothing is done.
+    Otherwise the GNU C library returns the memory of each map to the system, and gets it again page by page,
+    filled with zeros. That took a third of the time of small recordings (4100 pages for 32 x 640 x 480).
+    Other C libraries are not affected.
     """
     tune = getattr(ctypes.CDLL(None), "mallopt", None)
     if tune is not None:
         tune(_MMAP_THRESHOLD, _LARGE)
-        tune(_TRIM_THRESHOLD, _SPARE)
+        tune(_TRIM_THRESHOLD, _CACHE)

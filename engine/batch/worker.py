@@ -1,4 +1,4 @@
-"""A worker of a Dask cluster: whether it can take part in a batch, its share of the machine, a job on it."""
+"""A worker of a Dask cluster: the check whether it can take part, its share of the machine, and its jobs."""
 
 from __future__ import annotations
 
@@ -22,16 +22,15 @@ from mirrorskin.kernels.device import Device, list_devices, open_device
 from mirrorskin.kernels.errors import DeviceError
 
 RESOURCE = "mirrorskin"
-"""Workers that can take part have one of it and each job needs one, so that they do one job at a time. Also
-the topic of the event that says why a worker cannot."""
+"""Dask resource: an enlisted worker has one and each job needs one, so that a worker runs one job at a time.
+Also the topic of the events with the reasons why workers are left out."""
 
-
-_NUMBERS = f"\0mirrorskin-{os.getuid()}-worker-"  # of sockets that are in no folder (Linux, unix(7))
+_NUMBERS = f"\0mirrorskin-{os.getuid()}-worker-"  # names of abstract sockets, which are not files (unix(7))
 
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """What a worker has of its machine."""
+    """A worker's share of its machine."""
 
     device: Device
     cores: int
@@ -39,7 +38,7 @@ class Share:
 
 
 class Enlist(WorkerPlugin):
-    """Finds out whether a worker can take part: those that are there, and those that come later."""
+    """Checks whether a worker can take part; Dask runs it on current and on later workers."""
 
     program: str
     sizes: Mapping[Path, int]
@@ -49,9 +48,11 @@ class Enlist(WorkerPlugin):
         self.program, self.sizes, self.trace = program, sizes, trace
 
     async def setup(self, worker: Any) -> None:
-        """Give the worker what jobs need if it can do them; Dask calls this."""
-        own = version("mirrorskin")
-        problem = None if own == self.program else f"has mirrorskin {own}, and the batch {self.program}"
+        """Give the worker the resource that jobs need if it can take part; called by Dask."""
+        installed = version("mirrorskin")
+        problem = None
+        if installed != self.program:
+            problem = f"has mirrorskin {installed}, and the batch {self.program}"
         problem = problem or await check_worker(self.sizes, self.trace, worker)
         if problem is not None:
             worker.log_event(RESOURCE, f"worker {worker.address} is left out: it {problem}")
@@ -59,14 +60,14 @@ class Enlist(WorkerPlugin):
 
 
 async def check_worker(sizes: Mapping[Path, int], trace: Path, dask_worker: Any) -> str | None:
-    """Return what keeps a worker from taking part, and the remedy: the predicate of a sentence about it."""
+    """Return the reason why a worker cannot take part, and the remedy: the predicate of a sentence."""
     host = dask_worker.address.rpartition(":")[0]
     workers = [other for other in await dask_worker.scheduler.ncores() if other.rpartition(":")[0] == host]
     return await asyncio.to_thread(_problem, sizes, trace, dask_worker, max(1, len(workers)))
 
 
 def run_on_worker(job: Job, plan: Plan) -> Outcome:
-    """Make the result of a job, whose paths are absolute, on the device of this worker."""
+    """Run a job, whose paths are absolute, on the device of this worker."""
     worker: Any = get_worker()
     share: Share = worker.mirrorskin_share
     opening = {"threads": share.cores, **plan.opening}
@@ -74,33 +75,33 @@ def run_on_worker(job: Job, plan: Plan) -> Outcome:
 
 
 def dask_setup(worker: object) -> None:
-    """Leave Ctrl-C, which a terminal sends to workers as well, to the batch that they belong to.
+    """Ignore Ctrl-C, which a terminal also sends to workers: the batch handles it.
 
-    Dask calls it in each worker that loads this module at its start.
+    Dask calls this in each worker that preloads the module.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def take_share(workers: int) -> Share:
-    """Return the next share of a machine that has so many workers.
+    """Return the next share of a machine with a number of workers.
 
-    PoCL asks once in a process how many threads it may have, so this must be the first to look at OpenCL.
+    PoCL reads its number of threads once per process, so this must precede any other use of OpenCL.
     """
     keep_memory()
     number, held = _take_number()
     cores = len(os.sched_getaffinity(0))
-    own = max(1, cores // workers + (number < cores % workers))
-    os.environ.setdefault("POCL_MAX_PTHREAD_COUNT", str(own))
+    threads = max(1, cores // workers + (number < cores % workers))
+    os.environ.setdefault("POCL_MAX_PTHREAD_COUNT", str(threads))
     gpus = [str(index) for index, device in enumerate(list_devices()) if device.kind == "gpu"]
     choice = None if "PYOPENCL_CTX" in os.environ or not gpus else gpus[number % len(gpus)]
-    return Share(open_device(choice), own, held)
+    return Share(open_device(choice), threads, held)
 
 
 def _take_number() -> tuple[int, int]:
-    """Return the first number that no other worker of this machine has, and what holds it."""
+    """Return the first number that no other worker of this machine has, and the socket that reserves it."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as held:
         for number in count():
-            with suppress(OSError):  # it is taken
+            with suppress(OSError):  # the number is in use
                 held.bind(f"{_NUMBERS}{number}")
                 return number, held.detach()
     raise AssertionError

@@ -1,10 +1,10 @@
-"""The live loop: from a source that does not wait into an operation, within a bounded time."""
+"""The live loop, which pushes frames of a camera into an operation with bounded latency."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
@@ -12,16 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.live.operation import LiveOperation
-from mirrorskin.engine.live.status import (
-    PUSHED,
-    RAISED,
-    SHOWN,
-    UPDATED,
-    WAITED,
-    Monitor,
-    Status,
-    Update,
-)
+from mirrorskin.engine.live.status import PUSHED, RAISED, SHOWN, UPDATED, WAITED, Monitor, Status, Update
 from mirrorskin.engine.streaming import push_block
 from mirrorskin.io import Block, InputError, LiveSource
 
@@ -31,18 +22,18 @@ LATENCY = 0.1
 OnUpdate = Callable[[Update, Status], None]
 Mark = Callable[[int, NDArray[np.bool_]], None]
 
-_INTERVALS = 32  # between frames, from which the next one's time is expected
-_PATIENCE = 0.01  # seconds that an update waits at least for maps that take long
-_MARGIN = 0.001  # seconds before that, in which nothing is begun any more
+_INTERVALS = 32  # number of frames from which the frame rate is estimated
+_PATIENCE = 0.01  # seconds: least time that an update waits for slow maps
+_MARGIN = 0.001  # seconds before the next expected frame in which no work is started
 
 
 class Loop:
-    """Push the frames of a live source into an operation; the status can also be read after an exception.
+    """Push the frames of a live source into an operation; the status is available after an exception, too.
 
     *Policy.* All waiting frames are taken at once. Frames that are older than ``latency`` are skipped, except
     for the newest one; frames that the source has lost are counted as dropped. An update follows each push,
-    at most ``updates`` per second. The time until the next frame is expected is used for what can wait. So
-    nothing queues up, and each frame is pushed once, skipped or dropped, and counted.
+    at most ``updates`` per second. Low-priority work is done until the next frame is expected. So no queue
+    grows, and each frame is counted as pushed, skipped or dropped.
 
     Parameters
     ----------
@@ -58,9 +49,10 @@ class Loop:
     stop : callable, optional
         Called after each push; the loop ends when it returns True.
     mark : callable, optional
-        Called with the number of a first frame, and which from there on were used: ``StreamRecorder.mark``.
+        Called with the number of the first frame of a block and a mask of the used ones, such as
+        ``StreamRecorder.mark``.
     guard : callable, optional
-        Returns a context in which frames are pushed and marked, so that nothing interrupts that.
+        Returns a context in which frames are pushed and marked, to protect this from interrupts.
 
     Raises
     ------
@@ -92,15 +84,15 @@ class Loop:
         self._newest: tuple[float, float, NDArray[Any]] | None = None  # its time, position and picture
         self._pending = False
         self._times: deque[float] = deque(maxlen=_INTERVALS)
-        self._arrived: deque[float] = deque(maxlen=_INTERVALS)  # when the newest frames of updates did
+        self._arrived: deque[float] = deque(maxlen=_INTERVALS)  # times of the newest frames of updates
 
     @property
     def status(self) -> Status:
-        """What was counted and timed so far."""
+        """Counts and times so far."""
         return self._monitor.status(fresh=True)
 
     def run(self) -> Status:
-        """Push until the source ends, or ``stop`` says so."""
+        """Push until the source ends, or ``stop`` returns True."""
         while (block := self._source.read(self._operation.room)) is not None:
             self._take(block)
             if self._stop is not None and self._stop():
@@ -113,7 +105,7 @@ class Loop:
         return self.status
 
     def _take(self, block: Block) -> None:
-        """Push the frames of a block that are to be used, and mark all."""
+        """Push the frames of a block, except for those that are skipped, and mark them."""
         now, count = self._source.now(), len(block.frames)
         time = np.full(count, now) if block.time is None else block.time
         used = (now - time <= self._latency) | (np.arange(count) == count - 1)
@@ -122,8 +114,9 @@ class Loop:
         self._times.extend(time.tolist())
         with self._guard():
             self._monitor.took(now, count, int(np.count_nonzero(used)), block.dropped)
-            for part in _runs(used):
-                push_block(self._operation, block, part)
+            edges = np.flatnonzero(np.diff(used, prepend=False, append=False))
+            for start, stop in edges.reshape(-1, 2).tolist():  # contiguous frames
+                push_block(self._operation, block, slice(start, stop))
             if self._mark is not None:
                 self._mark(block.index, used)
         if used.any():
@@ -137,16 +130,17 @@ class Loop:
     def _update(self) -> None:
         if not self._pending or self._newest is None:
             return
-        begun = self._source.now()
+        started = self._source.now()
         (at, position, picture), frames = self._newest, self._monitor.used
         maps = self._operation.maps(max(_PATIENCE, self._idle()))
         update = Update(frames, at, self._source.motion, position, picture.copy(), **maps)
         done = self._source.now()
-        self._updated, self._pending = begun, False
+        self._updated, self._pending = started, False
         self._monitor.updated()
-        self._monitor.time(UPDATED, done - begun)
+        self._monitor.time(UPDATED, done - started)
         self._arrived.append(self._taken)
-        if any(one is not None for one in (update.height, update.normals, update.displacement, update.slope)):
+        shown = update.height, update.normals, update.displacement, update.slope
+        if any(values is not None for values in shown):
             self._monitor.time(SHOWN, done - self._taken)
         if update.height is not None:
             lag = min(update.height_lag, len(self._arrived) - 1)
@@ -160,10 +154,3 @@ class Loop:
             return 0.0
         interval = (self._times[-1] - self._times[0]) / (len(self._times) - 1)
         return self._times[-1] + interval - _MARGIN - self._source.now()
-
-
-def _runs(used: NDArray[np.bool_]) -> Iterator[slice]:
-    """Yield the frames that are used, in runs that follow each other."""
-    edges = np.flatnonzero(np.diff(used, prepend=False, append=False))
-    for start, stop in edges.reshape(-1, 2).tolist():
-        yield slice(start, stop)

@@ -1,4 +1,4 @@
-"""An operation, or a method, while the body moves."""
+"""Live operation: an operation or a method, and the source of its frames."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError, LiveSource, Result
 from mirrorskin.io.layout import POSITIONS
 
-_FRAMES = 64  # that may wait to be pushed at once
+_FRAMES = 64  # largest number of frames of a push
 _SHOWN = ("height", "normals", "contact", "edges", "displacement", "slope", "height_lag", "offset_unknown")
 
 
 class LiveOperation(ThreadSafe):
-    """What `Loop` pushes frames into: an operation or a method, and the source that its frames come from.
+    """An operation or a method that `Loop` pushes frames into, and the source of these frames.
 
     Parameters
     ----------
     source : LiveSource
-        Options that are not given are taken from its header and calibration, where these have them.
+        Options that are not given are taken from its header and calibration, if available.
     operation : Operation or Method
-        A method's steps are applied when the result is asked for.
+        The steps of a method are applied by `result`.
     every : int
         Only frames whose number is a multiple of this are used.
 
     Raises
     ------
     mirrorskin.io.InputError
-        The operation does not apply to the source's motion, or needs what is unknown while the body moves.
+        The operation does not apply to the source's motion, or needs data that are not available live.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class LiveOperation(ThreadSafe):
         return self.operation.room
 
     def warm(self) -> None:
-        """Compile and try all kernels, so that the first frames need not wait for that."""
+        """Compile and run all kernels, so that the first frames are not delayed."""
         self.operation.warm()
 
     def push(self, frames: NDArray[Any], **positions: Any) -> None:
@@ -90,23 +90,25 @@ class LiveOperation(ThreadSafe):
             self.operation.push(frames, **positions)
 
     def maps(self, seconds: float = math.inf, /) -> Maps:
-        """Return the maps of the frames so far that a display shows; none before they are determined."""
+        """Return the maps of the frames so far for a display; none before they are determined."""
         try:
             with naming(self._source):
-                found = self.operation.preview(seconds)
+                preview = self.operation.preview(seconds)
         except InputError:
             return {}
-        names = {name: found.name_of(name) or name for name in _SHOWN} if isinstance(found, Result) else {}
-        maps = {name: found.get(names.get(name, name)) for name in _SHOWN}
-        if maps["offset_unknown"] is not None:  # of each piece, or of all
+        names = {}
+        if isinstance(preview, Result):
+            names = {name: preview.name_of(name) or name for name in _SHOWN}
+        maps = {name: preview.get(names.get(name, name)) for name in _SHOWN}
+        if maps["offset_unknown"] is not None:  # one flag per piece, or one for all
             maps["offset_unknown"] = bool(np.any(maps["offset_unknown"]))
         contact, size = maps["contact"], self._source.header.pixel_size
         area = None if contact is None or size is None else float(np.count_nonzero(contact)) * math.prod(size)
-        shown = {name: one for name, one in {**maps, "contact_area": area}.items() if one is not None}
-        return cast(Maps, shown)
+        available = {**maps, "contact_area": area}.items()
+        return cast(Maps, {name: value for name, value in available if value is not None})
 
     def spare(self, seconds: float) -> None:
-        """Do what can wait, for some seconds at most."""
+        """Do low-priority work, for some seconds at most."""
         self.operation.spare(seconds)
 
     def reset(self) -> None:
@@ -114,7 +116,7 @@ class LiveOperation(ThreadSafe):
         self.operation.reset()
 
     def result(self) -> Result:
-        """Return all maps of the frames so far, and how they were computed.
+        """Return all maps of the frames so far, with provenance.
 
         Raises
         ------
@@ -128,7 +130,7 @@ class LiveOperation(ThreadSafe):
 
 
 def _live_plan(source: LiveSource, operation: Operation | Method, size: int) -> Plan:
-    """Return what is done with a source; ``size`` are the bytes of frames that may wait."""
+    """Return the plan for a source; ``size`` is the largest number of bytes of a push."""
     if isinstance(operation, Method):
         operation.check_motion(source)
         plan = operation.live_plan(source)

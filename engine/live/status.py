@@ -1,4 +1,4 @@
-"""What is known while the body still moves, and how well the work keeps up with the camera."""
+"""Updates of the maps while the body moves, and the status of the live loop."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from mirrorskin.io import Motion
 
 WAITED, PUSHED, UPDATED, SHOWN, RAISED = "waited", "push", "update", "frame to map", "frame to height"
 STAGES = (WAITED, PUSHED, UPDATED, SHOWN, RAISED)
-"""What is timed: a frame from its arrival until it was taken, a push of frames, an update, and from the
-newest frame's arrival until the maps that it is in; of heights, which may be of an earlier one, from that."""
+"""The timed stages: the wait of a frame from its arrival, a push, an update, and the delays of the maps and
+of the heights since the arrival of the newest frame that they include."""
 
-_KEPT = 4096  # times of a stage
-_LATELY = 1.0  # seconds over which a rate is counted
-_FRESH = 0.25  # seconds for which percentiles are returned again
+_KEPT = 4096  # number of times per stage
+_LATELY = 1.0  # seconds over which the rate is computed
+_FRESH = 0.25  # seconds for which percentiles are reused
 
 
 class Maps(TypedDict, total=False):
-    """Maps of the frames so far; see `Update`. Those that are not known, or not yet, are missing or None."""
+    """Maps of the frames so far; see `Update`. Unavailable maps are missing or None."""
 
     height: NDArray[np.float32] | None
     normals: NDArray[np.float32] | None
@@ -40,41 +40,38 @@ class Maps(TypedDict, total=False):
 
 @dataclass(frozen=True, slots=True)
 class Update:
-    """What is known after the frames so far.
-
-    Maps are the receiver's own: nothing writes to them any more. Those that are not known, or not yet, are
-    None.
+    """Maps of the frames so far. Unavailable maps are None; no other object writes to the maps.
 
     Attributes
     ----------
     frames : int
-        That were used so far.
+        Number of frames used so far.
     time : float
-        Of the newest of them, seconds on the scale of ``Block.time``; NaN where the source has none.
+        Time of the newest frame, seconds on the scale of ``Block.time``; NaN if the source has no times.
     motion : {"vertical", "axial", "horizontal", "twist"}
     position : float
-        Of the body in the newest frame: travel, mm; phase, twist or, of a body that rocks, tilt, radians; of
-        a slide the length of its displacement, mm.
+        Position of the body in the newest frame: travel, mm; phase, twist or, of a body that rocks, tilt,
+        radians; of a slide, the length of the displacement, mm.
     picture : ndarray, (H, W), uint8, uint16 or float32
         The newest frame, raw counts.
     height : ndarray, (H, W), float32
-        Millimetres; NaN where there is no answer.
+        Millimetres; NaN where undefined.
     height_lag : int
-        Updates since the one whose frames the heights are of.
+        Number of updates since the frames of the heights.
     normals : ndarray, (H, W, 3), float32
-        Unit vectors; NaN where there is no answer.
+        Unit vectors; NaN where undefined.
     contact : ndarray, (H, W), uint8
-        1 where sheet and object touch: of a press so far, of a rotation in all frames of its window.
+        1 where sheet and object touch: at any time of a press, or in all frames of a rotation's window.
     edges : ndarray, (H, W), uint8
-        1 on thin lines where the normal jumps or contact ends; of the last frames for which there was time.
+        1 on thin lines where the normal jumps or contact ends; may be of earlier frames.
     contact_area : float
         Square millimetres.
     offset_unknown : bool
-        Whether heights are relative, the mean of each connected piece being 0.
+        Whether heights are relative, with a mean of 0 for each connected piece.
     displacement : ndarray, (H, W, 2), float32
-        Millimetres along x and y that the skin has moved since the first frame.
+        Displacement of the skin along x and y since the first frame, mm.
     slope : ndarray, (H, W), float32
-        Of a body that rocks: millimetres that the surface rises for each along its way.
+        Of a body that rocks: slope of the surface along the direction of rocking.
     """
 
     frames: int
@@ -95,7 +92,7 @@ class Update:
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """Median and 99th percentile of the seconds that a stage took, of the last few thousand; NaN before."""
+    """Median and 99th percentile of the last 4096 times of a stage, seconds; NaN without any."""
 
     median: float
     p99: float
@@ -103,23 +100,23 @@ class Latency:
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """How well the work keeps up with the camera.
+    """Counts and times of the live loop.
 
     Attributes
     ----------
     frames : int
-        That were taken from the source: ``used`` and ``skipped``.
+        Frames taken from the source: ``used`` and ``skipped``.
     used : int
-        That were pushed into the estimator.
+        Frames pushed into the operation.
     skipped : int
-        That were too old when they were taken, or more than the estimator asks for.
+        Frames that were too old, or omitted because of ``every``.
     dropped : int
-        That the camera or its ring lost before they could be taken.
+        Frames that the camera or its ring buffer lost before they were taken.
     updates : int
     seconds : float
-        Since the first frame was taken.
+        Time since the first frame was taken.
     rate : float
-        Frames a second that were taken lately.
+        Frames taken per second, over the last second.
     latency : mapping of str to Latency
         By stage; see `STAGES`.
     """
@@ -141,19 +138,19 @@ class Monitor(ThreadSafe):
         self._counts = dict.fromkeys(("frames", "used", "skipped", "dropped", "updates"), 0)
         self._times: dict[str, deque[float]] = {stage: deque(maxlen=_KEPT) for stage in STAGES}
         self._lately: deque[tuple[float, int]] = deque()
-        self._begun = self._now = math.nan
+        self._started = self._now = math.nan
         self._latency: dict[str, Latency] = {}
         self._computed = -math.inf
 
     @property
     def used(self) -> int:
-        """Frames that were pushed so far."""
+        """Number of frames pushed so far."""
         return self._counts["used"]
 
     def took(self, now: float, frames: int, used: int, dropped: int) -> None:
-        """Count frames that were taken from the source."""
-        if math.isnan(self._begun):
-            self._begun = now
+        """Count frames taken from the source."""
+        if math.isnan(self._started):
+            self._started = now
         self._now = now
         counts = {"frames": frames, "used": used, "skipped": frames - used, "dropped": dropped}
         for name, count in counts.items():
@@ -167,23 +164,20 @@ class Monitor(ThreadSafe):
         self._counts["updates"] += 1
 
     def time(self, stage: str, *seconds: float) -> None:
-        """Note how long a stage took, once or some times; NaN is not noted."""
-        self._times[stage].extend(one for one in seconds if math.isfinite(one))
+        """Record durations of a stage; NaN is ignored."""
+        self._times[stage].extend(duration for duration in seconds if math.isfinite(duration))
 
     def status(self, fresh: bool = False) -> Status:
         """Return counts and times so far; percentiles may be a quarter of a second old, unless ``fresh``."""
         if fresh or not self._now - self._computed < _FRESH:
             self._latency = {stage: _latency(times) for stage, times in self._times.items()}
             self._computed = self._now
-        seconds = 0.0 if math.isnan(self._begun) else self._now - self._begun
-        return Status(**self._counts, seconds=seconds, rate=self._rate(), latency=dict(self._latency))
-
-    def _rate(self) -> float:
-        """Return the frames a second that were taken lately."""
-        if len(self._lately) < 2:
-            return 0.0
-        (first, before), (last, after) = self._lately[0], self._lately[-1]
-        return (after - before) / (last - first) if last > first else 0.0
+        seconds = 0.0 if math.isnan(self._started) else self._now - self._started
+        rate = 0.0
+        if len(self._lately) > 1:
+            (first, before), (last, after) = self._lately[0], self._lately[-1]
+            rate = (after - before) / (last - first) if last > first else 0.0
+        return Status(**self._counts, seconds=seconds, rate=rate, latency=dict(self._latency))
 
 
 def _latency(times: deque[float]) -> Latency:

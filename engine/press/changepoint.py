@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
@@ -11,18 +10,17 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.frames import Noise, reference_pair
 from mirrorskin.engine.operation import travel_function
-from mirrorskin.engine.press.crossing import Event, PressOperation
-from mirrorskin.engine.press.onset import STATUS, Onset
+from mirrorskin.engine.press.crossing import EVENT_MAPS, Event, PressOperation
+from mirrorskin.engine.press.onset import Onset
 from mirrorskin.engine.tiling import Band, Staged, cut_into_bands, join_rows, room_of
-from mirrorskin.io import InputError, Map, Result
-from mirrorskin.io.maps import TABLE
+from mirrorskin.io import InputError, Result
 from mirrorskin.io.positions import check_travel
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.changepoint import DECIDED, INVALID, REACH, SLOTS, UNIT
 from mirrorskin.kernels.device import C_TYPES, Kernel
 
-_EVIDENCE = 12.0  # log of how much likelier the samples must be with a change than without
-_RELEASED = np.array([0, 1, 3, 2], np.uint8)  # what never turns dark is light to the end, and so on
+_EVIDENCE = 12.0  # least logarithm of the likelihood ratio of a change
+_RELEASED = np.array([0, 1, 3, 2], np.uint8)  # status of a release, from that of a press
 
 
 class ChangePoint(PressOperation):
@@ -45,25 +43,17 @@ class ChangePoint(PressOperation):
     threshold: float = Onset.threshold
     event: Event = Onset.event
 
-    height = TABLE["height"]
-    status = TABLE["status"]
-    frame = TABLE["frame"]
-
     @property
     def passes(self) -> int:
         """How often all frames are pushed: twice if a level is unknown."""
         return 2 if self.dark is None or self.bright is None else 1
 
-    @property
-    def declarations(self) -> Mapping[str, Map]:
-        """Declarations of the maps; the legend of the status depends on the event."""
-        return {**self.maps, "status": STATUS[self.event]}
-
     def check_options(self) -> None:
         """Raise InputError unless a change can be searched for with this threshold and hold."""
         if not 0 < self.threshold < 1:
-            what = "a change-point needs a share between 0 and 1, such as 0.5"
-            raise InputError(f"threshold {self.threshold}: {what}")
+            raise InputError(
+                f"threshold {self.threshold}: a change-point needs a share between 0 and 1, such as 0.5"
+            )
         if self.hold > REACH:
             raise InputError(f"hold {self.hold}: a change-point needs a number of frames from 1 to {REACH}")
 
@@ -73,7 +63,7 @@ class ChangePoint(PressOperation):
         self._noise = Noise(self.noise, dtype.kind == "u")
         self._length = max(1, self.memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))
         self._bands = cut_into_bands(self.device, shape, dtype, self._planes(), self._length)
-        # A release is a change as well, from bright to dark: its first level is the bright one.
+        # A release is a change from bright to dark: its first level is the bright one.
         self._level = 1 - self.threshold if self._release else self.threshold
         self._travel: list[float] = []
         self._start = np.zeros(shape, np.int32)
@@ -90,7 +80,7 @@ class ChangePoint(PressOperation):
         return room_of(self._bands, self._length)
 
     def _planes(self) -> dict[str, DTypeLike]:
-        """Return what is kept of each pixel."""
+        """Return the state of each pixel on the device; see ``changepoint.cl``."""
         integers = dict.fromkeys(("start", "excess", "below", "since"), np.int32)
         floats = dict.fromkeys(("dark", "gain", "height", "sigma"), np.float32)
         twice = dict.fromkeys(("mean", "mean_rest", "total", "total_rest", "score"), np.float32)
@@ -141,24 +131,24 @@ class ChangePoint(PressOperation):
                     self._scan(band, staged, first + staged.frames.start)
 
     def _scan(self, band: Band, staged: Staged, first: int) -> None:
-        """Let the kernel of this pass go through frames of a band."""
-        known: dict[str, Any] = {"first": first}
+        """Run the kernel of this pass on frames of a band."""
+        arguments: dict[str, Any] = {"first": first}
         if self.passes == 1:
             name, maps = "changepoint_scan", "dark gain start excess below ring"
             level = round(self._level * UNIT)
-            known |= {"level": level, "least": self.hold * (UNIT - level), "quiet": self._quiet()}
+            arguments |= {"level": level, "least": self.hold * (UNIT - level), "quiet": self._quiet()}
         elif self._weight is None:
-            name, maps, known = "changepoint_sum", "total total_rest", {}
+            name, maps, arguments = "changepoint_sum", "total total_rest", {}
         else:
             name, maps = "changepoint_split", "mean mean_rest total total_rest start since score ring"
-            known |= {"weight": self._weight}
-        known |= {one: band.maps[one] for one in maps.split()}
+            arguments |= {"weight": self._weight}
+        arguments |= {plane: band.maps[plane] for plane in maps.split()}
         self._kernel(name)(
             self._items(band),
             frames=staged.array,
             count=staged.count,
             pixels=band.pixels,
-            **known,
+            **arguments,
             moved=staged.count * band.pixels * self.dtype.itemsize,
         )
 
@@ -171,13 +161,13 @@ class ChangePoint(PressOperation):
         answered = (status == 1) | (status == 3)
         status = _RELEASED[status] if self._release else status
         frame = np.where(answered, frame, np.int32(-1))
-        found = {"height": height, "height_sigma": sigma, "status": status, "frame": frame}
-        return Result(found, process={"noise": noise}, declarations=self.declarations)
+        named = dict(zip(EVENT_MAPS, (height, sigma, status, frame), strict=True))
+        return Result(named, process={"noise": noise}, declarations=self.declarations)
 
     def _finish(self, band: Band, noise: float) -> list[NDArray[Any]]:
         """Return height, sigma, status and frame of a band's rows."""
         if self.passes == 2:
-            self._take_levels(band, noise)
+            self._estimate_levels(band, noise)
         names = ["start", "excess", "below", "since", "dark", "gain", "ring", "height", "sigma", "status"]
         maps: dict[str, Any] = {name: band.maps[name] for name in names}
         with band.resident():
@@ -197,15 +187,15 @@ class ChangePoint(PressOperation):
             return [*answers, maps["start"].download().copy()]
 
     def _travel_pairs(self) -> Array:
-        """Hand the travel to the device as (T, 2) floats, whose sums are as good as float64."""
+        """Copy the travel to the device as (T, 2) floats, whose sums have the precision of float64."""
         pairs = self.device.array("travel", (len(self._travel), 2), np.float32)
         pairs.host[:, 0] = self._travel
         pairs.host[:, 1] = np.array(self._travel, np.float64) - pairs.host[:, 0]
         pairs.upload()
         return pairs
 
-    def _take_levels(self, band: Band, noise: float) -> None:
-        """Turn the best splits into levels, where noise alone would not make such a split."""
+    def _estimate_levels(self, band: Band, noise: float) -> None:
+        """Compute the levels from the best splits, where they are significant."""
         count = len(self._travel)
         with band.resident():
             score, mean, start = (
@@ -231,7 +221,7 @@ class ChangePoint(PressOperation):
         return -1 if self._release else 1
 
     def _quiet(self) -> float:
-        """Square counts of excess that noise alone would make; a first frame alone decides nothing."""
+        """Return the squared counts that noise alone may add up to; 0 before the second frame."""
         return _EVIDENCE * (self._noise.value or 0.0) ** 2
 
     def _items(self, band: Band) -> int:

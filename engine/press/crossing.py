@@ -1,7 +1,8 @@
-"""The search for a threshold crossing on a device, which operations of a press share (paper, section 3)."""
+"""Search for a threshold crossing on a device, shared by the operations on a press (paper, section 3)."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
@@ -12,6 +13,8 @@ from mirrorskin.engine.frames import Noise, reference_maps
 from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.options import option
 from mirrorskin.engine.tiling import Band, Planes, Staged, cut_into_bands, join_rows, room_of
+from mirrorskin.io import Map
+from mirrorskin.io.maps import TABLE, PressStatus, ReleaseStatus, status_of
 from mirrorskin.io.positions import check_travel
 from mirrorskin.io.types import FRAME_DTYPES
 from mirrorskin.kernels.device import C_TYPES, Device
@@ -22,20 +25,28 @@ if TYPE_CHECKING:
 
 Event = Literal["onset", "release"]
 
-_PLATEAU = 3.0  # sigmas by which a sample may differ from the plateau that it sits on
-_SURELY = 6.0  # sigmas by which a sample must miss the level so that its plateau is not near it
-_ROUNDING = 1e-12  # a threshold such as 0.55 is not exact: counts that reach it but for rounding are light
-_TILE = 4096  # pixels of a core's item: of long rows more is read at once, in 0.8 of the time of 1024
-_LONGEST = 2**30  # no stack is as long, and sums with frames' numbers stay in range
+STATUS: Mapping[str, Map] = {"onset": status_of(PressStatus), "release": status_of(ReleaseStatus)}
+"""Declaration of the status map of each event."""
+
+_PLATEAU = 3.0  # standard deviations: tolerance of a sample that belongs to a dark or light plateau
+_CLEARLY_DARK = 6.0  # standard deviations below the threshold: a sample whose plateau is not near it
+_ROUNDING = 1e-12  # tolerance of a threshold such as 0.55, which has no exact binary value
+_TILE = 4096  # pixels of a work-item on a CPU; 0.8 times the run time of 1024 for long rows
+_LONGEST = 2**30  # frames: limit of `hold`, so that sums of frame numbers do not overflow
 
 
 class PressOperation(Operation):
-    """Base of operations on a press: what is known of dark, light and noise."""
+    """Base of operations on a press: reference levels, noise, and the maps of an event."""
 
     motions = ("vertical",)
     dtypes = FRAME_DTYPES
     least_frames = 2
     on_device = long_blocks = True
+
+    height = TABLE["height"]
+    status = TABLE["status"]
+    frame = TABLE["frame"]
+    event: Event
 
     hold: int = option(
         default=2,
@@ -66,9 +77,16 @@ class PressOperation(Operation):
     )
 
     def configured_for(self, source: Source) -> Self:
-        """Return the operation with the source's own levels of dark and light, where none are given."""
+        """Return the operation with the source's levels of dark and light, where none are given."""
         levels = {name: getattr(source.header, name) for name in ("dark", "bright")}
-        return self.with_options(**{name: own for name, own in levels.items() if getattr(self, name) is None})
+        return self.with_options(
+            **{name: level for name, level in levels.items() if getattr(self, name) is None}
+        )
+
+    @property
+    def declarations(self) -> Mapping[str, Map]:
+        """Declarations of the maps; the legend of the status depends on the event."""
+        return {**self.maps, "status": STATUS[self.event]}
 
 
 class CrossingOperation(PressOperation):
@@ -80,17 +98,15 @@ class CrossingOperation(PressOperation):
     )
 
 
-class Found(NamedTuple):
-    """What a search found at each pixel.
+EVENT_MAPS = "height", "height_sigma", "status", "frame"
+"""Names of `EventMaps` in a result."""
 
-    Attributes
-    ----------
-    height, sigma : ndarray, (H, W), float32
-        Millimetres; NaN unless status is 1.
-    status : ndarray, (H, W), uint8
-        Codes of `mirrorskin.io.maps.PressStatus` or `mirrorskin.io.maps.ReleaseStatus`.
-    frame : ndarray, (H, W), int32
-        Number of the first frame after the event; -1 without one.
+
+class EventMaps(NamedTuple):
+    """The event at each pixel: height and its sigma, status, and number of the first frame after it.
+
+    Heights, mm, are NaN unless the status is 1 (see `mirrorskin.io.maps.PressStatus` and ``ReleaseStatus``);
+    frames are -1 without an event.
     """
 
     height: NDArray[np.float32]
@@ -102,7 +118,7 @@ class Found(NamedTuple):
 class Crossing:
     """Search for the crossing of one threshold on a device.
 
-    Options are those of ``operation``, which owns the search; the threshold may be another one.
+    It uses the options of ``operation``, except for the threshold.
     """
 
     def __init__(
@@ -123,50 +139,47 @@ class Crossing:
         self._length = max(1, operation.memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))
         self._bands = cut_into_bands(self.device, shape, dtype, self._planes(), self._length)
         self._travel = _TravelTable(self.device)
-        # The plateau that a run comes from: no reference says how light a pixel was before its release.
-        self._own_dark = self._release or dark is None
-        self._macros: dict[str, str | int] = {
-            "FRAME": C_TYPES[self._dtype.name],
-            "BITS": 8 * self._dtype.itemsize,
-        }
-        self._noise_of_bounds: float | None = None
-        self._set_levels(*reference_maps(dark, bright, shape, self._dtype), threshold)
+        # Of a release, the dark plateau is unknown: no reference specifies it.
+        self._dark_from_frames = self._release or dark is None
+        self._macros: dict[str, str | int] = {"FRAME": C_TYPES[dtype.name], "BITS": 8 * dtype.itemsize}
+        self._marked_noise: float | None = None
+        self._set_levels(*reference_maps(dark, bright, shape, dtype), threshold)
         self.reset()
 
     @cached_property
     def room(self) -> NDArray[Any]:
-        """Where a source may write the next frames, (n, H, W), not to be copied."""
+        """Array in which the next frames may be written before they are pushed, (n, H, W)."""
         return room_of(self._bands, self._length)
 
     def _planes(self) -> dict[str, Planes]:
-        """Return what is kept of each pixel."""
+        """Return the state of each pixel on the device; see ``onset.cl``."""
         return {
             "levels": Planes(2, np.float32),  # counts at the threshold, and of the dark plateau
-            "marks": Planes(3, self._dtype),  # the smallest sample that is light, not surely dark, near
-            "left": Planes(1, f"u{self._dtype.itemsize}"),  # frames after which nothing can change
-            "times": Planes(3, np.int32),  # where the run began; the last before surely dark, not near
+            "marks": Planes(3, self._dtype),  # least sample that is light, not clearly dark, near
+            "left": Planes(1, f"u{self._dtype.itemsize}"),  # frames until the pixel is finished
+            "times": Planes(3, np.int32),  # start of the run; last frames that were clearly dark, not near
             "answers": Planes(2, np.float32),  # height and sigma
             "status": Planes(1, np.uint8),
-            **({"samples": Planes(5, self._dtype)} if self._subframe else {}),  # around an open run
+            **({"samples": Planes(5, self._dtype)} if self._subframe else {}),  # those around an open run
         }
 
     def _set_levels(self, dark: NDArray[np.float32], bright: NDArray[np.float32], threshold: float) -> None:
-        """Turn references and threshold into each pixel's least light sample, in the frames' own type."""
+        """Compute the smallest sample of each pixel that counts as light, in the type of the frames."""
         share = threshold - _ROUNDING
         coarse = float(np.float32(share))
         for band in self._bands:
-            known: dict[str, Any] = {}
+            references: dict[str, Any] = {}
             for name, values in (("bright", bright), ("dark", dark)):
                 rows = values[band.rows] if values.ndim else values.reshape(1)
-                known |= {f"{name}s": self.device.seen(name, rows), f"{name}_step": values.ndim // 2}
+                references |= {f"{name}s": self.device.seen(name, rows), f"{name}_step": values.ndim // 2}
             with band.resident():
                 self._launch(
                     band, "onset_levels", "levels marks",
-                    release=self._release, share=coarse, share_rest=share - coarse, **known,
+                    release=self._release, share=coarse, share_rest=share - coarse, **references,
                 )  # fmt: skip
 
     def push(self, frames: NDArray[Any], travel: ArrayLike, lent: bool = False) -> None:
-        """Take in the next frames, (n, H, W), and the travel of each; InputError if it runs back."""
+        """Take in the next frames, (n, H, W), and the travel of each; InputError if it reverses."""
         first, last = self._travel.count, self._travel.values[-1:]
         self._travel.extend(check_travel(travel, len(frames), "travel", after=last, falls=self._release))
         self._noise.look(frames)
@@ -176,51 +189,51 @@ class Crossing:
             with band.resident():
                 for staged in band.stage(frames, lent):
                     self._scan(band, staged, first + staged.frames.start)
-        self._noise_of_bounds = self._noise.value
+        self._marked_noise = self._noise.value
 
     def _set_plateaus(self, band: Band, first: NDArray[Any] | None) -> None:
-        """Use the first frame as dark plateau, and the noise, once known, for what is surely dark."""
-        if first is not None and self._own_dark:
+        """Set the dark plateau from the first frame, and clearly dark samples once the noise is estimated."""
+        if first is not None and self._dark_from_frames:
             plateau = complement(first) if self._release else first
             band.write("levels", plateau[band.rows], plane=1)
         noise = self._noise.value
-        if noise is not None and noise != self._noise_of_bounds:
+        if noise is not None and noise != self._marked_noise:
             with band.resident():
-                self._launch(band, "onset_sure", "levels marks", tolerance=_SURELY * noise)
+                self._launch(band, "onset_sure", "levels marks", tolerance=_CLEARLY_DARK * noise)
 
     def _scan(self, band: Band, staged: Staged, first: int) -> None:
-        # From one frame no noise is estimated, and none is needed: it is taken for dark.
-        known = self._travel.arguments | self._tolerances(self._noise.value or 0.0)
-        known |= {"hold": self._hold, "release": self._release, "subframe": self._subframe, "first": first}
-        known |= {"frames": staged.array, "count": staged.count, "samples": band.maps.get("samples")}
+        noise = self._noise.value or 0.0  # not needed for a single frame, which is assumed to be dark
+        light = _PLATEAU * np.sqrt(2) * noise  # the plateau is a sample itself
+        dark = light if self._dark_from_frames else _PLATEAU * noise
+        arguments: dict[str, Any] = {"noise": noise, "dark_tolerance": dark, "light_tolerance": light}
+        arguments |= {"hold": self._hold, "release": self._release, "subframe": self._subframe}
+        arguments |= {"frames": staged.array, "count": staged.count, "samples": band.maps.get("samples")}
         moved = staged.count * band.pixels * self._dtype.itemsize
-        self._launch(band, "onset_scan", "marks left times levels answers status", moved, **known)
+        maps = "marks left times levels answers status"
+        self._launch(band, "onset_scan", maps, moved, first=first, **arguments, **self._travel.arguments)
 
-    def found(self, last: bool = False) -> Found:
-        """Return the maps of the frames so far; of the ``last`` ones without copies, before a `reset`."""
-        maps = [self._answers(band, last) for band in self._bands]
+    def event_maps(self, last: bool = False) -> EventMaps:
+        """Return the maps of the frames so far; without a copy if they are the ``last`` before a `reset`."""
+        maps = [self._band_maps(band, last) for band in self._bands]
         height, sigma, status, frame = (join_rows(parts) for parts in zip(*maps, strict=True))
-        return Found(height, sigma, status, np.maximum(frame, DARK, out=frame))
+        return EventMaps(height, sigma, status, np.maximum(frame, DARK, out=frame))
 
-    def _answers(self, band: Band, last: bool) -> list[NDArray[Any]]:
+    def _band_maps(self, band: Band, last: bool) -> list[NDArray[Any]]:
         """Return height, sigma, status and frame of a band's rows."""
         with band.resident():
             answers, status, times = (
                 band.detach(name) if last else band.maps[name].download()
                 for name in ("answers", "status", "times")
             )
-            found = [band.picture(plane) for plane in (answers[0], answers[1], status[0], times[0])]
-            return found if last else [plane.copy() for plane in found]
+            planes = [band.picture(plane) for plane in (answers[0], answers[1], status[0], times[0])]
+            return planes if last else [plane.copy() for plane in planes]
 
     def reset(self, noise: float | None = None) -> None:
-        """Forget the frames so far, and be ready for another press with the same references.
-
-        Its noise, counts, is estimated anew unless it is given.
-        """
+        """Prepare for another press with the same references and, if given, the same noise, counts."""
         self._travel.clear()
         self._noise.reset(noise)
-        if self._own_dark:  # what is near the level is looked for between it and the first frame
-            self._noise_of_bounds = None
+        if self._dark_from_frames:  # the marks depend on the first frame
+            self._marked_noise = None
 
     @property
     def travel(self) -> NDArray[np.float64]:
@@ -232,26 +245,20 @@ class Crossing:
         """Standard deviation of a sample, given or estimated, counts; 0 before the second frame."""
         return self._noise.value or 0.0
 
-    def _tolerances(self, noise: float) -> dict[str, float]:
-        """Return the noise, and what a sample may differ from the dark and the light plateau it sits on."""
-        light = _PLATEAU * np.sqrt(2) * noise  # from the plateau, which is a sample itself
-        dark = light if self._own_dark else _PLATEAU * noise
-        return {"noise": noise, "dark_tolerance": dark, "light_tolerance": light}
-
     def _launch(self, band: Band, name: str, maps: str, moved: int = 0, **arguments: Any) -> None:
-        """Run a kernel over a band; ``maps`` names those that it takes, ``moved`` the bytes of frames."""
+        """Run a kernel over a band; ``maps`` are names of its maps, ``moved`` the bytes of frames."""
         tile = _TILE if self.device.layout.tile > 1 else 1
         arguments |= {
             "pixels": band.pixels,
             "stride": band.stride,
-            **{one: band.maps[one] for one in maps.split()},
+            **{plane: band.maps[plane] for plane in maps.split()},
         }
         kernel = self.device.kernel("onset", name, **self._macros, TILE=tile)
         kernel(-(-band.pixels // tile), **arguments, moved=moved)
 
 
 class _TravelTable:
-    """The travel of all frames so far, as kernels look it up: itself, steps, since the first frame."""
+    """The travel of all frames so far in planes: travel, its steps, and the distance from the first frame."""
 
     def __init__(self, device: Device) -> None:
         self._device = device
@@ -260,7 +267,7 @@ class _TravelTable:
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """The planes of the table, and their length."""
+        """The table and its length, as kernel arguments."""
         return {"travel": self._table, "room": self._table.host.shape[1]}
 
     def clear(self) -> None:
@@ -277,9 +284,9 @@ class _TravelTable:
         count = old + len(travel)
         self._table.claim()
         if count > self._table.host.shape[1]:
-            known = self._table.host
+            old_table = self._table.host
             self._table = self._device.array("travel", (3, 2 * count), np.float32)
-            self._table.host[:, : known.shape[1]] = known
+            self._table.host[:, : old_table.shape[1]] = old_table
         self.values.extend(travel.tolist())
         self._table.host[:, old:count] = travel, steps, travel - self.values[0]
         self._table.upload()

@@ -1,4 +1,4 @@
-"""Heights of a press corrected for the elastomer: contact comes later than in eq. 3, light before contact."""
+"""Correction of a press for the elastomer: deeper contact than by eq. 3, and light before contact."""
 
 from __future__ import annotations
 
@@ -30,45 +30,48 @@ Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 LEARNED_AT = 0.5
-"""Share of the way from dark to bright that gels are learned with."""
+"""Threshold at which gels are calibrated, as a share of the range from dark to bright."""
 
 _FEWEST = 12  # cells that must have turned light
-_SAMPLED = 250  # cells whose onsets are used; more add nothing to so few splines
-_TRAVELS = 16  # at which the press is gone through
-# Third derivatives that surfaces usually have, 1/mm^2, in the first steps; the last from there on.
+_SAMPLED = 250  # cells whose onsets are fitted; the splines have too few coefficients to need more
+_TRAVELS = 16  # travels at which the press is simulated
+# Expected third derivatives of the surface in the first steps, 1/mm^2; the last value is kept.
 _BENDING = 0.1, 0.1, 0.3, 1.0
-_MOST_ROUNDS = 14
-_DAMPING, _STUCK = 1.0, 1e3  # at first, in units of steps; beyond the second nothing moves any more
-_STEP = 0.3  # mm that the surface may move in a round
-_SETTLED = 0.9  # of the cost of the round before: no better is good enough
-_SLOPE_ERROR = 0.006  # of the sheet, as cells so large resolve it
-_ROBUST = 2.0  # errors beyond which a cell counts less
-_MISFIT = 0.08  # median error of the slope beyond which the surface explains nothing
-_DEPTH = 0.6  # of a depth by eq. 3: half of it on a paraboloid, more on what is steeper
-_KNOWN = 0.01  # mm, of the heights that a first surface goes through
-_BEYOND = 0.3  # of the touch that may lie beyond the picture, where the object is a guess
-_SHARE_LEFT = 0.02  # of a change that is left, as the cells are coarse
-_FARTHEST = 0.05  # mm, standard deviation up to which heights beyond the contact are kept
-_RIDGE = 1e-12
+_MOST_ROUNDS = 14  # of Gauss-Newton steps
+_DAMPING, _STUCK = 1.0, 1e3  # initial damping, and damping above which the search ends; see `_STEP`
+_STEP = 0.3  # mm: largest change of the surface in a step
+_SETTLED = 0.9  # ratio of successive costs above which the search has converged
+_SLOPE_ERROR = 0.006  # standard deviation of the sheet's slope at the resolution of cells
+_ROBUST = 2.0  # Huber's limit, in units of `_SLOPE_ERROR`
+_MISFIT = 0.08  # largest median slope residual of an accepted fit
+_DEPTH = (
+    0.6  # initial depth over that of eq. 3; the exact ratio is 0.5 for a paraboloid, more for steeper tips
+)
+_INITIAL_ERROR = 0.01  # mm: standard deviation of heights in `_interpolate`
+_BEYOND = 0.3  # largest share of the contact outside the picture, where the object is extrapolated
+_SHARE_LEFT = 0.02  # standard deviation of a correction over the correction, from the size of cells
+_FARTHEST = 0.05  # mm: largest standard deviation of heights that are kept outside the contact
+_RIDGE = 1e-12  # relative
 
 
 def threshold_at(gel: Gel, x: ArrayLike, y: ArrayLike, azimuth: ArrayLike) -> Doubles:
-    """Return the zenith that turns a pixel light.
+    """Return the zenith angle at which a pixel turns light.
 
-    Seen along the axis, a mirror of zenith t shows what lies 2 t off it. Towards the azimuth the wall, of
-    radius R about the axis, is ``way`` off the pixel, and its rim is as high everywhere ::
+    Seen along the axis, a mirror of zenith t reflects a direction 2 t off the axis. At the sheet normal's
+    azimuth, the wall (radius R about the axis, rim at one height) is at the distance d from the pixel ::
 
-        tan 2t = way / R tan 2t0,    way = (R^2 - r^2) / (b + sqrt(b^2 + R^2 - r^2))
+        tan 2t = d / R tan 2t0,    d = (R^2 - r^2) / (b + sqrt(b^2 + R^2 - r^2))
 
-    with r the pixel's distance from the axis, b that along the azimuth, and t0 the threshold on the axis.
+    with r the pixel's distance from the axis, b its component along the azimuth, and t0 the threshold on the
+    axis.
 
     Parameters
     ----------
     gel : Gel
     x, y : array_like
-        Place, mm.
+        Position, mm.
     azimuth : array_like
-        Of the sheet's normal, radians.
+        Azimuth of the sheet's normal, radians.
 
     Returns
     -------
@@ -77,93 +80,37 @@ def threshold_at(gel: Gel, x: ArrayLike, y: ArrayLike, azimuth: ArrayLike) -> Do
     """
     across = gel.curvature * (np.asarray(x, np.float64) - gel.axis[0])
     up = gel.curvature * (np.asarray(y, np.float64) - gel.axis[1])
-    room = 1 - across**2 - up**2
+    square = 1 - across**2 - up**2  # (R^2 - r^2) / R^2
     along = across * np.cos(azimuth) + up * np.sin(azimuth)
-    room = np.where(room > 0, room, np.nan)
-    way = room / (along + np.sqrt(along**2 + room))
-    return np.asarray(np.arctan(way * math.tan(2 * gel.threshold)) / 2)
+    square = np.where(square > 0, square, np.nan)
+    distance = square / (along + np.sqrt(along**2 + square))
+    return np.asarray(np.arctan(distance * math.tan(2 * gel.threshold)) / 2)
 
 
 def correct_press(
-    result: Result,
-    source: Source,
-    deepest: float,
-    threshold: float,
-    gel: Gel | None,
+    result: Result, source: Source, deepest: float, threshold: float, gel: Gel | None
 ) -> tuple[Result, str, PressFit | None]:
-    """Correct the heights of a press or a release for the elastomer, where all is known that it takes.
+    """Correct the heights of a press or a release for the elastomer, if gel, pixel size and threshold permit.
 
-    Heights are not filled yet; ``deepest`` is the greatest travel of their frames, mm, and ``threshold``
-    what was taken for light, as a share from dark to bright. The text says what was done, for the process;
-    without a correction there is no fit.
+    Holes must not be filled yet. ``deepest`` is the greatest travel, mm, and ``threshold`` that of the
+    heights, as a share. Also returns an entry of ``process``, and the fit if there was a correction.
     """
-    assert result.height is not None
-    assert result.height_sigma is not None
-    assert result.status is not None
     pixel_size = source.header.pixel_size
     if gel is None:
         return result, "none: the calibration has no gel", None
     if pixel_size is None:
         return result, "none: the recording has no pixel size", None
     if threshold != LEARNED_AT:
-        said = f"none: the gel was learned with a threshold of {LEARNED_AT}, not of {threshold:g}"
-        return result, said, None
+        reason = f"the gel was learned with a threshold of {LEARNED_AT}, not of {threshold:g}"
+        return result, f"none: {reason}", None
     try:
-        maps = result.height, result.height_sigma, result.status
+        maps = result["height"], result["height_sigma"], result["status"]
         fit = fit_press(*maps, pixel_size, gel, deepest=deepest)
     except NotConverged as error:
         return result, f"none: {error}", None
-    lost = np.count_nonzero((result.status == PressStatus.ONSET) & np.isnan(fit.height))
-    said = f"corrected for the gel; {lost} pixels turned light too far from the touch"
-    return result.assign(height=fit.height, height_sigma=fit.sigma), said, fit
-
-
-def correct_onset(
-    height: ArrayLike,
-    sigma: ArrayLike,
-    status: ArrayLike,
-    pixel_size: ArrayLike,
-    gel: Gel,
-    *,
-    deepest: float | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Correct heights by eq. 3 for an elastomer that gives way.
-
-    Eq. 3 takes a pixel's travel at its onset for the object's depth there. An elastomer gives way around what
-    it touches: a paraboloid touches at twice the depth; and the sheet around the contact is steep enough for
-    light before it touches. So a smooth surface is fitted (cubic splines, no finer than an eighth of what
-    turned light) whose press into an elastic half-space brings the sheet to the threshold's slope at each
-    pixel's onset. It is found by damped Gauss-Newton steps, with third derivatives kept small, at first more
-    than in the end. Its difference from a surface as smooth through the heights as given is added to these;
-    so finer details stay as they were.
-
-    Parameters
-    ----------
-    height, sigma : array_like, (H, W)
-        As ``find_onset`` gives them, or those of a release: without friction the way does not matter.
-    status : array_like, (H, W)
-        0 invalid, 1 turned light, 2 never light, 3 light at start; 3 of a release means light to the end.
-    pixel_size : float or (float, float)
-        Millimetres, along x and y.
-    gel : Gel
-    deepest : float, optional
-        Greatest travel, mm; by default that of the last onset.
-
-    Returns
-    -------
-    height, sigma : ndarray, (H, W), float32
-        Millimetres, and their standard deviations, with the correction's own. NaN where a pixel turned light
-        but was never touched, unless near the contact: farther off, only smoothness is known of the object.
-
-    Raises
-    ------
-    mirrorskin.engine.NotConverged
-        Too little turned light, or no surface explains it.
-    mirrorskin.io.InputError
-        Maps or sizes that cannot be used.
-    """
-    fit = fit_press(height, sigma, status, pixel_size, gel, deepest=deepest)
-    return fit.height, fit.sigma
+    lost = np.count_nonzero((result["status"] == PressStatus.ONSET) & np.isnan(fit.height))
+    summary = f"corrected for the gel; {lost} pixels turned light too far from the touch"
+    return result.assign(height=fit.height, height_sigma=fit.sigma), summary, fit
 
 
 def fit_press(
@@ -175,7 +122,42 @@ def fit_press(
     *,
     deepest: float | None = None,
 ) -> PressFit:
-    """Find the surface whose press explains the onsets; see `correct_onset`."""
+    """Fit the surface whose press into the elastomer explains the onsets, and correct heights with it.
+
+    Eq. 3 takes a pixel's travel at its onset for the object's depth there. An elastomer is indented around
+    the contact: a paraboloid touches a point at twice its depth, and the sheet around a contact is steep
+    enough to turn light before it touches. Therefore a smooth surface is fitted (cubic splines, no finer than
+    an eighth of the lit area). Its press into an elastic half-space brings the sheet to the threshold's slope
+    at each pixel's onset. The fit uses Levenberg-Marquardt steps with penalised third derivatives; the
+    penalty is larger in the first steps. The correction is the difference between this surface and an equally
+    smooth one through the uncorrected heights, so finer details are preserved.
+
+    Parameters
+    ----------
+    height, sigma : array_like, (H, W)
+        As returned by ``find_onset``, mm, of a press or (without friction, equivalently) a release.
+    status : array_like, (H, W)
+        0 invalid, 1 turned light, 2 never light, 3 light at start; of a release, 3 is light until the end.
+    pixel_size : float or (float, float)
+        Millimetres, along x and y.
+    gel : Gel
+    deepest : float, optional
+        Greatest travel, mm; by default that of the last onset.
+
+    Returns
+    -------
+    PressFit
+        Its ``height`` and ``sigma``, (H, W) mm, include the correction and its uncertainty. They are NaN
+        where a pixel turned light without contact, except near the contact: farther away, only the penalty
+        determines the surface.
+
+    Raises
+    ------
+    mirrorskin.engine.NotConverged
+        Too few pixels turned light, or no surface explains the onsets.
+    mirrorskin.io.InputError
+        Maps or sizes that cannot be used.
+    """
     heights, sigmas, state = np.asarray(height, np.float64), np.asarray(sigma, np.float64), np.asarray(status)
     if heights.ndim != 2 or 0 in heights.shape:
         raise InputError(f"heights have shape {heights.shape}: one map (H, W) is needed")
@@ -190,39 +172,41 @@ def fit_press(
     factors, fit, form = _fit_surface(scene, _initial_surface(scene))
     here, everywhere = (int(np.sum(part)) for part in (scene.cells.inside(fit.contact), fit.contact))
     if everywhere - here > _BEYOND * everywhere:
-        raise NotConverged("much of what touches lies beyond the picture")
-    maps = factors - smooth, _variances(scene, fit, form), fit.contact
-    change, variance, touching = _on_pixels(scene, heights.shape, *maps)
-    own = variance + (_SHARE_LEFT * change) ** 2 + gel.error**2
-    known = np.isfinite(heights) & (touching | (own <= _FARTHEST**2))
-    heights = np.where(known, heights + change, np.nan)
-    sigmas = np.where(known, np.sqrt(sigmas**2 + own), np.nan)
+        raise NotConverged("much of the contact is outside the picture")
+    change = np.zeros(heights.shape)
+    change[scene.cells.box] = scene.splines.at(factors - smooth, *scene.cells.places(heights.shape))
+    variance = _on_pixels(scene, heights.shape, _variances(scene, fit, form))
+    contact = _on_pixels(scene, heights.shape, fit.contact.astype(np.float64)) >= 0.5
+    variance = variance + (_SHARE_LEFT * change) ** 2 + gel.error**2
+    usable = np.isfinite(heights) & (contact | (variance <= _FARTHEST**2))
+    heights = np.where(usable, heights + change, np.nan)
+    sigmas = np.where(usable, np.sqrt(sigmas**2 + variance), np.nan)
     return PressFit(heights.astype(np.float32), sigmas.astype(np.float32), scene, factors, fit, form)
 
 
 class PressFit(NamedTuple):
-    """A press that explains when pixels turned light: heights on pixels, and their surface of splines."""
+    """A fitted press: corrected heights of pixels, and the spline surface."""
 
     height: NDArray[np.float32]
     sigma: NDArray[np.float32]
     scene: _Scene
-    factors: Doubles
+    factors: Doubles  # coefficients of the surface's splines
     slopes: SlopeFit
-    form: Doubles  # that the factors minimise: the inverse of their covariance
+    form: Doubles  # matrix of the normal equations: the inverse covariance of the factors
 
     def pressed(self) -> Pressed:
-        """Return the press on the cells at the greatest travel."""
+        """Return the press at the greatest travel, on the cells."""
         surface = np.where(self.scene.surface, self.scene.splines.surface(self.factors), np.nan)
         return press(self.scene.space, surface + self.scene.travel[-1], self.scene.gel.compliance)
 
     def on_pixels(self, values: Doubles) -> Doubles:
-        """Return a map of the cells on the pixels, 0 beyond them."""
-        return _interpolated(self.scene, self.height.shape, values)
+        """Interpolate a map of cells to pixels; 0 outside the cells."""
+        return _on_pixels(self.scene, self.height.shape, values)
 
     def load_errors(self, pressed: Pressed) -> tuple[float, Doubles]:
-        """Return the load's standard error by the fit, and its changes by those of the gel's numbers, mm^2.
+        """Return the load's standard error from the fit, and its changes with the gel's parameters, mm^2.
 
-        The changes, (3,), are by a standard error of threshold, compliance and curvature.
+        The changes, (3,), are those by one standard error of threshold, compliance and curvature.
         """
         gel = self.scene.gel
         gradient = load_gradient(self.scene.space, pressed.contact, gel.compliance)
@@ -233,40 +217,40 @@ class PressFit(NamedTuple):
             np.sum(moved * np.einsum("ki,k->i", self.slopes.jacobian, slope / _SLOPE_ERROR**2))
             for slope in _gel_slopes(self.scene, self.slopes)
         ]
-        # The stage gives way by the load, too: more compliance also takes from the depth.
+        # The stage deflects under the load as well: a larger compliance also reduces the depth.
         by_gel[1] -= gel.sigma.get("compliance", 0.0) * pressed.load * float(gradient.sum())
         return math.sqrt(variance), np.array(by_gel, np.float64)
 
 
 class _Scene(NamedTuple):
-    """A press as the search for its surface sees it."""
+    """The data of a fit: a press, averaged over cells."""
 
     cells: Cells
-    height: Doubles  # of cells that turned light
-    sampled: Mask  # some of these, all over
-    dark: Mask  # cells that never did
-    surface: Mask  # cells that there may be something in
-    x: Doubles
-    y: Doubles
+    height: Doubles  # mean of a cell's lit pixels, mm; NaN without
+    sampled: Mask  # lit cells that are fitted, evenly spread
+    dark: Mask  # cells that never turned light
+    surface: Mask  # cells that may contain the object
+    x: Doubles  # centres of columns, mm
+    y: Doubles  # centres of rows, mm
     space: HalfSpace
     splines: CellSplines
-    travel: Doubles
+    travel: Doubles  # at which the press is simulated, mm
     gel: Gel
 
 
 def _scene_of(
     heights: Doubles, status: NDArray[Any], size: tuple[float, float], gel: Gel, deepest: float | None
 ) -> _Scene:
-    """Prepare the search: cells, what may touch in them, and when to look."""
-    known = np.isfinite(heights)
-    if not known.any():
+    """Average a press over cells, and choose the cells and the travels of the simulation."""
+    lit = np.isfinite(heights)
+    if not lit.any():
         raise NotConverged("nothing turned light")
-    cells = cut_into_cells(known, size)
+    cells = cut_into_cells(lit, size)
     means = cells.means(heights)
     onsets = -means[np.isfinite(means)]
     if len(onsets) < _FEWEST:
         raise NotConverged(
-            f"light in {len(onsets)} places is too little to determine a surface: {_FEWEST} are needed"
+            f"{len(onsets)} cells of the picture turned light, too little for a surface: {_FEWEST} are needed"
         )
     dark = cells.share(status == PressStatus.NEVER_LIGHT) == 1
     hidden = cells.inside(cells.share(status == PressStatus.LIGHT_AT_START)) >= 0.5
@@ -279,44 +263,33 @@ def _scene_of(
     left, top = x[0] - size[0] / 2, y[0] + size[1] / 2
     space, splines = HalfSpace(cells.shape, spacing[::-1]), CellSplines(cells.shape, spacing)
     row, column = np.indices(cells.shape)
-    looked = np.isfinite(means) & ((row + 2 * column) % math.ceil(len(onsets) / _SAMPLED) == 0)
+    sampled = np.isfinite(means) & ((row + 2 * column) % math.ceil(len(onsets) / _SAMPLED) == 0)
     x, y = left + columns, top - rows
-    return _Scene(cells, means, looked, dark, surface, x, y, space, splines, travel, gel)
+    return _Scene(cells, means, sampled, dark, surface, x, y, space, splines, travel, gel)
 
 
-def _on_pixels(
-    scene: _Scene, shape: tuple[int, ...], factors: Doubles, variances: Doubles, contact: Mask
-) -> tuple[Doubles, Doubles, Mask]:
-    """Return for each pixel a surface's height, the variance, and whether there is contact; 0 elsewhere."""
-    height = np.zeros(shape)
-    height[scene.cells.box] = scene.splines.at(factors, *scene.cells.places(shape))
-    touching = _interpolated(scene, shape, contact.astype(np.float64))
-    return height, _interpolated(scene, shape, variances), touching >= 0.5
-
-
-def _interpolated(scene: _Scene, shape: tuple[int, ...], values: Doubles) -> Doubles:
-    """Return a map of the cells on the pixels, 0 beyond them."""
-    found = np.zeros(shape)
+def _on_pixels(scene: _Scene, shape: tuple[int, ...], values: Doubles) -> Doubles:
+    pixels = np.zeros(shape)
     at = np.stack(np.meshgrid(*scene.cells.places(shape), indexing="ij"))
-    found[scene.cells.box] = ndimage.map_coordinates(values, at, order=1, mode="nearest")
-    return found
+    pixels[scene.cells.box] = ndimage.map_coordinates(values, at, order=1, mode="nearest")
+    return pixels
 
 
 def _interpolate(scene: _Scene, heights: Doubles) -> Doubles:
-    """Return the factors of a smooth surface through heights of cells, NaN where it is free."""
-    known = np.isfinite(heights).ravel()
-    basis = scene.splines.basis[known]
-    form = (basis.T @ basis).toarray() / _KNOWN**2 + _stiffness(scene, _BENDING[-1])
-    return _solve(form, basis.T @ heights.ravel()[known] / _KNOWN**2)
+    """Return the factors of a smooth surface through heights of cells, which are NaN where it is free."""
+    fixed = np.isfinite(heights).ravel()
+    basis = scene.splines.basis[fixed]
+    form = (basis.T @ basis).toarray() / _INITIAL_ERROR**2 + _stiffness(scene, _BENDING[-1])
+    return _solve(form, basis.T @ heights.ravel()[fixed] / _INITIAL_ERROR**2)
 
 
 def _initial_surface(scene: _Scene) -> Doubles:
-    """Return the factors of the initial surface: flat tops, and depths nearer to those of the contact."""
+    """Return the factors of the initial surface: flat tops, and the reduced depths of eq. 3."""
     lit = np.isfinite(scene.height)
     row, column = ndimage.distance_transform_edt(~lit, return_distances=False, return_indices=True)
     top = float(scene.height[lit].max())
-    known = np.where(lit | scene.surface, scene.height[row, column], np.nan)
-    return _interpolate(scene, top + _DEPTH * (known - top))
+    heights = np.where(lit | scene.surface, scene.height[row, column], np.nan)
+    return _interpolate(scene, top + _DEPTH * (heights - top))
 
 
 def _stiffness(scene: _Scene, bending: float) -> Doubles:
@@ -324,17 +297,14 @@ def _stiffness(scene: _Scene, bending: float) -> Doubles:
 
 
 def _solve(form: Doubles, values: Doubles) -> Doubles:
-    """Solve without BLAS, whose threads wait for each other longer than so little takes."""
+    """Solve a symmetric system without BLAS: for systems this small, its threads cost more than they save."""
     ridge = _RIDGE * float(np.trace(form)) / len(form)
     matrix = sparse.csc_matrix(form + ridge * np.eye(len(form)))
     return np.asarray(splu(matrix, permc_spec="NATURAL", options={"SymmetricMode": True}).solve(values))
 
 
 def _fit_surface(scene: _Scene, factors: Doubles) -> tuple[Doubles, SlopeFit, Doubles]:
-    """Return the surface's factors, what it would have shown, and the form that they minimise.
-
-    Gauss and Newton's steps are damped, more after one that has made things worse (Levenberg).
-    """
+    """Return the factors of the surface, its slopes and its normal matrix (Levenberg-Marquardt)."""
     lit, damping, accepted = np.isfinite(scene.height), _DAMPING, 0
     still = (scene.splines.basis.T @ scene.splines.basis).toarray() / _STEP**2
     fit = _simulate(scene, factors)
@@ -344,14 +314,14 @@ def _fit_surface(scene: _Scene, factors: Doubles) -> tuple[Doubles, SlopeFit, Do
         step = _solve(form + damping * still, pull)
         moved = float(np.abs(scene.splines.surface(step)[lit]).max())
         tried = factors + step * min(1.0, _STEP / max(moved, _STEP))
-        shown, before = _simulate(scene, tried), _cost(fit, stiffness, factors)
-        after = _cost(shown, stiffness, tried)
+        fit_tried, before = _simulate(scene, tried), _cost(fit, stiffness, factors)
+        after = _cost(fit_tried, stiffness, tried)
         if after >= before:
             if damping > _STUCK:
                 break
             damping *= 10
             continue
-        factors, fit, accepted, damping = tried, shown, accepted + 1, damping / 3
+        factors, fit, accepted, damping = tried, fit_tried, accepted + 1, damping / 3
         if accepted > len(_BENDING) and after > _SETTLED * before:
             break
     misfit = float(np.median(np.abs(fit.residual))) if fit.residual.size else math.inf
@@ -361,7 +331,7 @@ def _fit_surface(scene: _Scene, factors: Doubles) -> tuple[Doubles, SlopeFit, Do
 
 
 def _normal_equations(fit: SlopeFit, stiffness: Doubles, factors: Doubles) -> tuple[Doubles, Doubles]:
-    """Return the normal equations of the next step: form and right side."""
+    """Return the matrix and the right side of the next step's normal equations."""
     weights = np.minimum(1.0, _ROBUST * _SLOPE_ERROR / np.maximum(np.abs(fit.residual), _RIDGE))
     weights /= _SLOPE_ERROR**2
     form = np.einsum("ki,k,kj->ij", fit.jacobian, weights, fit.jacobian) + stiffness
@@ -370,46 +340,42 @@ def _normal_equations(fit: SlopeFit, stiffness: Doubles, factors: Doubles) -> tu
 
 
 def _cost(fit: SlopeFit, stiffness: Doubles, factors: Doubles) -> float:
-    """Return what a surface costs: residual slopes, by Huber's measure, and bending."""
-    wrong = np.abs(fit.residual) / _SLOPE_ERROR
-    small = np.minimum(wrong, _ROBUST)
-    bent = float(np.sum(factors * np.einsum("ij,j->i", stiffness, factors)))
-    return float(np.sum(small * (2 * wrong - small))) + bent
+    """Return the cost of a surface: Huber's loss of its slope residuals, and the bending penalty."""
+    residual = np.abs(fit.residual) / _SLOPE_ERROR
+    clipped = np.minimum(residual, _ROBUST)
+    bending = float(np.sum(factors * np.einsum("ij,j->i", stiffness, factors)))
+    return float(np.sum(clipped * (2 * residual - clipped))) + bending
 
 
 def _simulate(scene: _Scene, factors: Doubles) -> SlopeFit:
-    """Press a surface, and look when cells turned light."""
+    """Press a surface, and compare the sheet's slope with the threshold's when cells turned light.
+
+    Dark cells of the surface are flat tops: those steeper than the threshold add residuals, too.
+    """
     height = scene.splines.surface(factors)
     down, across = (part @ factors for part in scene.splines.slopes)
     azimuth = np.arctan2(down, -across).reshape(height.shape)
-    zenith = threshold_at(scene.gel, scene.x[np.newaxis], scene.y[:, np.newaxis], azimuth)
-    targets = Targets(
-        np.where(scene.sampled, -scene.height, np.nan), scene.dark & ~scene.surface, np.tan(zenith)
-    )
+    limit = np.tan(threshold_at(scene.gel, scene.x[np.newaxis], scene.y[:, np.newaxis], azimuth))
+    targets = Targets(np.where(scene.sampled, -scene.height, np.nan), scene.dark & ~scene.surface, limit)
     surface = np.where(scene.surface, height, np.nan)
     fit = sweep(scene.space, surface, scene.splines.basis, scene.travel, targets, scene.gel.compliance)
-    return _with_flat_tops(scene, fit, targets.slope.ravel(), down, across)
-
-
-def _with_flat_tops(scene: _Scene, fit: SlopeFit, limit: Doubles, down: Doubles, across: Doubles) -> SlopeFit:
-    """Add the dark cells of the surface that are steeper than what is dark can be."""
-    steep = np.hypot(down, across)
+    steep, limit = np.hypot(down, across), limit.ravel()
     cell = np.flatnonzero((scene.dark & scene.surface).ravel() & (steep > limit))
     along_y, along_x = (sparse.diags_array(part[cell] / steep[cell]) for part in (down, across))
     slopes = along_y @ scene.splines.slopes[0][cell] + along_x @ scene.splines.slopes[1][cell]
-    nothing = np.zeros(len(cell))
+    zeros = np.zeros(len(cell))
     return SlopeFit(
         np.append(fit.residual, (limit - steep)[cell]),
         np.concatenate([fit.jacobian, slopes.toarray()]),
-        np.append(fit.by_travel, nothing),
-        np.append(fit.load, nothing),
+        np.append(fit.by_travel, zeros),
+        np.append(fit.load, zeros),
         np.append(fit.cell, cell),
         fit.contact,
     )
 
 
 def _variances(scene: _Scene, fit: SlopeFit, form: Doubles) -> Doubles:
-    """Return the variance of the surface at each cell, mm^2: by the fit, and by what is known of the gel."""
+    """Return the variance of the surface at each cell, mm^2, from the fit and from the gel's parameters."""
     covariance = _solve(form, np.eye(len(form)))
     basis = scene.splines.basis
     variance = _excess(fit) * np.asarray(basis.multiply(basis @ covariance).sum(axis=1)).ravel()
@@ -421,13 +387,13 @@ def _variances(scene: _Scene, fit: SlopeFit, form: Doubles) -> Doubles:
 
 
 def _excess(fit: SlopeFit) -> float:
-    """Return by how much slopes scatter more than expected, as a factor of the variance from 1 on."""
-    usual = 1.4826 * float(np.median(np.abs(fit.residual)))
-    return max(1.0, (usual / _SLOPE_ERROR) ** 2)
+    """Return the ratio of the observed to the expected variance of slopes, at least 1."""
+    scatter = 1.4826 * float(np.median(np.abs(fit.residual)))
+    return max(1.0, (scatter / _SLOPE_ERROR) ** 2)
 
 
 def _gel_slopes(scene: _Scene, fit: SlopeFit) -> list[Doubles]:
-    """Return by how much a standard error of each of the gel's numbers changes what slopes are missing."""
+    """Return the changes of slope residuals by one standard error of each of the gel's parameters."""
     gel, sigma = scene.gel, scene.gel.sigma
     slope = math.tan(gel.threshold)
     threshold = np.full(fit.residual.shape, (1 + slope**2) * sigma.get("threshold", 0.0))

@@ -1,4 +1,4 @@
-"""Counts of dark and light that nobody gave: estimated from a press's frames, and what that adds to sigma."""
+"""Estimation of the dark and bright levels from the frames of a press, and of their uncertainty."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from mirrorskin.engine.frames import estimate_noise, thin_out
 from mirrorskin.io import Source
 
 _FEWEST = 16  # pixels that must have turned light
-_SURELY = 8.0  # sigmas by which they must have become brighter
+_RISE = 8.0  # standard deviations of the noise: least rise of brightness between dark and light
 
 
 @dataclass(frozen=True, slots=True)
 class EstimatedLevels:
-    """Counts without and with light, and the standard deviations of the pixels' own levels about them."""
+    """Dark and bright levels, counts, and the standard deviations of the pixels' levels about them."""
 
     dark: float
     bright: float
@@ -28,11 +28,11 @@ class EstimatedLevels:
 def estimate_levels(
     source: Source, frames: range, dark: ArrayLike | None = None, bright: ArrayLike | None = None
 ) -> EstimatedLevels | None:
-    """Estimate the counts of dark and light from the frames of least and greatest travel.
+    """Estimate the dark and bright levels from the frames of least and greatest travel.
 
-    The pixels of which these frames differ by more than half of the most that any 16 do have turned light;
-    the levels are the medians of their counts, and the deviations what is left of the counts' own without
-    the noise. A level that is given is kept, and is exact.
+    Pixels turned light if their brightness differs between these frames by more than half of the 16th largest
+    difference. The levels are the medians of these pixels; their standard deviations exclude the noise.
+    A given level is kept and has a standard deviation of 0.
 
     Parameters
     ----------
@@ -41,12 +41,12 @@ def estimate_levels(
     frames : range
         The press, or the release.
     dark, bright : array_like, scalar or (H, W), optional
-        What is given.
+        Given levels.
 
     Returns
     -------
     EstimatedLevels or None
-        None where the frames do not tell: nothing turns light, or the source must be read in order.
+        None if nothing turns light, or the source can only be read in order.
     """
     travel: NDArray[np.float64] | None = getattr(source, "travel", None)
     read = getattr(source, "frame", None)
@@ -54,14 +54,14 @@ def estimate_levels(
         return None
     part = travel[frames.start : frames.stop]
     least, most = (frames.start + int(number) for number in (np.argmin(part), np.argmax(part)))
-    beside = least + (1 if least + 1 < frames.stop else -1)
-    first, second, last = (thin_out(read(number)) for number in (least, beside, most))
+    neighbour = least + (1 if least + 1 < frames.stop else -1)
+    first, second, last = (thin_out(read(number)) for number in (least, neighbour, most))
     rise = last - first
     if rise.size < _FEWEST:
         return None
     top = float(np.partition(rise, -_FEWEST)[-_FEWEST])
     noise = estimate_noise(first, second, integer=True)
-    if top < _SURELY * noise:
+    if top < _RISE * noise:
         return None
     lit = rise >= top / 2
     low, low_sigma = _middle(first[lit], noise) if dark is None else (_median(dark), 0.0)
@@ -70,7 +70,7 @@ def estimate_levels(
 
 
 def _middle(counts: NDArray[np.float64], noise: float) -> tuple[float, float]:
-    """Return the median of counts, and their standard deviation without the noise and without outliers."""
+    """Return the median of counts, and their robust standard deviation without the noise."""
     middle = _median(counts)
     spread = math.sqrt(2) * estimate_noise(np.full_like(counts, middle), counts, integer=True)
     return middle, math.sqrt(max(0.0, spread**2 - noise**2) + noise**2 / counts.size)

@@ -1,4 +1,4 @@
-"""How fast contact grows: brightness locked in to the travel of a press that dithers about a mean."""
+"""Growth of the contact with travel: lock-in detection of brightness in a dithering press."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from mirrorskin.io.types import ProcessValue
 if TYPE_CHECKING:
     from mirrorskin.io import Source
 
-_SINUSOID = 0.9  # share of the travel's variance that its first harmonic has at least
-_PERIODS = 2  # of the dither, at least
+_SINUSOID = 0.9  # least share of the travel's variance in its first harmonic
+_PERIODS = 2  # least number of periods of the dither
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TravelWave:
     """The first harmonic of a travel: s = mean + amplitude cos(phase)."""
 
-    phase: Doubles  # (T,), radians, from 0 on
+    phase: Doubles  # (T,), radians
     mean: float  # mm
     amplitude: float  # mm
 
@@ -41,17 +41,17 @@ class TravelWave:
 class Growth(CorrelationOperation):
     """Growth of the contact with travel, from a press that dithers about a mean.
 
-    At the mean travel s0 the share of full light of a pixel, (E - dark) / (bright - dark), has the derivative
-    G by travel. To first order of the dither's amplitude d its part in phase with the travel is G d: this is
-    fitted. A pixel that turns light at once, at a travel in reach of the dither, has a part that is no
-    derivative; but its sum over the border is (dA/ds) d as well, A being the area of full light, whichever
-    shape the border has.
+    At the mean travel s0, the share of full light of a pixel, (E - dark) / (bright - dark), has the
+    derivative G with respect to travel. To first order in the dither's amplitude d, its component in phase
+    with the travel is G d, which is fitted. A pixel that turns light abruptly within the dither has a
+    component that is not a derivative; but the sum over the border of the contact is (dA/ds) d for any shape
+    of the border, with A the area of full light.
 
-    ``azimuth`` is the phase by which the light lags behind the travel. ``process`` contains the mean
-    ``travel`` and the ``travel_amplitude``, mm, and with a pixel size ``area_growth``, the sum over all
-    pixels, mm^2 of full light per mm of travel, and its standard deviation ``area_growth_sigma``.
+    ``azimuth`` is the phase lag of the light behind the travel. ``process`` contains the mean ``travel`` and
+    the ``travel_amplitude``, mm, and with a pixel size ``area_growth``, the sum over all pixels, mm^2 of full
+    light per mm of travel, and its standard deviation ``area_growth_sigma``.
 
-    The frames are needed twice, unless the travel is known beforehand.
+    The frames are needed twice, unless the travel is available in advance.
 
     Examples
     --------
@@ -76,7 +76,7 @@ class Growth(CorrelationOperation):
     )
     travel_wave: TravelWave | None = option(
         default=None,
-        help="first harmonic of the travel, if it is known beforehand",
+        help="first harmonic of the travel, if it is available in advance",
         shown_default="estimated from the travel of all frames in a first pass",
         python_only=True,
     )
@@ -98,7 +98,7 @@ class Growth(CorrelationOperation):
 
     @property
     def passes(self) -> int:
-        """How often all frames are pushed: twice if the travel is not known beforehand."""
+        """How often all frames are pushed: twice if the travel is not available in advance."""
         return 2 if self.travel_wave is None else 1
 
     def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
@@ -152,7 +152,7 @@ class Growth(CorrelationOperation):
 find_growth = travel_function(
     Growth,
     "find_growth",
-    """Find how fast contact grows with travel, from a stack of a dithering press; see `Growth`.
+    """Compute the growth of the contact with travel, from a stack of a dithering press; see `Growth`.
 
     Returns
     -------
@@ -182,13 +182,12 @@ def first_harmonic(travel: ArrayLike | None, frames: int) -> TravelWave:
     values = check_strokes(travel, frames, "travel")
     frame = np.arange(frames, dtype=np.float64)
     try:
-        each = estimate_frequency(values, frame).hertz
+        frequency = estimate_frequency(values, frame).hertz  # per frame
     except InputError as error:
         raise InputError(f"travel does not dither about a mean: {error}") from None
-    turn = 2 * math.pi * each * frame
-    mean, cosine, sine = np.linalg.lstsq(basis(turn), values, rcond=None)[0]
-    amplitude = math.hypot(cosine, sine)
-    alike = np.var(basis(turn) @ [0, cosine, sine]) >= _SINUSOID * np.var(values)
-    if not alike or each * frames < _PERIODS:
+    phase = 2 * math.pi * frequency * frame
+    mean, cosine, sine = np.linalg.lstsq(basis(phase), values, rcond=None)[0]
+    sinusoidal = np.var(basis(phase) @ [0, cosine, sine]) >= _SINUSOID * np.var(values)
+    if not sinusoidal or frequency * frames < _PERIODS:
         raise InputError("travel does not dither about a mean: several periods of one sinusoid are needed")
-    return TravelWave(turn - math.atan2(sine, cosine), float(mean), amplitude)
+    return TravelWave(phase - math.atan2(sine, cosine), float(mean), math.hypot(cosine, sine))

@@ -1,9 +1,9 @@
-"""Heights from onsets whose surroundings are known: intervals as likelihoods, and paraboloids through them.
+"""Heights from onsets near a predicted surface: intervals as likelihoods, and local paraboloids.
 
-All heights between two frames have one onset. Pixel by pixel their errors are spread evenly over the
-interval, but on a surface they are correlated: over each terrace they run from one end to the other. So
-their mean is not better for there being more pixels, as that of independent errors would be. But where the
-shape of a surface is known, the lines at which one terrace meets the next give its height precisely.
+All heights between two frames have the same onset. The error of a single pixel is uniformly distributed over
+the interval, but errors of neighbours are correlated: over each terrace they run from one end to the other.
+Therefore the mean over many pixels is not more accurate. But if the shape of the surface is given, the lines
+between terraces determine its height precisely.
 """
 
 from __future__ import annotations
@@ -19,47 +19,47 @@ from numpy.typing import NDArray
 
 Doubles = NDArray[np.float64]
 
-_LEAST = 0.02  # of half an interval: what its ends are blurred by at least
-_FAR = 6.0  # blurs beyond an end, from which on an onset is an outlier
-_SPAN = 20.0  # half intervals that outliers are spread over at least
-_FEWEST, _MOST = 1e-4, 0.5  # share of outliers
-_SAMPLES = 8192  # of errors that their distribution is estimated from
-_ROUNDS = 12  # until the share of outliers is found
-_FAINT = 1e-4  # of an end's own weight, below which a weight is not taken to be more sure
-_NEAR = 0.02  # by which the logarithm of a blur may be wrong
-_END, _DENSE = 8, 64  # of the table of the normal distribution: standard deviations, and entries in one
+_LEAST = 0.02  # least blur of an interval's ends, as a share of its half-width
+_FAR = 6.0  # blurs outside an interval beyond which an onset is an outlier
+_SPAN = 20.0  # half-widths: least range over which outliers are distributed
+_FEWEST, _MOST = 1e-4, 0.5  # limits of the share of outliers
+_SAMPLES = 8192  # largest number of errors from which their distribution is estimated
+_ROUNDS = 12  # iterations of the share of outliers
+_FAINT = 1e-4  # least curvature of the log-likelihood, relative to that of a single sharp end
+_NEAR = 0.02  # tolerance of the logarithm of the blur
+_END, _DENSE = 8, 64  # table of the normal distribution: its ends, standard deviations, and entries per unit
 _TABLE = np.array(
     [math.erfc(-x / _DENSE / math.sqrt(2)) / 2 for x in range(-_END * _DENSE, _END * _DENSE + 1)]
 )
 
 
 class Evidence(NamedTuple):
-    """A known height and its weight, (H, W), float64, 1/mm^2; the weight is 0 where nothing is known."""
+    """A height, mm, and its weight, 1/mm^2, both (H, W) float64; the weight is 0 without evidence."""
 
     height: Doubles
     weight: Doubles
 
 
 class IntervalErrors(NamedTuple):
-    """How errors of known heights are distributed."""
+    """Distribution of the errors of interval-valued heights."""
 
-    blur: float  # standard deviation that the ends of intervals are blurred by, mm
-    outlier_density: float  # of outliers, 1/mm, over the share of heights that are none
+    blur: float  # standard deviation of the ends of intervals, mm
+    outlier_density: float  # density of outliers, 1/mm, over the share of the other heights
 
 
 def estimate_interval_errors(error: Doubles, half: Doubles) -> IntervalErrors:
-    """Estimate by maximum likelihood how sharp intervals' ends are, and how many onsets are outliers.
+    """Estimate the blur of intervals' ends and the share of outliers, by maximum likelihood.
 
-    An error e is from a blurred interval with the chance 1 - m, and an outlier, which may be anything, with
-    the chance m: its density is (1 - m) P(e) / (2 half) + m / span. Outliers lie on one side, as late onsets
-    do, and what is within intervals is no evidence against them: they must not count as blurred ends.
+    With P(e) the probability of an error e for a blurred interval, and m the share of outliers, which are
+    uniformly distributed over a span, the density of errors is (1 - m) P(e) / (2 half) + m / span. Outliers
+    are on one side, such as late onsets; without this term they would be mistaken for blur.
 
     Parameters
     ----------
     error : ndarray, (n,), float64
-        Middles of intervals less the heights, mm.
+        Middles of the intervals less the predicted heights, mm.
     half : ndarray, (n,), float64
-        Half the intervals' widths, mm. The blur is at least a fiftieth of it.
+        Half-widths of the intervals, mm. The blur is at least a fiftieth of their median.
     """
     thin = slice(None, None, -(-error.size // _SAMPLES))
     error, half = error[thin], half[thin]
@@ -67,10 +67,10 @@ def estimate_interval_errors(error: Doubles, half: Doubles) -> IntervalErrors:
     span = max(float(np.ptp(error)), _SPAN * middle)
 
     def share(density: Doubles) -> float:
-        found = _MOST / 2
+        outliers = _MOST / 2
         for _ in range(_ROUNDS):
-            found = float(np.mean(found / (found + (1 - found) * span * density)))
-        return float(np.clip(found, _FEWEST, _MOST))
+            outliers = float(np.mean(outliers / (outliers + (1 - outliers) * span * density)))
+        return float(np.clip(outliers, _FEWEST, _MOST))
 
     def unlikely(size: float) -> float:
         density = _chance(error, half, float(np.exp(size))) / (2 * half)
@@ -88,19 +88,19 @@ def estimate_interval_errors(error: Doubles, half: Doubles) -> IntervalErrors:
 
 
 def interval_evidence(height: Doubles, middle: Doubles, half: Doubles, spread: IntervalErrors) -> Evidence:
-    """Return what intervals say of heights, by one Newton step on their likelihood.
+    """Return heights and weights that approximate the likelihood of intervals, by one Newton step.
 
-    The likelihood of a height u is the chance that u and an error of the standard deviation ``blur`` lie
-    between the interval's ends a and b, P = Phi((b - u) / blur) - Phi((a - u) / blur). Its logarithm has the
-    derivative g and the curvature -h at u; the same have a known height u + g / h of the weight h, which is
-    multiplied by the chance that it is no outlier. Far outside its interval the weight is 0.
+    The likelihood of a height u is the probability that u plus an error of standard deviation ``blur`` is
+    between the interval's ends a and b, P = Phi((b - u) / blur) - Phi((a - u) / blur). With the derivative g
+    and the curvature -h of its logarithm at u, it is equivalent to a height u + g / h of weight h. The weight
+    is multiplied by the probability that the onset is not an outlier; far outside its interval it is 0.
 
     Parameters
     ----------
     height : ndarray, (n,), float64
-        Where it is about, mm.
+        Predicted heights, mm.
     middle, half : ndarray, (n,), float64
-        Of the intervals, mm.
+        Middles and half-widths of the intervals, mm.
     spread : IntervalErrors
     """
     blur, outlier_density = spread
@@ -116,12 +116,12 @@ def interval_evidence(height: Doubles, middle: Doubles, half: Doubles, spread: I
 
 
 def _chance(error: Doubles, half: Doubles, blur: float) -> Doubles:
-    """Return the chance that a blurred height lies in an interval."""
+    """Return the probability of an error for a blurred interval."""
     return _normal((half - error) / blur) - _normal((-half - error) / blur)
 
 
 def _normal(places: Doubles) -> Doubles:
-    """Return the normal distribution, to 1e-7 of it: a table's values and three terms of Taylor's series."""
+    """Return the normal distribution function with an error of 1e-7: table and third-order Taylor series."""
     places = np.clip(places, -_END, _END)
     number = np.rint((places + _END) * _DENSE).astype(np.intp)
     node = number / _DENSE - _END
@@ -131,7 +131,7 @@ def _normal(places: Doubles) -> Doubles:
 
 
 def _lowest(function: Callable[[float], float], low: float, high: float) -> float:
-    """Return where a function with one valley is lowest, by golden sections."""
+    """Return the minimum of a function with one minimum, by golden-section search."""
     golden = (math.sqrt(5) - 1) / 2
     left, right = high - golden * (high - low), low + golden * (high - low)
     lefts, rights = function(left), function(right)
@@ -147,9 +147,9 @@ def _lowest(function: Callable[[float], float], low: float, high: float) -> floa
     return (low + high) / 2
 
 
-_TERMS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # powers of the offsets along columns and rows
-_REACH = 3.0  # widths of the window, to either side
-_FLAT = 1e-9  # least share of a fit's information that is worth inverting
+_TERMS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # powers of the column and row offsets
+_REACH = 3.0  # half the size of the window, in its widths
+_FLAT = 1e-9  # least eigenvalue of a scaled normal matrix that is inverted
 
 
 class Paraboloids(NamedTuple):
@@ -157,22 +157,20 @@ class Paraboloids(NamedTuple):
 
     height: Doubles  # mm
     along: Doubles  # (2, n): slopes along columns and rows, mm per pixel
-    variance: Doubles  # (2, n): of these
-    misfit: (
-        Doubles  # mean squared error in standard deviations; NaN where too little is known for a paraboloid
-    )
-    pixels: Doubles  # with a known height
+    variance: Doubles  # (2, n): variances of the slopes
+    misfit: Doubles  # mean squared residual in standard deviations; NaN with too few pixels for a paraboloid
+    pixels: Doubles  # number of pixels with a height
 
 
 def fit_paraboloids(height: Doubles, weight: Doubles, places: NDArray[np.bool_], width: float) -> Paraboloids:
-    """Fit paraboloids by least squares in a Gaussian window around some places, (H, W).
+    """Fit paraboloids by least squares in a Gaussian window around each of some pixels, a mask (H, W).
 
-    Heights are in mm, of any value where the weight, an inverse variance, is 0. The window's width is a
-    standard deviation in pixels.
+    Heights are in mm; weights are inverse variances, 0 without a height. ``width`` is the standard deviation
+    of the window, pixels.
     """
-    known = weight > 0
-    datum = float(np.average(height[known], weights=weight[known])) if known.any() else 0.0
-    relative = np.where(known, height - datum, 0.0)
+    valid = weight > 0
+    datum = float(np.average(height[valid], weights=weight[valid])) if valid.any() else 0.0
+    relative = np.where(valid, height - datum, 0.0)
     window = _Window(places, width)
     powers = [(i, j) for i, j in product(range(5), repeat=2) if i + j <= 4]
     moments = window.sums(weight, powers)
@@ -181,14 +179,14 @@ def fit_paraboloids(height: Doubles, weight: Doubles, places: NDArray[np.bool_],
         [np.stack([moments[a + c, b + d] for c, d in _TERMS], axis=-1) for a, b in _TERMS], axis=-2
     )
     square = window.sums(weight * relative**2, [(0, 0)])[0, 0]
-    pixels = window.sums(known.astype(np.float64), [(0, 0)])[0, 0]
+    pixels = window.sums(valid.astype(np.float64), [(0, 0)])[0, 0]
     inverse, sound = _invert(matrix)
-    found = np.einsum("nij,nj->ni", inverse, right)
-    residual = np.maximum(square - np.sum(found * right, axis=-1), 0)
+    terms = np.einsum("nij,nj->ni", inverse, right)
+    residual = np.maximum(square - np.sum(terms * right, axis=-1), 0)
     enough = sound & (pixels > 2 * len(_TERMS))
     return Paraboloids(
-        height=found[:, 0] + datum,
-        along=found[:, 1:3].T,
+        height=terms[:, 0] + datum,
+        along=terms[:, 1:3].T,
         variance=np.stack([inverse[:, 1, 1], inverse[:, 2, 2]]),
         misfit=np.where(enough, residual / np.maximum(pixels - len(_TERMS), 1), np.nan),
         pixels=pixels,
@@ -196,7 +194,7 @@ def fit_paraboloids(height: Doubles, weight: Doubles, places: NDArray[np.bool_],
 
 
 class _Window:
-    """Sums over a window around some pixels, times powers of the distance in windows' widths."""
+    """Moments over a Gaussian window around some pixels, with offsets in widths of the window."""
 
     def __init__(self, places: NDArray[np.bool_], width: float) -> None:
         self._places = places
@@ -206,14 +204,14 @@ class _Window:
         self._one = np.ones(1)
 
     def sums(self, values: Doubles, powers: list[tuple[int, int]]) -> dict[tuple[int, int], Doubles]:
-        """Return sums of values times column offsets and row offsets to the powers, at the pixels."""
+        """Return sums of values times powers of the column and row offsets, at the pixels."""
         across: dict[int, Doubles] = {}
-        found = {}
+        sums = {}
         for i, j in powers:
             if i not in across:
                 across[i] = self._correlate(values, self._kernels[i], self._one)
-            found[i, j] = self._correlate(across[i], self._one, self._kernels[j])[self._places]
-        return found
+            sums[i, j] = self._correlate(across[i], self._one, self._kernels[j])[self._places]
+        return sums
 
     def _correlate(self, values: Doubles, along: Doubles, down: Doubles) -> Doubles:
         border = cv2.BORDER_CONSTANT
@@ -221,7 +219,7 @@ class _Window:
 
 
 def _invert(matrix: Doubles) -> tuple[Doubles, NDArray[np.bool_]]:
-    """Return inverses of matrices, and which of them there are; the others are those of the identity."""
+    """Return the inverses of matrices, and which are regular; the others are replaced by the identity."""
     size = np.sqrt(np.maximum(np.einsum("nii->ni", matrix), np.finfo(float).tiny))
     scaled = matrix / (size[:, :, np.newaxis] * size[:, np.newaxis, :])
     sound = np.linalg.eigvalsh(scaled)[:, 0] > _FLAT

@@ -1,4 +1,4 @@
-"""Onsets at several thresholds: a wall with steps of light shows between which inclinations a sheet lies."""
+"""Onsets at several thresholds: a wall with steps of light bounds the inclination of the sheet."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from mirrorskin.io.maps import TABLE, PressStatus
 class Levels(ThresholdOperation):
     """Height from the lowest of several thresholds, and bounds of the sheet's inclination from all of them.
 
-    The wall has steps of light, so that a pixel passes one threshold after the other while the sheet tilts. A
-    pixel that passes a threshold is inclined by at least the angle that belongs to it.
+    The wall has steps of light, so that a pixel passes one threshold after the other while the sheet tilts.
+    A pixel that has passed a threshold is inclined by at least the angle of this threshold.
 
     Examples
     --------
@@ -53,7 +53,21 @@ class Levels(ThresholdOperation):
 
     def check_options(self) -> None:
         """Raise InputError unless thresholds and inclinations rise, and are equally many."""
-        _check_levels(self.thresholds, self.inclinations)
+        shares, angles = list(self.thresholds or ()), list(self.inclinations or ())
+        if not shares or any(high <= low for low, high in pairwise(shares)):
+            raise InputError(
+                f"thresholds {_listed(shares)}: give them from the lowest to the highest, such as 0.25, 0.75"
+            )
+        if len(angles) != len(shares):
+            raise InputError(
+                f"inclinations do not match: {len(shares)} thresholds and {len(angles)} inclinations. Give"
+                " the sheet's inclination at which each threshold is passed, starting with the lowest"
+            )
+        if not all(low < high for low, high in pairwise([0.0, *angles, math.pi / 2])):
+            degrees = _listed(map(math.degrees, angles))
+            raise InputError(
+                f"inclinations {degrees} deg: they must rise with the thresholds, between 0 and 90"
+            )
 
     def shares(self) -> Sequence[float]:
         """Return the thresholds."""
@@ -61,30 +75,13 @@ class Levels(ThresholdOperation):
 
     def result(self) -> Result:
         """Return heights by the lowest threshold, and the bounds of the inclination."""
-        found = [search.found() for search in self._searches]
-        light = [np.isin(one.status, (PressStatus.ONSET, PressStatus.LIGHT_AT_START)) for one in found]
+        levels = [search.event_maps() for search in self._searches]
+        light = [np.isin(maps.status, (PressStatus.ONSET, PressStatus.LIGHT_AT_START)) for maps in levels]
         passed = np.sum(np.logical_and.accumulate(light), axis=0).astype(np.intp)
-        passed[found[0].status == PressStatus.INVALID_INPUT] = -1  # the last entry of the bounds, NaN
+        passed[levels[0].status == PressStatus.INVALID_INPUT] = -1  # the last entry of the bounds, NaN
         least = np.array([0, *self.inclinations, np.nan], np.float32)
         greatest = np.array([*self.inclinations, np.nan, np.nan], np.float32)
-        return self.as_result(found[0], slope_min=least[passed], slope_max=greatest[passed])
-
-
-def _check_levels(thresholds: Sequence[float] | None, inclinations: Sequence[float] | None) -> None:
-    shares, angles = list(thresholds or ()), list(inclinations or ())
-    if not shares or any(high <= low for low, high in pairwise(shares)):
-        raise InputError(
-            f"thresholds {_listed(shares)}: give them from the lowest to the highest, such as 0.25, 0.75"
-        )
-    if len(angles) != len(shares):
-        raise InputError(
-            f"inclinations do not match: {len(shares)} thresholds and {len(angles)} inclinations. Give the"
-            " sheet's inclination at which each threshold is passed, from the lowest on"
-        )
-    rising = all(low < high for low, high in zip([0.0, *angles], [*angles, math.pi / 2], strict=True))
-    if not rising:
-        degrees = _listed(map(math.degrees, angles))
-        raise InputError(f"inclinations {degrees} deg: they must rise with the thresholds, between 0 and 90")
+        return self.as_result(levels[0], slope_min=least[passed], slope_max=greatest[passed])
 
 
 def _listed(numbers: Any) -> str:

@@ -1,4 +1,4 @@
-"""Membranes: Laplace's equation over the unknown pixels of a map, by multigrid on the picture's own grid."""
+"""Membranes: Laplace's equation over the free pixels of a map, by multigrid."""
 
 from __future__ import annotations
 
@@ -12,99 +12,96 @@ Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 _SQUARE = np.ones((3, 3), np.uint8)
-_STEPS = tuple(1 / (1.25 + sign * 0.75 * math.sqrt(0.5)) for sign in (-1, 1))  # of Jacobi, for short waves
-_LONGER = 1.5  # times the shorter side of a pixel, from which the longer one is not doubled
-_SMALLEST = 4  # pixels along the coarsest level's sides
-_SETTLED = 3e-4  # of the range of heights around, RMS, by which a cycle may still change them
-_CYCLES = 8
+_STEPS = tuple(1 / (1.25 + sign * 0.75 * math.sqrt(0.5)) for sign in (-1, 1))  # Jacobi steps, Chebyshev roots
+_LONGER = 1.5  # aspect ratio of pixels from which only the shorter side is doubled
+_SMALLEST = 4  # pixels along the sides of the coarsest level
+_SETTLED = 3e-4  # RMS change that ends the cycles, as a share of the range of heights at the rim
+_CYCLES = 8  # largest number
 
 
-def stretch(height: NDArray[np.floating], known: Mask, unknown: Mask, spacing: tuple[float, float]) -> Floats:
-    """Solve Laplace's equation: each unknown pixel is the mean of its four neighbours.
+def stretch(height: NDArray[np.floating], fixed: Mask, free: Mask, spacing: tuple[float, float]) -> Floats:
+    """Solve Laplace's equation: each free pixel is the mean of its four neighbours.
 
-    It reproduces planes, to about a thousandth of the range of heights around. Each group of unknown pixels
-    touches a known one; at pixels that are neither the membrane is free.
+    Planes are reproduced to about a thousandth of the range of heights at the rim. Each group of free pixels
+    touches a fixed one; at other pixels the membrane's border is free.
     """
     height = height.astype(np.float32)
-    level = _Level(unknown.astype(np.float32), known.astype(np.float32), spacing)
-    rim = cv2.dilate(unknown.view(np.uint8), _SQUARE) * known
+    level = _Level(free.astype(np.float32), fixed.astype(np.float32), spacing)
+    rim = cv2.dilate(free.view(np.uint8), _SQUARE) * fixed
     lowest, highest, _, _ = cv2.minMaxLoc(height, mask=rim)
     middle = np.float32((lowest + highest) / 2)
-    found = level.solve(np.where(known, height - middle, np.float32(0)))
-    enough = _SETTLED * (highest - lowest) * math.sqrt(np.count_nonzero(unknown))
+    heights = level.solve(np.where(fixed, height - middle, np.float32(0)))
+    tolerance = _SETTLED * (highest - lowest) * math.sqrt(np.count_nonzero(free))
     for _ in range(_CYCLES):
-        before = found.copy()
-        level.improve(found)
-        if cv2.norm(found, before, cv2.NORM_L2) <= enough:
+        before = heights.copy()
+        level.improve(heights)
+        if cv2.norm(heights, before, cv2.NORM_L2) <= tolerance:
             break
-    return np.where(unknown, np.clip(found + middle, lowest, highest), height)
+    return np.where(free, np.clip(heights + middle, lowest, highest), height)
 
 
 class _Level:
-    """Wanted and given pixels, 1 or 0, and the same in pixels of twice the size, down to a few."""
+    """One grid of the multigrid: free and fixed pixels, 1 or 0, and the next coarser grid."""
 
-    def __init__(self, wanted: Floats, given: Floats, spacing: tuple[float, float]) -> None:
-        self._wanted = wanted
+    def __init__(self, free: Floats, fixed: Floats, spacing: tuple[float, float]) -> None:
+        self._free = free
         down, across = (step**-2 for step in spacing)
         self._stiffness = 2 * (down + across)
         kernel = np.array([[0, down, 0], [across, 0, across], [0, down, 0]])
         self._kernel = (kernel / self._stiffness).astype(np.float32)
-        around = self._sum(wanted + given)
-        self._share = np.divide(wanted, around, out=np.zeros_like(wanted), where=around > 0)
-        self._room = np.empty_like(wanted), np.empty_like(wanted)
+        around = cv2.filter2D(free + fixed, -1, self._kernel, borderType=cv2.BORDER_CONSTANT)
+        self._share = np.divide(free, around, out=np.zeros_like(free), where=around > 0)
+        self._buffers = np.empty_like(free), np.empty_like(free)
         self._coarse: _Level | None = None
-        if max(wanted.shape) > _SMALLEST and wanted.any():
+        if max(free.shape) > _SMALLEST and free.any():
             steps = [
-                step if length > 1 else math.inf for step, length in zip(spacing, wanted.shape, strict=True)
+                step if length > 1 else math.inf for step, length in zip(spacing, free.shape, strict=True)
             ]
             self._factors = tuple(2 if step < _LONGER * min(steps) else 1 for step in steps)
-            self._given = self._reduce(given)  # the given share of large pixels
-            large = (self._given > 0).astype(np.float32)
-            free = (self._reduce(wanted) > 0).astype(np.float32) * (1 - large)
+            self._fixed = self._reduce(fixed)  # share of fixed pixels in large ones
+            large_fixed = (self._fixed > 0).astype(np.float32)
+            large_free = (self._reduce(free) > 0).astype(np.float32) * (1 - large_fixed)
             double = spacing[0] * self._factors[0], spacing[1] * self._factors[1]
-            self._coarse = _Level(free, large, double)
+            self._coarse = _Level(large_free, large_fixed, double)
 
     def solve(self, heights: Floats) -> Floats:
-        """Return what is near the solution, from the given heights, 0 elsewhere: full multigrid."""
-        found = heights.copy()
+        """Return an approximate solution from the fixed heights, 0 elsewhere: full multigrid."""
+        solution = heights.copy()
         if self._coarse is not None:
             large = self._reduce(heights)
-            np.divide(large, self._given, out=large, where=self._given > 0)
-            found += self._wanted * self._enlarge(self._coarse.solve(large))
-        self.improve(found)
-        return found
+            np.divide(large, self._fixed, out=large, where=self._fixed > 0)
+            solution += self._free * self._enlarge(self._coarse.solve(large))
+        self.improve(solution)
+        return solution
 
     def improve(self, heights: Floats, source: Floats | None = None) -> None:
-        """Do a V-cycle for heights that are their neighbours' mean plus a source."""
+        """Improve heights by one V-cycle; each is the mean of its neighbours plus a source."""
         self._smooth(heights, source)
         if self._coarse is None:
             for _ in range(_SMALLEST):
                 self._smooth(heights, source)
             return
-        rest = self._reduce(self._rest(heights, source))
-        rest *= self._coarse._wanted * np.float32(self._stiffness / self._coarse._stiffness)
-        error = np.zeros_like(rest)
-        self._coarse.improve(error, rest)
-        heights += self._wanted * self._enlarge(error)
+        residual = self._reduce(self._residual(heights, source))
+        residual *= self._coarse._free * np.float32(self._stiffness / self._coarse._stiffness)
+        error = np.zeros_like(residual)
+        self._coarse.improve(error, residual)
+        heights += self._free * self._enlarge(error)
         self._smooth(heights, source)
 
     def _smooth(self, heights: Floats, source: Floats | None) -> None:
         for step in _STEPS:
-            cv2.scaleAdd(self._rest(heights, source), step, heights, heights)
+            cv2.scaleAdd(self._residual(heights, source), step, heights, heights)
 
-    def _rest(self, heights: Floats, source: Floats | None) -> Floats:
-        """Return by how much wanted pixels are lower than they should be, until the next call."""
-        rest, other = self._room
-        cv2.filter2D(heights, -1, self._kernel, rest, borderType=cv2.BORDER_CONSTANT)
-        np.multiply(rest, self._share, out=rest)
-        np.multiply(self._wanted, heights, out=other)
-        np.subtract(rest, other, out=rest)
+    def _residual(self, heights: Floats, source: Floats | None) -> Floats:
+        """Return the residual of free pixels, in a buffer that the next call overwrites."""
+        residual, product = self._buffers
+        cv2.filter2D(heights, -1, self._kernel, residual, borderType=cv2.BORDER_CONSTANT)
+        np.multiply(residual, self._share, out=residual)
+        np.multiply(self._free, heights, out=product)
+        np.subtract(residual, product, out=residual)
         if source is not None:
-            np.add(rest, source, out=rest)
-        return rest
-
-    def _sum(self, values: Floats) -> Floats:
-        return np.asarray(cv2.filter2D(values, -1, self._kernel, borderType=cv2.BORDER_CONSTANT), np.float32)
+            np.add(residual, source, out=residual)
+        return residual
 
     def _reduce(self, values: Floats) -> Floats:
         """Return the means over large pixels; what is beyond the border counts as 0."""
@@ -119,4 +116,4 @@ class _Level:
         (rows, columns), (down, across) = values.shape, self._factors
         size = columns * across, rows * down
         large = cv2.resize(values, size, interpolation=cv2.INTER_NEAREST)
-        return np.asarray(large[: self._wanted.shape[0], : self._wanted.shape[1]], np.float32)
+        return np.asarray(large[: self._free.shape[0], : self._free.shape[1]], np.float32)

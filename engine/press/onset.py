@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,12 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.operation import travel_function
 from mirrorskin.engine.options import option
-from mirrorskin.engine.press.crossing import Crossing, CrossingOperation, Event, Found
-from mirrorskin.io import Map, Result
-from mirrorskin.io.maps import TABLE, PressStatus, ReleaseStatus, status_of
-
-STATUS: Mapping[str, Map] = {"onset": status_of(PressStatus), "release": status_of(ReleaseStatus)}
-"""Declaration of the status of each event."""
+from mirrorskin.engine.press.crossing import EVENT_MAPS, Crossing, CrossingOperation, Event, EventMaps
+from mirrorskin.io import Result
 
 
 class ThresholdOperation(CrossingOperation):
@@ -27,15 +23,6 @@ class ThresholdOperation(CrossingOperation):
         choices=("onset", "release"),
         help="event to find: dark to light while travel increases, or light to dark while it decreases",
     )
-
-    height = TABLE["height"]
-    status = TABLE["status"]
-    frame = TABLE["frame"]
-
-    @property
-    def declarations(self) -> Mapping[str, Map]:
-        """Declarations of the maps; the legend of the status depends on the event."""
-        return {**self.maps, "status": STATUS[self.event]}
 
     def shares(self) -> Sequence[float]:
         """Return the thresholds to search for, as shares of the range from dark to bright."""
@@ -62,10 +49,9 @@ class ThresholdOperation(CrossingOperation):
         for search in self._searches:
             search.push(frames, travel, lent)
 
-    def as_result(self, found: Found, **others: NDArray[Any]) -> Result:
-        """Return what was found, and other maps, as a result."""
-        names = ("height", "height_sigma", "status", "frame")
-        maps: dict[str, NDArray[Any]] = dict(zip(names, found, strict=True))
+    def as_result(self, event_maps: EventMaps, **others: NDArray[Any]) -> Result:
+        """Return the maps of the event, and others, as a result."""
+        maps: dict[str, NDArray[Any]] = dict(zip(EVENT_MAPS, event_maps, strict=True))
         process = {"noise": self._searches[0].noise}
         return Result(maps | others, process=process, declarations=self.declarations)
 
@@ -114,13 +100,9 @@ class Onset(ThresholdOperation):
         """Return the threshold, and a lower one if the levels are uncertain."""
         if not (self.dark_sigma or self.bright_sigma):
             return [self.threshold]
-        return [self.threshold, max(0.0, self.threshold - self._level_sigma())]
-
-    def _level_sigma(self) -> float:
-        """Return the standard deviation of the level at the threshold, as a share of the range."""
-        parts = (1 - self.threshold) * self.dark_sigma, self.threshold * self.bright_sigma
+        sigma = math.hypot((1 - self.threshold) * self.dark_sigma, self.threshold * self.bright_sigma)
         span = np.nanmedian(np.asarray(self.bright, np.float64) - np.asarray(self.dark, np.float64))
-        return math.hypot(*parts) / float(span)
+        return [self.threshold, max(0.0, self.threshold - sigma / float(span))]
 
     def result(self) -> Result:
         """Return height, status and frame of the frames so far."""
@@ -131,16 +113,13 @@ class Onset(ThresholdOperation):
         return self._result(last=True)
 
     def _result(self, last: bool) -> Result:
-        found, *lower = [search.found(last) for search in self._searches]
+        maps, *lower = [search.event_maps(last) for search in self._searches]
         if lower:
-            found = found._replace(sigma=np.hypot(found.sigma, self._shift(found, lower[0])))
-        return self.as_result(found)
-
-    def _shift(self, found: Found, lower: Found) -> NDArray[np.float32]:
-        """Return by how much heights depend on the uncertain level."""
-        # A pixel that is always light at the lower threshold turned light no later than in the first frame.
-        end = self._searches[0].travel[-1 if self.event == "release" else 0]
-        return found.height - np.where(np.isfinite(lower.height), lower.height, np.float32(-end))
+            # A pixel that is always light at the lower threshold turned light in the first frame or earlier.
+            end = self._searches[0].travel[-1 if self.event == "release" else 0]
+            height = np.where(np.isfinite(lower[0].height), lower[0].height, np.float32(-end))
+            maps = maps._replace(sigma=np.hypot(maps.sigma, maps.height - height))
+        return self.as_result(maps)
 
 
 find_onset = travel_function(

@@ -13,7 +13,7 @@ from mirrorskin.engine.method import Context, Method, Plan, Step
 from mirrorskin.engine.options import option
 from mirrorskin.engine.press.changepoint import ChangePoint
 from mirrorskin.engine.press.crossing import Event, PressOperation
-from mirrorskin.engine.press.estimated_levels import EstimatedLevels, estimate_levels
+from mirrorskin.engine.press.estimated_levels import estimate_levels
 from mirrorskin.engine.press.levels import Levels
 from mirrorskin.engine.press.onset import Onset
 from mirrorskin.engine.press.strokes import Strokes
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 PressMethod = Literal["threshold", "change-point"]
 
-_OMIT = ("frame",)  # it follows from height and travel
+_OMIT = ("frame",)  # redundant: it follows from height and travel
 
 
 class Elastomer(Step):
@@ -45,7 +45,7 @@ class Elastomer(Step):
     )
 
     def apply(self, result: Result, context: Context) -> Result:
-        """Return corrected heights; pressure and force if the modulus is known."""
+        """Return corrected heights; pressure and force if there is a modulus."""
         source = context.source
         if not isinstance(source, Calibrated):
             if self.modulus is not None:
@@ -56,40 +56,39 @@ class Elastomer(Step):
         from mirrorskin.engine.press.elastic import correct_press  # splines, a tenth of a second to load
 
         deepest, gel = float(np.max(context.pushed("travel"))), source.calibration.gel
-        result, said, fit = correct_press(result, source, deepest, self.threshold, gel)
-        result = result.assign(process={**result.process, "gel": said})
+        result, summary, fit = correct_press(result, source, deepest, self.threshold, gel)
+        result = result.assign(process={**result.process, "gel": summary})
         return self._with_force(result, fit, source.calibration)
 
     def _with_force(self, result: Result, fit: PressFit | None, calibration: Calibration) -> Result:
-        """Add pressure and force, where the modulus is known."""
+        """Add pressure and force, if there is a modulus."""
         from mirrorskin.engine.force.normal import check_modulus, force_of_press
 
-        stiffness, modulus = calibration.stiffness, self.modulus
-        known = stiffness if modulus is None else check_modulus(modulus)
-        if known is None:
+        calibrated = calibration.stiffness
+        stiffness = calibrated if self.modulus is None else check_modulus(self.modulus)
+        if stiffness is None:
             return result
         missing = ""
         if fit is None:
             missing = "the heights are not corrected for the gel"
-        elif modulus is None and stiffness is not None and stiffness.gel_threshold != fit.scene.gel.threshold:
+        elif not isinstance(stiffness, float) and stiffness.gel_threshold != fit.scene.gel.threshold:
             missing = "the modulus was learned with another gel: calibrate force again"
         else:
             try:
-                force = force_of_press(fit, known)
+                force = force_of_press(fit, stiffness)
             except NotConverged as error:
                 missing = str(error)
         if missing:
             return result.assign(process={**result.process, "force": f"none: {missing}"})
-        said = (
-            f"{known:g} MPa, given"
-            if isinstance(known, float)
-            else f"{known.modulus:.4g} MPa of the calibration"
-        )
+        if isinstance(stiffness, float):
+            origin = f"{stiffness:g} MPa, given"
+        else:
+            origin = f"{stiffness.modulus:.4g} MPa of the calibration"
         return result.assign(
             pressure=force.pressure,
             force=force.force,
             force_sigma=force.force_sigma,
-            process={**result.process, "modulus": said},
+            process={**result.process, "modulus": origin},
         )
 
 
@@ -107,13 +106,13 @@ class HoleFilling(Step):
         """Return heights without holes, and which pixels were filled."""
         pixel_size = context.source.header.pixel_size
         if not self.fill or pixel_size is None:
-            why = "not asked" if not self.fill else "the recording has no pixel size"
-            return result.assign(process={**result.process, "fill": f"none: {why}"})
+            reason = "not asked" if not self.fill else "the recording has no pixel size"
+            return result.assign(process={**result.process, "fill": f"none: {reason}"})
         from mirrorskin.engine.press.holes import fill_holes
 
         travel = context.pushed("travel")
         above = None
-        if self.event == "onset":  # what is light at start was touched before
+        if self.event == "onset":  # pixels that are light at the start were touched before
             above = np.where(result.status == PressStatus.LIGHT_AT_START, -travel[0], np.nan)
         height, filled = fill_holes(
             result.height, result.height_sigma, pixel_size, above=above, deepest=-float(np.max(travel))
@@ -126,8 +125,8 @@ class Press(Method, options_of=(Onset, Levels, Elastomer, HoleFilling)):
 
     If travel turns more than once, from a press to its release, all strokes are used; see
     `mirrorskin.engine.press.strokes.Strokes`. Levels of dark and light that neither the options nor the
-    source specify are estimated from the frames, and their uncertainty is added to ``height_sigma``; if the
-    frames do not show them, the range of their type is used. ``process`` says which.
+    source specify are estimated from the frames, and their uncertainty is added to ``height_sigma``; if that
+    is impossible, the range of the frames' type is used. ``process`` contains the origin of each level.
     """
 
     motions = ("vertical",)
@@ -158,31 +157,39 @@ class Press(Method, options_of=(Onset, Levels, Elastomer, HoleFilling)):
         self.make(ChangePoint)
 
     def plan(self, source: Source) -> Plan:
-        """Return the operation for a source: by its travel, the method, and what is known of the levels."""
-        oscillates = _oscillates(source)
-        frames = range(source.shape[0]) if oscillates else _frames_of(source, self.event)
+        """Return the operation for a source, depending on its travel, the method and the available levels."""
+        travel: NDArray[np.float64] | None = getattr(source, "travel", None)
+        # More than a press and its release.
+        oscillates = travel is not None and len(stroke_starts(travel, 1)) > 1
+        if travel is None or oscillates:
+            frames = range(source.shape[0])
+        else:
+            frames = _frames_of(source.name, travel, self.event)
         size = len(frames) * math.prod(source.shape[1:]) * source.dtype.itemsize
         limits = {"memory_limit": max(1, min(self.memory_limit, 2 * size))}
         kind = self._kind(source, oscillates)
         operation: PressOperation = self.make(kind, **limits).configured_for(source)
-        levels = self._estimated(source, frames, operation) if self.method == "threshold" else None
         process = self._process(source, frames, operation)
-        if levels is not None:
-            operation, process = _with_levels(operation, levels, process)
-        if operation.passes == 2:
-            _check_rewindable(source)
+        if self.method == "threshold":
+            operation = _with_estimated_levels(operation, source, frames, process)
+        elif operation.passes == 2:
+            if not source.rewindable:
+                raise InputError(
+                    f"{source.name} cannot be read twice, as a change between unknown levels needs: "
+                    "give dark and bright"
+                )
             process |= dict.fromkeys(("dark", "bright"), "each pixel's own")
         return Plan(operation, self._steps(operation), process, frames, _OMIT)
 
     def live_plan(self, source: Source) -> Plan:
-        """Return the search for strokes, which needs to know nothing of the travel beforehand."""
+        """Return the search for strokes, which does not need the travel in advance."""
         operation: PressOperation = self.make(Strokes).configured_for(source)
         process = self._process(source, range(0), operation)
-        del process["frames"]  # they are counted
+        del process["frames"]  # the operation counts them
         return Plan(operation, self._steps(operation), process, omit=_OMIT)
 
     def _kind(self, source: Source, oscillates: bool) -> type[PressOperation]:
-        """Return the class of operations that finds the heights."""
+        """Return the class of the operation."""
         if oscillates and self._has_levels:
             raise InputError(f"{source.name}: inclinations need a press that goes down once")
         if oscillates and self.method != "threshold":
@@ -192,12 +199,6 @@ class Press(Method, options_of=(Onset, Levels, Elastomer, HoleFilling)):
         if oscillates:
             return Strokes
         return Onset if self.method == "threshold" else ChangePoint
-
-    def _estimated(self, source: Source, frames: range, operation: PressOperation) -> EstimatedLevels | None:
-        """Estimate levels that neither the options nor the source specify."""
-        if operation.dark is not None and operation.bright is not None:
-            return None
-        return estimate_levels(source, frames, operation.dark, operation.bright)
 
     def _process(self, source: Source, frames: range, operation: PressOperation) -> dict[str, ProcessValue]:
         process: dict[str, ProcessValue] = {
@@ -212,29 +213,26 @@ class Press(Method, options_of=(Onset, Levels, Elastomer, HoleFilling)):
             "bright": level_origin(source, "bright", self.bright),
         }
         if isinstance(operation, Levels):
-            process |= {one: str(list(getattr(self, one))) for one in ("thresholds", "inclinations")}
+            process |= {name: str(list(getattr(self, name))) for name in ("thresholds", "inclinations")}
         return process
 
     def _steps(self, operation: PressOperation) -> list[Step]:
         return [self.make(Elastomer, threshold=self._lowest(operation)), self.make(HoleFilling)]
 
     def _lowest(self, operation: PressOperation) -> float:
-        """Return the threshold that heights belong to."""
+        """Return the threshold of the heights."""
         return float(self.thresholds[0] if isinstance(operation, Levels) else self.threshold)
 
 
-def _check_rewindable(source: Source) -> None:
-    if not source.rewindable:
-        raise InputError(
-            f"{source.name} cannot be read twice, as a change between unknown levels needs: "
-            "give dark and bright"
-        )
-
-
-def _with_levels(
-    operation: PressOperation, levels: EstimatedLevels, process: dict[str, ProcessValue]
-) -> tuple[PressOperation, dict[str, ProcessValue]]:
-    """Return an operation with estimated levels; an onset's standard deviation includes theirs."""
+def _with_estimated_levels(
+    operation: PressOperation, source: Source, frames: range, process: dict[str, ProcessValue]
+) -> PressOperation:
+    """Return an operation with levels that neither the options nor the source specify, and record them."""
+    if operation.dark is not None and operation.bright is not None:
+        return operation
+    levels = estimate_levels(source, frames, operation.dark, operation.bright)
+    if levels is None:
+        return operation
     changes: dict[str, Any] = {}
     for name in ("dark", "bright"):
         if getattr(operation, name) is None:
@@ -242,26 +240,17 @@ def _with_levels(
             process[name] = estimated_level(changes[name])
     if isinstance(operation, Onset):
         changes |= {"dark_sigma": levels.dark_sigma, "bright_sigma": levels.bright_sigma}
-    return operation.with_options(**changes), process
+    return operation.with_options(**changes)
 
 
-def _oscillates(source: Source) -> bool:
-    """Return whether a source's travel does more than go down, and then up, once; as far as it is known."""
-    travel: NDArray[np.float64] | None = getattr(source, "travel", None)
-    return travel is not None and len(stroke_starts(travel, 1)) > 1
-
-
-def _frames_of(source: Source, event: Event) -> range:
-    """Return the frames in which a source was pressed, or lifted; all if it does not know beforehand."""
-    travel: NDArray[np.float64] | None = getattr(source, "travel", None)
-    if travel is None:
-        return range(source.shape[0])
+def _frames_of(name: str, travel: NDArray[np.float64], event: Event) -> range:
+    """Return the frames of a press up to the greatest travel, or of a release from there."""
     deepest = np.flatnonzero(travel == travel.max())
     rises, falls = travel[0] < travel[deepest[0]], travel[-1] < travel[deepest[0]]
     if event == "release":
         if rises and not falls:
-            raise InputError(f"{source.name}: travel only rises: that is a press; give event onset")
-        return range(int(deepest[0]), source.shape[0])
+            raise InputError(f"{name}: travel only rises: that is a press; give event onset")
+        return range(int(deepest[0]), len(travel))
     if falls and not rises:
-        raise InputError(f"{source.name}: travel only falls: that is a release; give event release")
+        raise InputError(f"{name}: travel only falls: that is a release; give event release")
     return range(int(deepest[-1]) + 1)

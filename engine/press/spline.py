@@ -15,24 +15,27 @@ if TYPE_CHECKING:
 
 Doubles = NDArray[np.float64]
 
-# Of the four splines that live in a cell: the factors of t^0 to t^3, t from 0 to 1 across the cell.
+# Coefficients of t^0 to t^3 of the four splines that overlap a cell; t is 0 to 1 across the cell.
 _PIECES = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6
-_ORDER = 3  # of the derivatives that are kept small: a quadratic cap costs nothing
-_PULL = 1e-3  # weight of an interval's middle beside that of its ends
-_ITERATIONS = 20
-_HEAVIEST = 1e4  # weight of a pixel in units of the typical one's
-_SETTLED = 0.01  # half-widths that the surface may still move
-_LARGEST = 2.0  # half-widths that one pixel counts for in the misfit
-_FAR, _PATIENCE = 1.0, 3  # a misfit that is not mended any more after so many steps
-_SPLINES = 8  # along a side, were it square
+_ORDER = 3  # order of the penalised derivatives; those of a paraboloid are 0
+_PULL = 1e-3  # weight of the middle of an interval, relative to that of its ends
+_ITERATIONS = 20  # largest number
+_HEAVIEST = 1e4  # largest weight of a pixel, relative to a typical one
+_SETTLED = 0.01  # half-widths: changes of the surface below this end the iterations
+_LARGEST = 2.0  # half-widths: limit of one pixel's excess in the misfit
+_FAR, _PATIENCE = (
+    1.0,
+    3,
+)  # misfit at which the iterations are given up, and number of the first such iteration
+_SPLINES = 8  # along each side of the grid, if it were square
 _FEWEST_PIECES = 3
-_RIDGE = 1e-13  # of the diagonal, so that rounding leaves no matrix singular
+_RIDGE = 1e-13  # share of the diagonal that is added to keep matrices regular
 
 
 class Fit(NamedTuple):
-    """A smooth surface at the samples, its splines' factors, and by how much it leaves its intervals.
+    """A smooth surface: its heights at the samples, its splines' factors, and its misfit.
 
-    The last is an RMS in half-widths.
+    The misfit is the RMS distance from the intervals, in half-widths.
     """
 
     height: Doubles
@@ -48,11 +51,11 @@ class Spline:
     shape : (int, int)
         Rows and columns.
     spacing : (float, float)
-        Distance of rows, and of columns, in any unit.
+        Distances of rows and of columns, in any unit.
     cells : (int, int)
-        Between knots, along y and x.
+        Numbers of cells between knots, along y and x.
     strides : (int, int)
-        Rows and columns from one sample to the next; the first pixel is one.
+        Rows and columns from one sample to the next, starting with the first pixel.
     """
 
     def __init__(
@@ -69,7 +72,9 @@ class Spline:
             for length, count in zip(shape, cells, strict=True)
         ]
         self._y, self._x = (values[::stride] for values, stride in zip(self._all, strides, strict=True))
-        self._down, self._across = (_overlapping(values.shape[1]) for values in (self._y, self._x))
+        self._down, self._across = (
+            np.nonzero(np.triu(np.tri(values.shape[1], k=3), -3)) for values in (self._y, self._x)
+        )  # pairs of splines that share a cell
         self._pairs_y, self._pairs_x = (
             values[:, first] * values[:, second]
             for values, (first, second) in ((self._y, self._down), (self._x, self._across))
@@ -81,24 +86,20 @@ class Spline:
         )
 
     def roughness(self) -> Doubles:
-        """Return the form of the integral of the squared third derivatives, in all directions alike."""
-        along = [
-            [spline_products(count, order) * (count / span) ** (2 * order - 1) for order in range(_ORDER + 1)]
-            for count, span in zip(self._cells, self._spans, strict=True)
-        ]
+        """Return the quadratic form of the integral of the squared third derivatives, over all directions."""
+        y, x = (_derivative_products(*axis) for axis in zip(self._cells, self._spans, strict=True))
         parts = [
-            math.comb(_ORDER, order)
-            * np.outer(along[0][order][self._down], along[1][_ORDER - order][self._across])
+            math.comb(_ORDER, order) * np.outer(y[order][self._down], x[_ORDER - order][self._across])
             for order in range(_ORDER + 1)
         ]
         return np.asarray(np.sum(parts, axis=0))
 
     def squares(self, weights: Doubles) -> Doubles:
-        """Return the form of the sum over samples of weights times the squared surface."""
+        """Return the quadratic form of the sum over the samples of weights times the squared surface."""
         return _product(self._pairs_y.T, _product(weights, self._pairs_x))
 
     def lowest(self, form: Doubles, values: Doubles) -> Doubles:
-        """Return the factors for which half a form less the sum of values times the surface is lowest."""
+        """Return the factors that minimise half a quadratic form less the sum of values times the surface."""
         right = _product(self._y.T, _product(values, self._x))
         matrix = np.zeros((right.size,) * 2)
         matrix[self._entries] = form
@@ -106,30 +107,30 @@ class Spline:
         return _solve_banded(matrix, right.ravel(), _ORDER * right.shape[1]).reshape(right.shape)
 
     def at_samples(self, factors: Doubles) -> Doubles:
-        """Return the surface of factors at the samples."""
+        """Return the surface at the samples."""
         return _product(_product(self._y, factors), self._x.T)
 
     def over(self, factors: Doubles, part: tuple[slice, slice]) -> Doubles:
-        """Return the surface of factors at all pixels of a part of the box."""
+        """Return the surface at all pixels of a part of the box."""
         return _product(_product(self._all[0][part[0]], factors), self._all[1][part[1]].T)
 
 
 class CellSplines:
-    """Cubic splines over cells, from the first one's centre to the last one's.
+    """Cubic splines over cells, from the centre of the first cell to that of the last.
 
     Parameters
     ----------
     shape : (int, int)
         Rows and columns of cells, 2 or more of each.
     spacing : (float, float)
-        Distance of rows, and of columns, mm.
+        Distances of rows and of columns, mm.
 
     Attributes
     ----------
     basis : csr_matrix, (H W, m)
-        The splines at the cells.
+        Values of the splines at the cells.
     slopes : (csr_matrix, csr_matrix)
-        Their derivatives down the picture and across it, 1/mm.
+        Derivatives of the splines down the picture and across it, 1/mm.
     """
 
     def __init__(self, shape: tuple[int, int], spacing: tuple[float, float]) -> None:
@@ -157,21 +158,20 @@ class CellSplines:
         return np.asarray((self.basis @ factors).reshape(self._shape))
 
     def at(self, factors: Doubles, rows: Doubles, columns: Doubles) -> Doubles:
-        """Return a surface on rows and columns that lie at places between the cells."""
+        """Return a surface at fractional rows and columns of cells."""
         grid = factors.reshape(self._pieces[0] + 3, -1)
         return np.asarray((self._values(rows, 0) @ grid) @ self._values(columns, 1).T)
 
     def roughness(self) -> Doubles:
-        """Return the form of the mean squared third derivatives, in all directions alike, 1/mm^4."""
-        along = [
-            [spline_products(count, order) * (count / span) ** (2 * order - 1) for order in range(4)]
-            for count, span in zip(self._pieces, self._spans, strict=True)
+        """Return the quadratic form of the mean squared third derivatives, over all directions, 1/mm^4."""
+        y, x = (_derivative_products(*axis) for axis in zip(self._pieces, self._spans, strict=True))
+        parts = [
+            math.comb(_ORDER, order) * np.kron(y[order], x[_ORDER - order]) for order in range(_ORDER + 1)
         ]
-        parts = [math.comb(3, order) * np.kron(along[0][order], along[1][3 - order]) for order in range(4)]
         return np.asarray(np.sum(parts, axis=0) / (self._spans[0] * self._spans[1]))
 
     def _values(self, places: Doubles, axis: int, order: int = 0) -> sparse.csr_matrix:
-        """Return an axis' splines, or their derivatives, 1/mm, at places in cells."""
+        """Return the splines of an axis, or their derivatives, 1/mm, at fractional cells."""
         from scipy import sparse
 
         count, pieces = self._shape[axis], self._pieces[axis]
@@ -182,23 +182,24 @@ class CellSplines:
 def fit_within(spline: Spline, low: Doubles, high: Doubles, stiffness: float) -> Fit:
     """Fit the smoothest surface that stays within the pixels' intervals.
 
-    What leaves an interval costs its square, and beyond another half-width only its size (Huber), so that
-    wrong heights do not bend the surface: iteratively reweighted least squares, in which the surface is drawn
-    to the ends that it has passed. The intervals' ends, (H, W), mm, are NaN where nothing is known, and the
-    upper one is infinite where only the lower one is; at least one pixel has both. Stiffness is the cost of
-    the squared third derivatives beside that of the mean squared excess.
+    The excess beyond an interval is penalised by Huber's loss with a limit of one half-width, so that wrong
+    heights do not bend the surface: iteratively reweighted least squares, with the violated ends as targets.
+
+    Intervals end at ``low`` and ``high``, (H, W), mm; both are NaN without a height, and ``high`` is infinite
+    if only a lower bound is given. At least one pixel has both. ``stiffness`` is the weight of the squared
+    third derivatives relative to that of the mean squared excess.
     """
-    known, both = np.isfinite(low), np.isfinite(low) & np.isfinite(high)
+    bounded, both = np.isfinite(low), np.isfinite(low) & np.isfinite(high)
     half = np.where(both, (high - low) / 2, np.nan)
     typical = float(np.median(half[both]))
     half = np.where(both, half, typical)
     datum = float(np.mean(low[both] + half[both]))
-    low, high = np.where(known, low - datum, -np.inf), np.where(both, high - datum, np.inf)
+    low, high = np.where(bounded, low - datum, -np.inf), np.where(both, high - datum, np.inf)
     middle = np.where(both, low + half, 0.0)
-    weights = np.where(known, np.minimum((typical / half) ** 2, _HEAVIEST), 0.0)
+    weights = np.where(bounded, np.minimum((typical / half) ** 2, _HEAVIEST), 0.0)
     rough = spline.roughness() * (stiffness * np.sum(weights[both]))
     height, excess = middle, np.zeros_like(half)
-    pull = np.where(both, weights, 0.0)  # at first all intervals draw to their middles
+    pull = np.where(both, weights, 0.0)  # in the first iteration, the middles are fitted
     for step in range(_ITERATIONS):
         draw = np.where(excess > 0, weights / np.maximum(excess, 1.0), 0.0)
         ends = np.where(excess > 0, np.clip(height, low, high), 0.0)
@@ -206,20 +207,16 @@ def fit_within(spline: Spline, low: Doubles, high: Doubles, stiffness: float) ->
         factors = spline.lowest(rough + spline.squares(pull + draw), pull * middle + draw * ends)
         height = spline.at_samples(factors)
         excess = np.abs(np.clip(height, low, high) - height) / half
-        moved = np.max(np.abs(height - before)[known]) / typical
-        if step and (moved < _SETTLED or (step >= _PATIENCE and _misfit(excess[known]) > _FAR)):
+        misfit = float(np.sqrt(np.mean(np.minimum(excess[bounded], _LARGEST) ** 2)))
+        moved = np.max(np.abs(height - before)[bounded]) / typical
+        if step and (moved < _SETTLED or (step >= _PATIENCE and misfit > _FAR)):
             break
         pull = np.where(both, _PULL * weights, 0.0)
-    return Fit(height + datum, factors + datum, _misfit(excess[known]))  # splines add up to 1
-
-
-def _misfit(excess: Doubles) -> float:
-    """Return the RMS of excesses in half-widths, of which a few may be of any size."""
-    return float(np.sqrt(np.mean(np.minimum(excess, _LARGEST) ** 2)))
+    return Fit(height + datum, factors + datum, misfit)  # the splines sum to 1
 
 
 def spline_values(places: Doubles, pieces: int, order: int = 0) -> Doubles:
-    """Return an axis' splines, or their derivatives, at places from 0 to ``pieces``: (n, pieces + 3)."""
+    """Return the splines of an axis, or their derivatives, at positions 0 to ``pieces``: (n, pieces + 3)."""
     places = np.clip(places, 0, pieces)
     piece = np.minimum(places.astype(np.intp), pieces - 1)
     powers = np.zeros((len(places), 4))
@@ -230,20 +227,22 @@ def spline_values(places: Doubles, pieces: int, order: int = 0) -> Doubles:
     return values
 
 
-def spline_products(pieces: int, order: int) -> Doubles:
-    """Return the integrals of products of two splines' derivatives, with pieces of length 1."""
-    powers = np.arange(4 - order)
-    factors = [math.perm(int(power) + order, order) for power in powers]
-    parts = _PIECES[:, order:] * factors
-    one = parts @ (1 / (powers[:, np.newaxis] + powers + 1)) @ parts.T
-    matrix = np.zeros((pieces + 3, pieces + 3))
-    for piece in range(pieces):
-        matrix[piece : piece + 4, piece : piece + 4] += one
-    return matrix
+def _derivative_products(pieces: int, span: float) -> list[Doubles]:
+    """Return the integrals of products of two splines' derivatives over a span, for orders 0 to 3."""
+    products = []
+    for order in range(_ORDER + 1):
+        powers = np.arange(4 - order)
+        parts = _PIECES[:, order:] * [math.perm(int(power) + order, order) for power in powers]
+        block = parts @ (1 / (powers[:, np.newaxis] + powers + 1)) @ parts.T
+        matrix = np.zeros((pieces + 3, pieces + 3))
+        for piece in range(pieces):
+            matrix[piece : piece + 4, piece : piece + 4] += block
+        products.append(matrix * (pieces / span) ** (2 * order - 1))
+    return products
 
 
 def _solve_banded(matrix: Doubles, right: Doubles, size: int) -> Doubles:
-    """Solve equations whose matrix is zero except in blocks of a size on its diagonal and beside it."""
+    """Solve a block-tridiagonal system with blocks of a size."""
     blocks = [slice(start, start + size) for start in range(0, len(right), size)]
     pivot, rest = matrix[blocks[0], blocks[0]], right[blocks[0]]
     reduced = []
@@ -258,13 +257,7 @@ def _solve_banded(matrix: Doubles, right: Doubles, size: int) -> Doubles:
     return np.concatenate(parts[::-1])
 
 
-def _product(one: NDArray[Any], other: NDArray[Any]) -> Doubles:
-    """Return a product of matrices on one core: threads would wait for each other longer than it takes."""
+def _product(first: NDArray[Any], second: NDArray[Any]) -> Doubles:
+    """Return a matrix product, computed by one thread: at this size, several cost more than they save."""
     nothing: Any = None
-    return np.asarray(cv2.gemm(one, other, 1.0, nothing, 0.0))
-
-
-def _overlapping(count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the pairs of splines, in any order, that share a cell."""
-    first, second = np.nonzero(np.triu(np.tri(count, k=3), -3))
-    return first, second
+    return np.asarray(cv2.gemm(first, second, 1.0, nothing, 0.0))

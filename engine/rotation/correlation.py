@@ -1,9 +1,9 @@
 """Mean, cosine and sine of the brightness over an axial rotation (paper, section 4: equations 17 to 22).
 
-A device holds four sums a pixel, of E, E cos alpha, E sin alpha and E^2, and solves the fit from them. Whole
-counts of frames of weight 0 or 1 are summed as integers, with cosines rounded to multiples of 2^-17 or 2^-23:
-nothing drifts, and it does not matter how frames are cut into blocks. Anything else is summed as pairs of
-floats, in the order of the frames. See `mirrorskin.kernels.correlation`.
+A device holds four sums per pixel, of E, E cos alpha, E sin alpha and E^2, and solves the fit from them.
+Integer samples of frames with weights 0 and 1 are summed as integers, with cosines rounded to multiples of
+2^-17 or 2^-23: these sums are exact and do not depend on how frames are divided into blocks. Other samples
+are summed as pairs of floats, in the order of the frames. See `mirrorskin.kernels.correlation`.
 """
 
 from __future__ import annotations
@@ -27,18 +27,13 @@ from mirrorskin.kernels.array import Array, Operand
 from mirrorskin.kernels.correlation import WINDOW
 from mirrorskin.kernels.device import C_TYPES, Device
 
-_STEPS = {1: 2**17, 2: 2**23}  # of a cosine, by bytes of a count: no sum in kernels/correlation.cl overflows
-_BATCH = 256  # frames whose tables a kernel gets at once
-_MAX_FRAMES = 2**23  # that integer sums can take
+_STEPS = {1: 2**17, 2: 2**23}  # steps per unit of a cosine, by bytes of a sample: no integer sum overflows
+_BATCH = 256  # frames per launch
+_MAX_FRAMES = 2**23  # limit of integer sums
+# Maps of a band, by the arguments of kernels.
 _SUMS = {"total": "sum", "cosine": "cosine sum", "sine": "sine sum", "square": "square sum"}
 _PAIRS = {"reference": "reference", **_SUMS}
-_ANSWERS = {
-    "mean": "wave mean",
-    "cosine_part": "wave cosine",
-    "sine_part": "wave sine",
-    "residual": "wave residual",
-}
-"""Maps of a band, by the arguments of kernels."""
+_FIT = {name: f"wave {name}" for name in ("mean", "cosine_part", "sine_part", "residual")}
 
 
 class CorrelationOperation(Operation):
@@ -85,7 +80,7 @@ class CorrelationOperation(Operation):
     def _push(self, frames: NDArray[Any], alpha: Doubles, weights: Doubles, lent: bool) -> None:
         """Take in frames with the phase and the weight of each."""
         if lent and self.count == 0 and self._window() is None and StackSums.take(frames, weights):
-            self._stack = frames, alpha, weights  # summed and solved in one run, unless others follow
+            self._stack = frames, alpha, weights  # summed and solved by one kernel, unless more frames follow
             return
         if self._stack is not None:
             self._sums.push(*self._stack, lent=True)
@@ -193,7 +188,7 @@ correlate = phase_function(
 
 
 class _Sums:
-    """Sums over frames on a device, and the fit that follows from them."""
+    """Sums over frames on a device, and the fit that they determine."""
 
     _phase: Doubles
     _weight: Doubles
@@ -210,8 +205,8 @@ class _Sums:
         self._device, self._size, self._integer = device, dtype.itemsize, dtype.kind == "u"
         self._step = _STEPS.get(dtype.itemsize, 1)
         self._macros: dict[str, str | int] = {"FRAME": C_TYPES[dtype.name], "BITS": 8 * dtype.itemsize}
-        answers = dict.fromkeys(_ANSWERS.values(), np.float32)
-        self.bands: list[Band] = cut_into_bands(device, shape, dtype, {**maps, **answers}, length, least)
+        maps = {**maps, **dict.fromkeys(_FIT.values(), np.float32)}
+        self.bands: list[Band] = cut_into_bands(device, shape, dtype, maps, length, least)
         self._length = length
         self._place = device.array("place", (_BATCH,), np.int32)
         self._steps = device.array("basis", (3 * _BATCH,), np.int32)
@@ -220,52 +215,54 @@ class _Sums:
 
     @cached_property
     def room(self) -> NDArray[Any]:
-        """Where a source may write the next frames, (n, H, W), not to be copied."""
+        """Array in which the next frames may be written before they are pushed, (n, H, W)."""
         return room_of(self.bands, self._length)
 
     @property
     def frames(self) -> tuple[Doubles, Doubles]:
-        """Phases and weights of the frames that count; 0 for missing ones."""
+        """Phases and weights of the frames; the weight of a missing frame is 0."""
         return self._phase, self._weight
 
     def result(self) -> Result:
-        """Return the fit that the sums determine; InputError if their phases do not determine one yet."""
+        """Return the fit; InputError if the phases do not determine one."""
         used = self._weight > 0
         check_phases(self._phase[used], self._weight[used])
         self._solve()
         parts = []
         for band in self.bands:
             with band.resident():
-                parts.append([band.detach(answer) for answer in _ANSWERS.values()])
+                parts.append([band.detach(name) for name in _FIT.values()])
         mean, cosine, sine, residual = (join_rows(part) for part in zip(*parts, strict=True))
         return Result(
             mean=mean,
             cosine=cosine,
             sine=sine,
             modulation=lambda: np.hypot(cosine, sine),
-            azimuth=lambda: _phase_of_maximum(cosine, sine),
+            azimuth=lambda: np.where(
+                (cosine == 0) & (sine == 0), np.float32(np.nan), np.arctan2(sine, cosine)
+            ),
             residual=residual,
             process={"frames": int(np.count_nonzero(used))},
         )
 
     def _solve(self) -> None:
-        """Put mean, cosine, sine and residual into the bands' maps."""
+        """Write mean, cosine, sine and residual to the bands' maps."""
         raise NotImplementedError
 
     def _rows_in_steps(self, phase: Doubles, weight: Doubles) -> Doubles:
-        """Return 1, cos alpha and sin alpha, (N, 3), in whole steps; zeros for other weights than 1."""
+        """Return 1, cos alpha and sin alpha, (N, 3), in integer steps; zeros unless the weight is 1."""
         steps = np.array([1, self._step, self._step])
         return np.where((weight == 1)[:, np.newaxis], np.rint(basis(phase) * steps), 0)
 
     def _stage(self, frames: NDArray[Any], lent: bool, whole: bool = False) -> Iterator[tuple[Band, Staged]]:
-        """Have each band at work on its rows of the frames; yield which of these are on the device."""
+        """Yield the resident bands, with their rows of the frames on the device."""
         for band in self.bands:
             with band.resident():
                 for staged in band.stage(frames, lent, whole):
                     yield band, staged
 
     def _run(self, band: Band, name: str, moved: int, **arguments: Any) -> None:
-        """Run a kernel over a band; ``moved`` is bytes a pixel."""
+        """Run a kernel over a band; ``moved`` is bytes per pixel."""
         kernel = self._device.kernel("correlation", name, **self._macros)
         items = -(-band.pixels // self._device.layout.tile)
         kernel(items, pixels=band.pixels, moved=moved * band.pixels, **arguments)
@@ -279,12 +276,12 @@ class _Sums:
         phase: Doubles,
         weight: Doubles,
     ) -> None:
-        """Sum and solve frames, at most `WINDOW`, that are all on the device."""
+        """Sum and solve at most `WINDOW` frames on the device."""
         used, name = np.flatnonzero(weight), "correlation_window"
-        known: dict[str, int] = {}
+        counts: dict[str, int] = {}
         if self._integer and _are_counts(weight):
             rows, table = self._rows_in_steps(phase, weight), self._steps
-            known |= _counted(rows)
+            counts = _counted(rows)
         else:
             rows, table, name = _float_rows(phase, weight), self._floats, f"{name}_pairs"
         _fill(self._fit, _fit_table(phase, rows))
@@ -293,37 +290,37 @@ class _Sums:
         count = len(used)
         self._run(
             band, name, self._size * count + 16, frames=frames, count=count, stride=stride, place=self._place,
-            basis=table, fit=self._fit, **known, **_maps_of(band, _ANSWERS),
+            basis=table, fit=self._fit, **counts, **_maps_of(band, _FIT),
         )  # fmt: skip
 
 
 class StackSums(_Sums):
-    """Sums over a stack that is there all at once: it is summed and solved in one run, and no sum is kept."""
+    """Sums over a complete stack, which one kernel computes and solves, without storing them."""
 
     def __init__(self, device: Device, shape: tuple[int, int], dtype: np.dtype[Any], length: int) -> None:
         super().__init__(device, shape, dtype, {}, length, least=length)
 
     @staticmethod
     def take(frames: NDArray[Any], weight: Doubles) -> bool:
-        """Whether a stack is short enough, and its weights allow it."""
+        """Return whether a stack is short enough, and its weights allow integer sums."""
         few = np.count_nonzero(weight) <= WINDOW and frames.flags.c_contiguous and frames.flags.aligned
         return bool(few and (frames.dtype.kind == "f" or _are_counts(weight)))
 
     def push(self, frames: NDArray[Any], phase: Doubles, weight: Doubles) -> None:
-        """Sum all frames, which stay as they are until the result is there."""
+        """Sum all frames, which must not change before the result is returned."""
         self._phase, self._weight = phase, weight
         for band, staged in self._stage(frames, lent=True, whole=True):
             self._run_at_once(band, staged.array, band.pixels, np.arange(len(frames)), phase, weight)
 
     def _solve(self) -> None:
-        """Nothing is left to do."""
+        """Do nothing: `push` has solved the fit."""
 
 
 class TurnSums(_Sums):
     """Sums over all frames so far: integers until the first weight that is neither 0 nor 1, then pairs."""
 
     def __init__(self, device: Device, shape: tuple[int, int], dtype: np.dtype[Any], length: int) -> None:
-        # Eight bytes, for a whole number or for two floats.
+        # Eight bytes are one integer or two floats.
         maps = {"reference": np.float32, **dict.fromkeys(_SUMS.values(), np.int64)}
         super().__init__(device, shape, dtype, maps, length)
         self.reset()
@@ -331,7 +328,9 @@ class TurnSums(_Sums):
     def reset(self) -> None:
         """Forget the frames so far."""
         self._phase, self._weight = np.empty((2, 0))
-        self._counts: int | None = None if self._integer else 0  # frames in integer sums; None for all
+        self._counts: int | None = (
+            None if self._integer else 0
+        )  # frames that were summed as integers; None: all
 
     def push(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool = False) -> None:
         """Add some frames."""
@@ -348,16 +347,16 @@ class TurnSums(_Sums):
 
     def _solve(self) -> None:
         rows = self._rows_in_steps(self._phase, self._weight)
-        name, moved, sums, known = "counts", 48, _SUMS, _counted(rows)
+        name, moved, sums, counts = "counts", 48, _SUMS, _counted(rows)
         if self._counts is not None:
             rows /= [1, self._step, self._step]
             rows[self._counts :] = _float_rows(self._phase, self._weight)[self._counts :]
-            name, moved, sums, known = "pairs", 52, _PAIRS, {}
+            name, moved, sums, counts = "pairs", 52, _PAIRS, {}
         _fill(self._fit, _fit_table(self._phase, rows))
         for band in self.bands:
             with band.resident():
-                maps = _maps_of(band, {**sums, **_ANSWERS})
-                self._run(band, f"correlation_solve_{name}", moved, fit=self._fit, **maps, **known)
+                maps = _maps_of(band, {**sums, **_FIT})
+                self._run(band, f"correlation_solve_{name}", moved, fit=self._fit, **maps, **counts)
 
     def _add(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool) -> None:
         """Add frames to integer sums, or to pairs."""
@@ -371,33 +370,33 @@ class TurnSums(_Sums):
                 places = used[start : start + _BATCH]
                 _fill(self._place, places - staged.frames.start)
                 _fill(basis, rows[places])
-                known = _maps_of(band, _SUMS if counts else _PAIRS)
-                known |= {"frames": staged.array, "count": len(places), "stride": band.pixels}
-                known |= {"place": self._place, "basis": basis}
-                known["fresh"] = fresh and not np.any(weight[: places[0]])
+                arguments = _maps_of(band, _SUMS if counts else _PAIRS)
+                arguments |= {"frames": staged.array, "count": len(places), "stride": band.pixels}
+                arguments |= {"place": self._place, "basis": basis}
+                arguments["fresh"] = fresh and not np.any(weight[: places[0]])
                 moved = self._size * len(places) + (64 if counts else 72)
-                self._run(band, f"correlation_{name}", moved, **known)
+                self._run(band, f"correlation_{name}", moved, **arguments)
         self._phase = np.concatenate([self._phase, phase])
         self._weight = np.concatenate([self._weight, weight])
 
     def _convert_to_pairs(self) -> None:
-        """Turn integer sums, if there still are any, into pairs of floats."""
+        """Convert integer sums, if there are any, to pairs of floats."""
         if self._counts is not None:
             return
         self._counts = len(self._phase)
         if np.any(self._weight):
-            known = _counted(self._rows_in_steps(self._phase, self._weight))
+            counts = _counted(self._rows_in_steps(self._phase, self._weight))
             for band in self.bands:
                 with band.resident():
                     sums = _maps_of(band, _PAIRS)
-                    self._run(band, "correlation_convert", 68, unit=1 / self._step, **known, **sums)
+                    self._run(band, "correlation_convert", 68, unit=1 / self._step, **counts, **sums)
 
 
 class WindowSums(_Sums):
-    """The last frames of an endless rotation, in a ring buffer; they are summed when the fit is computed.
+    """The last frames of an endless rotation, which are summed when the fit is computed.
 
-    Map ``ring`` of each band holds its rows of the frames; the oldest frame of a full window is in its plane
-    ``oldest``, and the next frame goes there.
+    The map ``ring`` of each band is a ring buffer of frames; ``oldest`` is the number of the plane with the
+    oldest frame of a full window, which the next frame replaces.
     """
 
     def __init__(
@@ -415,11 +414,11 @@ class WindowSums(_Sums):
 
     def reset(self) -> None:
         """Forget the frames so far."""
-        self._phase, self._weight = np.zeros((2, self._window))  # the oldest frame first; weight 0 for none
+        self._phase, self._weight = np.zeros((2, self._window))  # oldest frame first; weight 0: no frame
         self.oldest: int = 0
 
     def push(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool = False) -> None:
-        """Move the window on; of a block that is longer than it, only the end is ever in it."""
+        """Add frames to the window, and remove as many of the oldest."""
         frames, phase, weight = (part[-self._window :] for part in (frames, phase, weight))
         for band in self.bands:
             with band.resident():
@@ -437,13 +436,8 @@ class WindowSums(_Sums):
                 self._run_at_once(band, ring, band.stride, places, self._phase, self._weight)
 
 
-def _phase_of_maximum(cosine: NDArray[np.float32], sine: NDArray[np.float32]) -> NDArray[np.float32]:
-    still = (cosine == 0) & (sine == 0)
-    return np.where(still, np.float32(np.nan), np.arctan2(sine, cosine))
-
-
 def _are_counts(weight: Doubles) -> bool:
-    """Whether frames of such weights can be summed as integers."""
+    """Return whether frames of these weights can be summed as integers."""
     return bool(np.all((weight == 0) | (weight == 1)))
 
 
@@ -453,20 +447,20 @@ def _maps_of(band: Band, names: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _float_rows(phase: Doubles, weight: Doubles) -> Doubles:
-    """Return w, w cos alpha and w sin alpha, (N, 3), as float32 has them."""
+    """Return w, w cos alpha and w sin alpha, (N, 3), rounded to float32."""
     return (basis(phase) * weight[:, np.newaxis]).astype(np.float32).astype(np.float64)
 
 
 def _counted(rows: Doubles) -> dict[str, int]:
-    """Return how many frames are in integer sums, and the sums of their cosines and sines, in steps."""
+    """Return the number of frames in integer sums, and the sums of their cosines and sines, in steps."""
     used, cosines, sines = np.sum(rows.astype(np.int64), axis=0)
     return {"used": int(used), "cosines": int(cosines), "sines": int(sines)}
 
 
 def _fit_table(phase: Doubles, rows: Doubles) -> NDArray[np.float32]:
-    """Return what `mirrorskin.kernels.correlation` calls the fit, (28,) float32.
+    """Return the table "fit" of `mirrorskin.kernels.correlation`, (28,) float32.
 
-    ``rows``, (N, 3), is Z: what the samples were multiplied by before they were summed, the weights first.
+    ``rows``, (N, 3), is Z: the factors of the samples in the sums, the weights first.
     """
     weight, exact = rows[:, :1], basis(phase)
     root = np.asarray(np.linalg.qr(np.sqrt(weight) * exact, mode="r"))
@@ -478,7 +472,7 @@ def _fit_table(phase: Doubles, rows: Doubles) -> NDArray[np.float32]:
 
 
 def _fill(array: Array, values: NDArray[Any]) -> None:
-    """Hand a table to the device."""
+    """Copy a table to the device."""
     array.claim()
     array.host[: values.size] = values.ravel()
     array.upload(values.size)

@@ -1,4 +1,4 @@
-"""The fit E = mean + cosine cos alpha + sine sin alpha of a rotation's samples: its turns, and its matrix."""
+"""The fit E = mean + cosine cos alpha + sine sin alpha to samples of a rotation: its matrix, and turns."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from mirrorskin.io.positions import check_phase
 Doubles = NDArray[np.float64]
 
 LONGEST = 64
-"""Frames of one turn at most."""
+"""Largest number of frames of one turn."""
 
 _MAX_CONDITION = 1e8  # of the Gram matrix
-_SAME = 1e-9  # radians within which two phases are one
-_DIGITS = 9  # of a phase modulo a turn, by which turns of the same phases are known
-_FULL_TURN = 2 * np.pi - 1e-6  # but for the rounding of phases
+_SAME = 1e-9  # radians: tolerance of equal phases
+_DIGITS = 9  # decimals of phases, radians, in the comparison of turns
+_FULL_TURN = 2 * np.pi - 1e-6  # radians, with a tolerance for rounding
 
 
 def basis(phase: ArrayLike) -> Doubles:
-    """Return the functions that are fitted, 1, cos alpha and sin alpha, as columns: (N, 3) float64."""
+    """Return the fitted functions 1, cos alpha and sin alpha as columns: (N, 3) float64."""
     alpha = np.asarray(phase, np.float64)
     return np.stack([np.ones_like(alpha), np.cos(alpha), np.sin(alpha)], axis=1)
 
@@ -34,8 +34,10 @@ def check_weights(frame_weights: ArrayLike | None, count: int) -> Doubles:
         return np.ones(count)
     values = np.asarray(frame_weights)
     if values.dtype.kind not in "biuf" or values.shape != (count,):
-        given = f"frame weights of type {values.dtype} and shape {values.shape} for {count} frames"
-        raise InputError(f"{given}: one number a frame is needed")
+        raise InputError(
+            f"frame weights of type {values.dtype} and shape {values.shape} for {count} frames: one number a"
+            " frame is needed"
+        )
     wrong = ~(np.isfinite(values) & (values >= 0))
     if np.any(wrong):
         frame = int(np.argmax(wrong))
@@ -44,21 +46,23 @@ def check_weights(frame_weights: ArrayLike | None, count: int) -> Doubles:
 
 
 def check_phases(phase: ArrayLike, frame_weights: ArrayLike | None = None) -> Doubles:
-    """Return phases as float64, (N,), if they determine mean, cosine and sine of what they sample.
+    """Return phases as float64, (N,), or raise InputError if they do not determine mean, cosine and sine.
 
-    InputError: phases, radians, or weights that are no finite numbers, weights below 0, fewer than three
-    different phases, or phases so close together that the condition of the Gram matrix exceeds 1e8.
+    InputError: phases, radians, or weights that are not finite, weights below 0, fewer than three different
+    phases, or phases so close together that the condition of the Gram matrix exceeds 1e8.
     """
     alpha = check_phase(phase, int(np.size(phase)), "phase")
     weight = check_weights(frame_weights, len(alpha))
-    known = alpha[weight > 0]
-    if len(alpha) > 0 and len(known) == 0:
-        raise InputError(f"all {len(alpha)} frames have weight 0: nothing is left to be fitted")
-    different = _count_different(known)
+    used = alpha[weight > 0]
+    if len(alpha) > 0 and len(used) == 0:
+        raise InputError(
+            f"all {len(alpha)} frames have weight 0: at least 3 with a weight above 0 are needed"
+        )
+    different = max(1, int(np.count_nonzero(_gaps(used) > _SAME))) if len(used) else 0
     if different < 3:
-        problem = f"{len(known)} frames at {different} different phases do not determine a fit"
+        problem = f"{len(used)} frames at {different} different phases do not determine a fit"
         raise InputError(f"{problem} of mean, cosine and sine: at least 3 are needed")
-    weighted = basis(known) * np.sqrt(weight[weight > 0] / weight.max())[:, np.newaxis]
+    weighted = basis(used) * np.sqrt(weight[weight > 0] / weight.max())[:, np.newaxis]
     condition = float(np.linalg.cond(weighted)) ** 2
     if not condition <= _MAX_CONDITION:
         limit = f"condition {condition:.0e}, at most {_MAX_CONDITION:.0e}"
@@ -68,7 +72,7 @@ def check_phases(phase: ArrayLike, frame_weights: ArrayLike | None = None) -> Do
 
 
 def fit_matrix(phase: ArrayLike, frame_weights: ArrayLike | None = None) -> Doubles:
-    """Return the matrix, (3, N), that makes mean, cosine and sine of samples: the weighted pseudo-inverse.
+    """Return the matrix, (3, N), from samples to mean, cosine and sine: the weighted pseudo-inverse.
 
     It minimises sum_k w_k (E_k - a - b cos alpha_k - c sin alpha_k)^2. With N evenly spaced phases and equal
     weights, its rows are 1/N, (2/N) cos alpha and (2/N) sin alpha: the time average of the paper, and the
@@ -88,21 +92,21 @@ def fit_matrix(phase: ArrayLike, frame_weights: ArrayLike | None = None) -> Doub
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TurnFit:
-    """How a turn of N frames is fitted; two are the same if they are one object."""
+    """The fit to a turn of N frames. Fits are compared by identity."""
 
-    phase: Doubles  # (N,), radians from 0 to a turn
+    phase: Doubles  # (N,), radians from 0 to 2 pi
     weights: Doubles  # (N,), above 0
     matrix: Doubles  # (3, N): see `fit_matrix`
     table: NDArray[np.float32]  # (6, N): cosines, sines, roots of the weights, and the matrix
-    covariance: Doubles  # (3, 3), of mean, cosine and sine, where samples of weight 1 have variance 1
-    weighted: bool  # whether a frame has another weight than 1
+    covariance: Doubles  # (3, 3), of mean, cosine and sine, if samples of weight 1 have variance 1
+    weighted: bool  # whether a weight differs from 1
     goes_round: bool  # see `goes_round`
 
 
 def turn_fit(phase: Doubles, weights: Doubles) -> TurnFit | None:
-    """Return how a turn is fitted, weights being above 0, or None if its phases do not determine that.
+    """Return the fit to a turn, or None if its phases do not determine one; weights are above 0.
 
-    Turns of the same phases, modulo a whole turn, share one fit.
+    Turns with the same phases, modulo 2 pi, share one fit.
     """
     return _turn_fit(np.round(np.mod(phase, 2 * np.pi), _DIGITS).tobytes(), weights.tobytes())
 
@@ -126,22 +130,22 @@ def _turn_fit(phases: bytes, weighing: bytes) -> TurnFit | None:
 
 
 def cut_into_turns(phase: Doubles) -> list[slice]:
-    """Return the frames of each turn, in order; the last turn may go on with later frames.
+    """Return the frames of each turn, in order; the last turn may be incomplete.
 
-    A turn is over with the first frame that is a whole turn away from its own first. Phases that fall back
-    by more than half a turn are taken to be given modulo a turn.
+    A turn ends before the first frame that is a whole turn away from its first frame. Phases that jump back
+    by more than half a turn are assumed to be modulo a turn.
     """
     if len(phase) == 0:
         return []
     steps = np.diff(phase)
     forward = 1.0 if (np.median(steps) if len(steps) else 0.0) >= 0 else -1.0
     steps = np.where(forward * steps < -np.pi, steps + forward * 2 * np.pi, steps)
-    way = np.concatenate([[0.0], np.cumsum(steps)])
+    angles = np.concatenate([[0.0], np.cumsum(steps)])
     starts = [0]
-    for frame, angle in enumerate(way):
-        if abs(angle - way[starts[-1]]) >= _FULL_TURN:
+    for frame, angle in enumerate(angles):
+        if abs(angle - angles[starts[-1]]) >= _FULL_TURN:
             starts.append(frame)
-    return [slice(start, stop) for start, stop in zip(starts, [*starts[1:], len(way)], strict=True)]
+    return [slice(start, stop) for start, stop in zip(starts, [*starts[1:], len(angles)], strict=True)]
 
 
 def longest_turn(phase: Doubles) -> int:
@@ -150,16 +154,11 @@ def longest_turn(phase: Doubles) -> int:
 
 
 def goes_round(phase: Doubles) -> bool:
-    """Return whether no gap between phases is above half a turn."""
+    """Return whether all gaps between phases are at most half a turn."""
     return bool(np.max(_gaps(phase)) <= np.pi + 1e-6)
 
 
-def _count_different(phase: Doubles) -> int:
-    """Return how many different points of the circle phases are, but for rounding."""
-    return max(1, int(np.count_nonzero(_gaps(phase) > _SAME))) if len(phase) else 0
-
-
 def _gaps(phase: Doubles) -> Doubles:
-    """Return the angles between phases that are next to each other on the circle."""
+    """Return the angles between neighbouring phases on the circle."""
     points = np.sort(np.mod(phase, 2 * np.pi))
     return np.diff(points, append=points[0] + 2 * np.pi)

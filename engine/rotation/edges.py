@@ -23,9 +23,9 @@ LIMITS = Limits(
     floor=math.radians(0.05),
     lowest=math.radians(5.0),
 )
-"""When a jump is an edge, for the device and its reference."""
+"""Limits of edges, for the kernels and their reference."""
 
-_SHORTER = 4  # by how much other kernels are shorter than the longest one
+_SHORTER = 4  # run time of the longest kernel over that of the others, about
 
 
 @checked
@@ -38,20 +38,20 @@ def find_edges(
 ) -> NDArray[np.uint8]:
     """Draw thin lines where the normal jumps by more than 10 degrees, and where contact ends.
 
-    A steady bend is no jump, and a jump must be 3.5 of its standard errors. Flags of contact that nearly
-    all neighbours contradict are mistakes. Where contact ends, the last pixels in contact are drawn:
-    those with one of four neighbours out of it. The picture's border is no edge.
+    A steady bend is not a jump, and a jump must exceed 3.5 of its standard errors. Flags of contact that
+    nearly all neighbours contradict are ignored. Where contact ends, the last pixels in contact are drawn:
+    those with one of four neighbours without contact. The picture's border is not an edge.
 
     Parameters
     ----------
     normals : ndarray, (H, W, 3), float32
-        Unit vectors; NaN where there is none.
+        Unit vectors; NaN where undefined.
     normals_sigma : ndarray, (H, W), float32
         Their predicted RMS angular error, radians.
     contact : ndarray, (H, W), uint8
         1 where there is contact in every frame.
     device : str or Device, optional
-        See ``mirrorskin.kernels.device.open_device``. It holds all maps at once, 74 bytes a pixel.
+        See ``mirrorskin.kernels.device.open_device``. It holds all maps at once, 74 bytes per pixel.
 
     Returns
     -------
@@ -61,9 +61,9 @@ def find_edges(
     Raises
     ------
     mirrorskin.io.InputError
-        The maps are not of one size.
+        Maps of different sizes.
     mirrorskin.kernels.errors.DeviceError
-        No device, or one without room for the maps.
+        No device, or one without memory for the maps.
 
     Examples
     --------
@@ -89,14 +89,13 @@ def find_edges(
 
 
 class EdgeDrawing:
-    """The maps of one picture on a device, and the kernels over them, which may be run in parts."""
+    """The maps of one picture on a device, and the kernels that draw edges, which can be run in parts."""
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
-        self._device, (rows, columns) = device, shape
-        self._shape = rows, columns
-        cells = (6, rows + 2 * MARGIN, columns + 2 * MARGIN)
+        self._device, self._shape = device, shape
+        cells = (6, shape[0] + 2 * MARGIN, shape[1] + 2 * MARGIN)
         kinds: dict[str, tuple[tuple[int, ...], type[np.generic]]] = {
-            "vectors": ((rows, columns, 3), np.float32),
+            "vectors": ((*shape, 3), np.float32),
             **dict.fromkeys(("sigma", "strength"), (shape, np.float32)),
             **dict.fromkeys(("contact", "clean", "lines", "more", "ways"), (shape, np.uint8)),
             **dict.fromkeys(("cells", "joined"), (cells, np.float32)),
@@ -105,12 +104,18 @@ class EdgeDrawing:
         for array in self._maps.values():
             array.upload()
         self._maps["doubt"] = device.given("doubt", np.ones(shape, np.uint8), np.uint8)
-        self._pairs = {chosen: self._place(chosen) for chosen in (NEAR, FINE, COARSE)}
+        self._pairs: dict[Pass, dict[str, Any]] = {}  # of cells that a pass compares
+        for chosen in (NEAR, FINE, COARSE):
+            places, distances = pairs(chosen)
+            self._pairs[chosen] = {
+                "places": device.given("places", places, np.int32),
+                "distances": device.given("distances", distances, np.float32),
+            }
 
     def take(
         self, vectors: NDArray[np.float32], sigma: NDArray[np.float32], contact: NDArray[np.uint8]
     ) -> None:
-        """Take the maps of a picture; see `find_edges`."""
+        """Copy the maps of a picture to the device; see `find_edges`."""
         for name, values in (("vectors", vectors), ("sigma", sigma), ("contact", contact != 0)):
             array = self._maps[name]
             array.claim()
@@ -118,7 +123,7 @@ class EdgeDrawing:
             array.upload()
 
     def steps(self, parts: int = 1) -> Iterator[None]:
-        """Put the kernels on the queue, the longest in so many parts, and yield after each."""
+        """Enqueue the kernels, the longest ones in ``parts`` parts, and yield after each."""
         maps, fewer = self._maps, -(-parts // _SHORTER)
         rows = self._shape[0] + 2 * MARGIN
         contact: dict[str, Any] = {name: maps[name] for name in ("contact", "clean")}
@@ -137,14 +142,6 @@ class EdgeDrawing:
         """Return the edges, once all steps are done."""
         return self._maps["lines"].download().copy()
 
-    def _place(self, chosen: Pass) -> dict[str, Any]:
-        """Return the pairs of cells that a pass compares."""
-        places, distances = pairs(chosen)
-        return {
-            "places": self._device.given("places", places, np.int32),
-            "distances": self._device.given("distances", distances, np.float32),
-        }
-
     def _draw(self, chosen: Pass, parts: int, cells: str, before: str, after: str) -> Iterator[None]:
         """Add the lines of one pass."""
         macros: dict[str, str | int] = {
@@ -157,7 +154,7 @@ class EdgeDrawing:
             "LAST": int(chosen is COARSE),
         }
         maps, (rows, columns) = self._maps, self._shape
-        found: dict[str, Any] = {name: maps[name] for name in ("strength", "ways")}
+        jumps: dict[str, Any] = {name: maps[name] for name in ("strength", "ways")}
         yield from self._run(
             "edges_jumps",
             parts,
@@ -172,10 +169,10 @@ class EdgeDrawing:
             floor_=LIMITS.floor,
             lowest=LIMITS.lowest,
             doubt=maps["doubt"],
-            **found,
+            **jumps,
         )
         lines: dict[str, Any] = {"edges": maps[before], "added": maps[after]}
-        yield from self._run("edges_thin", -(-parts // _SHORTER), self._tiles, macros, **found, **lines)
+        yield from self._run("edges_thin", -(-parts // _SHORTER), self._tiles, macros, **jumps, **lines)
 
     @property
     def _tiles(self) -> int:
@@ -190,9 +187,9 @@ class EdgeDrawing:
         macros: dict[str, str | int] | None = None,
         **arguments: Any,
     ) -> Iterator[None]:
-        """Run a kernel over its items in so many parts."""
+        """Run a kernel over its items in ``parts`` parts."""
         rows, columns = self._shape
-        moved = sum(one.host.nbytes for one in arguments.values() if isinstance(one, Array))
+        moved = sum(array.host.nbytes for array in arguments.values() if isinstance(array, Array))
         kernel, part = self._device.kernel("edges", name, **(macros or {})), -(-items // parts)
         for first in range(0, items, part):
             count = min(part, items - first)

@@ -1,4 +1,4 @@
-"""Heights that follow normals at their own rate, in a separate thread and on a separate queue."""
+"""Heights that follow the normals while the body moves, in a separate thread and on a separate queue."""
 
 from __future__ import annotations
 
@@ -17,20 +17,18 @@ from mirrorskin.kernels.device import Device
 
 
 class FollowingHeights:
-    """Follow the newest normals for which there was time, one step of a solver each.
+    """Integrate the newest normals, one solver step at a time; estimates during a step are skipped.
 
     Attributes
     ----------
     height : ndarray, (H, W), float32, or None
-        The heights of the last step that is done, mm; NaN where there is no answer.
-    lag : int
-        Estimates of normals since the one that they are of.
+        Heights of the last finished step, mm; NaN where undefined.
     """
 
     def __init__(self, device: Device, shape: tuple[int, int], pixel_size: ArrayLike) -> None:
-        beside = device.beside()
-        self._slopes = SlopeKernels(beside, shape)
-        self._integrator = WarmStartIntegrator(beside, shape, pixel_size)
+        device = device.beside()
+        self._slopes = SlopeKernels(device, shape)
+        self._integrator = WarmStartIntegrator(device, shape, pixel_size)
         self._thread = ThreadPoolExecutor(1, "heights")
         self._step: Future[NDArray[np.float32]] | None = None
         self.height: NDArray[np.float32] | None = None
@@ -41,38 +39,38 @@ class FollowingHeights:
         if self._step is not None:
             wait_for([self._step])
         self._step, self.height = None, None
-        self._taken = self._seen = self._known = 0  # estimates: of the step, in all, of the heights
+        self._in_step = self._estimates = self._in_height = 0  # numbers of estimates: current, total, shown
         self._slopes.typical = math.nan
         self._integrator.reset()
 
     @property
     def lag(self) -> int:
-        """Estimates of normals since the one that the heights are of."""
-        return self._seen - self._known
+        """Number of estimates of normals since the one that was integrated."""
+        return self._estimates - self._in_height
 
     def follow(self, normals: NormalWindow) -> None:
-        """Begin a step towards the normals that are being estimated, unless one is still under way."""
+        """Start a step with the normals that are being estimated, unless one is still running."""
         self.wait(0.0)
-        self._seen += 1
+        self._estimates += 1
         if self._step is not None:
             return
         maps = {name: normals.on_device(name) for name in ("vectors", "sigma", "contact")}
-        for array in maps.values():  # which the other queue has to wait for
+        for array in maps.values():  # this queue waits for the estimate
             array.arrived = array.last_use
         self._slopes.find(normals.model.tilt, maps, self._integrator.maps)
-        for array in maps.values():  # and the next estimate for this
+        for array in maps.values():  # the next estimate waits for the slopes
             array.arrived = array.last_use
-        self._taken = self._seen
-        self._step = self._thread.submit(self._go, self._slopes.typical)
+        self._in_step = self._estimates
+        self._step = self._thread.submit(self._solve, self._slopes.typical)
 
     def wait(self, seconds: float) -> None:
-        """Wait for the step under way, for so long at most, and take its heights."""
+        """Wait for the running step, with a timeout, and take its heights."""
         if self._step is not None:
             done, _ = wait_for([self._step], None if seconds == math.inf else max(0.0, seconds))
             if done:
                 step, self._step = self._step, None
-                self.height, self._known = step.result(), self._taken
+                self.height, self._in_height = step.result(), self._in_step
 
-    def _go(self, typical: float) -> NDArray[Any]:
+    def _solve(self, typical: float) -> NDArray[Any]:
         self._integrator.push(typical)
         return self._integrator.result()

@@ -1,4 +1,4 @@
-"""The frequency at which brightness oscillates: the maximum of the periodogram, refined by least squares."""
+"""Frequency of oscillating brightness: the maximum of the periodogram, refined by least squares."""
 
 from __future__ import annotations
 
@@ -13,22 +13,17 @@ from mirrorskin.engine.rotation.design_matrix import Doubles, basis
 from mirrorskin.io import InputError, Source
 from mirrorskin.io.arguments import checked
 
-_FEWEST = 8  # frames
-_PIXELS, _SAMPLES = 4096, 2**22  # pixels that are looked at, and samples, at most
-_GREATEST = 1e12  # of a sample
-_FINER = 4  # lines of the periodogram for each that is independent
-_SPARSE = 64  # times the median step between frames, by which there may be more steps than frames
-_SIGNIFICANT = 8.0  # standard deviations of what noise alone explains
-_STEPS = 3  # Gauss-Newton
+_FEWEST = 8  # least number of frames
+_PIXELS, _SAMPLES = 4096, 2**22  # largest numbers of pixels and of samples that are used
+_GREATEST = 1e12  # counts: largest sample
+_FINER = 4  # lines of the periodogram per independent line
+_SPARSE = 64  # largest duration over the number of frames, in median steps between frames
+_SIGNIFICANT = 8.0  # standard deviations of the power of noise: least power of an oscillation
+_STEPS = 3  # Gauss-Newton steps
 
 
 class Frequency(NamedTuple):
-    """A frequency, and its standard deviation.
-
-    Attributes
-    ----------
-    hertz, sigma : float
-    """
+    """A frequency and its standard deviation, hertz."""
 
     hertz: float
     sigma: float
@@ -36,24 +31,24 @@ class Frequency(NamedTuple):
 
 @checked
 def estimate_frequency(samples: NDArray[Any], time: ArrayLike) -> Frequency:
-    """Estimate the frequency that all pixels share, by any amplitude and phase of each.
+    """Estimate the common frequency of all pixels, whose amplitudes and phases differ.
 
-    The sum of all pixels' periodograms has its maximum near it, from one period of the recording up to half
-    the frame rate. From there, Gauss-Newton steps lead to the least squares of mean + cosine cos(2 pi f t) +
-    sine sin(2 pi f t) over f and the pixels' waves: the most likely frequency, of white noise. Its variance
-    is the inverse of Fisher's information, the Cramer-Rao bound (Rife and Boorstyn 1974).
+    The initial value is the maximum of the sum of all pixels' periodograms, between one period per recording
+    and half the frame rate. Gauss-Newton steps then minimise the squared residuals of mean +
+    cosine cos(2 pi f t) + sine sin(2 pi f t) over f and the pixels' coefficients: the maximum-likelihood
+    estimate for white noise. Its variance is the Cramer-Rao bound (Rife and Boorstyn 1974).
 
     Parameters
     ----------
     samples : ndarray, (T, ...), uint8, uint16 or float
         Frames, or samples of some pixels.
     time : array_like, (T,)
-        Seconds; evenly spaced or not, increasing.
+        Seconds, increasing; need not be evenly spaced.
 
     Raises
     ------
     mirrorskin.io.InputError
-        Fewer than 8 frames, times that do not increase, or nothing that oscillates beyond the noise.
+        Fewer than 8 frames, times that do not increase, or no significant oscillation.
 
     Examples
     --------
@@ -78,7 +73,7 @@ def estimate_frequency(samples: NDArray[Any], time: ArrayLike) -> Frequency:
     if counts.shape[1] == 0:
         raise InputError("every pixel has a missing sample: no frequency can be estimated")
     if (greatest := np.abs(counts).max()) > _GREATEST:
-        raise InputError(f"a sample is {greatest:.3g}: at most {_GREATEST:g} can be")
+        raise InputError(f"a sample is {greatest:.3g}: at most {_GREATEST:g} is supported")
     counts -= counts.mean(axis=0)
     if not counts.any():
         raise InputError("nothing oscillates: all samples of a pixel are the same")
@@ -99,12 +94,12 @@ def estimate_frequency(samples: NDArray[Any], time: ArrayLike) -> Frequency:
     explained = -unexplained(frequency) / max(variance, np.finfo(float).tiny)
     pixels = counts.shape[1]
     if not explained > 2 * pixels + _SIGNIFICANT * math.sqrt(4 * pixels) + 4 * math.log(len(counts)):
-        raise InputError("nothing oscillates beyond the noise: give the frequency")
+        raise InputError("no oscillation exceeds the noise: give the frequency")
     return Frequency(frequency, math.sqrt(variance / information))
 
 
 def frequency_of(source: Source, time: Doubles) -> Frequency:
-    """Estimate the frequency of a source's frames, which is rewound before and after; see above."""
+    """Estimate the frequency of a source's frames, and rewind it; see `estimate_frequency`."""
     step = max(1, math.prod(source.shape[1:]) // min(_PIXELS, max(1, _SAMPLES // source.shape[0])))
     source.rewind()
     samples: list[NDArray[Any]] = []
@@ -115,7 +110,7 @@ def frequency_of(source: Source, time: Doubles) -> Frequency:
 
 
 def _periodogram_peak(counts: Doubles, time: Doubles) -> tuple[float, float]:
-    """Return where the pixels' periodograms have their maximum, and the width of a line, hertz."""
+    """Return the maximum of the sum of periodograms, and the half-width of a line, hertz."""
     step = float(np.median(np.diff(time)))
     place = np.rint((time - time[0]) / step)
     if not place[-1] <= _SPARSE * len(time):
@@ -132,13 +127,13 @@ def _periodogram_peak(counts: Doubles, time: Doubles) -> tuple[float, float]:
 
 
 def _waves(time: Doubles, frequency: float) -> Doubles:
-    """Return an orthonormal base of the waves, (T, 2), free of constants."""
+    """Return an orthonormal basis of cosine and sine without their means, (T, 2)."""
     base = basis(2 * math.pi * frequency * time)[:, 1:]
     return np.asarray(np.linalg.qr(base - base.mean(axis=0)).Q)
 
 
 def _newton(counts: Doubles, time: Doubles, frequency: float) -> tuple[float, float, float]:
-    """Return a Gauss-Newton step of the frequency, its information in variances, and a sample's variance."""
+    """Return a Gauss-Newton step, the Fisher information times the variance, and the variance of samples."""
     full = basis(2 * math.pi * frequency * time)
     parts = np.linalg.lstsq(full, counts, rcond=None)[0]
     residual = counts - full @ parts
@@ -147,7 +142,7 @@ def _newton(counts: Doubles, time: Doubles, frequency: float) -> tuple[float, fl
     turn -= full @ np.linalg.lstsq(full, turn, rcond=None)[0]
     growth = turn @ parts[1:]
     square = float(np.sum(growth**2))
-    # The waves that noise makes tell nothing, and are not counted.
+    # Amplitudes due to noise do not contain information.
     by_noise = variance * np.trace(turn.T @ turn @ np.linalg.inv(full.T @ full)[1:, 1:])
-    told = max(square - counts.shape[1] * float(by_noise), np.finfo(float).tiny)
-    return float(np.sum(growth * residual)) / square, told, variance
+    information = max(square - counts.shape[1] * float(by_noise), np.finfo(float).tiny)
+    return float(np.sum(growth * residual)) / square, information, variance

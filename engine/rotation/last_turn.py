@@ -1,4 +1,4 @@
-"""The last turn of an endless rotation: normals, and edges and heights that follow while the body moves."""
+"""Normals of the last turn of an endless rotation, with edges and heights that follow at lower rates."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ from mirrorskin.kernels.device import Device
 if TYPE_CHECKING:
     from mirrorskin.io import Source
 
-_UPDATES_BETWEEN_PLACINGS = 8  # after which it is estimated anew how high the object stands
-_FEWEST = 3  # frames that determine a wave
-_WARMING = 10  # updates after which every kernel has run
-_PARTS = 24  # of the longest kernel of the edges
-_OVERDUE = 0.1  # seconds after which a part is done even if there is no time
-_FIRST_COST = 0.005  # seconds that a part is assumed to take before one is measured
-_DECAY = 0.7  # of the longest part's time, from part to part
+_UPDATES_BETWEEN_PLACINGS = 8  # updates between estimates of the object's height in the body
+_FEWEST = 3  # least number of frames of a fit
+_WARMING = 10  # updates until all kernels have been run
+_PARTS = 24  # parts of the longest kernel of the edges
+_OVERDUE = 0.1  # seconds without a part after which one is run without spare time
+_FIRST_COST = 0.005  # seconds: assumed duration of the first part
+_DECAY = 0.7  # decay of the expected duration of a part, per part
 
 
 def choose_window(frames_per_turn: float, window_frames: int | None = None) -> tuple[int, int]:
-    """Return how many frames a window of one turn should have, and n, where every n-th frame is used.
+    """Return the number of frames of a window of one turn, and n if every n-th frame is used.
 
     Parameters
     ----------
     frames_per_turn : float
     window_frames : int, optional
-        Frames of the window; by default as many as there are, up to 64.
+        Frames of the window; by default those of a turn, up to 64.
 
     Raises
     ------
     mirrorskin.io.InputError
-        A turn has fewer than three frames, which determine no wave, or fewer than the window.
+        A turn has fewer than three frames, or fewer than the window.
     """
     if not _FEWEST <= frames_per_turn < math.inf:
         raise InputError(f"{frames_per_turn:g} frames a turn: at least 3 are needed; turn more slowly")
@@ -61,10 +61,10 @@ def choose_window(frames_per_turn: float, window_frames: int | None = None) -> t
 class LastTurn(Normals):
     """Normals of the last turn of an endless rotation; while the body moves, also its edges and heights.
 
-    Heights follow the normals in a thread of their own, by one step of a solver per update for which there is
-    time: their error stays near what changes from one update to the next, and normals do not wait. Edges are
-    drawn in the time that is left. With a calibrated response, the height at which the object stands is
-    estimated from the heights so far, now and then.
+    Heights follow the normals in a separate thread, by at most one solver step per update: their error is
+    similar to the changes between updates, and normals do not wait for them. Edges are drawn in spare time.
+    With a calibrated response, the height of the object in the body is estimated at intervals, from the
+    heights so far.
     """
 
     updates_per_second = math.inf
@@ -75,21 +75,15 @@ class LastTurn(Normals):
     press: float | None = option(
         default=None,
         unit="mm",
-        help="distance by which the body is lowered, for a calibrated response",
+        help="depth to which the body is lowered, for a calibrated response",
         python_only=True,
     )
 
     def configured_for(self, source: Source) -> Self:
-        """Return the operation with what the source says of sensor and rotation, where it is not given."""
-        header = source.header
-        return (
-            super()
-            .configured_for(source)
-            .with_options(
-                pixel_size=self.pixel_size or header.pixel_size,
-                press=header.press if self.press is None else self.press,
-            )
-        )
+        """Return the operation with the source's values of options that are not given."""
+        press = source.header.press if self.press is None else self.press
+        pixel_size = self.pixel_size or source.header.pixel_size
+        return super().configured_for(source).with_options(pixel_size=pixel_size, press=press)
 
     def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         """Prepare for frames of a shape and type."""
@@ -113,7 +107,7 @@ class LastTurn(Normals):
             self._heights.reset()
 
     def preview(self, seconds: float) -> Mapping[str, Any]:
-        """Return the maps of the last turn; none before the first is complete. Heights may take so long."""
+        """Return the maps of the last turn; none before the first is complete. Waits for heights."""
         window, heights = self.window, self._heights
         if not window.is_full:
             return {}
@@ -144,8 +138,8 @@ class LastTurn(Normals):
             self._edges.work(self.window, seconds)
 
     def warm(self) -> None:
-        """Rotate a slanted plane for a while, and forget it."""
-        with suppress(InputError):  # such as noise or tilt, which a plane does not determine
+        """Push frames of a slanted plane, and forget them."""
+        with suppress(InputError):  # a plane may not determine the noise or the tilt
             for number in range(self.window.length + _WARMING):
                 phase = 2 * np.pi * number / self.window.length
                 self.push(self._plane(phase), phase=[phase])
@@ -155,7 +149,7 @@ class LastTurn(Normals):
         self.reset()
 
     def result(self) -> Result:
-        """Return the maps of the last turn, with the object placed by a first estimate of its heights."""
+        """Return the maps of the last turn; with a response, after an estimate of the object's height."""
         result = super().result()
         response = self.response
         if response is not None and self.pixel_size is not None and self.press is not None:
@@ -172,7 +166,7 @@ class LastTurn(Normals):
         return self.result()
 
     def _place(self, height: NDArray[np.float32]) -> None:
-        """Set where the object is, if that matters: its pieces' tops are as high as the press is deep."""
+        """Set the height of the object for a response: the top of each piece is at the depth of the press."""
         from scipy import ndimage
 
         response, press = self.response, self.press
@@ -190,7 +184,7 @@ class LastTurn(Normals):
         swing = 1.0 if gain is None or tilt is None else gain * tilt
         offset = np.asarray(0.0 if self.zenith_offset is None else self.zenith_offset, np.float64)
         level = offset if self.zenith_offset is None else offset + (0.5 if gain is None else 0.5 * gain)
-        ends = [np.asarray(one, np.float64) for one in (self.dark, self.bright) if one is not None]
+        ends = [np.asarray(end, np.float64) for end in (self.dark, self.bright) if end is not None]
         if len(ends) == 2:
             level = np.mean(np.stack(np.broadcast_arrays(*ends)), axis=0)
         most = np.iinfo(self.dtype).max if self.dtype.kind == "u" else np.inf
@@ -199,7 +193,7 @@ class LastTurn(Normals):
 
 
 class SpareEdges:
-    """Edges of the last normals for which there was time: ``lines``, (H, W), None until they are drawn."""
+    """Edges that are drawn in spare time: ``lines``, (H, W), None until the first drawing is complete."""
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
         self._device = device
@@ -213,7 +207,7 @@ class SpareEdges:
         self._cost, self._last = _FIRST_COST, -math.inf
 
     def work(self, window: NormalWindow, seconds: float) -> None:
-        """Continue to draw a window's last estimate for some seconds; a little now and then in any case."""
+        """Continue to draw a window's last estimate for some seconds; overdue parts are drawn in any case."""
         started = now = time.perf_counter()
         while started + seconds - now > self._cost or now - self._last > _OVERDUE:
             self._part(window)
@@ -222,14 +216,14 @@ class SpareEdges:
             now = self._last
 
     def finish(self, window: NormalWindow) -> None:
-        """Draw once from the start to the end."""
+        """Draw all edges."""
         self._steps = None
         self._part(window)
         while self._steps is not None:
             self._part(window)
 
     def _part(self, window: NormalWindow) -> None:
-        """Start a drawing, do a part of it, or fetch what was drawn."""
+        """Start a drawing, continue it by one part, or fetch its lines."""
         if self._steps is None:
             self._drawing.take(*(window.fetch(name) for name in ("vectors", "sigma", "contact")))
             self._steps = self._drawing.steps(_PARTS)

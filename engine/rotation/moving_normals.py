@@ -1,4 +1,4 @@
-"""Normals, or slopes, from frames at any known poses of the body; and from any stack that fits in memory."""
+"""Normals, or slopes, from frames at given poses of the body; and the function for stacks in memory."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from mirrorskin.io.types import body_axes
 
 P = ParamSpec("P")
 
-_FEWEST = 4  # frames of a preview: 3 determine a slope, and no noise
-_WARMING = 8  # frames
+_FEWEST = 4  # frames of a preview: one more than a slope needs, to estimate the noise
+_WARMING = 8  # frames that run all kernels
 
 
 class MovingNormals(NormalsOperation):
-    """Normals from frames at any known poses, or the slope along one direction if the body only rocks.
+    """Normals from frames at any given poses, or the slope along one direction if the body only rocks.
 
-    The frames are estimated in windows of `longest` frames; a later window that determines less than the
-    first is left out. Where travel differs from frame to frame, only frames in which a pixel is in contact
-    are used, and ``contact`` is 1 where the pixel is in contact in the frames of some window.
+    The frames are fitted in windows of `longest` frames; a later window that determines less than the first
+    is omitted. If the travel varies, only frames in which a pixel is in contact are used, and ``contact`` is
+    1 where the pixel is in contact in the frames of at least one window.
 
     If all axes lie in one plane, ``slope`` is the rise per millimetre along ``slope_direction`` in
     ``process``, radians from x towards y, and there are no normals.
@@ -85,7 +85,7 @@ class MovingNormals(NormalsOperation):
         return {} if self.count < _FEWEST else self.result()
 
     def warm(self) -> None:
-        """Rock a plane, and forget it."""
+        """Push frames of a rocking plane, and forget them."""
         tilts = np.linspace(-0.05, 0.05, _WARMING)
         level = np.random.default_rng(0).normal(100, 1, (_WARMING, *self.shape))
         frames = (level + 500 * tilts[:, np.newaxis, np.newaxis]).astype(self.dtype)
@@ -146,17 +146,16 @@ class NormalsFunction(Protocol[P]):
 
 
 def _estimate(frames: NDArray[Any], where: dict[str, Any], options: dict[str, Any]) -> Result:
-    """Choose the operation by what is given of the poses."""
+    """Estimate normals with the operation for the given positions: turns of one tilt, or poses."""
     phase, axis, travel = (where[name] for name in ("phase", "axis", "travel"))
     tilt, weights = options.pop("tilt", None), where["frame_weights"]
     options["memory_limit"] = max(1, min(MEMORY_LIMIT, 2 * frames.nbytes))
-    given = None if tilt is None or isinstance(tilt, str) else as_array("tilt", tilt).astype(np.float64)
-    varies = given is not None and (given.ndim > 0 or rocks(phase))
+    angle = None if tilt is None or isinstance(tilt, str) else as_array("tilt", tilt).astype(np.float64)
+    varies = angle is not None and (angle.ndim > 0 or rocks(phase))
     if axis is None and travel is None and not varies:
         return apply(Normals(tilt=tilt, **options), frames, phase=phase, frame_weights=weights)
-    pose = check_poses(len(frames) if frames.ndim else 0, phase, given, axis, travel)
-    foreign = Normals.options.keys() - MovingNormals.options
-    for name in foreign & options.keys():
+    pose = check_poses(len(frames) if frames.ndim else 0, phase, angle, axis, travel)
+    for name in (Normals.options.keys() - MovingNormals.options) & options.keys():
         if options.pop(name) != Normals.options[name].default:
             raise InputError(f"{name} needs whole turns of one tilt, but frames have poses. Remove {name}")
     options.setdefault("longest", even_windows(len(frames)) if frames.ndim and len(frames) else None)
@@ -169,7 +168,7 @@ _FUNCTION = array_function(
     """Estimate the normals from a stack that fits in memory; see `Normals` and `MovingNormals`.
 
     With a phase and one tilt, the frames are turns of a precession. With a tilt of each frame, two phases
-    half a turn apart, an axis or a travel, they are at known poses.
+    half a turn apart, an axis or a travel, they are at given poses.
 
     Returns
     -------
@@ -177,7 +176,7 @@ _FUNCTION = array_function(
         ``normals``, (H, W, 3), unit vectors in the mean pose; ``normals_sigma``, the predicted RMS angle to
         the true normal; ``contact``, 1 where sheet and object touched in every frame; ``zenith`` and
         ``azimuth``; ``mean``, ``cosine``, ``sine``, ``modulation`` and ``residual`` of the brightness. Maps
-        are NaN where there is no answer. Of known poses also ``status``; ``slope`` if the body only rocks.
+        are NaN where undefined. With poses also ``status``, and ``slope`` if the body only rocks.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Surface normals from axial rotation (paper, section 4), to the statistical limit."""
+"""Maximum-likelihood surface normals from an axial rotation (paper, section 4)."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ if TYPE_CHECKING:
 class NormalsOperation(SensorOptions, Operation):
     """Base of operations that estimate normals from groups of frames, such as turns.
 
-    Frames are kept until their group is complete, at most 64 of them. Of complete groups, the device keeps
-    the mean of the normals, weighted by inverse variance.
+    Frames are kept until their group is complete, at most 64 of them. The device keeps the mean of the
+    normals of complete groups, weighted by inverse variance.
     """
 
     motions = ("axial",)
@@ -82,7 +82,7 @@ class NormalsOperation(SensorOptions, Operation):
     residual = TABLE["residual"]
 
     _kernel_maps: tuple[str, ...] = MAPS
-    _width = 0  # components of a frame's position; 0 for a number
+    _width = 0  # components of a frame's position; 0 for a scalar
 
     def check_options(self) -> None:
         """Raise InputError if the zenith's gain is 0."""
@@ -90,7 +90,7 @@ class NormalsOperation(SensorOptions, Operation):
             check_gain(self.zenith_gain)
 
     def configured_for(self, source: Source) -> Self:
-        """Return the operation with what the source says of the sensor, where it is not given."""
+        """Return the operation with the source's values of options that are not given."""
         names = "zenith_gain", "zenith_offset", "dark", "bright"
         return self.with_options(
             **{name: getattr(source.header, name) for name in names if getattr(self, name) is None}
@@ -120,10 +120,10 @@ class NormalsOperation(SensorOptions, Operation):
     def clear(self) -> None:
         """Forget the frames so far, and what was estimated from them."""
         self._model = self._kernel.model
-        self._lent: NDArray[Any] | None = None  # a whole stack that is not copied to the buffer
+        self._lent: NDArray[Any] | None = None  # a whole stack, which is used without a copy
         self._phase = np.empty((0, self._width) if self._width else 0)  # of the frames in the buffer
         self._weights = np.empty(0)
-        self._turns = self._frames = 0  # that are in the maps
+        self._turns = self._frames = 0  # numbers of those in the maps
         self._each: list[list[NDArray[Any]]] = []
 
     @property
@@ -138,7 +138,7 @@ class NormalsOperation(SensorOptions, Operation):
         """Take in frames and the position of each, part by part as the buffer has space for them."""
         weights = check_weights(frame_weights, len(frames))
         first = self.count == 0 and len(self._phase) == 0
-        if lent and first and np.all(weights > 0):  # missing frames would be overwritten
+        if lent and first and np.all(weights > 0):  # otherwise frames would be moved in the caller's memory
             self._cut(where)
             self._lent, self._phase, self._weights = frames, where, weights
             return
@@ -150,7 +150,7 @@ class NormalsOperation(SensorOptions, Operation):
             start = part.stop
 
     def _copy_lent(self) -> None:
-        """Copy the frames of a whole stack, if there are any, to the buffer: others follow."""
+        """Copy a whole stack, if there is one, to the buffer, since other frames follow."""
         if self._lent is not None:
             frames, where, weights = self._lent, self._phase, self._weights
             self._lent, self._phase, self._weights = None, where[:0], weights[:0]
@@ -158,7 +158,7 @@ class NormalsOperation(SensorOptions, Operation):
 
     @property
     def _open(self) -> NDArray[Any]:
-        """The frames that are not in the maps yet, followed by others."""
+        """Memory that starts with the frames of the open turn."""
         return self._buffer if self._lent is None else self._lent
 
     def result(self) -> Result:
@@ -168,7 +168,7 @@ class NormalsOperation(SensorOptions, Operation):
         closed = [self._copy_maps(band) for band in self._bands] if self._turns and not self.per_turn else []
         try:
             return self._complete()
-        finally:  # more frames may follow: the last turn is as open as before
+        finally:  # more frames may follow: open the last turn again
             self._model, self._turns, self._frames, self._phase, self._weights = state
             del self._each[self._turns :]
             for band, maps in zip(self._bands, closed, strict=False):
@@ -198,20 +198,20 @@ class NormalsOperation(SensorOptions, Operation):
         return normals_result(maps, model, self._turns, self._frames)
 
     def _turns_in(self, where: Doubles) -> list[slice]:
-        """Return which frames are estimated together, by where the body was in them."""
+        """Return the groups of frames that are fitted together, from the positions of the body."""
         return cut_into_turns(where)
 
     def _fit_of(self, where: Doubles, weights: Doubles, first: bool) -> TurnFit | PoseFit | None:
-        """Return how frames are fitted that are estimated together, if they can be."""
+        """Return the fit to a group of frames, or None if they do not determine one."""
         fit = turn_fit(where, weights)
         return fit if fit is not None and (fit.goes_round or first) else None
 
     def _explain(self, where: Doubles, weights: Doubles) -> None:
-        """Raise InputError that says why frames cannot be fitted."""
+        """Raise an InputError with the reason why frames do not determine a fit."""
         check_phases(where, weights)
 
     def _take(self, frames: NDArray[Any], phase: Doubles, weights: Doubles) -> None:
-        """Take in frames that fit into the buffer, and estimate the turns that are then over."""
+        """Take in frames that fit into the buffer, and estimate the turns that are complete."""
         turns = self._cut(np.concatenate([self._phase, phase]))
         here = self._buffer[len(self._phase) :][: len(frames)]
         if frames.ctypes.data != here.ctypes.data or not frames.flags.c_contiguous:
@@ -229,39 +229,40 @@ class NormalsOperation(SensorOptions, Operation):
         turns = self._turns_in(phase)
         longest = max(turn.stop - turn.start for turn in turns)
         if longest > self._longest:
-            given = f"a turn of {longest} frames or more: normals take {self._longest} at most"
-            raise InputError(f"{given}; leave some out, or use 'mirrorskin correlate'")
+            raise InputError(
+                f"a turn of {longest} frames or more: normals take {self._longest} at most; leave some out,"
+                " or use 'mirrorskin correlate'"
+            )
         return turns
 
     def _estimate(self, turns: list[slice]) -> None:
-        """Estimate the normals of turns in the buffer."""
-        fitted = self._fitted([self._close_up(turn) for turn in turns])
+        """Estimate the normals of turns in the buffer.
+
+        The first turn that determines a normal is used, and later ones if their phases go all round.
+        """
+        fitted: list[tuple[slice, TurnFit | PoseFit]] = []
+        for turn in turns:
+            turn = self._without_missing(turn)
+            fit = self._fit_of(self._phase[turn], self._weights[turn], first=not (self._turns or fitted))
+            if fit is not None:
+                fitted.append((turn, fit))
         for start in range(0, len(fitted), self._kernel.tables_at_once):
             group = fitted[start : start + self._kernel.tables_at_once]
             self._kernel.write_tables([fit for _, fit in group])
             for turn, fit in group:
                 self._estimate_turn(turn, fit)
 
-    def _close_up(self, turn: slice) -> slice:
-        """Move the frames of a turn that are not missing to its begin, and return where they are."""
-        there = turn.start + np.flatnonzero(self._weights[turn] > 0)
-        known = slice(turn.start, turn.start + len(there))
-        if known != turn:
+    def _without_missing(self, turn: slice) -> slice:
+        """Move the frames of a turn with weights above 0 to its start, and return their slice."""
+        places = turn.start + np.flatnonzero(self._weights[turn] > 0)
+        present = slice(turn.start, turn.start + len(places))
+        if present != turn:
             for values in (self._open, self._phase, self._weights):
-                values[known] = values[there]
-        return known
-
-    def _fitted(self, turns: list[slice]) -> list[tuple[slice, TurnFit | PoseFit]]:
-        """Return the turns whose phases determine a normal, and, after the first that does, go all round."""
-        fitted: list[tuple[slice, TurnFit | PoseFit]] = []
-        for turn in turns:
-            fit = self._fit_of(self._phase[turn], self._weights[turn], first=not (self._turns or fitted))
-            if fit is not None:
-                fitted.append((turn, fit))
-        return fitted
+                values[present] = values[places]
+        return present
 
     def _estimate_turn(self, turn: slice, fit: TurnFit | PoseFit) -> None:
-        """Take a turn into the maps."""
+        """Add a turn to the maps."""
         count = turn.stop - turn.start
         if self._model is None:
             samples = np.stack([frame.reshape(-1)[:: thinning(self.shape)] for frame in self._open[turn]])
@@ -277,24 +278,24 @@ class NormalsOperation(SensorOptions, Operation):
             self._each.append(self._take_maps())
 
     def _copy_maps(self, band: Band) -> dict[str, NDArray[Any]]:
-        """Return copies of a band's maps, with their padding."""
+        """Return copies of a band's maps, including their padding."""
         with band.resident():
             return {name: band.maps[name].download().copy() for name in self._kernel_maps}
 
     def _take_maps(self) -> list[NDArray[Any]]:
-        """Return the maps of all rows, as they are listed; the bands have new ones then."""
+        """Return the maps of all rows in the order of `_kernel_maps`, without a copy."""
         parts = []
         for band in self._bands:
             with band.resident():
                 vectors, *others = (band.detach(name).reshape(-1) for name in self._kernel_maps)
             rows = (-1, self.shape[1])
-            flat = [one[: band.pixels].reshape(rows) for one in others]
+            flat = [values[: band.pixels].reshape(rows) for values in others]
             parts.append([vectors[: 3 * band.pixels].reshape(*rows, 3), *flat])
         return [join_rows(part) for part in zip(*parts, strict=True)]
 
 
 def normals_result(maps: list[NDArray[Any]], model: TurnModel, turns: int, frames: int) -> Result:
-    """Return what the kernel leaves, as `MAPS` lists it, as a result."""
+    """Return the maps of the kernel, in the order of `MAPS`, as a result."""
     normals, sigma, contact, mean, cosine, sine, residual = maps
     samples = thin_out(mean)
     finite = samples[np.isfinite(samples)]
@@ -336,9 +337,10 @@ def azimuth_of(normals: NDArray[np.float32]) -> NDArray[np.float32]:
 class Normals(NormalsOperation):
     """Normals from turns of an axial rotation at a constant tilt.
 
-    At each phase a pixel shows the angle between its normal n and the body's axis a, cos theta' = n . a
-    (equation 10); the normal is the most likely one given all samples. See the documentation, "Normals from
-    a rotation". Clipped and missing samples are left out: integers at the ends of their type, and NaN.
+    At each phase, the brightness of a pixel depends on the angle between its normal n and the body's axis a,
+    cos theta' = n . a (equation 10); the normal is the maximum-likelihood estimate from all samples. See the
+    documentation, "Normals from a rotation". Clipped samples (integers at the ends of their type) and NaN are
+    ignored.
 
     ``process`` contains the standard deviation ``noise`` of a sample in the middle of the brightness, counts,
     the growth ``shot_noise`` of its square per count, the ``tilt``, radians, and the numbers of ``turns`` and
@@ -388,7 +390,7 @@ class Normals(NormalsOperation):
             check_tilt(cast(float, self.tilt))
 
     def configured_for(self, source: Source) -> Self:
-        """Return the operation with what the source says of sensor and rotation, where it is not given."""
+        """Return the operation with the source's values of options that are not given."""
         header, changes = source.header, dict[str, Any]()
         if self.tilt is None:
             changes["tilt"] = header.tilt

@@ -1,4 +1,4 @@
-"""The kernel that estimates normals: its options, checked once, its launch, and the maps that it leaves."""
+"""The kernels that estimate normals: checked options, launches, and output maps."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ from mirrorskin.kernels.normals import contact_limits
 NormalMethod = Literal["exact", "paper"]
 NORMAL_METHODS: tuple[NormalMethod, ...] = get_args(NormalMethod)
 MAPS = "vectors", "sigma", "contact", "mean", "cosine", "sine", "residual"
-"""What the kernel leaves, by name."""
+"""Names of the output maps."""
 SLOPE_MAPS = "slopes", "slope_errors", "zeniths"
-"""What it leaves besides of a body that rocks."""
+"""Names of the additional maps of a body that rocks."""
 
-_TABLES = 64  # turns whose tables the device has at once
-_TURN_PLANES, _POSE_PLANES = 6, 13  # of a table
-_ENOUGH = 500  # pixels to estimate the noise from
+_TABLES = 64  # largest number of turns whose tables are on the device
+_TURN_PLANES, _POSE_PLANES = 6, 13  # rows of a table
+_ENOUGH = 500  # least number of clear pixels for an estimate of the noise
 _MOST_NOISE = 1e12  # counts
-_MAP_BYTES = 33  # of a pixel, in all of them
+_MAP_BYTES = 33  # bytes per pixel of all output maps
 
 
 class SensorOptions(Configured):
-    """Options of operations that estimate normals: what is known of the sensor."""
+    """Options of operations that estimate normals: the parameters of the sensor."""
 
     zenith_gain: ArrayLike | None = option(
         default=None,
@@ -82,7 +82,7 @@ class SensorOptions(Configured):
 
 @dataclass(frozen=True, slots=True)
 class TurnModel:
-    """What a turn's samples are taken to follow: the tilt, radians, and the noise."""
+    """The model of a turn's samples: the tilt, radians, and the noise."""
 
     tilt: float
     noise: CountNoise
@@ -90,10 +90,9 @@ class TurnModel:
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """Where the samples of a turn lie on the device: in ``count`` frames of a stack, from ``start`` on.
+    """The samples of a turn on the device: ``count`` frames of a stack, starting with frame ``start``.
 
-    A ring has ``count`` frames, as long as a band's stride, in which the turn goes round; otherwise frames
-    are as long as the band has pixels.
+    A ring buffer has ``count`` frames with a band's stride; other stacks have frames without padding.
     """
 
     stack: Operand
@@ -103,10 +102,7 @@ class Samples:
 
 
 class NormalKernel:
-    """Fits turns on a device.
-
-    With ``poses``, it fits windows of frames with an own pose each instead.
-    """
+    """Fits turns on a device; with ``poses``, windows of frames with individual poses."""
 
     def __init__(
         self,
@@ -126,7 +122,12 @@ class NormalKernel:
                 " use exact, or leave the calibration out"
             )
         self._tilt = None if isinstance(tilt, str) else tilt
-        self._noise = None if options.noise is None else _even_noise(options.noise)
+        noise = options.noise
+        if noise is not None and noise > _MOST_NOISE:
+            raise InputError(
+                f"noise {noise:g}: a standard deviation of at most {_MOST_NOISE:g} counts is needed"
+            )
+        self._noise = None if noise is None else CountNoise(noise**2, 0.0, noise**2)
         self._dtype, self._method, self._step = dtype, method, thinning(shape)
         levels = options.zenith_gain, options.zenith_offset, options.dark, options.bright
         self._scale = response or make_scale(*levels, shape)
@@ -134,7 +135,6 @@ class NormalKernel:
         if not self._scale.per_pixel:
             self._one_scale = self.device.given("scale", self._scale.planes)
         self._wall = None if response is None else self.device.given("wall", response.table)
-        # Turns whose tables the device has at once, at most.
         planes = _POSE_PLANES if poses else _TURN_PLANES
         self._poses = poses
         self.tables_at_once: int = max(1, min(_TABLES, self.device.max_allocation // (4 * planes * LONGEST)))
@@ -143,13 +143,13 @@ class NormalKernel:
 
     @property
     def model(self) -> TurnModel | None:
-        """What is given of the turns; None where tilt or noise are to be estimated."""
+        """The given tilt and noise; None if one of them is to be estimated."""
         if self._tilt is None or self._noise is None:
             return None
         return TurnModel(self._tilt, self._noise)
 
     def estimate_model(self, samples: NDArray[Any], fit: TurnFit | PoseFit) -> TurnModel:
-        """Estimate what was not given, noise or tilt, from samples, (N, n), of thinned-out pixels."""
+        """Return noise and tilt, estimated from samples (N, n) of every n-th pixel if they are not given."""
         noise, tilt = self._noise, self._tilt
         if isinstance(fit, PoseFit):
             deep = fit.deep if fit.presses else np.full(len(samples), True)
@@ -172,7 +172,7 @@ class NormalKernel:
 
     @property
     def planes(self) -> dict[str, Planes]:
-        """The maps that a band needs."""
+        """The maps of a band."""
         kinds: dict[str, Planes] = {name: Planes(1, np.float32) for name in MAPS}
         kinds |= {"vectors": Planes(3, np.float32), "contact": Planes(1, np.uint8)}
         if self._scale.per_pixel:
@@ -182,13 +182,13 @@ class NormalKernel:
         return kinds
 
     def write_scale(self, band: Band) -> None:
-        """Give a band the scale of its pixels, where each has its own."""
+        """Write the scale of a band's pixels, if it is a map."""
         if self._scale.per_pixel:
             for plane, values in enumerate(self._scale.planes):
                 band.write("scale", values[band.rows], plane=plane)
 
     def write_tables(self, fits: Sequence[TurnFit | PoseFit]) -> None:
-        """Hand the tables of some turns to the device; unless it has them, that waits for earlier turns."""
+        """Copy the tables of turns to the device, after earlier turns, unless they are there already."""
         if all(fit in self._places for fit in fits):
             return
         self._places = {fit: place for place, fit in enumerate(dict.fromkeys(fits))}
@@ -206,10 +206,10 @@ class NormalKernel:
         turns: int,
         bare: bool = False,
     ) -> None:
-        """Fit a resident band's samples of one turn, whose table was among those written last.
+        """Fit a resident band's samples of one turn, whose table was written by the last `write_tables`.
 
-        The maps become the mean of ``turns`` turns, this one included. ``bare`` leaves out those of the wave:
-        mean, cosine, sine and residual.
+        The maps become the mean of ``turns`` turns, including this one. ``bare`` omits mean, cosine, sine and
+        residual.
         """
         count, noise, layout = samples.count, model.noise, self.device.layout
         tilt = fit.tilt if isinstance(fit, PoseFit) else model.tilt
@@ -220,12 +220,12 @@ class NormalKernel:
             file, name = "normals_pose", "normals_pose" if fit.direction is None else "normals_rock"
         kernel = self.device.kernel(file, name, FRAME=C_TYPES[self._dtype.name], LANES=lanes)
         limits = contact_limits(count - 3, tilt)
-        fitted = tilt if self._method == "exact" else 0.0  # exact fits what a pixel's tilt is more than this
+        fitted = tilt if self._method == "exact" else 0.0  # the exact method fits a pixel's excess over this
         further: dict[str, Any] = {}
         if isinstance(fit, PoseFit):
             further = {"presses": int(fit.presses)}
             if fit.direction is not None:
-                further |= {one: band.maps[one] for one in SLOPE_MAPS}
+                further |= {name: band.maps[name] for name in SLOPE_MAPS}
         elif isinstance(self._scale, Response):
             wall = self._scale.wall
             sizes = {"curve_length": len(wall.curve), "inverse_length": len(wall.inverse)}
@@ -269,14 +269,7 @@ class NormalKernel:
 
 
 def vector_lanes(device: Device) -> int:
-    """Return how many pixels an item of `normals.cl` works on side by side: as a CPU's registers hold."""
+    """Return the number of pixels per vector in `normals.cl`: 1 on a GPU, the width of registers on a CPU."""
     if device.layout.tile == 1:
         return 1
     return 16 if device.queue.device.native_vector_width_float >= 16 else 8
-
-
-def _even_noise(noise: float) -> CountNoise:
-    """Return the noise of samples that all have the same standard deviation, counts."""
-    if noise > _MOST_NOISE:
-        raise InputError(f"noise {noise:g}: a standard deviation of at most {_MOST_NOISE:g} counts is needed")
-    return CountNoise(noise**2, 0.0, noise**2)

@@ -1,4 +1,4 @@
-"""The heights that fit the normals of a rotation: slopes, their variances, and their integration."""
+"""Heights from the normals of a rotation: slopes, their variances, and integration."""
 
 from __future__ import annotations
 
@@ -22,30 +22,22 @@ from mirrorskin.kernels.device import Device
 
 Floats = NDArray[np.float32]
 
-_STEEPEST = math.radians(80.0)  # zenith beyond which a slope would grow without bounds
-_AROUND = 5  # pixels across, from which the meridian's direction is taken
-_WIDEST = 0.5  # radians: standard deviation of an azimuth up to which its mean cosine is corrected for
-# Residual to accept of many small facets, where integrate's is not met: normals err far more.
+_STEEPEST = math.radians(80.0)  # largest zenith whose slope is used
+_AROUND = 5  # pixels: side of the window for the direction of the meridian
+_WIDEST = 0.5  # radians: limit of the standard deviation of an azimuth in the correction of bias
+# Accepted relative residual if many small facets prevent convergence; the errors of normals are larger.
 _TOLERANCE = 1e-4
-_NO_LIMIT = 1e9  # seconds: with a budget, integrate returns what was reached
-_CHUNK, _STRIP = 256, 16  # columns and rows of a work-item that is a core's loop; see slopes.cl
+_NO_LIMIT = 1e9  # seconds: with a budget, `integrate` returns an unconverged surface
+_CHUNK, _STRIP = 256, 16  # columns and rows of a work-item on a CPU; see slopes.cl
 
 
 @dataclass(frozen=True, slots=True)
 class Slopes:
-    """How much the surface rises along x, and along y, which runs up the picture.
+    """Slopes of the surface along x, and along y, which points up the picture."""
 
-    Attributes
-    ----------
-    dz_dx, dz_dy : ndarray, (H, W), float32
-        Without unit; NaN where there is none.
-    weights : ndarray, (2, H, W), float32
-        Inverse variances of both; 0 where there is none.
-    """
-
-    dz_dx: Floats
+    dz_dx: Floats  # (H, W); NaN where undefined
     dz_dy: Floats
-    weights: Floats
+    weights: Floats  # (2, H, W): inverse variances of both; 0 where undefined
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -59,7 +51,7 @@ def slopes_of(
     """Return the slopes of a result's normals; see `find_slopes`.
 
     ``contact``, (H, W), replaces that of the result; without either, all normals are used. The half-angle of
-    the precession and the number of turns are ``tilt`` and ``turns`` in the result's process, if there.
+    the precession and the number of turns are ``tilt`` and ``turns`` in the result's process, if available.
     """
     normals, process = result.normals, result.process
     if contact is None:
@@ -83,40 +75,39 @@ def find_slopes(
     turns: int = 1,
     independent_sigma: Floats | None = None,
 ) -> Slopes:
-    """Turn the normals of a rotation into slopes, -n_x / n_z and -n_y / n_z.
+    """Return the slopes -n_x / n_z and -n_y / n_z of the normals of a rotation.
 
-    *Variances.* Samples are distances from the axis, which goes round on a circle of radius d: they determine
-    a zenith far better than an azimuth. Of the information of samples evenly round the circle the share
-    that is across the meridian is ::
+    *Variances.* Samples measure the angle to the axis, which moves on a circle of radius d: they determine
+    the zenith far better than the azimuth. For samples evenly spaced on the circle, the share of information
+    across the meridian is ::
 
-        q = 1/2 within the circle,  sin(d)^2 / (2 sin(zenith)^2) without
+        q = 1/2 inside the circle,  sin(d)^2 / (2 sin(zenith)^2) outside
 
-    so the variance sigma^2 of an angular error is sigma^2 q along the meridian, sigma^2 (1 - q) across. An
-    error along it changes the slope by 1/cos(zenith)^2, one across it by 1/cos(zenith). Along x and y these
-    two are mixed; their covariance is left out.
+    so an angular error of variance sigma^2 has the variances sigma^2 q along the meridian and
+    sigma^2 (1 - q) across it. An error along the meridian changes the slope by 1/cos(zenith)^2, an error
+    across it by 1/cos(zenith). The slopes along x and y mix both; their covariance is neglected.
 
-    *Bias.* An azimuth that is uncertain by s makes the mean of its vectors shorter by exp(-s^2 / 2), and
-    a surface of them flatter. Slopes are made longer by as much.
+    *Bias.* An azimuth with the standard deviation s shortens the mean vector by exp(-s^2 / 2), which flattens
+    the surface. Slopes are multiplied by the inverse factor.
 
-    Of ``normals``, (H, W, 3) unit vectors, those count with a finite RMS angular error ``sigma``, (H, W)
-    radians, where ``contact`` is not 0. ``tilt`` is the half-angle d of the precession, radians; without it,
-    errors are the same in all directions. The normals are the mean of ``turns`` turns. Where errors of
-    neighbours are correlated, ``independent_sigma`` replaces sigma in the weights: independent errors that
-    leave as much in a mean over many pixels. A surface steeper than 80 degrees is taken to be as steep as
-    that.
+    ``normals``, (H, W, 3) unit vectors, are used if their RMS angular error ``sigma``, (H, W) radians, is
+    finite and ``contact`` is not 0. ``tilt`` is the half-angle d of the precession, radians; without it,
+    errors are isotropic. The normals are the mean of ``turns`` turns. If errors of neighbours are correlated,
+    ``independent_sigma`` replaces sigma in the weights: independent errors with the same mean over many
+    pixels. The zenith is limited to 80 degrees.
     """
     nx, ny, nz = np.moveaxis(normals, -1, 0)
     white = sigma if independent_sigma is None else independent_sigma
-    known = (contact != 0) & (nz > 0) & (sigma > 0) & (sigma < np.inf) & (white > 0) & (white < np.inf)
-    nx, ny, nz, sigma, white = (np.where(known, one, np.float32(1)) for one in (nx, ny, nz, sigma, white))
+    valid = (contact != 0) & (nz > 0) & (sigma > 0) & (sigma < np.inf) & (white > 0) & (white < np.inf)
+    nx, ny, nz, sigma, white = (np.where(valid, part, np.float32(1)) for part in (nx, ny, nz, sigma, white))
     nz = np.maximum(nz, np.float32(math.cos(_STEEPEST)))
-    longer = np.exp(0.5 * _azimuth_variance(nx, ny, sigma, tilt, turns))
-    nothing = np.float32(np.nan)
-    variances = _variances(nx, ny, nz, white, tilt, known)
+    factor = np.exp(0.5 * _azimuth_variance(nx, ny, sigma, tilt, turns))
+    nan = np.float32(np.nan)
+    variances = _variances(nx, ny, nz, white, tilt, valid)
     return Slopes(
-        dz_dx=np.where(known, -longer * nx / nz, nothing).astype(np.float32),
-        dz_dy=np.where(known, -longer * ny / nz, nothing).astype(np.float32),
-        weights=np.stack([np.where(known, 1 / one, 0) for one in variances]).astype(np.float32),
+        dz_dx=np.where(valid, -factor * nx / nz, nan).astype(np.float32),
+        dz_dy=np.where(valid, -factor * ny / nz, nan).astype(np.float32),
+        weights=np.stack([np.where(valid, 1 / variance, 0) for variance in variances]).astype(np.float32),
     )
 
 
@@ -137,21 +128,8 @@ def _azimuth_variance(nx: Floats, ny: Floats, sigma: Floats, tilt: float | None,
     return np.asarray(np.minimum(variance, _WIDEST**2), np.float32)
 
 
-def _cosine_squared(nx: Floats, ny: Floats, known: NDArray[np.bool_], azimuth_variance: Floats) -> Floats:
-    """Return the square of the azimuth's cosine, from the normals around.
-
-    By its own azimuth, a slope that noise has made shorter would be given another weight than one that it has
-    made longer, and the weighted mean would be wrong. Squares are the same on both sides of a ridge. Noise of
-    the azimuth makes their means more alike, by exp(-2 variance).
-    """
-    x, y = (_mean_around(np.where(known, n * n, 0)) for n in (nx, ny))
-    least = np.finfo(np.float32).tiny
-    square = (x + least) / (x + y + 2 * least)
-    return np.asarray(np.clip(0.5 + (square - 0.5) * np.exp(2 * azimuth_variance), 0, 1), np.float32)
-
-
 def _mean_around(values: Floats) -> Floats:
-    """Return the mean of each pixel's surroundings, (H, W), with 0 beyond the border."""
+    """Return the mean of a window around each pixel, (H, W), with zeros outside the picture."""
     height, width = values.shape
     padded = np.pad(values, _AROUND // 2)
     rows = sum(padded[row : row + height] for row in range(1, _AROUND)) + padded[:height]
@@ -160,14 +138,23 @@ def _mean_around(values: Floats) -> Floats:
 
 
 def _variances(
-    nx: Floats, ny: Floats, nz: Floats, sigma: Floats, tilt: float | None, known: NDArray[np.bool_]
+    nx: Floats, ny: Floats, nz: Floats, sigma: Floats, tilt: float | None, valid: NDArray[np.bool_]
 ) -> tuple[Floats, Floats]:
-    """Return the variances of the slopes along x and y."""
+    """Return the variances of the slopes along x and y.
+
+    The direction of the meridian is that of the surroundings: with a pixel's own azimuth, slopes that noise
+    shortened would get other weights than those that it lengthened, and their weighted mean would be biased.
+    Squares of components are equal on both sides of a ridge; noise of the azimuth reduces the contrast of
+    their means by exp(-2 variance).
+    """
     share, turned = _share_along(nx, ny, tilt), _azimuth_variance(nx, ny, sigma, tilt)
-    # An azimuth that is off by e makes a slope shorter by e^2 / 2 of it, besides what it does across.
+    # An error e of the azimuth also shortens the slope by e^2 / 2.
     along = share * (sigma / nz**2) ** 2 + (nx * nx + ny * ny) / nz**2 * turned**2 / 2
     across = (1 - share) * (sigma / nz) ** 2
-    square = _cosine_squared(nx, ny, known, turned)
+    x, y = (_mean_around(np.where(valid, n * n, 0)) for n in (nx, ny))
+    least = np.finfo(np.float32).tiny
+    square = (x + least) / (x + y + 2 * least)
+    square = np.asarray(np.clip(0.5 + (square - 0.5) * np.exp(2 * turned), 0, 1), np.float32)
     along_x, along_y = square * along + (1 - square) * across, (1 - square) * along + square * across
     return along_x.astype(np.float32), along_y.astype(np.float32)
 
@@ -183,8 +170,7 @@ def integrate_normals(
     """Integrate the normals of pixels in contact, of one picture or of each turn, or raise NotConverged.
 
     ``independent_sigma``, (H, W) or (turns, H, W), is that of `find_slopes`. The mean height of each
-    component is 0; components are numbered through all turns. Edges are where the surface breaks, if
-    ``robust``.
+    component is 0; components are numbered over all turns. With ``robust``, edges are breaks of the surface.
     """
     per_turn = result.contact.ndim == 3
     each, sigmas = [result], [independent_sigma]
@@ -198,13 +184,13 @@ def integrate_normals(
         _integrate(slopes_of(turn, sigma), pixel_size, robust, device)
         for turn, sigma in zip(each, sigmas, strict=True)
     ]
-    before = np.cumsum([0, *(len(one.offset_unknown) for one in surfaces)])
+    before = np.cumsum([0, *(len(surface.offset_unknown) for surface in surfaces)])
     components: list[NDArray[Any] | None] = [
-        np.where(one.component >= 0, one.component + np.int32(shift), np.int32(-1))
-        for one, shift in zip(surfaces, before, strict=False)
+        np.where(surface.component >= 0, surface.component + np.int32(shift), np.int32(-1))
+        for surface, shift in zip(surfaces, before, strict=False)
     ]
     names = ("height", "height_sigma", "edges")
-    stacked = {name: _stack([getattr(one, name) for one in surfaces], per_turn) for name in names}
+    stacked = {name: _stack([getattr(surface, name) for surface in surfaces], per_turn) for name in names}
     return Result(
         stacked,
         component=_stack(components, per_turn),
@@ -214,7 +200,7 @@ def integrate_normals(
 
 
 def describe_integration(surfaces: Sequence[Result]) -> dict[str, ProcessValue]:
-    """Return how surfaces were found, for a result's process."""
+    """Return the method and convergence of surfaces, for a result's process."""
     if not surfaces:
         return {}
     processes = [surface.process for surface in surfaces]
@@ -226,9 +212,16 @@ def describe_integration(surfaces: Sequence[Result]) -> dict[str, ProcessValue]:
 
 
 def _integrate(slopes: Slopes, pixel_size: tuple[float, float], robust: bool, device: Device) -> Result:
-    """Return the surface of one picture; one of no pixels, where there is no normal to begin with."""
+    """Return the surface of one picture; it has no pixels if there are no normals."""
     if not slopes.known.any():
-        return _empty_surface(slopes.known.shape)
+        nan, shape = np.full(slopes.known.shape, np.nan, np.float32), slopes.known.shape
+        return Result(
+            height=nan,
+            height_sigma=nan.copy(),
+            component=np.full(shape, -1, np.int32),
+            offset_unknown=np.zeros(0, np.uint8),
+            process={"integration": "multigrid", "integration_iterations": 0, "integration_residual": 0.0},
+        )
     surface = integrate(
         slopes.dz_dx,
         slopes.dz_dy,
@@ -245,29 +238,18 @@ def _integrate(slopes: Slopes, pixel_size: tuple[float, float], robust: bool, de
     return surface
 
 
-def _empty_surface(shape: tuple[int, ...]) -> Result:
-    unknown = np.full(shape, np.nan, np.float32)
-    return Result(
-        height=unknown,
-        height_sigma=unknown.copy(),
-        component=np.full(shape, -1, np.int32),
-        offset_unknown=np.zeros(0, np.uint8),
-        process={"integration": "multigrid", "integration_iterations": 0, "integration_residual": 0.0},
-    )
-
-
 def _stack(maps: list[NDArray[Any] | None], per_turn: bool) -> NDArray[Any] | None:
-    """Return a map of each turn as one, if there are all of them, or that of the only picture."""
-    known = [one for one in maps if one is not None]
-    if len(known) < len(maps):
+    """Return the stacked maps of all turns, or the map of the only picture; None if one is missing."""
+    available = [values for values in maps if values is not None]
+    if len(available) < len(maps):
         return None
-    return np.stack(known) if per_turn else known[0]
+    return np.stack(available) if per_turn else available[0]
 
 
 class SlopeKernels:
-    """Turns normals into slopes and weights on the device, as `find_slopes` does of one turn.
+    """Slopes and weights from normals on the device; equivalent to `find_slopes` for one turn.
 
-    ``typical``, a weight of middle size, bounds weights. It is found the first time, and again after NaN.
+    ``typical`` is the median weight, which determines the limits of weights; it is computed if it is NaN.
     """
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
@@ -279,9 +261,9 @@ class SlopeKernels:
         self.typical: float = math.nan
 
     def find(self, tilt: float, normals: Mapping[str, Array], to: Mapping[str, Array]) -> None:
-        """Put the work on the device's queue; the first time, wait for `typical`.
+        """Enqueue the kernels; the first time, wait for `typical`.
 
-        From ``vectors``, ``sigma`` and ``contact``, which may have padding, to ``dz_dx``, ``dz_dy``,
+        The input ``vectors``, ``sigma`` and ``contact`` may have padding; the output is ``dz_dx``, ``dz_dy``,
         ``weight_x`` and ``weight_y``, (H, W).
         """
         rows, columns = self._shape
@@ -330,11 +312,11 @@ class SlopeKernels:
 
 
 def _typical(*weights: Array) -> float:
-    """Return the median of weights above 0, of evenly spread pixels, or NaN where there is none."""
-    some = []
+    """Return the median of the weights above 0 of evenly spread pixels, or NaN."""
+    parts = []
     for array in weights:
         step = max(1, math.isqrt(array.host.size // SAMPLES))
-        some.append(array.download()[step // 2 :: step, step // 2 :: step].ravel())
-    known = np.concatenate(some)
-    known = known[known > 0]
-    return float(np.median(known)) if known.size else math.nan
+        parts.append(array.download()[step // 2 :: step, step // 2 :: step].ravel())
+    samples = np.concatenate(parts)
+    samples = samples[samples > 0]
+    return float(np.median(samples)) if samples.size else math.nan

@@ -1,4 +1,4 @@
-"""Normals of an endless rotation, from a window of its last frames."""
+"""Normals of an endless rotation, from a window of the last frames."""
 
 from __future__ import annotations
 
@@ -16,24 +16,23 @@ from mirrorskin.io import InputError, Result
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 
-_ROOM = 16  # frames that may be pushed at once without a copy
+_LENGTH = 16  # frames that can be pushed at once without a copy
 
 
 class NormalWindow:
-    """Estimates normals of a window of the last frames on the device, for `mirrorskin.engine.Normals`.
+    """Normals of a window of the last frames on the device, for `mirrorskin.engine.Normals`.
 
-    Noise and tilt are estimated from the first full window, unless they are given. Its frames are kept on
-    the device, in a ring buffer that the correlation shares. Normals and correlation are equal to those that
-    ``estimate_normals`` and ``correlate`` compute from the same frames, bit by bit.
+    Noise and tilt are estimated from the first full window, unless they are given. The frames are in a ring
+    buffer on the device that the correlation uses as well. Normals and correlation are equal, bit by bit, to
+    those that ``estimate_normals`` and ``correlate`` compute from the same frames.
     """
 
     def __init__(
         self, kernel: NormalKernel, shape: tuple[int, int], dtype: np.dtype[Any], length: int
     ) -> None:
-        self._shape, self.length = shape, length
-        self._kernel = kernel
+        self._shape, self.length, self._kernel = shape, length, kernel
         self.device: Device = kernel.device
-        self._sums = WindowSums(self.device, shape, dtype, _ROOM, length, kernel.planes)
+        self._sums = WindowSums(self.device, shape, dtype, _LENGTH, length, kernel.planes)
         for band in self.bands:
             kernel.write_scale(band)
         self._model, self.count = kernel.model, 0
@@ -45,12 +44,12 @@ class NormalWindow:
 
     @property
     def is_full(self) -> bool:
-        """Whether there are as many frames as the window has."""
+        """Whether the window is full."""
         return self.count >= self.length
 
     @property
     def model(self) -> TurnModel:
-        """Tilt and noise, given or estimated; once the window is full."""
+        """Tilt and noise, given or estimated from the first full window."""
         assert self._model is not None
         return self._model
 
@@ -75,10 +74,10 @@ class NormalWindow:
                 self._model = self._kernel.estimate_model(self._samples(), self._fit())
 
     def estimate(self, bare: bool = True) -> None:
-        """Enqueue the estimate of the window's normals; it writes to the maps of the bands.
+        """Enqueue the estimate of the window's normals, which writes to the maps of the bands.
 
-        ``bare`` leaves out mean, cosine, sine and residual. InputError: the window is not full, or its phases
-        do not determine a normal.
+        ``bare`` omits mean, cosine, sine and residual. InputError: the window is not full, or its phases do
+        not determine a normal.
         """
         fit = self._fit()
         self._kernel.write_tables([fit])
@@ -90,7 +89,7 @@ class NormalWindow:
                 self._estimated = ring.last_use
 
     def place(self, heights: NDArray[np.floating]) -> None:
-        """Set the height of the object from now on, (H, W), mm above the rest plane; with a response."""
+        """Set the height of the object for a response, (H, W), mm above the rest plane."""
         for band in self.bands:
             band.write("scale", heights[band.rows], plane=4)
 
@@ -99,7 +98,7 @@ class NormalWindow:
         return self._sums.result()
 
     def fetch(self, name: str) -> NDArray[Any]:
-        """Wait for a map of the last estimate, and return a copy, (H, W), or (H, W, 3)."""
+        """Wait for a map of the last estimate, and return a copy, (H, W) or (H, W, 3)."""
         parts = []
         for band in self.bands:
             with band.resident():
@@ -107,29 +106,29 @@ class NormalWindow:
         return join_rows(parts)
 
     def fetch_early(self, name: str) -> NDArray[Any]:
-        """Return what `fetch` does, but wait for the last estimate alone, not for what came after it."""
+        """Return the same as `fetch`, but wait for the last estimate only, not for later kernels."""
         if len(self.bands) > 1:
             return self.fetch(name)
         band = self.bands[0]
         return self._without_padding(band, band.maps[name].snapshot(self._estimated))
 
     def on_device(self, name: str) -> Array:
-        """Return a map of the last estimate as one array of the device; it may have padding."""
+        """Return a map of the last estimate as one array on the device; it may have padding."""
         if len(self.bands) == 1:
             return self.bands[0].maps[name]
         return self.device.given(name, self.fetch(name), self.bands[0].maps[name].host.dtype)
 
-    def _without_padding(self, band: Band, map_: NDArray[Any]) -> NDArray[Any]:
-        depth = len(map_)
-        flat = map_.reshape(-1)[: depth * band.pixels]
+    def _without_padding(self, band: Band, planes: NDArray[Any]) -> NDArray[Any]:
+        depth = len(planes)
+        flat = planes.reshape(-1)[: depth * band.pixels]
         return flat.reshape(-1, self._shape[1], *([depth] if depth > 1 else []))
 
     def _fit(self) -> TurnFit:
-        """Return how the window's frames are fitted."""
+        """Return the fit to the window's frames."""
         phase, weight = self._sums.frames
         fit = turn_fit(phase, weight) if self.is_full else None
         if fit is None:
-            check_phases(phase[weight > 0])  # raises an error that names the problem
+            check_phases(phase[weight > 0])  # raises an InputError with the reason
             raise InputError(f"{self.count} frames: a window of {self.length} is not full yet")
         return fit
 

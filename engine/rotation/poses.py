@@ -1,4 +1,4 @@
-"""How frames at any known poses are fitted: the body's axis in each, and what they determine of a normal."""
+"""The fit to frames at given poses: the body's axis in each, and what the axes determine of a normal."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from mirrorskin.io.positions import check_phase
 from mirrorskin.io.types import body_axes
 
 PRESSES = 0.02
-"""Least range of travel of a body that presses as well, as a share of the greatest travel."""
+"""Least range of travel of a body that also presses, as a share of the greatest travel."""
 
-_SAME = 1e-4  # share of the axes' greatest part up to which a part is none
-_PLANE = 1e-2  # share of the axes' swing in a plane up to which a swing across it is none
-_UPRIGHT = 0.05  # sine of the angle to the vertical up to which a plane is upright
-_FRAMES_OF_SECOND = 9  # least frames to fit second orders with the first
+_SAME = 1e-4  # ratio of singular values of the axes below which all axes are the same
+_PLANE = 1e-2  # ratio of singular values of the axes below which they are in a plane
+_UPRIGHT = 0.05  # sine of the largest angle between this plane and the vertical
+_FRAMES_OF_SECOND = 9  # least number of frames for a fit of second order
 _UNIT = 1e-6  # tolerance of the length of a unit vector
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseFit:
-    """How a window of N frames is fitted; two are the same if they are one object.
+    """The fit to a window of N frames. Fits are compared by identity.
 
-    ``direction`` is that of rocking, radians from x towards y; None where the axes determine a whole normal.
+    ``direction`` is that of rocking, radians from x towards y; None if the axes determine a normal.
     """
 
     weights: Doubles  # (N,), above 0
-    matrix: Doubles  # (3, N): makes mean, cosine and sine of samples
-    waves: Doubles  # (N, n): orthonormal; what samples of any normal show, nearly
+    matrix: Doubles  # (3, N): from samples to mean, cosine and sine
+    waves: Doubles  # (N, n): orthonormal basis of the samples of all normals, approximately
     table: NDArray[np.float32]  # (13, N): see mirrorskin.kernels.normals_pose
     tilt: float  # root mean square of the frames', radians
     presses: bool  # whether travel differs between frames
-    deep: NDArray[np.bool_]  # (N,), frames in which most of what is touched at all is touched
+    deep: NDArray[np.bool_]  # (N,): frames with at least the median travel
     direction: float | None
 
 
@@ -57,19 +57,19 @@ def check_poses(
     if axis is None:
         assert phase is not None
         assert tilt is not None
-        known = body_axes(check_phase(phase, count, "phase"), check_tilts(tilt, count))
+        axes = body_axes(check_phase(phase, count, "phase"), check_tilts(tilt, count))
     else:
-        known = np.asarray(axis, np.float64)
-        if known.shape != (count, 3) or not np.allclose(np.linalg.norm(known, axis=1), 1, atol=_UNIT):
-            raise InputError(f"axis of shape {known.shape} for {count} frames: a unit vector each is needed")
-        check_tilts(np.arctan2(np.hypot(known[:, 0], known[:, 1]), known[:, 2]), count)
+        axes = np.asarray(axis, np.float64)
+        if axes.shape != (count, 3) or not np.allclose(np.linalg.norm(axes, axis=1), 1, atol=_UNIT):
+            raise InputError(f"axis of shape {axes.shape} for {count} frames: a unit vector each is needed")
+        check_tilts(np.arctan2(np.hypot(axes[:, 0], axes[:, 1]), axes[:, 2]), count)
     depth = np.zeros(count) if travel is None else np.asarray(travel, np.float64)
     if depth.shape not in ((), (count,)):
         raise InputError(f"travel has shape {depth.shape} for {count} frames: one number a frame is needed")
     depth = np.broadcast_to(depth, count)
     if not np.isfinite(depth).all():
         raise InputError("travel is not finite: every frame needs a number, mm")
-    return np.column_stack([known, depth])
+    return np.column_stack([axes, depth])
 
 
 def rocks(phase: ArrayLike | None) -> bool:
@@ -81,7 +81,7 @@ def rocks(phase: ArrayLike | None) -> bool:
 
 
 def even_windows(frames: int) -> int:
-    """Return how many frames a window has, for as few as possible that are as even as can be.
+    """Return the length of windows, for the smallest number of windows of nearly equal length.
 
     Examples
     --------
@@ -92,9 +92,9 @@ def even_windows(frames: int) -> int:
 
 
 def pose_fit(pose: Doubles, weights: Doubles) -> PoseFit:
-    """Return how frames are fitted, of poses (N, 4) and weights above 0.
+    """Return the fit to frames with poses (N, 4) and weights above 0.
 
-    InputError: fewer than 3 frames, axes that are all the same, or that lie in a plane that is not upright.
+    InputError: fewer than 3 frames, axes that are all the same, or axes in a plane that is not upright.
     """
     axes, travel = pose[:, :3], pose[:, 3]
     if len(axes) < 3:
@@ -135,7 +135,7 @@ def pose_fit(pose: Doubles, weights: Doubles) -> PoseFit:
 
 
 def _waves(leans: Doubles, root: Doubles) -> Doubles:
-    """Return what samples show, to second order of the tilt: an orthonormal base, (N, n)."""
+    """Return an orthonormal basis of the samples of all normals, to second order in the tilt, (N, n)."""
     x, y = ((leans - leans.mean(axis=0)) / np.max(leans.std(axis=0))).T
     second = [x * x, x * y, y * y] if len(x) >= _FRAMES_OF_SECOND else []
     terms = np.column_stack([np.ones(len(x)), x, y, *second]) * root[:, np.newaxis]

@@ -1,82 +1,70 @@
-"""Axial frames, resampled so that they follow the object, which the tilt of the body moves in the picture."""
+"""Registration of axial frames: resampling that compensates the motion of the object in the picture."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.frames import check_dtype
-from mirrorskin.io import Block, Header, InputError, Motion, Source, pixel_axes
+from mirrorskin.engine.rotation.edited import DerivedSource
+from mirrorskin.io import Block, Header, InputError, Source, pixel_axes
 from mirrorskin.io.positions import check_phase
 from mirrorskin.io.types import block_memory
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
 from mirrorskin.kernels.registration import BORDER
 
-_BLOCK = 16_000_000  # bytes of the source's frames that are read at a time
-_FRAME: np.dtype[Any] = np.dtype(np.float32)
+_BLOCK = 16_000_000  # bytes of the source's frames that are read at once
 
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """How lines of sight lean towards an axis, mm: by ``lean`` for each mm up and each mm from it."""
+    """Inclination of lines of sight towards an axis: ``lean``, mm per mm of height and mm from the axis."""
 
     lean: float
     axis: tuple[float, float]
 
 
-class Registered:
-    """A source's frames, resampled so that each pixel keeps seeing one point of the object.
+class Registered(DerivedSource):
+    """A source's frames, resampled as float32 so that each pixel shows one point of the object in all frames.
 
-    That point is the one that the pixel sees in the mean pose, pressed and upright: p = (x, y, height +
-    press) in the body's frame, of which z = 0 is the sheet's rest plane. The body turns about the pivot q; at
-    the phase alpha it sees the point at ::
+    This is the point that the pixel shows in the mean pose, pressed and upright: p = (x, y, height + press)
+    in the body's coordinates, whose plane z = 0 is the sheet's rest plane. The body turns about the pivot q;
+    at the phase alpha, the point is at ::
 
         p' = q + Rz(alpha) Ry(tilt) Rz(-alpha) (p - q)
 
-    and a camera that looks straight down, at the pixel of p'.x and p'.y. So the point moves along the
-    direction of alpha alone ::
+    and a camera that looks straight down shows it at the pixel (p'.x, p'.y). It moves along the direction
+    alpha only ::
 
         (p'.x, p'.y) = (x, y) + (sin(tilt) (p.z - q.z) - (1 - cos(tilt)) u) (cos(alpha), sin(alpha))
 
-    with u = (x - q.x) cos(alpha) + (y - q.y) sin(alpha). There, eq. 10 of the paper holds for the normal of
-    the mean pose.
+    with u = (x - q.x) cos(alpha) + (y - q.y) sin(alpha). At this pixel, eq. 10 of the paper holds for the
+    normal in the mean pose.
 
-    A camera whose lines of sight lean towards an axis, by k for each millimetre from it, sees the point p at
-    the pixel of X where (p.x, p.y) = X - k p.z (X - axis). To the first order in k, that adds to the shift
-    of the pixel ::
+    If the lines of sight are inclined towards an axis, by k per millimetre of distance, the point p is at the
+    pixel X with (p.x, p.y) = X - k p.z (X - axis). To first order in k, the pixel's shift has an additional
+    term ::
 
         k (p'.z - p.z) (X - axis) + k p.z (p' - p)
 
-    A sample between the pixels is made of the 16 round it; see `mirrorskin.kernels.registration`. It is NaN
-    where any of them is outside the picture, clipped (at either end of an integer type) or not a finite
-    number, and where the height is unknown. Where each pixel has its own ``zenith_gain`` and
-    ``zenith_offset``, counts are brought to the scale of the pixel that they come to; one that has none, as
-    a defect, counts as the mean of those on opposite sides of it.
+    A sample is interpolated from the 16 nearest pixels; see `mirrorskin.kernels.registration`. It is NaN if
+    any of these is outside the picture, clipped (at either end of an integer type) or not finite, or if the
+    height is NaN. If ``zenith_gain`` and ``zenith_offset`` are maps, counts are converted to the scale of the
+    output pixel; a pixel without a scale, such as a defect, gets the mean of two opposite neighbours.
 
-    It is not checked whether the sheet touches a point in every pose, nor whether a point is hidden: a mirror
-    skin takes the object's shape, and a camera along the body's axis sees all of it that does not overhang.
+    It is assumed that the sheet touches all points in every pose and that none is hidden: a mirror skin
+    takes the object's shape, and a camera along the body's axis sees all of it that does not overhang.
 
     Attributes
     ----------
-    name, header, motion, shape, rewindable
-        Those of the source.
-    dtype : dtype
-        float32.
     phase : ndarray, (T,), float64, or None
-        That of the source, if it knows its phases beforehand.
+        The phases of the source, if it has them in advance.
     """
-
-    name: str
-    header: Header
-    shape: tuple[int, int, int]
-
-    dtype = _FRAME
 
     def __init__(
         self,
@@ -87,16 +75,14 @@ class Registered:
         sight: Sight | None = None,
         device: str | Device | None = None,
     ) -> None:
+        super().__init__(source)
         check_dtype(source.dtype)
-        header = source.header if header is None else header
+        self.header, self.dtype = header or source.header, np.dtype(np.float32)
+        header = self.header
         self._geometry = _Geometry.of(source, header, sight)
         height = check_heights(heights, source.shape[1:])
-        self.name, self.header, self.shape = source.name, header, source.shape
-        self.motion: Motion = source.motion
-        self.rewindable: bool = source.rewindable
         self.phase: NDArray[np.float64] | None = getattr(source, "phase", None)
         self.device: Device = open_device(device)
-        self._source = source
         rows, columns = self.shape[1:]
         offset, gain = _levels(header, (rows, columns))
         integer = source.dtype.kind == "u"
@@ -124,10 +110,10 @@ class Registered:
 
     @property
     def noise_gain(self) -> NDArray[np.float32]:
-        """Factor of the noise of a sample, (H, W), RMS over the frames read since the first.
+        """Factor of the noise of a sample, (H, W), RMS over the frames so far; NaN without a sample.
 
-        NaN where there was no sample. It is that of noise which is independent from pixel to pixel, and equal
-        on their shared scale; that of registered neighbours is not independent.
+        It assumes that the noise of the source's pixels is independent, and equal on their common scale. The
+        noise of registered neighbours is correlated.
         """
         squares, count = self._noise.download()
         gain: NDArray[np.float32] = np.sqrt(squares / np.where(count > 0, count, np.float32(np.nan)))
@@ -154,22 +140,22 @@ class Registered:
         return replace(block, frames=out[:count], lent=False)
 
     def _resample(self) -> None:
-        """Have the device resample the frame that it holds."""
+        """Resample the frame on the device."""
         rows, columns = self.shape[1:]
         tile, size = self.device.layout.tile, self._registered.host.nbytes
         items = rows * -(-columns // tile)
-        known: dict[str, Any] = {"rows": rows, "columns": columns, **self._maps}
-        admit, mend, resample = (
+        common: dict[str, Any] = {"rows": rows, "columns": columns, **self._maps}
+        pad, interpolate, resample = (
             self.device.kernel("registration", f"registration_{name}", **self._macros)
             for name in ("admit", "mend", "resample")
         )
-        admit(items, **known, frame=self._frame, moved=self._frame.host.nbytes + size)
+        pad(items, **common, frame=self._frame, moved=self._frame.host.nbytes + size)
         if self._places is not None:
             count, padded = len(self._places.host), self._maps["padded"]
-            mend(-(-count // tile), count=count, places=self._places, padded=padded, moved=9 * 4 * count)
+            interpolate(-(-count // tile), count=count, places=self._places, padded=padded, moved=36 * count)
         resample(
             items,
-            **known,
+            **common,
             height=self._height,
             shift=self._shift,
             registered=self._registered,
@@ -177,19 +163,10 @@ class Registered:
             moved=7 * size,
         )
 
-    def __enter__(self) -> Self:
-        self._source.__enter__()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
-    ) -> None:
-        self._source.__exit__(kind, error, trace)
-
 
 @dataclass(frozen=True, slots=True)
 class _Geometry:
-    """How the object's points move when the body tilts; lengths in mm, the tilt in radians."""
+    """Motion of the object's points in the picture as the body tilts; lengths in mm, the tilt in radians."""
 
     corner: tuple[float, float]  # x and y of the first pixel
     pixel_size: tuple[float, float]
@@ -203,18 +180,18 @@ class _Geometry:
         if source.motion != "axial":
             raise InputError(f"{source.name} has {source.motion} motion: only axial ones can be registered")
         pixel_size, tilt, press, pivot = (
-            _known(source, header, name) for name in ("pixel_size", "tilt", "press", "pivot")
+            _required(source, header, name) for name in ("pixel_size", "tilt", "press", "pivot")
         )
         x, y = pixel_axes(source.shape[1:], pixel_size)
         return cls((float(x[0]), float(y[0])), pixel_size, tilt, press, pivot, sight)
 
     def shift(self, phase: float) -> NDArray[np.float32]:
-        """Return where the points are found at a phase, as ``registration_resample`` takes it."""
+        """Return the shifts of the points at a phase, as ``registration_resample`` needs them."""
         cosine, sine = math.cos(phase), math.sin(phase)
         along_x, along_y = self.pixel_size
         rise, drop = math.sin(self.tilt), 2 * math.sin(self.tilt / 2) ** 2
         outwards = (self.corner[0] - self.pivot[0]) * cosine + (self.corner[1] - self.pivot[1]) * sine
-        # Millimetres along the phase's direction: a number, and what each column, row and mm of height adds.
+        # Shift along the phase's direction, mm: a constant, and terms per column, row and mm of height.
         moved = [
             rise * (self.press - self.pivot[2]) - drop * outwards,
             -drop * along_x * cosine,
@@ -226,7 +203,7 @@ class _Geometry:
         lean = self.sight.lean
         moved[0] += lean * rise * self.press * (self.press - self.pivot[2])
         moved[3] += lean * rise * (2 * self.press - self.pivot[2])
-        # Rise of the point; times the lean, it is the shift of the pixel per mm from the axis.
+        # Rise of the point; times the lean, it is the pixel's shift per mm of distance from the axis.
         up = -rise * outwards - drop * (self.press - self.pivot[2])
         shifts = self._radial(lean * up, -lean * rise * along_x * cosine, lean * rise * along_y * sine)
         shifts[:, :4] += np.outer([cosine, sine], moved)
@@ -252,10 +229,10 @@ def _fill(array: Array, values: NDArray[Any]) -> None:
 
 
 def _interpolated_pixels(offset: NDArray[np.float32], gain: NDArray[np.float32]) -> NDArray[np.int32]:
-    """Return the pixels without a scale between two that have one, (n, 5), for ``registration_mend``.
+    """Return the pixels without a scale between two pixels with one, (n, 5), for ``registration_mend``.
 
-    The two are opposite neighbours, so that a slope cancels: left and right or above and below, otherwise
-    those at the corners.
+    These two are opposite neighbours, so that a slope cancels: left and right or above and below, otherwise
+    the corners.
     """
     sound = np.pad(np.isfinite(offset) & np.isfinite(gain) & (gain != 0), BORDER)
     stride = sound.shape[1]
@@ -263,15 +240,15 @@ def _interpolated_pixels(offset: NDArray[np.float32], gain: NDArray[np.float32])
     lost = np.flatnonzero(~flat)
     lost = lost[(lost > stride) & (lost < flat.size - stride - 1)]
     chosen = np.zeros((2, len(lost)), np.intp)
-    for step in (stride + 1, stride - 1, stride, 1):  # the later, the better
+    for step in (stride + 1, stride - 1, stride, 1):  # in increasing order of preference
         both = flat[lost - step] & flat[lost + step]
         chosen = np.where(both, [np.full(len(lost), step), np.where(chosen[0] > 0, chosen[0], step)], chosen)
-    known = chosen[0] > 0
-    lost, (one, other) = lost[known], chosen[:, known]
-    return np.stack([lost, lost - one, lost + one, lost - other, lost + other], axis=1).astype(np.int32)
+    usable = chosen[0] > 0
+    lost, (first, second) = lost[usable], chosen[:, usable]
+    return np.stack([lost, lost - first, lost + first, lost - second, lost + second], axis=1).astype(np.int32)
 
 
-def _known(source: Source, header: Header, name: str) -> Any:
+def _required(source: Source, header: Header, name: str) -> Any:
     """Return a value of a header; InputError if it is missing or not finite."""
     value = getattr(header, name)
     words = name.replace("_", " ")
@@ -301,7 +278,7 @@ def check_heights(heights: ArrayLike, shape: tuple[int, int]) -> NDArray[np.floa
 
 
 def _levels(header: Header, shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return each pixel's counts at zenith 0 and for a unit of it; 0 and 1, (1, 1), where all are alike."""
+    """Return the offset and gain of each pixel; 0 and 1, (1, 1), if all pixels have the same."""
     offset = np.asarray(0.0 if header.zenith_offset is None else header.zenith_offset)
     gain = np.asarray(1.0 if header.zenith_gain is None else header.zenith_gain)
     if (offset == offset.flat[0]).all() and (gain == gain.flat[0]).all():

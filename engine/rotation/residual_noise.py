@@ -14,22 +14,22 @@ from mirrorskin.engine.frames import QUANTUM
 from mirrorskin.engine.rotation.design_matrix import Doubles, basis
 from mirrorskin.io import InputError
 
-_FLOAT_NOISE = 1e-6  # of the greatest count: the least noise that float frames are taken to have
-_FRAMES_OF_TWO = 7  # least frames to fit a second wave with the first
-_MAX_CONDITION = 100.0  # of both
-_BINS, _BIN_PIXELS = 16, 200  # bins of brightness at most, and pixels of one at least
-_AT_ONCE = 4096  # pixels, which stay in the cache
-_ROUNDS, _OUTLYING = 10, 0.2  # of the line's robust fit, and share by which a variance may miss it
-_BEYOND = 1e-3  # share of the pixels whose sum of squares is that large by noise alone
+_FLOAT_NOISE = 1e-6  # least noise of float frames, as a share of the greatest count
+_FRAMES_OF_TWO = 7  # least number of frames for a fit with the second harmonic
+_MAX_CONDITION = 100.0  # largest condition of this fit
+_BINS, _BIN_PIXELS = 16, 200  # largest number of bins of brightness, and least number of pixels of a bin
+_AT_ONCE = 4096  # pixels per block, which stays in the cache
+_ROUNDS, _OUTLYING = 10, 0.2  # iterations of the line's robust fit, and its limit of relative residuals
+_BEYOND = 1e-3  # significance level of outliers
 
 
 @dataclass(frozen=True, slots=True)
 class CountNoise:
-    """The noise of a sample by its brightness: read noise, and shot noise, which grows with the light."""
+    """The noise of a sample as a function of its brightness: read noise and shot noise."""
 
     base: float  # variance at 0 counts, extrapolated
     slope: float  # variance per count
-    least: float  # the smallest variance that there is
+    least: float  # lower limit of the variance
 
     def at(self, level: ArrayLike) -> Doubles:
         """Return the standard deviation of samples around a level, counts."""
@@ -39,32 +39,32 @@ class CountNoise:
 def residual_noise(
     samples: NDArray[Any], phase: Doubles, weights: Doubles, waves: Doubles | None = None
 ) -> CountNoise:
-    """Estimate the noise of samples of weight 1 from what waves of one and two a turn leave.
+    """Estimate the noise of samples of weight 1 from the residuals of a fit of the first two harmonics.
 
-    Level surfaces show the second one; of fewer than 7 frames a turn it is taken for noise. Pixels are sorted
-    by their brightness into bins. The median of a bin's sums of squares is a first guess of its variance;
-    then those beyond chi-square's quantile of 99.9 %, of pixels that lose contact, are left out until that
-    changes nothing. Through the bins' variances goes a line that does not fall.
+    The second harmonic occurs on level surfaces; with fewer than 7 frames it counts as noise. Pixels are
+    sorted into bins by brightness. The initial variance of a bin is from the median of the sums of squares;
+    then sums beyond the 99.9 % quantile of chi-square, such as those of pixels that lose contact, are
+    excluded iteratively. A non-decreasing line is fitted to the bins' variances.
 
-    Samples are (N, n), of n pixels; weights are above 0. Frames that have less than half as many valid
-    samples as others are left out, and then pixels of which a sample is clipped by its type or no number.
-    Where the frames are no turn, ``waves`` are what samples show of any normal, (N, n), times the weights'
-    roots; phases do not matter then.
+    Samples are (N, n), of n pixels; weights are above 0. Frames with less than half as many valid samples as
+    others are excluded, and then pixels with a sample that is clipped or not finite. If the frames are not a
+    turn, ``waves``, (N, n), is a basis of the samples of all normals, times the roots of the weights; phases
+    are not used.
     """
-    shown = 3 if waves is None else waves.shape[1]
-    if len(samples) <= shown:
+    coefficients = 3 if waves is None else waves.shape[1]
+    if len(samples) <= coefficients:
         raise InputError(
             f"{len(samples)} frames a turn leave no residual to estimate the noise from:"
             " give its standard deviation"
         )
     good = valid(samples)
     quantum = QUANTUM if samples.dtype.kind == "u" else _FLOAT_NOISE
-    if not (good.sum(axis=0) >= 3).any():  # no pixel will have an answer
+    if not (good.sum(axis=0) >= 3).any():  # no pixel has a normal
         return CountNoise(quantum**2, 0.0, quantum**2)
     share = good.mean(axis=1)
     frames = share > share.max() / 2
     pixels = good[frames].all(axis=0)
-    if np.count_nonzero(frames) <= shown or not pixels.any():
+    if np.count_nonzero(frames) <= coefficients or not pixels.any():
         raise InputError(
             "too few samples are valid to estimate the noise: give a sample's standard deviation, in counts"
         )
@@ -74,20 +74,25 @@ def residual_noise(
     level = total / len(counts)
     floor = quantum * (1.0 if integer else float(np.max(np.abs(counts))))
     root = np.sqrt(weights)[:, np.newaxis]
-    waves = root * _waves(phase) if waves is None else waves[frames]
+    if waves is None:
+        first = basis(phase)
+        both = np.concatenate([first, basis(2 * phase)[:, 1:]], axis=1)
+        separable = len(phase) >= _FRAMES_OF_TWO and np.linalg.cond(both) < _MAX_CONDITION
+        waves = root * (both if separable else first)
+    else:
+        waves = waves[frames]
     freedom = len(counts) - waves.shape[1]
-    # Of an orthonormal base, the directions that are no waves.
-    beside = np.linalg.qr(waves, mode="complete").Q[:, waves.shape[1] :]
+    residual_basis = np.linalg.qr(waves, mode="complete").Q[:, waves.shape[1] :]
     squares = np.empty(len(level))
     for start in range(0, len(level), _AT_ONCE):
         part = slice(start, start + _AT_ONCE)
-        residual = beside.T @ (root * counts[:, part])
+        residual = residual_basis.T @ (root * counts[:, part])
         np.einsum("ij,ij->j", residual, residual, out=squares[part])
-    # Integers of 16 bits are sorted in one pass.
+    # 16-bit integers are sorted in one pass.
     order = np.argsort(total.astype(np.uint16) if integer and total.max() < 2**16 else total, kind="stable")
     bins = np.array_split(order, max(1, min(_BINS, len(order) // _BIN_PIXELS)))
-    variances = np.array([_variance(squares[one], freedom) for one in bins])
-    levels = np.array([level[one].mean() for one in bins])
+    variances = np.array([_variance(squares[pixels], freedom) for pixels in bins])
+    levels = np.array([level[pixels].mean() for pixels in bins])
     return _line(levels, np.maximum(variances, floor**2), floor**2)
 
 
@@ -99,7 +104,7 @@ def valid(samples: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def _variance(squares: Doubles, freedom: int) -> float:
-    """Return the variance of normal samples from sums of squares, some of which are of other pixels."""
+    """Return the variance of normally distributed samples from sums of squares with outliers."""
     furthest = _chi_square_beyond(freedom, _BEYOND)
     kept_share = (1 - _share_beyond(freedom + 2, furthest)) / (1 - _share_beyond(freedom, furthest))
     variance = float(np.median(squares)) / _chi_square_beyond(freedom, 0.5)
@@ -111,9 +116,9 @@ def _variance(squares: Doubles, freedom: int) -> float:
 
 
 def _share_beyond(freedom: int, square: float) -> float:
-    """Return how probable it is that chi^2 exceeds a value: its sum for whole degrees of freedom.
+    """Return the probability that chi^2 exceeds a value, for integer degrees of freedom.
 
-    To load SciPy's takes a quarter of a second.
+    Loading SciPy's function takes a quarter of a second.
     """
     half = square / 2
     powers = np.arange(1 if freedom % 2 == 0 else 1.5, freedom / 2, dtype=np.float64)
@@ -127,7 +132,7 @@ def _share_beyond(freedom: int, square: float) -> float:
 
 @functools.cache
 def _chi_square_beyond(freedom: int, share: float) -> float:
-    """Return the value that chi^2 exceeds with this probability, to a double's last digits, by bisection."""
+    """Return the value that chi^2 exceeds with a probability, to double precision, by bisection."""
     low, high = 0.0, 1.0
     while _share_beyond(freedom, high) > share:
         low, high = high, 2 * high
@@ -137,7 +142,7 @@ def _chi_square_beyond(freedom: int, share: float) -> float:
 
 
 def _line(levels: Doubles, variances: Doubles, least: float) -> CountNoise:
-    """Fit a line that does not fall to variances, robustly: iteratively reweighted least squares."""
+    """Fit a non-decreasing line to variances by iteratively reweighted least squares."""
     weights = 1 / variances
     base, slope = float(np.median(variances)), 0.0
     for _ in range(_ROUNDS if np.ptp(levels) > 0 else 0):
@@ -151,10 +156,3 @@ def _line(levels: Doubles, variances: Doubles, least: float) -> CountNoise:
         off = np.abs(variances - fitted) / fitted
         weights = np.sqrt(np.minimum(1.0, _OUTLYING / np.maximum(off, _OUTLYING))) / fitted
     return CountNoise(base, slope, least)
-
-
-def _waves(phase: Doubles) -> Doubles:
-    """Return what to fit, (N, 3 or 5): one wave a turn, and two where the phases separate them."""
-    one = basis(phase)
-    both = np.concatenate([one, basis(2 * phase)[:, 1:]], axis=1)
-    return both if len(phase) >= _FRAMES_OF_TWO and np.linalg.cond(both) < _MAX_CONDITION else one

@@ -1,7 +1,7 @@
-"""Normals, contact, edges and heights from an axial rotation; or its wave alone.
+"""Normals, contact, edges and heights from an axial rotation, or its correlation only.
 
-Frames are read once where brightness is linear in the zenith. Under a calibrated wall, what a pixel shows
-depends on the height of what it sees as well: that is found in the first turn, unless it is given.
+Frames are read once if brightness is linear in the zenith. Under a calibrated wall, brightness also depends
+on the height of the surface: unless given, it is estimated from the first turn.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -43,20 +42,20 @@ if TYPE_CHECKING:
     from mirrorskin.io.types import ProcessValue
 
 _NO_GAIN = "none: the recording has no zenith gain"
-_ROUNDS = 2  # in which the height of the object is found
-_OMIT = ("cosine", "sine")  # they follow from azimuth and modulation
+_ROUNDS = 2  # iterations of the height of the object
+_OMIT = ("cosine", "sine")  # redundant: they follow from azimuth and modulation
 
 
 class Rotation(Method, options_of=(NormalsOperation, Integration)):
     """Normals of an axial rotation of one turn or more, and the heights that fit them.
 
-    Brightness is what the zenith response of the source's calibration says (see `mirrorskin.io.Calibrated`).
+    Brightness follows the zenith response of the source's calibration (see `mirrorskin.io.Calibrated`).
     Without one, it is assumed to be linear in the zenith between the source's dark and bright references, if
     it has them. Without a zenith gain, the result has azimuth, mean, cosine, sine, modulation and residual
     only; without a pixel size, no heights. Heights are relative: the mean of each component is 0.
 
-    If the source has a tilt of each frame, or two phases half a turn apart, its frames are at any known
-    poses; see `mirrorskin.engine.rotation.MovingNormals`. Rocking determines a slope and no heights.
+    If the source has a tilt of each frame, or two phases half a turn apart, its frames are at given poses;
+    see `mirrorskin.engine.rotation.MovingNormals`. Rocking determines a slope, but no heights.
     """
 
     motions = ("axial",)
@@ -66,8 +65,8 @@ class Rotation(Method, options_of=(NormalsOperation, Integration)):
     heights: Any = option(
         default=None,
         file="RES.h5",
-        help="heights of the surface, mm, by which frames are registered for the shift of the pivot; under a"
-        " calibrated response they are found in a first pass over the source otherwise",
+        help="heights of the surface, mm, to register frames for the shift of the pivot; with a calibrated"
+        " response, the default is to estimate them in a first pass over the source",
     )
     window_frames: int | None = Normals.window_frames
 
@@ -78,7 +77,7 @@ class Rotation(Method, options_of=(NormalsOperation, Integration)):
         self.make(Normals)
 
     def plan(self, source: Source) -> Plan:
-        """Return the operation for a source; it depends on the poses and on the known response."""
+        """Return the operation for a source, depending on the poses and on the response."""
         wall = self._wall_of(source)
         if self.zenith_gain is None and source.header.zenith_gain is None and wall is None:
             return self._correlation(source)
@@ -91,7 +90,7 @@ class Rotation(Method, options_of=(NormalsOperation, Integration)):
         return self._calibrated(source, header, wall, heights)
 
     def live_plan(self, source: Source) -> Plan:
-        """Return the normals of the last turn, without registration; or what the source determines."""
+        """Return the normals of the last turn, without registration, or what the source determines."""
         wall = self._wall_of(source)
         no_gain = self.zenith_gain is None and source.header.zenith_gain is None
         if self.tilt is None and source.header.tilt is None:
@@ -127,11 +126,15 @@ class Rotation(Method, options_of=(NormalsOperation, Integration)):
         operation = self.make(MovingNormals, longest=longest, memory_limit=limit).configured_for(source)
         process = {"method": "exact", "tilt_from": "each frame: this is their root mean square"}
         tilt = source.header.tilt
-        stream = None if tilt is None else EditedSource(source, partial(_with_tilts, tilt))
+
+        def with_tilts(block: Block) -> Block:
+            return replace(block, tilt=np.full(len(block.frames), tilt))
+
+        stream = None if tilt is None else EditedSource(source, with_tilts)
         return Plan(operation, [Edges(), self.make(Integration)], process, omit=_OMIT, stream=stream)
 
     def _linear(self, source: Source, header: Header, heights: ArrayLike | None) -> Plan:
-        """Return how normals are found of pixels that are linear in the zenith."""
+        """Return the plan for brightness that is linear in the zenith."""
         stream = source
         if heights is not None:
             stream = Registered(source, heights, device=self.device, header=header)
@@ -142,9 +145,9 @@ class Rotation(Method, options_of=(NormalsOperation, Integration)):
     def _calibrated(
         self, source: Source, header: Header, wall: WallResponse, heights: ArrayLike | None
     ) -> Plan:
-        """Return how normals are found under a wall, with frames registered if the pivot is known."""
+        """Return the plan for a calibrated wall; frames are registered if there is a pivot."""
         response = initial_response(wall, source, header)
-        assert header.press is not None  # or there is no response
+        assert header.press is not None  # `initial_response` needs it
         if heights is not None:
             values = check_heights(heights, source.shape[1:])
             origin, heights = "given", fill_with_nearest(values).astype(np.float64)
@@ -164,7 +167,7 @@ class Rotation(Method, options_of=(NormalsOperation, Integration)):
         return Plan(operation, self._steps(), self._process() | process, None, _OMIT, stream)
 
     def _first_heights(self, source: Source, header: Header, response: Response) -> Doubles:
-        """Find from the first turn how high the object is, less the press, (H, W), mm."""
+        """Return the height of the object less the press, (H, W), mm, from the first turn."""
         pixel_size, press = header.pixel_size, header.press
         assert pixel_size is not None
         assert press is not None
@@ -173,9 +176,9 @@ class Rotation(Method, options_of=(NormalsOperation, Integration)):
             stream, response = self._placed(turn, header, response, heights)
             operation = self._turns(stream, header, response).with_options(per_turn=False)
             feed(stream, operation)
-            found = operation.finish()
+            maps = operation.finish()
             top = coarse_heights(
-                found.normals, found.contact, response.too_level(found.mean), pixel_size, press, self.device
+                maps.normals, maps.contact, response.too_level(maps.mean), pixel_size, press, self.device
             )
             heights = top - press
         return heights
@@ -183,18 +186,18 @@ class Rotation(Method, options_of=(NormalsOperation, Integration)):
     def _placed(
         self, source: Source, header: Header, response: Response, heights: Doubles
     ) -> tuple[Source, Response]:
-        """Return frames that follow an object of known heights, mm, if they can, and the response to them."""
+        """Return frames registered with heights, mm, if possible, and the response for them."""
         assert header.press is not None
         follows = header.pivot is not None and header.tilt is not None
         response = response.at(header.press + heights, follows)
         if not follows:
             return source, response
-        offset, per_count = response.planes[:2]  # counts without light, and for full light, as a scale
+        offset, per_count = response.planes[:2]  # as a scale from no light to full light
         header = replace(header, zenith_offset=offset, zenith_gain=1 / per_count)
         return Registered(source, heights, device=self.device, header=header, sight=response.sight), response
 
     def _turns(self, stream: Source, header: Header, response: Response | None) -> Normals:
-        """Return the operation that estimates the normals of turns of a source, or of registered frames."""
+        """Return the operation for turns of a source or of registered frames."""
         operation: Normals = self.make(
             Normals,
             tilt="estimate" if header.tilt is None else header.tilt,
@@ -204,7 +207,7 @@ class Rotation(Method, options_of=(NormalsOperation, Integration)):
         return operation.configured_for(stream)
 
     def _header(self, source: Source) -> Header:
-        """Return the source's header with the options instead, if given; a tilt of None is estimated."""
+        """Return the source's header, with options in place of its values; a tilt of None is estimated."""
         header = source.header
         tilt = header.tilt if self.tilt is None else None if self.tilt == "estimate" else self.tilt
         if tilt is None and self.tilt != "estimate":
@@ -228,7 +231,7 @@ class Rotation(Method, options_of=(NormalsOperation, Integration)):
         return {"method": self.method, "tilt_from": origin, "per_turn": self.per_turn}
 
     def _brightness(self, source: Source) -> dict[str, ProcessValue]:
-        """Return where the numbers of a response that is linear in the zenith come from."""
+        """Return the origins of the parameters of a linear response."""
         header = source.header
         return {
             "zenith_gain": parameter_origin(self.zenith_gain, header.zenith_gain, "none"),
@@ -239,7 +242,7 @@ class Rotation(Method, options_of=(NormalsOperation, Integration)):
 
 
 def _heights_of(heights: Any, source: Source) -> ArrayLike | None:
-    """Return heights that are given as a map, as a result, or as the path of a result or a simulation."""
+    """Return heights from a map, a result, or the path of a result or a simulation."""
     if isinstance(heights, str | Path):
         recording = source.source if isinstance(source, Calibrated) else source
         return open_heights(heights, recording if isinstance(recording, Recording) else None)
@@ -249,24 +252,19 @@ def _heights_of(heights: Any, source: Source) -> ArrayLike | None:
 
 
 def _half_way(source: Source, press: float) -> Doubles:
-    """Return the height of an object before the first estimate, less the press, (H, W), mm."""
+    """Return the initial height of the object less the press, (H, W), mm."""
     return np.full(source.shape[1:], -HALF_WAY * press)
 
 
 def _at_most(memory_limit: int, source: Source) -> int:
-    """Return a memory limit that is no more than a source needs."""
+    """Return a memory limit, reduced to the size of a source."""
     return max(1, min(memory_limit, 2 * math.prod(source.shape) * source.dtype.itemsize))
 
 
-def _with_tilts(tilt: float, block: Block) -> Block:
-    """Give each frame the tilt of all."""
-    return replace(block, tilt=np.full(len(block.frames), tilt))
-
-
 def at_poses(source: Source, tilt: ArrayLike | None = None) -> bool:
-    """Return whether the frames of a source are at any known poses, not on whole turns of one tilt.
+    """Return whether the frames of a source are at given poses, not on whole turns of one tilt.
 
-    The first frame is read if the source does not have its positions beforehand and can be rewound.
+    The first frame is read if the source does not have its positions in advance and can be rewound.
     """
     if tilt is not None or source.motion != "axial":
         return False
@@ -283,7 +281,7 @@ def at_poses(source: Source, tilt: ArrayLike | None = None) -> bool:
 
 
 class FirstTurn(FrameSequence):
-    """The frames of a source's first turn, up to the first of the second and 64 at most, kept in memory."""
+    """The frames of a source's first turn, at most 64, in memory."""
 
     def __init__(self, source: Source) -> None:
         frames: list[NDArray[Any]] = []

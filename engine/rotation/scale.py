@@ -1,4 +1,4 @@
-"""From counts to zeniths: the scale of a sensor whose brightness is linear in the zenith."""
+"""Conversion of counts to zeniths, for a sensor whose brightness is linear in the zenith."""
 
 from __future__ import annotations
 
@@ -8,40 +8,36 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.rotation.design_matrix import Doubles
-from mirrorskin.engine.rotation.tilt import one_wave
+from mirrorskin.engine.rotation.tilt import STEEP
 from mirrorskin.io import InputError
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scale:
-    """How brightness goes with the zenith: E = offset + gain zenith, between two zeniths.
+    """Linear brightness E = offset + gain zenith, within limits of the zenith.
 
-    Attributes
-    ----------
-    planes : ndarray, (4,) or (4, H, W), float64
-        Counts at zenith 0; radians per count; the lowest and the highest zenith to which that holds. NaN
-        where a pixel has no scale.
+    The planes, (4,) or (4, H, W), are the counts at zenith 0, radians per count, and the lowest and the
+    highest zenith of the linear range. They are NaN without a scale.
     """
 
     planes: Doubles
 
     @property
     def per_pixel(self) -> bool:
-        """Whether each pixel has a scale of its own."""
+        """Whether the scale is a map."""
         return self.planes.ndim == 3
-
-    @property
-    def ends(self) -> bool:
-        """Whether brightness is linear between some zeniths only."""
-        return bool(np.isfinite(self.planes[2:]).any())
 
     def thinned(self, step: int) -> Doubles:
         """Return the scale of every ``step``-th pixel, (4,) or (4, n)."""
         return self.planes.reshape(4, -1)[:, ::step] if self.per_pixel else self.planes
 
     def clear_pixels(self, wave: Doubles, step: int) -> NDArray[np.bool_]:
-        """Return which of every ``step``-th pixel show little but one wave a turn; see `one_wave`."""
-        return one_wave(wave, self.thinned(step))
+        """Return which of every ``step``-th pixel are steep enough for one wave per turn to be a good fit.
+
+        ``wave``, (3, n), is the mean, cosine and sine of the samples, counts.
+        """
+        offset, per_count = np.broadcast_to(self.thinned(step).reshape(4, -1)[:2], (2, wave.shape[1]))
+        return np.asarray((wave[0] - offset) * per_count > STEEP * np.hypot(*wave[1:]) * np.abs(per_count))
 
 
 def make_scale(
@@ -51,35 +47,31 @@ def make_scale(
     bright: ArrayLike | None,
     shape: tuple[int, int],
 ) -> Scale:
-    """Return a scale in the kernels' form, if it is one; see `mirrorskin.engine.estimate_normals`.
+    """Return a scale, or raise InputError; see `mirrorskin.engine.estimate_normals`.
 
-    A gain below 0 is that of a sensor to which steeper is darker; a pixel with 0 or NaN has no answer.
+    With a gain below 0, steeper surfaces are darker; a pixel with a gain of 0 or NaN has no scale.
     """
     if gain is None:
         raise InputError("a zenith gain is needed: counts per radian, such as 206, or a calibration")
-    given = {
-        "zenith gain": gain,
-        "zenith offset": 0.0 if offset is None else offset,
-        "dark": dark,
-        "bright": bright,
-    }
-    known = {name: _as_map(name, value, shape) for name, value in given.items() if value is not None}
-    rate, zero = known["zenith gain"], known["zenith offset"]
+    offset = 0.0 if offset is None else offset
+    options = {"zenith gain": gain, "zenith offset": offset, "dark": dark, "bright": bright}
+    levels = {name: _as_map(name, value, shape) for name, value in options.items() if value is not None}
+    rate, zero = levels["zenith gain"], levels["zenith offset"]
     check_gain(rate)
     if not np.isfinite(zero).any():
         raise InputError("the zenith offset is not a number: give the counts at zenith 0, such as 10")
     for name in ("dark", "bright"):
-        if name in known and not np.isfinite(known[name]).any():
+        if name in levels and not np.isfinite(levels[name]).any():
             raise InputError(
                 f"{name} is not a number: give the counts at which brightness ends, or leave it out"
             )
-    if "dark" in known and "bright" in known and not np.any(known["dark"] < known["bright"]):
+    if "dark" in levels and "bright" in levels and not np.any(levels["dark"] < levels["bright"]):
         raise InputError("dark is not below bright at any pixel: are they swapped?")
     with np.errstate(divide="ignore", invalid="ignore"):
         sound = np.isfinite(rate) & (rate != 0) & np.isfinite(zero)
         per_count = np.where(sound, 1 / rate, np.nan)
         ends = [
-            (known.get(name, np.asarray(end)) - zero) * per_count
+            (levels.get(name, np.asarray(end)) - zero) * per_count
             for name, end in (("dark", -np.inf), ("bright", np.inf))
         ]
     planes = zero, per_count, np.fmin(*ends), np.fmax(*ends)

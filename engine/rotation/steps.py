@@ -14,7 +14,7 @@ from mirrorskin.engine.rotation.registration import Registered
 from mirrorskin.io import Result
 
 _NO_PIXEL_SIZE = "none: the recording has no pixel size"
-_REACH = 5  # pixels across, from which a registered sample is interpolated
+_REACH = 5  # pixels: size of the neighbourhood whose loss of contact affects a registered sample
 
 
 class Edges(Step):
@@ -35,9 +35,8 @@ class Edges(Step):
 class RegistrationErrors(Step):
     """Correct the errors of normals for the interpolation of registered frames.
 
-    If the noise of a sample is given, interpolation changes it; noise that was estimated from the registered
-    frames includes this. A sample is interpolated from 4 x 4 pixels, two of which on either side may have
-    lost contact.
+    A given noise of samples is corrected; noise that was estimated from the registered frames includes the
+    interpolation. A sample is interpolated from 4 x 4 pixels, which must all be in contact.
     """
 
     def apply(self, result: Result, context: Context) -> Result:
@@ -50,7 +49,7 @@ class RegistrationErrors(Step):
         reach = np.ones((1,) * (contact.ndim - 2) + (_REACH, _REACH), bool)
         lost = np.isfinite(sigma) & (contact == 0)
         inside = contact * ~ndimage.binary_dilation(lost, reach)
-        if _noise_is_given(context):
+        if context.operation.chosen()["noise"] is not None:
             sigma = sigma * context.stream.noise_gain
         return result.assign(normals_sigma=sigma, contact=inside)
 
@@ -85,12 +84,12 @@ class Integration(Step):
         return result.assign(surface, process={**result.process, **surface.process})
 
     def slopes(self, result: Result, context: Context) -> Slopes:
-        """Return the slopes that `apply` integrates, of normals that are not of single turns."""
+        """Return the slopes that `apply` integrates, for the mean of all turns."""
         return slopes_of(result, _independent_sigma(result, context))
 
 
 class CalibrationErrors(Step):
-    """Add the standard errors of a calibrated response, which neighbours share, to those of the normals."""
+    """Add the standard errors of a calibrated response, common to neighbours, to those of the normals."""
 
     def apply(self, result: Result, context: Context) -> Result:
         """Return the result with another ``normals_sigma``, if the operation has a response."""
@@ -100,15 +99,10 @@ class CalibrationErrors(Step):
         return result.assign(normals_sigma=np.hypot(result.normals_sigma, operation.response.sigma))
 
 
-def _noise_is_given(context: Context) -> bool:
-    return context.operation.chosen()["noise"] is not None
-
-
 def _independent_sigma(result: Result, context: Context) -> NDArray[np.float32]:
-    """Return the errors that normals would have without registration.
+    """Return the errors of normals without registration.
 
-    Registration makes errors smaller, but correlates those of neighbours: means over many pixels are no
-    better.
+    Registration reduces errors but correlates those of neighbours: means over many pixels are not better.
     """
     sigma: NDArray[np.float32] = result.normals_sigma
     return sigma / context.stream.noise_gain if isinstance(context.stream, Registered) else sigma

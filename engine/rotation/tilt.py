@@ -1,4 +1,4 @@
-"""The half-angle of the precession: whether it can be one, and its estimate from a turn."""
+"""The tilt, the half-angle of the precession: checks, and its estimate from a turn."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ from mirrorskin.engine.rotation.design_matrix import Doubles, TurnFit, basis
 from mirrorskin.engine.rotation.residual_noise import CountNoise, valid
 from mirrorskin.io import InputError
 
-_STEEPEST = math.radians(30.0)  # no sheet follows a body that leans further
-_STEEP = 4.0  # tilts that a zenith must have for one wave a turn to be nearly all of it
-_FEWEST = 30  # pixels that an estimate takes
-_ROUNDS = 5
+STEEP = 4.0
+"""Ratio of zenith and tilt above which one wave per turn is a good approximation."""
+
+_STEEPEST = math.radians(30.0)  # largest tilt that the sheet can follow
+_FEWEST = 30  # least number of pixels of an estimate
+_ROUNDS = 5  # iterations
 
 
 def check_tilt(tilt: float) -> float:
-    """Return the tilt, radians, if a body can lean so far, else raise InputError."""
+    """Return the tilt, radians, or raise InputError if it is impossible."""
     if not 0 < tilt <= _STEEPEST:
         raise InputError(
             f"tilt {math.degrees(tilt):g} deg: above 0 and up to 30 deg is needed, such as 2.5deg"
@@ -28,7 +30,7 @@ def check_tilt(tilt: float) -> float:
 
 
 def check_tilts(tilt: ArrayLike, count: int) -> Doubles:
-    """Return the tilts of so many frames, radians, from 0 to 30 degrees or the other way, as float64."""
+    """Return the tilts of ``count`` frames, radians within +-30 degrees, as float64."""
     values = np.asarray(tilt, np.float64)
     if values.shape not in ((), (count,)):
         raise InputError(f"tilt has shape {values.shape} for {count} frames: one number, or one a frame")
@@ -39,20 +41,14 @@ def check_tilts(tilt: ArrayLike, count: int) -> Doubles:
     return np.broadcast_to(values, count)
 
 
-def one_wave(wave: Doubles, scale: Doubles) -> NDArray[np.bool_]:
-    """Return which pixels are steep enough for one wave a turn, (3, n) counts, and little else."""
-    offset, per_count = np.broadcast_to(scale.reshape(4, -1)[:2], (2, wave.shape[1]))
-    return np.asarray((wave[0] - offset) * per_count > _STEEP * np.hypot(*wave[1:]) * np.abs(per_count))
-
-
 def estimate_tilt(samples: NDArray[Any], fit: TurnFit, scale: Doubles, noise: CountNoise) -> float:
-    """Estimate the tilt from the amplitude of the zenith's wave, which it is but for its third power.
+    """Estimate the tilt from the amplitude of the zenith's wave, which equals it except for third order.
 
-    Amplitudes are averaged as squares, from which the noise's share is taken: the mean of amplitudes would be
-    too large by the noise's variance over twice the tilt. Pixels count that have a zenith of four tilts or
-    more and show nothing but one wave and noise.
+    The squares of amplitudes are averaged and corrected for the noise: the mean of amplitudes would be biased
+    by the noise's variance over twice the tilt. Only pixels with a zenith of at least four tilts are used,
+    and only if one wave and noise explain their samples.
 
-    The pivot's shift changes amplitudes too: where the heights differ much from the pivot's, the estimate is
+    The shift of the pivot changes amplitudes as well: if the pivot is far from the surface, the estimate is
     wrong. Samples are (N, n), of n pixels in one turn; ``scale`` is the planes of a `Scale`, (4,) or (4, n).
     """
     from scipy import special
@@ -71,7 +67,7 @@ def estimate_tilt(samples: NDArray[Any], fit: TurnFit, scale: Doubles, noise: Co
 
     tilt = math.sqrt(max(0.0, float(np.median(square[clean])))) if clean.any() else 0.0
     for _ in range(_ROUNDS):
-        chosen = clean & (mean > max(_STEEP * tilt, 1e-3))
+        chosen = clean & (mean > max(STEEP * tilt, 1e-3))
         if np.count_nonzero(chosen) < _FEWEST or not tilt > 0:
             raise InputError(
                 "too few pixels are steep and clear enough to estimate the tilt: give it, such as 2.5deg"
@@ -84,6 +80,6 @@ def estimate_tilt(samples: NDArray[Any], fit: TurnFit, scale: Doubles, noise: Co
 
 
 def zenith_seen(zenith: Doubles, azimuth: Doubles, phase: Doubles, tilt: float) -> Doubles:
-    """Return the zenith at each phase, (N, n), radians, by eq. 10 as a sum that loses no digits."""
+    """Return the zenith at each phase, (N, n), radians: eq. 10 as a sum without cancellation."""
     lean = np.sin(zenith) * math.sin(tilt) * (1 + np.cos(azimuth - phase[:, np.newaxis])) / 2
     return np.asarray(2 * np.arcsin(np.sqrt(np.sin((zenith - tilt) / 2) ** 2 + lean)))

@@ -209,7 +209,7 @@ def test_a_cluster_that_goes_away_is_told(recordings, tmp_path, monkeypatch):
         next(run)
         monkeypatch.setattr(cluster, "_REACH", 0.3)
         running.close()
-        with pytest.raises(io.InputError, match="goes on where it stopped"):
+        with pytest.raises(io.InputError, match="continues where it stopped"):
             list(run)
 
 

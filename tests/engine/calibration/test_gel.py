@@ -8,7 +8,7 @@ from contact_theory import sphere
 
 from mirrorskin import io
 from mirrorskin.engine.calibration.gel import BallOnset, ball_onset, fit_gel, sphere_slope, sphere_travel
-from mirrorskin.engine.press.elastic import correct_onset
+from mirrorskin.engine.press.elastic import fit_press
 from mirrorskin.engine.press.press import Press
 from mirrorskin.hw.twin import Camera, Sphere, Twin, Vertical, visible_zenith
 from mirrorskin.hw.twin.body import Body
@@ -112,7 +112,7 @@ def test_the_twins_ball_tells_when_light_comes(learned):
 def test_a_gel_learned_on_a_small_ball_puts_larger_ones_right(learned, diameter):
     twin, result = pressed(diameter, seed=int(diameter))
     size = twin.header.pixel_size
-    corrected, _ = correct_onset(
+    corrected, *_ = fit_press(
         result.height, result.height_sigma, result.status, size, learned.gel, deepest=1.2
     )
     known = np.isfinite(corrected)

@@ -9,8 +9,8 @@ from contact_theory import Pressed, cone, paraboloid, rectangle_responses, spher
 from mirrorskin.engine import NotConverged
 from mirrorskin.engine.press.cells import touched
 from mirrorskin.engine.press.elastic import (
-    correct_onset,
     correct_press,
+    fit_press,
     threshold_at,
 )
 from mirrorskin.engine.press.halfspace import HalfSpace, press
@@ -119,7 +119,7 @@ def test_a_ball_is_put_right_with_pixels_of_two_sizes_and_defects():
     shape, size = (49, 80), (0.1, 0.16)
     height, sigma, status, truth = ball_press(3.0, shape, size, 1.2, 0.05)
     status[20:23, 30:33], status[10, 50] = 0, 0
-    corrected, spread = correct_onset(height, sigma, status, size, GEL, deepest=1.2)
+    corrected, spread, *_ = fit_press(height, sigma, status, size, GEL, deepest=1.2)
     known = np.isfinite(corrected)
     assert not known[status != 1].any()
     assert np.count_nonzero(known) > 0.5 * np.count_nonzero(status == 1)
@@ -134,7 +134,7 @@ def test_a_ball_at_the_edge_of_the_picture_is_put_right():
     height, sigma, status, truth = ball_press(5.0, (60, 60), (0.1, 0.1), 1.0, 0.05)
     cut = np.s_[:, 12:]
     gel = replace(GEL, axis=(-0.6, 0.0))
-    corrected, _ = correct_onset(height[cut], sigma[cut], status[cut], 0.1, gel, deepest=1.0)
+    corrected, *_ = fit_press(height[cut], sigma[cut], status[cut], 0.1, gel, deepest=1.0)
     known = np.isfinite(corrected)
     assert np.count_nonzero(known) > 0.5 * np.count_nonzero(status[cut] == 1)
     before, after = ((maps - truth[cut])[known] for maps in (height[cut], corrected))
@@ -144,20 +144,20 @@ def test_a_ball_at_the_edge_of_the_picture_is_put_right():
 def test_too_little_light_tells_no_surface():
     dark = np.full((20, 20), np.nan)
     with pytest.raises(NotConverged, match="nothing turned light"):
-        correct_onset(dark, dark, np.full((20, 20), 2), 0.1, GEL)
+        fit_press(dark, dark, np.full((20, 20), 2), 0.1, GEL)
     one = dark.copy()
     one[4, 5:8] = -0.1
     with pytest.raises(NotConverged, match="too little"):
-        correct_onset(one, 0.01, np.where(np.isfinite(one), 1, 2), 0.1, GEL)
+        fit_press(one, 0.01, np.where(np.isfinite(one), 1, 2), 0.1, GEL)
     with pytest.raises(NotConverged, match="too little"):
-        correct_onset(np.array([[-0.2]]), 0.01, np.array([[1]]), 0.1, GEL)
+        fit_press(np.array([[-0.2]]), 0.01, np.array([[1]]), 0.1, GEL)
 
 
 def test_maps_that_do_not_fit_are_refused():
     with pytest.raises(InputError, match="one map"):
-        correct_onset(np.zeros(4), 0.0, np.zeros(4), 0.1, GEL)
+        fit_press(np.zeros(4), 0.0, np.zeros(4), 0.1, GEL)
     with pytest.raises(InputError, match="do not fit"):
-        correct_onset(np.zeros((4, 4)), np.zeros((4, 3)), np.ones((4, 4)), 0.1, GEL)
+        fit_press(np.zeros((4, 4)), np.zeros((4, 3)), np.ones((4, 4)), 0.1, GEL)
 
 
 class Pixels:

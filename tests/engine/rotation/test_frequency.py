@@ -97,7 +97,7 @@ def test_a_harmonic_is_the_fit_of_a_multiple_of_the_phase(harmonic, dtype, devic
         ),
         (
             lambda: estimate_frequency(waves(np.zeros(3), np.zeros(3)), TIME),
-            "nothing oscillates beyond the noise",
+            "no oscillation exceeds the noise",
         ),
         (
             lambda: estimate_frequency(np.full((9, 2), np.nan), np.arange(9)),
