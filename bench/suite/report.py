@@ -36,8 +36,8 @@ _METHOD = (
     "triad) on the same number of bytes, and peers, each as an expert of the library would use it. Before "
     "anything is timed, all must return the same maps. A time is the median of up to 15 rounds by the host's "
     "clock, from the call until the device has finished. A limit is the time of the same device in the same "
-    "rounds for reading or copying alone. Compare times of one run; `compare` takes the quartiles into account when "
-    "it compares two runs."
+    "rounds for reading or copying alone. Compare times of one run; `compare` takes the quartiles into "
+    "account when it compares two runs."
 )
 _TARGETS = "Targets, and the measured values."
 _CALLS = (
