@@ -1,4 +1,4 @@
-"""Tables and statements of docs/formats.md, options.md, operations.md and sensor.md are right."""
+"""Tables, statements and examples of docs/formats.md, calibration.md, options.md and sensor.md are right."""
 
 from __future__ import annotations
 
@@ -94,6 +94,15 @@ def test_the_tables_of_operations_and_options_are_those_of_the_declarations(monk
         assert (DOCS / page).read_text(encoding="utf-8") == text, (
             "python docs/site/option_tables.py writes them"
         )
+
+
+def test_references_are_measured_from_arrays(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (code,) = examples("calibration.md")
+    exec(code, {})
+    references = io.open_calibration("cal.h5").references
+    np.testing.assert_allclose(references.dark, 16, atol=4 * 1.5 / np.sqrt(32) + 0.2)
+    np.testing.assert_allclose(references.bright, 210, atol=4 * 1.5 / np.sqrt(32) + 0.2)
 
 
 def test_all_that_is_in_a_recording_is_described(tmp_path):
