@@ -1,4 +1,4 @@
-"""One thread at a time inside an object: the base class of all estimators."""
+"""One thread at a time inside an object: the base class of operations."""
 
 from __future__ import annotations
 

@@ -132,7 +132,7 @@ class Sensor:
 
     @property
     def known(self) -> dict[str, Any]:
-        """The options of the estimator."""
+        """The options of the operation."""
         return {"tilt": TILT, "gain": self.gain, "offset": self.offset, "noise": self.spread}
 
 
