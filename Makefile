@@ -62,7 +62,7 @@ test-cameras: .venv/.genicam
 
 # The site, in site/; warnings are errors.
 docs: .venv/.docs
-	@(cd tests && MYPYPATH=../docs/site ../$(BIN)/mypy --strict --no-error-summary --config-file ../pyproject.toml -m hooks)
+	@(cd tests && MYPYPATH=../docs/site ../$(BIN)/mypy --strict --no-error-summary --config-file ../pyproject.toml -m hooks -m declared_options -m option_tables)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 lint: $(READY)

@@ -1,4 +1,4 @@
-"""Position of the body in each frame: checks shared by readers and estimators."""
+"""Position of the body in each frame: checks shared by readers and operations."""
 
 from __future__ import annotations
 

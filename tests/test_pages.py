@@ -1,4 +1,4 @@
-"""What docs/formats.md and docs/sensor.md say is so."""
+"""Tables, statements and examples of docs/formats.md, calibration.md, options.md and sensor.md are right."""
 
 from __future__ import annotations
 
@@ -85,6 +85,24 @@ def test_the_tables_of_maps_are_those_of_the_declarations():
     page = (DOCS / "formats.md").read_text(encoding="utf-8")
     made = runpy.run_path(str(DOCS / "site/map_tables.py"))
     assert made["with_tables"](page) == page, "python docs/site/map_tables.py writes them"
+
+
+def test_the_tables_of_operations_and_options_are_those_of_the_declarations(monkeypatch):
+    monkeypatch.syspath_prepend(DOCS / "site")
+    made = runpy.run_path(str(DOCS / "site/option_tables.py"))
+    for page, text in made["pages"]().items():
+        assert (DOCS / page).read_text(encoding="utf-8") == text, (
+            "python docs/site/option_tables.py writes them"
+        )
+
+
+def test_references_are_measured_from_arrays(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (code,) = examples("calibration.md")
+    exec(code, {})
+    references = io.open_calibration("cal.h5").references
+    np.testing.assert_allclose(references.dark, 16, atol=4 * 1.5 / np.sqrt(32) + 0.2)
+    np.testing.assert_allclose(references.bright, 210, atol=4 * 1.5 / np.sqrt(32) + 0.2)
 
 
 def test_all_that_is_in_a_recording_is_described(tmp_path):

@@ -138,7 +138,7 @@ class Sensor:
 
     @property
     def known(self) -> dict[str, Any]:
-        """The options of the estimator."""
+        """The options of the operation."""
         return {"tilt": TILT, "zenith_gain": self.gain, "zenith_offset": self.offset, "noise": self.spread}
 
 

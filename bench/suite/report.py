@@ -1,4 +1,4 @@
-"""A run as tables: of each case, and on a page of one or several runs."""
+"""Tables of one run, case by case, and the page of several runs."""
 
 from __future__ import annotations
 
@@ -20,35 +20,37 @@ LEGEND = (
 )
 
 _ABOUT = (
-    "The measurements of `make bench`. `python bench/run.py report` made this page of the runs at its end: "
-    "make it anew rather than change it. `mirrorskin bench` measures the core operations on your device."
+    "The measurements of `make bench`. `python bench/run.py report` generates this page from the runs that "
+    "are listed at its end, so do not edit it. `mirrorskin bench` measures the core operations on your "
+    "device."
 )
 _COMMANDS = """```sh
-pip install '.[bench]'                            # peers: Numba, PyTorch, pyamg, besides NumPy, SciPy, OpenCV
+pip install '.[bench]'                            # peers: Numba, PyTorch, pyamg, NumPy, SciPy, OpenCV
 python bench/run.py run --list                    # the cases
-python bench/run.py run 'call-*' -o mine.json     # some of them; the tables of all works go to mine.md
-python bench/run.py compare before.json mine.json # what is faster or slower by more than its rounds vary
+python bench/run.py run 'call-*' -o mine.json     # some of them; all tables are written to mine.md
+python bench/run.py compare before.json mine.json # differences larger than the variation between rounds
 python bench/run.py report mine.json -o page.md   # a page like this one
 ```"""
 _METHOD = (
-    "The works of a case take turns in one process: the engine, the limits of memory (read, copy, triad) "
-    "on the same number of bytes, and peers, each as an expert of the library would use it. All must return "
-    "the same maps before anything is timed. A time is the median of up to 15 rounds by the host's clock, "
-    "from the call until the device is done. A limit is what the same device did in the same rounds with "
-    "nothing else to do. Compare within a run rather than between runs, or let `compare` judge by "
-    "the quartiles."
+    "The works of a case run alternately in one process: the engine, the limits of memory (read, copy, "
+    "triad) on the same number of bytes, and peers, each as an expert of the library would use it. Before "
+    "anything is timed, all must return the same maps. A time is the median of up to 15 rounds by the host's "
+    "clock, from the call until the device has finished. A limit is the time of the same device in the same "
+    "rounds for reading or copying alone. Compare times of one run; `compare` takes the quartiles into "
+    "account when it compares two runs."
 )
 _TARGETS = "Targets, and the measured values."
 _CALLS = (
-    "Calls as users make them, NumPy arrays in and maps out, and commands from process start to end, in "
-    "milliseconds: reading the same bytes from memory, the kernels, a call after others, one without "
-    "memory kept from earlier calls, and the fastest peer that returns the same maps."
+    "Times in milliseconds of calls as users make them, from NumPy arrays to maps, and of commands, from "
+    "process start to end. limit: reading the same bytes from memory. call: a call after earlier ones. "
+    "first call: a call that cannot reuse memory of earlier calls. fastest peer: the fastest library that "
+    "returns the same maps."
 )
 _PEERS = (
     "Each work of the engine next to the fastest peer with the same result. of limit: bandwidth divided by "
     "that of memory; where this is small, arithmetic or the overhead of calls is the limit."
 )
-_ACCURACY = "Answers of this device compared with known truths, each a number and its bound."
+_ACCURACY = "Results of this device compared with the known truth: the measured value and its bound."
 
 Machine = Mapping[str, Case]  # cases by name
 
@@ -79,7 +81,7 @@ def as_table(head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: boo
 
 
 def as_markdown(run: Run) -> str:
-    """Return a run with all its tables and notes as a page, and at its end what it was made with."""
+    """Return a run with all its tables and notes as a page, and the versions and machine at its end."""
     parts = [f"# Benchmarks, run of {run.date[:10]}", LEGEND]
     for case in run.cases:
         parts.append(f"## {case.name}: {case.title}")
@@ -114,13 +116,13 @@ def _gather(runs: Iterable[Run]) -> dict[str, Machine]:
 
 
 def _runs(runs: Mapping[Path, Run]) -> str:
-    """List the machines, and what each run was made with."""
+    """List the machines, the runs and the versions."""
     lines = []
     for machine in dict.fromkeys(run.machine for run in runs.values()):
         lines.append(f"- {machine}:")
         for path, run in runs.items():
             if run.machine == machine:
-                quick = "; made with `--quick`: the times mean nothing" if run.quick else ""
+                quick = "; made with `--quick`: its times are not representative" if run.quick else ""
                 code = (run.commit or str(run.versions.get("mirrorskin")))[:12]
                 lines.append(f"    - {path.name}: {run.date[:10]}, mirrorskin {code}{quick}")
     versions: dict[str, dict[str, None]] = {}

@@ -17,7 +17,7 @@ import griffe
 
 from mirrorskin.engine.options import Configured
 
-_KINDS = {
+_KINDS: dict[Any, griffe.ParameterKind] = {
     inspect.Parameter.POSITIONAL_OR_KEYWORD: griffe.ParameterKind.positional_or_keyword,
     inspect.Parameter.KEYWORD_ONLY: griffe.ParameterKind.keyword_only,
 }
@@ -40,7 +40,7 @@ class _Docstring(griffe.Docstring):
 
     @cached_property
     def parsed(self) -> list[griffe.DocstringSection]:
-        sections = self.parse()
+        sections: list[griffe.DocstringSection] = self.parse()
         for section in sections:
             for one in section.value if isinstance(section.value, list) else ():
                 if isinstance(getattr(one, "annotation", None), griffe.ExprTuple):
@@ -58,9 +58,8 @@ def _modules_of(module: griffe.Module) -> Iterator[griffe.Module]:
 def _add_options(module: griffe.Module, loader: griffe.GriffeLoader) -> None:
     """Replace generated docstrings and signatures in a module."""
     for name, member in list(module.members.items()):
-        if member.is_alias or name.startswith("_") or not (member.is_class or member.is_attribute):
-            continue
-        if member.is_class and not member.bases:
+        is_class = isinstance(member, griffe.Class) and member.bases
+        if name.startswith("_") or not (is_class or isinstance(member, griffe.Attribute)):
             continue
         value = getattr(importlib.import_module(module.path), name, None)
         if isinstance(value, type) and issubclass(value, Configured):
@@ -68,9 +67,8 @@ def _add_options(module: griffe.Module, loader: griffe.GriffeLoader) -> None:
             if value.options:
                 member.set_member("__init__", griffe.Function("__init__", parameters=_parameters(value)))
         elif inspect.isfunction(value) and "__signature__" in vars(value):
-            lines = {"lineno": member.lineno, "endlineno": member.endlineno}
-            returns = griffe.ExprName("Result")
-            function = griffe.Function(name, parameters=_parameters(value), returns=returns, **lines)
+            function = griffe.Function(name, parameters=_parameters(value), lineno=member.lineno)
+            function.returns = griffe.ExprName("Result")
             function.docstring = _docstring(value, function, loader)
             module.set_member(name, function)
 

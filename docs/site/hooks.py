@@ -105,7 +105,7 @@ def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
 def _api_pages() -> dict[str, str]:
     """Return the pages from which mkdocstrings makes the Python reference."""
     index = "# Python\n\nMost programs need `engine` and `io` only.\n"
-    pages = {}
+    pages: dict[str, str] = {}
     for task, packages in _PACKAGES.items():
         rows = "".join(f"| [`mirrorskin.{name}`]({name}.md) | {what} |\n" for name, what in packages.items())
         index += f"\n## {task}\n\n| package | contents |\n|---|---|\n{rows}"

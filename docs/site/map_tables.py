@@ -39,14 +39,14 @@ _STATUS: dict[str, type[IntEnum]] = {
 
 
 def tables() -> dict[str, str]:
-    """Return the tables by the first cell of their head."""
+    """Return the tables by their first cell."""
     rows = [_row(name, one) for name, one in TABLE.items()]
     legends = [status_of(codes).codes for codes in _STATUS.values()]
     codes = sorted({code for legend in legends for code in legend})
     meanings = ([str(code), *(legend.get(code, "") for legend in legends)] for code in codes)
     return {
-        "map": _table(["map", "shape, type", "unit", "undefined", "content"], rows),
-        "code": _table(["code", *_STATUS], meanings),
+        "map": as_table(["map", "shape, type", "unit", "undefined", "content"], rows),
+        "code": as_table(["code", *_STATUS], meanings),
     }
 
 
@@ -63,16 +63,17 @@ def _row(name: str, one: Map) -> list[str]:
     return [f"`{name}`", f"{' or '.join(shapes)} {dtype.str[1:]}".strip(), unit, undefined, content]
 
 
-def _table(head: list[str], rows: Iterable[list[str]]) -> str:
+def as_table(head: list[str], rows: Iterable[list[str]]) -> str:
+    """Return a table of Markdown."""
     lines = [head, ["---"] * len(head), *rows]
     return "".join(f"| {' | '.join(cells)} |\n".replace("  ", " ").replace("  ", " ") for cells in lines)
 
 
 def with_tables(page: str) -> str:
-    """Return the page with the tables of today."""
+    """Return the page with its current tables."""
     for first, table in tables().items():
         found = re.findall(rf"^\| {first} \|.*\n(?:\|.*\n)+", page, flags=re.MULTILINE)
-        assert len(found) == 1, f"{PAGE} has {len(found)} tables that begin with {first}"
+        assert len(found) == 1, f"{PAGE} has {len(found)} tables whose first cell is {first}"
         page = page.replace(found[0], table)
     return page
 

@@ -70,9 +70,8 @@ def test_a_page_has_runs_targets_calls_and_the_fastest_peer():
         ),
         run(case("turn", LIMIT, *works), case("accuracy-all", targets=aims), quick=True),
     )
-    assert (
-        "run1.json: 2026-11-21, mirrorskin 0123456789ab; made with `--quick`: the times mean nothing" in found
-    )
+    quick_run = "made with `--quick`: its times are not representative"
+    assert f"run1.json: 2026-11-21, mirrorskin 0123456789ab; {quick_run}" in found
     assert "| press | whole path | at most 1.25 times | 1.3 times | yes |" in found
     assert r"| press | memory \| peak | at most 1.25 times | 12 MB | no |" in found
     assert "| all about call-edges | 100.0 | 200.0 | 200.0 | 250.0 | Numba 300.0 |" in found
