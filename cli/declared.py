@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 _CLASS = re.compile(r".+:[A-Za-z_]\w*")
 _LOADED = "mirrorskin.cli.declared"  # key of a context's class and its options
+_SHARED = ("tilt",)  # options of a stage that classes have, too, with the same meaning
 _COPY = Path(__file__).with_suffix(".json")
 _UNITS = {  # placeholder in help, function of `mirrorskin.cli.quantity`, example
     "mm": ("LENGTH", "length", "0.1mm"),
@@ -86,7 +87,10 @@ class Term:
         try:
             value = getattr(quantity, _UNITS.get(self.unit, ("", plain))[1])(text, where)
         except InputError as error:
-            raise InputError(", or ".join([str(error), *self.words])) from error
+            told = str(error)
+            if self.unit and self.unit not in _UNITS and re.fullmatch(r"[-+.\de]+\s*[A-Za-zµ/]+", text):
+                told = f"{where} {text}: a number of {self.unit} is needed, without a unit"
+            raise InputError(", or ".join([told, *self.words])) from error
         if self.least is not None and value < self.least:
             raise InputError(f"{where} {text}: a number of at least {self.least} is needed")
         if self.most is not None and value > self.most:
@@ -195,8 +199,7 @@ def term(
 class ClassCommand(Command):
     """A command one of whose words may be MODULE:CLASS: then it has the options of that class.
 
-    They replace other options of the engine. An option that the command has, too, with the same unit, such as
-    the tilt of a live rotation, is for both.
+    They replace other options of the engine. The tilt of a live rotation is for the stage and the class.
     """
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -218,13 +221,18 @@ class ClassCommand(Command):
         from mirrorskin.io import InputError
 
         kind = load_operation(name)
-        own = {one.name: one for one in self.params if not getattr(one, "of_engine", False)}
+        own = {
+            flag: one
+            for one in self.params
+            if not getattr(one, "of_engine", False)
+            for flag in (*one.opts, *one.secondary_opts)
+        }
         terms = []
         for one in terms_of({"": kind}):
-            same = own.get(one.name)
-            if same is None:
+            same = own.get(one.flag)
+            if same is None and one.flag not in self.get_help_option_names(click.Context(self)):
                 terms.append(one)
-            elif not isinstance(same, DeclaredOption) or same.unit != one.unit:
+            elif one.name not in _SHARED or getattr(same, "unit", None) != one.unit:
                 raise InputError(
                     f"{name} has an option {one.name}, and so has 'mirrorskin {self.name}' for something"
                     " else. Rename that of the class"

@@ -6,19 +6,19 @@ import inspect
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cached_property, wraps
-from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, Protocol, Self, cast, overload
+from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, Protocol, Self, cast, get_args, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.options import Configured, Option, documented, option, signature_of
+from mirrorskin.engine.options import RESERVED, Configured, Option, documented, option, signature_of
 from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Map, Result
 from mirrorskin.io.arguments import as_array
 from mirrorskin.io.maps import declaration_of
 from mirrorskin.io.result import result_of
-from mirrorskin.io.types import ProcessValue
+from mirrorskin.io.types import Motion, ProcessValue
 from mirrorskin.kernels.device import Device, open_device
 
 if TYPE_CHECKING:
@@ -53,9 +53,6 @@ class _DeviceOption(Option):
         if "_opened_device" not in vars(holder):
             vars(holder)["_opened_device"] = open_device(vars(holder)["_device"])
         return vars(holder)["_opened_device"]
-
-    def __set__(self, holder: object, value: str | Device | None) -> None:
-        raise AttributeError("options are read-only: use with_options(device=...)")
 
 
 _device: Option = option(
@@ -132,6 +129,8 @@ class Operation(ThreadSafe, OnDevice):
     updates_per_second: ClassVar[float] = 15.0
     """Live, as many updates are of use."""
     _takes_lent: ClassVar[bool] = False
+    on_objects: ClassVar[tuple[str, ...]] = ("shape", "dtype", "count")
+    """Attributes of objects: rows and columns of a frame, type of a sample, number of frames so far."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         if "maps" in vars(cls):
@@ -143,6 +142,7 @@ class Operation(ThreadSafe, OnDevice):
         for base in reversed(cls.__mro__):
             found |= {name: one for name, one in vars(base).items() if isinstance(one, Map)}
         cls.maps = found
+        _check_class(cls)
         if "push" in vars(cls):
             parameters = [*inspect.signature(cls.push).parameters.values()][2:]
             cls.positions = {
@@ -338,6 +338,10 @@ def _checked_result(method: Callable[..., Any]) -> Callable[..., Result]:
         if not isinstance(found, Mapping):
             raise InputError(f"{name}.result() returns a {type(found).__name__}. Return maps by name")
         declared = self.declarations
+        for one, value in found.items():
+            option_value = self.options[one].stored(self) if one in self.options else None
+            if one in RESERVED or (option_value is not None and np.any(value != option_value)):
+                raise InputError(f"{name}.result() returns {one}, which has a meaning already. Rename it")
         scalars = {
             one: value
             for one, value in found.items()
@@ -345,6 +349,8 @@ def _checked_result(method: Callable[..., Any]) -> Callable[..., Result]:
             and declaration_of(one, declared).axes != "none"
         }
         maps = {one: value for one, value in found.items() if one not in scalars}
+        if not maps:
+            raise InputError(f"{name}.result() returns no map: return at least one, (H, W)")
         process: dict[str, ProcessValue] = {
             one: value.item() if isinstance(value, np.generic) else value for one, value in scalars.items()
         }
@@ -354,6 +360,24 @@ def _checked_result(method: Callable[..., Any]) -> Callable[..., Result]:
             raise InputError(f"{name}.result(): {error}") from error
 
     return result
+
+
+def _check_class(cls: type[Operation]) -> None:
+    """Raise InputError if the attributes of a class cannot be those of an operation."""
+    own, name = vars(cls), cls.__name__
+    if isinstance(own.get("passes"), int) and own["passes"] not in (1, 2):
+        raise InputError(f"{name}: passes is {own['passes']}. Frames are pushed once or twice: use 1 or 2")
+    if isinstance(cls.motions, str) or not set(cls.motions) <= {*get_args(Motion)}:
+        motions = ", ".join(get_args(Motion))
+        raise InputError(f'{name}: motions is {cls.motions!r}. Use a tuple of {motions}, such as ("axial",)')
+    for one, kind in inspect.get_annotations(cls).items():
+        if isinstance(own.get(one), Map) and getattr(kind, "__name__", kind) in (
+            "bool",
+            "float",
+            "int",
+            "str",
+        ):
+            raise InputError(f"{name}: {one} is an option and a map. Rename one of them")
 
 
 def _check_started(operation: Operation) -> None:

@@ -9,8 +9,8 @@ from __future__ import annotations
 import inspect
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any, ClassVar, Literal, dataclass_transform
 
@@ -26,6 +26,13 @@ _ANY = 2**31 - 1  # an upper limit that messages do not mention
 _COLUMNS = 100  # of the lines of a docstring
 _INTEGERS = ("frames", "pixels", "turns")  # units of counts
 _EXAMPLES = {"share": "0.5", "mm": "0.1", "rad": "0.05", "counts": "1.5", "frames": "2", "pixels": "8"}
+_UNITS = (
+    *("", "share", "counts", *_INTEGERS, "mm", "rad", "s", "MPa", "N"),
+    *("counts/rad", "mm/N", "Hz", "frames/s"),
+)
+RESERVED = ("operation", "program", "version", "date", "source", "driver", "calibration", "live")
+"""Names of the process that mirrorskin writes: no option has one of them."""
+
 _NOUNS = {"share": "a share", "frames": "a number of frames", "pixels": "a number of pixels"}
 
 
@@ -33,7 +40,7 @@ _NOUNS = {"share": "a share", "frames": "a number of frames", "pixels": "a numbe
 class Option:
     """The declaration of an option; see `option`.
 
-    As a class attribute it is the declaration; on an object, the attribute is the value.
+    As a class attribute it is the declaration; on an object, the attribute is the value, which is read-only.
     """
 
     default: Any
@@ -52,6 +59,15 @@ class Option:
     def __set_name__(self, owner: type, name: str) -> None:
         object.__setattr__(self, "name", name)
 
+    def __get__(self, holder: object | None, owner: type) -> Any:
+        return self if holder is None else self.stored(holder)
+
+    def __set__(self, holder: object, value: Any) -> None:
+        raise AttributeError(
+            f"{self.name} is an option of {type(holder).__name__}, which is read-only: construct another"
+            " object, or choose another name for what you keep"
+        )
+
     def store(self, holder: object, value: Any) -> None:
         """Keep a checked value in an object."""
         vars(holder)[self.name] = value
@@ -59,6 +75,32 @@ class Option:
     def stored(self, holder: object) -> Any:
         """Return the value in an object."""
         return vars(holder)[self.name]
+
+    def settled(self, annotation: Any) -> Option:
+        """Return the declaration as it is in its class; an annotation ``float`` makes a number of an integer.
+
+        Raises
+        ------
+        InputError
+            The declaration contradicts itself.
+        """
+        made = self
+        if self.kind == "integer" and self.unit not in _INTEGERS and annotation in (float, "float"):
+            made = replace(self, kind="number")
+        if made.kind == "number" and isinstance(made.default, int):
+            made = replace(made, default=float(made.default))
+        low, high = self.within
+        if not self.help.strip():
+            raise InputError(f"option {self.name} has no help: say in a sentence what it means")
+        if self.unit not in _UNITS:
+            raise InputError(
+                f"option {self.name} has the unit {self.unit!r}. Use one of {', '.join(_UNITS[1:])}"
+            )
+        if low is not None and high is not None and low > high:
+            raise InputError(f"option {self.name}: no value is within {low:g} and {high:g}")
+        if self.default is not None:
+            made.check(self.default)
+        return made
 
     @property
     def flag_name(self) -> str:
@@ -210,7 +252,7 @@ def option(
         kind = "numbers"
     elif map:
         kind = "map"
-    elif unit in _INTEGERS or isinstance(default, int):
+    elif unit in _INTEGERS or (isinstance(default, int) and not unit):
         kind = "integer"
     elif python_only and not unit and not isinstance(default, float):
         kind = "object"
@@ -247,7 +289,9 @@ class Configured:
 
     def __init_subclass__(cls, options_of: Sequence[type[Configured]] = (), **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        found = {name: one for name, one in vars(cls).items() if isinstance(one, Option)}
+        found = {name: one.settled(annotation) for name, one, annotation in _declared(cls)}
+        for name, one in found.items():
+            setattr(cls, name, one)
         for base in (*options_of, *cls.__mro__[1:]):
             if issubclass(base, Configured):
                 found |= {name: one for name, one in base.options.items() if name not in found}
@@ -264,8 +308,18 @@ class Configured:
                 f"{type(self).__name__} has no option {names}. It has {', '.join(self.options) or 'none'}"
             )
         for name, one in self.options.items():
-            one.store(self, one.check(options[name]) if name in options else one.default)
+            value = options.get(name, one.default)
+            one.store(self, one.check(list(value) if isinstance(value, list) else value))
         self.check_options()
+
+    def __repr__(self) -> str:
+        chosen = {name: value for name, value in self.chosen().items() if name not in _LAST}
+        given = (f"{name}={value!r}" for name, value in chosen.items() if not self._is_default(name, value))
+        return f"{type(self).__name__}({', '.join(given)})"
+
+    def _is_default(self, name: str, value: Any) -> bool:
+        default = self.options[name].default
+        return value is default or (not isinstance(value, np.ndarray) and bool(value == default))
 
     def check_options(self) -> None:
         """Raise InputError if the options do not fit together; called at the end of construction.
@@ -280,6 +334,21 @@ class Configured:
     def part(self, kind: type[Configured]) -> dict[str, Any]:
         """Return the values of the options that another class has as well."""
         return {name: one.stored(self) for name, one in self.options.items() if name in kind.options}
+
+
+def _declared(cls: type) -> Iterator[tuple[str, Option, Any]]:
+    """Yield the options in the body of a class with their annotations, if their names can be used."""
+    annotations = inspect.get_annotations(cls)
+    taken = {name for base in cls.__mro__[1:] for name in (*vars(base), *getattr(base, "on_objects", ()))}
+    for name, one in list(vars(cls).items()):
+        if not isinstance(one, Option):
+            continue
+        inherited = next((vars(base)[name] for base in cls.__mro__[1:] if name in vars(base)), None)
+        if name in RESERVED or (name in taken and not isinstance(inherited, Option)):
+            raise InputError(
+                f"{cls.__name__}: an option cannot have the name {name}, which has a meaning already"
+            )
+        yield name, one, annotations.get(name)
 
 
 def signature_of(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.inputs import as_result
 from mirrorskin.engine.method import Method
 from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.provenance import attach_provenance, describe, naming, signature
@@ -25,6 +26,7 @@ def run(
     source: Source | Iterable[ArrayLike],
     operation: Operation | type[Operation],
     *,
+    pixel_size: ArrayLike | None = None,
     progress: Progress | None = None,
     **positions: ArrayLike,
 ) -> Result:
@@ -37,6 +39,8 @@ def run(
         the frames themselves: an array is pushed as a whole, frames of an iterable one by one.
     operation : Operation, or a class of operations
         It forgets all earlier frames. Options that are not given are taken from a source, where it has them.
+    pixel_size : float or (float, float), optional
+        Millimetres along x and y, for an array or an iterable; a recording has its own.
     progress : callable, optional
         Called with the number of frames so far.
     **positions : array_like, (T, ...)
@@ -70,12 +74,20 @@ def run(
         operation = operation()
     if not isinstance(operation, Operation):
         raise _no_operation(operation)
+    if wrong := [one for one in positions if one in operation.options]:
+        kind = type(operation).__name__
+        raise InputError(f"{wrong[0]} is an option: give it to the class, {kind}({wrong[0]}=...)")
     if hasattr(source, "read") and hasattr(source, "header"):
+        if pixel_size is not None:
+            raise InputError(
+                f"{cast('Source', source).name} is a recording: give pixel_size to io.open_recording"
+            )
         return _run_source(cast("Source", source), operation, positions, progress)
     if isinstance(source, str | os.PathLike) or not isinstance(source, Iterable):
         remedy = "open a path with io.open_recording, or give an array"
         raise InputError(f"frames are a {type(source).__name__}: {remedy}")
     result = _run_frames(source, operation, positions, progress)
+    result = as_result(result, pixel_size=pixel_size)
     return result.assign(process={**signature(), **describe(operation), **result.process})
 
 
@@ -99,7 +111,7 @@ def load_operation(name: str) -> type[Operation | Method]:
 
 
 def run_class(
-    kind: type[Operation | Method], source: Source, progress: Progress | None = None, **options: Any
+    kind: type[Operation | Method], source: Source, progress: Progress | None = None, /, **options: Any
 ) -> Result:
     """Run an operation or a method with these options over a source; see `run`."""
     configured = kind(**options)
@@ -171,8 +183,8 @@ def _cut(
     for piece in [frames] if whole else (np.asarray(frame)[np.newaxis] for frame in frames):
         array = np.asarray(piece)
         if array.ndim != 3 or 0 in array.shape or array.dtype.kind not in "uif":
-            shape = array.shape[not whole :]
-            raise InputError(f"frames are {array.dtype} {shape}: numbers (H, W) of one size are needed")
+            shape, needed = (array.shape, "(T, H, W)") if whole else (array.shape[1:], "(H, W) of one size")
+            raise InputError(f"frames are {array.dtype} {shape}: numbers {needed} are needed")
         stop = done + len(array)
         for name, values in given.items():
             if values.ndim == 0 or len(values) < stop or (whole and len(values) != stop):

@@ -40,9 +40,9 @@ def load_class(name: str) -> Callable[..., Any]:
         raise InputError(f"{name}: there is no {place} in {folder.resolve()}, nor installed") from error
     made = getattr(found, kind, None)
     if not callable(made):
-        own = [
-            one for one, it in vars(found).items() if isinstance(it, type) and it.__module__ == found.__name__
-        ]
+        exported = getattr(found, "__all__", ())
+        classes = {one: it for one in exported or vars(found) if isinstance(it := getattr(found, one), type)}
+        own = [one for one, it in classes.items() if exported or it.__module__ == found.__name__]
         raise InputError(f"{name}: there is no class {kind} in {place}; it has {', '.join(own) or 'none'}")
     return made  # type: ignore[no-any-return]
 

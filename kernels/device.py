@@ -32,7 +32,7 @@ from mirrorskin.kernels.waiting import close_at_exit, waiting
 
 DeviceKind = Literal["gpu", "cpu", "other"]
 C_TYPES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
-"""OpenCL's names of the types that a frame's sample can have."""
+"""OpenCL's names of the types that a recording's samples have; set ``dtypes`` of an operation to these."""
 
 _FOLDER = Path(__file__).parent
 _log = logging.getLogger("mirrorskin.kernels")

@@ -48,6 +48,12 @@ class Deep(Light):
 class Frames(Light):
     frames: int = engine.option(default=1, help="frames")
 
+class Own(Light):
+    json: float = engine.option(default=1.0, unit="mm", help="a length")
+
+class Step(Light):
+    travel_step: float = engine.option(default=0.0, unit="mm", help="a length")
+
 class Broken:
     pass
 
@@ -83,6 +89,13 @@ def test_files_of_one_name_are_two_modules():
         assert run("run", f"{folder}/mine.py:{kind}", "press.h5", "--level", "50").code == 0
 
 
+@pytest.mark.parametrize("text", ["5mm", "5counts", "1e1 µm"])
+def test_counts_are_written_without_a_unit(text):
+    ended = run("run", "mine_of_a_test:Light", "press.h5", "--level", text)
+    assert ended.code == 2
+    assert f"--level {text}: a number of counts is needed, without a unit" in ended.said
+
+
 def test_region_frames_and_travel_are_those_of_reconstruct():
     example = ROOT / "examples" / "steepest_rise.py"
     chosen = ("--region", "1,1,4x3", "--frames", "1:7", "--travel-step", "0.2mm")
@@ -105,12 +118,18 @@ def test_region_frames_and_travel_are_those_of_reconstruct():
         ("none_of_a_test.py:Light", "there is no none_of_a_test.py in "),
         (
             "mine_of_a_test:Dark",
-            "there is no class Dark in mine_of_a_test; it has Light, Deep, Frames, Broken",
+            "there is no class Dark in mine_of_a_test; it has Light, Deep, Frames, Own, Step, Broken",
         ),
         ("mine_of_a_test:some", "there is no class some in mine_of_a_test"),
         (
             "mine_of_a_test:Broken",
             "Broken is not an operation: derive the class from mirrorskin.engine.Operation",
+        ),
+        ("mine_of_a_test:Own", "has an option json, and so has 'mirrorskin run' for something else"),
+        ("mine_of_a_test:Step", "has an option travel_step, and so has 'mirrorskin run' for something else"),
+        (
+            "mirrorskin.engine:Onst",
+            "there is no class Onst in mirrorskin.engine; it has ChangePoint, Correlate",
         ),
         (
             "mine_of_a_test:Frames",

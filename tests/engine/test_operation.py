@@ -325,3 +325,109 @@ def test_what_result_returns_does_not_change_afterwards():
     kept = {name: values.copy() for name, values in first.items()}
     moments.push(FRAMES[3:], travel=TRAVEL[3:])
     same(first, kept)
+
+
+def declared(**attributes):
+    """Return a class of operations with some attributes; annotations are those of numbers."""
+    body = {"push": lambda self, frames: None, "result": lambda self: {}, "__module__": __name__}
+    return type("Own", (engine.Operation,), body | attributes)
+
+
+def number(default=1.0, **settings):
+    return engine.option(default=default, **{"help": "a number"} | settings)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "line"),
+    [
+        (lambda: {"count": number(unit="mm")}, "an option cannot have the name count"),
+        (lambda: {"shape": number()}, "an option cannot have the name shape"),
+        (lambda: {"passes": number()}, "an option cannot have the name passes"),
+        (lambda: {"chosen": number()}, "an option cannot have the name chosen"),
+        (lambda: {"version": number()}, "an option cannot have the name version"),
+        (lambda: {"least": number(5.0, within=(0, 1))}, "least 5.0: a number from 0 to 1 is needed"),
+        (lambda: {"least": number(within=(5, 1))}, "least: no value is within 5 and 1"),
+        (lambda: {"least": number(help=" ")}, "least has no help"),
+        (lambda: {"least": number(unit="furlong")}, "least has the unit 'furlong'. Use one of share"),
+        (lambda: {"kind": number("c", choices=("a", "b"))}, "unknown kind 'c'. Use a or b"),
+        (lambda: {"passes": 3}, "passes is 3"),
+        (lambda: {"motions": ("up",)}, r"motions is \('up',\). Use a tuple of vertical"),
+        (lambda: {"motions": "vertical"}, "motions is 'vertical'. Use a tuple"),
+        (
+            lambda: {"rise": io.Map("rise", "mm"), "__annotations__": {"rise": float}},
+            "rise is an option and a map",
+        ),
+    ],
+)
+def test_a_class_that_cannot_be_is_refused_where_it_is_defined(attributes, line):
+    with pytest.raises(io.InputError, match=line) as caught:
+        declared(**attributes())
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("annotation", [float, "float"])
+def test_a_whole_number_as_the_default_of_a_float_is_a_number(annotation):
+    own = declared(level=number(5), __annotations__={"level": annotation})
+    assert own(level=2.5).level == 2.5
+
+
+def test_a_length_is_a_number_whatever_its_default():
+    assert declared(zero=number(0, unit="mm"))(zero=0.02).zero == 0.02
+
+
+def test_options_are_read_only():
+    moments = Moments(factor=2)
+    with pytest.raises(AttributeError, match="factor is an option of Moments, which is read-only"):
+        moments.factor = 3
+    assert moments.factor == 2
+
+
+def test_a_list_as_default_is_of_one_object_alone():
+    own = declared(shares=number([0.5], several=True))
+    own().shares.append(1.0)
+    assert own().shares == [0.5]
+
+
+def test_it_is_shown_with_the_options_that_are_given():
+    assert repr(Moments(factor=2)) == "Moments(factor=2.0)"
+    assert repr(Moments()) == "Moments()"
+
+
+@pytest.mark.parametrize(
+    ("returned", "line"),
+    [
+        ({}, "returns no map"),
+        ({"note": "none"}, "returns no map"),
+        ({"light": np.zeros((5, 7)), "level": 99.0}, "returns level, which has a meaning already"),
+        ({"light": np.zeros((5, 7)), "program": "mine"}, "returns program, which has a meaning already"),
+    ],
+)
+def test_results_that_cannot_be_are_refused_in_a_line(returned, line):
+    own = declared(result=lambda self: returned, level=number())
+    with pytest.raises(io.InputError, match=line) as caught:
+        engine.run(FRAMES, own)
+    assert "\n" not in str(caught.value)
+
+
+def test_arrays_have_the_pixel_size_that_is_given():
+    found = engine.run(FRAMES, Moments, travel=TRAVEL, pixel_size=(0.5, 0.6))
+    x, y = io.pixel_axes((5, 7), (0.5, 0.6))
+    np.testing.assert_array_equal(found.x, x)
+    np.testing.assert_array_equal(found.y, y)
+
+
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        (
+            {"travel": TRAVEL, "factor": 2.0},
+            r"factor is an option: give it to the class, Moments\(factor=...\)",
+        ),
+        ({"pixel_size": 0.5}, "is a recording: give pixel_size to io.open_recording"),
+    ],
+)
+def test_what_is_not_of_each_frame_is_refused_with_its_place(tmp_path, given, line):
+    with io.open_recording(record(stack(), tmp_path / "own.h5")) as recording:
+        frames = recording if "pixel_size" in given else FRAMES
+        with pytest.raises(io.InputError, match=line):
+            engine.run(frames, Moments, **given)
