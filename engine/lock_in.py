@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from mirrorskin.io.types import ProcessValue
 
 
-class Correlation(Method, options_of=(Correlate,)):
+class Correlation(Method):
     """Mean, cosine and sine of the phase in each pixel's brightness, over all frames of a recording."""
 
     frequency: float | Literal["estimate"] | None = option(
@@ -47,6 +47,8 @@ class Correlation(Method, options_of=(Correlate,)):
         help="the phase is that of the travel of a press that dithers, and the growth of the contact is"
         " added; see `mirrorskin.engine.press.Growth`",
     )
+    harmonic: int = Correlate.harmonic
+    window_frames: int | None = Correlate.window_frames
 
     def check_options(self) -> None:
         """Raise InputError if the phase of a dither is given in another way, too."""

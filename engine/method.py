@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -16,10 +16,8 @@ from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.io import Calibrated, InputError, Result
 
 if TYPE_CHECKING:
-    from mirrorskin.engine.options import Option
     from mirrorskin.io import Source
     from mirrorskin.io.types import ProcessValue
-    from mirrorskin.kernels.device import Device
 
 
 @dataclass(frozen=True)
@@ -97,23 +95,13 @@ class Plan:
         return attach_provenance(result, source, device, dict(result.process))
 
 
-if TYPE_CHECKING:  # type checkers do not know the options of `options_of`
+class Method(OnDevice):
+    """Base of methods. Their options are those of their operations and steps, listed by name.
 
-    class _Options:
-        options: ClassVar[Mapping[str, Option]]
-        device: Device
+    ``threshold: float = Onset.threshold`` gives a method the option of an operation.
+    """
 
-        def __init_subclass__(cls, options_of: Sequence[type[Configured]] = ()) -> None: ...
-
-        def __init__(self, **options: Any) -> None: ...
-
-        def __getattr__(self, name: str) -> Any: ...
-else:
-    _Options = OnDevice
-
-
-class Method(_Options):
-    """Base of methods. Their options are those of their operations and steps."""
+    memory_limit: int = Operation.memory_limit
 
     motions: ClassVar[tuple[str, ...]] = ()
     """Motions of recordings that the method applies to; none for all."""
@@ -162,7 +150,7 @@ class Method(_Options):
         """Return a method of the same class in which some options differ."""
         return type(self)(**{**self.chosen(), **options})
 
-    def make(self, kind: Callable[..., Any], **changes: Any) -> Any:
+    def make(self, kind: type[Configured], **changes: Any) -> Any:
         """Return an operation or step with this method's values of its options."""
         return kind(**{**self.part(kind), **changes})
 

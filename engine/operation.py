@@ -54,6 +54,9 @@ class _DeviceOption(Option):
             vars(holder)["_opened_device"] = open_device(vars(holder)["_device"])
         return vars(holder)["_opened_device"]
 
+    def __set__(self, holder: object, value: str | Device | None) -> None:
+        super().__set__(holder, value)
+
 
 _device: Option = option(
     default=None, help="device to compute on; see `mirrorskin.kernels.device.open_device`", python_only=True

@@ -275,8 +275,8 @@ def option(
 class Configured:
     """Base of classes whose keyword arguments are declared options.
 
-    A class has the options that it declares, those of its bases, and those of the classes that are listed in
-    ``options_of=`` when it is defined.
+    A class has the options that it declares, and those of its bases. ``threshold: float = Onset.threshold``
+    declares the option of another class once more.
 
     Raises
     ------
@@ -287,12 +287,12 @@ class Configured:
     options: ClassVar[Mapping[str, Option]] = {}
     """All options by name."""
 
-    def __init_subclass__(cls, options_of: Sequence[type[Configured]] = (), **kwargs: Any) -> None:
+    def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         found = {name: one.settled(annotation) for name, one, annotation in _declared(cls)}
         for name, one in found.items():
             setattr(cls, name, one)
-        for base in (*options_of, *cls.__mro__[1:]):
+        for base in cls.__mro__[1:]:
             if issubclass(base, Configured):
                 found |= {name: one for name, one in base.options.items() if name not in found}
         common = {name: found.pop(name) for name in _LAST if name in found}

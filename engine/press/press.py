@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.method import Context, Method, Plan, Step
@@ -120,7 +121,7 @@ class HoleFilling(Step):
         return result.assign(height=height, filled=filled, process={**result.process, "fill": "holes"})
 
 
-class Press(Method, options_of=(Onset, Levels, Elastomer, HoleFilling)):
+class Press(Method):
     """Heights of a press or a release; of a press that oscillates also the hysteresis.
 
     If travel turns more than once, from a press to its release, all strokes are used; see
@@ -136,6 +137,19 @@ class Press(Method, options_of=(Onset, Levels, Elastomer, HoleFilling)):
         choices=("threshold", "change-point"),
         help="first crossing of the threshold, or most likely change",
     )
+    threshold: float = Onset.threshold
+    dark_sigma: float = Onset.dark_sigma
+    bright_sigma: float = Onset.bright_sigma
+    event: Event = Onset.event
+    subframe: bool = Onset.subframe
+    hold: int = Onset.hold
+    dark: ArrayLike | None = Onset.dark
+    bright: ArrayLike | None = Onset.bright
+    noise: float | None = Onset.noise
+    thresholds: Sequence[float] | None = Levels.thresholds
+    inclinations: Sequence[float] | None = Levels.inclinations
+    modulus: float | None = Elastomer.modulus
+    fill: bool = HoleFilling.fill
 
     @property
     def _has_levels(self) -> bool:
@@ -221,7 +235,7 @@ class Press(Method, options_of=(Onset, Levels, Elastomer, HoleFilling)):
 
     def _lowest(self, operation: PressOperation) -> float:
         """Return the threshold of the heights."""
-        return float(self.thresholds[0] if isinstance(operation, Levels) else self.threshold)
+        return operation.thresholds[0] if isinstance(operation, Levels) else self.threshold
 
 
 def _with_estimated_levels(

@@ -26,7 +26,7 @@ from mirrorskin.engine.rotation.design_matrix import LONGEST, Doubles, cut_into_
 from mirrorskin.engine.rotation.edited import EditedSource
 from mirrorskin.engine.rotation.last_turn import LastTurn
 from mirrorskin.engine.rotation.moving_normals import MovingNormals
-from mirrorskin.engine.rotation.normals import Normals, NormalsOperation
+from mirrorskin.engine.rotation.normals import Normals
 from mirrorskin.engine.rotation.normals_kernel import NormalMethod
 from mirrorskin.engine.rotation.poses import even_windows, rocks
 from mirrorskin.engine.rotation.registration import Registered, check_heights
@@ -46,7 +46,7 @@ _ROUNDS = 2  # iterations of the height of the object
 _OMIT = ("cosine", "sine")  # redundant: they follow from azimuth and modulation
 
 
-class Rotation(Method, options_of=(NormalsOperation, Integration)):
+class Rotation(Method):
     """Normals of an axial rotation of one turn or more, and the heights that fit them.
 
     Brightness follows the zenith response of the source's calibration (see `mirrorskin.io.Calibrated`).
@@ -69,6 +69,14 @@ class Rotation(Method, options_of=(NormalsOperation, Integration)):
         " response, the default is to estimate them in a first pass over the source",
     )
     window_frames: int | None = Normals.window_frames
+    longest: int | None = Normals.longest
+    per_turn: bool = Normals.per_turn
+    zenith_gain: ArrayLike | None = Normals.zenith_gain
+    zenith_offset: ArrayLike | None = Normals.zenith_offset
+    dark: ArrayLike | None = Normals.dark
+    bright: ArrayLike | None = Normals.bright
+    noise: float | None = Normals.noise
+    robust: bool = Integration.robust
 
     def check_options(self) -> None:
         """Raise InputError if options do not fit together or cannot be those of a rotation."""

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
+
+from numpy.typing import ArrayLike
 
 from mirrorskin.engine.errors import NotConverged
+from mirrorskin.engine.inputs import Maps
 from mirrorskin.engine.method import Context, Method, Plan, Step
 from mirrorskin.engine.options import option
 from mirrorskin.engine.slip.search import Slip
@@ -48,7 +52,7 @@ class Traction(Step):
         return result.assign(force, process=process)
 
 
-class Sliding(Method, options_of=(Slip, Traction)):
+class Sliding(Method):
     """Displacement of the skin and slip in a slide or a twist; with Young's modulus also the force.
 
     ``traction``, ``force_x`` and ``force_y`` assume that there is no load along the sheet in the first frame.
@@ -56,6 +60,16 @@ class Sliding(Method, options_of=(Slip, Traction)):
     """
 
     motions = ("horizontal", "twist")
+
+    contact: Maps | None = Slip.contact
+    per_frame: bool = Slip.per_frame
+    window_size: int = Slip.window_size
+    window_step: int = Slip.window_step
+    noise: float | None = Slip.noise
+    motion: Literal["horizontal", "twist"] = Slip.motion
+    pixel_size: ArrayLike | None = Slip.pixel_size
+    centre: tuple[float, float] = Slip.centre
+    modulus: float | None = Traction.modulus
 
     def plan(self, source: Source) -> Plan:
         """Return the search for slip, with the source's motion and pixel size, and the step for the force."""
