@@ -33,6 +33,7 @@ CYCLIC = "twilight"
 Colours = NDArray[np.uint8]
 
 _SHOWN = 0.2, 99.8  # percentiles at the ends of the colour scale
+_EQUAL = 1e-6  # relative difference, about 10 units in the last place of float32
 
 
 def span(values: NDArray[Any]) -> tuple[float, float]:
@@ -40,6 +41,13 @@ def span(values: NDArray[Any]) -> tuple[float, float]:
     known = values[np.isfinite(values)]
     low, high = np.percentile(known, _SHOWN) if known.size else (-1.0, 0.0)
     return float(low), float(high)
+
+
+def apart(low: float, high: float) -> tuple[float, float]:
+    """Separate the ends of a scale that are equal, or differ by no more than the rounding of float32."""
+    if high - low > _EQUAL * max(abs(low), abs(high)):
+        return low, high
+    return (low + high) / 2 - 0.5, (low + high) / 2 + 0.5
 
 
 def grey(values: NDArray[Any], low: float, high: float) -> Colours:
