@@ -34,6 +34,7 @@ Colours = NDArray[np.uint8]
 
 _SHOWN = 0.2, 99.8  # percentiles at the ends of the colour scale
 _EQUAL = 1e-6  # relative difference, about 10 units in the last place of float32
+_HALF = 0.01  # half the width of a scale of equal values, relative to them, so that ticks need no offset
 
 
 def span(values: NDArray[Any]) -> tuple[float, float]:
@@ -47,7 +48,9 @@ def apart(low: float, high: float) -> tuple[float, float]:
     """Separate the ends of a scale that are equal, or differ by no more than the rounding of float32."""
     if high - low > _EQUAL * max(abs(low), abs(high)):
         return low, high
-    return (low + high) / 2 - 0.5, (low + high) / 2 + 0.5
+    middle = (low + high) / 2
+    half = max(0.5, _HALF * abs(middle))
+    return middle - half, middle + half
 
 
 def grey(values: NDArray[Any], low: float, high: float) -> Colours:

@@ -432,10 +432,11 @@ def test_a_map_that_is_constant_up_to_rounding_has_one_colour():
 
 
 @pytest.mark.parametrize("scaled", [True, False])
+@pytest.mark.parametrize("value", [-1.3, 700])
 @pytest.mark.parametrize("draw", [draw_height, draw_section, draw_histogram])
-def test_heights_that_are_constant_up_to_rounding_have_a_plain_scale(draw, scaled):
+def test_heights_that_are_constant_up_to_rounding_have_a_plain_scale(draw, value, scaled):
     places = {"x": np.arange(10.0), "y": np.arange(6.0)[::-1]} if scaled else {}
-    result = io.Result(height=rounded(-1.3), **places)
+    result = in_micrometres(io.Result(height=rounded(value), **places))
     cut = (section(result),) if draw is draw_section else ()
     assert_plain(panel_of(draw, result, *cut))
 

@@ -139,7 +139,7 @@ def draw_histogram(axes: Axes, sheet: Sheet) -> None:
     height = sheet.result.height
     assert height is not None
     scale = sheet.of_height.figure_scale
-    parts = [scale * height[np.isfinite(height) & (sheet.filled == filled)] for filled in (False, True)]
+    parts = [height[np.isfinite(height) & (sheet.filled == filled)] for filled in (False, True)]
     known = np.concatenate(parts)
     low, high = _shown(known)
     beyond = int(np.count_nonzero((known < low) | (known > high)))
@@ -151,7 +151,7 @@ def draw_histogram(axes: Axes, sheet: Sheet) -> None:
     below = np.zeros(_BINS)
     for count, (name, colour) in zip(counts, names, strict=True):
         if count.any():
-            axes.stairs(below + count, bins, baseline=below, fill=True, color=colour, label=name)
+            axes.stairs(below + count, scale * bins, baseline=below, fill=True, color=colour, label=name)
         below = below + count
     axes.set_xlabel(f"{quantity(sheet)} ({sheet.of_height.figure_unit})", fontsize=TEXT)
     axes.set_ylabel("pixels", fontsize=TEXT)
@@ -162,7 +162,7 @@ def draw_histogram(axes: Axes, sheet: Sheet) -> None:
     if known.size:
         axes.legend(fontsize=SMALL, **BESIDE)
     sigma = sheet.result.height_sigma
-    notes = [f"median {sheet.height_text(float(np.median(known)) / scale)}"] if known.size else ["no answer"]
+    notes = [f"median {sheet.height_text(float(np.median(known)))}"] if known.size else ["no answer"]
     if sigma is not None and np.isfinite(sigma).any():
         declared = sheet.result.declaration(sheet.result.name_of("height_sigma") or "height_sigma")
         error = declared.figure_scale * np.nanmedian(sigma)
