@@ -33,6 +33,8 @@ CYCLIC = "twilight"
 Colours = NDArray[np.uint8]
 
 _SHOWN = 0.2, 99.8  # percentiles at the ends of the colour scale
+_EQUAL = 1e-6  # relative difference, about 10 units in the last place of float32
+_HALF = 0.01  # half the width of a scale of equal values, relative to them, so that ticks need no offset
 
 
 def span(values: NDArray[Any]) -> tuple[float, float]:
@@ -40,6 +42,15 @@ def span(values: NDArray[Any]) -> tuple[float, float]:
     known = values[np.isfinite(values)]
     low, high = np.percentile(known, _SHOWN) if known.size else (-1.0, 0.0)
     return float(low), float(high)
+
+
+def apart(low: float, high: float) -> tuple[float, float]:
+    """Separate the ends of a scale that are equal, or differ by no more than the rounding of float32."""
+    if high - low > _EQUAL * max(abs(low), abs(high)):
+        return low, high
+    middle = (low + high) / 2
+    half = max(0.5, _HALF * abs(middle))
+    return middle - half, middle + half
 
 
 def grey(values: NDArray[Any], low: float, high: float) -> Colours:

@@ -134,7 +134,7 @@ def test_the_summary_is_about_the_declared_map(name, line):
 @pytest.mark.parametrize(
     ("name", "title", "label"),
     [
-        ("wear", "Wear", "wear (mm)"),
+        ("wear", "Wear", "wear (µm)"),
         ("wear_sigma", "Standard deviation of the wear", "standard deviation (µm)"),
         ("flow", "Flow", "length (µm)"),
         ("stress", "Stress", "stress (kPa)"),

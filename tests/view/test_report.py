@@ -19,7 +19,7 @@ from mirrorskin.view import report
 from mirrorskin.view.report import contents
 from mirrorskin.view.report.contents import align
 from mirrorskin.view.report.surface import sample, surface_data
-from mirrorskin.view.report.words import split_process
+from mirrorskin.view.report.words import picture_texts, split_process
 
 SHAPE = (23, 31)
 HOSTILE = '"><script>alert(1)</script>&$x'
@@ -159,6 +159,17 @@ def test_each_picture_is_there_in_words_too(page):
         picture = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
         assert picture.shape[:2] == (int(one["height"]), int(one["width"]))
         assert picture.std() > 1
+
+
+def test_a_caption_that_repeats_the_title_is_left_out():
+    caption, _ = picture_texts(cap(), "height_sigma")
+    assert caption == "Standard deviation of the height."
+
+
+@pytest.mark.parametrize("filled", [None, np.zeros(SHAPE, np.uint8)])
+def test_a_caption_mentions_filled_heights_only_if_there_are_some(filled):
+    assert "orange was filled" in picture_texts(cap(), "height")[0]
+    assert "orange" not in picture_texts(cap().assign(filled=filled), "height")[0]
 
 
 def test_names_are_shown_and_never_run(page):

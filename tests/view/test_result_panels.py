@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from shown import ball, colours_at, rendered
@@ -366,3 +367,87 @@ def test_a_histogram_leaves_out_a_few_pixels_far_from_all_others():
     axes = panel_of(draw_histogram, io.Result(height=height))
     assert axes.get_xlim()[0] > -1.3
     assert any("1 pixels beyond" in text.get_text() for text in axes.texts)
+
+
+def in_micrometres(result):
+    """Return a result whose heights are a declared map that is displayed in micrometres."""
+    declared = {"rise": io.Map("rise of the sheet", "mm", quantity="height", displayed="µm")}
+    maps = {"rise": result.height, "rise_sigma": result.height_sigma, "filled": result.filled}
+    return io.Result(maps, x=result.x, y=result.y, declarations=declared)
+
+
+def test_declared_heights_have_the_displayed_unit_in_the_map():
+    bar = map_of("rise", in_micrometres(along())).child_axes[0]
+    assert bar.get_ylabel() == "rise (µm)"
+    np.testing.assert_allclose(bar.get_ylim(), [-1000, 0], atol=1)
+
+
+def test_declared_heights_have_the_displayed_unit_in_the_section():
+    sheet, cut = cut_of(in_micrometres(along()))
+    axes = panel_of(draw_section, sheet.result, cut)
+    assert axes.get_ylabel() == "rise (µm)"
+    lines = {line.get_label(): line for line in axes.lines}
+    np.testing.assert_allclose(np.nanmin(lines["measured"].get_ydata()), -1000)
+    band = np.concatenate([path.vertices for path in axes.collections[0].get_paths()])
+    assert -1100 < band[:, 1].min() < -1010
+    assert f"{1000 * cut.height[19]:.4g} µm" in [text.get_text() for text in axes.texts]
+
+
+def test_a_section_in_micrometres_is_stretched_as_it_says():
+    sheet, cut = cut_of(in_micrometres(along(span=0.3)))
+    axes = panel_of(draw_section, sheet.result, cut)
+    axes.apply_aspect()
+    (x0, y0), (x1, y1) = axes.transData.transform([(0, 0), (1, 1000)])
+    assert (y1 - y0) / (x1 - x0) == pytest.approx(10)
+    assert note(axes).endswith("stretched 10 times")
+
+
+def test_declared_heights_have_the_displayed_unit_in_the_histogram():
+    axes = panel_of(draw_histogram, in_micrometres(along()))
+    assert axes.get_xlabel() == "rise (µm)"
+    assert -1100 < axes.get_xlim()[0] < -1000
+    median = 1000 * np.nanmedian(along().height)
+    assert note(axes) == f"median {median:.4g} µm; median expected error 10 µm"
+
+
+def rounded(value, shape=(6, 10)):
+    """Return a constant map, up to one unit in the last place of float32."""
+    values = np.full(shape, value, np.float32)
+    values[::2] = np.nextafter(np.float32(value), np.float32(np.inf))
+    return values
+
+
+def assert_plain(axes):
+    """Assert that no scale of a panel has an offset, such as 1e-5+2.8867e1."""
+    FigureCanvasAgg(axes.figure).draw()
+    scales = [axis for one in (axes, *axes.child_axes) for axis in (one.xaxis, one.yaxis)]
+    assert [axis.get_offset_text().get_text() for axis in scales] == [""] * len(scales)
+
+
+def test_a_map_that_is_constant_up_to_rounding_has_one_colour():
+    axes = map_of("height_sigma", io.Result(height_sigma=rounded(0.0288675)))
+    (picture,) = axes.images
+    assert np.ptp(picture.norm(np.asarray(picture.get_array()))) < 1e-3
+    assert_plain(axes)
+
+
+@pytest.mark.parametrize("scaled", [True, False])
+@pytest.mark.parametrize("value", [-1.3, 700])
+@pytest.mark.parametrize("draw", [draw_height, draw_section, draw_histogram])
+def test_heights_that_are_constant_up_to_rounding_have_a_plain_scale(draw, value, scaled):
+    places = {"x": np.arange(10.0), "y": np.arange(6.0)[::-1]} if scaled else {}
+    result = in_micrometres(io.Result(height=rounded(value), **places))
+    cut = (section(result),) if draw is draw_section else ()
+    assert_plain(panel_of(draw, result, *cut))
+
+
+def test_a_section_of_equal_heights_is_not_stretched():
+    level = io.Result(height=rounded(-1.3), x=np.arange(10.0), y=np.arange(6.0)[::-1])
+    axes = panel_of(draw_section, level, section(level))
+    assert note(axes).endswith("true to scale")
+
+
+def test_vectors_that_are_equal_up_to_rounding_have_one_colour():
+    moved = np.dstack([rounded(0.003), np.zeros((6, 10), np.float32)])
+    (picture,) = map_of("displacement", io.Result(displacement=moved)).images
+    assert np.ptp(picture.norm(np.asarray(picture.get_array()))) < 1e-3

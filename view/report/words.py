@@ -17,7 +17,8 @@ _GRAPHS: Mapping[str, tuple[str, str]] = {
     "histogram": ("Number of pixels with each height.", "Histogram of the heights"),
 }
 _ADDITIONS: Mapping[str, str] = {  # notes on the colours of a figure
-    "height": "Blue has no answer, and orange was filled, not measured.",
+    "height": "Blue has no answer.",
+    "filled": "Blue has no answer, and orange was filled, not measured.",
     "direction": "Red, green and blue are the components along x, y and z; edges are black.",
     "vectors": "Arrows show the direction.",
 }
@@ -30,8 +31,10 @@ def picture_texts(result: Result, name: str) -> tuple[str, str]:
     declared, title = result.declaration(name), result.declaration(name).title_of(name)
     kind = "vectors" if declared.components else ""
     kind = "direction" if declared.sampling == "direction" else kind
-    kind = "height" if name == result.name_of("height") else kind
-    sentences = [f"{title}: {declared.caption}." if declared.caption else f"{title}."]
+    if name == result.name_of("height"):
+        kind = "filled" if result.filled is not None and result.filled.any() else "height"
+    repeats = declared.caption.casefold() in ("", title.casefold())
+    sentences = [f"{title}." if repeats else f"{title}: {declared.caption}."]
     sentences += [_ADDITIONS[kind]] if kind else []
     unit = f" in {declared.figure_unit}" if declared.figure_unit else ""
     return " ".join(sentences), f"Map: {title[:1].lower()}{title[1:]}{unit}"

@@ -20,6 +20,7 @@ from mirrorskin.view.colours import (
     MISSING_RGB,
     SEQUENTIAL,
     Colours,
+    apart,
     normal_colours,
     span,
 )
@@ -42,10 +43,10 @@ def draw_height(axes: Axes, sheet: Sheet, cut: Section | None = None) -> None:
 
     height = sheet.result.height
     assert height is not None
-    ends = span(height)
+    ends, scale = apart(*span(height)), sheet.of_height.figure_scale
     draw_map(axes, sheet, height_picture(height, sheet.filled, ends), interpolation="antialiased")
-    colours = ScalarMappable(Normalize(*_apart(*ends)), SEQUENTIAL)
-    explain_colours(axes, colours, f"{quantity(sheet)} (mm)", exceeded(height, *ends))
+    colours = ScalarMappable(Normalize(*(scale * end for end in ends)), SEQUENTIAL)
+    explain_colours(axes, colours, _label(quantity(sheet), sheet.of_height), exceeded(height, *ends))
     if sheet.true_to_scale and sheet.unit == "mm" and height.size > 1:
         _draw_scale(axes, sheet)
     if cut is not None:
@@ -56,9 +57,8 @@ def draw_height(axes: Axes, sheet: Sheet, cut: Section | None = None) -> None:
 
 def quantity(sheet: Sheet) -> str:
     """Return the title of the heights in lower case: relative ones if the absolute offset is unknown."""
-    result = sheet.result
-    name = result.name_of("height") or "height"
-    title, unknown = result.declaration(name).title_of(name), result.offset_unknown
+    name, unknown = sheet.result.name_of("height") or "height", sheet.result.offset_unknown
+    title = sheet.of_height.title_of(name)
     title = f"{title[:1].lower()}{title[1:]}"
     return f"relative {title}" if unknown is not None and unknown.size and unknown.all() else title
 
@@ -76,11 +76,6 @@ def _notes(sheet: Sheet) -> Iterator[str]:
     if unknown is not None and unknown.any():
         pieces = "each piece" if unknown.all() else f"{np.count_nonzero(unknown)} of {unknown.size} pieces"
         yield "mean 0" if unknown.size == 1 else f"{pieces} about its mean"
-
-
-def _apart(low: float, high: float) -> tuple[float, float]:
-    """Separate the ends of a scale that coincide."""
-    return (low, high) if high > low else (low - 0.5, high + 0.5)
 
 
 def outlined(width: float) -> list[Any]:
@@ -226,7 +221,9 @@ def _label(text: str, declared: Map) -> str:
 def _draw_vectors(axes: Axes, sheet: Sheet, values: Floats, name: str, declared: Map) -> None:
     """Draw the length of vectors, and arrows if they have the components x and y."""
     length = np.sqrt(np.sum(values**2, axis=-1))
-    draw_map(axes, sheet, length, _label("length", declared), cmap=SEQUENTIAL)
+    known = length[np.isfinite(length)]
+    low, high = apart(float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    draw_map(axes, sheet, length, _label("length", declared), cmap=SEQUENTIAL, vmin=low, vmax=high)
     entitle(axes, declared.title_of(name), _missing_note(length))
     if declared.components[:2] != ("x", "y"):
         return
@@ -243,7 +240,7 @@ def _draw_numbers(axes: Axes, sheet: Sheet, values: Floats, name: str, declared:
     known = values[np.isfinite(values)]
     low, high = (float(v) for v in np.percentile(known, _SHOWN)) if known.size else (0.0, 1.0)
     decades = declared.colours != "sequential" and low > 0 and high > _DECADES * low
-    scale = (LogNorm if decades else Normalize)(*_apart(low, high))
+    scale = (LogNorm if decades else Normalize)(*apart(low, high))
     colours = ERROR if declared.colours == "error" else SEQUENTIAL
     text = "standard deviation" if declared.colours == "error" else name.replace("_", " ")
     beyond = exceeded(known, low, high)

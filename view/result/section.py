@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.types import Floats
 from mirrorskin.view.canvas import BESIDE, round_length
-from mirrorskin.view.colours import FILLED, span
+from mirrorskin.view.colours import FILLED, apart, span
 from mirrorskin.view.result.maps import outlined, quantity
 from mirrorskin.view.result.sheet import BOX, SMALL, TEXT, Sheet, entitle
 
@@ -30,17 +30,21 @@ def draw_section(axes: Axes, sheet: Sheet, cut: Section) -> None:
 
     Filled heights are dashed; a hole is a gap; the highest measured point is marked.
     """
-    measured = np.where(cut.filled, np.nan, cut.height)
+    scale = sheet.of_height.figure_scale
+    height, sigma = scale * cut.height, scale * cut.sigma
+    measured = np.where(cut.filled, np.nan, height)
     if np.isfinite(measured).any():
         axes.plot(cut.distance, measured, color="tab:blue", lw=1.5, label="measured")
-        _draw_apex(axes, cut.distance, measured)
+        _draw_apex(axes, sheet, cut)
     if cut.filled.any():
-        axes.plot(cut.distance, _joined(cut), color=FILLED, ls=(0, (2, 1)), lw=1.5, label="filled")
+        axes.plot(
+            cut.distance, _joined(height, cut.filled), color=FILLED, ls=(0, (2, 1)), lw=1.5, label="filled"
+        )
     if np.isfinite(cut.sigma).any():
         times = _visible(cut)
-        band = measured - times * cut.sigma, measured + times * cut.sigma
+        band = measured - times * sigma, measured + times * sigma
         axes.fill_between(cut.distance, *band, color="tab:blue", alpha=0.25, lw=0, label=f"± {times} sigma")
-    scale = _scale(axes, sheet, cut)
+    stretched = _stretch(axes, sheet, cut)
     for name, end in (("A", 0), ("B", 1)):
         axes.annotate(
             name,
@@ -54,12 +58,12 @@ def draw_section(axes: Axes, sheet: Sheet, cut: Section) -> None:
             va="top",
         )
     axes.set_xlabel(f"distance from A ({sheet.unit})", fontsize=TEXT)
-    axes.set_ylabel(f"{quantity(sheet)} (mm)", fontsize=TEXT)
+    axes.set_ylabel(f"{quantity(sheet)} ({sheet.of_height.figure_unit})", fontsize=TEXT)
     axes.tick_params(labelsize=SMALL)
     axes.grid(alpha=0.3)
     if np.isfinite(cut.height).any():
         axes.legend(fontsize=SMALL, **BESIDE)
-    entitle(axes, "Section", f"{_ends(cut, sheet.unit)}{scale}")
+    entitle(axes, "Section", f"{_ends(cut, sheet.unit)}{stretched}")
 
 
 def _visible(cut: Section) -> int:
@@ -68,22 +72,24 @@ def _visible(cut: Section) -> int:
     return next((times for times in _TIMES if times * sigma >= _SEEN * spread), _TIMES[-1])
 
 
-def _joined(cut: Section) -> Floats:
+def _joined(height: Floats, filled: NDArray[np.bool_]) -> Floats:
     """Return the filled heights, and the adjacent measured ones, so that the lines connect."""
-    near: NDArray[np.bool_] = cut.filled.copy()
-    near[1:] |= cut.filled[:-1]
-    near[:-1] |= cut.filled[1:]
-    return np.where(near, cut.height, np.nan)
+    near: NDArray[np.bool_] = filled.copy()
+    near[1:] |= filled[:-1]
+    near[:-1] |= filled[1:]
+    return np.where(near, height, np.nan)
 
 
-def _draw_apex(axes: Axes, distance: Floats, height: Floats) -> None:
+def _draw_apex(axes: Axes, sheet: Sheet, cut: Section) -> None:
     """Mark the highest measured point."""
-    top = int(np.nanargmax(height))
-    axes.plot(distance[top], height[top], "v", color="tab:red", ms=5, label="highest measured")
+    distance = cut.distance
+    top = int(np.nanargmax(np.where(cut.filled, np.nan, cut.height)))
+    drawn = sheet.of_height.figure_scale * float(cut.height[top])
+    axes.plot(distance[top], drawn, "v", color="tab:red", ms=5, label="highest measured")
     share = (distance[top] - distance[0]) / (distance[-1] - distance[0] or 1.0)
     axes.annotate(
-        f"{height[top]:.3f} mm",
-        (float(distance[top]), float(height[top])),
+        sheet.height_text(float(cut.height[top])),
+        (float(distance[top]), drawn),
         (0, 6),
         textcoords="offset points",
         ha="left" if share < _NEAR else "right" if share > 1 - _NEAR else "center",
@@ -93,20 +99,27 @@ def _draw_apex(axes: Axes, distance: Floats, height: Floats) -> None:
     )
 
 
-def _scale(axes: Axes, sheet: Sheet, cut: Section) -> str:
-    """Set the limits of the panel so that the vertical exaggeration is a round number; return it as text."""
+def _stretch(axes: Axes, sheet: Sheet, cut: Section) -> str:
+    """Set the limits of the panel so that the vertical exaggeration is a round number; return it as text.
+
+    Equal heights are drawn to scale.
+    """
     axes.set_box_aspect(BOX)
     length = float(cut.distance[-1] - cut.distance[0]) or 1.0
     axes.set_xlim(float(cut.distance[0]), float(cut.distance[0]) + length)
     known = cut.height[np.isfinite(cut.height)]
+    scale = sheet.of_height.figure_scale
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    equal = apart(low, high) != (low, high)
     if sheet.unit != "mm" or not known.size:
         axes.margins(y=0.2)
+        if equal:
+            axes.set_ylim(*(scale * end for end in apart(low, high)))
         return ""
-    low, high = float(known.min()), float(known.max())
-    times = round_length(BOX * length / max(_ROOM * (high - low), 1e-6))
+    times = 1.0 if equal else round_length(BOX * length / max(_ROOM * (high - low), 1e-6))
     half = BOX * length / times / 2
     middle = (low + high) / 2
-    axes.set_ylim(middle - half, middle + half)
+    axes.set_ylim(scale * (middle - half), scale * (middle + half))
     if times == 1:
         return "; true to scale"
     return f"; heights stretched {times:g} times" if times > 1 else f"; heights shrunk {1 / times:g} times"
@@ -125,19 +138,22 @@ def draw_histogram(axes: Axes, sheet: Sheet) -> None:
     """Draw a histogram of heights, filled ones stacked on measured ones."""
     height = sheet.result.height
     assert height is not None
+    scale = sheet.of_height.figure_scale
     parts = [height[np.isfinite(height) & (sheet.filled == filled)] for filled in (False, True)]
     known = np.concatenate(parts)
     low, high = _shown(known)
     beyond = int(np.count_nonzero((known < low) | (known > high)))
-    bins = np.histogram_bin_edges(known[(known >= low) & (known <= high)], _BINS)
+    shown = known[(known >= low) & (known <= high)]
+    ends = (float(shown.min()), float(shown.max())) if shown.size else (0.0, 1.0)
+    bins = np.histogram_bin_edges(shown, _BINS, apart(*ends))
     counts = [np.histogram(part, bins)[0] for part in parts]
     names = ("measured", "tab:blue"), ("filled", FILLED)
     below = np.zeros(_BINS)
     for count, (name, colour) in zip(counts, names, strict=True):
         if count.any():
-            axes.stairs(below + count, bins, baseline=below, fill=True, color=colour, label=name)
+            axes.stairs(below + count, scale * bins, baseline=below, fill=True, color=colour, label=name)
         below = below + count
-    axes.set_xlabel(f"{quantity(sheet)} (mm)", fontsize=TEXT)
+    axes.set_xlabel(f"{quantity(sheet)} ({sheet.of_height.figure_unit})", fontsize=TEXT)
     axes.set_ylabel("pixels", fontsize=TEXT)
     axes.tick_params(labelsize=SMALL)
     axes.grid(alpha=0.3)
@@ -146,9 +162,11 @@ def draw_histogram(axes: Axes, sheet: Sheet) -> None:
     if known.size:
         axes.legend(fontsize=SMALL, **BESIDE)
     sigma = sheet.result.height_sigma
-    notes = [f"median {np.median(known):.3f} mm"] if known.size else ["no answer"]
+    notes = [f"median {sheet.height_text(float(np.median(known)))}"] if known.size else ["no answer"]
     if sigma is not None and np.isfinite(sigma).any():
-        notes.append(f"median expected error {1e3 * np.nanmedian(sigma):.3g} \N{MICRO SIGN}m")
+        declared = sheet.result.declaration(sheet.result.name_of("height_sigma") or "height_sigma")
+        error = declared.figure_scale * np.nanmedian(sigma)
+        notes.append(f"median expected error {error:.3g} {declared.figure_unit}")
     if beyond:
         notes.append(f"{beyond} pixels beyond")
     entitle(axes, "Distribution of heights", "; ".join(notes))
@@ -156,6 +174,6 @@ def draw_histogram(axes: Axes, sheet: Sheet) -> None:
 
 def _shown(known: Floats) -> tuple[float, float]:
     """Return the range of heights, except for a few pixels far from all others."""
-    low, high = span(known)
+    low, high = apart(*span(known))
     room = _TAIL * (high - low)
     return low - room, high + room

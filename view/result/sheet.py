@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import Result, pixel_axes, select_turn
+from mirrorskin.io.maps import Map
 from mirrorskin.io.result import map_shape
 from mirrorskin.io.types import Floats
 from mirrorskin.view.canvas import Extent, draw_image, extent
@@ -35,7 +36,7 @@ class Sheet:
     x, y : ndarray, (W,) and (H,), float64
         Pixel centres from the picture's centre.
     unit : {"mm", "px"}
-        Unit of ``x`` and ``y``: pixels if their size is unknown. Heights are always in mm.
+        Unit of ``x`` and ``y``: pixels if their size is unknown.
     """
 
     result: Result
@@ -65,6 +66,16 @@ class Sheet:
         assert self.result.height is not None
         known: NDArray[np.bool_] = np.isfinite(self.result.height)
         return np.zeros_like(known) if self.result.filled is None else known & (self.result.filled > 0)
+
+    @property
+    def of_height(self) -> Map:
+        """Declaration of the heights, which have its ``figure_unit`` in figures."""
+        return self.result.declaration(self.result.name_of("height") or "height")
+
+    def height_text(self, height: float) -> str:
+        """Return a height, given in mm, as text in the unit of figures."""
+        unit, value = self.of_height.figure_unit, self.of_height.figure_scale * height
+        return f"{value:.3f} mm" if unit == "mm" else f"{value:.4g} {unit}"
 
 
 def sheet_of(result: Result) -> Sheet:
