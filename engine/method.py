@@ -146,6 +146,11 @@ class Method(_Options):
         undistort : bool
             Whether maps are undistorted, if the source's calibration has a lens.
 
+        Returns
+        -------
+        Result
+            The maps by name. ``process`` contains the options and the origin of their values.
+
         Raises
         ------
         mirrorskin.io.InputError
