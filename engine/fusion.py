@@ -53,9 +53,9 @@ def fuse(
     ends of their intervals have a weight in the final solution; see `mirrorskin.engine.press.intervals`.
 
     Where there is a height but no normal, the surface has that height; near normals it has the slope of a
-    smooth surface fitted to the surrounding heights, if one fits. Where there is a normal but no height, slopes
-    determine the surface. Components without any height are marked in ``offset_unknown``. Holes that have
-    neither are filled, and marked so (`mirrorskin.engine.fill_holes`); filled pixels have no standard
+    smooth surface fitted to the surrounding heights, if one fits. Where there is a normal but no height,
+    slopes determine the surface. Components without any height are marked in ``offset_unknown``. Holes that
+    have neither are filled, and marked so (`mirrorskin.engine.fill_holes`); filled pixels have no standard
     deviation.
 
     Parameters
