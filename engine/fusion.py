@@ -48,15 +48,14 @@ def fuse(
 
     Heights are those of a press, a focus stack, or of any operation; normals are those of a rotation, of
     photometric stereo, or of any operation. The surface is the one that fits the slopes of the normals and
-    the heights best, weighted by inverse variance; see `mirrorskin.engine.integrate`. A height of a press is
-    in the interval between two frames, which is more than its standard deviation says: once a first surface
-    is there, heights inside their intervals have no more weight, and those at the ends do; see
-    `mirrorskin.engine.press.intervals`.
+    the heights best, weighted by inverse variance; see `mirrorskin.engine.integrate`. After a first solution,
+    each height is treated as an interval, such as that between two frames of a press: only heights near the
+    ends of their intervals have a weight in the final solution; see `mirrorskin.engine.press.intervals`.
 
-    Where there is a height but no normal, the surface has that height; near normals it gets the slope of the
-    smooth surface that fits the heights around, if one does. Where there is a normal but no height, slopes
-    determine the surface. Components without any height are marked in ``offset_unknown``. Holes that have
-    neither are filled, and marked so (`mirrorskin.engine.fill_holes`); filled pixels have no standard
+    Where there is a height but no normal, the surface has that height; near normals it has the slope of a
+    smooth surface fitted to the surrounding heights, if one fits. Where there is a normal but no height,
+    slopes determine the surface. Components without any height are marked in ``offset_unknown``. Holes that
+    have neither are filled, and marked so (`mirrorskin.engine.fill_holes`); filled pixels have no standard
     deviation.
 
     Parameters
@@ -89,6 +88,16 @@ def fuse(
         size is not possible.
     mirrorskin.engine.NotConverged
         The surface was not found.
+
+    Notes
+    -----
+    Errors of normals are assumed to be independent and normally distributed. Each height is assumed to be
+    within sqrt(3) ``height_sigma`` of the surface, with equal probability everywhere in this interval. A
+    height that is rounded to multiples of a step fits this with step / sqrt(12) as its sigma.
+
+    If the surface of a component rises by less than one step, all of its heights have nearly the same error,
+    which normals cannot reduce. The returned ``height_sigma`` contains only a part of it: add
+    step / sqrt(12) in quadrature.
 
     Examples
     --------

@@ -134,6 +134,11 @@ class Method(OnDevice):
         undistort : bool
             Whether maps are undistorted, if the source's calibration has a lens.
 
+        Returns
+        -------
+        Result
+            The maps by name. ``process`` contains the options and the origin of their values.
+
         Raises
         ------
         mirrorskin.io.InputError

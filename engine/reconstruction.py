@@ -72,6 +72,11 @@ def reconstruct(
         one, of `mirrorskin.engine.Sliding` for a horizontal one or a twist; ``help(engine.Press)`` shows
         them.
 
+    Returns
+    -------
+    Result
+        The maps of the method, by name; the help of its class lists them.
+
     Raises
     ------
     mirrorskin.io.InputError

@@ -128,6 +128,23 @@ class Press(Method):
     `mirrorskin.engine.press.strokes.Strokes`. Levels of dark and light that neither the options nor the
     source specify are estimated from the frames, and their uncertainty is added to ``height_sigma``; if that
     is impossible, the range of the frames' type is used. ``process`` contains the origin of each level.
+
+    `run` returns ``height``, ``height_sigma`` and ``status``; ``filled`` if holes are filled; of a press that
+    oscillates also ``hysteresis`` and ``strokes``; with a calibrated elastomer and its modulus also
+    ``pressure``, ``force`` and ``force_sigma``.
+
+    Examples
+    --------
+    >>> from mirrorskin import engine, hw
+    >>> travel = 0.1 * np.arange(12)
+    >>> press = hw.Twin(
+    ...     object="sphere", shape=(40, 40), pixel_size=0.26, movement=hw.twin.Vertical(travel)
+    ... )
+    >>> result = engine.Press(fill=False).run(press)
+    >>> bool(np.nanmax(np.abs(result.height - press.truth.height)) < 0.05)  # half of a step of the travel
+    True
+    >>> result.process["threshold"]
+    0.5
     """
 
     motions = ("vertical",)

@@ -56,6 +56,23 @@ class Rotation(Method):
 
     If the source has a tilt of each frame, or two phases half a turn apart, its frames are at given poses;
     see `mirrorskin.engine.rotation.MovingNormals`. Rocking determines a slope, but no heights.
+
+    `run` returns ``normals``, ``zenith`` and ``azimuth``, ``normals_sigma``, ``contact``, ``mean``,
+    ``modulation``, ``residual`` and ``edges``; with a pixel size also ``height``, ``height_sigma``,
+    ``component`` and ``offset_unknown``.
+
+    Examples
+    --------
+    >>> from mirrorskin import engine, hw
+    >>> movement = hw.twin.Axial(np.pi / 4 * np.arange(8), tilt=0.05, press=1.0)
+    >>> turn = hw.Twin(
+    ...     object="sphere", shape=(40, 40), pixel_size=0.26, movement=movement, pattern="linear"
+    ... )
+    >>> result = engine.Rotation().run(turn)
+    >>> bool(np.nanmax(np.abs(result.zenith - turn.truth.zenith)) < 0.01)  # radians
+    True
+    >>> result.height.shape
+    (40, 40)
     """
 
     motions = ("axial",)

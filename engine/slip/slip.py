@@ -57,6 +57,25 @@ class Sliding(Method):
 
     ``traction``, ``force_x`` and ``force_y`` assume that there is no load along the sheet in the first frame.
     ``process`` contains ``angle``, ``centre_x`` and ``centre_y`` of a twist; see `Slip`.
+
+    `run` returns ``displacement``, ``slip_onset``, ``status``, and for each frame ``slide_distance`` or
+    ``twist_angle`` and ``stick_ratio``; with Young's modulus also ``traction``, ``force_x`` and ``force_y``.
+
+    Examples
+    --------
+    `mirrorskin.engine.reconstruct` uses this class for frames with a displacement:
+
+    >>> import cv2
+    >>> import numpy as np
+    >>> from mirrorskin import engine
+    >>> texture = np.random.default_rng(1).normal(100, 20, (60, 80))
+    >>> texture = cv2.GaussianBlur(texture, (0, 0), 1.5).astype(np.float32)
+    >>> frames = np.stack([np.roll(texture, -k, axis=1) for k in range(4)])  # the skin sticks to the object
+    >>> path = np.outer(range(4), [0.1, 0.0])  # the body moves to the right by one pixel per frame
+    >>> options = {"contact": np.ones((60, 80)), "noise": 0.1}
+    >>> result = engine.reconstruct(frames, displacement=path, pixel_size=0.1, **options)
+    >>> [round(float(part), 3) for part in result.displacement[30, 40]]
+    [-0.3, 0.0]
     """
 
     motions = ("horizontal", "twist")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import run
-from stacks import assert_same, record, sphere
+from stacks import MadeUp, assert_same, record, sphere
 
 from mirrorskin import engine, io
 from mirrorskin.engine.running import load_operation
@@ -257,15 +257,21 @@ def test_what_a_module_itself_lacks_is_not_hidden():
 
 def test_what_the_page_says_runs():
     page = (ROOT / "docs" / "operations.md").read_text(encoding="utf-8")
-    own, code, declared, with_kernel = re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
+    blocks = re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
+    own, code, configured, declared, with_kernel = blocks
     Path("light.py").write_text(own)
-    Path("light_on_device.py").write_text(with_kernel)
+    Path("first_light.py").write_text(with_kernel)
     for line in "".join(re.findall(r"^```sh\n(.*?)^```", page, re.DOTALL | re.MULTILINE)).splitlines():
         words = line.partition(" #")[0].replace("device=gpu", "device=cpu").split()[1:]
         if not {"live", "--live"} & {*words}:  # tests/cli/test_live.py
             ended = run(*words)
             assert ended.code == 0, ended.said
     known = {}
-    exec(own + code + declared, known)
+    exec(own + code + configured + declared, known)
     assert known["result"]["light"].any()
     assert known["Wear"].maps["wear"].quantity == "height"
+    header = io.Header("vertical", dark=np.full((2, 3), 60, np.float32))
+    frames = 10 * np.arange(24, dtype=np.uint8).reshape(4, 2, 3)
+    for chosen, level in ({}, 60), ({"dark": 10}, 10):
+        above = engine.run(MadeUp(frames, header), known["LightAboveDark"](level=50, **chosen))
+        np.testing.assert_array_equal(above["light"], (frames > 50 + level).sum(axis=0))
