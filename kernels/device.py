@@ -321,6 +321,9 @@ class Device:
     def _make_kernel(self, file: str | Path, name: str, options: tuple[str, ...]) -> Kernel:
         try:
             program, signatures = self._program(file, options)
+            if name not in signatures:
+                there = ", ".join(signatures) or "none"
+                raise DeviceError(f"there is no kernel {name} in the source; it has {there}")
             try:
                 kernel = cl.Kernel(program, name)
             except cl.LogicError:  # what the driver keeps of built programs is damaged: the source has it
@@ -331,6 +334,9 @@ class Device:
             problem = f"pyopencl cannot write its cache ({error})"
             raise DeviceError(f"{problem}; set XDG_CACHE_HOME to a writable folder") from error
         except cl.Error as error:
+            if error.code == cl.status_code.INVALID_KERNEL_NAME:  # of a kernel that the source has
+                problem = f"kernel {name} has the name of a function of OpenCL"
+                raise DeviceError(f"{problem}: rename it, such as to {name}_of_pixels") from error
             raise failed(self, f"compile {name}", error) from error
 
     def _program(

@@ -106,6 +106,19 @@ def test_a_kernel_in_a_text_runs_and_one_that_does_not_compile_is_quoted(device)
         device.kernel(TWICE.replace("values[item]", "valus[item]"), "twice")
 
 
+@pytest.mark.parametrize(
+    ("named", "wanted", "line"),
+    [
+        ("cross", "cross", "kernel cross has the name of a function of OpenCL: rename it"),
+        ("one", "two", "there is no kernel two in the source; it has one"),
+    ],
+)
+def test_a_kernel_name_that_cannot_be_is_one_line(device, named, wanted, line):
+    source = f"__kernel void {named}(__global float *values, const int count) {{}}"
+    with pytest.raises(DeviceError, match=line):
+        device.kernel(source, wanted)
+
+
 def test_arguments_are_named_and_numbers_become_what_the_source_says(device):
     numbers = device.given("numbers", np.ones((8, 16), np.float32))
     kernel = device.kernel("limits", "multiply_all", LANES=16, WORDS=8, STRIDE=1)
