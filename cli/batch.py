@@ -236,7 +236,8 @@ def _report(outcomes: Sequence[Outcome], folder: Path, seconds: float, as_json: 
             click.echo(f"failed: {_problem(outcome)}")
     counts = ", ".join(f"{count} {state}" for state, count in states.items())
     speed = f"{size / 1e9:.3g} GB in {seconds:.3g} s, {size / 1e9 / seconds:.3g} GB/s"
-    click.echo(f"{printable(str(folder))}: {len(outcomes)} recordings: {counts}; {speed}")
+    recordings = "1 recording" if len(outcomes) == 1 else f"{len(outcomes)} recordings"
+    click.echo(f"{printable(str(folder))}: {recordings}: {counts}; {speed}")
 
 
 def _fields(outcome: Outcome) -> dict[str, Any]:

@@ -205,9 +205,10 @@ def option(
     default : object
         Value if nothing is given. None means that the operation chooses; ``shown_default`` says how.
     unit : str
-        Unit of the value in Python: ``"share"``, ``"frames"``, ``"pixels"``, ``"counts"``, ``"mm"``,
-        ``"rad"``, ``"MPa"``, ``"counts/rad"``. On the command line, lengths, angles and pressures are written
-        with a unit.
+        Unit of the value in Python: ``"share"``, ``"frames"``, ``"pixels"``, ``"turns"``, ``"counts"``,
+        ``"mm"``, ``"rad"``, ``"s"``, ``"MPa"``, ``"N"``, ``"counts/rad"``, ``"mm/N"``, ``"Hz"`` or
+        ``"frames/s"``. On the command line, lengths, angles, times, pressures and forces are written with a
+        unit, other values without.
     help : str
         What the option means: one sentence.
     within : (float or None, float or None)
