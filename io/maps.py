@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from enum import IntEnum
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin
 
 import msgspec
 import numpy as np
@@ -121,7 +121,7 @@ class Map(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields
             try:
                 msgspec.structs.force_setattr(self, name, msgspec.convert(value, kind))
             except msgspec.ValidationError as error:
-                raise InputError(f"{name} of a map is invalid: {error}") from error
+                raise InputError(_type_problem(name, kind, value, error)) from error
         if not self.dtype:
             msgspec.structs.force_setattr(self, "dtype", "uint8" if self.codes else "float32")
         problem = next((text for check in _CHECKS for text in check(self)), None)
@@ -217,6 +217,21 @@ def _field_types() -> dict[str, Any]:
     return {field.name: field.type for field in msgspec.structs.fields(Map)}
 
 
+def _type_problem(name: str, kind: Any, value: Any, error: Exception) -> str:
+    """Return why a field has the wrong type."""
+    if name == "codes":
+        return f"codes of a map are {value!r:.40}: codes are a dictionary of integers and texts"
+    if get_origin(kind) is Literal:
+        return f"{name} of a map is {value!r:.40}. Use one of {', '.join(get_args(kind))}"
+    return f"{name} of a map is invalid: {error}"
+
+
+def _subject(one: Map) -> str:
+    """Return how a message calls a map whose name is unknown: by its title or caption."""
+    words = one.title or one.caption
+    return f"the map {words[:60]!r}" if words else "a map"
+
+
 def _text_problems(one: Map) -> Iterator[str]:
     for name in ("caption", "unit", "title", "displayed", "within", "included_in", "summary"):
         if not getattr(one, name).isprintable():
@@ -239,6 +254,9 @@ def _type_problems(one: Map) -> Iterator[str]:
             yield f"{wrong[0]:g} is not a value of {one.dtype}. Declare another dtype"
     elif one.codes:
         yield f"a map of {one.dtype} has codes. Declare a dtype of integers"
+    if one.codes and one.undefined is not None and one.undefined not in one.codes:
+        codes = ", ".join(map(str, one.codes))
+        yield f"{_subject(one)} is undefined at {one.undefined:g}, which is not in its codes ({codes:.100})"
     if len(one.codes) > _MOST_CODES:
         yield f"a legend has {len(one.codes)} codes; at most {_MOST_CODES} are supported"
 
@@ -258,12 +276,18 @@ def _shape_problems(one: Map) -> Iterator[str]:
 
 
 def _unit_problems(one: Map) -> Iterator[str]:
-    if one.displayed:
-        ratio(one.unit, one.displayed)
+    subject = _subject(one)
+    if one.displayed and not one.unit:
+        yield f"{subject} has no unit, but is displayed in {one.displayed[:40]}. Declare its unit"
+    elif one.displayed:
+        try:
+            ratio(one.unit, one.displayed)
+        except InputError as error:
+            yield f"{subject} cannot be displayed: {error}"
     if one.quantity and one.quantity not in TABLE:
-        yield f"the quantity of a map is {one.quantity[:40]!r}. Use a built-in map's name, such as 'height'"
+        yield f"the quantity of {subject} is {one.quantity[:40]!r}. Use one of {', '.join(TABLE)}"
     elif one.quantity:
-        yield from conflicts(one, TABLE[one.quantity], f"a map of quantity {one.quantity}")
+        yield from conflicts(one, TABLE[one.quantity], f"{subject} of quantity {one.quantity}")
 
 
 _CHECKS = (_text_problems, _type_problems, _shape_problems, _unit_problems)
@@ -558,8 +582,8 @@ UNDECLARED = Map()
 def check_declarations(declarations: Mapping[str, Map]) -> None:
     """Raise InputError if declarations change the meaning of a built-in name, or two maps have one quantity.
 
-    Only the legend and the texts of a built-in map may differ from the table, and the unit of maps that are
-    angles for a twist.
+    A standard deviation has the unit of its map. Only the legend and the texts of a built-in map may differ
+    from the table, and the unit of maps that are angles for a twist.
     """
     stands_for: dict[str, str] = {}
     for name, one in declarations.items():
@@ -569,9 +593,26 @@ def check_declarations(declarations: Mapping[str, Map]) -> None:
         if name in table:
             for problem in conflicts(one, table[name], f"the map {name}"):
                 raise InputError(f"{problem}, as the built-in map has, or choose another name")
+        base = name.removesuffix(SIGMA)
+        if name not in table and is_deviation(name) and (base in declarations or base in TABLE):
+            unit = declaration_of(base, declarations).unit
+            if one.unit != unit:
+                raise InputError(
+                    f"the map {name} has the unit {one.unit or 'none'}, but {base} has the unit "
+                    f"{unit or 'none'}. Declare {unit or 'none'}"
+                )
         if one.quantity and one.quantity != name:
+            check_quantity(name, one, declarations)
             other = stands_for.setdefault(one.quantity, name)
             if other != name:
                 raise InputError(
                     f"both {other} and {name} have the quantity {one.quantity}. Leave it out of one"
                 )
+
+
+def check_quantity(name: str, one: Map, names: Container[str]) -> None:
+    """Raise InputError if a map stands for a quantity that is also among the names of maps."""
+    if one.quantity and one.quantity != name and one.quantity in names:
+        raise InputError(
+            f"both {one.quantity} and {name} have the quantity {one.quantity}. Leave one of them out"
+        )
