@@ -17,7 +17,7 @@ from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Map, Result
 from mirrorskin.io.arguments import as_array
 from mirrorskin.io.maps import declaration_of
-from mirrorskin.io.result import result_of
+from mirrorskin.io.result import check_maps, result_of
 from mirrorskin.io.types import Motion, ProcessValue
 from mirrorskin.kernels.device import Device, open_device
 
@@ -144,6 +144,7 @@ class Operation(ThreadSafe, OnDevice):
         found: dict[str, Map] = {}
         for base in reversed(cls.__mro__):
             found |= {name: one for name, one in vars(base).items() if isinstance(one, Map)}
+        _check_maps(cls, found)
         cls.maps = found
         _check_class(cls)
         if "push" in vars(cls):
@@ -297,6 +298,19 @@ class Operation(ThreadSafe, OnDevice):
             names = ", ".join(sorted(foreign))
             taken = ", ".join(self.positions) or "frames only"
             raise InputError(f"{type(self).__name__} does not take {names}. It takes {taken}")
+
+
+def _check_maps(kind: type[Operation], maps: Mapping[str, Map]) -> None:
+    """Raise InputError if maps of a class have names or units that its results cannot have."""
+    try:
+        check_maps(maps)
+    except InputError as error:
+        raise InputError(f"{kind.__name__}: {error}") from error
+    for name in maps:
+        if hasattr(Operation, name):
+            raise InputError(
+                f"{kind.__name__}: a map cannot be called {name!r}, which operations use. Choose another name"
+            )
 
 
 def _checked_push(method: Callable[..., None]) -> Callable[..., None]:

@@ -79,8 +79,12 @@ class Summary:
             yield f"{name.replace('_', ' ')} {value:.4g}{spread} {unit}".rstrip()
 
     def as_dict(self) -> dict[str, Any]:
-        """Return everything by name, for JSON; counts and numbers are entries of their own."""
+        """Return everything by name, for JSON; counts and numbers are entries of their own.
+
+        ``lowest`` and ``highest`` are rounded to nine digits, which distinguish all values of float32.
+        """
         facts = asdict(self)
+        facts |= {name: float(f"{facts[name]:.9g}") for name in ("lowest", "highest")}
         facts |= {name.replace(" ", "_"): count for name, count in facts.pop("counts").items()}
         for name, (value, sigma, _) in facts.pop("numbers").items():
             facts[name] = value

@@ -35,6 +35,12 @@ VERSIONS = ("v110", "v110")
 
 _NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)  # a file system without hard links
 
+_OTHER_FORMATS = {  # suffixes that a result cannot have, with the command that makes one from it
+    **dict.fromkeys(("csv", "tif", "tiff", "png", "ply", "stl", "npz", "mcap", "xyz"), "export"),
+    "html": "report",
+    **dict.fromkeys(("jpg", "jpeg", "npy", "avi", "mp4", "json", "toml"), ""),
+}
+
 _LARGE = 4096  # bytes of a dataset that is not cached with the layout of its file
 _MOST_LAYOUTS = 16  # cached layouts
 
@@ -61,7 +67,7 @@ def check_output(
     *keep : Path or None
         Inputs, files or folders of files, that must not be overwritten.
     or_zarr : bool
-        Whether the output may also be a Zarr store, which must not exist.
+        Whether the output is a result: HDF5, or a Zarr store, which must not exist.
     replaces : {"nothing", "derived", "calibration", "anything"}
         Which existing file may be replaced; see `mirrorskin.io.existing.Replaces`.
 
@@ -69,7 +75,7 @@ def check_output(
     ------
     InputError
         Its folder does not exist or cannot be written to, it is a folder, it is the input, a file that is
-        being written, or a file that may not be replaced.
+        being written, or a file that may not be replaced; a result has the suffix of another format.
 
     Examples
     --------
@@ -81,6 +87,8 @@ def check_output(
 
             check_store(path)
             return
+        if or_zarr:
+            _check_format(path)
         if is_zarr(path):
             raise InputError(f"{path}: this is written as HDF5: name a local file, .h5, with -o")
         if path.is_dir():
@@ -96,6 +104,15 @@ def check_output(
             _check_existing(path, replaces)
         with tempfile.TemporaryFile(dir=path.parent):
             pass
+
+
+def _check_format(path: Path) -> None:
+    """Raise InputError if the suffix of a result is that of another format."""
+    suffix = path.suffix.lower().removeprefix(".")
+    if suffix in _OTHER_FORMATS:
+        command = _OTHER_FORMATS[suffix]
+        then = f", then 'mirrorskin {command}' makes .{suffix} of it" if command else ""
+        raise InputError(f"{path}: a result is HDF5 (.h5) or Zarr (.zarr): write it so{then}")
 
 
 def _check_existing(path: Path, replaces: Replaces) -> None:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from enum import IntEnum
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin
 
 import msgspec
 import numpy as np
@@ -121,7 +121,7 @@ class Map(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields
             try:
                 msgspec.structs.force_setattr(self, name, msgspec.convert(value, kind))
             except msgspec.ValidationError as error:
-                raise InputError(f"{name} of a map is invalid: {error}") from error
+                raise InputError(_type_problem(name, kind, value, error)) from error
         if not self.dtype:
             msgspec.structs.force_setattr(self, "dtype", "uint8" if self.codes else "float32")
         problem = next((text for check in _CHECKS for text in check(self)), None)
@@ -217,6 +217,21 @@ def _field_types() -> dict[str, Any]:
     return {field.name: field.type for field in msgspec.structs.fields(Map)}
 
 
+def _type_problem(name: str, kind: Any, value: Any, error: Exception) -> str:
+    """Return why a field has the wrong type."""
+    if name == "codes":
+        return f"codes of a map are {value!r:.40}: codes are a dictionary of integers and texts"
+    if get_origin(kind) is Literal:
+        return f"{name} of a map is {value!r:.40}. Use one of {', '.join(get_args(kind))}"
+    return f"{name} of a map is invalid: {error}"
+
+
+def _subject(one: Map) -> str:
+    """Return how a message calls a map whose name is unknown: by its title or caption."""
+    words = one.title or one.caption
+    return f"the map {words[:60]!r}" if words else "a map"
+
+
 def _text_problems(one: Map) -> Iterator[str]:
     for name in ("caption", "unit", "title", "displayed", "within", "included_in", "summary"):
         if not getattr(one, name).isprintable():
@@ -258,12 +273,18 @@ def _shape_problems(one: Map) -> Iterator[str]:
 
 
 def _unit_problems(one: Map) -> Iterator[str]:
-    if one.displayed:
-        ratio(one.unit, one.displayed)
+    subject = _subject(one)
+    if one.displayed and not one.unit:
+        yield f"{subject} has no unit, but is displayed in {one.displayed[:40]}. Declare its unit"
+    elif one.displayed:
+        try:
+            ratio(one.unit, one.displayed)
+        except InputError as error:
+            yield f"{subject} cannot be displayed: {error}"
     if one.quantity and one.quantity not in TABLE:
-        yield f"the quantity of a map is {one.quantity[:40]!r}. Use a built-in map's name, such as 'height'"
+        yield f"the quantity of {subject} is {one.quantity[:40]!r}. Use one of {', '.join(TABLE)}"
     elif one.quantity:
-        yield from conflicts(one, TABLE[one.quantity], f"a map of quantity {one.quantity}")
+        yield from conflicts(one, TABLE[one.quantity], f"{subject} of quantity {one.quantity}")
 
 
 _CHECKS = (_text_problems, _type_problems, _shape_problems, _unit_problems)
@@ -575,3 +596,30 @@ def check_declarations(declarations: Mapping[str, Map]) -> None:
                 raise InputError(
                     f"both {other} and {name} have the quantity {one.quantity}. Leave it out of one"
                 )
+
+
+def check_new(declarations: Mapping[str, Map], others: Container[str] = ()) -> None:
+    """Raise InputError if declarations contradict each other, or the names of other maps in one result.
+
+    This is for declarations in programs; those of files are read as they are.
+    """
+    check_declarations(declarations)
+    for name, one in declarations.items():
+        base, undefined = name.removesuffix(SIGMA), one.undefined
+        if is_deviation(name) and name not in TABLE and (base in declarations or is_builtin(base)):
+            unit = declaration_of(base, declarations).unit
+            if one.unit != unit:
+                raise InputError(
+                    f"the map {name} has the unit {one.unit or 'none'}, but {base} has the unit "
+                    f"{unit or 'none'}. Declare {unit or 'none'}"
+                )
+        if one.codes and undefined is not None and undefined not in one.codes:
+            codes = ", ".join(map(str, one.codes))
+            raise InputError(
+                f"the map {name} is undefined at {undefined:g}, which is not in its codes ({codes:.100})"
+            )
+        quantity = one.quantity
+        if quantity and quantity != name and (quantity in declarations or quantity in others):
+            raise InputError(
+                f"both {quantity} and {name} have the quantity {quantity}. Leave one of them out"
+            )

@@ -14,6 +14,7 @@ from mirrorskin.io.maps import (
     UNDECLARED,
     Map,
     check_declarations,
+    check_new,
     declaration_of,
     is_builtin,
     is_deviation,
@@ -34,6 +35,8 @@ RESERVED = frozenset(
     {*FIELDS, "own_maps", "turn", "height_errors", "units", "legends", "file", "allow_pickle"}
 )
 """Names that maps cannot have, because files use them for other purposes."""
+
+_FEW_GAPS = 16  # numbers missing between codes, up to which each is searched for
 
 
 class Shown:
@@ -328,16 +331,21 @@ def result_of(
     declarations = declarations or {}
     if not isinstance(declarations, Mapping):
         raise InputError(f"maps are declared as {declarations!r:.40}. Use a dictionary of names and Map(...)")
-    check_declarations(declarations)
-    for name in (*maps, *declarations):
-        if not may_name_a_map(name):
-            taken = ", ".join(sorted(RESERVED))
-            raise InputError(f"a map cannot be called {name!r}: use letters, digits and _, but not {taken}")
+    check_maps(declarations, *maps)
     copies = {
         name: _checked_map(name, np.array(values), declaration_of(name, declarations), shape)
         for name, values in maps.items()
     }
     return Result(copies, process=process, declarations=declarations)
+
+
+def check_maps(declarations: Mapping[str, Map], *others: str) -> None:
+    """Raise InputError if maps cannot be declared like this, or with these other names in one result."""
+    check_new(declarations, others)
+    for name in (*others, *declarations):
+        if not may_name_a_map(name):
+            taken = ", ".join(sorted(RESERVED))
+            raise InputError(f"a map cannot be called {name!r}: use letters, digits and _, but not {taken}")
 
 
 def _checked_map(name: str, values: NDArray[Any], declared: Map, shape: tuple[int, int]) -> Any:
@@ -357,7 +365,28 @@ def _checked_map(name: str, values: NDArray[Any], declared: Map, shape: tuple[in
                 f"map {name} has values from {low:g} to {high:g}, which {declared.dtype} cannot hold. "
                 "Declare another dtype"
             )
-    return values.astype(declared.dtype, copy=False) if values.ndim else float(values)
+    converted = values.astype(declared.dtype, copy=False)
+    if declared.codes and values.size:
+        code = _unlisted(converted, declared.codes)
+        if code is not None:
+            legend = ", ".join(f"{number} {text}" for number, text in declared.codes.items())
+            raise InputError(
+                f"map {name} has the value {code}, which is not in its codes ({legend:.200}). Add it to codes"
+            )
+    return converted if values.ndim else float(values)
+
+
+def _unlisted(values: NDArray[Any], codes: Mapping[int, str]) -> int | None:
+    """Return a value that is not among the codes; `numpy.isin` takes 60 ms for a map of 4K."""
+    low, high = int(values.min()), int(values.max())
+    if low not in codes or high not in codes:
+        return low if low not in codes else high
+    inner = sum(low <= code <= high for code in codes)
+    if high - low + 1 - inner <= _FEW_GAPS:
+        gaps = (number for number in range(low, high) if number not in codes)
+        return next((number for number in gaps if np.any(values == number)), None)
+    others = values[~np.isin(values, [*codes])]
+    return int(others[0]) if others.size else None
 
 
 def absolute_heights(result: Result) -> NDArray[np.float32] | None:

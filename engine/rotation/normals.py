@@ -73,7 +73,7 @@ class NormalsOperation(SensorOptions, Operation):
     normals = TABLE["normals"]
     zenith = TABLE["zenith"]
     azimuth = TABLE["azimuth"]
-    normals_sigma = TABLE["normals"].deviation("normals")
+    normals_sigma = TABLE["normals_sigma"]
     contact = TABLE["contact"]
     mean = TABLE["mean"]
     cosine = TABLE["cosine"]

@@ -131,6 +131,12 @@ def test_the_summary_is_about_the_declared_map(name, line):
     assert str(summarise(of(name))).startswith(line)
 
 
+def test_the_range_in_json_has_as_many_digits_as_float32():
+    values = np.full(SHAPE, np.float32(-2.9941936))
+    facts = summarise(of("wear").assign(wear=values)).as_dict()
+    assert (facts["lowest"], facts["highest"], facts["unit"]) == (-2994.19355, -2994.19355, "µm")
+
+
 @pytest.mark.parametrize(
     ("name", "title", "label"),
     [
@@ -178,7 +184,7 @@ def test_a_report_has_the_caption_the_unit_and_the_legend(name, tmp_path):
     result = of(name)
     declared = result.declaration(name)
     caption, alternative = picture_texts(result, name)
-    assert declared.caption in caption
+    assert declared.caption.casefold() in caption.casefold()
     assert declared.figure_unit in alternative
     (row,) = (row for row in map_rows(result) if row[0] == name)
     assert row[1] == declared.unit
@@ -297,14 +303,8 @@ def test_an_operation_declares_its_maps(tmp_path):
 @pytest.mark.parametrize(
     ("maps", "result", "message"),
     [
-        ({"height": io.Map("h", "µm")}, {"height": BALL}, "height has the unit µm. Declare mm"),
         ({"a": io.Map(codes={1: "b"})}, {"a": MATERIAL + 300}, "values from 300 to 302, which uint8 cannot"),
         ({"a": io.Map(codes={1: "b"})}, {"a": BALL}, "which uint8 cannot hold. Declare another dtype"),
-        (
-            {name: io.Map(unit="mm", quantity="height") for name in "ab"},
-            {"a": BALL, "b": BALL},
-            "both a and b have the quantity height",
-        ),
         ({"a": io.Map(components=("x", "y"))}, {"a": BALL}, r"map a is float32 \(24, 32\): numbers"),
     ],
 )

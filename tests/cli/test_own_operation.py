@@ -180,7 +180,7 @@ def test_measure_score_and_fuse_take_its_height(result):
 
 def test_figures_and_the_report_have_its_title_unit_and_legend(folder, result, tmp_path):
     figure = overview(result, name="res.h5")
-    assert panel(figure, "Depth").child_axes[0].get_ylabel() == "depth (mm)"
+    assert panel(figure, "Depth").child_axes[0].get_ylabel() == "depth (µm)"
     assert [text.get_text().splitlines()[0] for text in panel(figure, "Kind").get_legend().get_texts()]
     assert run("report", folder / "res.h5", "-o", tmp_path / "res.html").code == 0
     page = (tmp_path / "res.html").read_text(encoding="utf-8")

@@ -217,3 +217,12 @@ def test_other_commands_refuse_too(tmp_path, monkeypatch, words, said_of):
     assert said_of in said
     assert said.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("command", ["run mirrorskin.engine:Onset", "reconstruct"])
+def test_a_result_is_not_written_as_another_format(tmp_path, command):
+    ours(tmp_path / "press.h5")
+    ended = run(*command.split(), tmp_path / "press.h5", "-o", tmp_path / "w.csv")
+    assert ended.code == 2
+    assert ended.said.endswith("write it so, then 'mirrorskin export' makes .csv of it\n")
+    assert not (tmp_path / "w.csv").exists()

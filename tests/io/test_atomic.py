@@ -1,10 +1,12 @@
 """Files that exist whole or not at all, and what is left of those whose writers were killed."""
 
+import re
 import subprocess
 import sys
 
 import pytest
 
+from mirrorskin import io
 from mirrorskin.io import atomic
 from mirrorskin.io.atomic import new_hdf5, remove_leftovers, write_new
 
@@ -102,3 +104,27 @@ def test_what_a_link_leads_to_is_replaced_and_the_link_stays(tmp_path):
     write_new(link, [b"new"])
     assert link.is_symlink()
     assert target.read_bytes() == b"new"
+
+
+@pytest.mark.parametrize(
+    ("name", "then"),
+    [
+        ("w.csv", ", then 'mirrorskin export' makes .csv of it"),
+        ("W.TIF", ", then 'mirrorskin export' makes .tif of it"),
+        ("w.html", ", then 'mirrorskin report' makes .html of it"),
+        ("w.json", ""),
+    ],
+)
+def test_a_result_with_the_suffix_of_another_format_is_refused(tmp_path, name, then):
+    message = f"{tmp_path / name}: a result is HDF5 (.h5) or Zarr (.zarr): write it so{then}"
+    with pytest.raises(io.InputError, match=f"^{re.escape(message)}$"):
+        io.check_output(tmp_path / name, or_zarr=True)
+
+
+@pytest.mark.parametrize("name", ["w.h5", "w.hdf5", "w.nxs", "w", "run.7"])
+def test_a_result_may_have_a_suffix_of_no_other_format(tmp_path, name):
+    io.check_output(tmp_path / name, or_zarr=True)
+
+
+def test_a_file_that_is_no_result_may_have_any_suffix(tmp_path):
+    io.check_output(tmp_path / "page.html")

@@ -31,8 +31,10 @@ CODES = np.zeros((3, 4), np.uint8)
     ("fields", "message"),
     [
         ({"unit": 5}, "unit of a map is invalid: Expected `str`, got `int`"),
-        ({"axes": "pixel"}, "axes of a map is invalid: Invalid enum value 'pixel'"),
-        ({"codes": ["a"]}, "codes of a map is invalid: Expected `object`, got `array`"),
+        ({"axes": "pixel"}, "axes of a map is 'pixel'. Use one of pixels, frames, pieces, none"),
+        ({"colours": "red"}, "colours of a map is 'red'. Use one of sequential, positive, signed, error"),
+        ({"codes": ["a"]}, "codes of a map are ['a']: codes are a dictionary of integers and texts"),
+        ({"codes": {1: 5}}, "codes of a map are {1: 5}: codes are a dictionary of integers and texts"),
         ({"codes": {256: "a"}}, "256 is not a value of uint8. Declare another dtype"),
         ({"codes": {1: "a"}, "dtype": "float32"}, "a map of float32 has codes. Declare a dtype of integers"),
         ({"codes": dict.fromkeys(range(256), "a")}, "a legend has 256 codes; at most 255"),
@@ -42,7 +44,22 @@ CODES = np.zeros((3, 4), np.uint8)
         ({"caption": "a" * LONGEST_DECLARATION}, "longer than 60000 bytes. Shorten its texts"),
         ({"dtype": "V99999999999"}, "the dtype of a map is 'V99999999999'. Use one of uint8"),
         ({"unit": "mm", "displayed": "N"}, "'mm' cannot be converted to 'N'"),
-        ({"unit": "mm", "quantity": "heigth"}, "the quantity of a map is 'heigth'. Use a built-in"),
+        (
+            {"caption": "rise", "displayed": "µm"},
+            "the map 'rise' has no unit, but is displayed in µm. Declare its unit",
+        ),
+        (
+            {"caption": "rise", "unit": "mm", "displayed": "N"},
+            "the map 'rise' cannot be displayed: 'mm' cannot be converted to 'N'",
+        ),
+        (
+            {"unit": "mm", "quantity": "heigth"},
+            "the quantity of a map is 'heigth'. Use one of height, status,",
+        ),
+        (
+            {"caption": "rise", "unit": "µm", "quantity": "height"},
+            "the map 'rise' of quantity height has the unit µm. Declare mm",
+        ),
         ({"quantity": "height"}, "a map of quantity height has the unit none. Declare mm"),
         ({"components": ("x",)}, "the components of a map are not 2 to 16 different names"),
         ({"components": ("x", "y"), "axes": "frames"}, "a map has components, but is not a map of vectors"),

@@ -43,9 +43,10 @@ def draw_height(axes: Axes, sheet: Sheet, cut: Section | None = None) -> None:
 
     height = sheet.result.height
     assert height is not None
-    ends, scale = apart(*span(height)), sheet.of_height.figure_scale
+    low, high = ends = apart(*span(height))
+    scale = sheet.of_height.figure_scale
     draw_map(axes, sheet, height_picture(height, sheet.filled, ends), interpolation="antialiased")
-    colours = ScalarMappable(Normalize(*(scale * end for end in ends)), SEQUENTIAL)
+    colours = ScalarMappable(Normalize(scale * low, scale * high), SEQUENTIAL)
     explain_colours(axes, colours, _label(quantity(sheet), sheet.of_height), exceeded(height, *ends))
     if sheet.true_to_scale and sheet.unit == "mm" and height.size > 1:
         _draw_scale(axes, sheet)
