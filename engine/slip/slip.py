@@ -29,8 +29,6 @@ class Traction(Step):
 
     def apply(self, result: Result, context: Context) -> Result:
         """Return the result with traction and force; if they cannot be computed, the process says why."""
-        from mirrorskin.engine.force.tangential import find_tangential_force
-
         source, modulus, modulus_sigma, origin = context.source, self.modulus, 0.0, "given"
         if modulus is None:
             stiffness = source.calibration.stiffness if isinstance(source, Calibrated) else None
@@ -38,6 +36,8 @@ class Traction(Step):
                 return result
             modulus, modulus_sigma = stiffness.modulus, math.sqrt(stiffness.covariance[0, 0])
             origin = "of the calibration"
+        from mirrorskin.engine.force.tangential import find_tangential_force
+
         try:
             force = find_tangential_force(
                 result,
