@@ -115,7 +115,7 @@ def run_frames(device: Device, quick: bool) -> Case:
         for dz_dx, dz_dy in frames:
             start = time.perf_counter()
             integrator.push(dz_dx, dz_dy, mask=mask)
-            height = integrator.result().height
+            height: NDArray[np.float32] = integrator.result().height
             seconds.append(time.perf_counter() - start)
         return height
 
@@ -143,7 +143,8 @@ def run_many(device: Device, quick: bool) -> Case:
     truth = find_truth(slopes[:, -1], mask, None)
 
     def find(some: Floats) -> Floats:
-        return engine.integrate(some[0], some[1], PIXEL, mask=mask, device=device).height
+        height: Floats = engine.integrate(some[0], some[1], PIXEL, mask=mask, device=device).height
+        return height
 
     one, all_ = (count * _FULL * pixels + pixels for count in (1, _SIDES))
     works = {OURS: Work(partial(find, slopes), all_), alone: Work(partial(find, slopes[:, -1]), one)}
@@ -185,9 +186,10 @@ def _calls(
     """Return `integrate` with its defaults, that is with sigma, and without sigma."""
 
     def call(sigma: bool) -> Floats:
-        return engine.integrate(
+        height: Floats = engine.integrate(
             slopes[0], slopes[1], PIXEL, mask=mask, edges=edges, sigma=sigma, device=device
         ).height
+        return height
 
     default = partial(call, True)
     return {

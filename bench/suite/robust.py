@@ -94,7 +94,7 @@ CASES: Cases = {"integrate-robust": run_robust}
 
 
 def _integrate(scene: Scene, robust: bool, device: Device) -> NDArray[np.float32]:
-    return engine.integrate(
+    height: NDArray[np.float32] = engine.integrate(
         normals=scene.normals,
         mask=scene.mask,
         pixel_size=scene.pixel_size,
@@ -102,6 +102,7 @@ def _integrate(scene: Scene, robust: bool, device: Device) -> NDArray[np.float32
         sigma=False,
         device=device,
     ).height
+    return height
 
 
 def _once(name: str, seconds: float, scene: Scene) -> Row:
