@@ -75,7 +75,12 @@ def _fuse(shape: Shape, device: Device) -> Call:
     offset, gain, _ = SCALES[_BYTE.name]
     dark, bright = LEVELS[_BYTE.name]
     onset = engine.find_onset(frames, travel_of(_PRESS), dark=dark, bright=bright, device=device)
-    options: dict[str, Any] = {"tilt": TILT, "gain": gain, "offset": offset, "noise": turn_noise(_BYTE)}
+    options: dict[str, Any] = {
+        "tilt": TILT,
+        "zenith_gain": gain,
+        "zenith_offset": offset,
+        "noise": turn_noise(_BYTE),
+    }
     normals = engine.estimate_normals(turns, phases(STEPS), device=device, **options)
     moved = (4 + 3 * 4) * math.prod(shape)  # heights and normals
     return partial(engine.fuse, onset, normals, PIXEL, device=device), moved, 0

@@ -19,7 +19,7 @@ WORKERS = 2
 def workers():
     """A scheduler, and workers that are processes and are started again when they end."""
     with (
-        cluster._own_cluster(WORKERS) as running,
+        cluster._local_cluster(WORKERS) as running,
         distributed.Client(running, set_as_default=False) as client,
     ):
         yield client
