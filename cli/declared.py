@@ -221,20 +221,19 @@ class ClassCommand(Command):
         from mirrorskin.io import InputError
 
         kind = load_operation(name)
-        own = {
-            flag: one
-            for one in self.params
-            if not getattr(one, "of_engine", False)
-            for flag in (*one.opts, *one.secondary_opts)
-        }
+        taken: dict[str, click.Parameter | None] = dict.fromkeys(
+            self.get_help_option_names(click.Context(self))
+        )
+        for one in self.params:
+            if not getattr(one, "of_engine", False):
+                taken |= dict.fromkeys((*one.opts, *one.secondary_opts), one)
         terms = []
-        for one in terms_of({"": kind}):
-            same = own.get(one.flag)
-            if same is None and one.flag not in self.get_help_option_names(click.Context(self)):
-                terms.append(one)
-            elif one.name not in _SHARED or getattr(same, "unit", None) != one.unit:
+        for wanted in terms_of({"": kind}):
+            if wanted.flag not in taken:
+                terms.append(wanted)
+            elif wanted.name not in _SHARED or getattr(taken[wanted.flag], "unit", None) != wanted.unit:
                 raise InputError(
-                    f"{name} has an option {one.name}, and so has 'mirrorskin {self.name}' for something"
+                    f"{name} has an option {wanted.name}, and so has 'mirrorskin {self.name}' for something"
                     " else. Rename that of the class"
                 )
         return kind, [DeclaredOption(one) for one in terms]

@@ -114,14 +114,6 @@ class Method(OnDevice):
         """Return what is done with a source whose frames come while the body moves."""
         return self.plan(source)
 
-    def check_motion(self, source: Source) -> None:
-        """Raise InputError unless the method applies to the source's motion."""
-        if self.motions and source.motion not in self.motions:
-            motions = " or ".join(self.motions)
-            raise InputError(
-                f"{source.name} has {source.motion} motion, but {type(self).__name__} needs {motions} motion"
-            )
-
     def run(self, source: Source, progress: Progress | None = None, *, undistort: bool = True) -> Result:
         """Reconstruct a source.
 
@@ -144,7 +136,7 @@ class Method(OnDevice):
         mirrorskin.io.InputError
             The source has another motion, or it and the options cannot be used.
         """
-        self.check_motion(source)
+        check_motion(source, self)
         with naming(source):
             plan = self.plan(source)
             feed(plan.stream or source, plan.operation, plan.frames, progress)
@@ -158,6 +150,15 @@ class Method(OnDevice):
     def make(self, kind: type[Configured], **changes: Any) -> Any:
         """Return an operation or step with this method's values of its options."""
         return kind(**{**self.part(kind), **changes})
+
+
+def check_motion(source: Source, computed: Operation | Method) -> None:
+    """Raise InputError if an operation or a method does not apply to a source's motion."""
+    if computed.motions and source.motion not in computed.motions:
+        motions = " or ".join(computed.motions)
+        raise InputError(
+            f"{source.name} has {source.motion} motion, but {type(computed).__name__} needs {motions} motion"
+        )
 
 
 def undistorted(result: Result, source: Source) -> Result:

@@ -28,6 +28,7 @@ P = ParamSpec("P")
 
 _COMPONENTS = {"displacement": (2,), "pose": (4,)}  # positions that are not single numbers
 _NOT_POSITIONS = ("lent", "frame_weights")  # keywords of push that are not positions of the body
+_SIMPLE_TYPES = ("bool", "float", "int", "str")  # annotations of options, not of maps
 ABOUT_WEIGHTS = "Weight of each frame, such as its inverse variance; 0 for a missing frame. By default 1."
 """Description of ``frame_weights`` of array functions."""
 
@@ -144,7 +145,6 @@ class Operation(ThreadSafe, OnDevice):
         found: dict[str, Map] = {}
         for base in reversed(cls.__mro__):
             found |= {name: one for name, one in vars(base).items() if isinstance(one, Map)}
-        _check_maps(cls, found)
         cls.maps = found
         _check_class(cls)
         if "push" in vars(cls):
@@ -300,19 +300,6 @@ class Operation(ThreadSafe, OnDevice):
             raise InputError(f"{type(self).__name__} does not take {names}. It takes {taken}")
 
 
-def _check_maps(kind: type[Operation], maps: Mapping[str, Map]) -> None:
-    """Raise InputError if maps of a class have names or units that its results cannot have."""
-    try:
-        check_maps(maps)
-    except InputError as error:
-        raise InputError(f"{kind.__name__}: {error}") from error
-    for name in maps:
-        if hasattr(Operation, name):
-            raise InputError(
-                f"{kind.__name__}: a map cannot be called {name!r}, which operations use. Choose another name"
-            )
-
-
 def _checked_push(method: Callable[..., None]) -> Callable[..., None]:
     """Return a method ``push`` that checks its arguments, and counts frames."""
 
@@ -382,19 +369,23 @@ def _checked_result(method: Callable[..., Any]) -> Callable[..., Result]:
 def _check_class(cls: type[Operation]) -> None:
     """Raise InputError if the attributes of a class cannot be those of an operation."""
     own, name = vars(cls), cls.__name__
+    try:
+        check_maps(cls.maps)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
+    for one in cls.maps:
+        if hasattr(Operation, one):
+            raise InputError(
+                f"{name}: a map cannot be called {one!r}, which operations use. Choose another name"
+            )
+    for one, kind in inspect.get_annotations(cls).items():
+        if isinstance(own.get(one), Map) and getattr(kind, "__name__", kind) in _SIMPLE_TYPES:
+            raise InputError(f"{name}: {one} is an option and a map. Rename one of them")
     if isinstance(own.get("passes"), int) and own["passes"] not in (1, 2):
         raise InputError(f"{name}: passes is {own['passes']}. Frames are pushed once or twice: use 1 or 2")
     if isinstance(cls.motions, str) or not set(cls.motions) <= {*get_args(Motion)}:
         motions = ", ".join(get_args(Motion))
         raise InputError(f'{name}: motions is {cls.motions!r}. Use a tuple of {motions}, such as ("axial",)')
-    for one, kind in inspect.get_annotations(cls).items():
-        if isinstance(own.get(one), Map) and getattr(kind, "__name__", kind) in (
-            "bool",
-            "float",
-            "int",
-            "str",
-        ):
-            raise InputError(f"{name}: {one} is an option and a map. Rename one of them")
 
 
 def _check_started(operation: Operation) -> None:

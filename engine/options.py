@@ -102,11 +102,6 @@ class Option:
             made.check(self.default)
         return made
 
-    @property
-    def flag_name(self) -> str:
-        """Name of the option on the command line."""
-        return f"--{self.name.replace('_', '-')}"
-
     def described(self) -> str:
         """Return type and unit for a docstring, such as ``float, share, default 0.5``."""
         kinds = {"number": "float", "integer": "int", "flag": "bool", "numbers": "sequence of float"}

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.inputs import as_result
-from mirrorskin.engine.method import Method
+from mirrorskin.engine.method import Method, check_motion
 from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.provenance import attach_provenance, describe, naming, signature
 from mirrorskin.engine.reconstruction import calibrated
@@ -137,15 +137,6 @@ def _run_source(
         result = configured.finish()
     process = {**describe(configured, source), **result.process}
     return attach_provenance(result, source, configured.opened_device, process)
-
-
-def check_motion(source: Source, operation: Operation) -> None:
-    """Raise InputError if an operation does not apply to a source's motion."""
-    if operation.motions and source.motion not in operation.motions:
-        motions = " or ".join(operation.motions)
-        raise InputError(
-            f"{source.name} has {source.motion} motion, but {type(operation).__name__} needs {motions} motion"
-        )
 
 
 def _run_frames(

@@ -83,12 +83,10 @@ def _feed_once(source: Source, operation: Operation, frames: range, progress: Pr
 def push_block(operation: Receiver, block: Block, part: slice = slice(None)) -> None:
     """Push what a source yields, or a part of it: frames and what the operation needs of each."""
     given = {}
-    for name, needed in operation.positions.items():
+    for name in operation.positions:
         values = getattr(block, name, None)
         if values is not None:
             given[name] = values[part]
-        elif needed:
-            raise InputError(f"{name} is missing: {type(operation).__name__} needs it of each frame")
     operation.push(block.frames[part], **given, lent=block.lent)
 
 

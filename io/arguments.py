@@ -109,12 +109,6 @@ def as_array(name: str, value: Any) -> NDArray[Any]:
     return np.where(mask, array.dtype.type(0), array)
 
 
-def check_has(name: str, value: Any, *parts: str) -> None:
-    """Raise InputError unless an argument has the given attributes."""
-    if not all(hasattr(value, part) for part in parts):
-        raise InputError(f"{name} is {shown(value)}: something with {' and '.join(parts)} is needed")
-
-
 def _as_array_or_number(name: str, value: Any) -> Any:
     return value if isinstance(value, Real) else as_array(name, value)
 

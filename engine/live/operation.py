@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.live.status import Maps
-from mirrorskin.engine.method import Method, Plan, undistorted
+from mirrorskin.engine.method import Method, Plan, check_motion, undistorted
 from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.provenance import describe, naming
-from mirrorskin.engine.running import check_motion
 from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError, LiveSource, Result
 from mirrorskin.io.layout import POSITIONS
@@ -131,11 +130,10 @@ class LiveOperation(ThreadSafe):
 
 def _live_plan(source: LiveSource, operation: Operation | Method, size: int) -> Plan:
     """Return the plan for a source; ``size`` is the largest number of bytes of a push."""
+    check_motion(source, operation)
     if isinstance(operation, Method):
-        operation.check_motion(source)
         plan = operation.live_plan(source)
     else:
-        check_motion(source, operation)
         configured = operation.configured_for(source)
         plan = Plan(configured, process=describe(configured, source))
     return replace(plan, operation=plan.operation.with_options(memory_limit=2 * size))

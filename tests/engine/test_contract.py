@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
-import inspect
-import pkgutil
-
 import numpy as np
 import pytest
-from operations import CASES, CUTS, Case
+from operations import CASES, CUTS, Case, engine_classes
 
 from mirrorskin import engine, io
 from mirrorskin.engine.live import LiveOperation
@@ -132,17 +128,7 @@ def test_frames_that_do_not_fit_are_refused_and_change_nothing(name, wrong):
 
 
 def test_every_operation_has_a_case():
-    modules = [
-        importlib.import_module(one.name)
-        for one in pkgutil.walk_packages(engine.__path__, "mirrorskin.engine.")
-        if not one.name.startswith("mirrorskin.engine.batch")
-    ]
-    kinds = {
-        one
-        for module in modules
-        for one in vars(module).values()
-        if inspect.isclass(one) and issubclass(one, engine.Operation) and one.maps
-        if one.__module__.startswith("mirrorskin.engine.") and one.push is not engine.Operation.push
-    }
+    operations = (one for one in engine_classes() if issubclass(one, engine.Operation) and one.maps)
+    kinds = {one for one in operations if one.push is not engine.Operation.push}
     bases = {base for kind in kinds for base in kind.__mro__[1:]}
     assert kinds - bases <= {case.kind for case in CASES.values()}

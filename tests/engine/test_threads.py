@@ -1,8 +1,5 @@
 """Operations in several threads: one pushes, others look on, and every answer is that of one thread."""
 
-import importlib
-import inspect
-import pkgutil
 import threading
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -140,16 +137,10 @@ def test_each_answer_beside_pushes_is_that_of_a_single_thread(name):
 
 
 def test_every_class_that_is_pushed_to_is_thread_safe():
-    modules = [
-        importlib.import_module(one.name)
-        for one in pkgutil.walk_packages(engine.__path__, "mirrorskin.engine.")
-        if not one.name.startswith("mirrorskin.engine.batch")
-    ]
     public = {
         one
-        for module in modules
-        for name, one in vars(module).items()
-        if inspect.isclass(one) and one.__module__ == module.__name__ and not name.startswith("_")
+        for one in operations.engine_classes()
+        if not one.__name__.startswith("_")
         if callable(getattr(one, "push", None)) and callable(getattr(one, "result", None))
     }
     inside = {"NormalWindow", "WarmStartIntegrator", "StackSums", "TurnSums", "WindowSums"}

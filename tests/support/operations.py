@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -36,6 +39,15 @@ ROCKED = np.clip(120 + 400 * LEAN[:, None, None] + np.zeros(SHAPE), 0, 255).asty
 SLIDE = np.arange(12)[:, None] * [0.006, 0.003]
 SKIN = np.stack([Speckle(3).frame((64, 72), -x / PIXEL, y / PIXEL, 1.0, k) for k, (x, y) in enumerate(SLIDE)])
 LAMPS = np.stack([np.cos(PHASE), np.sin(PHASE), np.ones(len(PHASE))], axis=1)
+
+
+def engine_classes() -> Iterator[type]:
+    """Yield each class that a module of the engine defines; those of batches need Dask."""
+    for found in pkgutil.walk_packages(engine.__path__, "mirrorskin.engine."):
+        if not found.name.startswith("mirrorskin.engine.batch"):
+            for one in vars(importlib.import_module(found.name)).values():
+                if inspect.isclass(one) and one.__module__ == found.name:
+                    yield one
 
 
 class Readable(MadeUp):
