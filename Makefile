@@ -1,10 +1,10 @@
-# make [demo|test|test-all|test-lowest|test-browser|test-cameras|test-hardware|docs|lint|types|fuzz|bench|portability|gpu-check|gpu|clean]; each sets up what it needs in .venv first.
+# make [demo|test|test-all|test-lowest|test-browser|test-cameras|test-hardware|docs|lint|types|fuzz|bench|portability|gpu-check|gpu|gpu-wheels|clean]; each sets up what it needs in .venv first.
 # PYTHON=/path/to/python3.12 chooses the interpreter (3.11 or newer).
 
 SHELL := /bin/sh
 .SHELLFLAGS := -ec
 .ONESHELL:
-.PHONY: demo test test-all test-lowest test-browser test-cameras test-hardware docs lint types fuzz bench portability gpu-check gpu clean
+.PHONY: demo test test-all test-lowest test-browser test-cameras test-hardware docs lint types fuzz bench portability gpu-check gpu gpu-wheels clean
 
 PYTHON ?= $(shell for python in python3.13 python3.12 python3.11 python3; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
@@ -92,9 +92,19 @@ portability: $(READY)
 gpu-check: .venv/.ptxas
 	@$(BIN)/python tests/portability/gpu_check.py
 
-# The day that a GPU is there: tests, answers and limits, in gpu.json and gpu.md.
+# With a GPU: copies, whole calls, answers and device tests, in gpu.json and gpu.md.
 gpu: $(READY)
 	@PYTHONPATH=bench $(BIN)/python tests/portability/gpu.py
+
+# Wheels for a machine with a GPU and without network: carry the checkout there, and run
+# 'tests/portability/gpu.sh build/gpu-wheels'. VERSION is that machine's Python.
+VERSION ?= 3.12
+gpu-wheels: $(READY)
+	@rm -rf build/gpu-wheels
+	$(PIP) wheel --no-deps --wheel-dir build/gpu-wheels .
+	$(PIP) download --no-deps --only-binary=:all: --dest build/gpu-wheels --python-version $(VERSION) \
+	    $(patsubst %,--platform manylinux%_x86_64,2014 _2_17 _2_27 _2_28 _2_34) click flexcache flexparser lazy_loader \
+	    msgspec pint platformdirs pyopencl pyserial pytools siphash24 tifffile typing_extensions
 
 clean:
 	@rm -rf .venv build site dist *.egg-info .hypothesis .import_linter_cache

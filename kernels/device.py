@@ -39,6 +39,7 @@ _log = logging.getLogger("mirrorskin.kernels")
 _opening = threading.Lock()
 _opened: list[Device] = []
 _KINDS = ("gpu", "cpu")  # in the order in which they are taken
+_PLACE = re.compile(r"(\w+\.clh?|<kernel>):(\d+):(\d+):\s*(?:fatal )?(?:error:)?\s*(.+)")
 _INSTALL = "install a GPU's OpenCL driver, or on x86-64 Linux 'pip install pocl-binary-distribution'"
 
 
@@ -366,7 +367,7 @@ class Device:
                 with waiting:
                     program = self._compile(source, ["-cl-std=CL1.2", *options])
         except cl.RuntimeError as error:
-            raise DeviceError(_explain_build(path, text, str(error), self.info)) from error
+            raise DeviceError(_explain_build(path, source, str(error), self.info)) from error
         self.profile.add("compile", path.stem, time.perf_counter() - start)
         defines = dict(option.removeprefix("-D").split("=", 1) for option in options)
         return program, read_signatures(source, defines)
@@ -602,13 +603,28 @@ def _shared(name: str) -> str:
     return _with_includes(name, (_FOLDER / name).read_text(encoding="utf-8"))
 
 
-def _explain_build(path: Path, text: str, log: str, info: DeviceInfo) -> str:
+def _explain_build(path: Path, source: str, log: str, info: DeviceInfo) -> str:
     """Quote the first line that a compiler complains of, in one line."""
-    found = re.search(r"(\w+\.clh?):(\d+):(\d+):\s*(?:fatal )?(?:error:)?\s*(.+)", log)
+    errors = [line.strip() for line in log.splitlines() if "error" in line.lower()]
+    found = next(filter(None, (_PLACE.search(line) for line in errors)), _PLACE.search(log))
+    lines = _lines_of(source)
     if found is None:
-        errors = [line.strip() for line in log.splitlines() if "error" in line.lower()]
         return f"{path.name} does not compile on {info.title}: {(errors or [log.strip()])[-1]}"
-    file, number, message = found[1], int(found[2]), found[4].strip()
-    lines = (text if file == path.name else (_FOLDER / file).read_text(encoding="utf-8")).splitlines()
-    quoted = f" `{lines[number - 1].strip()}`" if 0 < number <= len(lines) else ""
+    number, message = int(found[2]), found[4].strip()
+    if found[1] == "<kernel>":  # NVIDIA's compiler counts the lines of the whole source
+        file, number, text = lines[min(number, len(lines)) - 1]
+    else:
+        file, text = found[1], next((text for *place, text in lines if place == [found[1], number]), "")
+    quoted = f" `{text.strip()}`" if text else ""
     return f"{file} line {number} does not compile on {info.title}: {message}{quoted}"
+
+
+def _lines_of(source: str) -> list[tuple[str, int, str]]:
+    """Return each line of a source with its includes, with its file and its number there."""
+    found, file, number = [], "", 0
+    for line in source.splitlines():
+        found.append((file, number, line))
+        number += 1
+        if place := re.fullmatch(r'#line (\d+) "(.+)"', line):
+            number, file = int(place[1]), place[2]
+    return found

@@ -397,17 +397,11 @@ value gathered(
     for (int x = lane * WIDTH - ((more) ? SIDE : 0), i = base + stride * (top + y + 1) + left + x,         \
              p = (y + AROUND) * ACROSS + SIDE + x;                                                         \
          x < wide + ((more) ? SIDE : 0); x += lanes * WIDTH, i += lanes * WIDTH, p += lanes * WIDTH)
-#define FILL(more, room, ...)                                                                              \
-    EACH_LINE(more) {                                                                                      \
-        if (top + y >= 0 && top + y < rows) {                                                              \
-            EACH_OF_LINE(more) {                                                                           \
-                __VA_ARGS__                                                                                \
-            }                                                                                              \
-        } else {                                                                                           \
-            EACH_OF_LINE(more) PUT_NEAR(room + p) = 0;                                                     \
-        }                                                                                                  \
-    }                                                                                                      \
-    barrier(CLK_LOCAL_MEM_FENCE);
+// What follows is done for the nodes of a tile and `more` around it; outside of the level's rows the room is set to 0.
+#define FILL(more, room)                                                                                   \
+    EACH_LINE(more) if (top + y < 0 || top + y >= rows) EACH_OF_LINE(more) PUT_NEAR(room + p) = 0;         \
+    EACH_LINE(more) if (top + y >= 0 && top + y < rows) EACH_OF_LINE(more)
+#define FILLED barrier(CLK_LOCAL_MEM_FENCE);
 #define STEP_NEAR(omega, from, to) SIDES PUT_NEAR(to + p) = STEP_BY(omega, NEAR, from + p, ACROSS);
 #define EACH_COARSE_OF_TILE                                                                                \
     for (int y = line, coarse_of_tile = coarse_base + coarse_stride * (top / 2 + 1) + left / 2;            \
@@ -435,16 +429,25 @@ __kernel void multigrid_descend(
 {
     TILE_ITEMS
     if (again) {
-        FILL(3, one, SIDES PUT_NEAR(one + p) = STEP_BY(FIRST, AT, x_before + i, stride);)
+        FILL(3, one) { SIDES PUT_NEAR(one + p) = STEP_BY(FIRST, AT, x_before + i, stride); }
     } else {
-        FILL(3, one, PUT_NEAR(one + p) = FIRST * AT(inverse + i) * AT(b + i);)
+        FILL(3, one) PUT_NEAR(one + p) = FIRST * AT(inverse + i) * AT(b + i);
     }
-    FILL(2, other, STEP_NEAR(SECOND, one, other))
-    FILL(1, one, STEP_NEAR(THIRD, other, one) if (MINE) STREAM(t + i, NEAR(one + p));)
-    FILL(0, other, SIDES
+    FILLED
+    FILL(2, other) { STEP_NEAR(SECOND, one, other) }
+    FILLED
+    FILL(1, one) {
+        STEP_NEAR(THIRD, other, one)
+        if (MINE) STREAM(t + i, NEAR(one + p));
+    }
+    FILLED
+    FILL(0, other) {
+        SIDES
         const values rest = AT(b + i) + FLOW(NEAR, one + p, ACROSS);
         PUT_NEAR(other + p) = rest;
-        if (keep) PUT(residual + i) = rest;)
+        if (keep) PUT(residual + i) = rest;
+    }
+    FILLED
     EACH_COARSE_OF_TILE {
         __local const value *upper = other + (2 * y + AROUND) * ACROSS + SIDE + 2 * x, *lower = upper + ACROSS;
         const values sum = (EVEN_OF(NEAR, upper) + ODD_OF(NEAR, upper)) + (EVEN_OF(NEAR, lower) + ODD_OF(NEAR, lower));
@@ -470,16 +473,23 @@ __kernel void multigrid_ascend(
     OUT_VALUES x_new, OUT_VALUES parts)
 {
     TILE_ITEMS
-    FILL(3, one,
+    FILL(3, one) {
         const int J = coarse_base + coarse_stride * (((top + y) >> 1) + 1) + ((left + x) >> 1);
-        PUT_NEAR(one + p) = AT(t + i) + injected(i, J, coarse_stride, e, moved_nodes, to);)
-    FILL(2, other, STEP_NEAR(THIRD, one, other))
-    FILL(1, one, STEP_NEAR(SECOND, other, one))
+        PUT_NEAR(one + p) = AT(t + i) + injected(i, J, coarse_stride, e, moved_nodes, to);
+    }
+    FILLED
+    FILL(2, other) { STEP_NEAR(THIRD, one, other) }
+    FILLED
+    FILL(1, one) { STEP_NEAR(SECOND, other, one) }
+    FILLED
     values sum = 0;
-    FILL(0, other, SIDES
+    FILL(0, other) {
+        SIDES
         const values height = STEP_BY(FIRST, NEAR, one + p, ACROSS);
         STREAM(x_new + i, height);
-        sum += height * AT(b + i);)
+        sum += height * AT(b + i);
+    }
+    FILLED
     for (int y = line; y < ROWS && top + y < rows && !is_live; y += lines) {
         EACH_OF_LINE(0) PUT(x_new + i) = 0;
     }
