@@ -2,6 +2,7 @@
 //
 // TILE     pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
 // ONE      1 where there is one component: labels are then not read
+// GROUP    work-items that add up one component of a strip together; 1 where an item adds up all components of its strip
 //
 // PoCL makes vector code of loops without branches.
 
@@ -19,8 +20,10 @@
 
 #if ONE
 #define LABEL(p) 0
+#define IS_OF(p, component) 1
 #else
 #define LABEL(p) (labels[p] > 0 ? labels[p] : 0)
+#define IS_OF(p, component) (labels[p] == (component))
 #endif
 
 // Both are there before one is chosen: no branch.
@@ -40,12 +43,39 @@ float chosen(const int which, const float one, const float other)
     total += share;                                                                                    \
 }
 
-// Each item sums over its rows, into its own row of the sums.
-__kernel void components_sum(
+// Sums over strips of rows, each into its own row of the sums.
+__kernel GROUP_SIZE void components_sum(
     const int rows, const int columns, __global const uchar *restrict flags, __global const int *restrict labels,
     MAP reliefs, const int place, const float plane_x, const float plane_y, const float plane_z, MAP heights, MAP height_weights,
     const int strip, const int components, OUT sums, OUT totals)
 {
+#if GROUP > 1
+    __local float some[GROUP], share_of[GROUP];
+    const int lane = get_local_id(0), lanes = get_local_size(0);
+    const int item = get_group_id(0) / components, component = get_group_id(0) % components;
+    const int top = item * strip, bottom = LESSER(rows, top + strip);
+    MAP relief = reliefs + (long)place * rows * columns;
+    float part = 0.0f, shares = 0.0f;
+    for (int row = top; row < bottom; ++row) {
+        const float start = plane_z + plane_y * row;
+        const int first = row * columns;
+        for (int column = lane; column < columns; column += lanes)
+            if (IS_OF(first + column, component)) ADD(part, shares, first + column, column)
+    }
+    some[lane] = part;
+    share_of[lane] = shares;
+    for (int reach = lanes / 2; reach > 0; reach /= 2) {
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (lane < reach) {
+            some[lane] += some[lane + reach];
+            share_of[lane] += share_of[lane + reach];
+        }
+    }
+    if (lane == 0 && top < rows) {
+        sums[item * components + component] = some[0];
+        totals[item * components + component] = share_of[0];
+    }
+#else
     const int item = get_global_id(0), top = item * strip, bottom = LESSER(rows, top + strip);
     if (top >= rows) return;
     MAP relief = reliefs + (long)place * rows * columns;
@@ -83,6 +113,7 @@ __kernel void components_sum(
         }
 #endif
     }
+#endif
 }
 
 __kernel void components_add_offsets(

@@ -488,8 +488,11 @@ class Kernel:
 
 
 def _group_of(kernel: cl.Kernel, device: cl.Device, wanted: int) -> int:
-    """Return the work-items of a group: as many as wanted, unless the kernel or the device allows fewer."""
+    """Return the work-items of a group: what the kernel demands, else what is wanted and allowed."""
     ask = cl.kernel_work_group_info
+    demanded = int(kernel.get_work_group_info(ask.COMPILE_WORK_GROUP_SIZE, device)[0])
+    if demanded:
+        return demanded
     allowed = kernel.get_work_group_info(ask.WORK_GROUP_SIZE, device)
     most = min(wanted, allowed, device.max_work_item_sizes[0])
     lanes = kernel.get_work_group_info(ask.PREFERRED_WORK_GROUP_SIZE_MULTIPLE, device)

@@ -6,6 +6,7 @@
 // PART       nodes of one part of a sum
 // LINKS      of a node: 4, or 8 on coarse levels whose aggregates are not all blocks of two by two
 // ANCHORED   1 where there are known heights, 0 where there are none
+// GROUP      work-items of the group that does all small levels, 1 where an item is a core's loop
 // LANES      right sides that are solved for at once, 1, 4, 8 or 16: a node's value is a vector of them; WIDTH is 1 then
 //
 // All levels lie one after the other in the same arrays. A level begins at `base` with a row of nodes that are
@@ -503,7 +504,8 @@ __kernel void multigrid_ascend(
 }
 
 // A cycle over all levels from `from` on, too small for launches of their own, by one group: the answer to b goes to x, from
-// heights x if `again` is 1. Levels up to `twice` are gone through twice.
+// heights x if `again` is 1. If `twice` is 1, each coarser level is followed by another visit, from there straight to the
+// coarsest one and back.
 typedef struct {
     int base, rows, stride, moved;
 } Level;
@@ -520,11 +522,11 @@ typedef struct {
         PUT(to + i) = STEP_BY(omega, AT, from + i, stride);                                                \
     }                                                                                                      \
     FENCE
-__kernel void multigrid_tail(
+__kernel GROUP_SIZE void multigrid_tail(
     const int from, const int last, __global const Level *restrict levels, GRAPH_ARGS, MAP inverse,
-    BYTES to, COUNTS changed, const int again, __global value *b, __global value *x, __global value *t)
+    BYTES to, COUNTS changed, const int again, const int twice, __global value *b, __global value *x, __global value *t)
 {
-    int l = from, start = again, gone = 0;  // a bit for each level
+    int l = from, start = again, repeated = twice ? last : from;  // the finest level that was visited again
     do {
         for (; l < last; ++l, start = 0) {
             OF_LEVEL(l)
@@ -571,8 +573,8 @@ __kernel void multigrid_tail(
             SMOOTH(THIRD, t, x)
             SMOOTH(SECOND, x, t)
             SMOOTH(FIRST, t, x)
-            start = l > from && !(gone >> l & 1);
-            gone = start ? gone | 1 << l : gone & ~(1 << l);
+            start = from < l && l < repeated;
+            repeated = start ? l : repeated;
         }
     } while (start);
 }

@@ -14,7 +14,8 @@ _SCALARS = {
     "uint": np.uint32, "long": np.int64, "ulong": np.uint64, "float": np.float32, "double": np.float64,
 }  # fmt: skip
 _COMMENT = re.compile(r"/\*.*?\*/|//[^\n]*", re.DOTALL)
-_KERNEL = re.compile(r"\b(?:__)?kernel\s+void\s+(\w+)\s*\(([^{]*)\)\s*\{")
+_ATTRIBUTE = r"(?:__attribute__\s*\(\(.*?\)\)|\w+)\s+"  # or a macro that stands for some
+_KERNEL = re.compile(rf"\b(?:__)?kernel\s+(?:{_ATTRIBUTE})*?void\s+(\w+)\s*\(([^{{]*)\)\s*\{{")
 _ARGUMENT = re.compile(r"(?P<type>.*?)(?P<pointer>\*?)\s*(?:\brestrict\b)?\s*\b(?P<name>\w+)", re.DOTALL)
 _QUALIFIERS = re.compile(r"\b(__global|global|__constant|constant|const|restrict|volatile)\b")
 

@@ -21,7 +21,8 @@ Plane = tuple[float, float, float]
 LEVEL: Plane = (0.0, 0.0, 0.0)
 _CHUNK, _STRIP = 256, 16  # columns and rows of a work-item that is a core's loop; see links.cl, components.cl
 _SAMPLES = 64  # samples along each side of the picture for the mean slope
-_PARTIAL_SUMS = 64  # largest number of partial sums of a component
+_PARTIAL_SUMS = 64  # largest number of partial sums of a component, four times as many of work-groups
+_FEW = 64  # components up to which a work-group adds up each, so that a picture is read once for each
 _MOST_SUMS = 1 << 22  # largest number of partial sums of all components
 
 
@@ -281,13 +282,16 @@ class Levelling:
 
     def _means(self, relief: dict[str, Any], maps: Mapping[str, Operand]) -> NDArray[np.float64]:
         """Return mean heights of components, or mean differences from known ones, (components,), mm."""
-        rows, count = self._graph.shape[0], self._count
-        strip = max(-(-rows // _PARTIAL_SUMS), -(-rows * count // _MOST_SUMS))
+        rows, count, layout = self._graph.shape[0], self._count, self._device.layout
+        group = layout.group if layout.tile == 1 and count <= _FEW else 1
+        most = _PARTIAL_SUMS if layout.tile > 1 else 4 * _PARTIAL_SUMS if group > 1 else rows
+        strip = max(-(-rows // most), -(-rows * count // _MOST_SUMS))
         strips = -(-rows // strip)
         sums, totals = (self._array(name, (strips, count)) for name in ("sums", "totals"))
         known = {"heights": None, "height_weights": None, **maps}
         sizes = {"strip": strip, "components": count}
-        self._run("components_sum", strips, relief, **known, **sizes, sums=sums, totals=totals)
+        items = strips * (count * group if group > 1 else 1)
+        self._run("components_sum", items, relief, **known, **sizes, sums=sums, totals=totals, group=group)
         sum_, total = (part.download().sum(axis=0, dtype=np.float64) for part in (sums, totals))
         return np.asarray(np.divide(sum_, total, out=np.zeros(count), where=total > 0))
 
@@ -301,10 +305,10 @@ class Levelling:
             self._arrays[name].upload()
         return self._arrays[name]
 
-    def _run(self, name: str, items: int, relief: dict[str, Any], **arguments: Any) -> None:
+    def _run(self, name: str, items: int, relief: dict[str, Any], group: int = 1, **arguments: Any) -> None:
         single = self._count == 1
         labels = self._graph.flags if single else self._graph.array("labels", np.int32)
         rows, columns = self._graph.shape
-        kernel = self._device.kernel("components", name, ONE=int(single))
+        kernel = self._device.kernel("components", name, ONE=int(single), GROUP=group)
         arguments |= {"flags": self._graph.flags, "labels": labels, **relief}
         kernel(items, rows=rows, columns=columns, **arguments, moved=8 * rows * columns)

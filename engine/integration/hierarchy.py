@@ -25,6 +25,7 @@ _ROUNDS = 4  # rounds in which parts of blocks move to another aggregate; an eve
 _VECTOR = 16  # the length of a row is a multiple of it: two of a kernel's vectors
 _BEFORE = _VECTOR  # nodes before the first level, which vectors left of its margin read
 _WIDE_TILE_MEMORY = 45056  # bytes of local memory needed; OpenCL guarantees only 32768
+_TAIL_GROUP = 512  # work-items of one group that does several levels
 _BEYOND = 64  # nodes after the last level, which vectors may read
 
 
@@ -179,7 +180,8 @@ class Hierarchy:
         width = 8 if self.device.layout.tile > 1 and lanes == 1 else 1
         macros = {"ANCHORED": int(self.anchored), "LINKS": links, "PART": part_of(self.device)}
         macros |= {"ROWS": tile_rows(self.device, lanes), "COLUMNS": tile_columns(self.device, lanes)}
-        return self.device.kernel("multigrid", f"multigrid_{name}", **macros, WIDTH=width, LANES=lanes)
+        macros |= {"WIDTH": width, "LANES": lanes, "GROUP": tail_group(self.device)}
+        return self.device.kernel("multigrid", f"multigrid_{name}", **macros)
 
     def places(self, number: int) -> dict[str, int]:
         """Return arguments of kernels between a level and the next coarser one."""
@@ -253,6 +255,12 @@ def tile_columns(device: Device, lanes: int) -> int:
 def tile_rows(device: Device, lanes: int) -> int:
     """Return the number of rows of a work-group's tile."""
     return 16 if device.layout.tile == 1 and lanes > 1 else 32
+
+
+def tail_group(device: Device) -> int:
+    """Return the number of work-items of the group that does all small levels."""
+    lanes = min(_TAIL_GROUP, device.context.devices[0].max_work_group_size)
+    return lanes if device.layout.tile == 1 else 1
 
 
 def choose_lanes(device: Device, sides: int) -> int:
