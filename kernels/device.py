@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import itertools
 import logging
 import os
 import re
@@ -37,6 +38,7 @@ C_TYPES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
 _FOLDER = Path(__file__).parent
 _log = logging.getLogger("mirrorskin.kernels")
 _opening = threading.Lock()
+_numbers = itertools.count()  # of buffers that were arguments of kernels
 _opened: list[Device] = []
 _KINDS = ("gpu", "cpu")  # in the order in which they are taken
 _PLACE = re.compile(r"(\w+\.clh?|<kernel>):(\d+):(\d+):\s*(?:fatal )?(?:error:)?\s*(.+)")
@@ -416,6 +418,7 @@ class Kernel:
         self._signature = signature
         self.arguments: tuple[str, ...] = tuple(name for name, _ in signature)
         self._names = frozenset(self.arguments)
+        self._set: list[object] = [...] * len(signature)  # what each argument was set to
         self.group: int = _group_of(kernel, device.context.devices[0], device.layout.group)
 
     def __call__(
@@ -452,17 +455,31 @@ class Kernel:
         arrays = [arg for arg in args if isinstance(arg, Operand)]
         try:
             with self._device._launching:  # as a kernel object holds the arguments until it is enqueued
-                values = [arg.buffer if isinstance(arg, Operand) else arg for arg in args]
+                for place, arg in enumerate(args):
+                    self._put(place, arg)
                 copies = [array.arrived for array in arrays if array.arrived is not None]
-                event = self._kernel(
-                    self._device.queue, (size,), (group,), *values,
-                    global_offset=(first_item,), wait_for=copies,
-                )  # fmt: skip
+                event = cl.enqueue_nd_range_kernel(
+                    self._device.queue, self._kernel, (size,), (group,), (first_item,), wait_for=copies
+                )
                 for array in arrays:
                     array.last_use = event
             self._device.profile.watch("kernel", self.name, event, moved)
         except cl.Error as error:
             raise failed(self._device, f"run {self.name}", error) from error
+
+    def _put(self, place: int, value: Operand | np.generic | None) -> None:
+        """Set an argument, unless it has this value already: that takes longer than a launch."""
+        key: object = value
+        if isinstance(value, Operand):
+            value = value.buffer
+            # Not id(), which the buffer of a dropped array may have had.
+            key = value.__dict__.setdefault("number", next(_numbers))
+        elif value is not None:
+            key = value.tobytes()  # 0 and -0 are equal
+        if key != self._set[place]:
+            self._set[place] = ...
+            self._kernel.set_arg(place, value)
+            self._set[place] = key
 
     def _in_order(self, arguments: dict[str, Any]) -> tuple[Any, ...]:
         """Return arguments in the source's order, numbers in its types."""
