@@ -7,6 +7,7 @@
 // LINKS      of a node: 4, or 8 on coarse levels whose aggregates are not all blocks of two by two
 // ANCHORED   1 where there are known heights, 0 where there are none
 // GROUP      work-items of the group that does all small levels, 1 where an item is a core's loop
+// SUMS       work-items of a group that adds up one part together, 1 where an item does
 // LANES      right sides that are solved for at once, 1, 4, 8 or 16: a node's value is a vector of them; WIDTH is 1 then
 //
 // All levels lie one after the other in the same arrays. A level begins at `base` with a row of nodes that are
@@ -608,18 +609,41 @@ __kernel void multigrid_residual(LEVEL_ARGS, GRAPH_ARGS, VALUES b, VALUES x, OUT
     }
 }
 
-#define EACH_PART                                                                                          \
+// A sum over PART nodes: of an item that goes through them, or of a group, each of whose items takes one of SUMS nodes.
+#if SUMS > 1
+#define SUM_GROUP __attribute__((reqd_work_group_size(SUMS, 1, 1)))
+#define PART_NODES                                                                                         \
+    __local value room[SUMS];                                                                              \
+    const int begin = base + stride + (int)get_group_id(0) * PART;                                         \
+    const int end = LESSER(begin + PART, base + stride * (rows + 1));
+#define EACH_OF_PART for (int i = begin + (int)get_local_id(0); i < end; i += SUMS)
+#define WRITE_SUM(place, sum)                                                                              \
+    barrier(CLK_LOCAL_MEM_FENCE);                                                                          \
+    room[get_local_id(0)] = sum;                                                                           \
+    for (int reach = SUMS / 2; reach > 0; reach /= 2) {                                                    \
+        barrier(CLK_LOCAL_MEM_FENCE);                                                                      \
+        if ((int)get_local_id(0) < reach) room[get_local_id(0)] += room[get_local_id(0) + reach];          \
+    }                                                                                                      \
+    if (get_local_id(0) == 0) parts[(place) + get_group_id(0)] = room[0];
+#else
+#define SUM_GROUP
+#define PART_NODES                                                                                         \
     const int begin = base + stride + (int)get_global_id(0) * PART;                                        \
-    const int end = LESSER(begin + PART, base + stride * (rows + 1));                                      \
+    const int end = LESSER(begin + PART, base + stride * (rows + 1));
+#define EACH_OF_PART for (int i = begin; i < end; i += WIDTH)
+#define WRITE_SUM(place, sum) if (begin < end) parts[(place) + get_global_id(0)] = WHOLE(sum);
+#endif
+#define EACH_PART                                                                                          \
+    PART_NODES                                                                                             \
     values sum = 0;                                                                                        \
-    EACH_NODE
-#define WRITE_PART if (begin < end) parts[get_global_id(0)] = WHOLE(sum);
+    EACH_OF_PART
+#define WRITE_PART WRITE_SUM(0, sum)
 
 // The next direction, and the product of it with the matrix times it. The last step, along the direction before, is taken here, as it is
 // read anyway: `taken` of it, if `step` is 1 from zero, if 2 from x.
 #define DIRECTION(i) (AT(z + (i)) + FACTOR * AT(before + (i)))
 #define TAKEN(along) ((step == 1 ? (values)0 : AT(x + i)) + STEP_FACTOR * AT(along + i))
-__kernel void multigrid_direct(
+__kernel SUM_GROUP void multigrid_direct(
     LEVEL_ARGS, FACTOR_ARG, STEP_ARGS, GRAPH_ARGS, MAP inverse, VALUES z, VALUES before, OUT_VALUES direction, OUT_VALUES x,
     OUT_VALUES parts)
 {
@@ -634,7 +658,7 @@ __kernel void multigrid_direct(
 }
 
 // The residual after a step along it, and the square of that.
-__kernel void multigrid_advance(
+__kernel SUM_GROUP void multigrid_advance(
     LEVEL_ARGS, FACTOR_ARG, GRAPH_ARGS, MAP inverse, VALUES direction, OUT_VALUES b, OUT_VALUES parts)
 {
     EACH_LIVE {
@@ -659,12 +683,11 @@ __kernel void multigrid_take(LEVEL_ARGS, STEP_ARGS, VALUES direction, OUT_VALUES
 // z A p, p A p and b p.
 #define STEP(i) AT(p + (i))
 #define CORRECTION(i) AT(z + (i))
-__kernel void multigrid_curve(LEVEL_ARGS, GRAPH_ARGS, MAP b, MAP z, MAP p, const int count, OUT parts)
+__kernel SUM_GROUP void multigrid_curve(LEVEL_ARGS, GRAPH_ARGS, MAP b, MAP z, MAP p, const int count, OUT parts)
 {
-    const int begin = base + stride + (int)get_global_id(0) * PART;
-    const int end = LESSER(begin + PART, base + stride * (rows + 1));
+    PART_NODES
     reals zz = 0, zp = 0, pp = 0, bp = 0;
-    EACH_NODE {
+    EACH_OF_PART {
         SIDES
         const reals along = -FLOW(STEP, i, stride);
         zz -= CORRECTION(i) * FLOW(CORRECTION, i, stride);
@@ -672,41 +695,54 @@ __kernel void multigrid_curve(LEVEL_ARGS, GRAPH_ARGS, MAP b, MAP z, MAP p, const
         pp += STEP(i) * along;
         bp += AT(b + i) * STEP(i);
     }
-    if (begin >= end) return;
-    __global float *part = parts + get_global_id(0);
-    part[0] = WHOLE(zz);
-    part[count] = WHOLE(zp);
-    part[2 * count] = WHOLE(pp);
-    part[3 * count] = WHOLE(bp);
+    WRITE_SUM(0, zz)
+    WRITE_SUM(count, zp)
+    WRITE_SUM(2 * count, pp)
+    WRITE_SUM(3 * count, bp)
 }
 
-// The best step in the plane of both, by the parts of these products and of that of b and z. No sum goes to the host.
+// How far to go along both, to the least in their plane, by the parts of these products and of that of b and z, which one group
+// adds up. No sum goes to the host.
 #define INDEPENDENT 1e-4f  // share of the products' determinant from which on both directions are used
-__kernel void multigrid_follow(
-    LEVEL_ARGS, const int products, MAP product, const int count, MAP parts, MAP z, OUT p, OUT x)
+#define ADD_UP(sum, from, number)                                                                          \
+    float sum = 0;                                                                                         \
+    for (int k = get_local_id(0); k < (number); k += get_local_size(0)) sum += (from)[k];                  \
+    barrier(CLK_LOCAL_MEM_FENCE);                                                                          \
+    room[get_local_id(0)] = sum;                                                                           \
+    for (int reach = get_local_size(0) / 2; reach > 0; reach /= 2) {                                       \
+        barrier(CLK_LOCAL_MEM_FENCE);                                                                      \
+        if ((int)get_local_id(0) < reach) room[get_local_id(0)] += room[get_local_id(0) + reach];          \
+    }                                                                                                      \
+    barrier(CLK_LOCAL_MEM_FENCE);                                                                          \
+    sum = room[0];
+__kernel GROUP_SIZE void multigrid_best(const int products, MAP product, const int count, MAP parts, OUT lengths)
 {
-    ITEMS_NODES
-    float bz = 0, zz = 0, zp = 0, pp = 0, bp = 0;
-    for (int k = 0; k < products; ++k) bz += product[k];
-    for (int k = 0; k < count; ++k) {
-        zz += parts[k];
-        zp += parts[count + k];
-        pp += parts[2 * count + k];
-        bp += parts[3 * count + k];
-    }
+    __local float room[GROUP];
+    ADD_UP(bz, product, products)
+    ADD_UP(zz, parts, count)
+    ADD_UP(zp, parts + count, count)
+    ADD_UP(pp, parts + 2 * count, count)
+    ADD_UP(bp, parts + 3 * count, count)
     const float whole = zz * pp, determinant = whole - zp * zp;
     const int both = whole > 0 && determinant > INDEPENDENT * whole;
-    const float along = both ? (bz * pp - bp * zp) / determinant : zz > 0 ? bz / zz : 0;
-    const float again = both ? (bp * zz - bz * zp) / determinant : 0;
+    if (get_local_id(0)) return;
+    lengths[0] = both ? (bz * pp - bp * zp) / determinant : zz > 0 ? bz / zz : 0;
+    lengths[1] = both ? (bp * zz - bz * zp) / determinant : 0;
+}
+
+// The step of these lengths along both.
+__kernel void multigrid_follow(LEVEL_ARGS, MAP lengths, MAP z, OUT p, OUT x)
+{
+    ITEMS_NODES
     EACH_NODE {
-        const reals step = along * CORRECTION(i) + again * STEP(i);
+        const reals step = lengths[0] * CORRECTION(i) + lengths[1] * STEP(i);
         PUT(p + i) = step;
         PUT(x + i) = AT(x + i) + step;
     }
 }
 
 // The product of two.
-__kernel void multigrid_dot(LEVEL_ARGS, VALUES one, VALUES other, OUT_VALUES parts)
+__kernel SUM_GROUP void multigrid_dot(LEVEL_ARGS, VALUES one, VALUES other, OUT_VALUES parts)
 {
     EACH_PART {
         sum += AT(one + i) * AT(other + i);
@@ -715,7 +751,7 @@ __kernel void multigrid_dot(LEVEL_ARGS, VALUES one, VALUES other, OUT_VALUES par
 }
 
 // What the anchors weigh of heights.
-__kernel void multigrid_weigh(LEVEL_ARGS, MAP anchor, VALUES x, OUT_VALUES parts)
+__kernel SUM_GROUP void multigrid_weigh(LEVEL_ARGS, MAP anchor, VALUES x, OUT_VALUES parts)
 {
     EACH_PART {
         sum += AT(anchor + i) * AT(x + i) * AT(x + i);

@@ -26,6 +26,7 @@ _VECTOR = 16  # the length of a row is a multiple of it: two of a kernel's vecto
 _BEFORE = _VECTOR  # nodes before the first level, which vectors left of its margin read
 _WIDE_TILE_MEMORY = 45056  # bytes of local memory needed; OpenCL guarantees only 32768
 _TAIL_GROUP = 512  # work-items of one group that does several levels
+_SUM_GROUP = 128  # work-items of one that adds up a part; any device of lanes allows so many
 _BEYOND = 64  # nodes after the last level, which vectors may read
 
 
@@ -181,6 +182,7 @@ class Hierarchy:
         macros = {"ANCHORED": int(self.anchored), "LINKS": links, "PART": part_of(self.device)}
         macros |= {"ROWS": tile_rows(self.device, lanes), "COLUMNS": tile_columns(self.device, lanes)}
         macros |= {"WIDTH": width, "LANES": lanes, "GROUP": tail_group(self.device)}
+        macros["SUMS"] = sum_group(self.device)
         return self.device.kernel("multigrid", f"multigrid_{name}", **macros)
 
     def places(self, number: int) -> dict[str, int]:
@@ -213,12 +215,18 @@ class Hierarchy:
             arguments |= {"residual": residual, "coarse_b": b}
             self.kernel("gather", 4, lanes)(items, **self.places(number), **arguments, moved=80 * count)
 
+    def alone(self, name: str, **arguments: Any) -> None:
+        """Run a kernel in one work-group."""
+        kernel = self.kernel(name, 4)
+        kernel(kernel.group, **arguments, moved=_bytes(self.levels[0], arguments))
+
     def over_parts(self, name: str, parts: Array, *, lanes: int = 1, **arguments: Any) -> None:
         """Run a reduction over the finest level; ``parts`` receives the partial sums."""
         level = self.levels[0]
         count = -(-level.nodes // part_of(self.device))
         kernel = self.kernel(name, 4, lanes)
-        kernel(count, **level.place, **arguments, parts=parts, moved=_bytes(level, arguments))
+        items = count * sum_group(self.device)
+        kernel(items, **level.place, **arguments, parts=parts, moved=_bytes(level, arguments))
 
     def copy_picture(self, name: str, level: Array, map_: Array, *, lanes: int = 1, **arguments: Any) -> None:
         """Copy a map of pixels to the finest level ("admit"), or back ("release")."""
@@ -281,7 +289,12 @@ def choose_lanes(device: Device, sides: int) -> int:
 
 def part_of(device: Device) -> int:
     """Return the number of nodes of a partial sum."""
-    return 4096 if device.layout.tile > 1 else 64
+    return 4096 if device.layout.tile > 1 else 2048
+
+
+def sum_group(device: Device) -> int:
+    """Return the number of work-items that add up a part together."""
+    return 1 if device.layout.tile > 1 else _SUM_GROUP
 
 
 def _bytes(level: Level, arguments: dict[str, Any]) -> int:

@@ -56,6 +56,7 @@ class Multigrid:
         self._alone = _Gradients(self._hierarchy, 1)
         self._together: _Gradients | None = None
         self._products: Array | None = None
+        self._lengths: Array
 
     def rebuild(self, links: Links, *, plain: bool = False, strength: float = STRENGTH) -> None:
         """Use another graph of the same shape, and the same memory.
@@ -143,11 +144,13 @@ class Multigrid:
         cycle.launch()
         count = len(solver.parts.host)
         if self._products is None:
-            self._products = h.array("parts", 4 * count)
+            self._products, self._lengths = h.array("parts", 4 * count), h.array("lengths", 2)
         step: dict[str, Any] = {"z": cycle.x, "p": solver.p}
         h.over_parts("curve", self._products, **h.graph, b=cycle.b, **step, count=count)
         products: dict[str, Any] = {"products": len(cycle.parts.host), "product": cycle.parts}
-        h.over("follow", h.levels[0], **products, count=count, parts=self._products, **step, x=solver.x)
+        lengths = {"lengths": self._lengths}
+        h.alone("best", **products, count=count, parts=self._products, **lengths)
+        h.over("follow", h.levels[0], **lengths, **step, x=solver.x)
         solver.copy("release", solver.x, self._height)
         return self._height
 

@@ -174,9 +174,11 @@ def test_the_best_step_in_a_plane(cases, graph, same):
     given = {
         name: case.device.given(name, values) for name, values in (("product", halves), ("parts", parts))
     }
-    places = {"products": 2, "count": 2, **given}
-    case.h.over("follow", case.h.levels[0], **places, z=z_given, p=p_given, x=x_given)
+    lengths = case.h.array("lengths", 2)
+    case.h.alone("best", products=2, count=2, **given, lengths=lengths)
+    case.h.over("follow", case.h.levels[0], lengths=lengths, z=z_given, p=p_given, x=x_given)
     along, again = twin.best_step((b * z).sum(), *expected)
+    close(lengths.download(), [along, again], 1e-4)
     assert (again == 0) == same
     close(case.get(p_given), along * z + again * p, 1e-4)
     close(case.get(x_given), x + along * z + again * p, 1e-4)
