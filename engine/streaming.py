@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol
 
+import numpy as np
+
 from mirrorskin.engine.operation import Operation
 from mirrorskin.io import Block, InputError, Source
 
@@ -124,7 +126,7 @@ def _read_ahead(source: Source, operation: Operation, count: int) -> Iterator[Bl
     """Read frames into two arrays in turn, one while the other is copied from."""
     length = max(1, len(operation.room) // 2)
     shape = max(1, min(length, count)), *operation.room.shape[1:]
-    buffers = [operation.device.pinned(shape, source.dtype) for _ in range(2)]
+    buffers = [np.empty(shape, source.dtype) for _ in range(2)]
     with ThreadPoolExecutor(1, "mirrorskin-read") as reader:
         coming = reader.submit(source.read, buffers[0][:count])
         while (block := coming.result()) is not None:

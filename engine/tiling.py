@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.kernels import memory
-from mirrorskin.kernels.array import SLACK, Array, BorrowedBuffer, Operand
+from mirrorskin.kernels.array import SLACK, Array, BorrowedBuffer, Operand, fetch
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.device import free_memory as free_memory
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError
@@ -128,28 +128,46 @@ class Band:
         self._park()
 
     def write(self, name: str, values: ArrayLike, plane: int | None = None) -> None:
-        """Fill a map, or one of several planes, from the host."""
-        array = self.maps[name]
-        if plane is not None and self._resident:
-            array.download()  # the other planes
-        array.claim()
+        """Fill a map, or one of several planes, from the host; a single number fills all of it."""
+        array, values = self.maps[name], np.asarray(values)
+        parked = not (self._resident or self._only or array.is_shared)
+        if not parked:
+            self._keep_resident()
         self._blank.discard(name)
-        target = array.host if plane is None else self.picture(array.host[plane])
-        target[:] = values
-        if self._resident:
-            array.upload()
+        if plane is None and values.ndim == 0 and not parked:
+            array.fill(values.item())
+        elif array.is_shared or parked:
+            if plane is not None and self._resident:
+                array.download()  # the other planes
+            array.claim()
+            target = array.host if plane is None else self.picture(array.host[plane])
+            target[:] = values
+        else:
+            array.write(np.broadcast_to(values, array.shape if plane is None else self._shape), plane or 0)
 
     def picture(self, plane: NDArray[Any]) -> NDArray[Any]:
         """Return a plane, (stride,), without its padding, (rows, W)."""
         return plane[: self.pixels].reshape(self._shape)
 
-    def detach(self, name: str) -> NDArray[Any]:
-        """Return the contents of a map, (count, stride) or (rows, W), without a copy; it is then blank."""
-        return self.maps.pop(name).detach()
+    def fetch(self, parts: Mapping[str, int | slice], keep: bool = False) -> list[NDArray[Any]]:
+        """Wait once, and return planes or rows of maps, (count, stride) or (rows, W).
+
+        They are copies if ``keep``; otherwise the maps are blank afterwards, and memory that is shared with
+        the device is returned as it is.
+        """
+        with self.resident():
+            maps = self.maps if keep else {name: self.maps.pop(name) for name in parts}
+            return fetch([(maps[name], rows) for name, rows in parts.items()], keep)
 
     @contextmanager
     def resident(self) -> Iterator[None]:
         """Keep the maps on the device within a context."""
+        self._keep_resident()
+        yield
+        if not self._only:
+            self._park()
+
+    def _keep_resident(self) -> None:
         if not self._resident:
             for name, array in self.maps.items():
                 if name in self._blank:
@@ -158,9 +176,6 @@ class Band:
                     array.upload()
             self._blank.clear()
             self._resident = True
-        yield
-        if not self._only:
-            self._park()
 
     def stage(self, frames: NDArray[Any], lent: bool = False, whole: bool = False) -> Iterator[Staged]:
         """Yield frames, (n, H, W), on the device in pieces; launch the kernels for each before the next.
@@ -176,7 +191,6 @@ class Band:
             rest = frames[start:]
             if self._places:
                 yield (staged := self._copy(rest, start))
-                self._places[0].wait()
             else:
                 yield (staged := self._share(rest[: self._most], start, whole))
                 assert self._borrowed is not None
@@ -200,8 +214,8 @@ class Band:
     def _copy(self, frames: NDArray[Any], start: int) -> Staged:
         """Start to copy frames to one of two buffers on the device, while kernels process the other."""
         self._places.reverse()
-        part = np.ascontiguousarray(frames[: self._places[0].shape[0]])
-        self._places[0].upload_async(part)
+        part = frames[: self._places[0].shape[0]]
+        self._places[0].write(part)
         return Staged(self._places[0], slice(start, start + len(part)))
 
     def _make(self, name: str) -> Array:

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from mirrorskin.kernels import memory
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError
+from mirrorskin.kernels.mapping import Mapping
+from mirrorskin.kernels.transfer import Piece
 from mirrorskin.kernels.waiting import keep_for_ever, waiting
 
 if TYPE_CHECKING:
@@ -24,7 +26,9 @@ if TYPE_CHECKING:
 SLACK = 64
 """Bytes behind an array that a kernel may load with its last word."""
 
-_READ_WRITE = cl.map_flags.READ | cl.map_flags.WRITE
+ZERO = 0
+"""What arrays of all types can be filled with."""
+
 _NO_ROOM = {
     cl.status_code.MEM_OBJECT_ALLOCATION_FAILURE,
     cl.status_code.OUT_OF_HOST_MEMORY,
@@ -58,66 +62,31 @@ def _told(work: Callable[Concatenate[Any, _Given], _Made]) -> Callable[Concatena
     return told
 
 
-class _Mapping:
-    """A device's buffer, mapped into the host's memory until ``release``; an array for ``np.asarray``.
-
-    A `pyopencl.MemoryMap` unmaps the buffer when it is destroyed. If that fails, because the device is lost
-    or the buffer is unmapped already, pyopencl aborts the process. So the buffer is unmapped here, once, and
-    a map that cannot be unmapped is never destroyed.
-    """
-
-    def __init__(
-        self,
-        queue: cl.CommandQueue,
-        buffer: cl.Buffer,
-        like: NDArray[Any],
-        flags: Any,
-        after: Sequence[cl.Event] = (),
-    ) -> None:
-        """Map a buffer with the shape and dtype of an array, once some events are over."""
-        self._maps: list[cl.MemoryMap] = []  # none after the release
-        view, _ = cl.enqueue_map_buffer(
-            queue, buffer, flags, 0, like.shape, like.dtype, wait_for=after, is_blocking=True
-        )
-        self._maps.append(view.base)
-        self.__array_interface__ = view.__array_interface__
-
-    def __del__(self) -> None:
-        with suppress(cl.Error):
-            self.release()
-
-    def release(self, queue: cl.CommandQueue | None = None) -> None:
-        """Unmap the buffer, unless that was done before; by default on the queue that mapped it."""
-        try:
-            mapped = self._maps.pop()  # at once, so that no two threads have it
-        except IndexError:
-            return
-        try:
-            mapped.release(queue)
-        except cl.Error:
-            keep_for_ever(mapped)
-            raise
-
-
 class Array:
     """An array that host and device both see: one memory where they share it, a copy each otherwise.
 
-    It is filled with zeros, unless what it holds at first does not matter.
-    The host writes it at first; ``upload`` hands it to the device and ``download`` brings it back, which
-    moves nothing on a device that shares the host's memory.
+    It holds zeros at first, on both sides, unless its first content does not matter.
+    Either the host writes ``host`` and calls ``upload``, or it calls ``write``, which copies values to the
+    device without filling ``host``. ``download`` brings everything back to ``host``, ``read`` a copy of some
+    rows; neither has to be undone before the next kernel. On a device that shares the host's memory nothing
+    is copied.
 
     Attributes
     ----------
     name : str
     shape : tuple of int
+    dtype : dtype
     nbytes : int
+    is_shared : bool
+        Whether host and device have one memory.
     arrived : pyopencl.Event or None
         A copy under way that kernels have to wait for.
     last_use : pyopencl.Event or None
-        The last kernel that took it as an argument.
+        The last kernel that took it as an argument, unless it was written after that.
     """
 
     shape: tuple[int, ...]
+    dtype: np.dtype[Any]
 
     def __init__(
         self, device: Device, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], zeroed: bool
@@ -125,18 +94,20 @@ class Array:
         self.name = name
         self.arrived: cl.Event | None = None
         self.last_use: cl.Event | None = None
-        self._arriving = 0  # bytes
         self._device = device
-        self._shared = device.info.shares_memory
+        self.is_shared: bool = device.info.shares_memory
         self._lock = threading.RLock()
-        self._mapped: _Mapping | None = None
+        self._mapped: Mapping | None = None
         self._buffer: cl.Buffer | None = None
-        self.shape, self._dtype, self._zeroed = shape, dtype, zeroed
+        self.shape, self.dtype, self._zeroed = shape, dtype, zeroed
+        self._filling: Any = (
+            ZERO if zeroed and not self.is_shared else None
+        )  # a number that it will be filled with
         self.nbytes: int = math.prod(shape) * dtype.itemsize
         if self.nbytes > device.max_allocation:
             raise DeviceMemoryError(_no_room(device, name, self.nbytes))
         # A device that shares memory sees it from its first kernel on, with what the host wrote before.
-        if not self._shared:
+        if not self.is_shared:
             self._allocate()
         else:
             try:
@@ -147,92 +118,91 @@ class Array:
     @cached_property
     def host(self) -> NDArray[Any]:
         """The host's side."""
-        return self._memory[: self.nbytes].view(self._dtype).reshape(self.shape)
+        return self._memory[: self.nbytes].view(self.dtype).reshape(self.shape)
 
     @cached_property
     def _memory(self) -> NDArray[np.uint8]:
         return memory.take(self.nbytes + SLACK, self._zeroed)
 
+    @property
+    def latest(self) -> cl.Event | None:
+        """The last command that wrote or read it on the device."""
+        return self.last_use or self.arrived
+
     def __del__(self) -> None:
         # A kernel may still use this memory, which another array gets next. On a lost device none does.
-        if self._shared and self.last_use is not None:
+        if not self.is_shared:
+            self._give_back()
+        elif self.last_use is not None:
             _wait_before_end(self.last_use, self._memory)
 
     @_told
     def claim(self) -> None:
         """Let the host write anew, whatever the device holds."""
-        if self._shared and self._mapped is None and self._buffer is not None:
+        if self.is_shared and self._mapped is None and self._buffer is not None:
             if self.last_use is not None:
-                self.last_use.wait()
+                self._device.profile.wait(self.name, self.last_use)
             self._buffer = None  # a new one sees what the host wrote, without a turn of the queue
 
     @_told
     def upload(self, rows: int | None = None) -> None:
-        """Let the device see what the host wrote; ``rows`` limits it to the first so many."""
-        if not self._shared:
-            self.reserve()
-            part = self.host[:rows]
-            event = cl.enqueue_copy(self._device.queue, self.buffer, part)
-            self._device.profile.wait("upload", self.name, event, part.nbytes)
+        """Let the device see what the host wrote; ``rows`` limits it to the first so many.
 
-    @_told
-    def put(self, row: int, values: NDArray[Any]) -> None:
-        """Write one row where the device holds it; the others stay as they are."""
-        if self._shared:
-            self.claim()
-            self.host[row].reshape(-1)[: values.size].reshape(values.shape)[...] = values
-        else:
-            part = np.ascontiguousarray(values, self.host.dtype)
-            place = row * self.host[row].nbytes
-            event = cl.enqueue_copy(self._device.queue, self.buffer, part, dst_offset=place)
-            self._device.profile.wait("upload", self.name, event, part.nbytes)
-
-    @_told
-    def upload_async(self, values: NDArray[Any]) -> None:
-        """Begin to copy values from elsewhere on the host; kernels that take this array wait for it.
-
-        The device has memory of its own, and the values stay as they are until ``wait``.
+        If the host has not touched its side, nothing is copied: the device then holds zeros, or anything.
         """
+        if self.is_shared:
+            return
         self.reserve()
-        self._arriving = values.nbytes
-        after = [] if self.last_use is None else [self.last_use]
-        self._device.queue.flush()  # where that kernel waits
-        self.arrived = cl.enqueue_copy(
-            self._device.copies, self.buffer, values, is_blocking=False, wait_for=after
-        )
-        self._device.copies.flush()
+        if "host" in vars(self):
+            self._copy_up(self.host[:rows], 0)
+        elif self._zeroed:
+            self._filling = ZERO
 
     @_told
-    def wait(self) -> None:
-        """Wait until a copy under way has arrived."""
-        if self.arrived is not None:
-            self._device.profile.wait("upload", self.name, self.arrived, self._arriving)
-            self.arrived = None
+    def write(self, values: NDArray[Any], row: int = 0) -> None:
+        """Write values in C order from a row on; what comes behind them stays as it is.
 
-    @_told
-    def download(self) -> NDArray[Any]:
-        """Wait for the device and return what it wrote, in the host's array."""
-        if self._shared:
-            if self._mapped is None and self._buffer is not None:
-                self._mapped = _Mapping(self._device.queue, self._buffer, self.host, _READ_WRITE)
+        The values may be changed at once. On a device with its own memory, ``host`` stays as it is.
+        """
+        start = row * (self.nbytes // self.shape[0])
+        if self.is_shared:
+            self.claim()
+            first = start // self.dtype.itemsize
+            self.host.reshape(-1)[first : first + values.size].reshape(values.shape)[...] = values
         else:
-            event = cl.enqueue_copy(self._device.queue, self.host, self.buffer)
-            self._device.profile.wait("download", self.name, event, self.host.nbytes)
-        return self.host
+            self.reserve()
+            self._copy_up(values, start)
+
+    @_told
+    def fill(self, value: float | np.generic = ZERO) -> None:
+        """Set all elements to a number; on a device with its own memory, ``host`` stays as it is."""
+        if self.is_shared:
+            self.claim()
+            self.host[...] = value
+        else:
+            self.reserve()
+            self._filling = value
+
+    @_told
+    def read(self, rows: int | slice = slice(None)) -> NDArray[Any]:
+        """Wait for the device and return a copy of some rows, without a step; both sides stay as they are."""
+        return self._read(rows, self._device.queue, [self.latest] if self.latest else [])
 
     @_told
     def snapshot(self, kernel: cl.Event | None) -> NDArray[Any]:
         """Wait for one kernel, while others that only read may run, and return a copy of what it wrote."""
-        queue, after = self._device.copies, [] if kernel is None else [kernel]
         self._device.queue.flush()
-        if not self._shared:
-            event = cl.enqueue_copy(queue, self.host, self.buffer, wait_for=after)
-            self._device.profile.wait("download", self.name, event, self.host.nbytes)
-            return self.host.copy()
-        mapping = _Mapping(queue, self.buffer, self.host, cl.map_flags.READ, after)
-        copied: NDArray[Any] = np.array(mapping)
-        mapping.release(queue)
-        return copied
+        return self._read(slice(None), self._device.copies, [] if kernel is None else [kernel])
+
+    @_told
+    def download(self) -> NDArray[Any]:
+        """Wait for the device and return what it wrote, in the host's array."""
+        if not self.is_shared:
+            self._copy_down(self.host, 0, self._device.queue, [self.latest] if self.latest else [])
+        elif self._mapped is None and self._buffer is not None:
+            with self._device.profile.waiting_for(self.name):
+                self._mapped = Mapping(self._device.queue, self._buffer, self.shape, self.dtype)
+        return self.host
 
     @_told
     def detach(self) -> NDArray[Any]:
@@ -242,20 +212,20 @@ class Array:
             self._mapped.release()
             self._mapped = None
             self._device.finish()
-        self._buffer = None
+        self._give_back()
         return host
 
     def evict(self) -> None:
         """Make room on the device: keep the content on the host until the next upload."""
-        if not self._shared and self._buffer is not None:
+        if not self.is_shared and self._buffer is not None:
             self.download()
             self.discard()
 
     @_told
     def discard(self) -> None:
         """Make room on the device, and forget what the device held."""
-        if not self._shared:
-            self._buffer = None
+        if not self.is_shared:
+            self._give_back()
 
     @_told
     def reserve(self) -> None:
@@ -267,48 +237,149 @@ class Array:
     def buffer(self) -> cl.Buffer:
         """The device's side, for kernels; the host must not write while they run."""
         buffer = self._buffer
-        return self._unmapped() if buffer is None or self._mapped is not None else buffer
+        if buffer is not None and self._mapped is None and self._filling is None:
+            return buffer
+        if buffer is None and not self.is_shared:
+            raise RuntimeError(f"{self.name} was evicted: upload it first")
+        return self._ready()
 
     @_told
-    def _unmapped(self) -> cl.Buffer:
-        """Return the device's side, allocated and unmapped."""
+    def _ready(self) -> cl.Buffer:
+        """Return the device's side, allocated, filled and unmapped."""
         if self._buffer is None:
-            if not self._shared:
-                raise RuntimeError(f"{self.name} was evicted: upload it first")
             self._allocate()
             assert self._buffer is not None
         if self._mapped is not None:
             self._mapped.release()
             self._mapped = None
+        if self._filling is not None:
+            self._fill_on_device()
         return self._buffer
+
+    def _fill_on_device(self) -> None:
+        value, self._filling = self._filling, None
+        # Single bytes are slow, and there is room behind the last element.
+        pattern = (
+            np.zeros(1, np.uint32)
+            if value == ZERO and not np.signbit(value)
+            else np.array([value]).astype(self.dtype)
+        )
+        queue, size = self._device.queue, -(-self.nbytes // pattern.itemsize) * pattern.itemsize
+        assert self._buffer is not None
+        with self._device.enqueuing:
+            event = cl.enqueue_fill_buffer(
+                queue, self._buffer, pattern, 0, size, wait_for=[self.latest] if self.latest else None
+            )
+        self._device.profile.watch("fill", self.name, event, size)
+        self.arrived, self.last_use = event, None
+
+    def _copy_up(self, values: NDArray[Any], start: int) -> None:
+        """Copy values to the device's side, from a place in bytes on."""
+        if values.size == 0:
+            return
+        if start == 0 and values.size * self.dtype.itemsize == self.nbytes:
+            self._filling = None
+        piece = Piece(self.name, self.buffer, start)
+        after = [self.latest] if self.latest else []
+        event = self._device.transfers.upload(self._device, piece, values, self.dtype, after)
+        self.arrived, self.last_use = event, None
+
+    def _copy_down(
+        self, out: NDArray[Any], start: int, queue: cl.CommandQueue, after: Sequence[cl.Event]
+    ) -> None:
+        """Copy from the device's side to an array in C order, from a place in bytes on."""
+        piece = Piece(self.name, self.buffer, start)
+        self._device.transfers.download(self._device, [(piece, out)], queue, after)
+
+    def _read(self, rows: int | slice, queue: cl.CommandQueue, after: Sequence[cl.Event]) -> NDArray[Any]:
+        """Return a copy of some rows, once some commands are over."""
+        start, shape = self._part(rows)
+        if not self.is_shared:
+            out = _empty(shape, self.dtype)
+            self._copy_down(out, start, queue, after)
+            return out
+        if self._mapped is not None or self._buffer is None:
+            return self.host[rows].copy()
+        with self._device.profile.waiting_for(self.name):
+            mapping = Mapping(
+                queue, self.buffer, shape, self.dtype, cl.map_flags.READ, offset=start, after=after
+            )
+        copied: NDArray[Any] = np.array(mapping)
+        mapping.release(queue)
+        return copied
+
+    def _part(self, rows: int | slice) -> tuple[int, tuple[int, ...]]:
+        """Return the place of some rows, in bytes, and their shape."""
+        chosen = range(self.shape[0])[rows]
+        first, count = (chosen, ()) if isinstance(chosen, int) else (chosen.start, (len(chosen),))
+        return first * (self.nbytes // self.shape[0]), (*count, *self.shape[1:])
+
+    def _give_back(self) -> None:
+        """Give the device's side back; other arrays wait for what still uses it."""
+        buffer, self._buffer = self._buffer, None
+        if buffer is not None and not self.is_shared:
+            self._device.pool.give(buffer, self.latest)
 
     def _allocate(self) -> None:
         flags = cl.mem_flags.READ_WRITE
         with _naming(self._device, self.name, self.nbytes), waiting:
-            if self._shared:
+            if self.is_shared:
                 self._buffer = cl.Buffer(
                     self._device.context, flags | cl.mem_flags.USE_HOST_PTR, hostbuf=self._memory
                 )
             else:
-                self._buffer = cl.Buffer(self._device.context, flags, size=self.nbytes + SLACK)
-                # Drivers allocate at first use; a migration makes a lack of memory show here.
-                undefined = cl.mem_migration_flags.CONTENT_UNDEFINED
-                cl.enqueue_migrate_mem_objects(self._device.queue, [self._buffer], flags=undefined).wait()
+                self._buffer, self.arrived = self._device.take_buffer(self.nbytes + SLACK)
+                self.last_use = None
+
+
+def fetch(parts: Sequence[tuple[Array, int | slice]], keep: bool = False) -> list[NDArray[Any]]:
+    """Return rows of several arrays, for which the device is waited for once.
+
+    Unless ``keep``, the arrays are no longer of use, and nothing is copied where memory is shared.
+    """
+    device = parts[0][0]._device
+    if parts[0][0].is_shared:
+        return [array.read(rows) if keep else array.detach()[rows] for array, rows in parts]
+    reads, results, after = [], [], []
+    try:
+        with waiting:
+            for array, rows in parts:
+                start, shape = array._part(rows)
+                reads.append((Piece(array.name, array.buffer, start), _empty(shape, array.dtype)))
+                if array.latest is not None:
+                    after.append(array.latest)
+            device.transfers.download(device, reads, device.queue, after)
+    except cl.Error as error:
+        raise failed(device, f"copy {', '.join(array.name for array, _ in parts)}", error) from error
+    results = [out for _, out in reads]
+    for array in () if keep else {id(array): array for array, _ in parts}.values():
+        array.discard()
+    return results
+
+
+def _empty(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return memory on the host that was used before, if there is some."""
+    nbytes = math.prod(shape) * dtype.itemsize
+    return memory.take(nbytes, zeroed=False)[:nbytes].view(dtype).reshape(shape)
 
 
 class BorrowedBuffer:
     """Another owner's memory, which kernels read in place; it stays alive until they are done.
 
-    ``name``, ``host``, ``buffer``, ``arrived`` and ``last_use`` are as of an `Array`; nothing is ever copied.
+    ``name``, ``host``, ``shape``, ``nbytes``, ``buffer``, ``arrived`` and ``last_use`` are as of an `Array`;
+    nothing is ever copied.
     """
 
     name: str
     host: NDArray[Any]
+    shape: tuple[int, ...]
+    nbytes: int
 
     arrived = None
 
     def __init__(self, device: Device, name: str, values: NDArray[Any]) -> None:
         self._device, self.name, self.host = device, name, values
+        self.shape, self.nbytes = values.shape, values.nbytes
         self.last_use: cl.Event | None = None
         self._lock = threading.RLock()
         flags = cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR
@@ -324,7 +395,7 @@ class BorrowedBuffer:
     def wait(self) -> None:
         """Wait until no kernel reads it."""
         if self.last_use is not None:
-            self.last_use.wait()
+            self._device.profile.wait(self.name, self.last_use)
 
 
 def can_be_borrowed(values: NDArray[Any]) -> bool:
@@ -344,16 +415,6 @@ def can_be_borrowed(values: NDArray[Any]) -> bool:
 
 Operand = Array | BorrowedBuffer
 """What a kernel takes besides numbers."""
-
-
-def pinned(device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Make room on the host from where copies to a device are fastest; see ``Device.pinned``."""
-    nbytes = math.prod(shape) * dtype.itemsize
-    flags = cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR
-    with _naming(device, "frames on the host", nbytes), waiting:
-        buffer = cl.Buffer(device.context, flags, size=nbytes)
-        like = np.broadcast_to(np.empty((), dtype), shape)
-        return np.asarray(_Mapping(device.copies, buffer, like, _READ_WRITE))
 
 
 def _wait_before_end(last_use: cl.Event, memory_in_use: NDArray[Any]) -> None:

@@ -23,12 +23,14 @@ import pyopencl as cl
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.kernels import embedded, memory
-from mirrorskin.kernels.array import Array, BorrowedBuffer, Operand, can_be_borrowed, failed, pinned
+from mirrorskin.kernels.array import Array, BorrowedBuffer, Operand, can_be_borrowed, failed
 from mirrorskin.kernels.disk_cache import keep, recall
 from mirrorskin.kernels.errors import DeviceError, UnknownDeviceError
 from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT, Layout
+from mirrorskin.kernels.pool import SHARE, BufferPool
 from mirrorskin.kernels.profile import Profile
 from mirrorskin.kernels.signature import Signature, read_signatures
+from mirrorskin.kernels.transfer import Transfers
 from mirrorskin.kernels.waiting import close_at_exit, waiting
 
 DeviceKind = Literal["gpu", "cpu", "other"]
@@ -136,6 +138,8 @@ def free_memory() -> None:
     with _opening:
         for device in _opened:
             device.spare.clear()
+            device.transfers.free(device)
+            device.pool.free()
     memory.free()
 
 
@@ -155,6 +159,11 @@ class Device:
         Bytes that one array may take.
     layout : Layout
         How work is cut for it: for the cores of a CPU, or for the lanes of anything else.
+    enqueuing : threading.Lock
+        Held while a command is enqueued, and for nothing else: drivers differ in what several threads may
+        do at once.
+    transfers, pool
+        Staging buffers and buffers that are kept, if it has memory of its own.
     spare : dict of str to object
         What callers keep on it from one call to the next, taken out while in use.
     """
@@ -163,6 +172,8 @@ class Device:
     process: int
     queue: cl.CommandQueue
     copies: cl.CommandQueue
+    transfers: Transfers
+    pool: BufferPool
 
     def __init__(self, device: cl.Device) -> None:
         self.info, self.process = _describe(device), os.getpid()
@@ -180,6 +191,8 @@ class Device:
         self._programs: dict[tuple[str | Path, tuple[str, ...]], tuple[cl.Program, dict[str, Signature]]] = {}
         self._lock = threading.Lock()
         self._launching = threading.Lock()
+        self.enqueuing = threading.Lock()
+        self.transfers, self.pool = Transfers(), BufferPool(self.info.memory // SHARE)
         self._kernels: dict[tuple[object, ...], Kernel] = {}
         self.spare: dict[str, Any] = {}
         _log.info("using %s (driver %s)", self.info.title, self.info.driver)
@@ -194,7 +207,7 @@ class Device:
         shape : tuple of int
         dtype : dtype
         zeroed : bool
-            Whether it holds zeros on the host at first, or anything; ``given`` brings values to the device.
+            Whether it holds zeros at first, without a copy of them, or anything.
 
         Raises
         ------
@@ -218,12 +231,11 @@ class Device:
         DeviceMemoryError
             It does not fit.
         """
-        shape = np.shape(values)
-        if 0 in shape:
+        values = np.asarray(values)
+        if values.size == 0:
             return self.given(name, np.zeros(1), dtype)
-        array = self.array(name, shape, dtype, zeroed=False)
-        array.host[...] = values
-        array.upload()
+        array = self.array(name, values.shape or (1,), dtype, zeroed=False)
+        array.write(values)
         return array
 
     def borrow(self, name: str, values: NDArray[Any]) -> BorrowedBuffer | None:
@@ -252,15 +264,25 @@ class Device:
         borrowed = self.borrow(name, values) if self.info.shares_memory else None
         return borrowed or self.given(name, values, values.dtype)
 
-    def pinned(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        """Make room on the host from where copies to the device are fastest.
+    def take_buffer(self, nbytes: int) -> tuple[cl.Buffer, cl.Event | None]:
+        """Return memory on the device, and the last command that uses it; `cl.Error` if there is none."""
+        kept = self.pool.take(nbytes)
+        if kept is not None:
+            return kept
+        try:
+            return self._new_buffer(nbytes), None
+        except cl.Error:
+            self.pool.free()
+            return self._new_buffer(nbytes), None
 
-        Raises
-        ------
-        DeviceMemoryError
-            It does not fit.
-        """
-        return pinned(self, shape, np.dtype(dtype))
+    def _new_buffer(self, nbytes: int) -> cl.Buffer:
+        buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, size=nbytes)
+        # Drivers allocate at first use; a migration makes a lack of memory show here.
+        undefined = cl.mem_migration_flags.CONTENT_UNDEFINED
+        with self.enqueuing:
+            event = cl.enqueue_migrate_mem_objects(self.copies, [buffer], flags=undefined)
+        self.profile.wait("allocation", event)
+        return buffer
 
     def kernel(self, file: str | Path, name: str, /, **defines: str | int) -> Kernel:
         """Return a kernel, compiled once for each set of defines.
@@ -306,6 +328,15 @@ class Device:
         other._launching, other._kernels = threading.Lock(), {}
         return other
 
+    def free(self) -> None:
+        """Give memory that is kept for later calls back to the driver."""
+        self.spare.clear()
+        try:
+            self.transfers.free(self)
+            self.pool.free()
+        except cl.Error as error:
+            raise failed(self, "give memory back", error) from error
+
     def flush(self) -> None:
         """Have the device begin what it was given, without waiting for it."""
         try:
@@ -316,7 +347,7 @@ class Device:
     def finish(self) -> None:
         """Wait until everything given to the device is done."""
         try:
-            with waiting:
+            with self.profile.waiting_for("queue"):
                 self.queue.finish()
         except cl.Error as error:
             raise failed(self, "finish its work", error) from error
@@ -453,14 +484,17 @@ class Kernel:
         group = self.group
         size = -(-items // group) * group
         arrays = [arg for arg in args if isinstance(arg, Operand)]
+        complete = cl.command_execution_status.COMPLETE
         try:
             with self._device._launching:  # as a kernel object holds the arguments until it is enqueued
                 for place, arg in enumerate(args):
                     self._put(place, arg)
                 copies = [array.arrived for array in arrays if array.arrived is not None]
-                event = cl.enqueue_nd_range_kernel(
-                    self._device.queue, self._kernel, (size,), (group,), (first_item,), wait_for=copies
-                )
+                copies = [copy for copy in copies if copy.command_execution_status != complete]
+                with self._device.enqueuing:
+                    event = cl.enqueue_nd_range_kernel(
+                        self._device.queue, self._kernel, (size,), (group,), (first_item,), wait_for=copies
+                    )
                 for array in arrays:
                     array.last_use = event
             self._device.profile.watch("kernel", self.name, event, moved)

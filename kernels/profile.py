@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,14 +13,17 @@ import pyopencl as cl
 
 from mirrorskin.kernels.waiting import waiting
 
-Kind = Literal["compile", "upload", "kernel", "download"]
+Kind = Literal["compile", "upload", "fill", "kernel", "download", "wait"]
 
 _PENDING_LIMIT = 1024  # events held before they are read, so that an endless run stays bounded
 
 
 @dataclass(slots=True)
 class Record:
-    """All runs of one kernel, program or array: seconds and bytes moved are those of all of them together."""
+    """All runs of one kernel, program or array: seconds and bytes moved are those of all of them together.
+
+    Those of kind "wait" are the times that the host waited for the device; all other kinds are work.
+    """
 
     kind: Kind
     name: str
@@ -45,19 +51,25 @@ class Profile:
         with self._lock:
             self._add(kind, name, seconds, 0)
 
-    def wait(self, kind: Kind, name: str, event: cl.Event, nbytes: int) -> None:
-        """Wait for the run that ``event`` ends, and count it; a pending copy would keep its array alive."""
-        with waiting:
+    def wait(self, name: str, event: cl.Event) -> None:
+        """Wait for a command, and count that."""
+        with self.waiting_for(name):
             event.wait()
-        with self._lock:
-            self._count(kind, name, event, nbytes)
+
+    @contextmanager
+    def waiting_for(self, name: str) -> Iterator[None]:
+        """Count a wait for the device, which is what is done in this context."""
+        start = time.perf_counter()
+        with waiting:
+            yield
+        self.add("wait", name, time.perf_counter() - start)
 
     def watch(self, kind: Kind, name: str, event: cl.Event, nbytes: int) -> None:
         """Count the run that ``event`` ends, once it is over."""
         with self._lock:
             self._pending.append((kind, name, event, nbytes))
             if len(self._pending) >= _PENDING_LIMIT:
-                self._read_pending()
+                self._read_pending(_PENDING_LIMIT // 2)  # those are over, mostly
 
     def records(self) -> list[Record]:
         """Wait for what is under way and return all records, longest first."""
@@ -71,15 +83,14 @@ class Profile:
             self._read_pending()
             self._records.clear()
 
-    def _read_pending(self) -> None:
-        pending, self._pending = self._pending, []  # one that failed is not waited for again
+    def _read_pending(self, count: int | None = None) -> None:
+        """Count the oldest of the runs that were watched, by default all."""
+        pending = self._pending[:count]
+        del self._pending[:count]  # one that failed is not waited for again
         for kind, name, event, nbytes in pending:
             with waiting:
                 event.wait()
-            self._count(kind, name, event, nbytes)
-
-    def _count(self, kind: Kind, name: str, event: cl.Event, nbytes: int) -> None:
-        self._add(kind, name, (event.profile.end - event.profile.start) * 1e-9, nbytes)
+            self._add(kind, name, (event.profile.end - event.profile.start) * 1e-9, nbytes)
 
     def _add(self, kind: Kind, name: str, seconds: float, nbytes: int) -> None:
         record = self._records.setdefault((kind, name), Record(kind, name))

@@ -181,10 +181,10 @@ class ChangePoint(PressOperation):
                 level=self._level,
                 own=self.passes == 2,
                 **maps,
-                moved=sum(array.host.nbytes for array in maps.values()),
+                moved=sum(array.nbytes for array in maps.values()),
             )
-            answers = [band.detach(name) for name in ("height", "sigma", "status")]
-            return [*answers, maps["start"].download().copy()]
+            (start,) = band.fetch({"start": slice(None)}, keep=True)
+            return [*band.fetch(dict.fromkeys(("height", "sigma", "status"), slice(None))), start]
 
     def _travel_pairs(self) -> Array:
         """Copy the travel to the device as (T, 2) floats, whose sums have the precision of float64."""

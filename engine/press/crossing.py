@@ -220,13 +220,8 @@ class Crossing:
 
     def _band_maps(self, band: Band, last: bool) -> list[NDArray[Any]]:
         """Return height, sigma, status and frame of a band's rows."""
-        with band.resident():
-            answers, status, times = (
-                band.detach(name) if last else band.maps[name].download()
-                for name in ("answers", "status", "times")
-            )
-            planes = [band.picture(plane) for plane in (answers[0], answers[1], status[0], times[0])]
-            return planes if last else [plane.copy() for plane in planes]
+        answers, status, frame = band.fetch({"answers": slice(None), "status": 0, "times": 0}, keep=not last)
+        return [band.picture(plane) for plane in (*answers, status, frame)]
 
     def reset(self, noise: float | None = None) -> None:
         """Prepare for another press with the same references and, if given, the same noise, counts."""
@@ -268,7 +263,7 @@ class _TravelTable:
     @property
     def arguments(self) -> dict[str, Any]:
         """The table and its length, as kernel arguments."""
-        return {"travel": self._table, "room": self._table.host.shape[1]}
+        return {"travel": self._table, "room": self._table.shape[1]}
 
     def clear(self) -> None:
         self.values: list[float] = []
@@ -283,7 +278,7 @@ class _TravelTable:
         steps = np.diff(travel, prepend=self.values[-1] if old else travel[0])
         count = old + len(travel)
         self._table.claim()
-        if count > self._table.host.shape[1]:
+        if count > self._table.shape[1]:
             old_table = self._table.host
             self._table = self._device.array("travel", (3, 2 * count), np.float32)
             self._table.host[:, : old_table.shape[1]] = old_table

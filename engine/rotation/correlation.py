@@ -231,7 +231,7 @@ class _Sums:
         parts = []
         for band in self.bands:
             with band.resident():
-                parts.append([band.detach(name) for name in _FIT.values()])
+                parts.append(band.fetch(dict.fromkeys(_FIT.values(), slice(None))))
         mean, cosine, sine, residual = (join_rows(part) for part in zip(*parts, strict=True))
         return Result(
             mean=mean,
@@ -423,7 +423,7 @@ class WindowSums(_Sums):
         for band in self.bands:
             with band.resident():
                 for number, frame in enumerate(frames[:, band.rows], self.oldest):
-                    band.maps["ring"].put(number % self._window, frame)
+                    band.maps["ring"].write(frame, number % self._window)
         self.oldest = (self.oldest + len(frames)) % self._window
         self._phase = np.concatenate([self._phase, phase])[-self._window :]
         self._weight = np.concatenate([self._weight, weight])[-self._window :]
@@ -473,6 +473,4 @@ def _fit_table(phase: Doubles, rows: Doubles) -> NDArray[np.float32]:
 
 def _fill(array: Array, values: NDArray[Any]) -> None:
     """Copy a table to the device."""
-    array.claim()
-    array.host[: values.size] = values.ravel()
-    array.upload(values.size)
+    array.write(values.ravel())

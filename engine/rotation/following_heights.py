@@ -56,10 +56,10 @@ class FollowingHeights:
             return
         maps = {name: normals.on_device(name) for name in ("vectors", "sigma", "contact")}
         for array in maps.values():  # this queue waits for the estimate
-            array.arrived = array.last_use
+            array.arrived = array.latest
         self._slopes.find(normals.model.tilt, maps, self._integrator.maps)
         for array in maps.values():  # the next estimate waits for the slopes
-            array.arrived = array.last_use
+            array.arrived = array.latest
         self._in_step = self._estimates
         self._step = self._thread.submit(self._solve, self._slopes.typical)
 

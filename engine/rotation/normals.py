@@ -279,15 +279,15 @@ class NormalsOperation(SensorOptions, Operation):
 
     def _copy_maps(self, band: Band) -> dict[str, NDArray[Any]]:
         """Return copies of a band's maps, including their padding."""
-        with band.resident():
-            return {name: band.maps[name].download().copy() for name in self._kernel_maps}
+        names = self._kernel_maps
+        return dict(zip(names, band.fetch(dict.fromkeys(names, slice(None)), keep=True), strict=True))
 
     def _take_maps(self) -> list[NDArray[Any]]:
         """Return the maps of all rows in the order of `_kernel_maps`, without a copy."""
         parts = []
         for band in self._bands:
-            with band.resident():
-                vectors, *others = (band.detach(name).reshape(-1) for name in self._kernel_maps)
+            planes = band.fetch(dict.fromkeys(self._kernel_maps, slice(None)))
+            vectors, *others = (plane.reshape(-1) for plane in planes)
             rows = (-1, self.shape[1])
             flat = [values[: band.pixels].reshape(rows) for values in others]
             parts.append([vectors[: 3 * band.pixels].reshape(*rows, 3), *flat])

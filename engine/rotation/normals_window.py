@@ -101,8 +101,8 @@ class NormalWindow:
         """Wait for a map of the last estimate, and return a copy, (H, W) or (H, W, 3)."""
         parts = []
         for band in self.bands:
-            with band.resident():
-                parts.append(self._without_padding(band, band.maps[name].download()).copy())
+            (planes,) = band.fetch({name: slice(None)}, keep=True)
+            parts.append(self._without_padding(band, planes))
         return join_rows(parts)
 
     def fetch_early(self, name: str) -> NDArray[Any]:
@@ -116,7 +116,7 @@ class NormalWindow:
         """Return a map of the last estimate as one array on the device; it may have padding."""
         if len(self.bands) == 1:
             return self.bands[0].maps[name]
-        return self.device.given(name, self.fetch(name), self.bands[0].maps[name].host.dtype)
+        return self.device.given(name, self.fetch(name), self.bands[0].maps[name].dtype)
 
     def _without_padding(self, band: Band, planes: NDArray[Any]) -> NDArray[Any]:
         depth = len(planes)
@@ -137,8 +137,7 @@ class NormalWindow:
         order = np.roll(np.arange(self.length), -self._sums.oldest)
         step, before, parts = thinning(self._shape), 0, []
         for band in self.bands:
-            with band.resident():
-                ring = band.maps["ring"].download()
-                parts.append(ring[:, -before % step : band.pixels : step][order])
+            (ring,) = band.fetch({"ring": slice(None)}, keep=True)
+            parts.append(ring[:, -before % step : band.pixels : step][order])
             before += band.pixels
         return np.concatenate(parts, axis=1)

@@ -13,6 +13,7 @@ from injected_faults import lost
 
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels import embedded
+from mirrorskin.kernels.array import fetch
 from mirrorskin.kernels.device import list_devices, open_device
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError, UnknownDeviceError
 from mirrorskin.kernels.signature import read_signatures
@@ -186,6 +187,47 @@ def test_only_the_first_rows_travel_when_asked(device):
         assert sum(record.bytes for record in uploads if record.kind == "upload") >= 48 + 24
 
 
+def test_rows_are_read_and_written_and_the_others_stay(device):
+    array = device.given("numbers", np.arange(12).reshape(4, 3), np.int32)
+    array.write(np.array([30, 31, 32, 40]), row=2)
+    expected = [[0, 1, 2], [3, 4, 5], [30, 31, 32], [40, 10, 11]]
+    assert array.read().tolist() == expected
+    assert array.read(2).tolist() == expected[2]
+    rows = array.read(slice(1, 3))
+    rows[...] = 0  # a copy
+    assert array.read(slice(1, 3)).tolist() == expected[1:3]
+    assert array.read(-1).tolist() == expected[-1]
+
+
+def test_an_array_that_the_host_never_wrote_is_filled_or_left_on_the_device(device):
+    device.profile.clear()
+    zeros = device.array("zeros", (5, 7), np.uint8)
+    for _ in range(2):
+        device.kernel(TWICE, "twice")(1, values=zeros, count=0, moved=0)
+        zeros.upload()
+        assert not zeros.read().any()
+    device.array("anything", (5, 7), np.uint8, zeroed=False).upload()
+    zeros.fill(3)
+    assert np.all(zeros.read() == 3)
+    counts = device.array("counts", (5,), np.float32)
+    counts.fill(-0.0)
+    assert np.all(np.signbit(counts.read()))
+    assert not [record for record in device.profile.records() if record.kind == "upload"]
+
+
+def test_parts_of_several_arrays_are_waited_for_once(device):
+    arrays = [device.given(name, np.full((3, 4), n), np.int32) for n, name in enumerate("abc")]
+    for keep in (True, False):
+        device.profile.clear()
+        found = fetch([(arrays[0], slice(None)), (arrays[1], 2), (arrays[2], slice(1, 3))], keep)
+        assert [part.shape for part in found] == [(3, 4), (4,), (2, 4)]
+        assert [int(part.max()) for part in found] == [int(part.min()) for part in found] == [0, 1, 2]
+        records = [record for record in device.profile.records() if record.kind == "download"]
+        assert sum(record.bytes for record in records) == (0 if device.info.shares_memory else 4 * 24)
+        if not device.info.shares_memory:
+            assert sum(record.runs for record in device.profile.records() if record.kind == "wait") == 1
+
+
 def test_a_lack_of_memory_is_told_apart(small_device):
     small_device.max_allocation = 100
     with pytest.raises(DeviceMemoryError, match="no room for too much"):
@@ -213,7 +255,9 @@ def test_the_profile_tells_what_was_run(device):
     assert 0 < kernel.fastest <= kernel.seconds
     assert kernel.bandwidth == pytest.approx(kernel.bytes / kernel.seconds)
     copied = not device.info.shares_memory
-    assert (("upload", "words") in records) is copied
+    assert (("fill", "words") in records) is copied
+    assert ("upload", "words") not in records
+    assert records["wait", "words"].runs == 1
     assert (("download", "words") in records) is copied
 
 

@@ -152,7 +152,7 @@ except DeviceError as error:
     print(error)
 """,
     "no more": "values.download(); del values",
-    "pinned": "device.pinned((64,), np.int32)",
+    "staging": "from mirrorskin.kernels import transfer; transfer._make_slot(device)",
 }
 
 

@@ -32,6 +32,7 @@ from gpu_check import ROOT, frozen_cases, taken_for_gpu
 from mirrorskin.cli.bench.limits import measure_limits
 from mirrorskin.cli.bench.records import describe_run
 from mirrorskin.kernels.device import Device, list_devices, open_device
+from mirrorskin.kernels.mapping import Mapping
 
 LOOSER = 10  # times the tolerance of the frozen answers, which are those of one machine's arithmetic
 FEW = 1e-3  # of an array may differ by more: pixels on the other side of a threshold
@@ -117,14 +118,23 @@ def measure_device(trial: Trial, end: float) -> dict[str, float]:
 
 def measure_copies(device: Device, size: int) -> dict[str, float]:
     """Measure copies from and to both kinds of memory on the host, and on the host itself."""
-    buffer = device.array("copied", (size,), np.uint8).buffer
-    plain, pinned = np.ones(size, np.uint8), device.pinned((size,), np.uint8)
+    array, plain = device.array("copied", (size,), np.uint8), np.ones(size, np.uint8)
+    buffer, flags = array.buffer, cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR
+    pinned = np.asarray(
+        Mapping(device.copies, cl.Buffer(device.context, flags, size), (size,), np.dtype(np.uint8))
+    )
     pinned[:] = 1
     seconds = {
         f"{name} {way}": median(partial(cl.enqueue_copy, device.queue, *pair))
         for name, host in (("pageable", plain), ("pinned", pinned))
         for way, pair in (("up", (buffer, host)), ("down", (host, buffer)))
     }
+
+    def write() -> None:
+        array.write(plain)
+        array.read(0)  # waits
+
+    seconds |= {"staged up": median(write), "staged down": median(array.read)}
     other = np.empty_like(plain)
     parts = np.split(other, 4), np.split(plain, 4)
     seconds["host to host, one thread"] = median(partial(np.copyto, other, plain))

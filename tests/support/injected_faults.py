@@ -20,7 +20,7 @@ import pyopencl as cl
 import pytest
 
 from mirrorskin.io import atomic
-from mirrorskin.kernels import array, device, memory
+from mirrorskin.kernels import array, device, mapping, memory, transfer
 
 _CLOSE = os.close
 
@@ -59,7 +59,7 @@ def _exhausted() -> Exception:
 
 
 _NAMES = ("Buffer", "CommandQueue", "Context", "Kernel", "Program")
-_ENQUEUE = ("enqueue_copy", "enqueue_map_buffer", "enqueue_migrate_mem_objects")
+_ENQUEUE = ("enqueue_copy", "enqueue_fill_buffer", "enqueue_map_buffer", "enqueue_migrate_mem_objects")
 _WAITS = [
     (cl.Event, "wait"),
     (cl.CommandQueue, "finish"),
@@ -79,7 +79,7 @@ _FILES = [
 
 
 def _opencl(calls: Calls, patch: pytest.MonkeyPatch) -> None:
-    for module in (array, device):
+    for module in (array, device, mapping, transfer):
         functions = {name: calls.watch(getattr(cl, name)) for name in (*_NAMES, *_ENQUEUE)}
         patch.setattr(module, "cl", SimpleNamespace(**{**vars(cl), **functions}))
     for owner, name in _WAITS:
