@@ -160,7 +160,7 @@ def _steps(dz_dx: Array, dz_dy: Array, flags: Flags, weight_x: Array | None, wei
     map_x = np.ones(flags.shape) if weight_x is None else weight_x.astype(np.float64)
     map_y = map_x if weight_y is None else weight_y.astype(np.float64)
     right, down = flags & RIGHT != 0, flags & DOWN != 0
-    across, along = _slopes(dz_dx, right), _slopes(dz_dy.T, down.T).T
+    across, along = link_slopes(dz_dx, right), link_slopes(dz_dy.T, down.T).T
     wx, wy = (map_x, map_y) if owned else (_harmonic(map_x), _harmonic(map_y.T).T)
     return (
         (np.where(right, weights[0] * wx, 0.0), np.where(right, size[0] * (across - plane[0]), 0.0)),
@@ -168,8 +168,8 @@ def _steps(dz_dx: Array, dz_dy: Array, flags: Flags, weight_x: Array | None, wei
     )
 
 
-def _slopes(slope: Array, linked: Mask) -> Doubles:
-    """Return the slopes of the links to the next column."""
+def link_slopes(slope: Array, linked: Mask) -> Doubles:
+    """Return the slopes of the links to the next column: of four pixels in line, or at the ends of two."""
     ends = linked | np.roll(linked, 1, axis=1)
     known, found = np.where(ends, slope, 0.0).astype(np.float64), np.zeros(slope.shape)
     found[:, :-1] = (known[:, :-1] + known[:, 1:]) / 2

@@ -30,7 +30,7 @@ from mirrorskin.kernels.normals import (
     step,
     tangents,
 )
-from mirrorskin.kernels.response import light_slopes, wall_light
+from mirrorskin.kernels.response import light_slopes, sight_slopes, wall_light
 
 Array = NDArray[Any]
 
@@ -124,7 +124,7 @@ def _start(samples: Samples, scale: Doubles, wall: Wall) -> Doubles:
     )
     _, _, x, y, z = scale
     radius = wall.geometry[0]
-    slope_x, slope_y = _slopes(x, y, wall)
+    slope_x, slope_y = sight_slopes(np.stack([x, y]), wall.sight)
     x, y = x + z * slope_x, y + z * slope_y
     with np.errstate(invalid="ignore"):
         along = x * east + y * north
@@ -167,16 +167,10 @@ def _rotations(turn: Doubles, tilt: float) -> tuple[Doubles, Doubles]:
     return turning, math.cos(tilt) * swap - math.sin(tilt) * (flat + steep)
 
 
-def _slopes(x: Doubles, y: Doubles, wall: Wall) -> tuple[Doubles, Doubles]:
-    """Return by how much the lines of sight move along x and y for each millimetre of z."""
-    bend = wall.sight[0] + wall.sight[1] * (x**2 + y**2)
-    return -bend * x, -bend * y
-
-
 def _places(scale: Doubles, turning: Doubles, wall: Wall) -> Doubles:
     """Return where each sample's point is seen, as `wall_light` takes it, (5, N, n)."""
     x, y, z = scale[2:]
-    slope_x, slope_y = _slopes(x, y, wall)
+    slope_x, slope_y = sight_slopes(np.stack([x, y]), wall.sight)
     point = np.stack([x + z * slope_x, y + z * slope_y, z])
     pivot = np.array(wall.pivot)[:, np.newaxis]
     moved = pivot[:, np.newaxis] + np.einsum("kij,jn->ikn", turning, point - pivot)

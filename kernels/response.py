@@ -11,7 +11,7 @@ of a mirror at the centre that shows it is pi/4 - atan(q). The light is what the
 
     light = (1 + lamp_x mx + lamp_y my) (curve[0] + curve[1] q + curve[2] q^2 ...)
 
-`mirrorskin.kernels.normals` uses the same formula.
+``normals_wall.cl`` computes the same; all other code calls the functions here.
 """
 
 from __future__ import annotations
@@ -25,21 +25,17 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[Any]
 Doubles = NDArray[np.float64]
 
+_LEVEL = 1e-24  # added to the squared level part of rays, which is 0 for vertical ones
 
-class _Ray(NamedTuple):
-    """Where a mirrored line of sight goes, each of the samples' shape.
 
-    ``sight`` and ``ray`` are unit vectors in three parts; ``at`` is where it meets the wall, mm across the
-    axis, after ``way`` mm; ``cosine`` is its cosine to the wall's normal times the radius.
-    """
+class Ray(NamedTuple):
+    """A mirrored line of sight."""
 
-    sight: Doubles
-    ray: Doubles
-    at: Doubles
-    cosine: Doubles
-    way: Doubles
-    height: Doubles
-    q: Doubles
+    direction: Doubles  # (3, ...): a unit vector, away from the mirror
+    at: Doubles  # (2, ...): where it meets the wall, across the axis, as a share of the radius
+    way: Doubles  # from the mirror to the wall, mm
+    cosine: Doubles  # to the wall's normal, times the radius
+    height: Doubles  # at which it meets the wall, mm
 
 
 def wall_light(place: ArrayLike, normals: ArrayLike, geometry: Sequence[float], lamps: Sequence[float],
@@ -59,10 +55,11 @@ def wall_light(place: ArrayLike, normals: ArrayLike, geometry: Sequence[float], 
     curve : polynomial in q, from the lowest power on
     reach : lowest and highest q at which the curve is known
     """
-    ray = _follow(place, normals, geometry[0])
-    lamp = 1 + (lamps[0] * ray.at[0] + lamps[1] * ray.at[1]) / geometry[0]
-    light = lamp * _level(ray.q, curve, reach)[0]
-    return light, _within(ray, np.asarray(place, np.float64)[2], geometry, reach)
+    _, _, ray = _follow(place, normals, geometry[0])
+    q = half_tangent(ray.height, geometry[0])
+    light = lamp_light(ray, lamps) * level(q, curve, reach)[0]
+    within = _meets_wall(ray, np.asarray(place, np.float64)[2], geometry) & (q >= reach[0]) & (q <= reach[1])
+    return light, within
 
 
 def light_slopes(place: ArrayLike, normals: ArrayLike, geometry: Sequence[float], lamps: Sequence[float],
@@ -72,57 +69,67 @@ def light_slopes(place: ArrayLike, normals: ArrayLike, geometry: Sequence[float]
     By the formula as it stands, which takes the normals for unit vectors: only the parts across a normal
     have a meaning.
     """
-    ray = _follow(place, normals, geometry[0])
-    level, steepness = _level(ray.q, curve, reach)
-    lamp = 1 + (lamps[0] * ray.at[0] + lamps[1] * ray.at[1]) / geometry[0]
-    by_height = (1 - ray.q**2) ** 2 / (2 * geometry[0] * (1 + ray.q**2))
-    by_height *= lamp * steepness
-    # A ray that turns by dr meets the wall way (dr - r (at . dr) / c) further on.
-    towards = lamps[0] * ray.ray[0] + lamps[1] * ray.ray[1]
-    along = (level / geometry[0] * towards + by_height * ray.ray[2]) / ray.cosine
-    by_ray = ray.way * np.stack(
-        [
-            level / geometry[0] * lamps[0] - along * ray.at[0],
-            level / geometry[0] * lamps[1] - along * ray.at[1],
-            by_height,
-        ]
-    )
-    normal = np.moveaxis(np.asarray(normals, np.float64), -1, 0)
-    facing, pull = (ray.sight * normal).sum(axis=0), (by_ray * normal).sum(axis=0)
-    return np.asarray(np.moveaxis(-2 * (facing * by_ray + pull * ray.sight), 0, -1))
+    sight, normal, ray = _follow(place, normals, geometry[0])
+    q = half_tangent(ray.height, geometry[0])
+    light, steepness = level(q, curve, reach)
+    by_height = (1 - q**2) ** 2 / (2 * geometry[0] * (1 + q**2))
+    by_height *= lamp_light(ray, lamps) * steepness
+    by_lamps = light * np.reshape(np.asarray(lamps, np.float64) / geometry[0], (2, *[1] * q.ndim))
+    # A ray that turns by dr meets the wall way (dr - r (R at . dr) / c) further on.
+    along = ((by_lamps * ray.direction[:2]).sum(axis=0) + by_height * ray.direction[2]) / ray.cosine
+    by_ray = ray.way * np.stack([*(by_lamps - along * geometry[0] * ray.at), by_height])
+    facing, pull = (sight * normal).sum(axis=0), (by_ray * normal).sum(axis=0)
+    return np.asarray(np.moveaxis(-2 * (facing * by_ray + pull * sight), 0, -1))
 
 
-def reflect(sight: Doubles, normal: Doubles) -> Doubles:
-    """Return where lines of sight go from mirrors: r of unit vectors s and n, each (3, ...)."""
-    return np.asarray(sight - 2 * (sight * normal).sum(axis=0) * normal)
+def sight_slopes(from_axis: Doubles, sight: Sequence[float]) -> Doubles:
+    """Return how far lines of sight move along x and y for each mm of z, (2, ...).
 
-
-def way_to_wall(along: Doubles, across: Doubles, room: Doubles) -> tuple[Doubles, Doubles]:
-    """Return how far it is to the wall, and the ray's cosine to the wall's normal times the radius.
-
-    ``along`` is A, ``across`` the square of the ray's part across the axis, ``room`` the radius squared less
-    the place squared.
+    ``from_axis`` are places on the rest plane, mm from the body's axis; ``sight`` is the slope for each mm of
+    distance, and its growth with the square of the distance.
     """
-    cosine = np.sqrt(along**2 + across * room)
-    return room / (along + cosine), cosine
+    return np.asarray(-(sight[0] + sight[1] * (from_axis**2).sum(axis=0)) * from_axis, np.float64)
 
 
-def _follow(place: ArrayLike, normals: ArrayLike, radius: float) -> _Ray:
-    """Follow lines of sight by way of mirrors to the wall."""
-    x, y, z, slope_x, slope_y = np.asarray(place, np.float64)
-    normal = np.moveaxis(np.asarray(normals, np.float64), -1, 0)
-    x, y = x + z * slope_x, y + z * slope_y
-    sight = np.stack([-slope_x, -slope_y, -np.ones_like(slope_x)]) / np.sqrt(slope_x**2 + slope_y**2 + 1)
-    sight = np.broadcast_to(sight.reshape(3, -1, x.shape[-1]), normal.shape)
-    ray = reflect(sight, normal)
-    room, along = radius**2 - x**2 - y**2, x * ray[0] + y * ray[1]
+def sight_of(slopes: Doubles) -> Doubles:
+    """Return unit vectors down the lines of sight, (3, ...), from their slopes along x and y, (2, ...)."""
+    return np.asarray(-np.stack([*slopes, np.ones_like(slopes[0])]) / np.sqrt((slopes**2).sum(axis=0) + 1))
+
+
+def lamp_light(ray: Ray, lamps: Sequence[float]) -> Doubles:
+    """Return the light of the lamps as a share of their mean, where rays meet the wall."""
+    return np.asarray(1 + lamps[0] * ray.at[0] + lamps[1] * ray.at[1])
+
+
+def shade_terms(x: ArrayLike, y: ArrayLike) -> Doubles:
+    """Return the functions of which shading is composed, (5, ...); x and y are shares of the radius."""
+    u, v = np.asarray(x, np.float64), np.asarray(y, np.float64)
+    return np.stack([u, v, u * u, u * v, v * v])
+
+
+def follow(point: Doubles, sight: Doubles, normal: Doubles, radius: float, closest: float = -np.inf) -> Ray:
+    """Follow lines of sight from points of mirrors to the wall.
+
+    Points, (3, ...), are mm from the body's axis and above the rest plane; ``sight`` and ``normal`` are unit
+    vectors. Outside the wall there is no answer, or that for ``closest``: the least square of the radius less
+    that of a point's distance from the axis.
+    """
+    x, y, z = point
+    ray = sight - 2 * (sight * normal).sum(axis=0) * normal
+    room, along = np.maximum(radius**2 - x**2 - y**2, closest), x * ray[0] + y * ray[1]
     with np.errstate(divide="ignore", invalid="ignore"):
-        way, cosine = way_to_wall(along, ray[0] ** 2 + ray[1] ** 2, room)
-        at, height = np.stack([x + way * ray[0], y + way * ray[1]]), z + way * ray[2]
-        return _Ray(sight, ray, at, cosine, way, height, height / (radius + np.hypot(height, radius)))
+        cosine = np.sqrt(along**2 + (ray[0] ** 2 + ray[1] ** 2 + _LEVEL) * room)
+        way = room / (along + cosine)
+        at, height = np.stack([x + way * ray[0], y + way * ray[1]]) / radius, z + way * ray[2]
+        return Ray(ray, at, way, cosine, height)
 
 
-def _level(q: Doubles, curve: ArrayLike, reach: Sequence[float]) -> tuple[Doubles, Doubles]:
+def half_tangent(height: Doubles, radius: float) -> Doubles:
+    """Return q: the tangent of half the elevation at which the centre sees a height of the wall, mm."""
+    return np.asarray(height / (radius + np.hypot(height, radius)))
+
+
+def level(q: Doubles, curve: ArrayLike, reach: Sequence[float]) -> tuple[Doubles, Doubles]:
     """Return the curve's value and slope, which stays out of reach what it is at the end of it."""
     polynomial = np.polynomial.polynomial
     powers = np.append(np.asarray(curve, np.float64), 0.0)  # of which even a constant has a slope
@@ -131,13 +138,23 @@ def _level(q: Doubles, curve: ArrayLike, reach: Sequence[float]) -> tuple[Double
     return polynomial.polyval(held, powers) + slope * (q - held), slope
 
 
-def _within(ray: _Ray, z: Doubles, geometry: Sequence[float], reach: Sequence[float]) -> NDArray[np.bool_]:
-    """Tell which samples lie within the range in which the light is known."""
+def _follow(place: ArrayLike, normals: ArrayLike, radius: float) -> tuple[Doubles, Doubles, Ray]:
+    """Return sights and normals, (3, N, n), and the rays, of `wall_light`'s arguments."""
+    x, y, z, slope_x, slope_y = np.asarray(place, np.float64)
+    normal = np.moveaxis(np.asarray(normals, np.float64), -1, 0)
+    sight = sight_of(np.stack([slope_x, slope_y]))
+    sight = np.broadcast_to(sight.reshape(3, -1, x.shape[-1]), normal.shape)
+    point = np.stack([x + z * slope_x, y + z * slope_y, z])
+    return sight, normal, follow(point, sight, normal, radius)
+
+
+def _meets_wall(ray: Ray, z: Doubles, geometry: Sequence[float]) -> NDArray[np.bool_]:
+    """Return whether the two rays that scatter turns up and down most meet the wall."""
     turned = np.tan(geometry[2])
-    out = np.hypot(ray.ray[0], ray.ray[1])
+    out = np.hypot(ray.direction[0], ray.direction[1])
     with np.errstate(divide="ignore", invalid="ignore"):
-        rise = ray.ray[2] / out
+        rise = ray.direction[2] / out
         upper = z + ray.way * out * (rise + turned) / (1 - rise * turned)
         lower = z + ray.way * out * (rise - turned) / (1 + rise * turned)
-        meets = (rise * turned < 1) & (rise * turned > -1) & (upper <= geometry[1]) & (lower >= 0)
-        return np.asarray(meets & (ray.q >= reach[0]) & (ray.q <= reach[1]))
+        meets = (rise * turned < 1) & (rise * turned > -1)
+        return np.asarray(meets & (upper <= geometry[1]) & (lower >= 0))

@@ -1,7 +1,6 @@
 """Slopes and their weights from normals: what ``slopes.cl`` computes, in NumPy with float64.
 
-`mirrorskin.engine.rotation.normals_to_height.find_slopes` says why; this is the same for one turn of a known
-tilt, in two steps as kernels take them.
+`mirrorskin.engine.rotation.normals_to_height.find_slopes` explains the variances and the bias.
 """
 
 from __future__ import annotations
@@ -15,31 +14,49 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 Doubles = NDArray[np.float64]
 
-_STEEPEST = math.cos(math.radians(80.0))
-_WIDEST = 0.5**2
-_AROUND = 2
+_STEEPEST = math.cos(math.radians(80.0))  # of the largest zenith whose slope is used
+_WIDEST = 0.5**2  # radians^2: limit of the variance of an azimuth
+_AROUND = 2  # pixels on each side, in the window for the direction of the meridian
 _LEAST = float(np.finfo(np.float32).tiny)
 
 
 def slopes_find(least: float, vectors: Array, sigma: Array, contact: Array) -> tuple[Doubles, ...]:
     """Return the slopes, NaN where nothing is known, and the squares of the normal's parts, 0 there.
 
-    ``least`` is the squared sine of the tilt.
+    ``least`` is the squared sine of the tilt; infinite if it is unknown, then errors are isotropic.
     """
-    x, y, z = np.moveaxis(vectors.astype(np.float64), -1, 0)
-    with np.errstate(invalid="ignore"):
-        known = (contact != 0) & (z > 0) & (sigma > 0) & (sigma < np.inf)
-    x, y, z = (np.where(known, one, other) for one, other in ((x, 0), (y, 0), (np.maximum(z, _STEEPEST), 1)))
-    _, turned = _unsure(least, x * x + y * y, np.where(known, sigma, 0.0) ** 2)
-    slopes = (np.where(known, -np.exp(turned / 2) * n / z, np.nan) for n in (x, y))
-    return (*slopes, x * x, y * y)
+    return find(least, vectors.astype(np.float64), sigma.astype(np.float64), contact)
 
 
 def slopes_weigh(least: float, lowest: float, highest: float, sigma: Array, dz_dx: Doubles,
                  squares_x: Doubles, squares_y: Doubles) -> tuple[Doubles, Doubles]:  # fmt: skip
     """Return inverse variances of the slopes along x and y, within bounds; 0 where nothing is known."""
+    return weigh(least, (lowest, highest), sigma.astype(np.float64), dz_dx, squares_x, squares_y)
+
+
+def find(least: float, vectors: Array, sigma: Array, contact: Array) -> tuple[Array, Array, Array, Array]:
+    """Return what `slopes_find` does, in the precision of the arguments."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    with np.errstate(invalid="ignore"):
+        known = (contact != 0) & (z > 0) & (sigma > 0) & (sigma < np.inf)
+    x, y, z = (np.where(known, one, other) for one, other in ((x, 0), (y, 0), (np.maximum(z, _STEEPEST), 1)))
+    _, turned = _unsure(least, x * x + y * y, np.where(known, sigma, 0) ** 2)
+    longer = np.where(known, -np.exp(turned / 2) / z, np.nan)
+    return longer * x, longer * y, x * x, y * y
+
+
+def weigh(
+    least: float, bounds: tuple[float, float], sigma: Array, dz_dx: Array, squares_x: Array, squares_y: Array
+) -> tuple[Array, Array]:
+    """Return what `slopes_weigh` does, in the precision of the arguments.
+
+    The direction of the meridian is that of the surroundings: with a pixel's own azimuth, slopes that noise
+    shortened would get other weights than those that it lengthened, and their weighted mean would be biased.
+    Squares of components are equal on both sides of a ridge; noise of the azimuth reduces the contrast of
+    their means by exp(-2 variance). An error e of the azimuth also shortens the slope by e^2 / 2.
+    """
     known = np.isfinite(dz_dx)
-    variance = np.where(known, sigma.astype(np.float64), 1.0) ** 2
+    variance = np.where(known, sigma, 1) ** 2
     flat = squares_x + squares_y
     steep = 1 / np.maximum(1 - flat, _STEEPEST**2)
     share, turned = _unsure(least, flat, variance)
@@ -48,20 +65,19 @@ def slopes_weigh(least: float, lowest: float, highest: float, sigma: Array, dz_d
     x, y = (_sum_around(one) + _LEAST for one in (squares_x, squares_y))
     east = np.clip(0.5 + (x / (x + y) - 0.5) * np.exp(2 * turned), 0, 1)
     variances = east * along + (1 - east) * across, (1 - east) * along + east * across
-    weight_x, weight_y = (np.where(known, np.clip(1 / one, lowest, highest), 0) for one in variances)
+    weight_x, weight_y = (np.where(known, np.clip(1 / one, *bounds), 0) for one in variances)
     return weight_x, weight_y
 
 
-def _unsure(least: float, flat: Doubles, variance: Doubles) -> tuple[Doubles, Doubles]:
+def _unsure(least: float, flat: Array, variance: Array) -> tuple[Array, Array]:
     """Return the share of an angular error's variance along the meridian, and the azimuth's variance."""
-    outside = np.maximum(flat, least)
-    share = 0.5 * least / outside
-    return share, np.minimum((1 - share) * variance / outside, _WIDEST)
+    share = 0.5 * np.minimum(least / np.maximum(flat, _LEAST), 1)
+    return share, np.minimum((1 - share) * variance / np.maximum(flat, least), _WIDEST)
 
 
-def _sum_around(values: Doubles) -> Doubles:
+def _sum_around(values: Array) -> Array:
     """Return the sums over squares of 5 x 5 pixels, 0 beyond the picture."""
     rows, columns = values.shape
-    wide = np.pad(values, _AROUND)
-    size = 2 * _AROUND + 1
-    return np.asarray(sum(wide[r : r + rows, c : c + columns] for r in range(size) for c in range(size)))
+    wide, size = np.pad(values, _AROUND), 2 * _AROUND + 1
+    lines = np.asarray(sum(wide[row : row + rows] for row in range(size)))
+    return np.asarray(sum(lines[:, column : column + columns] for column in range(size)))

@@ -10,6 +10,7 @@ import numpy as np
 
 from mirrorskin.engine.calibration.wall_response import threshold_zenith
 from mirrorskin.engine.press.elastic import threshold_at
+from mirrorskin.engine.rotation.response import shade
 from mirrorskin.io import Gel, Stiffness, WallResponse
 from mirrorskin.io.types import Floats
 from mirrorskin.view.calibration import draw_pixels, new_sheet
@@ -132,11 +133,11 @@ def _draw_shade(axes: Axes, response: WallResponse) -> None:
     radius = response.radius
     across = np.linspace(-1, 1, _FINE)
     x, y = np.meshgrid(across, across[::-1])
-    shade = 100 * np.tensordot(response.shade, np.stack([x, y, x * x, x * y, y * y]), 1)
-    shade[np.hypot(x, y) > 1] = np.nan
-    reach = max(float(np.nanmax(np.abs(shade))), 0.01)
+    percent = 100 * (shade(response, radius * x, radius * y) - 1)
+    percent[np.hypot(x, y) > 1] = np.nan
+    reach = max(float(np.nanmax(np.abs(percent))), 0.01)
     picture = axes.imshow(
-        shade,
+        percent,
         cmap=DIVERGING,
         vmin=-reach,
         vmax=reach,

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.rotation.response import shade
 from mirrorskin.io import Header, InputError, WallResponse, pixel_axes
-from mirrorskin.kernels.response import wall_light
+from mirrorskin.kernels.response import sight_slopes, wall_light
 
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -105,7 +105,7 @@ class WallBrightness:
 
     def sight(self, pixels: Pixels) -> Doubles:
         """Return the displacement of lines of sight along x and y per mm of z, (2, n)."""
-        return self.wall.sight_slopes(self.place[:, pixels])
+        return sight_slopes(self.place[:, pixels], self.wall.sight)
 
     def of_counts(self, counts: NDArray[Any], pixels: Pixels) -> Doubles:
         """Return the light of counts of pixels, (..., n), as a share; NaN if clipped or unknown."""

@@ -15,6 +15,7 @@ from mirrorskin.engine.provenance import naming
 from mirrorskin.engine.reconstruction import reconstruct
 from mirrorskin.io import Calibration, InputError, Result, Source, WallResponse
 from mirrorskin.kernels.device import Device
+from mirrorskin.kernels.response import sight_slopes
 
 Doubles = NDArray[np.float64]
 
@@ -207,7 +208,7 @@ def _axes(result: Result) -> tuple[Doubles, Doubles]:
 def _sight_of(response: WallResponse, result: Result) -> Doubles:
     """Return the lines of sight of all pixels, (4, H, W), as in `see_ball`."""
     place = np.stack(np.meshgrid(*_axes(result)))
-    slopes = response.sight_slopes(place - np.reshape(response.axis, (2, 1, 1)))
+    slopes = sight_slopes(place - np.reshape(response.axis, (2, 1, 1)), response.sight)
     return np.concatenate([place, slopes])
 
 

@@ -121,6 +121,7 @@ def ball_onset(result: Result, source: Source, radius: float) -> BallOnset:
     mirrorskin.io.InputError
         The result is not a press, there is no pixel size, or fewer than 50 pixels turned bright.
     """
+    import cv2
     from scipy import ndimage
 
     height, sigma, status = result.height, result.height_sigma, result.status
@@ -139,8 +140,9 @@ def ball_onset(result: Result, source: Source, radius: float) -> BallOnset:
     onset = BallOnset(maps[0], maps[1], maps[2], maps[3], radius)
     # The dark top is the largest dark patch that is surrounded by light.
     closed = ndimage.binary_closing(np.pad(status == PressStatus.ONSET, 1), np.ones((3, 3), bool))[1:-1, 1:-1]
-    patches, count = ndimage.label(ndimage.binary_fill_holes(closed) & ~closed)
-    if count == 0:
+    dark = ndimage.binary_fill_holes(closed) & ~closed
+    count, patches = cv2.connectedComponents(dark.view(np.uint8), connectivity=4)
+    if count == 1:
         return onset
     largest = patches == 1 + np.argmax(np.bincount(patches.ravel())[1:])
     area = float(np.count_nonzero(largest & (status == PressStatus.NEVER_LIGHT))) * size[0] * size[1]

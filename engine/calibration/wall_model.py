@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.calibration.ball import rotations
-from mirrorskin.kernels.response import reflect, way_to_wall
+from mirrorskin.kernels.response import Ray, follow, lamp_light, shade_terms, sight_of, sight_slopes
 
 Doubles = NDArray[np.float64]
 
@@ -91,6 +91,7 @@ STEPS = slice(len(SENSOR), len(SENSOR) + CURVE_COEFFICIENTS)
 _GEOMETRIC = len(SENSOR) - 7  # number of parameters that change the path of rays; others change their light
 _OF_THE_WALL = ("radius", "rim", "scatter")  # parameters without influence on where rays are reflected
 _STEEPEST = np.radians(89.0)  # greatest elevation of a ray that is followed to the wall
+_CLOSEST = 1e-6  # mm^2: to the wall; see `follow`
 _SMALL = 1e-5  # step of numerical derivatives, relative to a parameter's scale
 SCALES = dict(zip(SENSOR, (1, 1, 1, 1, 1e-3, 1e-6, 1e-2, 1, 1, 1, 1e-2, *[0.1] * 7), strict=True))
 """Order of magnitude of the error of each parameter of the sensor."""
@@ -128,7 +129,7 @@ class WallHit(NamedTuple):
 
     low: Doubles  # (N,): first share that a ray is spread over
     high: Doubles  # (N,): last share
-    azimuth: Doubles  # (2, N): direction of the wall's point, a unit vector
+    ray: Ray  # without scatter
 
 
 def meet_balls(samples: LightSamples, named: Mapping[str, float], centres: Doubles) -> SheetPoints:
@@ -141,19 +142,15 @@ def meet_balls(samples: LightSamples, named: Mapping[str, float], centres: Doubl
     turns = rotations(samples.lean @ np.array([[cos, sin], [-sin, cos]]))
     in_frames = np.asarray(pivot + np.einsum("pij,pj->pi", turns, centres[samples.press] - pivot))
     middle = in_frames[samples.pose].T
-    (x, y), (slope_x, slope_y) = look(samples.place, named)
+    (x, y), slope = look(samples.place, named)
+    slope_x, slope_y = slope
     start_x, start_y, start_z = samples.place[0] - middle[0], samples.place[1] - middle[1], -middle[2]
     square = slope_x * slope_x + slope_y * slope_y + 1
     linear = start_x * slope_x + start_y * slope_y + start_z
     discriminant = linear**2 - square * (start_x**2 + start_y**2 + start_z**2 - samples.ball**2)
     z = (np.sqrt(np.maximum(discriminant, 0)) - linear) / square
     normal = np.stack([start_x + z * slope_x, start_y + z * slope_y, start_z + z]) / samples.ball
-    return SheetPoints(x + z * slope_x, y + z * slope_y, z, down(np.stack([slope_x, slope_y])), normal)
-
-
-def down(slope: Doubles) -> Doubles:
-    """Return unit vectors along lines of sight, (3, N), from their slopes along x and y, (2, N)."""
-    return np.asarray(-np.stack([*slope, np.ones(slope.shape[1])]) / np.sqrt((slope**2).sum(axis=0) + 1))
+    return SheetPoints(x + z * slope_x, y + z * slope_y, z, sight_of(slope), normal)
 
 
 def look(place: Doubles, named: Mapping[str, float]) -> tuple[Doubles, Doubles]:
@@ -162,7 +159,7 @@ def look(place: Doubles, named: Mapping[str, float]) -> tuple[Doubles, Doubles]:
     All are (2, N): the lines pass ``position + z slope``.
     """
     from_axis = place - np.array([[named["axis_x"]], [named["axis_y"]]])
-    return from_axis, -(named["sight_0"] + named["sight_2"] * (from_axis**2).sum(axis=0)) * from_axis
+    return from_axis, sight_slopes(from_axis, (named["sight_0"], named["sight_2"]))
 
 
 def reach_wall(met: SheetPoints, named: Mapping[str, float]) -> WallHit:
@@ -173,26 +170,23 @@ def reach_wall(met: SheetPoints, named: Mapping[str, float]) -> WallHit:
     ``d da / (rx^2 + ry^2)``.
     """
     radius = named["radius"]
-    ray = reflect(met.sight, met.normal)
-    # Vertical rays, and points that an iteration of the fit puts outside the wall, must not cause errors.
-    out = np.sqrt(ray[0] ** 2 + ray[1] ** 2) + 1e-12
-    clearance = np.maximum(radius**2 - met.x**2 - met.y**2, 1e-6)
-    distance, cosine = way_to_wall(met.x * ray[0] + met.y * ray[1], out**2, clearance)
-    elevation = np.arctan2(ray[2], out)
-    spread = named["scatter"] * np.sqrt(out**2 + (ray[2] * radius * out / cosine) ** 2)
+    # An iteration of the fit may put points outside the wall.
+    ray = follow(np.stack([met.x, met.y, met.z]), met.sight, met.normal, radius, _CLOSEST)
+    out, rise = np.sqrt(ray.direction[0] ** 2 + ray.direction[1] ** 2), ray.direction[2]
+    elevation = np.arctan2(rise, out)
+    spread = named["scatter"] * np.sqrt(out**2 + (rise * radius * out / ray.cosine) ** 2)
     whole = np.arctan2(named["rim"], radius)
     high, low = (
-        1 - np.arctan2(met.z + distance * out * np.tan(np.clip(angle, -_STEEPEST, _STEEPEST)), radius) / whole
+        1 - np.arctan2(met.z + ray.way * out * np.tan(np.clip(angle, -_STEEPEST, _STEEPEST)), radius) / whole
         for angle in (elevation - spread, elevation + spread)
     )
-    return WallHit(low, high, np.stack([met.x + distance * ray[0], met.y + distance * ray[1]]) / radius)
+    return WallHit(low, high, ray)
 
 
-def shade_terms(met: SheetPoints, radius: float) -> Doubles:
-    """Return the five functions of the position on the rest plane that shading is composed of, (5, N)."""
+def _shade_terms(met: SheetPoints, radius: float) -> Doubles:
+    """Return the functions of the position on the rest plane that shading is composed of, (5, N)."""
     back = met.z / met.sight[2]
-    x, y = (met.x - back * met.sight[0]) / radius, (met.y - back * met.sight[1]) / radius
-    return np.stack([x, y, x * x, x * y, y * y])
+    return shade_terms((met.x - back * met.sight[0]) / radius, (met.y - back * met.sight[1]) / radius)
 
 
 def split(parameters: Doubles) -> tuple[dict[str, float], Doubles, Doubles]:
@@ -239,9 +233,9 @@ def linearise(samples: LightSamples, parameters: Doubles, rising: bool) -> tuple
         changed = {**named, name: named[name] + step}
         points = met if name in _OF_THE_WALL else meet_balls(samples, changed, centres)
         slopes[:, number] = change(step, changed, points)
-    lamp = 1 + named["lamp_x"] * wall.azimuth[0] + named["lamp_y"] * wall.azimuth[1]
-    slopes[:, _GEOMETRIC : _GEOMETRIC + 2] = (factor * level / lamp * wall.azimuth).T
-    slopes[:, _GEOMETRIC + 2 : STEPS.start] = (lamp * level * shade_terms(met, named["radius"])).T
+    lamp = lamp_light(wall.ray, (named["lamp_x"], named["lamp_y"]))
+    slopes[:, _GEOMETRIC : _GEOMETRIC + 2] = (factor * level / lamp * wall.ray.at).T
+    slopes[:, _GEOMETRIC + 2 : STEPS.start] = (lamp * level * _shade_terms(met, named["radius"])).T
     slopes[:, STEPS] = factor[:, np.newaxis] * np.einsum("nk,ks->ns", basis, curve_from_steps(rising))
     centre = STEPS.stop + 3 * samples.press[samples.pose]
     for axis, shift in enumerate(_SMALL * np.eye(3)):
@@ -252,6 +246,6 @@ def linearise(samples: LightSamples, parameters: Doubles, rising: bool) -> tuple
 
 def _factor(met: SheetPoints, wall: WallHit, named: Mapping[str, float]) -> Doubles:
     """Return the factor of lamps and shading."""
-    lamp = 1 + named["lamp_x"] * wall.azimuth[0] + named["lamp_y"] * wall.azimuth[1]
+    lamp = lamp_light(wall.ray, (named["lamp_x"], named["lamp_y"]))
     shade = np.array([named[f"shade_{number}"] for number in range(5)])
-    return np.asarray(lamp * (1 + shade @ shade_terms(met, named["radius"])))
+    return np.asarray(lamp * (1 + shade @ _shade_terms(met, named["radius"])))

@@ -13,8 +13,9 @@ from mirrorskin.engine.calibration import wall_model as model
 from mirrorskin.engine.calibration.ball import rotations
 from mirrorskin.engine.calibration.sources import pixel_size_of
 from mirrorskin.engine.calibration.wall_fit import WallFit
+from mirrorskin.engine.rotation.response import shade
 from mirrorskin.io import InputError, Source, WallResponse, pixel_axes
-from mirrorskin.kernels.response import reflect, way_to_wall
+from mirrorskin.kernels.response import follow, half_tangent, lamp_light, level, sight_of, sight_slopes
 
 Doubles = NDArray[np.float64]
 
@@ -87,26 +88,20 @@ def full_light(response: WallResponse, places: Doubles, zenith: Doubles, azimuth
     """
     z, radius = places[2], response.radius
     from_axis = places[:2] - np.reshape(response.axis, (2, 1))
-    slope = response.sight_slopes(from_axis)
-    ray = reflect(model.down(slope), _normals(zenith, azimuth))
+    slope = sight_slopes(from_axis, response.sight)
     mirror = from_axis + z * slope
-    out = np.sqrt(ray[0] ** 2 + ray[1] ** 2) + 1e-12
-    with np.errstate(invalid="ignore"):
-        clearance = radius**2 - (mirror**2).sum(axis=0)
-        clearance = np.where(clearance > 0, clearance, np.nan)
-        distance, _ = way_to_wall((mirror * ray[:2]).sum(axis=0), out**2, clearance)
-        # Share of the ray, spread evenly over the scatter, that meets the wall.
-        elevation, spread = np.arctan2(ray[2], out), max(response.scatter, 1e-9)
-        top = np.minimum(np.arctan2(response.rim - z, distance * out), _STEEPEST)
-        bottom = np.arctan2(-z, distance * out)
-        lit = np.minimum(elevation + spread, top) - np.maximum(elevation - spread, bottom)
-        height = z + distance * ray[2]
-        q = np.clip(height / (radius + np.hypot(height, radius)), *response.reach)
-        lamp = 1 + np.array(response.lamps) @ (mirror + distance * ray[:2]) / radius
-    u, v = from_axis / radius
-    shade = 1 + response.shade @ np.stack([u, v, u * u, u * v, v * v])
-    level = np.polynomial.polynomial.polyval(q, response.curve)
-    return np.asarray(shade * lamp * np.clip(lit / (2 * spread), 0, 1) * level)
+    mirror = np.where((mirror**2).sum(axis=0) < radius**2, mirror, np.nan)
+    ray = follow(np.stack([*mirror, z]), sight_of(slope), _normals(zenith, azimuth), radius)
+    # Share of the ray, spread evenly over the scatter, that meets the wall.
+    out = np.sqrt(ray.direction[0] ** 2 + ray.direction[1] ** 2)
+    elevation, spread = np.arctan2(ray.direction[2], out), max(response.scatter, 1e-9)
+    top = np.minimum(np.arctan2(response.rim - z, ray.way * out), _STEEPEST)
+    bottom = np.arctan2(-z, ray.way * out)
+    lit = np.minimum(elevation + spread, top) - np.maximum(elevation - spread, bottom)
+    q = np.clip(half_tangent(ray.height, radius), *response.reach)
+    light = level(q, response.curve, response.reach)[0]
+    light *= shade(response, *from_axis) * lamp_light(ray, response.lamps)
+    return np.asarray(light * np.clip(lit / (2 * spread), 0, 1))
 
 
 def _normals(zenith: Doubles, azimuth: Doubles) -> Doubles:
@@ -291,5 +286,5 @@ def _light_of_turn(
     turns = rotations(_LEAN * np.stack([np.cos(phase), np.sin(phase)], axis=1))
     normal = np.moveaxis(turns @ _normals(zenith, azimuth), 0, -1).reshape(3, -1)
     (x, y), slope = model.look(np.repeat(places, _FRAMES, axis=1), named)
-    met = model.SheetPoints(x, y, np.zeros_like(x), model.down(slope), normal)
+    met = model.SheetPoints(x, y, np.zeros_like(x), sight_of(slope), normal)
     return model.light_of(met, named, model.curve_from_steps(rising) @ steps).reshape(-1, _FRAMES)

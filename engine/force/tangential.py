@@ -16,6 +16,7 @@ from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.press.halfspace import spectrum_of
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import checked
+from mirrorskin.kernels.conjugate_gradients import Face, conjugate_gradients
 
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -212,20 +213,17 @@ class _System:
     def solve(self, target: Doubles, tolerance: float, damping: float = 0.0) -> Doubles:
         """Return the traction for a displacement of the contact, by preconditioned conjugate gradients."""
         goal = tolerance * float(np.abs(target).max())
-        strain, residual = np.zeros_like(target), target
-        direction, last = np.zeros_like(target), np.inf
-        for _ in range(_STEPS):
-            if float(np.abs(residual).max()) <= goal:
-                return strain
-            steepest = np.where(self._contact, _filtered(residual, self._inverse, self._contact.shape), 0.0)
-            square = float(np.sum(residual * steepest))
-            direction = steepest + square / last * direction
-            moved = self.displaced(direction) + damping * direction
-            length = square / float(np.sum(direction * moved))
-            strain = strain + length * direction
-            residual = residual - length * moved
-            last = square
-        raise NotConverged(f"the traction in contact was not found in {_STEPS} steps")
+        shape = self._contact.shape
+        found = conjugate_gradients(
+            lambda strain: self.displaced(strain) + damping * strain,
+            target,
+            Face.of(self._contact, lambda residual: _filtered(residual, self._inverse, shape)),
+            converged=lambda residual: float(np.abs(residual).max()) <= goal,
+            steps=_STEPS,
+        )
+        if not found.converged:
+            raise NotConverged(f"the traction in contact was not found in {_STEPS} steps")
+        return np.asarray(found.x)
 
     def damped(self, target: Doubles, sigma: Doubles) -> Doubles:
         """Return the damped traction whose misfit equals the standard deviation of the displacements."""

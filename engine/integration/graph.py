@@ -12,7 +12,7 @@ from numpy.typing import DTypeLike, NDArray
 from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
 from mirrorskin.kernels.array import Array, Operand
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.links import DOWN, KNOWN, RIGHT, SLOPE, Mask
+from mirrorskin.kernels.links import DOWN, KNOWN, RIGHT, SLOPE
 
 Labels = NDArray[np.int32]
 Plane = tuple[float, float, float]
@@ -200,45 +200,21 @@ class Components:
 
 def find_components(flags: Flags, cut: bool) -> Components:
     """Label connected pixels. ``cut``: neighbours with an answer may have no link."""
-    answered = flags & (SLOPE | KNOWN) != 0
-    right, down = answered[:, :-1] & answered[:, 1:], answered[:-1] & answered[1:]
-    if cut:
-        right, down = right & (flags[:, :-1] & RIGHT != 0), down & (flags[:-1] & DOWN != 0)
-    labels, count = _label(answered, right, down)
+    import cv2
+
+    grid = (flags & (SLOPE | KNOWN) != 0).view(np.uint8)
+    if cut:  # links between the pixels
+        grid = np.zeros((2 * flags.shape[0] - 1, 2 * flags.shape[1] - 1), np.uint8)
+        grid[::2, ::2] = flags & (SLOPE | KNOWN)
+        grid[::2, 1::2], grid[1::2, ::2] = flags[:, :-1] & RIGHT, flags[:-1] & DOWN
+    count, numbers = cv2.connectedComponents(grid, connectivity=4)
+    step = 2 if cut else 1
+    labels, count = np.subtract(numbers[::step, ::step], 1, dtype=np.int32), count - 1
     unknown = np.ones(count, bool)
     unknown[labels[flags & KNOWN != 0]] = False
     for array in (labels, unknown):  # shared by the surfaces of several frames
         array.flags.writeable = False
     return Components(labels, unknown)
-
-
-def _label(answered: Mask, right: Mask, down: Mask) -> tuple[Labels, int]:
-    """Label pixels that are linked to the right and down: first runs within a row, then connected runs."""
-    starts = answered.copy()
-    starts[:, 1:] &= ~right
-    first_pixel = np.flatnonzero(starts)  # of each run
-    changes = down.copy()  # one link of each pair of runs
-    changes[:, 1:] &= ~(down[:, :-1] & right[:-1] & right[1:])
-    pixel = np.flatnonzero(changes)
-    upper, lower = (
-        np.searchsorted(first_pixel, end, "right") - 1 for end in (pixel, pixel + answered.shape[1])
-    )
-    label = np.arange(first_pixel.size, dtype=np.int32)
-    while upper.size:
-        a, b = label[upper], label[lower]
-        apart = a != b
-        upper, lower, a, b = upper[apart], lower[apart], a[apart], b[apart]
-        np.minimum.at(label, np.maximum(a, b), np.minimum(a, b))
-        while not np.array_equal(label, shorter := label[label]):
-            label = shorter
-    first = label == np.arange(label.size)
-    count = int(first.sum())
-    if count < 2:
-        return answered.astype(np.int32) - 1, count
-    number = (np.cumsum(first, dtype=np.int32) - 1)[label]
-    ends = np.append(first_pixel[1:], answered.size)
-    labels = np.concatenate([np.zeros(first_pixel[0], np.int32), np.repeat(number, ends - first_pixel)])
-    return np.where(answered, labels.reshape(answered.shape), np.int32(-1)), count
 
 
 class Levelling:

@@ -64,11 +64,12 @@ def rim(patch: Patch) -> Quantity | None:
     Borders of holes and the picture's border are no rim. None if more than half of the area's outline is the
     picture's border.
     """
+    import cv2
     from scipy import ndimage
 
     area = patch.measured | np.isfinite(patch.filled)
-    label, count = ndimage.label(area, np.ones((3, 3)))
-    if count > 1:
+    count, label = cv2.connectedComponents(area.view(np.uint8), connectivity=8)
+    if count > 2:
         area = label == 1 + np.argmax(np.bincount(label.ravel())[1:])
     area = ndimage.binary_fill_holes(area)
     outermost = border(area)

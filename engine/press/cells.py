@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -114,13 +114,12 @@ def touched(height: Doubles, dark: Mask, hidden: Mask) -> Mask:
     """
     lit = np.isfinite(height)
     surface = lit | hidden
-    groups, count = ndimage.label(~surface)
-    sizes = np.bincount(groups.ravel(), minlength=count + 1)
-    square = np.ones((3, 3), bool)
-    for number in range(1, count + 1):
+    count, groups = cv2.connectedComponents((~surface).view(np.uint8), connectivity=4)
+    sizes = np.bincount(groups.ravel(), minlength=count)
+    square = np.ones((3, 3), np.uint8)
+    for number in range(1, count):
         group = groups == number
-        near = ndimage.binary_dilation(group, square)
-        far = ndimage.binary_dilation(group, square, iterations=3)
+        near, far = (cv2.dilate(group.view(np.uint8), square, iterations=steps) > 0 for steps in (1, 3))
         rim, ring = height[near & lit], height[far & ~near & lit]
         rises = rim.size and ring.size and rim.mean() > ring.mean()
         if sizes[number] <= _SMALL or (np.any(group & dark) and rises):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple, TypeVar
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from scipy import fft, sparse, special
 
 from mirrorskin.engine.errors import NotConverged
+from mirrorskin.kernels.conjugate_gradients import Face, conjugate_gradients
 
 Doubles = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -29,7 +31,6 @@ _NO_SLOPE = 1e-9  # slope below which its direction is undefined
 _FIRM = 0.05  # share of the greatest pressure below which a cell's contact is neglected in derivatives
 _ROUGH, _ROUGH_STEPS = 2e-2, 60  # relative residual, and largest number of steps, of derivatives
 _SIZES = 4  # cells: granularity of the size of windows
-_TINY = np.float32(1e-30)
 
 
 class HalfSpace:
@@ -137,29 +138,30 @@ def _solve(
     space: HalfSpace, surface: Doubles, compliance: float, tolerance: float, contact: Mask, strain: Doubles
 ) -> tuple[Doubles, Doubles]:
     """Return the strain for which the sheet follows the surface in contact, and the gap everywhere."""
+    found = conjugate_gradients(
+        _opening(space, compliance),
+        surface,
+        Face.of(contact, space.pressed),
+        converged=lambda residual: float(np.abs(residual).max()) <= tolerance,
+        steps=_STEPS,
+        start=strain,
+    )
+    if not found.converged:
+        raise NotConverged(f"the pressure in contact was not found in {_STEPS} steps")
+    return found.x, found.product - surface
+
+
+def _opening(space: HalfSpace, compliance: float) -> Callable[[NDArray[Real]], NDArray[Real]]:
+    """Return the function from strains, (..., H, W), to displacements of the sheet against the stage, mm."""
     lift = compliance * space.pixel_area
 
-    def opening(strain: Doubles) -> Doubles:
-        opened = space.displacement(strain)
+    def opened(strain: NDArray[Real]) -> NDArray[Real]:
+        moved = space.displacement(strain)
         if lift:
-            opened += lift * float(strain.sum())
-        return opened
+            moved += strain.dtype.type(lift) * strain.sum(axis=(-2, -1), keepdims=True)
+        return moved
 
-    gap = opening(strain) - surface
-    direction, last = np.zeros_like(gap), np.inf
-    for _ in range(_STEPS):
-        residual = np.where(contact, -gap, 0.0)
-        if float(np.abs(residual).max()) <= tolerance:
-            return strain, gap
-        steepest = np.where(contact, space.pressed(residual), 0.0)
-        square = float(np.sum(residual * steepest))
-        direction = steepest + square / last * direction
-        opened = opening(direction)
-        length = square / float(np.sum(direction * opened))
-        strain = strain + length * direction
-        gap += length * opened
-        last = square
-    raise NotConverged(f"the pressure in contact was not found in {_STEPS} steps")
+    return opened
 
 
 def _padded(shape: tuple[int, int]) -> tuple[int, int]:
@@ -318,27 +320,16 @@ def _pressed_by(space: HalfSpace, contact: Mask, heights: Singles, compliance: f
     """
     window, space = _window(space, contact)
     contact, heights = contact[window], heights[(slice(None), *window)]
-    lift = np.float32(compliance * space.pixel_area)
-    strain: Singles = np.zeros_like(heights)
-    direction: Singles = np.zeros_like(heights)
-    residual: Singles = heights
-    target: Singles = _ROUGH**2 * _square(heights, heights)
-    last = np.full_like(target, np.inf)
-    for _ in range(_ROUGH_STEPS):
-        steepest: Singles = space.pressed(residual) * contact
-        square = _square(residual, steepest)
-        direction = np.add(steepest, square / last * direction, dtype=np.float32)
-        moved = space.displacement(direction)
-        if lift:
-            moved = moved + lift * direction.sum(axis=(1, 2), keepdims=True)
-        moved = np.multiply(moved, contact, dtype=np.float32)
-        length = np.divide(square, np.maximum(_square(direction, moved), _TINY), dtype=np.float32)
-        strain = np.add(strain, length * direction, dtype=np.float32)
-        residual = np.subtract(residual, length * moved, dtype=np.float32)
-        if (_square(residual, residual) <= target).all():
-            break
-        last = np.maximum(square, _TINY)
-    return np.asarray(strain[:, contact], np.float64)
+    enough = _ROUGH**2 * _square(heights)
+    found = conjugate_gradients(
+        _opening(space, compliance),
+        heights,
+        Face.of(contact, space.pressed),
+        converged=lambda residual: bool((_square(residual) <= enough).all()),
+        steps=_ROUGH_STEPS,
+        axes=(1, 2),
+    )
+    return np.asarray(found.x[:, contact], np.float64)
 
 
 def _window(space: HalfSpace, contact: Mask) -> tuple[tuple[slice, slice], HalfSpace]:
@@ -354,6 +345,6 @@ def _window(space: HalfSpace, contact: Mask) -> tuple[tuple[slice, slice], HalfS
     return (window[0], window[1]), HalfSpace(shape, space.pixel_size)
 
 
-def _square(a: Singles, b: Singles) -> Singles:
-    """Return the sum of the products of each pair of maps, (n, 1, 1)."""
-    return np.asarray(np.sum(a * b, axis=(1, 2), keepdims=True))
+def _square(maps: Singles) -> Singles:
+    """Return the sum of the squares of each map, (n,)."""
+    return np.asarray(np.sum(maps * maps, axis=(1, 2)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -43,6 +44,50 @@ class Fit(NamedTuple):
     misfit: float
 
 
+class _Axis:
+    """Cubic B-splines with evenly spaced knots, from the first to the last of some equidistant places."""
+
+    def __init__(self, places: int, spacing: float, pieces: int) -> None:
+        self._places, self._span, self._pieces = places, (places - 1) * spacing, pieces
+
+    def values(self, places: Doubles | None = None, order: int = 0) -> Doubles:
+        """Return the splines, (n, pieces + 3), or their derivatives, at fractional places; or at all."""
+        if places is None:
+            places = np.arange(float(self._places))
+        places = np.clip(places * (self._pieces / (self._places - 1)), 0, self._pieces)
+        piece = np.minimum(places.astype(np.intp), self._pieces - 1)
+        powers = np.zeros((len(places), 4))
+        for power in range(order, 4):
+            powers[:, power] = math.perm(power, order) * (places - piece) ** (power - order)
+        values = np.zeros((len(places), self._pieces + 3))
+        first = piece[:, np.newaxis]
+        values[np.arange(len(places))[:, np.newaxis], first + np.arange(4)] = powers @ _PIECES.T
+        return values * (self._pieces / self._span) ** order
+
+    def products(self, order: int) -> Doubles:
+        """Return the integrals of the products of two splines' derivatives, (pieces + 3, pieces + 3)."""
+        powers = np.arange(4 - order)
+        parts = _PIECES[:, order:] * [math.perm(int(power) + order, order) for power in powers]
+        block = parts @ (1 / (powers[:, np.newaxis] + powers + 1)) @ parts.T
+        matrix = np.zeros((self._pieces + 3, self._pieces + 3))
+        for piece in range(self._pieces):
+            matrix[piece : piece + 4, piece : piece + 4] += block
+        return matrix * (self._pieces / self._span) ** (2 * order - 1)
+
+
+def _roughness(axes: list[_Axis], multiply: Callable[..., Doubles]) -> Doubles:
+    """Return the quadratic form of the integral of the squared third derivatives, over all directions.
+
+    ``multiply`` combines the forms of both axes.
+    """
+    y, x = axes
+    parts = [
+        math.comb(_ORDER, order) * multiply(y.products(order), x.products(_ORDER - order))
+        for order in range(_ORDER + 1)
+    ]
+    return np.asarray(np.sum(parts, axis=0))
+
+
 class Spline:
     """Cubic splines over a box of pixels, from the centre of its first pixel to that of its last.
 
@@ -65,12 +110,8 @@ class Spline:
         cells: tuple[int, int],
         strides: tuple[int, int] = (1, 1),
     ) -> None:
-        self._spans = [(length - 1) * step for length, step in zip(shape, spacing, strict=True)]
-        self._cells = cells
-        self._all = [
-            spline_values(np.linspace(0, count, length), count)
-            for length, count in zip(shape, cells, strict=True)
-        ]
+        self._axes = [_Axis(*axis) for axis in zip(shape, spacing, cells, strict=True)]
+        self._all = [axis.values() for axis in self._axes]
         self._y, self._x = (values[::stride] for values, stride in zip(self._all, strides, strict=True))
         self._down, self._across = (
             np.nonzero(np.triu(np.tri(values.shape[1], k=3), -3)) for values in (self._y, self._x)
@@ -87,12 +128,7 @@ class Spline:
 
     def roughness(self) -> Doubles:
         """Return the quadratic form of the integral of the squared third derivatives, over all directions."""
-        y, x = (_derivative_products(*axis) for axis in zip(self._cells, self._spans, strict=True))
-        parts = [
-            math.comb(_ORDER, order) * np.outer(y[order][self._down], x[_ORDER - order][self._across])
-            for order in range(_ORDER + 1)
-        ]
-        return np.asarray(np.sum(parts, axis=0))
+        return _roughness(self._axes, lambda y, x: np.outer(y[self._down], x[self._across]))
 
     def squares(self, weights: Doubles) -> Doubles:
         """Return the quadratic form of the sum over the samples of weights times the squared surface."""
@@ -137,15 +173,14 @@ class CellSplines:
         from scipy import sparse
 
         self._shape = shape
-        self._spans = [(count - 1) * step for count, step in zip(shape, spacing, strict=True)]
-        size = math.sqrt(self._spans[0] * self._spans[1]) / _SPLINES
-        self._pieces = [
-            max(_FEWEST_PIECES, min(round(span / size), count // 2))
-            for span, count in zip(self._spans, shape, strict=True)
+        spans = [(count - 1) * step for count, step in zip(shape, spacing, strict=True)]
+        self._area = spans[0] * spans[1]
+        self._axes = [
+            _Axis(count, step, max(_FEWEST_PIECES, min(round(span * _SPLINES / self._area**0.5), count // 2)))
+            for count, step, span in zip(shape, spacing, spans, strict=True)
         ]
         (y, down), (x, across) = (
-            [self._values(np.arange(float(count)), axis, order) for order in (0, 1)]
-            for axis, count in enumerate(shape)
+            [sparse.csr_matrix(axis.values(order=order)) for order in (0, 1)] for axis in self._axes
         )
         self.basis: sparse.csr_matrix = sparse.csr_matrix(sparse.kron(y, x))
         self.slopes: tuple[sparse.csr_matrix, sparse.csr_matrix] = (
@@ -159,24 +194,12 @@ class CellSplines:
 
     def at(self, factors: Doubles, rows: Doubles, columns: Doubles) -> Doubles:
         """Return a surface at fractional rows and columns of cells."""
-        grid = factors.reshape(self._pieces[0] + 3, -1)
-        return np.asarray((self._values(rows, 0) @ grid) @ self._values(columns, 1).T)
+        y, x = (axis.values(places) for axis, places in zip(self._axes, (rows, columns), strict=True))
+        return _product(_product(y, factors.reshape(y.shape[1], -1)), x.T)
 
     def roughness(self) -> Doubles:
         """Return the quadratic form of the mean squared third derivatives, over all directions, 1/mm^4."""
-        y, x = (_derivative_products(*axis) for axis in zip(self._pieces, self._spans, strict=True))
-        parts = [
-            math.comb(_ORDER, order) * np.kron(y[order], x[_ORDER - order]) for order in range(_ORDER + 1)
-        ]
-        return np.asarray(np.sum(parts, axis=0) / (self._spans[0] * self._spans[1]))
-
-    def _values(self, places: Doubles, axis: int, order: int = 0) -> sparse.csr_matrix:
-        """Return the splines of an axis, or their derivatives, 1/mm, at fractional cells."""
-        from scipy import sparse
-
-        count, pieces = self._shape[axis], self._pieces[axis]
-        values = spline_values(places * pieces / (count - 1), pieces, order)
-        return sparse.csr_matrix(values * (pieces / self._spans[axis]) ** order)
+        return _roughness(self._axes, lambda y, x: np.asarray(np.kron(y, x))) / self._area
 
 
 def fit_within(spline: Spline, low: Doubles, high: Doubles, stiffness: float) -> Fit:
@@ -213,32 +236,6 @@ def fit_within(spline: Spline, low: Doubles, high: Doubles, stiffness: float) ->
             break
         pull = np.where(both, _PULL * weights, 0.0)
     return Fit(height + datum, factors + datum, misfit)  # the splines sum to 1
-
-
-def spline_values(places: Doubles, pieces: int, order: int = 0) -> Doubles:
-    """Return the splines of an axis, or their derivatives, at positions 0 to ``pieces``: (n, pieces + 3)."""
-    places = np.clip(places, 0, pieces)
-    piece = np.minimum(places.astype(np.intp), pieces - 1)
-    powers = np.zeros((len(places), 4))
-    for power in range(order, 4):
-        powers[:, power] = math.perm(power, order) * (places - piece) ** (power - order)
-    values = np.zeros((len(places), pieces + 3))
-    values[np.arange(len(places))[:, np.newaxis], piece[:, np.newaxis] + np.arange(4)] = powers @ _PIECES.T
-    return values
-
-
-def _derivative_products(pieces: int, span: float) -> list[Doubles]:
-    """Return the integrals of products of two splines' derivatives over a span, for orders 0 to 3."""
-    products = []
-    for order in range(_ORDER + 1):
-        powers = np.arange(4 - order)
-        parts = _PIECES[:, order:] * [math.perm(int(power) + order, order) for power in powers]
-        block = parts @ (1 / (powers[:, np.newaxis] + powers + 1)) @ parts.T
-        matrix = np.zeros((pieces + 3, pieces + 3))
-        for piece in range(pieces):
-            matrix[piece : piece + 4, piece : piece + 4] += block
-        products.append(matrix * (pieces / span) ** (2 * order - 1))
-    return products
 
 
 def _solve_banded(matrix: Doubles, right: Doubles, size: int) -> Doubles:

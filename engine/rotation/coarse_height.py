@@ -35,6 +35,7 @@ def coarse_heights(
     visible, this slope decreases towards the middle, as on a ball. Outside, the nearest height is used.
     Without any contact, all heights are equal to the press.
     """
+    import cv2
     from scipy import ndimage
 
     shape = contact.shape
@@ -49,8 +50,9 @@ def coarse_heights(
     region = ndimage.binary_fill_holes(ndimage.binary_dilation(valid, around, reach))
     inside = valid | ndimage.binary_erosion(region, around, reach, border_value=1)
     far, nearest = ndimage.distance_transform_edt(~valid, return_indices=True)
-    hole, count = ndimage.label(region & ~valid & (level > 0.5), np.ones((3, 3)))
-    deepest = np.concatenate([[np.inf], ndimage.maximum(far, hole, np.arange(1, count + 1))])[hole]
+    unlit = region & ~valid & (level > 0.5)
+    count, hole = cv2.connectedComponents(unlit.view(np.uint8), connectivity=8)
+    deepest = np.append(np.inf, ndimage.maximum(far, hole, np.arange(1, count)))[hole]
     remaining = np.asarray(1 - np.minimum(far / (deepest + 0.5), 1))  # of the nearest slope
     surface = integrate(
         remaining * east[tuple(nearest)],

@@ -167,13 +167,14 @@ class LastTurn(Normals):
 
     def _place(self, height: NDArray[np.float32]) -> None:
         """Set the height of the object for a response: the top of each piece is at the depth of the press."""
+        import cv2
         from scipy import ndimage
 
         response, press = self.response, self.press
         if response is None or press is None:
             return
-        piece, count = ndimage.label(np.isfinite(height), np.ones((3, 3)))
-        tops = np.concatenate([[0.0], ndimage.maximum(height, piece, np.arange(1, count + 1))])
+        count, piece = cv2.connectedComponents(np.isfinite(height).view(np.uint8), connectivity=8)
+        tops = np.append(0.0, ndimage.maximum(height, piece, np.arange(1, count)))
         heights = np.where(piece > 0, np.clip(press + height - tops[piece], 0, press), response.planes[4])
         self.window.place(heights)
 

@@ -19,12 +19,10 @@ from mirrorskin.io import Result
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
+from mirrorskin.kernels.slopes import find, weigh
 
 Floats = NDArray[np.float32]
 
-_STEEPEST = math.radians(80.0)  # largest zenith whose slope is used
-_AROUND = 5  # pixels: side of the window for the direction of the meridian
-_WIDEST = 0.5  # radians: limit of the standard deviation of an azimuth in the correction of bias
 # Accepted relative residual if many small facets prevent convergence; the errors of normals are larger.
 _TOLERANCE = 1e-4
 _NO_LIMIT = 1e9  # seconds: with a budget, `integrate` returns an unconverged surface
@@ -96,67 +94,12 @@ def find_slopes(
     ``independent_sigma`` replaces sigma in the weights: independent errors with the same mean over many
     pixels. The zenith is limited to 80 degrees.
     """
-    nx, ny, nz = np.moveaxis(normals, -1, 0)
+    least = math.inf if tilt is None else math.sin(tilt) ** 2
     white = sigma if independent_sigma is None else independent_sigma
-    valid = (contact != 0) & (nz > 0) & (sigma > 0) & (sigma < np.inf) & (white > 0) & (white < np.inf)
-    nx, ny, nz, sigma, white = (np.where(valid, part, np.float32(1)) for part in (nx, ny, nz, sigma, white))
-    nz = np.maximum(nz, np.float32(math.cos(_STEEPEST)))
-    factor = np.exp(0.5 * _azimuth_variance(nx, ny, sigma, tilt, turns))
-    nan = np.float32(np.nan)
-    variances = _variances(nx, ny, nz, white, tilt, valid)
-    return Slopes(
-        dz_dx=np.where(valid, -factor * nx / nz, nan).astype(np.float32),
-        dz_dy=np.where(valid, -factor * ny / nz, nan).astype(np.float32),
-        weights=np.stack([np.where(valid, 1 / variance, 0) for variance in variances]).astype(np.float32),
-    )
-
-
-def _share_along(nx: Floats, ny: Floats, tilt: float | None) -> Floats:
-    """Return the share of an angular error's variance that is along the meridian."""
-    if tilt is None:
-        return np.full(nx.shape, 0.5, np.float32)
-    least = math.sin(tilt) ** 2
-    return np.asarray(0.5 * least / np.maximum(nx * nx + ny * ny, least), np.float32)
-
-
-def _azimuth_variance(nx: Floats, ny: Floats, sigma: Floats, tilt: float | None, turns: int = 1) -> Floats:
-    """Return the variance of the azimuth in one turn, radians^2, within bounds; 0 without a tilt."""
-    if tilt is None:
-        return np.zeros(nx.shape, np.float32)
-    outside = np.maximum(nx * nx + ny * ny, math.sin(tilt) ** 2)
-    variance = turns * (1 - _share_along(nx, ny, tilt)) * sigma**2 / outside
-    return np.asarray(np.minimum(variance, _WIDEST**2), np.float32)
-
-
-def _mean_around(values: Floats) -> Floats:
-    """Return the mean of a window around each pixel, (H, W), with zeros outside the picture."""
-    height, width = values.shape
-    padded = np.pad(values, _AROUND // 2)
-    rows = sum(padded[row : row + height] for row in range(1, _AROUND)) + padded[:height]
-    columns = sum(rows[:, column : column + width] for column in range(1, _AROUND)) + rows[:, :width]
-    return np.asarray(columns / np.float32(_AROUND**2), np.float32)
-
-
-def _variances(
-    nx: Floats, ny: Floats, nz: Floats, sigma: Floats, tilt: float | None, valid: NDArray[np.bool_]
-) -> tuple[Floats, Floats]:
-    """Return the variances of the slopes along x and y.
-
-    The direction of the meridian is that of the surroundings: with a pixel's own azimuth, slopes that noise
-    shortened would get other weights than those that it lengthened, and their weighted mean would be biased.
-    Squares of components are equal on both sides of a ridge; noise of the azimuth reduces the contrast of
-    their means by exp(-2 variance).
-    """
-    share, turned = _share_along(nx, ny, tilt), _azimuth_variance(nx, ny, sigma, tilt)
-    # An error e of the azimuth also shortens the slope by e^2 / 2.
-    along = share * (sigma / nz**2) ** 2 + (nx * nx + ny * ny) / nz**2 * turned**2 / 2
-    across = (1 - share) * (sigma / nz) ** 2
-    x, y = (_mean_around(np.where(valid, n * n, 0)) for n in (nx, ny))
-    least = np.finfo(np.float32).tiny
-    square = (x + least) / (x + y + 2 * least)
-    square = np.asarray(np.clip(0.5 + (square - 0.5) * np.exp(2 * turned), 0, 1), np.float32)
-    along_x, along_y = square * along + (1 - square) * across, (1 - square) * along + square * across
-    return along_x.astype(np.float32), along_y.astype(np.float32)
+    usable = (contact != 0) & (white > 0) & (white < np.inf)
+    dz_dx, dz_dy, *squares = find(least, normals, np.float32(math.sqrt(turns)) * sigma, usable)
+    weights = weigh(least, (0.0, math.inf), white, dz_dx, *squares)
+    return Slopes(dz_dx, dz_dy, np.stack(weights))
 
 
 def integrate_normals(
@@ -247,7 +190,7 @@ def _stack(maps: list[NDArray[Any] | None], per_turn: bool) -> NDArray[Any] | No
 
 
 class SlopeKernels:
-    """Slopes and weights from normals on the device; equivalent to `find_slopes` for one turn.
+    """Slopes and weights from normals on the device; as `find_slopes` for one turn of a known tilt.
 
     ``typical`` is the median weight, which determines the limits of weights; it is computed if it is NaN.
     """

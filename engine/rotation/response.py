@@ -14,6 +14,7 @@ from mirrorskin.engine.rotation.design_matrix import Doubles
 from mirrorskin.engine.rotation.registration import Sight
 from mirrorskin.io import Calibrated, Header, InputError, Source, WallResponse, pixel_axes
 from mirrorskin.kernels.normals_wall import Wall
+from mirrorskin.kernels.response import shade_terms
 
 _SAMPLES = 400  # samples of the curve from which its ends and its inverse are determined
 _INVERSE = 8  # coefficients of the inverse, which is only an initial value
@@ -163,10 +164,8 @@ def make_response(
 
 def shade(wall: WallResponse, x: Doubles, y: Doubles) -> Doubles:
     """Return full light as a share of the bright reference, at positions relative to the axis, mm."""
-    u, v = x / wall.radius, y / wall.radius
-    return np.asarray(
-        1 + np.tensordot(np.asarray(wall.shade, np.float64), np.stack([u, v, u * u, u * v, v * v]), 1)
-    )
+    terms = shade_terms(x / wall.radius, y / wall.radius)
+    return np.asarray(1 + np.tensordot(np.asarray(wall.shade, np.float64), terms, 1))
 
 
 def _wall_of(wall: WallResponse, pivot: tuple[float, float, float], follows: bool) -> Wall:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.types import Floats
+from mirrorskin.kernels.conjugate_gradients import Face, conjugate_gradients
 
 Spectrum = NDArray[np.complex64]
 
@@ -104,11 +105,6 @@ class HalfSpace:
         field: Floats = fft.irfft(half, self._padded[1], axis=1, workers=_WORKERS)[:, :columns]
         field *= self.softness
         return field
-
-
-def inner(a: Floats, b: Floats) -> float:
-    """Return the sum of products; not by BLAS, whose threads take longer to meet than to add so few."""
-    return float(np.sum(a * b))
 
 
 def rectangle(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
@@ -218,69 +214,40 @@ def press(
     if reach.any():
         window = rectangle(reach)
         first = np.zeros(reach.shape) if start is None else np.maximum(start, 0.0)
-        system = _System(space, obstacle[window], reach[window], compliance)
-        pressure[window], iterations = _minimise(system, np.where(reach, first, 0.0)[window])
+        first = np.where(reach, first, 0.0)[window]
+        pressure[window], iterations = _minimise(space, obstacle[window], reach[window], compliance, first)
     return Contact(space, pressure, iterations)
 
 
-class _System:
-    """The problem on the rectangle that the object can touch."""
+def _minimise(
+    space: HalfSpace, obstacle: Floats, reach: NDArray[np.bool_], compliance: float, start: Floats
+) -> tuple[Floats, int]:
+    """Return the pressure at rest on the rectangle that the object can touch, and the steps that it took."""
+    space = space.window(*reach.shape)
+    tolerance = TOLERANCE * float(obstacle[reach].max())
+    lift, precondition = compliance * space.pixel_area, _inverse(space)
 
-    def __init__(
-        self, space: HalfSpace, obstacle: Floats, reach: NDArray[np.bool_], compliance: float
-    ) -> None:
-        self.space = space.window(*reach.shape)
-        self.reach = reach
-        self.obstacle = np.where(reach, obstacle, 0.0)
-        self.precondition = _inverse(self.space)
-        self._lift = compliance * space.pixel_area
+    def opened(pressure: Floats) -> Floats:
+        moved = space.surface(pressure)
+        if lift:
+            moved += lift * pressure.sum()
+        return moved
 
-    def response(self, pressure: Floats) -> Floats:
-        """Return by how much a pressure opens the gap, mm."""
-        opened = self.space.surface(pressure)
-        if self._lift:
-            opened += self._lift * pressure.sum()
-        return opened
-
-    def gap(self, pressure: Floats) -> Floats:
-        return self.response(pressure) - self.obstacle
-
-
-def _minimise(system: _System, pressure: Floats) -> tuple[Floats, int]:
-    """Return the pressure at rest, and the iterations that it took."""
-    tolerance = TOLERANCE * float(system.obstacle.max())
-    gap = system.gap(pressure)
-    direction = last = np.zeros_like(pressure)
-    last_decline = np.inf
-    for iteration in range(ITERATIONS):
-        free = system.reach & ((pressure > 0) | (gap < 0))
-        residual = np.where(free, gap, 0.0)
-        if float(np.abs(residual).max()) <= tolerance:
-            return pressure, iteration
-        steepest = np.where(free, system.precondition(residual), 0.0)
-        decline = inner(residual, steepest)
-        # Polak and Ribiere's rule, which forgets by itself when pixels come and go.
-        memory = max(0.0, (decline - inner(last, steepest)) / last_decline)
-        direction = steepest + memory * np.where(free, direction, 0.0)
-        last, last_decline = residual, decline
-        pressure, gap = _step(system, pressure, gap, residual, direction)
-    raise RuntimeError(
-        f"the contact did not come to rest in {ITERATIONS} iterations: the gap is wrong by"
-        f" {float(np.abs(residual).max()):.2g} mm, the tolerance {tolerance:.2g} mm"
+    found = conjugate_gradients(
+        opened,
+        np.where(reach, obstacle, 0.0),
+        lambda pressure, overlap: Face.of(reach & ((pressure > 0) | (overlap > 0)), precondition),
+        converged=lambda residual: float(np.abs(residual).max()) <= tolerance,
+        steps=ITERATIONS,
+        start=start,
+        limit=lambda pressure: pressure if pressure.min() >= 0 else np.maximum(pressure, 0.0),
     )
-
-
-def _step(
-    system: _System, pressure: Floats, gap: Floats, residual: Floats, direction: Floats
-) -> tuple[Floats, Floats]:
-    """Go to the lowest energy along the direction, without pull; return pressure and gap."""
-    response = system.response(direction)
-    length = inner(residual, direction) / inner(direction, response)
-    moved = pressure - length * direction
-    if moved.min() >= 0:
-        return moved, gap - length * response
-    np.maximum(moved, 0.0, out=moved)
-    return moved, system.gap(moved)
+    if not found.converged:
+        raise RuntimeError(
+            f"the contact did not come to rest in {ITERATIONS} iterations: the gap is wrong by"
+            f" {float(np.abs(found.residual).max()):.2g} mm, the tolerance {tolerance:.2g} mm"
+        )
+    return found.x, found.steps
 
 
 def _inverse(space: HalfSpace) -> Callable[[Floats], Floats]:

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin.elastic import HalfSpace, Spectrum, filter_roughly, inner, rectangle, wavenumbers
+from mirrorskin.hw.twin.elastic import HalfSpace, Spectrum, filter_roughly, rectangle, wavenumbers
 from mirrorskin.io.types import Floats
+from mirrorskin.kernels.conjugate_gradients import Face, conjugate_gradients
 
 TOLERANCE = 1e-3
 """Largest error of the surface's shift in a step, as a share of how far the object moves in it."""
@@ -86,36 +87,50 @@ class Friction:
 
     def _likeness(self, step: Floats) -> float:
         """Return how much of the last step is in this one; 0 if it goes back."""
-        before = inner(self._step, self._step)
-        return max(0.0, inner(step, self._step) / before) if before > 0 else 0.0
+        before = float(np.sum(self._step**2))
+        return max(0.0, float(np.sum(step * self._step)) / before) if before > 0 else 0.0
 
     def _follow(self, traction: Floats, target: Floats, tolerance: float) -> tuple[Floats, Floats, _Limited]:
         """Return the traction that shifts the surface to the target where the limit allows, and its shift."""
-        direction = last = np.zeros_like(traction)
-        last_gain = np.inf
-        for _ in range(ITERATIONS):
-            shift = self._space.tangential(traction)
-            lag = np.where(self._touches, target - shift, 0.0)
-            limited = _limited(traction, lag, self._limit)
-            residual = limited.turn(lag)
-            if float(_length(residual).max()) <= tolerance:
-                return traction, shift, limited
-            # What may stick moves together. Where it slips far, only tiny turns of the traction are called
-            # for: Jacobi's preconditioner.
-            free = np.where(limited.where, 0.0, residual)
-            steepest = np.where(
-                limited.where, residual / (self._own + limited.curvature), self._touches * self._inverse(free)
+
+        def within(traction: Floats) -> Floats:
+            factors = _shrink(traction, self._limit)
+            return traction if (factors == 1).all() else traction * factors
+
+        found = conjugate_gradients(
+            self._space.tangential,
+            target,
+            lambda traction, lag: self._face(self._limited(traction, lag)),
+            converged=lambda residual: float(_length(residual).max()) <= tolerance,
+            steps=ITERATIONS,
+            start=traction,
+            limit=within,
+        )
+        if not found.converged:
+            raise RuntimeError(
+                f"stick and slip did not converge in {ITERATIONS} iterations: the shift is wrong by"
+                f" {float(_length(found.residual).max()):.2g} mm, the tolerance {tolerance:.2g} mm"
             )
-            gain = inner(residual, steepest)
-            memory = max(0.0, (gain - inner(last, steepest)) / last_gain)
-            direction = steepest + memory * limited.turn(direction)
-            last, last_gain = residual, gain
-            resistance = self._space.tangential(direction) + limited.curvature * direction
-            traction = traction + inner(residual, direction) / inner(direction, resistance) * direction
-            traction *= _shrink(traction, self._limit)
-        raise RuntimeError(
-            f"stick and slip did not converge in {ITERATIONS} iterations: the shift is wrong by"
-            f" {float(_length(residual).max()):.2g} mm, the tolerance {tolerance:.2g} mm"
+        return found.x, found.product, self._limited(found.x, target - found.product)
+
+    def _limited(self, traction: Floats, lag: Floats) -> _Limited:
+        return _limited(traction, np.where(self._touches, lag, 0.0), self._limit)
+
+    def _face(self, limited: _Limited) -> Face:
+        """Return the directions in which the traction can change.
+
+        What may stick moves together. Where it slips far, only tiny turns of the traction are called for:
+        Jacobi's preconditioner.
+        """
+
+        def precondition(residual: Floats) -> Floats:
+            free = self._inverse(np.where(limited.where, 0.0, residual))
+            return np.where(limited.where, residual / (self._own + limited.curvature), free)
+
+        return Face(
+            lambda vectors: limited.turn(np.where(self._touches, vectors, 0.0)),
+            precondition,
+            limited.curvature,
         )
 
 

@@ -210,11 +210,6 @@ class WallResponse:
     covariance: Floats = field(metadata=kept("array", shape=("p", "p")))
     error: float = field(metadata=kept("number", "rad"))
 
-    def sight_slopes(self, from_axis: Floats) -> Floats:
-        """Return the displacement of lines of sight at (X, Y), (2, ...), mm, along x and y per mm of z."""
-        near, far = self.sight
-        return np.asarray(-(near + far * (from_axis**2).sum(axis=0)) * from_axis, np.float64)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Precession:

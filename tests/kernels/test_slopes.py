@@ -46,17 +46,6 @@ def test_kernels_do_what_the_reference_does(device, shape):
         np.testing.assert_allclose(found[name], exact, rtol=2e-5, atol=1e-6, err_msg=name)
 
 
-@pytest.mark.parametrize("shape", SHAPES[3:6])
-def test_the_reference_does_what_find_slopes_does(shape):
-    given = normals(shape)
-    known = find_slopes(*given, TILT)
-    first = slopes.slopes_find(math.sin(TILT) ** 2, *given)
-    dz_dx, _, *squares = first
-    weights = slopes.slopes_weigh(math.sin(TILT) ** 2, 0.0, np.inf, given[1], dz_dx, *squares)
-    for one, other in zip((*first[:2], *weights), (known.dz_dx, known.dz_dy, *known.weights), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
-
-
 def test_the_typical_weight_is_told_once_and_bounds_the_others(device):
     given = normals((30, 40))
     given[1][3, 4] = 1e-9

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mirrorskin import hw
 from mirrorskin.io import WallResponse
-from mirrorskin.kernels.response import wall_light
+from mirrorskin.kernels.response import shade_terms, sight_slopes, wall_light
 
 SHAPE, PIXEL = (48, 48), 0.25
 DIAMETER, PRESS = 4.0, 0.9
@@ -30,11 +30,10 @@ def light_of_response(response: WallResponse, place: Any, z: float, normals: Any
     """Return light and whether it is in reach, (N, n), of pixels at places, (2, n); normals are (N, n, 3)."""
     at = place - np.reshape(response.axis, (2, 1))
     geometry = response.radius, response.rim, response.scatter
-    points = np.stack([*at, np.full(at.shape[1], z), *response.sight_slopes(at)])
+    points = np.stack([*at, np.full(at.shape[1], z), *sight_slopes(at, response.sight)])
     normals = np.broadcast_to(normals, (len(normals), at.shape[1], 3))
     light, within = wall_light(points, normals, geometry, response.lamps, response.curve, response.reach)
-    u, v = at / response.radius
-    return light * (1 + response.shade @ np.stack([u, v, u * u, u * v, v * v])), within
+    return light * (1 + response.shade @ shade_terms(*at / response.radius)), within
 
 
 def _press(place: tuple[float, float], number: int) -> Frames:

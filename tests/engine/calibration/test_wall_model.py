@@ -16,7 +16,6 @@ from mirrorskin.engine.calibration.wall_model import (
     SheetPoints,
     curve_from_steps,
     curve_values,
-    down,
     light_of,
     linearise,
     look,
@@ -24,7 +23,7 @@ from mirrorskin.engine.calibration.wall_model import (
     predict,
     split,
 )
-from mirrorskin.kernels.response import wall_light
+from mirrorskin.kernels.response import sight_of, wall_light
 
 TRUE = {
     "radius": 17.2,
@@ -93,7 +92,7 @@ def test_without_scatter_the_light_is_that_of_the_kernels_formula():
     zenith, azimuth = np.radians(rng.uniform(15, 42, 500)), rng.uniform(-np.pi, np.pi, 500)
     normal = np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)])
     coefficients = curve_from_steps(True) @ STEEP
-    found = light_of(SheetPoints(*(from_axis + z * lean), z, down(lean), normal), named, coefficients)
+    found = light_of(SheetPoints(*(from_axis + z * lean), z, sight_of(lean), normal), named, coefficients)
 
     whole = math.atan2(TRUE["rim"], TRUE["radius"])
     q = np.linspace(0.0, math.tan(whole / 2), 400)

@@ -16,12 +16,12 @@ from mirrorskin.engine.calibration.wall_model import (
     LightSamples,
     SheetPoints,
     curve_means,
-    down,
     light_of,
     look,
     predict,
 )
 from mirrorskin.engine.calibration.wall_response import make_response, threshold_zenith
+from mirrorskin.kernels.response import sight_of
 
 NOMINAL = dict.fromkeys(SENSOR, (0.0, 3.0)) | dict.fromkeys(SENSOR[-5:], (0.0, 0.02))
 NOMINAL |= {"radius": (17.5, 1.75), "rim": (40.0, 4.0), "axis_x": (0.0, 1.0), "axis_y": (0.0, 1.0)}
@@ -105,7 +105,7 @@ def bias(response, coefficients, highest):
     def true(theta):
         normal = np.stack([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.cos(theta)])
         at, lean = look(place, TRUE)
-        met = SheetPoints(*(at + z * lean), z, down(lean), normal)
+        met = SheetPoints(*(at + z * lean), z, sight_of(lean), normal)
         return light_of(met, TRUE, coefficients), normal
 
     (light, normal), (more, _) = true(zenith), true(zenith + 1e-4)
