@@ -45,9 +45,6 @@ MEDIAN_MAGNITUDE = 0.6744897501960817
 
 _TOLERANCE = 1e-8  # relative decrease of the cost that ends the iteration
 _STEPS = 100  # steps, at most
-_DAMPING = 1e-4  # of the first step, relative to the curvature
-_DAMPED, _RELAXED = 10.0, 30.0  # factor of the damping after a step without success, divisor after the others
-_STUCK = 1e8  # damping at which the search for a better step ends
 _RIDGE = 1e-12  # relative to the curvature: keeps the damped matrix regular
 _SINGULAR = 1e-13  # relative to the largest eigenvalue of scaled equations: directions without information
 _DIFFERENCE = 1e-8  # relative to a parameter's unit: step of forward differences
@@ -144,16 +141,28 @@ AnyModel = TypeVar("AnyModel", bound=Model)
 Bounds = tuple[Doubles, Doubles]
 
 
+class Damping(NamedTuple):
+    """How steps are damped: the matrix that is added to the normal matrix, times a factor."""
+
+    first: float = 1e-4  # factor of the first step
+    relaxed: float = (
+        30.0  # divisor of the factor after a step that decreased the cost; otherwise it is tenfold
+    )
+    stuck: float = 1e8  # factor at which the search for a better step ends
+    matrix: Doubles | None = None  # by default the diagonal of the normal matrix
+
+
 def descend(
     at: Callable[[Doubles], AnyModel],
     start: Doubles,
     *,
     bounds: Bounds | None = None,
     shorten: Callable[[Doubles], Doubles] | None = None,
-    damping: float = _DAMPING,
+    damping: Damping = Damping(),  # noqa: B008
     tolerance: float = _TOLERANCE,
     rounding: float = 0.0,
     steps: int = _STEPS,
+    solve: Callable[[Doubles, Doubles], Doubles] = np.linalg.solve,
 ) -> AnyModel:
     """Return the model at the minimum of its cost.
 
@@ -166,24 +175,26 @@ def descend(
         Lower and upper limits of the parameters.
     shorten : function, optional
         Limits a step, (k,).
-    damping : float
-        Damping of the first step, relative to the curvature.
+    damping : Damping
     tolerance, rounding : float
         Relative and absolute decrease of the cost below which the iteration ends.
     steps : int
         Largest number of successful steps.
+    solve : function
+        Solves the equations of a step without bounds.
     """
-    best = at(start)
+    best, factor = at(start), damping.first
     for _ in range(steps):
         matrix, right = best.equations()
+        added = np.diag(np.diag(matrix)) if damping.matrix is None else damping.matrix
         while True:
-            step = _damped_step(matrix, right, damping, best.parameters, bounds)
+            step = _step(matrix + factor * added, right, solve, best.parameters, bounds)
             there = best.parameters + (step if shorten is None else shorten(step))
             trial = at(there if bounds is None else np.clip(there, *bounds))
-            if trial.cost <= best.cost + rounding or damping > _STUCK:
+            if trial.cost <= best.cost + rounding or factor > damping.stuck:
                 break
-            damping *= _DAMPED
-        gain, damping = best.cost - trial.cost, damping / _RELAXED
+            factor *= 10
+        gain, factor = best.cost - trial.cost, factor / damping.relaxed
         if gain >= 0:
             best = trial
         if not gain > tolerance * best.cost + rounding:
@@ -191,14 +202,18 @@ def descend(
     return best
 
 
-def _damped_step(
-    matrix: Doubles, right: Doubles, damping: float, parameters: Doubles, bounds: Bounds | None
+def _step(
+    matrix: Doubles,
+    right: Doubles,
+    solve: Callable[[Doubles, Doubles], Doubles],
+    parameters: Doubles,
+    bounds: Bounds | None,
 ) -> Doubles:
     """Return the step within the bounds; parameters are scaled to a curvature of 1."""
     scale = _scale(matrix)
-    scaled = matrix * np.outer(scale, scale) + (damping + _RIDGE) * np.eye(len(matrix))
+    scaled = matrix * np.outer(scale, scale) + _RIDGE * np.eye(len(matrix))
     if bounds is None:
-        return np.asarray(np.linalg.solve(scaled, right * scale) * scale)
+        return np.asarray(solve(scaled, right * scale) * scale)
     from scipy.optimize import lsq_linear
 
     root = np.linalg.cholesky(scaled)
@@ -279,7 +294,7 @@ class Fit:
         right = -np.einsum("nk,n->k", self.jacobian, weights * residuals)
         if prior is not None:
             right -= prior.rows.T @ prior.off(self.parameters)
-        return self._products(weights), right
+        return self._products(self.information), right
 
     def covariance(self, excess: float = 1.0) -> Doubles:
         """Return the covariance of the parameters, (k, k).
