@@ -33,28 +33,26 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Doubles = NDArray[np.float64]
 
-MEDIAN_MAGNITUDE = 0.6744897501960817
-"""Median magnitude of a standard normal variate."""
-
+_MEDIAN = 0.6744897501960817  # median magnitude of a standard normal variate
 _TOLERANCE = 1e-8  # relative decrease of the cost that ends the iteration
 _STEPS = 100  # steps, at most
 _RIDGE = 1e-12  # relative to the curvature: keeps the damped matrix regular
 _SINGULAR = 1e-13  # relative to the largest eigenvalue of scaled equations: directions without information
-_DIFFERENCE = 1e-8  # relative to a parameter's unit: step of forward differences
+_DIFFERENCE = 1e-8  # step of forward differences; relative for parameters above 1
 _ROUNDS = 8  # fits with noise from the residuals of the one before, at most
 _ALIKE = 0.01  # relative change of this noise below which they end
 
 
 def mad_sigma(residuals: Doubles) -> float:
     """Return the standard deviation of residuals about 0, from their median magnitude; 0 without any."""
-    return float(np.median(np.abs(residuals))) / MEDIAN_MAGNITUDE if residuals.size else 0.0
+    return float(np.median(np.abs(residuals))) / _MEDIAN if residuals.size else 0.0
 
 
 # --- losses -------------------------------------------------------------------------------------------------
@@ -65,8 +63,8 @@ class Loss(NamedTuple):
 
     limit: float
     rho: Callable[[Doubles], Doubles]
-    slope: Callable[[Doubles], Doubles]
-    bend: Callable[[Doubles], Doubles]
+    slope: Callable[[Doubles], Doubles]  # derivative of rho
+    curvature: Callable[[Doubles], Doubles] | None = None  # half that of the loss, if it is smooth and convex
 
     def cost(self, residuals: Doubles) -> float:
         """Return the sum of the losses."""
@@ -77,46 +75,32 @@ class Loss(NamedTuple):
         return np.asarray(self.slope((residuals / self.limit) ** 2))
 
     def information(self, residuals: Doubles) -> Doubles:
-        """Return the weights in the covariance: the curvature of a smooth convex loss, else `weights`."""
-        return np.asarray(self.bend((residuals / self.limit) ** 2))
+        """Return the weights of residuals in the normal matrix."""
+        return np.asarray((self.curvature or self.slope)((residuals / self.limit) ** 2))
 
 
-SQUARES = Loss(1.0, lambda z: z, np.ones_like, np.ones_like)
+SQUARES = Loss(1.0, lambda z: z, np.ones_like)
 """The loss of ordinary least squares."""
 
 
 def soft_l1(limit: float) -> Loss:
     """Return a smooth loss that is linear beyond a limit, in standard deviations."""
-    return Loss(
-        limit, lambda z: 2 * (np.sqrt(1 + z) - 1), lambda z: (1 + z) ** -0.5, lambda z: (1 + z) ** -1.5
-    )
+    return Loss(limit, lambda z: 2 * np.sqrt(1 + z) - 2, lambda z: (1 + z) ** -0.5, lambda z: (1 + z) ** -1.5)
 
 
 def huber(limit: float) -> Loss:
     """Return the loss of Huber (1964), quadratic up to a limit and linear beyond."""
-
-    def weights(z: Doubles) -> Doubles:
-        return np.asarray(1 / np.sqrt(np.maximum(z, 1)))
-
-    return Loss(limit, lambda z: np.where(z > 1, 2 * np.sqrt(z) - 1, z), weights, weights)
+    return Loss(limit, lambda z: np.where(z > 1, 2 * np.sqrt(z) - 1, z), lambda z: np.maximum(z, 1) ** -0.5)
 
 
 def cauchy(limit: float) -> Loss:
-    """Return the loss of Cauchy, the logarithm of the density of Student's t with one degree of freedom."""
-
-    def weights(z: Doubles) -> Doubles:
-        return np.asarray(1 / (1 + z))
-
-    return Loss(limit, np.log1p, weights, weights)
+    """Return the loss of Cauchy, from the density of Student's t with one degree of freedom."""
+    return Loss(limit, np.log1p, lambda z: 1 / (1 + z))
 
 
 def geman_mcclure(limit: float) -> Loss:
     """Return a bounded loss, under which far outliers have no influence."""
-
-    def weights(z: Doubles) -> Doubles:
-        return np.asarray((1 + z) ** -2)
-
-    return Loss(limit, lambda z: z / (1 + z), weights, weights)
+    return Loss(limit, lambda z: z / (1 + z), lambda z: (1 + z) ** -2)
 
 
 # --- the iteration ------------------------------------------------------------------------------------------
@@ -145,9 +129,7 @@ class Damping(NamedTuple):
     """How steps are damped: the matrix that is added to the normal matrix, times a factor."""
 
     first: float = 1e-4  # factor of the first step
-    relaxed: float = (
-        30.0  # divisor of the factor after a step that decreased the cost; otherwise it is tenfold
-    )
+    relaxed: float = 30.0  # divisor of the factor after each step that decreases the cost
     stuck: float = 1e8  # factor at which the search for a better step ends
     matrix: Doubles | None = None  # by default the diagonal of the normal matrix
 
@@ -162,7 +144,7 @@ def descend(
     tolerance: float = _TOLERANCE,
     rounding: float = 0.0,
     steps: int = _STEPS,
-    solve: Callable[[Doubles, Doubles], Doubles] = np.linalg.solve,
+    solve: Callable[..., Any] = np.linalg.solve,
 ) -> AnyModel:
     """Return the model at the minimum of its cost.
 
@@ -205,7 +187,7 @@ def descend(
 def _step(
     matrix: Doubles,
     right: Doubles,
-    solve: Callable[[Doubles, Doubles], Doubles],
+    solve: Callable[..., Any],
     parameters: Doubles,
     bounds: Bounds | None,
 ) -> Doubles:
@@ -249,14 +231,6 @@ class Prior(NamedTuple):
         return np.asarray(self.rows @ parameters - self.values)
 
 
-class _Problem(NamedTuple):
-    residuals: Callable[[Doubles], Doubles]
-    jacobian: Callable[[Doubles, Doubles], Doubles]
-    loss: Loss
-    noise: float | Doubles
-    prior: Prior | None
-
-
 class Fit:
     """Residuals at some parameters.
 
@@ -270,31 +244,41 @@ class Fit:
     cost : float
     """
 
-    def __init__(self, problem: _Problem, parameters: Doubles) -> None:
+    def __init__(
+        self,
+        function: Callable[[Doubles], Doubles],
+        slopes: Callable[[Doubles, Doubles], Doubles],
+        loss: Loss,
+        noise: float | Doubles,
+        prior: Prior | None,
+        parameters: Doubles,
+    ) -> None:
+        self._slopes, self._loss, self._prior = slopes, loss, prior
         self.parameters: Doubles = parameters
-        self.residuals: Doubles = problem.residuals(parameters)
-        self.noise: float | Doubles = problem.noise
-        self.cost: float = problem.loss.cost(self.residuals / problem.noise)
-        if problem.prior is not None:
-            self.cost += float(np.sum(problem.prior.off(parameters) ** 2))
-        self._problem, self._jacobian = problem, np.empty((0, 0))
+        self.residuals: Doubles = function(parameters)
+        self.noise: float | Doubles = noise
+        self.cost: float = loss.cost(self.residuals / noise)
+        if prior is not None:
+            self.cost += float(np.sum(prior.off(parameters) ** 2))
 
-    @property
+    @functools.cached_property
     def jacobian(self) -> Doubles:
         """Derivatives of the residuals in standard deviations, (n, k)."""
-        if not self._jacobian.size:
-            slopes = self._problem.jacobian(self.parameters, self.residuals)
-            self._jacobian = slopes / np.reshape(self.noise, (-1, 1))
-        return self._jacobian
+        slopes = self._slopes(self.parameters, self.residuals)
+        return np.asarray(slopes / np.reshape(self.noise, (-1, 1)))
+
+    @property
+    def information(self) -> Doubles:
+        """Weights of the residuals in the normal matrix, (n,)."""
+        return self._loss.information(self.residuals / self.noise)
 
     def equations(self) -> tuple[Doubles, Doubles]:
         """Return matrix, (k, k), and right side, (k,), of the normal equations of a step."""
         residuals = self.residuals / self.noise
-        weights, prior = self._problem.loss.weights(residuals), self._problem.prior
-        right = -np.einsum("nk,n->k", self.jacobian, weights * residuals)
-        if prior is not None:
-            right -= prior.rows.T @ prior.off(self.parameters)
-        return self._products(self.information), right
+        right = -np.einsum("nk,n->k", self.jacobian, self._loss.weights(residuals) * residuals)
+        if self._prior is not None:
+            right -= self._prior.rows.T @ self._prior.off(self.parameters)
+        return self._matrix(), right
 
     def covariance(self, excess: float = 1.0) -> Doubles:
         """Return the covariance of the parameters, (k, k).
@@ -302,18 +286,13 @@ class Fit:
         ``excess`` is the ratio of the residuals' variance to that of their standard deviations, or of that of
         means of residuals if these are correlated.
         """
-        return inverse(self._products(self.information / excess))
+        return inverse(self._matrix(excess))
 
-    @property
-    def information(self) -> Doubles:
-        """Weights of the residuals in the covariance, (n,)."""
-        return self._problem.loss.information(self.residuals / self.noise)
-
-    def _products(self, weights: Doubles) -> Doubles:
+    def _matrix(self, excess: float = 1.0) -> Doubles:
         # Not by BLAS, whose threads wait for each other if other programs use the cores as well.
-        matrix: Doubles = np.einsum("nk,nl->kl", self.jacobian * weights[:, np.newaxis], self.jacobian)
-        prior = self._problem.prior
-        return matrix if prior is None else matrix + prior.rows.T @ prior.rows
+        weighted = self.jacobian * (self.information / excess)[:, np.newaxis]
+        matrix: Doubles = np.einsum("nk,nl->kl", weighted, self.jacobian)
+        return matrix if self._prior is None else matrix + self._prior.rows.T @ self._prior.rows
 
 
 def fit(
@@ -327,10 +306,7 @@ def fit(
     loss: Loss = SQUARES,
     prior: Prior | None = None,
     bounds: Bounds | None = None,
-    units: ArrayLike = 1.0,
-    shorten: Callable[[Doubles], Doubles] | None = None,
     tolerance: float = _TOLERANCE,
-    steps: int = _STEPS,
 ) -> Fit:
     """Fit parameters to residuals; see the module.
 
@@ -348,11 +324,7 @@ def fit(
         the noise changes by less than 1 %, and at most ``rounds`` fits are done.
     loss : Loss
     prior : Prior, optional
-    bounds : (ndarray, ndarray), optional
-        Lower and upper limits of the parameters.
-    units : array_like, (k,)
-        Sizes of the parameters, which scale the steps of differences.
-    shorten, tolerance, steps
+    bounds, tolerance
         See `descend`.
 
     Examples
@@ -362,21 +334,19 @@ def fit(
     >>> fit(lambda p: p[0] * x - y, [1.0], loss=cauchy(3.0), noise=0.1).parameters.round(3)
     array([2.001])
     """
-    parameters, sizes = np.asarray(start, np.float64), np.asarray(units, np.float64)
+    parameters = np.asarray(start, np.float64)
 
     def slopes(at: Doubles, here: Doubles) -> Doubles:
         if jacobian is not None:
             return jacobian(at)
-        h = _DIFFERENCE * np.maximum(sizes, np.abs(at))
+        h = _DIFFERENCE * np.maximum(1.0, np.abs(at))
         if bounds is not None:
             h = np.where(at + h > bounds[1], -h, h)
-        ahead = [(residuals(at + step) - here) / step.sum() for step in np.diag(h)]
-        return np.stack(ahead, axis=1)
+        return np.stack([(residuals(at + step) - here) / step.sum() for step in np.diag(h)], axis=1)
 
     for _ in range(rounds):
-        problem = _Problem(residuals, slopes, loss, noise, prior)
-        at = functools.partial(Fit, problem)
-        fitted = descend(at, parameters, bounds=bounds, shorten=shorten, tolerance=tolerance, steps=steps)
+        at = functools.partial(Fit, residuals, slopes, loss, noise, prior)
+        fitted = descend(at, parameters, bounds=bounds, tolerance=tolerance)
         parameters, before = fitted.parameters, noise
         if rescale is None or np.allclose(noise := rescale(fitted.residuals), before, rtol=_ALIKE):
             break

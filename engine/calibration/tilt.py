@@ -23,7 +23,6 @@ Doubles = NDArray[np.float64]
 NAMES = ("tilt", "phase_offset", "oval_x", "oval_y", "centre_x", "centre_y", "pivot_x", "pivot_y", "pivot_z")
 """The body's parameters; in a fit, three of each ball and two of each wedge follow."""
 
-_SCALES = (1e-3, 1e-2, 1e-3, 1e-3, 1e-3, 1e-3, 0.1, 0.1, 0.1)  # typical errors of the body's parameters
 _ACROSS, _DEPTH, _ZENITH = 0, 1, 2  # kinds of residuals: a ball's x and y, its z, a plate's zenith
 _NOMINAL = math.radians(2.5)  # first guess of the tilt
 _PRIOR = np.array([0.0, 10.0, 1.0, 1.0, 0.2, 0.2, 1e3, 1e3, 1e3])  # weak prior standard deviations
@@ -267,12 +266,11 @@ class _Fit(NamedTuple):
 def _fit(model: _Model, start: Doubles, scale: Doubles, rounds: int) -> _Fit:
     """Fit parameters; after each round the errors of each kind are scaled by the residuals."""
     kinds = model.kinds()
-    units = np.concatenate([_SCALES, np.full(len(start) - len(_SCALES), 1e-2)])
     parameters = start
     for _ in range(rounds):
         error = np.concatenate([scale[kinds], np.ones(len(start))])
         found = least_squares.fit(
-            functools.partial(model.residuals, start=start), parameters, noise=error, units=units, loss=_LOSS
+            functools.partial(model.residuals, start=start), parameters, noise=error, loss=_LOSS
         )
         parameters = found.parameters
         if parameters[0] < 0:  # the same lean with a positive tilt

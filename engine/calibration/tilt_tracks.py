@@ -179,7 +179,6 @@ def _fit_centre(turn: _BallTurn, frame: NDArray[Any], centre: Doubles, sigma: Do
         rescale=noise,
         loss=least_squares.geman_mcclure(_OUTLIER),
         prior=least_squares.Prior(np.array([[0, 0, 1 / prior]]), centre[2:] / prior),
-        shorten=lambda step: np.clip(step, -1, 1) * min(1.0, float(turn.radius)),
     )
     place, used = found.parameters, found.residuals != _OUT
     if np.count_nonzero(used) < _FEWEST:

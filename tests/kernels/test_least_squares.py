@@ -106,6 +106,15 @@ def test_a_function_of_derivatives_replaces_differences():
     np.testing.assert_allclose(given.covariance(), numerical.covariance(), rtol=1e-5)
 
 
+class Parabola:
+    def __init__(self, parameters):
+        self.parameters = parameters
+        self.cost = float(np.sum((parameters - 3) ** 2))
+
+    def equations(self):
+        return np.eye(2), 3 - self.parameters
+
+
 def test_steps_can_be_limited_in_length_and_number():
     lengths = []
 
@@ -113,8 +122,8 @@ def test_steps_can_be_limited_in_length_and_number():
         lengths.append(float(np.abs(step).max()))
         return step * min(1.0, 0.1 / lengths[-1])
 
-    found = fit(lambda p: p - 1.0, [0.0], shorten=shorten, steps=3)
-    assert found.parameters == pytest.approx([0.3])
+    found = least_squares.descend(Parabola, np.zeros(2), shorten=shorten, steps=3)
+    assert found.parameters == pytest.approx([0.3, 0.3])
 
 
 def test_parameters_without_influence_stay():
@@ -138,12 +147,4 @@ def test_a_model_that_becomes_undefined_is_not_entered():
 
 
 def test_a_model_without_arrays_needs_only_its_cost_and_equations():
-    class Parabola:
-        def __init__(self, parameters):
-            self.parameters = parameters
-            self.cost = float(np.sum((parameters - 3) ** 2))
-
-        def equations(self):
-            return np.eye(2), 3 - self.parameters
-
     assert least_squares.descend(Parabola, np.zeros(2)).parameters == pytest.approx([3, 3])
