@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.io import InputError
 from mirrorskin.io.types import FRAME_DTYPES
+from mirrorskin.kernels.least_squares import mad_sigma
 
 SAMPLES = 65536
 """Smallest number of pixels from which the noise of a larger frame is estimated."""
@@ -18,7 +19,6 @@ QUANTUM = 1 / math.sqrt(12)
 
 _AT_ONCE = 65536  # pixels processed at once
 _CLIP = 4.0  # standard deviations beyond which differences are clipped
-_MEDIAN = 0.6745  # median magnitude of a normal variate
 
 
 def check_dtype(dtype: DTypeLike) -> np.dtype[Any]:
@@ -81,7 +81,7 @@ def estimate_noise(first: NDArray[np.float64], second: NDArray[np.float64], inte
     difference = second[usable] - first[usable]
     if difference.size == 0:
         return QUANTUM if integer else 0.0
-    spread = max(np.median(np.abs(difference)) / _MEDIAN, 1.0 if integer else 0.0)
+    spread = max(mad_sigma(difference), 1.0 if integer else 0.0)
     for _ in range(10):
         kept = difference[np.abs(difference) <= _CLIP * spread]
         if spread == (spread := float(np.sqrt(np.mean(kept**2)))):

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.rotation.design_matrix import basis, check_phases
 from mirrorskin.io import InputError, pixel_axes
+from mirrorskin.kernels.least_squares import geman_mcclure
 
 Doubles = NDArray[np.float64]
 
@@ -85,7 +86,7 @@ _RAYS = 90  # directions from the centre in which the edge is located
 _SHARP = 0.5  # pixels: least scatter of the edge's distances, for weights
 _CONVERGED = 3e-3  # pixels: size of the last step of a fit
 _ROUND = 1.5  # pixels: greatest distance of the edge from the fitted circle
-_STRAY = 3.0  # times the median residual: scale of the robust weights of frames
+_STRAY, _OFF = 3.0, 2.0  # times the median residual: scale of the robust weights of frames, and of an edge
 _ROUNDS = 8  # iterations of a fit
 
 
@@ -145,8 +146,7 @@ def smooth_turn(values: Doubles, phase: Doubles) -> Doubles:
         root = np.sqrt(weight)[:, np.newaxis]
         wave = np.linalg.lstsq(functions * root, values * root, rcond=None)[0]
         residual = np.sqrt(np.sum((values - functions @ wave) ** 2, axis=1))
-        usual = _STRAY * float(np.median(residual)) + 1e-9
-        weight = 1 / (1 + (residual / usual) ** 2) ** 2
+        weight = geman_mcclure(_STRAY).weights(residual / (float(np.median(residual)) + 1e-9))
     return np.asarray(wave)
 
 
@@ -282,7 +282,7 @@ def _fit_circle(picture: _Gradients, circle: _Circle, radius: float) -> tuple[_C
             return None
         # An error (x, y) of the centre and r of the radius makes the residual x cos + y sin + r.
         usual = max(float(np.median(np.abs(away[fall > 0]))), _SHARP * pixel)
-        weight = np.sqrt(np.maximum(fall / fall.max(), 0)) / (1 + (away / (2 * usual)) ** 2)
+        weight = np.sqrt(np.maximum(fall / fall.max(), 0) * geman_mcclure(_OFF).weights(away / usual))
         weighted = functions * weight[:, np.newaxis]
         step = np.linalg.lstsq(weighted, away * weight, rcond=None)[0]
         x, y, outline = np.array(circle) + step

@@ -14,6 +14,7 @@ from mirrorskin.engine.calibration.sources import check_ball_radius
 from mirrorskin.engine.provenance import naming
 from mirrorskin.engine.reconstruction import reconstruct
 from mirrorskin.io import Calibration, InputError, Result, Source, WallResponse
+from mirrorskin.kernels import least_squares
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.response import sight_slopes
 
@@ -282,8 +283,6 @@ def _measured(result: Result) -> NDArray[np.bool_]:
 
 def _top_by_heights(result: Result, radius: float) -> tuple[float, float]:
     """Return the position of the top of a ball, mm, that fits best to measured heights."""
-    from scipy.optimize import least_squares
-
     measured = _measured(result)
     _check_enough(np.count_nonzero(measured), "turn light")
     x, y = (values[measured] for values in np.meshgrid(*_axes(result)))
@@ -294,8 +293,8 @@ def _top_by_heights(result: Result, radius: float) -> tuple[float, float]:
         return np.asarray(top[2] + np.sqrt(radius**2 - square) - radius - height)
 
     start = [np.median(x), np.median(y), height.max()]
-    fitted = least_squares(residuals, start, loss="soft_l1", f_scale=0.02, x_scale=[1.0, 1.0, 0.1])
-    return float(fitted.x[0]), float(fitted.x[1])
+    fitted = least_squares.fit(residuals, start, loss=least_squares.soft_l1(0.02))
+    return float(fitted.parameters[0]), float(fitted.parameters[1])
 
 
 def _height_errors(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,11 +10,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.calibration.levels import mad_sigma
 from mirrorskin.engine.calibration.sources import check_ball_radius, pixel_size_of
 from mirrorskin.engine.press.elastic import threshold_at
 from mirrorskin.io import Gel, InputError, Result, Source, pixel_axes
 from mirrorskin.io.maps import PressStatus
+from mirrorskin.kernels import least_squares
+from mirrorskin.kernels.least_squares import mad_sigma, soft_l1
 
 Doubles = NDArray[np.float64]
 
@@ -31,7 +33,7 @@ _WORST = (0.01, 0.02, 0.02)  # standard errors above which they are not determin
 _LATER = np.linspace(-0.1, 0.2, 13)  # radii of the ball: delays of the contact that are tried for the start
 _INDEPENDENT = 200  # number of pixels of a press with independent errors
 _AROUND = 24  # points on a dark top's rim
-_STEPS = 40  # function evaluations of a fit, at most
+_LOSS = soft_l1(1.0)  # standard deviations
 _TABLE = 400  # entries of the table from travel to contact radius
 _WIDEST = 0.999  # radii of the ball: largest contact radius
 _SLOPE_ERROR = 0.003  # standard deviation of the sheet's slope by the theory
@@ -242,24 +244,16 @@ class _Fit:
 
     def solve(self) -> tuple[Gel, dict[str, float]]:
         """Return the shared parameters and their standard errors."""
-        from scipy.optimize import least_squares
-
         for _ in range(2):  # the rates of slopes are more accurate in the second fit
-            found = least_squares(
-                self._residuals,
-                self._solution,
-                bounds=(self._low, self._high),
-                x_scale=np.where(np.arange(len(self._solution)) < len(self._free), 0.05, 0.2),
-                loss="soft_l1",
-                ftol=1e-6,
-                max_nfev=_STEPS,
+            residuals = functools.partial(self._residuals, self._rates)
+            found = least_squares.fit(
+                residuals, self._solution, bounds=(self._low, self._high), loss=_LOSS, tolerance=1e-6
             )
-            self._solution = np.clip(found.x, self._low + 1e-9, self._high - 1e-9)
+            self._solution = found.parameters
             self._rates = self._rates_of_slopes()
         count = sum(len(press.travel) for press in self._presses)
         dependent = max(1.0, count / (_INDEPENDENT * len(self._presses)))
-        excess = max(1.0, 2 * found.cost / count)
-        errors = np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac)) * excess * dependent)
+        errors = np.sqrt(np.diag(found.covariance(max(1.0, found.cost / count) * dependent)))
         sigma = dict(zip(self._free, errors.tolist(), strict=False))
         sigma["travel_zero"] = float(errors[len(self._free) + 2])
         return self._gel(self._solution), sigma
@@ -273,8 +267,7 @@ class _Fit:
         """Return the robust standard deviation of the residual heights, mm."""
         residuals = [self._excess(self._solution, number) for number in range(len(self._presses))]
         residual, rate = np.concatenate(residuals), np.concatenate(self._rates)
-        heights = residual[rate > _LEAST_RATE] / rate[rate > _LEAST_RATE]
-        return mad_sigma(heights) if heights.size else 0.0
+        return mad_sigma(residual[rate > _LEAST_RATE] / rate[rate > _LEAST_RATE])
 
     def _bounds(self) -> tuple[Doubles, Doubles, Doubles]:
         """Return lower and upper bounds, and the start."""
@@ -318,9 +311,9 @@ class _Fit:
     def _places(self, parameters: Doubles) -> Doubles:
         return parameters[len(self._free) :].reshape(-1, 3)
 
-    def _residuals(self, parameters: Doubles) -> Doubles:
+    def _residuals(self, rates: list[Doubles], parameters: Doubles) -> Doubles:
         parts = []
-        for number, (press, rate) in enumerate(zip(self._presses, self._rates, strict=True)):
+        for number, (press, rate) in enumerate(zip(self._presses, rates, strict=True)):
             error = np.hypot(_SLOPE_ERROR, rate * np.maximum(press.sigma, _TRAVEL_ERROR))
             parts.append(self._excess(parameters, number) / error)
             if math.isfinite(press.inner):

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.calibration.board import FEWEST, Board, Charuco
-from mirrorskin.engine.calibration.levels import mad_sigma
 from mirrorskin.engine.calibration.marks import Marks, centre_marks, find_marks, stretch_contrast
 from mirrorskin.engine.undistort import distorted, picture_places
 from mirrorskin.io import InputError, Lens
+from mirrorskin.kernels import least_squares
+from mirrorskin.kernels.least_squares import mad_sigma, soft_l1
 
 Doubles = NDArray[np.float64]
 
@@ -29,7 +30,7 @@ _MARKER = 0.1  # greatest relative difference of the markers' size from the spec
 _PLANE = 8  # parameters of the homography; then those of the distortion, then the pose of each other board
 _LENS = _PLANE + 5
 _LIKELY = np.array([0.3, 0.03, 0.003, 0.003, 0.008])  # prior standard deviations of k1, k2, p1, p2, k3
-_OUTLIER = 3.0  # standard deviations beyond which the loss is linear
+_LOSS = soft_l1(3.0)  # standard deviations
 _NOISE, _LEAST_NOISE = 0.1, 0.003  # pixels: first guess, and lower limit
 _DIFFERENCE = 1e-6  # step of numerical derivatives; all parameters are of the order of 1
 _OUT = 0.9  # relative distance from the map's centre to its corners at which standard errors are computed
@@ -199,30 +200,29 @@ class CameraFit:
 
     def __init__(self, pictures: Sequence[Marks]) -> None:
         """Fit twice; the second fit is weighted by the noise estimated from the first."""
-        from scipy.optimize import least_squares
-
         self.pictures = pictures
         self._shape = pictures[0].shape
         self._unit = float(max(np.abs(picture.board).max() for picture in pictures))  # of lengths, mm
         self._middle = (np.array(self._shape[::-1]) - 1) / 2  # column and row of the picture's centre
         self._focal = math.hypot(*self._shape) / 2  # half the picture's diagonal, pixels
-        self.parameters, noise = self._start(), _NOISE
-        for tolerance in (1e-4, 1e-8):
-            solution = least_squares(
-                self._normalised_residuals,
-                self.parameters,
-                self._jacobian,
-                args=(noise,),
-                loss="soft_l1",
-                f_scale=_OUTLIER,
-                x_scale="jac",
-                ftol=tolerance,
-                max_nfev=200,
-            )
-            self.parameters = solution.x
-            noise = max(_LEAST_NOISE, mad_sigma(np.concatenate(self.residuals())))
-        excess = max(1.0, 2 * solution.cost / max(1, solution.fun.size - solution.x.size))
-        self.covariance = np.linalg.pinv(solution.jac.T @ solution.jac) * excess
+        start = self._start()
+        marks = 2 * sum(len(picture.board) for picture in pictures)
+
+        def noise(size: float) -> Doubles:
+            return np.repeat([size, 1.0], [marks, _LIKELY.size])
+
+        found = least_squares.fit(
+            self._residuals,
+            start,
+            jacobian=self._jacobian,
+            noise=noise(_NOISE),
+            rescale=lambda residuals: noise(max(_LEAST_NOISE, mad_sigma(residuals[:marks]))),
+            rounds=2,
+            loss=_LOSS,
+        )
+        self.parameters = found.parameters
+        excess = max(1.0, found.cost / max(1, found.residuals.size - start.size))
+        self.covariance = found.covariance() * excess
 
     def places(self, number: int, board: Doubles) -> Doubles:
         """Return the places of points of a board, (..., 2), mm, in a picture."""
@@ -295,17 +295,16 @@ class CameraFit:
             raise InputError(f"{marks.name}: the marks do not determine a plane: show more of the board")
         return np.asarray(plane / plane[2, 2])
 
-    def _normalised_residuals(self, parameters: Doubles, noise: float) -> Doubles:
-        """Return residuals in standard deviations, (..., m), for parameters (..., p)."""
-        parts = [(self._centres(parameters, k) - one.places) / noise for k, one in enumerate(self.pictures)]
+    def _residuals(self, parameters: Doubles) -> Doubles:
+        """Return residuals of marks, pixels, and the distortion in standard deviations, (..., m)."""
+        parts = [self._centres(parameters, k) - one.places for k, one in enumerate(self.pictures)]
         flat = [part.reshape(*parameters.shape[:-1], -1) for part in parts]
         return np.concatenate([*flat, parameters[..., _PLANE:_LENS] / _LIKELY], axis=-1)
 
-    def _jacobian(self, parameters: Doubles, noise: float) -> Doubles:
-        """Return the derivatives of the normalised residuals, (m, p), by central differences."""
+    def _jacobian(self, parameters: Doubles) -> Doubles:
+        """Return the derivatives of the residuals, (m, p), by central differences."""
         steps = _DIFFERENCE * np.eye(parameters.size)
-        moved = np.stack([parameters + steps, parameters - steps])
-        ahead, behind = self._normalised_residuals(moved, noise)
+        ahead, behind = self._residuals(np.stack([parameters + steps, parameters - steps]))
         return np.asarray((ahead - behind).T / (2 * _DIFFERENCE))
 
     def _centres(self, parameters: Doubles, number: int) -> Doubles:

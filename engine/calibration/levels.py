@@ -28,11 +28,6 @@ _STEPS = 4  # iterations, which converge in fewer
 _TINY = 1e-30  # counts^2: avoids division by 0
 
 
-def mad_sigma(residuals: Floats) -> float:
-    """Return a robust standard deviation of residuals about 0: 1.4826 times their median magnitude."""
-    return 1.4826 * float(np.median(np.abs(residuals)))
-
-
 class Moments:
     """Running count, mean, variance and extremes of each pixel; samples that are not finite are ignored.
 

@@ -25,6 +25,7 @@ from mirrorskin.engine.calibration.sources import check_one_camera, read_blocks
 from mirrorskin.io import Block, InputError, References, Source
 from mirrorskin.io.calibration.types import DEAD, HOT, SATURATED
 from mirrorskin.io.types import Floats
+from mirrorskin.kernels.least_squares import mad_sigma
 
 _CHUNK = 8_000_000  # bytes of float64 samples that are processed at a time
 _MEMORY = 256_000_000  # bytes of frames of a rolled ball that are kept in memory
@@ -34,7 +35,6 @@ _MOST_HOT = 0.05  # greatest share of hot pixels
 
 # Limits of `find_defects`; "full light" is bright minus dark of the picture's brighter pixels.
 _WINDOW = 5  # pixels of a side of the neighbourhood
-_MEDIAN = 0.6745  # median magnitude of a standard normal variate
 _FAR = 7.0  # standard deviations of a hot pixel's dark level, and of a live one's light
 _GLOW = 0.05  # of full light: least excess of a hot pixel over its neighbours
 _GLARE = 0.5  # of full light: dark level above which a pixel is hot in any case
@@ -142,7 +142,7 @@ def find_defects(dark: Level, bright: Level, freedom: int, integer: bool) -> NDA
     light = _full_span(span)
     above = dark.value - _neighbourhood(dark.value)
     finite = above[np.isfinite(above)]
-    usual = float(np.median(np.abs(finite))) / _MEDIAN if finite.size else 0.0
+    usual = mad_sigma(finite)
     middle = float(np.nanmedian(dark.value)) if finite.size else 0.0
     glows = (above > max(_FAR * usual, _GLOW * light)) | (dark.value > middle + _GLARE * light)
     # With almost no noise, samples that alternate between two integers have a far larger variance.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import cmath
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,24 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.calibration.ball import rotations, smooth_turn
-from mirrorskin.engine.calibration.levels import mad_sigma
 from mirrorskin.engine.calibration.tilt_tracks import BallTrack, PlateTrack
 from mirrorskin.io import InputError, Precession
+from mirrorskin.kernels import least_squares
+from mirrorskin.kernels.least_squares import mad_sigma
 
 Doubles = NDArray[np.float64]
 
 NAMES = ("tilt", "phase_offset", "oval_x", "oval_y", "centre_x", "centre_y", "pivot_x", "pivot_y", "pivot_z")
 """The body's parameters; in a fit, three of each ball and two of each wedge follow."""
 
-_SCALES = (1e-3, 1e-2, 1e-3, 1e-3, 1e-3, 1e-3, 0.1, 0.1, 0.1)  # typical errors of the body's parameters
 _ACROSS, _DEPTH, _ZENITH = 0, 1, 2  # kinds of residuals: a ball's x and y, its z, a plate's zenith
 _NOMINAL = math.radians(2.5)  # first guess of the tilt
 _PRIOR = np.array([0.0, 10.0, 1.0, 1.0, 0.2, 0.2, 1e3, 1e3, 1e3])  # weak prior standard deviations
 _HALF = 0.5  # prior standard deviation of the tilt relative to its start
 _FIXED = 1e-9  # prior standard deviation of a fixed parameter
 _ROUNDS = 5  # fits, each weighted by the residuals of the one before
-_STEPS = 40  # function evaluations of a fit, at most
-_OUTLIER = 3.0  # standard deviations beyond which the loss is linear
+_LOSS = least_squares.soft_l1(3.0)  # standard deviations
 _BEYOND = 5.0  # standard deviations beyond which a residual does not count for the scale of its kind
 _ALIKE = 0.03  # relative change of the scales at which fits end
 _CLEAR = 16.0  # difference of chi^2 that decides between two solutions
@@ -265,33 +265,23 @@ class _Fit(NamedTuple):
 
 def _fit(model: _Model, start: Doubles, scale: Doubles, rounds: int) -> _Fit:
     """Fit parameters; after each round the errors of each kind are scaled by the residuals."""
-    from scipy.optimize import least_squares
-
     kinds = model.kinds()
-    steps = np.concatenate([_SCALES, np.full(len(start) - len(_SCALES), 1e-2)])
     parameters = start
     for _ in range(rounds):
         error = np.concatenate([scale[kinds], np.ones(len(start))])
-        found = least_squares(
-            lambda trial, error=error: model.residuals(trial, start) / error,
-            parameters,
-            x_scale=steps,
-            loss="soft_l1",
-            f_scale=_OUTLIER,
-            max_nfev=_STEPS,
+        found = least_squares.fit(
+            functools.partial(model.residuals, start=start), parameters, noise=error, loss=_LOSS
         )
-        parameters = found.x
+        parameters = found.parameters
         if parameters[0] < 0:  # the same lean with a positive tilt
             parameters[:2] = -parameters[0], parameters[1] + math.pi
-        jacobian = found.jac * steps
-        _, values, rows = np.linalg.svd(jacobian, full_matrices=False)
-        spread = rows.T / values
-        freedom = 1 - np.sum((jacobian @ spread) ** 2, axis=1)[: len(kinds)]
+        covariance = found.covariance()
+        spread = np.einsum("nk,kl,nl->n", found.jacobian, covariance, found.jacobian)
+        freedom = (1 - found.information * spread)[: len(kinds)]
         residuals = model.residuals(parameters, start)[: len(kinds)]
         before, scale = scale, _scales(residuals, freedom, kinds, scale)
         if np.allclose(before, scale, rtol=_ALIKE):
             break
-    covariance = (spread @ spread.T) * np.outer(steps, steps)
     return _Fit(parameters, covariance, residuals, scale)
 
 

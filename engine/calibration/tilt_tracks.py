@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.calibration.ball import follow_ball, see_ball
 from mirrorskin.engine.calibration.brightness import Brightness, LinearBrightness
-from mirrorskin.engine.calibration.levels import mad_sigma
 from mirrorskin.engine.calibration.sources import check_ball_radius, pixel_size_of, read_turn
 from mirrorskin.engine.provenance import naming
 from mirrorskin.engine.rotation.design_matrix import check_phases
 from mirrorskin.io import InputError, Source, pixel_axes
+from mirrorskin.kernels import least_squares
+from mirrorskin.kernels.least_squares import mad_sigma
 
 Doubles = NDArray[np.float64]
 
@@ -24,10 +25,9 @@ _SAME_PHASE = 1e-6  # radians
 _MARGIN = 2.0  # pixels from the outline within which a sample may show the free sheet
 _MOST = 20_000  # samples of a frame that are fitted, at most
 _FEWEST = 30  # samples of a frame, at least
-_ROUNDS = 8  # Gauss-Newton steps, at most
 _STEP = 1e-3  # mm: step of numerical derivatives
-_CONVERGED = 1e-6  # mm: size of the last step
 _OUTLIER = 4.0  # standard deviations: scale of the robust weights
+_OUT = 1e3  # residual of a sample that does not show the ball, or is out of range
 _FAR = 0.25  # radii: greatest distance of the fitted centre from that of the outline
 _DEEP = 0.5  # mm: standard deviation of the depth if the outline is not that of the contact
 _RIM = 0.85  # share of the outline's radius at which the rim begins
@@ -154,33 +154,44 @@ def _fit_centre(turn: _BallTurn, frame: NDArray[Any], centre: Doubles, sigma: Do
     linear = isinstance(turn.light, LinearBrightness)
     prior, outline_sigma = float(sigma[2]) if linear else _DEEP, sigma[2]
     sigma[2] = _DEEP  # unless the outline proves to be that of the contact
-    place = centre.copy()
-    for _ in range(_ROUNDS):
+
+    def residuals(place: Doubles) -> Doubles:
         expected, within = _expected(turn, sight, pixels, place)
+        off = expected - light
+        return np.where(within & np.isfinite(off), off, _OUT)
+
+    def jacobian(place: Doubles) -> Doubles:
+        expected, _ = _expected(turn, sight, pixels, place)
         moved = [_expected(turn, sight, pixels, place + step)[0] for step in _STEP * np.eye(3)]
-        slopes, residual = (np.stack(moved, axis=1) - expected[:, np.newaxis]) / _STEP, light - expected
-        used = within & np.isfinite(residual) & np.isfinite(slopes).all(axis=1)
-        if np.count_nonzero(used) < _FEWEST:
-            return
-        slopes, residual = slopes[used], residual[used]
-        noise = mad_sigma(residual) + 1e-9
-        weighted = slopes / ((1 + (residual / (_OUTLIER * noise)) ** 2) * noise)[:, np.newaxis] ** 2
-        curvature, pull = weighted.T @ slopes, weighted.T @ residual
-        curvature[2, 2] += prior**-2
-        pull[2] += (centre[2] - place[2]) / prior**2
-        step = np.linalg.solve(curvature, pull)
-        place = place + np.clip(step, -1, 1) * min(1.0, float(turn.radius))
-        if np.max(np.abs(step)) < _CONVERGED:
-            break
+        return np.nan_to_num((np.stack(moved, axis=1) - expected[:, np.newaxis]) / _STEP)
+
+    def noise(off: Doubles) -> float:
+        return mad_sigma(off[off != _OUT]) + 1e-9
+
+    first = residuals(centre)
+    if np.count_nonzero(first != _OUT) < _FEWEST:
+        return
+    found = least_squares.fit(
+        residuals,
+        centre.copy(),
+        jacobian=jacobian,
+        noise=noise(first),
+        rescale=noise,
+        loss=least_squares.geman_mcclure(_OUTLIER),
+        prior=least_squares.Prior(np.array([[0, 0, 1 / prior]]), centre[2:] / prior),
+    )
+    place, used = found.parameters, found.residuals != _OUT
+    if np.count_nonzero(used) < _FEWEST:
+        return
     if np.linalg.norm((place - centre)[:2]) > _FAR * turn.radius:
         return
-    centre[:], sigma[:] = place, np.sqrt(np.diag(np.linalg.inv(curvature)))
+    centre[:], sigma[:] = place, np.sqrt(np.diag(found.covariance()))
     if linear:
         away = np.hypot(x - place[0], y - place[1])
         rim = away > _RIM * away.max()
-        off = residual[rim[used]]
+        off = found.residuals[rim & used]
         visible = off.size >= max(1, _MOSTLY * np.count_nonzero(rim)) and (
-            abs(float(np.mean(off))) < _RIM_ERROR + _OUTLIER * noise / math.sqrt(off.size)
+            abs(float(np.mean(off))) < _RIM_ERROR + _OUTLIER * noise(found.residuals) / math.sqrt(off.size)
         )
         sigma[2] = outline_sigma if visible else _DEEP
 

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from mirrorskin.engine.calibration import wall_fit
 from mirrorskin.engine.calibration import wall_model as model
 from mirrorskin.engine.calibration.ball import moved
-from mirrorskin.engine.calibration.levels import mad_sigma
 from mirrorskin.engine.calibration.sources import check_ball_radius
 from mirrorskin.engine.calibration.wall_response import make_response
 from mirrorskin.io import InputError, Precession, References, Source, WallResponse
 from mirrorskin.io.calibration.types import PATTERNS
+from mirrorskin.kernels.least_squares import mad_sigma
 
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]

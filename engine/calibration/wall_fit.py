@@ -24,6 +24,7 @@ from mirrorskin.engine.calibration.wall_model import (
 )
 from mirrorskin.engine.provenance import naming
 from mirrorskin.io import InputError, Precession, References, Source, pixel_axes
+from mirrorskin.kernels import least_squares
 
 Doubles = NDArray[np.float64]
 
@@ -187,14 +188,10 @@ def _clipped_counts(frames: NDArray[Any]) -> NDArray[Any]:
 
 # --- the fit ------------------------------------------------------------------------------------------------
 
-_OUTLIER = 3.0  # standard deviations: scale of the Cauchy loss
+_LOSS = least_squares.cauchy(3.0)  # standard deviations
 _ROUGH = 0.05  # of full light: prior standard deviation of third differences of the curve's coefficients
 _SCATTER = (1e-3, 0.3)  # radians: bounds of the scatter
-_CHUNK = 8192  # samples whose derivatives are in memory at a time
-_ROUNDS = 60  # iterations, at most
-_DAMPING = 1e-4  # of the first step, relative to the curvature
-_RELAXED = 30.0  # divisor of the damping after a successful step
-_STUCK = 1e8  # damping at which the search for a better step ends
+_CHUNK = 8192  # samples whose derivatives are computed at a time
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -204,6 +201,17 @@ class Prior:
     mean: Doubles  # (P,)
     sigma: Doubles  # (P,): standard deviations; inf for no information, 0 for a fixed parameter
     rising: bool = True  # whether the curve rises from the rim to the rest plane
+
+    def equations(self, free: NDArray[np.intp]) -> least_squares.Prior:
+        """Return the prior of the free parameters; the curve, if it is free, is smooth."""
+        rows = np.diag(1 / self.sigma[free])[np.isfinite(self.sigma[free])]
+        values = rows @ self.mean[free]
+        if self.sigma[STEPS].all():
+            rough = np.zeros((CURVE_COEFFICIENTS - 3, len(self.mean)))
+            rough[:, STEPS] = curve_roughness() @ curve_from_steps(self.rising) / _ROUGH
+            rows = np.concatenate([rows, rough[:, free]])
+            values = np.concatenate([values, np.zeros(len(rough))])
+        return least_squares.Prior(rows, values)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -219,28 +227,53 @@ class WallFit:
 def fit_wall(
     samples: LightSamples, prior: Prior, start: Doubles, noise: float | Doubles, tolerance: float = 1e-7
 ) -> WallFit:
-    """Find the maximum a posteriori parameters by the Levenberg-Marquardt method.
+    """Find the maximum a posteriori parameters.
 
-    A residual r contributes ``c^2 log(1 + (r / c)^2)``, where c is three times the noise of its sample: the
-    Cauchy loss, under which dust and glare have little influence. The fit ends when the relative decrease of
-    the sum is less than ``tolerance``.
+    Dust and glare have little influence under the Cauchy loss beyond three standard deviations. The fit ends
+    when the relative decrease of the sum is less than ``tolerance``.
     """
-    problem = _Problem(samples, prior, np.broadcast_to(noise, samples.light.shape))
-    parameters, total, damping = start.copy(), problem.sum(start), _DAMPING
-    for _ in range(_ROUNDS):
-        curvature, pull = problem.normal_equations(parameters)
-        while True:
-            trial = parameters + problem.step(parameters, curvature, pull, damping)
-            after = problem.sum(trial)
-            if after <= total or damping > _STUCK:
-                break
-            damping *= 10
-        gain, total = total - after, min(after, total)
-        parameters, damping = (trial if gain >= 0 else parameters), damping / _RELAXED
-        if gain <= tolerance * total:
-            break
-    residuals = samples.light - predict(samples, parameters, prior.rising)
-    return WallFit(parameters, problem.covariance(parameters, residuals), residuals, prior.rising)
+    free = np.flatnonzero(prior.sigma > 0)
+    every = start.copy()
+
+    def filled(parameters: Doubles) -> Doubles:
+        every[free] = parameters
+        return every
+
+    def residuals(parameters: Doubles) -> Doubles:
+        return predict(samples, filled(parameters), prior.rising) - samples.light
+
+    def jacobian(parameters: Doubles) -> Doubles:
+        parts = [samples[first : first + _CHUNK] for first in range(0, len(samples.light), _CHUNK)]
+        slopes = [linearise(part, filled(parameters), prior.rising)[1][:, free] for part in parts]
+        return np.concatenate(slopes)
+
+    low, high = np.full_like(start, -np.inf), np.full_like(start, np.inf)
+    low[STEPS] = 0
+    scatter = SENSOR.index("scatter")
+    low[scatter], high[scatter] = _SCATTER
+    found = least_squares.fit(
+        residuals,
+        start[free],
+        jacobian=jacobian,
+        noise=noise,
+        loss=_LOSS,
+        prior=prior.equations(free),
+        bounds=(low[free], high[free]),
+        tolerance=tolerance,
+    )
+    covariance = np.zeros((len(start), len(start)))
+    covariance[np.ix_(free, free)] = found.covariance(_excess(found.residuals / noise))
+    return WallFit(filled(found.parameters), covariance, -found.residuals, prior.rising)
+
+
+def _excess(residuals: Doubles) -> float:
+    """Return the factor of the covariance for the size of the residuals, in standard deviations.
+
+    Huber's proposal: the variance of the weighted residuals divided by the square of their mean slope.
+    """
+    weights = _LOSS.weights(residuals)
+    slope = weights**2 * (1 - (residuals / _LOSS.limit) ** 2)
+    return float(np.mean((weights * residuals) ** 2) / np.mean(slope) ** 2 * np.mean(weights))
 
 
 def start_curve(samples: LightSamples, start: Doubles) -> tuple[Doubles, bool]:
@@ -258,83 +291,3 @@ def start_curve(samples: LightSamples, start: Doubles) -> tuple[Doubles, bool]:
     parameters = start.copy()
     parameters[STEPS] = steps
     return parameters, rising
-
-
-class _Problem:
-    """The negative log posterior, and its normal equations."""
-
-    def __init__(self, samples: LightSamples, prior: Prior, noise: Doubles) -> None:
-        self._samples, self._prior, self._noise = samples, prior, noise
-        self._free = np.flatnonzero(prior.sigma > 0)
-        self._per_sigma = 1 / np.where(prior.sigma > 0, prior.sigma, np.inf)
-        self._rough = np.zeros((CURVE_COEFFICIENTS - 3, len(prior.mean)))
-        if np.any(self._per_sigma[STEPS] < np.inf) and prior.sigma[STEPS].all():
-            self._rough[:, STEPS] = curve_roughness() @ curve_from_steps(prior.rising) / _ROUGH
-        self._low, self._high = np.full((2, len(prior.mean)), -np.inf)
-        self._high[:] = np.inf
-        self._low[STEPS] = 0
-        scatter = SENSOR.index("scatter")
-        self._low[scatter], self._high[scatter] = _SCATTER
-
-    def sum(self, parameters: Doubles) -> float:
-        """Return the sum that is minimised."""
-        light = predict(self._samples, parameters, self._prior.rising)
-        residual = (self._samples.light - light) / self._noise
-        loss = _OUTLIER**2 * np.log1p((residual / _OUTLIER) ** 2)
-        off = [(parameters - self._prior.mean) * self._per_sigma, self._rough @ parameters]
-        return float(np.sum(loss) + np.sum(np.concatenate(off) ** 2))
-
-    def normal_equations(self, parameters: Doubles) -> tuple[Doubles, Doubles]:
-        """Return curvature, (P, P), and right side, (P,), of the undamped step."""
-        curvature = np.diag(self._per_sigma**2) + self._rough.T @ self._rough
-        pull = self._per_sigma**2 * (self._prior.mean - parameters)
-        pull -= self._rough.T @ (self._rough @ parameters)
-        for first in range(0, len(self._samples.light), _CHUNK):
-            part = slice(first, first + _CHUNK)
-            light, slopes = linearise(self._samples[part], parameters, self._prior.rising)
-            residual = (self._samples.light[part] - light) / self._noise[part]
-            slopes /= self._noise[part, np.newaxis]
-            weighted = slopes * _weight(residual)[:, np.newaxis]
-            # Not by BLAS, whose threads wait for each other if other programs use the cores as well.
-            curvature += np.einsum("na,nb->ab", weighted, slopes)
-            pull += np.einsum("na,n->a", weighted, residual)
-        return curvature, pull
-
-    def step(self, parameters: Doubles, curvature: Doubles, pull: Doubles, damping: float) -> Doubles:
-        """Return the damped step within the bounds."""
-        from scipy.linalg import cholesky
-        from scipy.optimize import lsq_linear
-
-        free = self._free
-        scale = 1 / np.sqrt(np.diag(curvature)[free])
-        scaled = curvature[np.ix_(free, free)] * np.outer(scale, scale) + damping * np.eye(len(free))
-        root = cholesky(scaled + 1e-12 * np.eye(len(free)))
-        target = np.linalg.solve(root.T, pull[free] * scale)
-        bounds = [(bound[free] - parameters[free]) / scale for bound in (self._low, self._high)]
-        bounds = [np.minimum(bounds[0], -1e-12), np.maximum(bounds[1], 1e-12)]
-        step = np.zeros_like(parameters)
-        step[free] = np.clip(lsq_linear(root, target, bounds, method="bvls").x, *bounds) * scale
-        return step
-
-    def covariance(self, parameters: Doubles, residuals: Doubles) -> Doubles:
-        """Return the parameters' covariance, scaled by the size of the residuals.
-
-        Huber's proposal: the variance of the weighted residuals divided by the square of their mean slope.
-        """
-        residual = residuals / self._noise
-        weight = _weight(residual)
-        slope = weight**2 * (1 - (residual / _OUTLIER) ** 2)
-        ratio = float(np.mean((weight * residual) ** 2) / np.mean(slope) ** 2 * np.mean(weight))
-        prior = np.diag(self._per_sigma**2) + self._rough.T @ self._rough
-        curvature = (self.normal_equations(parameters)[0] - prior) / ratio + prior
-        covariance = np.zeros_like(curvature)
-        inner = np.ix_(self._free, self._free)
-        scale = np.sqrt(np.diag(curvature)[self._free])
-        scaled = curvature[inner] / np.outer(scale, scale)
-        covariance[inner] = np.linalg.pinv(scaled, 1e-13, hermitian=True) / np.outer(scale, scale)
-        return covariance
-
-
-def _weight(residual: Doubles) -> Doubles:
-    """Return the weights of residuals in standard deviations by the Cauchy loss."""
-    return np.asarray(1 / (1 + (residual / _OUTLIER) ** 2))

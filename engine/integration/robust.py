@@ -15,6 +15,7 @@ from mirrorskin.engine.integration.multigrid import Multigrid, Solution
 from mirrorskin.engine.integration.validation import Flags, Inputs
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.breaks import DOWN, RIGHT
+from mirrorskin.kernels.least_squares import mad_sigma
 
 _BROKEN = 6.0
 """k r^2 (see ``mirrorskin.kernels.breaks``) above which a link crosses a discontinuity."""
@@ -237,7 +238,7 @@ class _Search:
         curl.upload()
         most, step = float(sizes.max()), max(1, sizes.size // _SAMPLES)
         samples = sizes.ravel()[::step][(flags & (RIGHT | DOWN) == RIGHT | DOWN).ravel()[::step]]
-        noise = float(np.median(samples)) / 0.6745 if samples.size else 0.0  # of a normal distribution
+        noise = mad_sigma(samples)
         self.contradicted = most > _CLEAR * noise
         return curl, noise
 

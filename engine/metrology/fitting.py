@@ -13,6 +13,7 @@ missing variance is counted as absorbed.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -20,15 +21,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.metrology.quantity import Quantity, micrometres
+from mirrorskin.kernels import least_squares
+from mirrorskin.kernels.least_squares import mad_sigma
 
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 _Frame = tuple[Doubles, Doubles]
 
-_STEPS, _HALVINGS = 50, 10
-_CONVERGED = 1e-6  # largest relative change of the residuals by the last step
+_CONVERGED = 1e-12  # largest relative decrease of the sum of squares by the last step
 _SINGULAR = 1e-14  # smallest eigenvalue of normal equations with columns of length 1
-_MEDIAN = 0.6745  # median magnitude of a normal variate
 _FAR = 5.0  # standard deviations, estimated from the median distance, beyond which points are outliers
 _FEW = 0.15  # largest share of outliers or uncertain points; if there are more, they belong to the surface
 _PASSES = 5  # largest number of updates of the outliers
@@ -150,8 +151,8 @@ def _fit_robustly(
         if minimum is None:
             return None
         parameters = minimum
-        misfit = abs(form.distance(points, parameters)) * np.sqrt(weight)
-        share = 1 / np.maximum(misfit / (_typical(misfit) + rounding), 1)
+        misfit = form.distance(points, parameters) * np.sqrt(weight)
+        share = least_squares.huber(1.0).weights(misfit / (mad_sigma(misfit) + rounding))
     return parameters
 
 
@@ -161,8 +162,8 @@ def _fit_without_outliers(
     """Fit without outliers until these no longer change; return the parameters and the points used."""
     kept = np.zeros(weight.size, bool)
     for _ in range(_PASSES):
-        misfit = abs(form.distance(points, parameters)) * np.sqrt(weight)
-        near = misfit <= _FAR * max(_typical(misfit), rounding)
+        misfit = form.distance(points, parameters) * np.sqrt(weight)
+        near = np.abs(misfit) <= _FAR * max(mad_sigma(misfit), rounding)
         if np.count_nonzero(~near) > _FEW * near.size:
             near[:] = True
         if np.array_equal(kept, near):
@@ -176,11 +177,6 @@ def _fit_without_outliers(
     return parameters, kept
 
 
-def _typical(misfit: Doubles) -> float:
-    """Return the standard deviation, estimated from the median magnitude."""
-    return float(np.median(misfit)) / _MEDIAN
-
-
 def _weights(sigma: Doubles) -> Doubles:
     """Return inverse variances, (n,), relative to the median and capped there; 1 without variances."""
     typical = float(np.median(sigma))
@@ -189,39 +185,33 @@ def _weights(sigma: Doubles) -> Doubles:
     return np.asarray(np.maximum(sigma / typical, 1.0) ** -2)
 
 
+class _Sums:
+    """The weighted sum of squares of a form's distances: a model of `least_squares.descend`."""
+
+    def __init__(self, form: Form, points: Doubles, weight: Doubles, parameters: Doubles) -> None:
+        self.parameters: Doubles = parameters
+        self.gram: Doubles = _gram(form, points, weight, parameters)
+        self.cost: float = float(self.gram[-1, -1])
+
+    def equations(self) -> tuple[Doubles, Doubles]:
+        return self.gram[:-1, :-1], -self.gram[:-1, -1]
+
+
 def _minimise(
     form: Form, points: Doubles, weight: Doubles, parameters: Doubles, rounding: float
 ) -> Doubles | None:
-    """Minimise the sum of squares by Gauss-Newton steps with step halving."""
-    gram = _gram(form, points, weight, parameters)
-    least = rounding**2 * weight.size
-    for _ in range(_STEPS):
-        step_and_gain = _step(gram)
-        if step_and_gain is None:
-            return None
-        step, gain = step_and_gain
-        before = gram[-1, -1]
-        for _ in range(_HALVINGS):
-            gram = _gram(form, points, weight, parameters + step)
-            if gram[-1, -1] <= before + least:
-                break
-            step = step / 2
-        parameters = parameters + step
-        if gain <= _CONVERGED**2 * before + least:
-            return parameters
-    return None
-
-
-def _step(gram: Doubles) -> tuple[Doubles, float] | None:
-    """Return the Gauss-Newton step, and the expected decrease of the sum of squares."""
-    scale = np.sqrt(np.diag(gram)[:-1])
-    if not np.all(scale > 0):
+    """Minimise the sum of squares; None if the points do not determine the parameters."""
+    found = least_squares.descend(
+        functools.partial(_Sums, form, points, weight),
+        parameters,
+        tolerance=_CONVERGED,
+        rounding=rounding**2 * weight.size,
+    )
+    lengths = np.sqrt(np.diag(found.gram)[:-1])
+    if not np.all(lengths > 0):
         return None
-    normal, right = gram[:-1, :-1] / np.multiply.outer(scale, scale), -gram[:-1, -1] / scale
-    if np.linalg.eigvalsh(normal)[0] < _SINGULAR:
-        return None
-    step = np.linalg.solve(normal, right)
-    return step / scale, float(step @ normal @ step)
+    normal = found.gram[:-1, :-1] / np.multiply.outer(lengths, lengths)
+    return found.parameters if np.linalg.eigvalsh(normal)[0] >= _SINGULAR else None
 
 
 def _gram(

@@ -18,11 +18,13 @@ from mirrorskin.io import InputError
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.pose import BLOCK, PARTS, SUMS
 
+FEWEST_SHARED = 20
+"""Smallest number of pixels that two maps must share."""
+
 _UPPER = np.triu_indices(6)
 _FLOOR = 1e-5  # share of the mean information that is added to all directions, for rounding errors
 _LIKELY = 0.5, 0.02  # noise that `Equations.free` assumes during steps, near the solution and far from it
 _AWAY = 3.0  # chi square above which a motion is far from the solution
-_FEWEST = 20  # smallest number of pixels that two maps must share
 _COARSEST = 24  # pixels along the shorter side of the coarsest maps
 _STEPS, _STILL = 40, 1e-2  # largest number of steps; step, in standard deviations, that ends them
 _BLOCKS = 100  # weight, in blocks, of the covariance of independent errors
@@ -180,7 +182,7 @@ class PairFit:
         levels = [self]
         while min(levels[-1].first.records.shape[:2]) >= 2 * _COARSEST:
             first, second = (map_.halved(self.device) for map_ in (levels[-1].first, levels[-1].second))
-            if min(len(first.points), len(second.points)) < _FEWEST:
+            if min(len(first.points), len(second.points)) < FEWEST_SHARED:
                 break
             levels.append(PairFit(first, second, self.device))
         return levels
@@ -232,7 +234,7 @@ class PairFit:
         """Refine a motion until steps outside of the free directions are small; None without overlap."""
         for _ in range(_STEPS):
             now = self.equations(motion, unbiased=not free.size)
-            if now.pixels < _FEWEST:
+            if now.pixels < FEWEST_SHARED:
                 return None
             directions = complement(free if free.size else now.free(_LIKELY[now.chi_square > _AWAY]))
             if not directions.size:

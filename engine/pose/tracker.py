@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mirrorskin.engine.inputs import Maps, as_result
-from mirrorskin.engine.pose.fit import PairFit, complement
+from mirrorskin.engine.pose.fit import FEWEST_SHARED, PairFit, complement
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import STILL, Doubles, Motion
 from mirrorskin.engine.pose.pose import IDENTITY, Pose, pose_of
@@ -16,7 +16,6 @@ from mirrorskin.kernels.device import Device, open_device
 
 _SHARED = 0.6  # share of the key's pixels below which the next result becomes the key
 _COARSE, _STEPS, _STILL = 4, 8, 0.3  # pixel step of the coarse fit; number of steps, and sigmas that end them
-_FEWEST = 20  # smallest number of pixels of a coarse comparison
 _LOST = 3.0  # times the key's first chi square, above which the motion is searched again
 
 
@@ -85,7 +84,7 @@ class PoseTracker(ThreadSafe):
         for step in (_COARSE, 1):
             for _ in range(_STEPS):
                 now = fit.equations(motion, step=step)
-                if now.pixels < _FEWEST:
+                if now.pixels < FEWEST_SHARED:
                     return self._search(result)
                 motion, moved = fit.step(motion, now, directions)
                 if moved < _STILL:

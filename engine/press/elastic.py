@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any, NamedTuple
 
@@ -25,6 +26,8 @@ from mirrorskin.engine.press.halfspace import (
 from mirrorskin.engine.press.spline import CellSplines
 from mirrorskin.io import Gel, InputError, Result, Source, pixel_axes
 from mirrorskin.io.maps import PressStatus
+from mirrorskin.kernels import least_squares
+from mirrorskin.kernels.least_squares import mad_sigma
 
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -35,14 +38,13 @@ LEARNED_AT = 0.5
 _FEWEST = 12  # cells that must have turned light
 _SAMPLED = 250  # cells whose onsets are fitted; the splines have too few coefficients to need more
 _TRAVELS = 16  # travels at which the press is simulated
-# Expected third derivatives of the surface in the first steps, 1/mm^2; the last value is kept.
-_BENDING = 0.1, 0.1, 0.3, 1.0
-_MOST_ROUNDS = 14  # of Gauss-Newton steps
-_DAMPING, _STUCK = 1.0, 1e3  # initial damping, and damping above which the search ends; see `_STEP`
+_BENDING = 1.0  # expected third derivatives of the surface, 1/mm^2
+# Stages of its fit, which is stiff at first: bending, number of steps, relative decrease of the cost.
+_STAGES = (0.1, 1, 0.0), (0.1, 1, 0.0), (0.3, 1, 0.0), (_BENDING, 1, 0.0), (_BENDING, 10, 0.1)
+_RELAXED, _STUCK = 3.0, 1e3  # divisor of the damping from step to step, and its limit; see `_STEP`
 _STEP = 0.3  # mm: largest change of the surface in a step
-_SETTLED = 0.9  # ratio of successive costs above which the search has converged
 _SLOPE_ERROR = 0.006  # standard deviation of the sheet's slope at the resolution of cells
-_ROBUST = 2.0  # Huber's limit, in units of `_SLOPE_ERROR`
+_LOSS = least_squares.huber(2.0)  # of slopes, in units of `_SLOPE_ERROR`
 _MISFIT = 0.08  # largest median slope residual of an accepted fit
 _DEPTH = (
     0.6  # initial depth over that of eq. 3; the exact ratio is 0.5 for a paraboloid, more for steeper tips
@@ -169,7 +171,8 @@ def fit_press(
     heights = np.where(state == PressStatus.ONSET, heights, np.nan)
     scene = _scene_of(heights, state, check_pixel_size(pixel_size), gel, deepest)
     smooth = _interpolate(scene, scene.height)
-    factors, fit, form = _fit_surface(scene, _initial_surface(scene))
+    surface = _fit_surface(scene, _initial_surface(scene))
+    factors, fit, form = surface.parameters, surface.slopes, surface.equations()[0]
     here, everywhere = (int(np.sum(part)) for part in (scene.cells.inside(fit.contact), fit.contact))
     if everywhere - here > _BEYOND * everywhere:
         raise NotConverged("much of the contact is outside the picture")
@@ -279,7 +282,7 @@ def _interpolate(scene: _Scene, heights: Doubles) -> Doubles:
     """Return the factors of a smooth surface through heights of cells, which are NaN where it is free."""
     fixed = np.isfinite(heights).ravel()
     basis = scene.splines.basis[fixed]
-    form = (basis.T @ basis).toarray() / _INITIAL_ERROR**2 + _stiffness(scene, _BENDING[-1])
+    form = (basis.T @ basis).toarray() / _INITIAL_ERROR**2 + _stiffness(scene, _BENDING)
     return _solve(form, basis.T @ heights.ravel()[fixed] / _INITIAL_ERROR**2)
 
 
@@ -303,48 +306,49 @@ def _solve(form: Doubles, values: Doubles) -> Doubles:
     return np.asarray(splu(matrix, permc_spec="NATURAL", options={"SymmetricMode": True}).solve(values))
 
 
-def _fit_surface(scene: _Scene, factors: Doubles) -> tuple[Doubles, SlopeFit, Doubles]:
-    """Return the factors of the surface, its slopes and its normal matrix (Levenberg-Marquardt)."""
-    lit, damping, accepted = np.isfinite(scene.height), _DAMPING, 0
+def _fit_surface(scene: _Scene, factors: Doubles) -> _Surface:
+    """Return the surface whose press explains the onsets."""
+    lit = np.isfinite(scene.height)
+
+    def shorten(step: Doubles) -> Doubles:
+        return step / max(1.0, float(np.abs(scene.splines.surface(step)[lit]).max()) / _STEP)
+
     still = (scene.splines.basis.T @ scene.splines.basis).toarray() / _STEP**2
-    fit = _simulate(scene, factors)
-    for _ in range(_MOST_ROUNDS):
-        stiffness = _stiffness(scene, _BENDING[min(accepted, len(_BENDING) - 1)])
-        form, pull = _normal_equations(fit, stiffness, factors)
-        step = _solve(form + damping * still, pull)
-        moved = float(np.abs(scene.splines.surface(step)[lit]).max())
-        tried = factors + step * min(1.0, _STEP / max(moved, _STEP))
-        fit_tried, before = _simulate(scene, tried), _cost(fit, stiffness, factors)
-        after = _cost(fit_tried, stiffness, tried)
-        if after >= before:
-            if damping > _STUCK:
-                break
-            damping *= 10
-            continue
-        factors, fit, accepted, damping = tried, fit_tried, accepted + 1, damping / 3
-        if accepted > len(_BENDING) and after > _SETTLED * before:
-            break
-    misfit = float(np.median(np.abs(fit.residual))) if fit.residual.size else math.inf
+    surface = _Surface(scene, _stiffness(scene, _BENDING), None, factors)
+    for number, (bending, steps, tolerance) in enumerate(_STAGES):
+        surface = least_squares.descend(
+            functools.partial(_Surface, scene, _stiffness(scene, bending), surface),
+            surface.parameters,
+            shorten=shorten,
+            damping=least_squares.Damping(_RELAXED**-number, _RELAXED, _STUCK, still),
+            tolerance=tolerance,
+            steps=steps,
+            solve=_solve,
+        )
+    misfit = float(np.median(np.abs(surface.slopes.residual))) if surface.slopes.residual.size else math.inf
     if misfit > _MISFIT:
         raise NotConverged(f"no surface explains when the pixels turned light: slopes differ by {misfit:.2g}")
-    return factors, fit, _normal_equations(fit, _stiffness(scene, _BENDING[-1]), factors)[0]
+    return surface
 
 
-def _normal_equations(fit: SlopeFit, stiffness: Doubles, factors: Doubles) -> tuple[Doubles, Doubles]:
-    """Return the matrix and the right side of the next step's normal equations."""
-    weights = np.minimum(1.0, _ROBUST * _SLOPE_ERROR / np.maximum(np.abs(fit.residual), _RIDGE))
-    weights /= _SLOPE_ERROR**2
-    form = np.einsum("ki,k,kj->ij", fit.jacobian, weights, fit.jacobian) + stiffness
-    bend = np.einsum("ij,j->i", stiffness, factors)
-    return form, np.einsum("ki,k->i", fit.jacobian, weights * fit.residual) - bend
+class _Surface:
+    """Factors of a surface, with the cost of its slopes and its bending: a model of `least_squares`."""
 
+    def __init__(
+        self, scene: _Scene, stiffness: Doubles, before: _Surface | None, parameters: Doubles
+    ) -> None:
+        self.parameters: Doubles = parameters
+        same = before if before is not None and before.parameters is parameters else None
+        self.slopes: SlopeFit = _simulate(scene, parameters) if same is None else same.slopes
+        self._stiffness, self._residual = stiffness, self.slopes.residual / _SLOPE_ERROR
+        self._bend = np.einsum("ij,j->i", stiffness, parameters)
+        self.cost: float = _LOSS.cost(self._residual) + float(np.sum(parameters * self._bend))
 
-def _cost(fit: SlopeFit, stiffness: Doubles, factors: Doubles) -> float:
-    """Return the cost of a surface: Huber's loss of its slope residuals, and the bending penalty."""
-    residual = np.abs(fit.residual) / _SLOPE_ERROR
-    clipped = np.minimum(residual, _ROBUST)
-    bending = float(np.sum(factors * np.einsum("ij,j->i", stiffness, factors)))
-    return float(np.sum(clipped * (2 * residual - clipped))) + bending
+    def equations(self) -> tuple[Doubles, Doubles]:
+        """Return the matrix and the right side of the next step's normal equations."""
+        jacobian, weights = self.slopes.jacobian / _SLOPE_ERROR, _LOSS.weights(self._residual)
+        form = np.einsum("ki,k,kj->ij", jacobian, weights, jacobian) + self._stiffness
+        return form, np.einsum("ki,k->i", jacobian, weights * self._residual) - self._bend
 
 
 def _simulate(scene: _Scene, factors: Doubles) -> SlopeFit:
@@ -388,8 +392,7 @@ def _variances(scene: _Scene, fit: SlopeFit, form: Doubles) -> Doubles:
 
 def _excess(fit: SlopeFit) -> float:
     """Return the ratio of the observed to the expected variance of slopes, at least 1."""
-    scatter = 1.4826 * float(np.median(np.abs(fit.residual)))
-    return max(1.0, (scatter / _SLOPE_ERROR) ** 2)
+    return max(1.0, (mad_sigma(fit.residual) / _SLOPE_ERROR) ** 2)
 
 
 def _gel_slopes(scene: _Scene, fit: SlopeFit) -> list[Doubles]:

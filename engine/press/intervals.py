@@ -16,6 +16,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 Doubles = NDArray[np.float64]
 
@@ -27,10 +28,6 @@ _SAMPLES = 8192  # largest number of errors from which their distribution is est
 _ROUNDS = 12  # iterations of the share of outliers
 _FAINT = 1e-4  # least curvature of the log-likelihood, relative to that of a single sharp end
 _NEAR = 0.02  # tolerance of the logarithm of the blur
-_END, _DENSE = 8, 64  # table of the normal distribution: its ends, standard deviations, and entries per unit
-_TABLE = np.array(
-    [math.erfc(-x / _DENSE / math.sqrt(2)) / 2 for x in range(-_END * _DENSE, _END * _DENSE + 1)]
-)
 
 
 class Evidence(NamedTuple):
@@ -107,7 +104,7 @@ def interval_evidence(height: Doubles, middle: Doubles, half: Doubles, spread: I
     below, above = (middle - half - height) / blur, (middle + half - height) / blur
     near = (below < _FAR) & (above > -_FAR)
     below, above = np.where(near, below, -1.0), np.where(near, above, 1.0)
-    chance = _normal(above) - _normal(below)
+    chance = ndtr(above) - ndtr(below)
     left, right = (np.exp(-(end**2) / 2) / np.sqrt(2 * np.pi) / chance for end in (below, above))
     pull = left - right
     weight = np.clip(pull**2 - (below * left - above * right), _FAINT, 1.0)
@@ -117,17 +114,7 @@ def interval_evidence(height: Doubles, middle: Doubles, half: Doubles, spread: I
 
 def _chance(error: Doubles, half: Doubles, blur: float) -> Doubles:
     """Return the probability of an error for a blurred interval."""
-    return _normal((half - error) / blur) - _normal((-half - error) / blur)
-
-
-def _normal(places: Doubles) -> Doubles:
-    """Return the normal distribution function with an error of 1e-7: table and third-order Taylor series."""
-    places = np.clip(places, -_END, _END)
-    number = np.rint((places + _END) * _DENSE).astype(np.intp)
-    node = number / _DENSE - _END
-    off = places - node
-    density = np.exp(-(node**2) / 2) / math.sqrt(2 * math.pi)
-    return _TABLE[number] + density * off * (1 - off * (node / 2 - off * (node**2 - 1) / 6))
+    return np.asarray(ndtr((half - error) / blur) - ndtr((-half - error) / blur))
 
 
 def _lowest(function: Callable[[float], float], low: float, high: float) -> float:

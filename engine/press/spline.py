@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.kernels.least_squares import huber
+
 if TYPE_CHECKING:
     from scipy import sparse
 
@@ -224,7 +226,7 @@ def fit_within(spline: Spline, low: Doubles, high: Doubles, stiffness: float) ->
     height, excess = middle, np.zeros_like(half)
     pull = np.where(both, weights, 0.0)  # in the first iteration, the middles are fitted
     for step in range(_ITERATIONS):
-        draw = np.where(excess > 0, weights / np.maximum(excess, 1.0), 0.0)
+        draw = np.where(excess > 0, weights * huber(1.0).weights(excess), 0.0)
         ends = np.where(excess > 0, np.clip(height, low, high), 0.0)
         before = height
         factors = spline.lowest(rough + spline.squares(pull + draw), pull * middle + draw * ends)

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.frames import QUANTUM
 from mirrorskin.engine.rotation.design_matrix import Doubles, basis
 from mirrorskin.io import InputError
+from mirrorskin.kernels.least_squares import huber
 
 _FLOAT_NOISE = 1e-6  # least noise of float frames, as a share of the greatest count
 _FRAMES_OF_TWO = 7  # least number of frames for a fit with the second harmonic
@@ -153,6 +154,5 @@ def _line(levels: Doubles, variances: Doubles, least: float) -> CountNoise:
         slope = max(0.0, float(rise))
         base = float(mean - slope * centre)
         fitted = np.maximum(base + slope * levels, least)
-        off = np.abs(variances - fitted) / fitted
-        weights = np.sqrt(np.minimum(1.0, _OUTLYING / np.maximum(off, _OUTLYING))) / fitted
+        weights = np.sqrt(huber(_OUTLYING).weights((variances - fitted) / fitted)) / fitted
     return CountNoise(base, slope, least)

@@ -11,13 +11,14 @@ from numpy.typing import ArrayLike
 from mirrorskin.hw.rig.plans import Plan, Trapezoid
 from mirrorskin.hw.stage import Report
 from mirrorskin.io.types import Floats
+from mirrorskin.kernels import least_squares
+from mirrorskin.kernels.least_squares import mad_sigma
 
 _RECENT = 8  # of the latest reports, that show how far the way has come
 _SLOPES = (0.2, 2.0)  # of a planned second, that may pass in one
 _AT_REST = 1e-3  # of the way's length, that the body may seem to have moved
 _RAMPS = (0.004, 2.0)  # seconds in which a stage reaches its speed
 _REPORTS_MIN = 4  # reports under way, to find more than when the move began
-_MAD_TO_SIGMA = 1.4826  # standard deviations in a median magnitude, of a normal distribution
 _SYSTEMATIC = 1.5  # by which the plan's deviations exceed chance
 _SMOOTH = 5  # reports on either side
 _LOST_FRAME_GAP = 0.6  # periods more than one, between two frames, among which one may have been lost
@@ -108,7 +109,7 @@ class Track:
         self._extra = _smooth_residual(residual)
         self._time = time
         self.reports: int = len(time)
-        self.spread: float = _robust_sigma(residual - self._extra)
+        self.spread: float = mad_sigma(residual - self._extra)
 
     @property
     def ended(self) -> float:
@@ -126,8 +127,6 @@ class Track:
 
 def _fit(time: Floats, way: Floats, path: Trapezoid) -> tuple[float, Trapezoid]:
     """Find the beginning, the speed and the acceleration that suit all reports best."""
-    from scipy.optimize import least_squares
-
     rest = _AT_REST * path.length
     moving = (way > rest) & (way < path.length - rest)
     if not moving.any():
@@ -146,38 +145,22 @@ def _fit(time: Floats, way: Floats, path: Trapezoid) -> tuple[float, Trapezoid]:
         start, trial = trajectory(values)
         return trial.place(time - start) - way
 
-    scale = _robust_sigma(residuals(np.array([0.0, 0.0, math.log(path.ramp)]))) + 1e-5 * path.length
+    scale = mad_sigma(residuals(np.array([0.0, 0.0, math.log(path.ramp)]))) + 1e-5 * path.length
     low, high = (math.log(ramp) for ramp in _RAMPS)
-    best = min(
-        (
-            least_squares(
-                residuals,
-                [0.0, 0.0, math.log(ramp)],
-                loss="soft_l1",
-                f_scale=0.3 * scale,
-                bounds=([-np.inf, -3.0, low], [np.inf, 3.0, high]),
-                x_scale=[0.01, 0.01, 0.3],
-            )
-            for ramp in (0.02, 0.1, 0.5)
-        ),
-        key=lambda fit: float(fit.cost),
-    )
-    return trajectory(best.x)
+    loss, bounds = least_squares.soft_l1(0.3), (np.array([-np.inf, -3.0, low]), np.array([np.inf, 3.0, high]))
+    starts = ([0.0, 0.0, math.log(ramp)] for ramp in (0.02, 0.1, 0.5))
+    fits = [least_squares.fit(residuals, start, noise=scale, loss=loss, bounds=bounds) for start in starts]
+    return trajectory(min(fits, key=lambda fit: fit.cost).parameters)
 
 
 def _smooth_residual(residual: Floats) -> Floats:
     """Return what neighbouring reports agree on of what is residual; nothing where it looks like chance."""
-    chance = _robust_sigma(np.diff(residual)) / math.sqrt(2)
-    if len(residual) <= 2 * _SMOOTH or _robust_sigma(residual) <= _SYSTEMATIC * chance:
+    chance = mad_sigma(np.diff(residual)) / math.sqrt(2)
+    if len(residual) <= 2 * _SMOOTH or mad_sigma(residual) <= _SYSTEMATIC * chance:
         return np.zeros_like(residual)
     weights = (1 - (np.abs(np.arange(-_SMOOTH, _SMOOTH + 1)) / (_SMOOTH + 1)) ** 3) ** 3
     edges = np.pad(residual, _SMOOTH, mode="edge")
     return np.asarray(np.convolve(edges, weights / weights.sum(), mode="valid"))
-
-
-def _robust_sigma(values: Floats) -> float:
-    """Return the standard deviation, of which outliers take no notice."""
-    return float(_MAD_TO_SIGMA * np.median(np.abs(values))) if values.size else 0.0
 
 
 def even_times(number: ArrayLike, arrival: ArrayLike, window: int = 25) -> Floats:

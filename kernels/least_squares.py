@@ -1,0 +1,353 @@
+"""Robust least squares: the one iteration, the losses and the scale that all fits share.
+
+A fit has three parts that are independent of each other.
+
+1. *A cost*. ``fit`` minimises, over the parameters p, the sum of a loss of the residuals r(p), in standard
+   deviations, and of a prior::
+
+       sum L(r / noise) + |rows p - values|^2
+
+   A ``Loss`` is quadratic near 0; its weight L'(r) / 2 r limits the influence of outliers. Residuals are a
+   function of p; their derivatives are another one, or forward differences.
+2. *An iteration*. ``descend`` takes Levenberg-Marquardt steps: Gauss-Newton steps of the weighted residuals
+   (iteratively reweighted least squares), damped while they do not decrease the cost. It ends when the
+   relative decrease is below a tolerance. It needs of a model only its cost and its normal equations at some
+   parameters (``Model``), so that a caller with sums from blocks of many samples, or with a penalty that
+   changes, supplies these; ``fit`` supplies them from arrays.
+3. *A scale*. ``mad_sigma`` is the standard deviation of most residuals. With ``rescale``,
+   ``fit`` estimates the noise from the residuals, and fits again.
+
+The covariance of a fit is the inverse of its normal matrix. How residuals are correlated, and by how much
+they exceed their standard deviations, is known to the caller, who multiplies by it.
+
+Fits whose steps are of another kind have their own loops, with the losses and the scale of this module: many
+small fits at once (`engine.calibration.marks`), rotations from sums on a device (`engine.pose.fit`), sparse
+systems (`engine.slip.onset_map`), and fits that are linear but for their weights.
+
+The module is in ``kernels`` because ``engine`` and ``hw`` fit, and may not import each other. SciPy's
+``least_squares`` has neither a prior nor residuals whose number changes, it keeps parameters away from
+bounds that are active in most of our fits, and importing it takes longer than most of them.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Doubles = NDArray[np.float64]
+
+_MEDIAN = 0.6744897501960817  # median magnitude of a standard normal variate
+_TOLERANCE = 1e-8  # relative decrease of the cost that ends the iteration
+_STEPS = 100  # steps, at most
+_RIDGE = 1e-12  # relative to the curvature: keeps the damped matrix regular
+_SINGULAR = 1e-13  # relative to the largest eigenvalue of scaled equations: directions without information
+_DIFFERENCE = 1e-8  # step of forward differences; relative for parameters above 1
+_ROUNDS = 8  # fits with noise from the residuals of the one before, at most
+_ALIKE = 0.01  # relative change of this noise below which they end
+
+
+def mad_sigma(residuals: Doubles) -> float:
+    """Return the standard deviation of residuals about 0, from their median magnitude; 0 without any."""
+    return float(np.median(np.abs(residuals))) / _MEDIAN if residuals.size else 0.0
+
+
+# --- losses -------------------------------------------------------------------------------------------------
+
+
+class Loss(NamedTuple):
+    """A loss of residuals in standard deviations: c^2 rho((r / c)^2) with a limit c."""
+
+    limit: float
+    rho: Callable[[Doubles], Doubles]
+    slope: Callable[[Doubles], Doubles]  # derivative of rho
+    curvature: Callable[[Doubles], Doubles] | None = None  # half that of the loss, if it is smooth and convex
+
+    def cost(self, residuals: Doubles) -> float:
+        """Return the sum of the losses."""
+        return float(np.sum(self.rho((residuals / self.limit) ** 2))) * self.limit**2
+
+    def weights(self, residuals: Doubles) -> Doubles:
+        """Return the weights of residuals in least squares with the same gradient."""
+        return np.asarray(self.slope((residuals / self.limit) ** 2))
+
+    def information(self, residuals: Doubles) -> Doubles:
+        """Return the weights of residuals in the normal matrix."""
+        return np.asarray((self.curvature or self.slope)((residuals / self.limit) ** 2))
+
+
+SQUARES = Loss(1.0, lambda z: z, np.ones_like)
+"""The loss of ordinary least squares."""
+
+
+def soft_l1(limit: float) -> Loss:
+    """Return a smooth loss that is linear beyond a limit, in standard deviations."""
+    return Loss(limit, lambda z: 2 * np.sqrt(1 + z) - 2, lambda z: (1 + z) ** -0.5, lambda z: (1 + z) ** -1.5)
+
+
+def huber(limit: float) -> Loss:
+    """Return the loss of Huber (1964), quadratic up to a limit and linear beyond."""
+    return Loss(limit, lambda z: np.where(z > 1, 2 * np.sqrt(z) - 1, z), lambda z: np.maximum(z, 1) ** -0.5)
+
+
+def cauchy(limit: float) -> Loss:
+    """Return the loss of Cauchy, from the density of Student's t with one degree of freedom."""
+    return Loss(limit, np.log1p, lambda z: 1 / (1 + z))
+
+
+def geman_mcclure(limit: float) -> Loss:
+    """Return a bounded loss, under which far outliers have no influence."""
+    return Loss(limit, lambda z: z / (1 + z), lambda z: (1 + z) ** -2)
+
+
+# --- the iteration ------------------------------------------------------------------------------------------
+
+
+class Model(Protocol):
+    """A sum of losses at some parameters, (k,)."""
+
+    @property
+    def parameters(self) -> Doubles:
+        """The parameters."""
+
+    @property
+    def cost(self) -> float:
+        """The sum that is minimised."""
+
+    def equations(self) -> tuple[Doubles, Doubles]:
+        """Return matrix, (k, k), and right side, (k,), of the normal equations of a Gauss-Newton step."""
+
+
+AnyModel = TypeVar("AnyModel", bound=Model)
+Bounds = tuple[Doubles, Doubles]
+
+
+class Damping(NamedTuple):
+    """How steps are damped: the matrix that is added to the normal matrix, times a factor."""
+
+    first: float = 1e-4  # factor of the first step
+    relaxed: float = 30.0  # divisor of the factor after each step that decreases the cost
+    stuck: float = 1e8  # factor at which the search for a better step ends
+    matrix: Doubles | None = None  # by default the diagonal of the normal matrix
+
+
+def descend(
+    at: Callable[[Doubles], AnyModel],
+    start: Doubles,
+    *,
+    bounds: Bounds | None = None,
+    shorten: Callable[[Doubles], Doubles] | None = None,
+    damping: Damping = Damping(),  # noqa: B008
+    tolerance: float = _TOLERANCE,
+    rounding: float = 0.0,
+    steps: int = _STEPS,
+    solve: Callable[..., Any] = np.linalg.solve,
+) -> AnyModel:
+    """Return the model at the minimum of its cost.
+
+    Parameters
+    ----------
+    at : function
+        Returns the model at some parameters.
+    start : ndarray, (k,)
+    bounds : (ndarray, ndarray), optional
+        Lower and upper limits of the parameters.
+    shorten : function, optional
+        Limits a step, (k,).
+    damping : Damping
+    tolerance, rounding : float
+        Relative and absolute decrease of the cost below which the iteration ends.
+    steps : int
+        Largest number of successful steps.
+    solve : function
+        Solves the equations of a step without bounds.
+    """
+    best, factor = at(start), damping.first
+    for _ in range(steps):
+        matrix, right = best.equations()
+        added = np.diag(np.diag(matrix)) if damping.matrix is None else damping.matrix
+        while True:
+            step = _step(matrix + factor * added, right, solve, best.parameters, bounds)
+            there = best.parameters + (step if shorten is None else shorten(step))
+            trial = at(there if bounds is None else np.clip(there, *bounds))
+            if trial.cost <= best.cost + rounding or factor > damping.stuck:
+                break
+            factor *= 10
+        gain, factor = best.cost - trial.cost, factor / damping.relaxed
+        if gain >= 0:
+            best = trial
+        if not gain > tolerance * best.cost + rounding:
+            break
+    return best
+
+
+def _step(
+    matrix: Doubles,
+    right: Doubles,
+    solve: Callable[..., Any],
+    parameters: Doubles,
+    bounds: Bounds | None,
+) -> Doubles:
+    """Return the step within the bounds; parameters are scaled to a curvature of 1."""
+    scale = _scale(matrix)
+    scaled = matrix * np.outer(scale, scale) + _RIDGE * np.eye(len(matrix))
+    if bounds is None:
+        return np.asarray(solve(scaled, right * scale) * scale)
+    from scipy.optimize import lsq_linear
+
+    root = np.linalg.cholesky(scaled)
+    low, high = ((bound - parameters) / scale for bound in bounds)
+    low, high = np.minimum(low, -_RIDGE), np.maximum(high, _RIDGE)
+    step = lsq_linear(root.T, np.linalg.solve(root, right * scale), (low, high), method="bvls").x
+    return np.asarray(np.clip(step, low, high) * scale)
+
+
+def inverse(matrix: Doubles) -> Doubles:
+    """Return the pseudoinverse of a normal matrix, whose parameters may have any units."""
+    scale = np.outer(_scale(matrix), _scale(matrix))
+    return np.asarray(np.linalg.pinv(matrix * scale, _SINGULAR, hermitian=True) * scale)
+
+
+def _scale(matrix: Doubles) -> Doubles:
+    """Return the units of parameters in which the diagonal is 1, or 0."""
+    diagonal = np.diag(matrix)
+    return np.asarray(1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)))
+
+
+# --- fits of arrays -----------------------------------------------------------------------------------------
+
+
+class Prior(NamedTuple):
+    """What is known before: combinations of the parameters, divided by their standard deviations."""
+
+    rows: Doubles  # (m, k)
+    values: Doubles  # (m,): their means
+
+    def off(self, parameters: Doubles) -> Doubles:
+        """Return the deviations of parameters, (m,), in standard deviations."""
+        return np.asarray(self.rows @ parameters - self.values)
+
+
+class Fit:
+    """Residuals at some parameters.
+
+    Attributes
+    ----------
+    parameters : ndarray, (k,)
+    residuals : ndarray, (n,)
+        In their unit.
+    noise : float or ndarray, (n,)
+        Standard deviations of the residuals.
+    cost : float
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Doubles], Doubles],
+        slopes: Callable[[Doubles, Doubles], Doubles],
+        loss: Loss,
+        noise: float | Doubles,
+        prior: Prior | None,
+        parameters: Doubles,
+    ) -> None:
+        self._slopes, self._loss, self._prior = slopes, loss, prior
+        self.parameters: Doubles = parameters
+        self.residuals: Doubles = function(parameters)
+        self.noise: float | Doubles = noise
+        self.cost: float = loss.cost(self.residuals / noise)
+        if prior is not None:
+            self.cost += float(np.sum(prior.off(parameters) ** 2))
+
+    @functools.cached_property
+    def jacobian(self) -> Doubles:
+        """Derivatives of the residuals in standard deviations, (n, k)."""
+        slopes = self._slopes(self.parameters, self.residuals)
+        return np.asarray(slopes / np.reshape(self.noise, (-1, 1)))
+
+    @property
+    def information(self) -> Doubles:
+        """Weights of the residuals in the normal matrix, (n,)."""
+        return self._loss.information(self.residuals / self.noise)
+
+    def equations(self) -> tuple[Doubles, Doubles]:
+        """Return matrix, (k, k), and right side, (k,), of the normal equations of a step."""
+        residuals = self.residuals / self.noise
+        right = -np.einsum("nk,n->k", self.jacobian, self._loss.weights(residuals) * residuals)
+        if self._prior is not None:
+            right -= self._prior.rows.T @ self._prior.off(self.parameters)
+        return self._matrix(), right
+
+    def covariance(self, excess: float = 1.0) -> Doubles:
+        """Return the covariance of the parameters, (k, k).
+
+        ``excess`` is the ratio of the residuals' variance to that of their standard deviations, or of that of
+        means of residuals if these are correlated.
+        """
+        return inverse(self._matrix(excess))
+
+    def _matrix(self, excess: float = 1.0) -> Doubles:
+        # Not by BLAS, whose threads wait for each other if other programs use the cores as well.
+        weighted = self.jacobian * (self.information / excess)[:, np.newaxis]
+        matrix: Doubles = np.einsum("nk,nl->kl", weighted, self.jacobian)
+        return matrix if self._prior is None else matrix + self._prior.rows.T @ self._prior.rows
+
+
+def fit(
+    residuals: Callable[[Doubles], Doubles],
+    start: ArrayLike,
+    *,
+    jacobian: Callable[[Doubles], Doubles] | None = None,
+    noise: float | Doubles = 1.0,
+    rescale: Callable[[Doubles], float | Doubles] | None = None,
+    rounds: int = _ROUNDS,
+    loss: Loss = SQUARES,
+    prior: Prior | None = None,
+    bounds: Bounds | None = None,
+    tolerance: float = _TOLERANCE,
+) -> Fit:
+    """Fit parameters to residuals; see the module.
+
+    Parameters
+    ----------
+    residuals : function
+        Returns the residuals, (n,), for parameters, (k,).
+    start : array_like, (k,)
+    jacobian : function, optional
+        Returns the residuals' derivatives, (n, k); by default forward differences.
+    noise : float or ndarray, (n,)
+        Standard deviations of the residuals.
+    rescale : function, optional
+        Estimates the noise from the residuals of a fit, such as `mad_sigma`; the fit is then repeated, until
+        the noise changes by less than 1 %, and at most ``rounds`` fits are done.
+    loss : Loss
+    prior : Prior, optional
+    bounds, tolerance
+        See `descend`.
+
+    Examples
+    --------
+    >>> x = np.arange(6.0)
+    >>> y = 2 * x + [0, 0, 0, 9, 0, 0]  # one outlier
+    >>> fit(lambda p: p[0] * x - y, [1.0], loss=cauchy(3.0), noise=0.1).parameters.round(3)
+    array([2.001])
+    """
+    parameters = np.asarray(start, np.float64)
+
+    def slopes(at: Doubles, here: Doubles) -> Doubles:
+        if jacobian is not None:
+            return jacobian(at)
+        h = _DIFFERENCE * np.maximum(1.0, np.abs(at))
+        if bounds is not None:
+            h = np.where(at + h > bounds[1], -h, h)
+        return np.stack([(residuals(at + step) - here) / step.sum() for step in np.diag(h)], axis=1)
+
+    for _ in range(rounds):
+        at = functools.partial(Fit, residuals, slopes, loss, noise, prior)
+        fitted = descend(at, parameters, bounds=bounds, tolerance=tolerance)
+        parameters, before = fitted.parameters, noise
+        if rescale is None or np.allclose(noise := rescale(fitted.residuals), before, rtol=_ALIKE):
+            break
+    return fitted
