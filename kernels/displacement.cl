@@ -4,6 +4,7 @@
 // FRAME   type of a sample
 // TILE    pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
 // WINDOW  pixels of a window's side
+// TOP     what a saturated sample holds; floats have none
 //
 // A window's sums are kept for each of its columns, and put together at the end: on cores the columns of a chunk
 // lie side by side in vectors, and no sum changes its order.
@@ -16,6 +17,7 @@
 #define MARGIN (TAPS + 4)
 #define PARAMETERS 10
 #define AFFINE 6  // of them
+#define MOST 1e5f  // magnitude of an inverse matrix
 
 __kernel void displacement_pad(const int rows, const int columns, __global const FRAME *restrict frame, OUT padded)
 {
@@ -40,6 +42,77 @@ __kernel void displacement_filter(const int pixels, const int step, MAP source, 
         filtered[p] = 1.7320508f * source[p] + BESIDE(1, -0.46410162f) + BESIDE(2, 0.12435565f)
             + BESIDE(3, -0.033320997f) + BESIDE(4, 0.0089283345f) + BESIDE(5, -0.0023923402f)
             + BESIDE(6, 6.4102660e-4f) + BESIDE(7, -1.7176256e-4f) + BESIDE(8, 4.6023640e-5f);
+    }
+}
+
+#ifdef TOP
+#define KNOWN(sample) ((sample) != TOP)
+#else
+#define KNOWN(sample) ((sample) - (sample) == 0)
+#endif
+
+// Of a place beyond an end, its mirror image.
+#define MIRROR(place, length) \
+    ((place) < 0 ? -(place) : (place) < (length) ? (place) : 2 * ((length) - 1) - (place))
+
+#define FIRST_OF_MEAN (-(WINDOW / 2))
+
+__kernel void displacement_across(
+    const int rows, const int columns, __global const FRAME *restrict frame, OUT sums, OUT counts)
+{
+    const int pieces = (columns + TILE - 1) / TILE, row = get_global_id(0) / pieces;
+    if (row >= rows) return;
+    const int first = (get_global_id(0) - row * pieces) * TILE, end = min(first + TILE, columns);
+    __global const FRAME *restrict samples = frame + row * columns;
+    for (int column = first; column < end; ++column) {
+        float sum = 0, count = 0;
+        for (int k = FIRST_OF_MEAN; k < FIRST_OF_MEAN + WINDOW; ++k) {
+            const FRAME sample = samples[MIRROR(column + k, columns)];
+            const int known = KNOWN(sample);
+            sum += known ? (float)sample : 0;
+            count += known;
+        }
+        sums[row * columns + column] = sum;
+        counts[row * columns + column] = count;
+    }
+}
+
+#define BESIDES(at) ((at)[1] - (at)[-1])
+#define ABOVES(at) ((at)[stride] - (at)[-stride])
+
+__kernel void displacement_planes(
+    const int rows, const int columns, const int halo, __global const FRAME *restrict frame, MAP coefficients, MAP sums,
+    MAP counts, OUT planes, OUT difference)
+{
+    const int width = columns + 2 * halo, height = rows + 2 * halo, plane = width * height;
+    const int pieces = (width + TILE - 1) / TILE, y = get_global_id(0) / pieces;
+    if (y >= height) return;
+    const int row = y - halo, stride = columns + 2 * MARGIN;
+    const int first = (get_global_id(0) - y * pieces) * TILE, end = min(first + TILE, width);
+    for (int x = first; x < end; ++x) {
+        const int column = x - halo, p = y * width + x;
+        float value = NAN, along_x = 0, along_y = 0, texture = 0;
+        if (row >= 0 && row < rows && column >= 0 && column < columns) {
+            const FRAME sample = frame[row * columns + column];
+            if (KNOWN(sample)) {
+                value = sample;
+                MAP at = coefficients + (row + MARGIN) * stride + column + MARGIN;
+                along_x = (BESIDES(at - stride) + 4 * BESIDES(at) + BESIDES(at + stride)) * (1.0f / 12);
+                along_y = (ABOVES(at - 1) + 4 * ABOVES(at) + ABOVES(at + 1)) * (1.0f / 12);
+                float sum = 0, count = 0;
+                for (int k = FIRST_OF_MEAN; k < FIRST_OF_MEAN + WINDOW; ++k) {
+                    const int other = MIRROR(row + k, rows) * columns + column;
+                    sum += sums[other];
+                    count += counts[other];
+                }
+                texture = value - sum / count;
+            }
+        }
+        planes[p] = value;
+        planes[plane + p] = along_x;
+        planes[2 * plane + p] = along_y;
+        planes[3 * plane + p] = texture;
+        difference[p] = difference[plane + p] = 0;
     }
 }
 
@@ -73,6 +146,15 @@ __kernel void displacement_filter(const int pixels, const int step, MAP source, 
     node = node < (nodes) - 2 ? node : (nodes) - 2; \
     node = node > 0 ? node : 0; \
     part -= node;
+
+// Weights of the nodes at -1, 0, 1 and 2: Keys' cubic, straight between the last two at either end.
+#define KEYS(node, part, nodes) \
+    const float bend_##node = node > 0 && node < (nodes) - 2 ? (part) * (1 - (part)) / 2 : 0; \
+    const float node##0 = -bend_##node * (1 - (part)), node##3 = -bend_##node * (part); \
+    const float node##1 = 1 - (part) + bend_##node * (2 - 3 * (part)); \
+    const float node##2 = (part) + bend_##node * (3 * (part) - 1);
+
+#define DOWN(node) (y0 * at[up + (node)] + y1 * at[here + (node)] + y2 * at[low + (node)] + y3 * at[lowest + (node)])
 
 __kernel void displacement_warp(
     const int rows, const int columns, const int node_rows, const int node_columns, const int step, const float start,
@@ -112,6 +194,35 @@ __kernel void displacement_warp(
         const float found = counts - value + planes[plane + p] * right + planes[2 * plane + p] * down;
         difference[p] = measured ? (inside ? found : NAN) : 0;
         difference[plane + p] = measured ? 1 + NOISE_GAIN(x) * NOISE_GAIN(y) : 0;
+    }
+}
+
+__kernel void displacement_pixels(
+    const int rows, const int columns, const int node_rows, const int node_columns, const int step, const float start,
+    const int count, const int parts, const int logarithms, MAP nodes, OUT pixels)
+{
+    const int pieces = (columns + TILE - 1) / TILE, line = get_global_id(0) / pieces;
+    const int number = line / rows, row = line - number * rows;
+    if (number >= count) return;
+    const int first = (get_global_id(0) - line * pieces) * TILE, end = min(first + TILE, columns);
+    OUT out = pixels + (size_t)line * columns * parts;
+    SPLIT(row, node_rows, y, part_y)
+    KEYS(y, part_y, node_rows)
+    const int up = max(y - 1, 0) * node_columns, low = min(y + 1, node_rows - 1) * node_columns;
+    const int lowest = min(y + 2, node_rows - 1) * node_columns, here = y * node_columns;
+    for (int column = first; column < end; ++column) {
+        SPLIT(column, node_columns, x, part_x)
+        KEYS(x, part_x, node_columns)
+        const int left = max(x - 1, 0), right = min(x + 1, node_columns - 1), farthest = min(x + 2, node_columns - 1);
+        for (int k = 0; k < parts; ++k) {
+            MAP at = nodes + (number * parts + k) * node_rows * node_columns;
+            float value = x0 * DOWN(left) + x1 * DOWN(x) + x2 * DOWN(right) + x3 * DOWN(farthest);
+            if (!(value - value == 0)) {
+                value = (1 - part_x) * ((1 - part_y) * at[here + x] + part_y * at[low + x])
+                    + part_x * ((1 - part_y) * at[here + right] + part_y * at[low + right]);
+            }
+            out[column * parts + k] = logarithms ? exp(value) : value;
+        }
     }
 }
 
@@ -182,4 +293,79 @@ __kernel void displacement_solve(
     }
     answer[(AFFINE + 1) * nodes + node] = squares;
     answer[(AFFINE + 2) * nodes + node] = variances;
+}
+
+// Inverts a matrix of which the lower triangle is given, in place, after its diagonal was made 1 (Cholesky). Returns
+// whether that is possible within rounding.
+int invert(float normal[PARAMETERS][PARAMETERS])
+{
+    float scale[PARAMETERS];
+    for (int k = 0; k < PARAMETERS; ++k) {
+        const float square = normal[k][k];
+        if (!(square > 0 && square < INFINITY)) return 0;
+        scale[k] = inverse_root(square);
+    }
+    // The triangle L of A = L L', with the inverse of its diagonal.
+    for (int k = 0; k < PARAMETERS; ++k) {
+        for (int l = 0; l <= k; ++l) {
+            float sum = k == l ? 1 : normal[k][l] * scale[k] * scale[l];
+            for (int m = 0; m < l; ++m) sum -= normal[k][m] * normal[l][m];
+            if (k == l && !(sum > 0)) return 0;
+            normal[k][l] = k == l ? inverse_root(sum) : sum * normal[l][l];
+        }
+    }
+    // Its inverse, by columns.
+    for (int l = 0; l < PARAMETERS; ++l) {
+        for (int k = l + 1; k < PARAMETERS; ++k) {
+            float sum = 0;
+            for (int m = l; m < k; ++m) sum -= normal[k][m] * normal[m][l];
+            normal[k][l] = sum * normal[k][k];
+        }
+    }
+    float squares = 0;
+    for (int k = 0; k < PARAMETERS; ++k) {
+        for (int l = 0; l <= k; ++l) {
+            float sum = 0;
+            for (int m = k; m < PARAMETERS; ++m) sum += normal[m][k] * normal[m][l];
+            squares += (k == l ? 1 : 2) * sum * sum;
+            normal[l][k] = sum;  // above the diagonal; on it, no later sum needs it
+        }
+    }
+    for (int k = 0; k < PARAMETERS; ++k)
+        for (int l = 0; l <= k; ++l) normal[k][l] = normal[l][k] = normal[l][k] * scale[k] * scale[l];
+    return squares < MOST * MOST;
+}
+
+__kernel void displacement_normals(
+    const int rows, const int columns, const int node_rows, const int node_columns, const int step, const int first,
+    const int halo, MAP planes, OUT inverse, OUT summary)
+{
+    const int nodes = node_rows * node_columns, node = get_global_id(0);
+    if (node >= nodes) return;
+    const int width = columns + 2 * halo, plane = width * (rows + 2 * halo);
+    MAP corner = planes + (first + node / node_columns * step) * width + first + node % node_columns * step;
+    float normal[PARAMETERS][PARAMETERS];
+    for (int k = 0; k < PARAMETERS; ++k)
+        for (int l = 0; l < PARAMETERS; ++l) normal[k][l] = 0;
+    for (int j = 0; j < WINDOW; ++j) {
+        for (int i = 0; i < WINDOW; ++i) {
+            MAP at = corner + j * width + i;
+            const float x = at[plane], y = at[2 * plane], known = at[0] - at[0] == 0, beside = PLACE(i), below = PLACE(j);
+            const float column[PARAMETERS] = {x, y, x * beside, x * below, y * beside, y * below, known, known * beside,
+                known * below, at[3 * plane]};
+            #pragma unroll
+            for (int k = 0; k < PARAMETERS; ++k) {
+                #pragma unroll
+                for (int l = 0; l <= k; ++l) normal[k][l] += column[k] * column[l];
+            }
+        }
+    }
+    summary[3 * nodes + node] = normal[AFFINE][AFFINE];
+    const int usable = invert(normal);
+    for (int k = 0; k < PARAMETERS; ++k)
+        for (int l = 0; l < PARAMETERS; ++l)
+            inverse[(k * PARAMETERS + l) * nodes + node] = usable ? normal[k][l] : NAN;
+    summary[node] = usable ? normal[0][0] : NAN;
+    summary[nodes + node] = usable ? normal[1][0] : NAN;
+    summary[2 * nodes + node] = usable ? normal[1][1] : NAN;
 }

@@ -29,6 +29,8 @@ MARGIN = TAPS + 4
 """Mirrored samples round a padded frame, of which the outer ones have no coefficient."""
 PARAMETERS, AFFINE = 10, 6
 """Of a window, and those of them that tell how it moves."""
+MOST = 1e5
+"""Magnitude of the inverse of a normal matrix, whose diagonal was 1, up to which it is used."""
 
 _ROOT = (4 + 2 * np.cos(_ANGLES := np.linspace(0, 2 * np.pi, 256, endpoint=False))) / 6
 CORRELATION = tuple(float(np.mean(np.cos(k * _ANGLES) / _ROOT**2)) for k in range(4))
@@ -53,6 +55,57 @@ def displacement_filter(step: int, source: Array, filtered: Array) -> None:
         )
         middle += POLE**k * beside
     out[reach:-reach] = np.sqrt(3.0) * middle
+
+
+def displacement_across(window: int, frame: Array, sums: Array, counts: Array) -> None:
+    """Write the sum of the known samples of a row around each pixel, and their number, mirrored at the ends.
+
+    Known are samples that are finite, and those below the greatest value of an integer type.
+    """
+    samples, known = _known(frame)
+    for values, summed in ((np.where(known, samples, 0.0), sums), (known, counts)):
+        summed[:] = np.sum(_around(values.astype(np.float64), window, axis=1), axis=-1)
+
+
+def displacement_planes(
+    halo: int,
+    window: int,
+    frame: Array,
+    coefficients: Array,
+    sums: Array,
+    counts: Array,
+    planes: Array,
+    difference: Array,
+) -> None:
+    """Write the four planes of a reference, (4, H + 2 halo, W + 2 halo), and fill the differences with 0.
+
+    ``coefficients`` are those of its spline, ``sums`` and ``counts`` as of `displacement_across`.
+    """
+    samples, known = _known(frame)
+    c = coefficients[MARGIN - 1 : 1 - MARGIN, MARGIN - 1 : 1 - MARGIN].astype(np.float64)
+    along_x, along_y = c[:, 2:] - c[:, :-2], c[2:] - c[:-2]
+    along_x = (along_x[:-2] + 4 * along_x[1:-1] + along_x[2:]) / 12
+    along_y = (along_y[:, :-2] + 4 * along_y[:, 1:-1] + along_y[:, 2:]) / 12
+    total, number = (
+        np.sum(_around(part.astype(np.float64), window, axis=0), axis=-1) for part in (sums, counts)
+    )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        parts = [along_x, along_y, samples - total / number]
+    rest = [np.pad(np.where(known, part, 0.0), halo) for part in parts]
+    planes[:] = np.stack([np.pad(np.where(known, samples, np.nan), halo, constant_values=np.nan), *rest])
+    difference[:] = 0
+
+
+def _known(frame: Array) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return samples, and which of them are measurements."""
+    known = frame < np.iinfo(frame.dtype).max if frame.dtype.kind == "u" else np.isfinite(frame)
+    return frame.astype(np.float64), np.asarray(known)
+
+
+def _around(values: Array, window: int, axis: int) -> Array:
+    """Return the samples of a window around each along an axis, (H, W, window), mirrored at the ends."""
+    widths = [(window // 2, window - 1 - window // 2) if k == axis else (0, 0) for k in range(2)]
+    return np.lib.stride_tricks.sliding_window_view(np.pad(values, widths, mode="reflect"), window, axis=axis)
 
 
 def cubic(part: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -80,6 +133,37 @@ def interpolate_nodes(field: Array, start: float, step: int, size: tuple[int, in
             np.minimum(before + 1, last), axis
         )
     return values
+
+
+def keys(place: NDArray[np.float64], nodes: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Return the four nodes around each place and their weights: Keys' cubic, straight at the ends.
+
+    Keys, IEEE Trans. Acoustics, Speech and Signal Processing 29, 1981.
+    """
+    before = np.clip(place.astype(int), 0, max(nodes - 2, 0))
+    t = place - before
+    bend = np.where((before > 0) & (before < nodes - 2), t * (1 - t) / 2, 0.0)
+    weights = [-bend * (1 - t), 1 - t + bend * (2 - 3 * t), t + bend * (3 * t - 1), -bend * t]
+    return np.clip(before + np.arange(-1, 3)[:, np.newaxis], 0, nodes - 1), np.stack(weights)
+
+
+def displacement_pixels(step: int, start: float, logarithms: bool, nodes: Array, pixels: Array) -> None:
+    """Write at pixels, (T, H, W, n), the values of nodes, (T, n, rows, columns).
+
+    They are cubic, where nodes are missing linear, and else NaN.
+    ``logarithms``: the nodes' values are logarithms of what is written, which is then above 0.
+    """
+    for values, written in zip(nodes, pixels, strict=True):
+        fine = values.astype(np.float64)
+        for axis, length in ((1, written.shape[0]), (2, written.shape[1])):
+            place = np.clip((np.arange(length) - start) / step, 0, values.shape[axis] - 1)
+            taps, weights = keys(place, values.shape[axis])
+            shape = (-1, 1) if axis == 1 else (-1,)
+            pairs = zip(taps, weights, strict=True)
+            fine = np.sum([weight.reshape(shape) * fine.take(tap, axis) for tap, weight in pairs], axis=0)
+        linear = interpolate_nodes(values, start, step, written.shape[:2])
+        found = np.where(np.isfinite(fine), fine, linear)
+        written[:] = np.moveaxis(np.exp(found) if logarithms else found, 0, -1)
 
 
 def displacement_warp(
@@ -141,6 +225,37 @@ def basis(planes: NDArray[np.float64], window: int) -> NDArray[np.float64]:
     known = np.isfinite(counts).astype(np.float64)
     columns = [along_x, along_y, along_x * x, along_x * y, along_y * x, along_y * y]
     return np.stack([*columns, known, known * x, known * y, texture], axis=-1)
+
+
+def displacement_normals(
+    step: int, first: int, window: int, planes: Array, inverse: Array, summary: Array
+) -> None:
+    """Write the inverse of each node's normal matrix.
+
+    Parameters
+    ----------
+    step, first, window, planes : as of ``displacement_solve``
+    inverse : (10, 10, rows, columns) of nodes; NaN where it does not exist within rounding: where a column
+        is 0 or not finite, or where the inverse has a Frobenius norm above 1e5 once the diagonal is made 1
+    summary : (4, rows, columns): the inverse's elements 00, 10 and 11, and the window's number of samples
+    """
+    node_rows, node_columns = inverse.shape[2:]
+    for row in range(node_rows):
+        columns = basis(windows(planes, row, step, first, window, node_columns), window)
+        normal = columns.transpose(0, 2, 1) @ columns
+        summary[3, row] = normal[:, AFFINE, AFFINE]
+        scale = np.sqrt(np.einsum("nii->ni", normal))
+        usable = ((scale > 0) & np.isfinite(scale)).all(axis=1)
+        scale[~usable], normal[~usable] = 1, np.eye(PARAMETERS)
+        normal /= scale[:, :, None] * scale[:, None, :]
+        usable &= np.linalg.eigvalsh(normal)[:, 0] > 1e-9
+        normal[~usable] = np.eye(PARAMETERS)
+        found = np.linalg.inv(normal)
+        usable &= np.sum(found**2, axis=(1, 2)) < MOST**2
+        found /= scale[:, :, None] * scale[:, None, :]
+        found[~usable] = np.nan
+        inverse[:, :, row] = found.transpose(1, 2, 0)
+    summary[:3] = inverse[[0, 1, 1], [0, 0, 1]]
 
 
 def displacement_solve(

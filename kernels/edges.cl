@@ -7,6 +7,7 @@
 // REACH     pixels across a line over which it must be the highest
 // GUARD     pixels from the lines of the passes before within which there is no other
 // PART      of the mean difference that the jump must be
+// FIRST     1 in the first pass, before which nothing is drawn and all is in doubt
 // LAST      1 in the last pass
 //
 // Cells are six planes (x, y, z, variance, share known, 1 where no line is drawn), with a margin so that no pair leaves
@@ -41,17 +42,22 @@ __kernel void edges_clean(
     }
 }
 
-// One item a row, of the cells with their margin.
+// Runs of TILE cells of a row, one an item; rows are those of the cells with their margin.
+#define EACH_CELL                                                                                  \
+    const int stride = columns + 2 * MARGIN, high = rows + 2 * MARGIN, plane = high * stride;      \
+    const int runs = (stride + TILE - 1) / TILE, y = (int)get_global_id(0) / runs;                 \
+    const int begin = ((int)get_global_id(0) - y * runs) * TILE;                                   \
+    if (y >= high) return;                                                                         \
+    for (int x = begin; x < LESSER(begin + TILE, stride); ++x)
+
 __kernel void edges_cells(
     const int rows, const int columns, MAP vectors, MAP sigma, __global const uchar *restrict contact,
     __global const uchar *restrict clean, OUT cells)
 {
-    const int y = get_global_id(0), stride = columns + 2 * MARGIN, plane = (rows + 2 * MARGIN) * stride;
-    if (y >= rows + 2 * MARGIN) return;
-    const int row = y - MARGIN, outside = row < 0 || row >= rows;
-    for (int x = 0; x < stride; ++x) {
-        const int column = x - MARGIN, q = y * stride + x;
-        const int p = outside || column < 0 || column >= columns ? -1 : row * columns + column;
+    EACH_CELL {
+        const int row = y - MARGIN, column = x - MARGIN, q = y * stride + x;
+        const int inside = row >= 0 && row < rows && column >= 0 && column < columns;
+        const int p = inside ? row * columns + column : -1;
         float part[4] = {0, 0, 0, 0};
         int known = 0;
         if (p >= 0 && clean[p] && contact[p]) {
@@ -68,16 +74,13 @@ __kernel void edges_cells(
     }
 }
 
-// One item a row, of the cells with their margin.
 __kernel void edges_join(const int rows, const int columns, MAP cells, __global const uchar *restrict edges, OUT joined)
 {
-    const int y = get_global_id(0), stride = columns + 2 * MARGIN, plane = (rows + 2 * MARGIN) * stride;
-    if (y >= rows + 2 * MARGIN) return;
-    const int rim = y == 0 || y == rows + 2 * MARGIN - 1;
-    for (int x = 0; x < stride; ++x) {
+    EACH_CELL {
+        const int rim = y == 0 || y == high - 1 || x == 0 || x == stride - 1;
         float sum[4] = {0, 0, 0, 0}, count = 0;
         int drawn = 0;
-        for (int k = 0; k < 9 && !rim && x > 0 && x < stride - 1; ++k) {
+        for (int k = 0; k < 9 && !rim; ++k) {
             const int down = y + k / 3 - 1, right = x + k % 3 - 1, q = down * stride + right;
             const int row = down - MARGIN, column = right - MARGIN;
             for (int i = 0; i < 4; ++i) sum[i] += cells[i * plane + q];
@@ -86,15 +89,15 @@ __kernel void edges_join(const int rows, const int columns, MAP cells, __global 
         }
         for (int i = 0; i < 4; ++i) joined[i * plane + y * stride + x] = sum[i] / GREATER(count, 1);
         joined[4 * plane + y * stride + x] = count / 9;
-        joined[5 * plane + y * stride + x] = !rim && x > 0 && x < stride - 1 && !drawn;
+        joined[5 * plane + y * stride + x] = !rim && !drawn;
     }
 }
 
 #ifdef SPACING
 // Runs of CHUNK pixels of a row, one an item.
 __kernel void edges_jumps(
-    const int rows, const int columns, MAP cells, __global const int *restrict places, MAP distances, const float jump,
-    const float bend, const float significance, const float quiet, const float floor_, const float lowest,
+    const int rows, const int columns, MAP cells, MAP pairs, const float jump, const float bend,
+    const float significance, const float quiet, const float floor_, const float lowest,
     __global uchar *restrict doubt, OUT strength, __global uchar *restrict ways)
 {
     const int runs = (columns + CHUNK - 1) / CHUNK, row = (int)get_global_id(0) / runs;
@@ -102,7 +105,7 @@ __kernel void edges_jumps(
     if (row >= rows) return;
     const int width = LESSER(CHUNK, columns - first), target = row * columns + first;
     int busy = 0;
-    for (int i = 0; i < width; ++i) busy |= doubt[target + i];
+    for (int i = 0; i < width; ++i) busy |= FIRST || doubt[target + i];
     if (!busy) {
         for (int i = 0; i < width; ++i) strength[target + i] = 0;
         return;
@@ -126,16 +129,17 @@ __kernel void edges_jumps(
             float open[CHUNK];
             for (int i = 0; i < width; ++i) open[i] = 1;
             for (int step = 0; step < STEPS; ++step) {
-                const int pair = (w * LINES + line) * STEPS + step;
-                const int away = places[2 * pair + 1] * stride + places[2 * pair];
-                const float u = distances[pair], there = u > 0;
+                MAP pair = pairs + 3 * ((w * LINES + line) * STEPS + step);  // columns, rows, distance
+                const int away = (int)pair[1] * stride + (int)pair[0];
+                const float u = pair[2];
 #if SPACING > 1
                 if (step > 0) {
                     for (int i = 0; i < width; ++i) open[i] *= unbarred[i + away] * unbarred[i - away];
                 }
 #endif
+                if (!(u > 0)) continue;
                 for (int i = 0; i < width; ++i) {
-                    const float both = share[i + away] * share[i - away] * open[i] * there;
+                    const float both = share[i + away] * share[i - away] * open[i];
 #if STEPS == 2
                     const float weight = step == 0 ? both : 0, moment = step == 0 ? 0 : both;
 #else
@@ -193,10 +197,10 @@ __kernel void edges_jumps(
         const int clear = LAST | !unclear;
         const float deviation = sqrt(error[i]), wanted = jump + (clear ? -1 : 0.5f) * deviation;
         const float enough = GREATER(GREATER(wanted, lowest), significance * deviation) + (STEPS == 2 ? bend : 0);
-        const int edge = doubt[target + i] && best[i] > 0 && sqrt(square[i]) >= enough;
+        const int doubtful = FIRST || doubt[target + i], edge = doubtful && best[i] > 0 && sqrt(square[i]) >= enough;
         strength[target + i] = edge ? sqrt(best[i]) : 0;
         ways[target + i] = way[i];
-        doubt[target + i] &= unclear;
+        doubt[target + i] = doubtful && unclear;
     }
 }
 
@@ -226,7 +230,7 @@ __kernel void edges_thin(
 {
     EACH_PIXEL {
         float here = strength[p];
-        added[p] = edges[p];
+        added[p] = FIRST ? 0 : edges[p];
         if (!(here > 0)) continue;
         const int row = p / columns, column = p % columns;
         const float angle = M_PI_F / WAYS * ways[p], cosine = cos(angle), sine = sin(angle);
@@ -235,7 +239,7 @@ __kernel void edges_thin(
             if (at(strength, rows, columns, row + down, column + right) > here) here = 0;
             if (at(strength, rows, columns, row - down, column - right) >= here) here = 0;
         }
-        if (here > 0 && !guarded(edges, rows, columns, row, column, cosine, sine)) added[p] = 1;
+        if (here > 0 && (FIRST || !guarded(edges, rows, columns, row, column, cosine, sine))) added[p] = 1;
     }
 }
 #endif

@@ -41,3 +41,70 @@ def focus_scan(frames: Array, first: int, radius: int, reach: int, best: Array, 
         peak[reach][better] = sharp[better]
         best[better] = t
         recent[t % reach] = sharp
+
+
+def focus_fit(radius: int, reach: int, variance: float, least_contrast: float, least_curvature: float,
+              places: Array, travel: Array, unit: float, best: Array, peak: Array, height: Array,
+              spread: Array, gain: Array, misfit: Array, sharpness: Array,
+              status: Array) -> None:  # fmt: skip
+    """Fit a parabola to the logarithms of the contrast around the peak, by orthogonal polynomials.
+
+    See Forsythe, J. SIAM 5, 1957.
+
+    Parameters
+    ----------
+    radius, reach, best, peak : as of `focus_scan`
+    variance : of a sample, counts^2
+    least_contrast : of a peak above that of noise, in standard errors
+    least_curvature : of a peak, in standard errors
+    places : (T, 2 reach + 1), travel of the frames around each frame, from there, in units
+    travel : (T,), mm
+    unit : mm
+    height : (H, W), mm; NaN where there is no peak, as ``spread``
+    spread : (H, W), variance of the height, mm^2, for noise of variance 1
+    gain : (H, W), that if all logarithms had the variance 1
+    misfit : (H, W), estimate of the variance of the logarithms in excess of noise, of four points or more;
+        else NaN. Residuals have a chi-square distribution with n degrees of freedom, whose median is
+        (1 - 2 / 9n)^3 n (Wilson and Hilferty 1931)
+    sharpness : (H, W), standard deviation of the window's samples in the sharpest frame, without the noise
+    status : (H, W), codes of FocusStatus
+    """
+    sizes = [
+        np.minimum(place + radius, length - 1.0) - np.maximum(place - radius, 0) + 1
+        for length, place in ((length, np.arange(length)) for length in best.shape)
+    ]
+    freedom = np.multiply.outer(*sizes) - 1
+    signal, place = peak - freedom * variance, np.moveaxis(places[best], -1, 0).astype(np.float64)
+    top = signal[reach]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weight = np.where(signal > 0, signal**2 / (2 * freedom * variance + 4 * signal), 0)
+        value = np.log(np.where(signal > 0, signal / top, 1))
+        total = weight.sum(axis=0)
+        mean = (weight * place).sum(axis=0) / total
+        first = place - mean
+        norm = (weight * first**2).sum(axis=0)
+        skew = (weight * first**3).sum(axis=0) / norm
+        second = first**2 - skew * first - norm / total
+        bent = (weight * second**2).sum(axis=0)
+        level, along = (weight * value).sum(axis=0) / total, (weight * value * first).sum(axis=0) / norm
+        across = (weight * value * second).sum(axis=0) / bent
+        scale, points = unit / (2 * across), (weight > 0).sum(axis=0)
+        vertex = mean + skew / 2 - along / (2 * across)
+        found = (points > 2) & (top > least_contrast * variance * np.sqrt(2 * freedom))
+        found &= np.where(across < 0, across**2 * bent, 0) > least_curvature**2 * variance
+        residual = (weight * (value - level - along * first - across * second) ** 2).sum(axis=0)
+        free = total - (weight**2 * (1 / total + first**2 / norm + second**2 / bent)).sum(axis=0)
+        degrees = points - 3.0
+        excess = (residual / (1 - 2 / (9 * degrees)) ** 3 - degrees * variance) / free
+        misfit[:] = np.where(found & (points > 3) & (free > 0), excess, np.nan)
+        neighbours = place[reach - 1 : reach + 2]
+        found &= (neighbours.min(axis=0) < vertex) & (vertex < neighbours.max(axis=0))
+        status[:] = np.where(found, 1, 2)
+        status[(best == 0) | (best == len(travel) - 1)] = 3
+        status[~np.isfinite(top)] = 0
+        found = status == 1
+        height[:] = np.where(found, -(travel[best] + unit * vertex), np.nan)
+        spread[:] = np.where(found, (1 / norm + (along / across) ** 2 / bent) * scale**2, np.nan)
+        moves = (weight**2 * (first / norm - along / across * second / bent) ** 2).sum(axis=0)
+        gain[:] = moves * scale**2
+        sharpness[:] = np.sqrt(np.where(top < 0, 0, top) / np.maximum(freedom, 1))

@@ -97,20 +97,11 @@ class EdgeDrawing:
         kinds: dict[str, tuple[tuple[int, ...], type[np.generic]]] = {
             "vectors": ((*shape, 3), np.float32),
             **dict.fromkeys(("sigma", "strength"), (shape, np.float32)),
-            **dict.fromkeys(("contact", "clean", "lines", "more", "ways"), (shape, np.uint8)),
+            **dict.fromkeys(("contact", "clean", "doubt", "lines", "more", "ways"), (shape, np.uint8)),
             **dict.fromkeys(("cells", "joined"), (cells, np.float32)),
         }
-        self._maps = {name: device.array(name, *kind) for name, kind in kinds.items()}
-        for array in self._maps.values():
-            array.upload()
-        self._maps["doubt"] = device.given("doubt", np.ones(shape, np.uint8), np.uint8)
-        self._pairs: dict[Pass, dict[str, Any]] = {}  # of cells that a pass compares
-        for chosen in (NEAR, FINE, COARSE):
-            places, distances = pairs(chosen)
-            self._pairs[chosen] = {
-                "places": device.given("places", places, np.int32),
-                "distances": device.given("distances", distances, np.float32),
-            }
+        # Every kernel writes all of its maps, so that none need be filled before.
+        self._maps = {name: device.array(name, *kind, zeroed=False) for name, kind in kinds.items()}
 
     def take(
         self, vectors: NDArray[np.float32], sigma: NDArray[np.float32], contact: NDArray[np.uint8]
@@ -125,15 +116,16 @@ class EdgeDrawing:
     def steps(self, parts: int = 1) -> Iterator[None]:
         """Enqueue the kernels, the longest ones in ``parts`` parts, and yield after each."""
         maps, fewer = self._maps, -(-parts // _SHORTER)
-        rows = self._shape[0] + 2 * MARGIN
+        rows, columns = (size + 2 * MARGIN for size in self._shape)
+        cells = rows * -(-columns // self._device.layout.tile)
         contact: dict[str, Any] = {name: maps[name] for name in ("contact", "clean")}
         normals: dict[str, Any] = {name: maps[name] for name in ("vectors", "sigma", "cells")}
         yield from self._run("edges_clean", fewer, self._tiles, **contact)
-        yield from self._run("edges_cells", fewer, rows, **contact, **normals)
+        yield from self._run("edges_cells", fewer, cells, **contact, **normals)
         yield from self._draw(NEAR, parts, "cells", "lines", "more")
         yield from self._draw(FINE, parts, "cells", "more", "lines")
         joined: dict[str, Any] = {"cells": maps["cells"], "edges": maps["lines"], "joined": maps["joined"]}
-        yield from self._run("edges_join", fewer, rows, **joined)
+        yield from self._run("edges_join", fewer, cells, **joined)
         yield from self._draw(COARSE, parts, "joined", "lines", "more")
         drawn: dict[str, Any] = {"clean": maps["clean"], "edges": maps["more"], "drawn": maps["lines"]}
         yield from self._run("edges_bound", fewer, self._tiles, **drawn)
@@ -151,6 +143,7 @@ class EdgeDrawing:
             "REACH": chosen.reach,
             "GUARD": chosen.guard,
             "PART": f"{chosen.part}f",
+            "FIRST": int(chosen is NEAR),
             "LAST": int(chosen is COARSE),
         }
         maps, (rows, columns) = self._maps, self._shape
@@ -161,7 +154,7 @@ class EdgeDrawing:
             rows * -(-columns // min(self._device.layout.tile, 64)),
             macros,
             cells=maps[cells],
-            **self._pairs[chosen],
+            pairs=_pairs_on(self._device, chosen),
             jump=LIMITS.jump,
             bend=LIMITS.bend,
             significance=LIMITS.significance,
@@ -189,10 +182,23 @@ class EdgeDrawing:
     ) -> Iterator[None]:
         """Run a kernel over its items in ``parts`` parts."""
         rows, columns = self._shape
-        moved = sum(array.host.nbytes for array in arguments.values() if isinstance(array, Array))
-        kernel, part = self._device.kernel("edges", name, **(macros or {})), -(-items // parts)
+        moved = sum(array.nbytes for array in arguments.values() if isinstance(array, Array))
+        kernel = self._device.kernel("edges", name, **(macros or {}))
+        part = -(-items // (parts * kernel.group)) * kernel.group  # so that no item is run twice
         for first in range(0, items, part):
             count = min(part, items - first)
             share = moved * count // items
             kernel(count, rows=rows, columns=columns, **arguments, moved=share, first_item=first)
             yield
+
+
+def _pairs_on(device: Device, chosen: Pass) -> Array:
+    """Return the pairs of a pass on a device, where they stay: columns, rows and distance of each."""
+    name = f"pairs of edges, {chosen}"
+    table = device.spare.get(name)
+    if table is None:
+        places, distances = pairs(chosen)
+        values = np.concatenate([places, distances[..., np.newaxis]], axis=-1)
+        table = device.spare[name] = device.given("pairs", values)
+    assert isinstance(table, Array)
+    return table

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.frames import check_dtype, check_frames
 from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.nearest_fill import fill_with_nearest
-from mirrorskin.engine.slip.tracking import GRADIENT_NOISE, NodeField, Tracker
+from mirrorskin.engine.slip.tracking import GRADIENT_NOISE, NodeField, Tracker, invert_symmetric
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import checked
 from mirrorskin.io.maps import TABLE, DisplacementStatus, status_of
@@ -31,7 +31,6 @@ MAPS = {
 """Declarations of the maps of `find_displacement`: each component has a standard deviation of its own."""
 
 _RANK = np.array([1, 0, 2, 3], np.uint8)  # rank of a status: a pixel has the highest of its nodes
-_CODES = np.argsort(_RANK).astype(np.uint8)
 _MOST_STEP = 64  # largest distance of nodes, pixels
 _ALIKE = 4  # samples over which residuals are correlated
 _LAPLACIAN_NOISE = 4 * 20 / 24**2  # noise of the squared bias, two standard deviations, per variance
@@ -115,8 +114,13 @@ def find_displacement(
     texture = Texture.of(tracker, np.mean([field.variance for field in fields], axis=0), noise)
     texture.refuse_clear("the frames")
     sigma = np.sqrt(np.einsum("yxii->yxi", texture.covariance)) * size
-    parts = [_maps(tracker, field, texture, window_size, sigma, size) for field in fields]
-    maps = dict(zip(MAPS, (np.stack(part) for part in zip(*parts, strict=True)), strict=True))
+    nodes = [_at_nodes(tracker, field, texture, window_size, sigma, size) for field in fields]
+    displacement, sigma, status = (np.stack(part) for part in zip(*nodes, strict=True))
+    maps = {
+        "displacement": tracker.to_pixels(displacement),
+        "displacement_sigma": tracker.positive_to_pixels(sigma),
+        "status": tracker.worst_at_pixels(status, _RANK),
+    }
     x, y = pixel_axes(frames.shape[1:], size)
     return Result(maps, x=x, y=y, process={"noise": texture.noise}, declarations=MAPS)
 
@@ -155,14 +159,14 @@ class Texture:
         known = variance[np.isfinite(variance)] if noise is None else np.array([noise**2])
         usual = float(np.median(known)) if known.size else np.nan
         variance = np.where(np.isfinite(variance) & (noise is None), variance, usual)
-        spurious = (GRADIENT_NOISE * variance * level.measured)[..., None, None] * np.eye(2)
-        information = level.information - spurious
-        usable = np.isfinite(information[..., 0, 0])
-        least = np.full(level.grid, np.nan)
-        least[usable] = np.linalg.eigvalsh(information[usable])[:, 0]
-        there = least >= np.maximum(spurious[..., 0, 0], np.finfo(float).tiny)
-        covariance = np.full(information.shape, np.nan)
-        covariance[there] = 2 * variance[there][:, None, None] * np.linalg.inv(level.information[there])
+        spurious = GRADIENT_NOISE * variance * level.measured
+        first, mixed, last = level.information
+        mean, half = (first + last) / 2, (first - last) / 2
+        least = mean - spurious - np.sqrt(half**2 + mixed**2)  # smaller eigenvalue
+        there = least >= np.maximum(spurious, np.finfo(float).tiny)
+        inverse = 2 * variance * invert_symmetric(level.information)
+        covariance = np.where(there, inverse[[0, 1, 1, 2]], np.nan)
+        covariance = np.moveaxis(covariance, 0, -1).reshape(*level.grid, 2, 2)
         return cls(covariance, there, level.usable, variance, float(np.sqrt(usual)))
 
     def refuse_clear(self, name: str) -> None:
@@ -175,25 +179,21 @@ class Texture:
             )
 
 
-def _maps(
+def _at_nodes(
     tracker: Tracker,
     field: NodeField,
     texture: Texture,
     window: int,
     sigma: Doubles,
     size: tuple[float, float],
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return a frame's displacement, sigma, mm, and status, of all pixels."""
+) -> tuple[Doubles, Doubles, NDArray[np.uint8]]:
+    """Return a frame's displacement, sigma, mm, and status, of all nodes."""
     status = node_status(field, texture)
     known = (status == DisplacementStatus.FOUND)[..., None]
     displacement = np.where(known, field.moved.transpose(1, 2, 0) * [size[0], -size[1]], np.nan)
     noisy = (sigma * misfit(field, texture, window)) ** 2
     sigma = np.sqrt(noisy + bending_variance(displacement, sigma**2, tracker.finest.step, window))
-    return (
-        tracker.to_pixels(displacement),
-        tracker.positive_to_pixels(np.where(known, sigma, np.nan)),
-        _CODES[tracker.worst_at_pixels(_RANK[status])],
-    )
+    return displacement, np.where(known, sigma, np.nan), status
 
 
 def misfit(field: NodeField, texture: Texture, window: int) -> Doubles:

@@ -14,7 +14,7 @@ from scipy.ndimage import map_coordinates
 
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import C_TYPES, Device
-from mirrorskin.kernels.displacement import AFFINE, MARGIN, PARAMETERS, basis, interpolate_nodes, windows
+from mirrorskin.kernels.displacement import AFFINE, MARGIN, PARAMETERS
 
 Doubles = NDArray[np.float64]
 
@@ -109,24 +109,24 @@ class Tracker:
         return best
 
     def to_pixels(self, values: Doubles) -> NDArray[np.float32]:
-        """Return values of the nodes, (rows, columns, ...), at all pixels: cubic, else linear, else NaN."""
-        level, fine = self.finest, np.moveaxis(values.reshape(*self.finest.grid, -1), -1, 0)
-        linear = interpolate_nodes(fine, level.start, level.step, level.shape)
-        for axis, place in enumerate(self._places(), 1):
-            fine = _cubic(fine, place, axis)
-        found = np.where(np.isfinite(fine), fine, linear).astype(np.float32)
-        return np.asarray(np.moveaxis(found, 0, -1).reshape(*level.shape, *values.shape[2:]))
+        """Return values of the nodes, (rows, columns) or ([T,] rows, columns, n), at all pixels.
+
+        They are cubic, where nodes are missing linear, and else NaN.
+        """
+        return self.finest.to_pixels(values, logarithms=False)
 
     def positive_to_pixels(self, values: Doubles) -> NDArray[np.float32]:
         """Return values above 0 at all pixels, interpolated as logarithms to remain above 0."""
-        return np.asarray(np.exp(self.to_pixels(np.log(values))))
+        return self.finest.to_pixels(np.log(values), logarithms=True)
 
-    def worst_at_pixels(self, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return at all pixels the largest code of the nodes around, (rows, columns)."""
-        places = [np.floor(place).astype(int) for place in self._places()]
-        both = [[place, np.minimum(place + 1, n - 1)] for place, n in zip(places, codes.shape, strict=True)]
-        corners = [codes[np.ix_(rows, columns)] for rows in both[0] for columns in both[1]]
-        return np.asarray(np.max(corners, axis=0))
+    def worst_at_pixels(self, codes: NDArray[np.uint8], rank: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return at all pixels the code of highest rank of the nodes around, (T, rows, columns)."""
+        ranks = rank[codes]
+        for axis in (1, 2):
+            ranks = np.maximum(ranks, ranks.take(np.arange(1, ranks.shape[axis] + 1), axis, mode="clip"))
+        worst = np.argsort(rank).astype(np.uint8)[ranks]
+        rows, columns = (place.astype(int) for place in self._places())
+        return worst.take(rows, 1).take(columns, 2)
 
     def nearest(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return at all pixels the value of the nearest node, (rows, columns)."""
@@ -179,6 +179,7 @@ class _Level:
     def __init__(self, reference: NDArray[Any], window: int, step: int, device: Device) -> None:
         self._device, self._window, self.step = device, window, step
         self._frame_type = C_TYPES[reference.dtype.name]
+        self._top = int(np.iinfo(reference.dtype).max) if reference.dtype.kind == "u" else 0
         self._tile = _TILE if device.layout.tile > 1 else 1
         self.shape: tuple[int, int] = reference.shape
         rows, columns = self.shape
@@ -187,66 +188,85 @@ class _Level:
         self.grid: tuple[int, int] = -(-rows // step), -(-columns // step)
         self.rest: NDArray[Any] = np.zeros((2, *self.grid))
         padded = rows + 2 * MARGIN, columns + 2 * MARGIN
-        self._maps = {
-            "padded": device.array("padded", padded, np.float32),
-            "half": device.array("half", padded, np.float32),
-            "coefficients": device.array("coefficients", padded, np.float32),
-            "difference": device.given(
-                "difference", np.zeros((2, rows + 2 * self._halo, columns + 2 * self._halo))
-            ),
-            "field": device.array("field", self.rest.shape, np.float32),
-            "answer": device.array("answer", (AFFINE + 3, *self.grid), np.float32),
-            "frame": device.array("frame", self.shape, reference.dtype),
+        with_halo = rows + 2 * self._halo, columns + 2 * self._halo
+        shapes = {
+            **dict.fromkeys(("padded", "half", "coefficients"), padded),
+            "planes": (4, *with_halo),
+            "difference": (2, *with_halo),
+            "field": self.rest.shape,
+            "answer": (AFFINE + 3, *self.grid),
+            "inverse": (PARAMETERS, PARAMETERS, *self.grid),
+            "summary": (4, *self.grid),
         }
-        self._fit_spline(reference)
-        planes = self._planes(reference, self._maps["coefficients"].download())
-        self._maps["planes"] = device.given("planes", planes)
-        inverse, self.measured = self._invert_normals(planes)
-        self._maps["inverse"] = device.given("inverse", inverse.transpose(1, 2, 0))
+        self._maps = {
+            name: device.array(name, shape, np.float32, zeroed=False) for name, shape in shapes.items()
+        }
+        self._maps["frame"] = device.array("frame", self.shape, reference.dtype, zeroed=False)
+        self._measure_reference(reference)
+        summary = self._maps["summary"].download().astype(np.float64)
+        variances, self.measured = summary[:3], summary[3]
         # Information about the displacement, with all other parameters free.
-        self.information: NDArray[Any] = np.linalg.inv(inverse[:, :2, :2]).reshape(*self.grid, 2, 2)
-        self.usable: NDArray[np.bool_] = np.isfinite(self.information[..., 0, 0])
-        trust = 1 / np.trace(inverse[:, :2, :2], axis1=1, axis2=2).reshape(self.grid)
-        self._trust = np.nan_to_num(trust)
+        self.information: NDArray[Any] = invert_symmetric(variances)
+        self.usable: NDArray[np.bool_] = np.isfinite(self.information[0])
+        self._trust = np.nan_to_num(1 / (variances[0] + variances[2]))
         self._trust += 1e-9 * self._trust.max() + np.finfo(float).tiny
 
-    def _planes(self, reference: NDArray[Any], coefficients: NDArray[np.float32]) -> Doubles:
-        """Return counts, derivatives and texture of the reference, padded."""
-        counts = reference.astype(np.float64)
-        if reference.dtype.kind == "u":
-            counts[reference == np.iinfo(reference.dtype).max] = np.nan
-        c = coefficients[MARGIN - 1 : 1 - MARGIN, MARGIN - 1 : 1 - MARGIN].astype(np.float64)
-        along_x, along_y = c[:, 2:] - c[:, :-2], c[2:] - c[:-2]
-        along_x = (along_x[:-2] + 4 * along_x[1:-1] + along_x[2:]) / 12
-        along_y = (along_y[:, :-2] + 4 * along_y[:, 1:-1] + along_y[:, 2:]) / 12
-        known = np.isfinite(counts)
-        filled = np.where(known, counts, 0.0)
-        size = (self._window, self._window)
-        mean = cv2.blur(filled, size) / np.maximum(cv2.blur(known.astype(np.float64), size), 1e-9)
-        parts = [along_x, along_y, filled - mean]
-        halo = self._halo
-        rest = [np.pad(np.where(known, part, 0.0), halo) for part in parts]
-        return np.stack([np.pad(counts, halo, constant_values=np.nan), *rest])
+    def _measure_reference(self, reference: NDArray[Any]) -> None:
+        """Compute the reference's planes, and the inverse normal matrix of each node."""
+        self._fit_spline(reference)
+        maps, (rows, columns) = self._maps, self.shape
+        sizes: dict[str, Any] = {"rows": rows, "columns": columns}
+        frame = {"frame": maps["frame"]}
+        sums = {"sums": maps["padded"], "counts": maps["half"]}
+        self._launch("across", rows * math.ceil(columns / self._tile), **sizes, **frame, **sums)
+        wide = columns + 2 * self._halo
+        self._launch(
+            "planes",
+            (rows + 2 * self._halo) * math.ceil(wide / self._tile),
+            **sizes,
+            **frame,
+            **sums,
+            halo=self._halo,
+            **{name: maps[name] for name in ("coefficients", "planes", "difference")},
+        )
+        found = {name: maps[name] for name in ("planes", "inverse", "summary")}
+        self._launch("normals", math.prod(self.grid), **self._sizes, first=self._first + self._halo, **found)
 
-    def _invert_normals(self, planes: Doubles) -> tuple[Doubles, Doubles]:
-        """Return the inverse normal matrix of each node, and its number of samples."""
-        rows, columns = self.grid
-        first = self._halo + self._first
-        normals = np.empty((rows, columns, PARAMETERS, PARAMETERS))
-        for row in range(rows):
-            part = basis(windows(planes, row, self.step, first, self._window, columns), self._window)
-            normals[row] = part.transpose(0, 2, 1) @ part
-        measured = normals[..., AFFINE, AFFINE].copy()
-        normal = normals.reshape(-1, PARAMETERS, PARAMETERS)
-        scale = np.sqrt(np.einsum("nii->ni", normal))
-        usable = ((scale > 0) & np.isfinite(scale)).all(axis=1)
-        scale[~usable], normal[~usable] = 1, np.eye(PARAMETERS)
-        normal /= scale[:, :, None] * scale[:, None, :]
-        usable &= np.linalg.eigvalsh(normal)[:, 0] > 1e-5  # singular otherwise, within rounding
-        normal[~usable] = np.eye(PARAMETERS)
-        inverse = np.linalg.inv(normal) / (scale[:, :, None] * scale[:, None, :])
-        inverse[~usable] = np.nan
-        return inverse, measured
+    def to_pixels(self, values: Doubles, logarithms: bool) -> NDArray[np.float32]:
+        """Return values, or their exponentials, (rows, columns) or ([T,] rows, columns, n), at all pixels."""
+        kind = values.shape[values.ndim - 1 :] if values.ndim > 2 else ()
+        nodes = np.moveaxis(values.reshape(-1, *self.grid, math.prod(kind)), -1, 1)
+        nbytes = 4 * math.prod(self.shape) * math.prod(kind)
+        most = max(1, self._device.max_allocation // nbytes)
+        parts = [self._pixels(nodes[k : k + most], logarithms) for k in range(0, len(nodes), most)]
+        pixels = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        return pixels.reshape(*values.shape[:-3], *self.shape, *kind)
+
+    def _pixels(self, values: Doubles, logarithms: bool) -> NDArray[np.float32]:
+        """Return values of nodes, (T, n, rows, columns), at all pixels, (T, H, W, n)."""
+        (rows, columns), (count, parts) = self.shape, values.shape[:2]
+        nodes = self._device.given("nodes", values)
+        pixels = self._device.array("pixels", (count, rows, columns, parts), np.float32, zeroed=False)
+        sizes = {name: size for name, size in self._sizes.items() if name != "halo"}
+        self._launch(
+            "pixels",
+            count * rows * math.ceil(columns / self._tile),
+            **sizes,
+            start=self.start,
+            count=count,
+            parts=parts,
+            logarithms=logarithms,
+            nodes=nodes,
+            pixels=pixels,
+        )
+        return pixels.detach()
+
+    @property
+    def _sizes(self) -> dict[str, int]:
+        """Sizes of the picture, of the nodes, and of the halo, as arguments of kernels."""
+        (rows, columns), (node_rows, node_columns) = self.shape, self.grid
+        sizes = {"rows": rows, "columns": columns, "node_rows": node_rows, "node_columns": node_columns}
+        return sizes | {"step": self.step, "halo": self._halo}
 
     def _fit_spline(self, frame: NDArray[Any]) -> None:
         """Compute the coefficients of a frame's spline on the device."""
@@ -267,7 +287,7 @@ class _Level:
         for _ in range(ITERATIONS):
             answer = self._solve(field)
             last, field = field, self._next_field(field, answer[:AFFINE])
-            if np.quantile(np.abs(field - last), _MOST) < _SETTLED:
+            if np.mean(np.abs(field - last) < _SETTLED) > _MOST:
                 break
         moved = answer[:2]
         gain, squares, variances = answer[AFFINE:]
@@ -280,16 +300,14 @@ class _Level:
 
     def _solve(self, field: Doubles) -> Doubles:
         """Warp the frame back by a field, and solve all windows."""
-        maps, (rows, columns), (node_rows, node_columns) = self._maps, self.shape, self.grid
+        maps, (rows, columns), sizes = self._maps, self.shape, self._sizes
         _write(maps["field"], field)
-        sizes = {"rows": rows, "columns": columns, "node_rows": node_rows, "node_columns": node_columns}
-        sizes |= {"step": self.step, "halo": self._halo}
         shared = {name: maps[name] for name in ("planes", "field", "difference")}
         items = rows * math.ceil(columns / self._tile)
         self._launch("warp", items, **sizes, **shared, start=self.start, coefficients=maps["coefficients"])
         arrays = {"inverse": maps["inverse"], "answer": maps["answer"]}
         first = self._first + self._halo
-        self._launch("solve", node_rows * node_columns, **sizes, **shared, first=first, **arrays)
+        self._launch("solve", math.prod(self.grid), **sizes, **shared, first=first, **arrays)
         return maps["answer"].download().astype(np.float64)
 
     def _next_field(self, field: Doubles, affine: Doubles) -> Doubles:
@@ -328,23 +346,17 @@ class _Level:
 
     def _launch(self, name: str, items: int, **arguments: Any) -> None:
         macros: dict[str, str | int] = {"FRAME": self._frame_type, "WINDOW": self._window, "TILE": self._tile}
+        if self._top:
+            macros["TOP"] = self._top
         moved = sum(array.nbytes for array in arguments.values() if isinstance(array, Array))
         self._device.kernel("displacement", f"displacement_{name}", **macros)(items, **arguments, moved=moved)
 
 
-def _cubic(values: Doubles, places: Doubles, axis: int) -> Doubles:
-    """Return values along an axis at places between them: Keys' cubic, straight at the ends."""
-    last = values.shape[axis] - 1
-    before = np.clip(np.floor(places).astype(int), 0, max(last - 1, 0))
-    t = places - before
-    bend = np.where((before > 0) & (before < last - 1), t * (1 - t) / 2, 0.0)
-    weights = [-bend * (1 - t), 1 - t + bend * (2 - 3 * t), t + bend * (3 * t - 1), -bend * t]
-    taps = [np.clip(before + k, 0, last) for k in (-1, 0, 1, 2)]
-    shape = [-1 if one == axis else 1 for one in range(values.ndim)]
-    parts = [
-        weight.reshape(shape) * values.take(tap, axis) for weight, tap in zip(weights, taps, strict=True)
-    ]
-    return np.asarray(sum(parts))
+def invert_symmetric(matrices: Doubles) -> Doubles:
+    """Return the inverse of symmetric matrices of two rows, each (3, ...): elements 00, 10 and 11."""
+    first, mixed, last = matrices
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.stack([last, -mixed, first]) / (first * last - mixed**2))
 
 
 def _write(array: Array, values: NDArray[Any]) -> None:

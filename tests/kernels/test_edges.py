@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mirrorskin.engine.rotation.edges import LIMITS, find_edges
+from mirrorskin.engine.rotation.edges import LIMITS, EdgeDrawing, find_edges
 from mirrorskin.kernels import edges
 from mirrorskin.kernels.edges import COARSE, FINE, NEAR, PASSES
 
@@ -54,6 +54,16 @@ def test_kernels_and_reference_draw_the_same(device, shape):
     drawn, told = find_edges(vectors, sigma, contact, device=device), draw(vectors, sigma, contact)
     assert np.mean(drawn != told) < 0.002  # float32 decides of what is at a limit
     assert min(shape) < 9 or told.sum() > 8
+
+
+def test_a_drawing_depends_on_nothing_that_was_drawn_before(device):
+    first, second = (scene((23, 37), seed) for seed in (1, 2))
+    drawing = EdgeDrawing(device, (23, 37))
+    for maps in (first, second):
+        drawing.take(*maps)
+        for _ in drawing.steps(3):
+            pass
+        np.testing.assert_array_equal(drawing.lines(), find_edges(*maps, device=device))
 
 
 def test_flags_that_neighbours_contradict_are_turned_over():
