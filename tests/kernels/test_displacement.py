@@ -14,7 +14,6 @@ from mirrorskin.kernels.device import C_TYPES
 from mirrorskin.kernels.displacement import (
     MARGIN,
     PARAMETERS,
-    TAPS,
     basis,
     cubic,
     displacement_across,
@@ -24,7 +23,6 @@ from mirrorskin.kernels.displacement import (
     displacement_pixels,
     displacement_planes,
     displacement_solve,
-    displacement_warp,
     interpolate_nodes,
     noise_gain,
     windows,
@@ -57,15 +55,6 @@ def planes_of(reference):
     rest = [np.where(np.isnan(counts), 0, part) for part in (right, down, reference - reference.mean())]
     rest = [np.pad(part, HALO) for part in rest]
     return np.stack([np.pad(counts, HALO, constant_values=np.nan), *rest]).astype(np.float32)
-
-
-def case(dtype):
-    reference = SPECKLE.frame(SHAPE, 0, 0).astype(dtype)
-    frame = SPECKLE.frame(SHAPE, 2.3, -1.4, noise=1).astype(dtype)
-    field = np.stack([np.full(GRID, 2.0), np.full(GRID, -1.0)])
-    field += np.random.default_rng(1).normal(0, 0.4, field.shape)
-    inverse = np.random.default_rng(2).normal(0, 1e-4, (PARAMETERS, PARAMETERS, math.prod(GRID)))
-    return frame, planes_of(reference), field.astype(np.float32), inverse.astype(np.float32)
 
 
 def test_coefficients_are_those_of_a_cubic_spline():
@@ -183,46 +172,3 @@ def test_cubics_through_nodes_keep_parabolas():
     row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
     inside = np.s_[2 + STEP : 33 - STEP, 2 + STEP : 44 - STEP]
     np.testing.assert_allclose(pixels[0, ..., 0][inside], ((column - 20) ** 2 + column * row)[inside])
-
-
-@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
-def test_the_kernels_do_as_the_reference(device, dtype):
-    frame, planes, field, inverse = case(dtype)
-    expected = dict(zip(("padded", "half", "coefficients"), spline(frame), strict=True))
-    difference = np.zeros((2, *planes.shape[1:]), np.float32)
-    displacement_warp(STEP, START, HALO, expected["coefficients"], planes, field, difference)
-    answer = np.empty((9, math.prod(GRID)), np.float32)
-    displacement_solve(STEP, FIRST + HALO, WINDOW, planes, difference, field, inverse, answer)
-    expected |= {"difference": difference, "answer": answer}
-
-    tile = device.layout.tile
-    macros = {"FRAME": C_TYPES[dtype], "WINDOW": WINDOW, "TILE": tile}
-    kernels = {
-        name: device.kernel("displacement", f"displacement_{name}", **macros)
-        for name in ("pad", "filter", "warp", "solve")
-    }
-    given = {"planes": planes, "field": field, "inverse": inverse}
-    maps = {name: device.given(name, values) for name, values in given.items()}
-    maps["frame"] = device.given("frame", frame, frame.dtype)
-    maps |= {name: device.given(name, np.zeros_like(values)) for name, values in expected.items()}
-    (rows, columns), width = SHAPE, SHAPE[1] + 2 * MARGIN
-    pixels = expected["padded"].size
-    launch(kernels["pad"], -(-pixels // tile), rows, columns, maps["frame"], maps["padded"])
-    launch(kernels["filter"], -(-pixels // tile), pixels, 1, maps["padded"], maps["half"])
-    launch(kernels["filter"], -(-pixels // tile), pixels, width, maps["half"], maps["coefficients"])
-    sizes = (rows, columns, *GRID, STEP)
-    launch(
-        kernels["warp"], rows * -(-columns // tile), *sizes, START, HALO,
-        *(maps[name] for name in ("coefficients", "planes", "field", "difference")),
-    )  # fmt: skip
-    launch(
-        kernels["solve"], math.prod(GRID), *sizes, FIRST + HALO, HALO,
-        *(maps[name] for name in ("planes", "difference", "field", "inverse", "answer")),
-    )  # fmt: skip
-    near = np.s_[TAPS:-TAPS, TAPS:-TAPS]  # of a padded map, what is a coefficient
-    for name, values in expected.items():
-        part = near if name in ("half", "coefficients") else ...
-        scale = np.nanmax(np.abs(values[part]))
-        np.testing.assert_allclose(
-            maps[name].download()[part], values[part], rtol=1e-4, atol=3e-6 * scale, err_msg=name
-        )

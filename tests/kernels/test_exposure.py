@@ -1,52 +1,14 @@
-"""Exposure: the generator and its noise against closed forms, and the kernel against its reference."""
+"""Exposure: the generator and its noise against closed forms."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
-from launches import launch
 from numpy.polynomial.hermite_e import hermegauss
 from numpy.typing import NDArray
 from scipy import stats
 
 from mirrorskin.kernels import exposure
-from mirrorskin.kernels.device import Device
-
-C_TYPES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
-QUARTERS = [1, 7, 1025]
-LAST = 2**64 - 1
-
-
-def expose(device: Device, maps: list[NDArray[np.float32]], dtype: str, **how: float) -> NDArray[Any]:
-    """Run the kernel; maps are light, offset and span."""
-    given = {"frame": 0, "seed": 0, "read": 0.0, "grain": 0.0, "top": 255.0} | how
-    arrays = [device.array(name, part.shape, np.float32) for name, part in zip("los", maps, strict=True)]
-    counts = device.array("counts", maps[0].shape, dtype)
-    for array, part in zip(arrays, maps, strict=True):
-        array.host[:] = part
-        array.upload()
-    counts.upload()
-    quarter = len(maps[0]) // 4
-    modes = {"WHOLE": int(dtype != "float32"), "SHOT": int(given["grain"] > 0)}
-    kernel = device.kernel("exposure", "expose", FRAME=C_TYPES[dtype], **modes)
-    launch(kernel, -(-quarter // device.layout.tile), *arrays, quarter, *given.values(), counts)
-    return counts.download().copy()
-
-
-def device_normals(device: Device, quarter: int, **keys: int) -> NDArray[np.float32]:
-    """Read the normal numbers themselves: noise of one count, without any light."""
-    nothing = np.zeros(4 * quarter, np.float32)
-    return expose(device, [nothing, nothing, nothing], "float32", read=1.0, **keys)
-
-
-def random_maps(quarter: int, scale: float) -> list[NDArray[np.float32]]:
-    """Light from none to full, and pixels that all differ."""
-    rng = np.random.default_rng(quarter)
-    light = rng.uniform(0, 1, 4 * quarter).round(1)
-    levels = rng.uniform(0, 20, 4 * quarter) * scale, rng.uniform(0, 230, 4 * quarter) * scale
-    return [part.astype(np.float32) for part in (light, *levels)]
 
 
 def moments(signal: float, read: float, grain: float) -> list[float]:
@@ -137,50 +99,10 @@ def test_counted_electrons_are_distributed_almost_as_poissons() -> None:
         assert error < without / 4
 
 
-@pytest.mark.parametrize(("frame", "seed"), [(0, 0), (2**32 + 5, 2**40 + 3), (LAST, LAST)])
-@pytest.mark.parametrize("quarter", QUARTERS)
-def test_the_devices_numbers_are_the_references(device: Device, quarter: int, frame: int, seed: int) -> None:
-    found = device_normals(device, quarter, frame=frame, seed=seed)
-    np.testing.assert_allclose(found, exposure.normals(quarter, frame, seed), rtol=0, atol=3e-6)
-
-
-@pytest.mark.parametrize(
-    ("dtype", "bits", "read", "grain", "quarter"),
-    [
-        ("uint8", 8, 1.5, 0.0, 7),
-        ("uint8", 8, 0.0, 1.0, 4099),
-        ("uint16", 10, 1.5, 0.02, 1),
-        ("uint16", 16, 1.5, 0.02, 4099),
-        ("float32", 8, 1.5, 1.0, 4099),
-    ],
-)
-def test_the_devices_counts_are_the_references_but_for_ties(
-    device: Device, quarter: int, dtype: str, bits: int, read: float, grain: float
-) -> None:
-    scale, top = 2.0 ** (bits - 8), 2.0**bits - 1
-    maps = random_maps(quarter, scale)
-    how = {"frame": 5, "seed": 9, "read": read * scale, "grain": grain * scale, "top": top}
-    expected = np.empty(4 * quarter, dtype)
-    exposure.expose(*maps, **how, counts=expected)
-    found = expose(device, maps, dtype, **how)
-
-    difference = np.abs(found.astype(np.float64) - expected)
-    if dtype == "float32":
-        assert difference.max() < 2e-6 * top
-    else:
-        # A float32 errs by some 1e-7 of its value; counts that fall so near to a half may go either way.
-        assert difference.max() <= 1
-        assert difference.sum() <= 3 + 5e-8 * top * len(found)
-        assert np.unique(found).size > 1
-
-
 @pytest.mark.parametrize(("dtype", "bits"), [("uint8", 8), ("uint16", 10), ("uint16", 12), ("uint16", 16)])
-def test_counts_end_where_the_bits_do(device: Device, dtype: str, bits: int) -> None:
+def test_counts_end_where_the_bits_do(dtype: str, bits: int) -> None:
     top = 2.0**bits - 1
-    offset = np.array(
-        [-1e9, -70000, -257, -1, -0.4, 0.5, 1.5, 2.5, 8, top - 1, top - 0.4, top, top + 1], np.float32
-    )
-    offset = np.append(offset, [top + 257, top + 70000, 1e9]).astype(np.float32)
-    light = np.zeros(len(offset), np.float32)
-    found = expose(device, [light, offset, light], dtype, top=top)
-    assert found.tolist() == [0, 0, 0, 0, 0, 0, 2, 2, 8, top - 1, *[top] * 6]
+    offset = np.array([-1e9, -257, -1, -0.4, 0.5, 1.5, 2.5, 8, top - 1, top - 0.4, top + 1, 1e9, 2, 2, 2, 2])
+    counts = np.zeros(offset.shape, dtype)
+    exposure.expose(0 * offset, offset, 0 * offset, 0, 0, 0.0, 0.0, top, counts)
+    assert counts.tolist() == [0, 0, 0, 0, 0, 2, 2, 8, top - 1, *[top] * 3, *[2] * 4]

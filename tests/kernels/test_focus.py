@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from launches import launch
 
-from mirrorskin.kernels.device import C_TYPES
 from mirrorskin.kernels.focus import focus_fit, focus_scan
 
 SHAPE = (11, 130)
@@ -31,29 +30,6 @@ def test_the_frames_around_the_greatest_contrast_are_kept():
     top = np.nanargmax(contrast) - 2
     assert best[5, 60] == top
     np.testing.assert_allclose(peak[:, 5, 60], contrast[top : top + 5])
-
-
-@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
-@pytest.mark.parametrize(("radius", "reach"), [(1, 1), (3, 2)])
-def test_the_kernel_is_the_reference(device, dtype, radius, reach):
-    frames = FRAMES.astype(dtype)
-    if dtype == "float32":
-        frames[4, 5, 20] = np.nan
-        frames[0, 9, 50] = np.nan
-    best, peak, recent = expected = state(reach)
-    arrays = [
-        device.given("state", one, kind) for one, kind in zip(expected, ("i4", "f4", "f4"), strict=True)
-    ]
-    scan = device.kernel("focus", "focus_scan", FRAME=C_TYPES[dtype])
-    for part in (slice(0, 4), slice(4, 9)):
-        focus_scan(frames[part], part.start, radius, reach, best, peak, recent)
-        scan(
-            -(-best.size // device.layout.tile), frames=device.given("frames", frames[part], dtype),
-            count=part.stop - part.start, rows=SHAPE[0], columns=SHAPE[1], first=part.start, radius=radius,
-            reach=reach, best=arrays[0], peak=arrays[1], recent=arrays[2], moved=0,
-        )  # fmt: skip
-    for found, one in zip(arrays, expected, strict=True):
-        np.testing.assert_allclose(found.download(), one, rtol=2e-5)
 
 
 @pytest.mark.parametrize("reach", [1, 2, 4])

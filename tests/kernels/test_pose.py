@@ -4,38 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from launches import launch
 from scipy.spatial.transform import Rotation
 
-from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.pose import BLOCK, FAR, PARTS, SUMS, pose_equations, pose_gradient
+from mirrorskin.kernels.pose import BLOCK, PARTS, SUMS, pose_equations, pose_gradient
 
 PIXEL = 0.05, 0.06
-
-
-def quadratic_map(rows: int, columns: int, tilt: float, seed: int = 0) -> np.ndarray:
-    """Records of a wavy surface, some of them unknown, and some with heights that are not compared."""
-    rng = np.random.default_rng(seed)
-    row, column = np.indices((rows, columns))
-    x, y = (column - (columns - 1) / 2) * PIXEL[0], ((rows - 1) / 2 - row) * PIXEL[1]
-    height = 0.1 * np.sin(1.3 * x + tilt) * np.cos(0.9 * y) + 0.05 * x
-    p, q = (
-        0.13 * np.cos(1.3 * x + tilt) * np.cos(0.9 * y) + 0.05,
-        -0.09 * np.sin(1.3 * x + tilt) * np.sin(0.9 * y),
-    )
-    length = np.sqrt(1 + p * p + q * q)
-    parts = [
-        -p / length,
-        -q / length,
-        rng.uniform(1e-4, 2e-4, x.shape),
-        height,
-        rng.uniform(1e-6, 2e-6, x.shape),
-    ]
-    records = np.stack([*parts, *rng.uniform(-1, 1, (3, *x.shape))], axis=-1)
-    records[rng.random(x.shape) < 0.02] = np.nan
-    records[rng.random(x.shape) < 0.02, 4] = FAR
-    records[rng.random(x.shape) < 0.02, 2] = 1e6
-    return records.astype(np.float32)
 
 
 def pose_of(
@@ -49,45 +22,6 @@ def pose_of(
 
 def blocks_of(shape: tuple[int, int], step: int) -> int:
     return int(np.prod([-(-size // (BLOCK * step)) for size in shape]))
-
-
-def on_device(device: Device, step: int, first, second, poses) -> np.ndarray:
-    count = blocks_of(first.shape[:2], step)
-    given = [
-        device.given(name, one) for name, one in (("first", first), ("second", second), ("poses", poses))
-    ]
-    sums = device.array("sums", (len(poses), count, SUMS), np.float32)
-    kernel = device.kernel("pose", "pose_equations", BESIDE=1)
-    launch(kernel, len(poses) * count, len(poses), *first.shape[:2], *second.shape[:2], step, *given, sums)
-    return sums.download()
-
-
-@pytest.mark.parametrize(("shape", "step"), [((24, 33), 1), ((3, 2), 1), ((40, 30), 2)])
-@pytest.mark.parametrize("least", [1.0, 0.002])
-def test_sums_agree_with_the_reference(
-    device: Device, shape: tuple[int, int], step: int, least: float
-) -> None:
-    first, second = quadratic_map(*shape, 0.0), quadratic_map(*shape, 0.1, seed=1)
-    poses = np.stack(
-        [pose_of((0.02, -0.05, turn), shape, (0.03, -0.04, 0.01), least) for turn in (0.3, -0.1, 0.0)]
-    )
-    wanted = np.zeros((3, blocks_of(shape, step), SUMS))
-    pose_equations(step, first, second, poses, wanted)
-    found = on_device(device, step, first, second, poses)
-    scale = np.abs(wanted).max(axis=(0, 1))
-    assert wanted[..., PARTS[5]].any()
-    np.testing.assert_allclose(found / (scale + 1e-9), wanted / (scale + 1e-9), atol=1e-4)
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (3, 50), (40, 37)])
-def test_gradients_agree_with_the_reference(device: Device, shape: tuple[int, int]) -> None:
-    values = quadratic_map(*shape, 0.2)[..., 3]
-    wanted = np.zeros((*shape, 2))
-    pose_gradient(*PIXEL, values, wanted)
-    gradient = device.array("gradient", (*shape, 2), np.float32)
-    kernel, items = device.kernel("pose", "pose_gradient", BESIDE=0), -(-values.size // device.layout.tile)
-    launch(kernel, items, *shape, *PIXEL, device.given("values", values), gradient)
-    np.testing.assert_allclose(gradient.download(), wanted, atol=1e-4)
 
 
 def test_the_gradient_of_a_plane_is_its_slope_up_to_the_border() -> None:

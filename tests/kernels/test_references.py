@@ -1,0 +1,573 @@
+"""Each kernel against its reference: a function for each kernel returns what both are given."""
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from references import CASES, KERNELS, agree, case, named, near
+from scipy.spatial.transform import Rotation
+from speckle import Speckle
+
+from mirrorskin.cli.bench.limits import CHAINS, CORES, LANES
+from mirrorskin.kernels import correlation, displacement, focus, lambert, pose, registration
+from mirrorskin.kernels.breaks import DOWN, RIGHT
+from mirrorskin.kernels.device import C_TYPES
+
+DTYPES, WHOLE = {"dtype": ("uint8", "uint16", "float32")}, {"dtype": ("uint8", "uint16")}
+
+# --- Links that let go
+
+SHAPES = {"shape": ((1, 1), (1, 9), (9, 1), (37, 53), (5, 700))}
+BREAKS, SIZE = {"axes": SHAPES, "per": "row", "atol": 2e-6}, {"width": 0.4, "height": 0.7}
+SUMS = {"axes": SHAPES | {"reach": (1, 5), "wide": (0, 1)}, "per": "row", "atol": 2e-6}
+
+
+def linked(shape, normal="", **others):
+    """Return flags and links to the right and down, and normal numbers."""
+    rng = np.random.default_rng(shape[0] * 1000 + shape[1])
+    flags = ((rng.random(shape) < 0.85) * RIGHT + (rng.random(shape) < 0.85) * DOWN).astype(np.uint8)
+    flags[:, -1] &= DOWN
+    flags[-1] &= RIGHT
+    links = [np.where(flags & bit, rng.uniform(0.1, 2, shape), 0) for bit in (RIGHT, DOWN)]
+    made = {name: rng.normal(0, 0.5, shape) for name in normal.split()} | {"shape": shape} | others
+    return flags, *links, rng.uniform(0.05, 1, shape), made
+
+
+@case("breaks_curl", **BREAKS)
+def _(shape):
+    flags, *_, made = linked(shape, "slope_x slope_y", **SIZE)
+    return made | {"flags": flags}
+
+
+@case("breaks_sum", **SUMS)
+def _(shape, reach, wide):
+    return linked(shape, "values", reach=reach, downwards=wide)[-1]
+
+
+@case("breaks_spread", **SUMS)
+def _(shape, **chosen):
+    return linked(shape, "curl sums", noise=0.05, **chosen)[-1]
+
+
+RIGHTWARDS, DOWNWARDS = near(1e-5, 1e-6, of="right"), near(1e-5, 1e-6, of="down")
+
+
+@case("breaks_trust", **BREAKS, checks=named("weight_x weight_y rise_x rise_y", *[RIGHTWARDS, DOWNWARDS] * 2))
+def _(shape):
+    numbers = {"noise": 0.01, "bend": 0.5, "tear": 2.0, "least": 1e-3}
+    _, *links, facing, made = linked(shape, "slope_x slope_y tears", **numbers)
+    tears = np.pad(np.abs(made["tears"])[:-1, :-1], (0, 1))
+    return made | named("right down facing tears", *links, facing, tears)
+
+
+# A square of 6 is cut, or not, by its last digit.
+@case("breaks_links", **BREAKS, checks=dict.fromkeys(("right", "down", "source"), near(0, 2e-5, share=0.002)))
+def _(shape):
+    numbers = SIZE | {"slack": 0.25, "sharpness": 4.0, "most": 6.0}
+    _, *links, held, made = linked(shape, "slope_x slope_y rise_x rise_y heights", **numbers)
+    return made | named("weight_x weight_y held", *links, held)
+
+
+# --- Correlation
+
+PHASES = np.array([0.1, 1.0, 1.7, 2.9, 3.3, 4.4, 5.2, 6.1, 7.0, 8.8, 9.1])
+ROWS = np.stack([np.ones_like(PHASES), np.cos(PHASES), np.sin(PHASES)], axis=1)
+PIXELS, STEPS = {"shape": ((1, 1), (1, 1300))}, {"uint8": 2**17, "uint16": 2**23}
+TOTALS, FIT = "total cosine sine square", {"rtol": 3e-7, "atol": 1e-7}
+ORDER = np.arange(len(PHASES), dtype=np.int32)
+
+
+class Fit:
+    """Frames of a full swing with the extreme counts among them, their sums, and the table of their fit."""
+
+    def __init__(self, shape, dtype, whole=False, turns=1):
+        rng, size, top = np.random.default_rng(0), (len(PHASES), shape[1]), STEPS.get(dtype, 1)
+        self.frames = rng.normal(1000, 3, size).astype(dtype)
+        if dtype != "float32":
+            largest = np.iinfo(dtype).max
+            self.frames = rng.integers(0, largest, size, endpoint=True).astype(dtype)
+            self.frames[:, 0] = largest
+        self.rows = np.rint(ROWS * [1, top, top]).astype(np.int32) if whole else ROWS.astype(np.float32)
+        upper = np.linalg.cholesky(ROWS.T @ ROWS).T
+        project = (upper @ np.linalg.inv(self.rows.T.astype(np.float64) @ ROWS)).ravel()
+        high = project.astype(np.float32)
+        table = [high, project - high, np.linalg.inv(upper).ravel(), [1 / (len(PHASES) - 3)]]
+        macros = {"FRAME": C_TYPES[dtype], "BITS": 8 * np.dtype(dtype).itemsize}
+        self.fit = {"fit": np.concatenate(table).astype(np.float32), "shape": shape, "macros": macros}
+        self.stack = {"frames": self.frames, "place": ORDER, "basis": self.rows}
+        self.used = named("used cosines sines", *(turns * self.rows.sum(axis=0, dtype=np.int64)).tolist())
+        totals = np.zeros((4 if whole else 5, shape[1]), np.int64 if whole else float)
+        add = correlation.correlation_add if whole else correlation.correlation_sum
+        add(self.frames, ORDER, self.rows, True, *totals)
+        self.totals = named(TOTALS if whole else f"reference {TOTALS}", *turns * totals)
+
+
+@case("correlation_add", PIXELS | WHOLE | {"count": (1, 11, 150), "fresh": (0, 1)})
+def _(shape, dtype, count, fresh):
+    made, place = Fit(shape, dtype, whole=True), np.arange(count, dtype=np.int32) * 5 % len(PHASES)
+    totals = named(TOTALS, *np.random.default_rng(1).integers(-(10**6), 10**6, (4, shape[1])))
+    some = {"frames": made.frames, "place": place, "basis": made.rows[place], "fresh": fresh}
+    return totals | some | {"shape": shape, "macros": made.fit["macros"]}
+
+
+@case("correlation_solve_counts", PIXELS | WHOLE, **FIT)
+def _(shape, dtype):
+    made = Fit(shape, dtype, whole=True)
+    return made.used | made.totals | made.fit
+
+
+@case("correlation_window", PIXELS | WHOLE | {"largest": (0, 1)}, **FIT)
+def _(shape, dtype, largest):
+    made = Fit(shape, dtype, whole=True)
+    if not largest:
+        return made.stack | made.used | made.fit
+    # The largest sums there can be: saturated samples where all cosines are 1.
+    basis = np.tile(np.array([1, STEPS[dtype], -STEPS[dtype]], np.int32), (correlation.WINDOW, 1))
+    basis[::9, 1:] = 0
+    frames = np.full((correlation.WINDOW, shape[1]), np.iinfo(dtype).max, dtype)
+    used = named("used cosines sines", *basis.sum(axis=0, dtype=np.int64).tolist())
+    stack = {"frames": frames, "place": np.arange(correlation.WINDOW, dtype=np.int32), "basis": basis}
+    return stack | used | made.fit | {"fit": np.full(28, 0.001, np.float32)}
+
+
+def as_pairs(found, wanted, values):
+    """Compare sums of samples less a whole number next to their mean; one next to a half may be either."""
+    clear = np.abs(values["total"] / values["used"] % 1 - 0.5) > 1e-3
+    assert clear.mean() > 0.9
+    held = found.view(np.float32).reshape(len(found), -1).sum(axis=1, dtype=np.float64)
+    np.testing.assert_allclose(held[clear], wanted[clear], rtol=1e-13)
+
+
+LESS = f"reference {TOTALS}"
+
+
+@case(
+    "correlation_convert",
+    PIXELS | WHOLE | {"turns": (1, 50_000)},
+    returns=LESS,
+    checks=dict.fromkeys(LESS.split(), as_pairs),
+)
+def _(shape, dtype, turns):
+    made = Fit(shape, dtype, True, turns)
+    return made.used | made.totals | made.fit | {"unit": 1 / STEPS[dtype], "fit": None}
+
+
+@case("correlation_sum", PIXELS | DTYPES | {"fresh": (0, 1)}, pairs=TOTALS, rtol=1e-13, atol=1e-13)
+def _(shape, dtype, fresh):
+    made, place = Fit(shape, dtype), np.array([3, 1, 4] if fresh else [0, 9], np.int32)
+    basis = np.random.default_rng(2).normal(1, 3, (len(place), 3)).astype(np.float32)
+    return made.totals | made.fit | {"frames": made.frames, "place": place, "basis": basis, "fresh": fresh}
+
+
+@case("correlation_window_pairs", PIXELS | DTYPES, **FIT)
+def _(shape, dtype):
+    made, order = Fit(shape, dtype), (ORDER + 3) % len(PHASES)
+    return made.fit | {"frames": made.frames[np.argsort(order)], "place": order, "basis": made.rows}
+
+
+@case("correlation_solve_pairs", PIXELS | DTYPES, **FIT, pairs=TOTALS)
+def _(shape, dtype):
+    made = Fit(shape, dtype)
+    return made.totals | made.fit
+
+
+# --- Displacement of a texture
+
+PICTURE, STEP, WINDOW, GRID = (34, 45), 4, 11, (9, 12)
+FIRST, HALO, MARGIN = (STEP - WINDOW) // 2, 2 * WINDOW + 8, displacement.MARGIN
+NODES = {"node_rows": GRID[0], "node_columns": GRID[1], "step": STEP, "halo": HALO, "shape": PICTURE}
+COEFFICIENTS = np.s_[displacement.TAPS : -displacement.TAPS, displacement.TAPS : -displacement.TAPS]
+TEXTURE, CLOSE = Speckle(3), {"rtol": 1e-4, "atol": 3e-6}
+
+
+def textures(dtype="float32"):
+    """Return a moved frame, without and with its margin, and planes of a reference that lacks a pixel."""
+    first = TEXTURE.frame(PICTURE, 0, 0).astype(dtype).astype(float)
+    frame = TEXTURE.frame(PICTURE, 2.3, -1.4, noise=1).astype(dtype)
+    padded = np.zeros([size + 2 * MARGIN for size in PICTURE], np.float32)
+    displacement.displacement_pad(frame, padded)
+    down, right = np.gradient(first)
+    lost = np.arange(first.size).reshape(first.shape) == 20 * PICTURE[1] + 20
+    rest = [np.pad(np.where(lost, 0, part), HALO) for part in (right, down, first - first.mean())]
+    planes = np.stack([np.pad(np.where(lost, np.nan, first), HALO, constant_values=np.nan), *rest])
+    field = np.array([2.0, -1.0])[:, None, None] + np.random.default_rng(1).normal(0, 0.4, (2, *GRID))
+    return frame, padded, {"planes": planes, "field": field, "macros": {"FRAME": "float", "WINDOW": WINDOW}}
+
+
+@case("displacement_pad", DTYPES, per=lambda device, values: -(-values["padded"].size // device.layout.tile))
+def _(dtype):
+    frame, padded, _ = textures(dtype)
+    return {"frame": frame, "padded": 0 * padded, "shape": PICTURE, "macros": {"WINDOW": WINDOW}}
+
+
+@case(
+    "displacement_filter",
+    {"step": (1, PICTURE[1] + 2 * MARGIN)},
+    checks={"filtered": near(1e-4, 1e-3, inside=COEFFICIENTS)},
+)
+def _(step):
+    _, padded, made = textures()
+    arrays = {"source": padded, "filtered": 0 * padded, "step": step, "shape": padded.shape}
+    return arrays | {"macros": made["macros"]}
+
+
+@case("displacement_warp", per="whole row", **CLOSE)
+def _():
+    _, padded, made = textures()
+    difference, start = np.zeros((2, *made["planes"].shape[1:])), FIRST + (WINDOW - 1) / 2
+    return NODES | made | {"start": start, "coefficients": padded, "difference": difference}
+
+
+@case("displacement_solve", per=lambda device, values: math.prod(GRID), **CLOSE)
+def _():
+    (_, padded, made), rng, count = textures(), np.random.default_rng(2), math.prod(GRID)
+    inverse = rng.normal(0, 1e-4, (displacement.PARAMETERS, displacement.PARAMETERS, count))
+    arrays = {"difference": np.zeros((2, *made["planes"].shape[1:])), "answer": np.zeros((9, count))}
+    start = FIRST + (WINDOW - 1) / 2
+    maps = made["planes"], made["field"], arrays["difference"]
+    displacement.displacement_warp(STEP, start, HALO, padded, *maps)
+    return NODES | made | arrays | {"first": FIRST + HALO, "window": WINDOW, "inverse": inverse}
+
+
+# --- Exposure
+
+SENSORS = [("uint8", 8, 1.5, 0.0), ("uint8", 8, 0.0, 1.0), ("float32", 8, 1.5, 1.0)]
+SENSORS += [("uint16", 10, 1.5, 0.02), ("uint16", 16, 1.5, 0.02)]
+KEYS = {"key": ((0, 0), (2**32 + 5, 2**40 + 3), (2**64 - 1, 2**64 - 1)), "quarter": (1, 7, 1025)}
+
+
+def exposed(dtype, *maps, read=0.0, grain=0.0, top=255.0, key=(0, 0)):
+    macros = {"FRAME": C_TYPES[dtype], "WHOLE": int(dtype != "float32"), "SHOT": int(grain > 0)}
+    given = named("light offset span", *maps) | {"read": read, "grain": grain, "top": top, "macros": macros}
+    pixels = len(maps[0])
+    given |= {"shape": (1, pixels // 4), "quarter": pixels // 4, "counts": np.zeros(pixels, dtype)}
+    return given | named("frame seed", *key)
+
+
+def ties(found, expected, values):
+    """A float32 errs by some 1e-7 of its value; counts that fall so near to a half may go either way."""
+    difference, whole = np.abs(found.astype(np.float64) - expected), found.dtype.kind == "u"
+    assert difference.max() <= (1 if whole else 2e-6 * values["top"])
+    assert difference.sum() <= 3 + 5e-8 * values["top"] * len(found) or not whole
+
+
+@case("expose", {"sensor": SENSORS, "quarter": (1, 7, 4099)}, checks={"counts": ties})
+def _(sensor, quarter):
+    dtype, bits, read, grain = sensor
+    rng, scale = np.random.default_rng(quarter), 2.0 ** (bits - 8)
+    maps = [rng.uniform(0, end, 4 * quarter) * by for end, by in ((1, 1), (20, scale), (230, scale))]
+    return exposed(dtype, *maps, read=read * scale, grain=grain * scale, top=2.0**bits - 1, key=(5, 9))
+
+
+@case("expose", KEYS, checks={"counts": near(0, 3e-6)})
+def _(key, quarter):  # noise of one count, without any light
+    return exposed("float32", *[np.zeros(4 * quarter)] * 3, read=1.0, key=key)
+
+
+ENDS = np.array([-1e9, -70000, -257, -1, -0.4, 0.5, 1.5, 2.5])
+
+
+@case("expose", {"bits": (8, 10, 12, 16)})
+def _(bits):  # counts end where the bits do
+    top = 2.0**bits - 1
+    offset = np.array([*ENDS, 8, top - 1, top - 0.4, top, top + 1, top + 257, top + 70000, 1e9])
+    return exposed("uint8" if bits == 8 else "uint16", 0 * offset, offset, 0 * offset, top=top)
+
+
+# --- Focus and lamps
+
+
+@case("focus_scan", DTYPES | {"radius": (1, 3), "reach": (1, 2), "first": (0, 4)}, rtol=2e-5)
+def _(dtype, radius, reach, first):
+    frames = np.random.default_rng(0).integers(0, 250, (9, 11, 130)).astype(dtype)
+    if dtype == "float32":
+        frames[4, 5, 20] = frames[0, 9, 50] = np.nan
+    state = np.zeros((11, 130), np.int32), np.zeros((2 * reach + 1, 11, 130)), np.zeros((reach, 11, 130))
+    if first:
+        focus.focus_scan(frames[:first], 0, radius, reach, *state)
+    known = {"frames": frames[first:], "first": first, "radius": radius, "reach": reach, "shape": (11, 130)}
+    return known | named("best peak recent", *state)
+
+
+def triangles(found, wanted, values):
+    scale = np.abs(wanted[:10]).max(axis=1, keepdims=True)
+    np.testing.assert_allclose(found[:10] / scale, wanted[:10] / scale, atol=2e-6)
+    np.testing.assert_array_equal(found[10], wanted[10])
+
+
+@case("lambert_add", DTYPES | {"dark_step": (0, 1)}, checks={"triangle": triangles})
+def _(dtype, dark_step):
+    rng, pixels = np.random.default_rng(0), 1100
+    frames = (rng.integers(0, 256, (9, pixels)) * (200 if dtype == "uint16" else 1)).astype(dtype)
+    if dtype == "float32":
+        frames[3, 8] = np.nan
+    darks = rng.uniform(0, 9, pixels if dark_step else 1).astype(np.float32)
+    known = {"darks": darks, "shadow": 10.0, "bright": float(frames[0].max())}
+    triangle, lights = np.zeros((11, pixels)), rng.normal(size=(9, 3))
+    lambert.lambert_add(frames[:2], lights[:2], True, **known, triangle=triangle)
+    known |= {"frames": frames[2:], "lights": lights[2:], "fresh": 0, "triangle": triangle}
+    return known | {"dark_step": dark_step, "shape": (1, pixels)}
+
+
+# --- Limits of memory and arithmetic
+
+
+def words(limits, count, length, **others):
+    """Return random words in the shape of a limit."""
+    random = np.random.default_rng(count).integers(0, 2**32, (length, limits.lanes), np.uint32)
+    return {"words": random, "count": count, "macros": limits.macros} | others
+
+
+def per_limit(device, values):
+    block = values["macros"]["WORDS"] * values["macros"]["STRIDE"]
+    return -(-values["count"] // block) * values["macros"]["STRIDE"]
+
+
+MEMORY = {"limits": (*CORES, *LANES), "count": (1, 127, 9001)}
+
+
+@case("read_all", MEMORY, per=per_limit, returns="sums")
+def _(limits, count):
+    sums = np.zeros((limits.items(count), limits.lanes), np.uint32)
+    return words(limits, count, count, each=limits.words, stride=limits.stride, sums=sums)
+
+
+@case("copy_all", MEMORY, per=per_limit)
+def _(limits, count):
+    return words(limits, count, 3 * count + 5)
+
+
+@case("triad_all", MEMORY, per=per_limit)
+def _(limits, count):
+    return words(limits, count, 3 * count + 5, scale=2**31 + 3)
+
+
+@case(
+    "multiply_all", {"limits": (*CHAINS[0], *CHAINS[1]), "count": (1, 8, 500, 2049)}, per=per_limit, rtol=0.0
+)
+def _(limits, count):
+    numbers = np.arange(count * limits.lanes, dtype=np.float32).reshape(count, limits.lanes) % 97
+    known = {"numbers": numbers, "count": count, "macros": limits.macros, "stride": limits.stride}
+    return known | {"steps": 7, "factor": -2.0, "summand": 3.0}
+
+
+# --- Poses
+
+
+def waves(shape, tilt, seed=0):
+    """Return records of a wavy surface, some of them unknown, and some with heights that are not compared."""
+    rng, (row, column) = np.random.default_rng(seed), np.indices(shape)
+    x, y = (column - (shape[1] - 1) / 2) * 0.05, ((shape[0] - 1) / 2 - row) * 0.06
+    height = 0.1 * np.sin(1.3 * x + tilt) * np.cos(0.9 * y) + 0.05 * x
+    p = 0.13 * np.cos(1.3 * x + tilt) * np.cos(0.9 * y) + 0.05
+    q = -0.09 * np.sin(1.3 * x + tilt) * np.sin(0.9 * y)
+    length = np.sqrt(1 + p * p + q * q)
+    parts = [-p / length, -q / length, rng.uniform(1e-4, 2e-4, shape), height, rng.uniform(1e-6, 2e-6, shape)]
+    records = np.stack([*parts, *rng.uniform(-1, 1, (3, *shape))], axis=-1)
+    for index, value in ((slice(None), np.nan), (4, pose.FAR), (2, 1e6)):
+        records[rng.random(shape) < 0.02, index] = value
+    return records
+
+
+def summed(found, wanted, values):
+    scale = np.abs(wanted).max(axis=(0, 1)) + 1e-9
+    assert wanted[..., pose.PARTS[5]].any()
+    np.testing.assert_allclose(found / scale, wanted / scale, atol=1e-4)
+
+
+POSES = {"size": (((24, 33), 1), ((3, 2), 1), ((40, 30), 2)), "least": (1.0, 0.002)}
+
+
+@case(
+    "pose_equations",
+    POSES,
+    per=lambda device, values: math.prod(values["sums"].shape[:2]),
+    checks={"sums": summed},
+)
+def _(size, least):
+    shape, step = size
+    grid = -(shape[1] - 1) / 2 * 0.05, (shape[0] - 1) / 2 * 0.06, 0.05, 0.06
+    turns = (Rotation.from_rotvec((0.02, -0.05, turn)).as_matrix().ravel() for turn in (0.3, -0.1, 0.0))
+    poses = [[*turn, 0.03, -0.04, 0.01, 0.1, -0.2, 0.05, *grid, *grid, least, least] for turn in turns]
+    sums = np.zeros((3, math.prod(-(-size // (pose.BLOCK * step)) for size in shape), pose.SUMS))
+    maps = named(
+        "first second poses sums", waves(shape, 0.0), waves(shape, 0.1, seed=1), np.array(poses), sums
+    )
+    sizes = {"count": 3, "other_rows": shape[0], "other_columns": shape[1], "step": step, "shape": shape}
+    return maps | sizes | {"macros": {"BESIDE": 1}}
+
+
+@case("pose_gradient", {"shape": ((1, 1), (3, 50), (40, 37))}, atol=1e-4)
+def _(shape):
+    maps = {"values": waves(shape, 0.2)[..., 3], "gradient": np.zeros((*shape, 2)), "shape": shape}
+    return maps | {"step_x": 0.05, "step_y": 0.06, "macros": {"BESIDE": 0}}
+
+
+# --- Registration
+
+FRAMES = DTYPES | {"shape": ((1, 1), (1, 9), (9, 1), (5, 6), (33, 1100))}
+TURNED = {"per": "whole row", "rtol": 2e-5, "atol": 2e-6}
+# Pixels to the right and down: a number, and what a column, a row and a millimetre of height add.
+SHIFT = np.array([[1.3, 0.011, -0.017, 2.1], [-0.6, -0.021, 0.013, -1.4]])
+
+
+def clipped(dtype, shape):
+    """Return a frame with clipped and missing samples, with levels of each pixel where it is uint16."""
+    rng, kind, each = np.random.default_rng(shape[1]), np.dtype(dtype), dtype == "uint16"
+    ends = (np.inf, np.nan) if kind.kind == "f" else (np.iinfo(kind).max, 0)
+    frame, some = rng.normal(100, 30, shape).astype(kind), rng.random(shape)
+    frame[some < 0.01], frame[some > 0.99] = ends
+    macros = {"LEVELS": int(each), "FRAME": C_TYPES[dtype]} | (
+        {} if kind.kind == "f" else {"TOP": int(ends[0])}
+    )
+    levels = [
+        rng.uniform(*at, shape) if each else np.full((1, 1), at[0] / 200) for at in ((0, 20), (200, 260))
+    ]
+    padded = np.full([size + 2 * registration.BORDER for size in shape], np.nan)
+    return frame, named("offset gain", *levels) | {"padded": padded, "shape": shape, "macros": macros}
+
+
+@case("registration_admit", FRAMES, **TURNED)
+def _(dtype, shape):
+    frame, known = clipped(dtype, shape)
+    return known | {"frame": frame}
+
+
+def resampled(dtype, shape, shift=SHIFT):
+    """Return heights with gaps, and shifts that leave the picture."""
+    rng, (frame, known) = np.random.default_rng(shape[0]), clipped(dtype, shape)
+    registration.registration_admit(frame, *(known[name] for name in ("offset", "gain", "padded")))
+    height = np.where(rng.random(shape) < 0.05, np.nan, rng.uniform(-1, 0, shape))
+    arrays = named("height shift registered noise", height, shift, np.zeros(shape), np.zeros((2, *shape)))
+    return known | arrays
+
+
+case("registration_resample", FRAMES, **TURNED)(resampled)
+
+
+def nothing(found, wanted, values):
+    for answer in (found, wanted):
+        assert not np.any(answer) or np.isnan(answer).all()
+
+
+FAR = {"far": (1e4, -1e4, 3e9, np.inf, -np.inf, np.nan), "axis": (0, 1)}
+
+
+@case("registration_resample", FAR, per="whole row", checks=dict.fromkeys(("registered", "noise"), nothing))
+def _(far, axis):
+    shift = np.zeros((2, 4))
+    shift[axis, 0] = far
+    return resampled("uint8", (6, 8), shift)
+
+
+@case("registration_mend", {"count": (1, 3, 200)})
+def _(count):
+    rng = np.random.default_rng(count)
+    order = rng.permutation(1200)
+    places = np.column_stack([order[:count], rng.choice(order[count:], (count, 4))]).astype(np.int32)
+    macros = {"FRAME": "uchar", "LEVELS": 1, "TOP": 255}
+    return {
+        "places": places,
+        "padded": rng.normal(size=(40, 30)),
+        "count": count,
+        "shape": (1, count),
+        "macros": macros,
+    }
+
+
+# --- The wall in the mirror
+
+LAMPS, NONE = ((0.3, -0.2), (0.1, 0.2)), (0.0, 0.0)
+WALLS = [(0, 0.0, NONE, 0), (1, 0.0, LAMPS[0], 1), (2, 0.0, NONE, 0), (0, 2.0, NONE, 1), (1, 0.6, NONE, 0)]
+WALLS += [(2, 0.6, LAMPS[1], 1), (3, 0.0, NONE, 0)]  # the last one without scatter
+
+
+def lit(found, expected, values):
+    """Light grows as a root from the angle of total reflection on; hard by the side the way is uncertain."""
+    difference = np.abs(found - expected)
+    if values["scatter"] == 0:  # only rays at an edge may differ
+        assert set(np.unique(expected)) == {0.0, 1.0}
+        assert np.count_nonzero(difference) <= 1
+        return
+    assert 0.1 < (expected > 0.01).mean() < 0.9
+    assert difference.max() < 1e-3
+    assert np.median(difference) < 1e-6
+    if values["gap"] == 0:
+        assert difference[17.5 - np.hypot(*values["places"][:2]) > 0.2].max() < 2e-5
+
+
+@case("wall_light", {"wall": WALLS}, checks={"light": lit})
+def _(wall):
+    """Return mirrors of any zenith and azimuth, many of them flat, at places some of which are outside."""
+    (kind, gap, lamps, oblique), rng, pixels = (
+        wall,
+        np.random.default_rng(1),
+        1500,
+    )  # more than a tile
+    rows, both = np.repeat(rng.random((12, 1)), 5, axis=1), rng.random((9, 14))
+    both = np.pad(np.pad(both, ((1, 1), (0, 0)), "edge"), ((0, 0), (1, 1)), "wrap")
+    table = np.full((3, 3), 0.75), rows, both, np.ones((3, 3))
+    zenith = np.radians(60) * rng.random(pixels) * (rng.random(pixels) > 0.3)
+    azimuth, turn = 2 * np.pi * rng.random((2, pixels))
+    slopes = -np.tan(zenith) * np.array([np.cos(azimuth), np.sin(azimuth)])
+    places = 18.5 * np.sqrt(rng.random(pixels)) * np.array([np.cos(turn), np.sin(turn)])
+    places = np.concatenate([places, -places / 90]) if oblique else places
+    scatter = np.radians(3) * (kind < 3)
+    off, turn = scatter * rng.random(24) * (np.arange(24) > 0), 2 * np.pi * rng.random(24)
+    rays = np.stack([np.cos(off), np.sin(off) * np.cos(turn), np.sin(off) * np.sin(turn)], axis=1)
+    rays = rays[: 24 if scatter else 1]
+    sheet = np.stack([3 * rng.random(pixels) * (zenith > 0), *slopes])
+    maps = named("sheet places rays table", sheet, places, rays, table[kind])
+    numbers = named(
+        "gap scatter fade radius rim index asymmetry_x asymmetry_y",
+        gap,
+        scatter,
+        scatter / 12,
+        17.5,
+        40.0,
+        1.41,
+        *lamps,
+    )
+    sizes = named(
+        "rows columns samples shape",
+        table[kind].shape[0] - 2,
+        table[kind].shape[1] - 2,
+        len(rays),
+        (1, pixels),
+    )
+    macros = {"TABLE": kind % 3, "GAP": int(gap > 0), "LAMPS": int(lamps != NONE), "OBLIQUE": oblique}
+    return maps | numbers | sizes | {"macros": macros}
+
+
+@pytest.mark.parametrize(("name", "function", "chosen", "options"), CASES)
+def test_a_kernel_computes_its_reference(device, name, function, chosen, options):
+    with np.errstate(invalid="ignore"):
+        agree(device, name, function(**chosen), **options)
+
+
+ELSEWHERE = {
+    "changepoint": "support/changes.py",
+    "components": "kernels/test_components.py",
+    "displacement": "kernels/test_displacement.py",
+    "edges": "kernels/test_edges.py",
+    "focus": "kernels/test_focus.py",
+    "links": "kernels/test_links.py",
+    "multigrid": "kernels/test_multigrid.py",
+    "normals": "kernels/test_normals.py",
+    "normals_pose": "kernels/test_normals_pose.py",
+    "normals_wall": "kernels/test_normals_wall.py",
+    "onset": "engine/press/test_onset.py",
+    "rectangle": "kernels/test_rectangle.py",
+    "slopes": "kernels/test_slopes.py",
+}
+"""Where kernels that work on what the engine prepares, such as a graph, are compared with their reference."""
+
+
+def test_every_kernel_is_compared_with_its_reference():
+    here = {one.values[0] for one in CASES}
+    assert {file for name, file in KERNELS.items() if name not in here} == ELSEWHERE.keys()
+    for file, test in ELSEWHERE.items():
+        text = (Path(__file__).parents[1] / test).read_text(encoding="utf-8")
+        assert re.search(rf"kernels(\.| import .*\b){file}\b", text), test
