@@ -1,24 +1,36 @@
-"""What holds for every operation: the same maps offline and live, and however frames are divided."""
+"""What holds for every operation, whatever it computes; a test fails if a class of the engine has no case."""
 
 from __future__ import annotations
 
+import ctypes
+import functools
+import mmap
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from operations import CASES, CUTS, Case, engine_classes
+from operations import CASES, CUTS, LEVELS, engine_classes
 
 from mirrorskin import engine, io
 from mirrorskin.engine.live import LiveOperation
+from mirrorskin.engine.thread_safe import ThreadSafe
+from mirrorskin.kernels import memory
 
 EACH = pytest.mark.parametrize("name", CASES)
+ONCE = pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.make().passes == 1])
 
 
-def whole(case: Case) -> io.Result:
-    operation = case.make()
-    for number in range(operation.passes):
-        if number:
-            operation.next_pass()
-        case.push(operation, slice(None))
-    return operation.result()
+def of_type(name, dtype=None):
+    case = CASES[name]
+    known = {**LEVELS, **case.options} if dtype == "float32" and hasattr(case.kind, "dark") else case.options
+    return replace(case, frames=case.frames.astype(dtype or case.frames.dtype), options=known)
+
+
+@functools.cache
+def whole(name, device=None, dtype=None):
+    return of_type(name, dtype).whole(device=device)
 
 
 def assert_same(found, expected):
@@ -30,53 +42,162 @@ def assert_same(found, expected):
     assert {name: found.process[name] for name in numbers} == pytest.approx(numbers, nan_ok=True, rel=0)
 
 
-@EACH
-def test_each_map_is_declared_and_each_has_its_standard_deviation_by_name(name):
-    found = whole(CASES[name])
-    for one in found:
-        assert found.declaration(one) is not io.maps.UNDECLARED, one
-    deviations = [one.removesuffix("_sigma") for one in found if one.endswith("_sigma")]
-    assert set(deviations) <= set(found)
+def answer(operation):
+    """Return the result, or None if there are too few frames."""
+    try:
+        return operation.result()
+    except io.InputError:
+        return None
+
+
+def content(result):
+    """Return all values of a result as bytes."""
+    return result and tuple((name, np.asarray(values).tobytes()) for name, values in result.items())
 
 
 @EACH
-@pytest.mark.parametrize("cut", CUTS)
-def test_the_result_does_not_depend_on_how_frames_are_divided(name, cut):
-    case = CASES[name]
-    operation = case.make()
-    for number in range(operation.passes):
-        if number:
-            operation.next_pass()
-        for part in CUTS[cut](len(case.frames)):
-            case.push(operation, part)
-    assert_same(operation.result(), whole(case))
+def test_maps_are_as_declared_and_each_has_its_standard_deviation_by_name(name):
+    case, found = CASES[name], whole(name)
+    for one, values in found.items():
+        declared = found.declaration(one)
+        assert declared is not io.maps.UNDECLARED, one
+        assert np.asarray(values).dtype == declared.dtype, one
+        if declared.axes == "pixels":
+            shape = case.frames.shape[1:] + (len(declared.components),) * bool(declared.components)
+            assert np.shape(values)[-len(shape) :] == shape, one
+            assert np.ndim(values) - len(shape) in (0, 1), one  # 1: of each frame or turn
+    assert {one.removesuffix("_sigma") for one in found if one.endswith("_sigma")} <= set(found)
 
 
 @EACH
-def test_result_has_no_side_effects_and_reset_forgets_everything(name):
-    case = CASES[name]
-    operation, count = case.make(), len(case.frames)
-    for part in (slice(0, count // 2), slice(count // 2, count)):
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+def test_the_result_does_not_depend_on_how_frames_are_divided_nor_on_memory(device, name, dtype):
+    case = of_type(name, dtype)
+    for cut in CUTS.values():
+        operation = case.make(device=device)
+        for number in range(operation.passes):
+            if number:
+                operation.next_pass()
+            for part in cut(len(case.frames)):
+                case.push(operation, part)
+        assert_same(operation.result(), whole(name, device, dtype))
+    assert_same(case.whole(device=device, memory_limit=1), whole(name, device, dtype))
+
+
+@ONCE
+def test_a_result_on_the_way_is_that_of_the_frames_so_far_and_stays(device, name):
+    case, seen = CASES[name], []
+    operation = case.make(device=device)
+    for part in CUTS["unevenly"](len(case.frames)):
         case.push(operation, part)
-        if operation.passes == 1:
-            first = operation.result()
-            kept = {one: np.copy(values) for one, values in first.items()}
-            assert_same(operation.result(), first)
-    if operation.passes == 1:
-        assert_same(first, first.assign(kept))
+        found = answer(operation)
+        assert content(answer(operation)) == content(found)
+        so_far = case.make(device=device)
+        case.push(so_far, slice(part.stop))
+        assert content(answer(so_far)) == content(found)
+        seen.append((found, content(found)))
+    assert all(content(found) == before for found, before in seen)
+    assert len({before for _, before in seen}) > 1
+
+
+@EACH
+def test_reset_forgets_everything(device, name):
+    case = CASES[name]
+    backwards = replace(case, frames=case.frames[::-1].copy())
+    operation = case.make(device=device)
+    backwards.push(operation, slice(0, 9))
+    answer(operation)
     operation.reset()
+    with pytest.raises(io.InputError):
+        operation.result()
     for number in range(operation.passes):
         if number:
             operation.next_pass()
         case.push(operation, slice(None))
-    assert_same(operation.result(), whole(case))
+    assert_same(operation.result(), whole(name, device))
+
+
+def at(offset, frames):
+    """Copy frames to so many bytes behind the begin of a page."""
+    room = np.zeros(frames.nbytes + 2 * mmap.PAGESIZE, np.uint8)
+    placed = np.ndarray(frames.shape, frames.dtype, room.data, -room.ctypes.data % mmap.PAGESIZE + offset)
+    placed[:] = frames
+    return placed
+
+
+def read_only(frames):
+    placed = frames.copy()
+    placed.flags.writeable = False
+    return placed
+
+
+def before_a_forbidden_page(frames, gap):
+    """Copy frames so that so many bytes lie between them and a page that cannot be read."""
+    size = -(-(frames.nbytes + gap) // mmap.PAGESIZE) * mmap.PAGESIZE
+    pages = mmap.mmap(-1, size + mmap.PAGESIZE)
+    address = ctypes.addressof(ctypes.c_char.from_buffer(pages))
+    libc = ctypes.CDLL(None, use_errno=True)
+    assert libc.mprotect(ctypes.c_void_p(address + size), ctypes.c_size_t(mmap.PAGESIZE), 0) == 0
+    placed = np.frombuffer(pages, frames.dtype, frames.size, size - gap - frames.nbytes).reshape(frames.shape)
+    placed[:] = frames
+    return placed
+
+
+PLACES = {
+    "one byte behind a page": lambda frames: at(1, frames),
+    "two bytes behind a page": lambda frames: at(2, frames),
+    "read-only": read_only,
+    "Fortran order": np.asfortranarray,
+    "backwards": lambda frames: frames[::-1].copy()[::-1],
+    "every other": lambda frames: np.repeat(frames, 2, axis=0)[::2],
+    "a part of each row": lambda frames: np.pad(frames, ((0, 0), (0, 0), (3, 5)))[:, :, 3:-5],
+    "the end of memory": lambda frames: before_a_forbidden_page(frames, 0),
+    "a word before the end of memory": lambda frames: before_a_forbidden_page(frames, 32),
+}
+
+
+@EACH
+@pytest.mark.parametrize("dtype", ["uint8", "uint16"])
+def test_it_does_not_matter_where_frames_are_and_they_do_not_change(device, name, dtype):
+    case = of_type(name, dtype)
+    for place, put in PLACES.items():
+        placed = replace(case, frames=put(case.frames))
+        assert_same(placed.whole(device=device), whole(name, device, dtype))
+        np.testing.assert_array_equal(placed.frames, case.frames, err_msg=place)
+    room = np.zeros(case.frames.nbytes + 64, np.uint8)  # the bytes behind lent frames can be read
+    lent = replace(case, frames=np.ndarray(case.frames.shape, dtype, room.data))
+    lent.frames[:] = case.frames
+    operation = lent.make(device=device)
+    for number in range(operation.passes):
+        if number:
+            operation.next_pass()
+        operation.push(lent.frames, **case.given, lent=True)
+    assert_same(operation.result(), whole(name, device, dtype))
+
+
+@EACH
+def test_what_memory_held_before_and_what_comes_after_changes_nothing(device, name, monkeypatch):
+    def soiled(nbytes, zeroed):
+        found = take(nbytes, zeroed)
+        if not zeroed:
+            found[:] = 0x7F
+        return found
+
+    take, case = memory.take, CASES[name]
+    monkeypatch.setattr(memory, "take", soiled)
+    found = case.whole(device=device)
+    replace(case, frames=255 - case.frames).whole(device=device)
+    engine.free_memory()
+    assert_same(found, whole(name, device))
+    for values in found.values():
+        np.asarray(values)[...] = 1  # it is the caller's
 
 
 @EACH
 def test_running_it_over_a_recording_gives_the_same(name):
-    case = CASES[name]
+    case = replace(CASES[name], weights={})
     found = engine.run(case.source(), case.make())
-    assert_same(found, whole(case))
+    assert_same(found, case.whole())
     assert found.process["operation"] == case.kind.__name__
     numbers = {one: value for one, value in case.options.items() if isinstance(value, bool | int | float)}
     chosen = {one: value for one, value in numbers.items() if one not in ("tilt", "noise")}  # estimated
@@ -89,13 +210,13 @@ def test_the_function_on_arrays_gives_the_same(name):
     if case.function is None:
         assert case.kind.__name__ in {"Levels", "Strokes", "Normals", "LastTurn", "MovingNormals", "Slip"}
         return
-    assert_same(case.function(case.frames, **case.positions, **case.options), whole(case))
+    assert_same(case.function(case.frames, **case.given, **case.options), whole(name))
 
 
 @EACH
 def test_live_gives_the_same_or_refuses_before_anything_moves(name):
-    case, source = CASES[name], CASES[name].source()
-    operation = case.make()
+    case = replace(CASES[name], weights={})
+    operation, source = case.make(), case.source()
     if operation.configured_for(source).passes == 2:
         with pytest.raises(io.InputError, match="twice"):
             LiveOperation(source, operation)
@@ -108,23 +229,73 @@ def test_live_gives_the_same_or_refuses_before_anything_moves(name):
         live.maps(0.0)
     found = live.result()
     assert found.process["live"] is True
-    assert_same(found, whole(case))
+    assert_same(found, case.whole())
 
 
 @EACH
-@pytest.mark.parametrize("wrong", ["shape", "type", "none", "positions"])
+@pytest.mark.parametrize("wrong", ["shape", "type", "byte order", "none", "positions"])
 def test_frames_that_do_not_fit_are_refused_and_change_nothing(name, wrong):
     case = CASES[name]
     operation, part = case.make(), slice(0, 6)
     case.push(operation, part)
-    frames = {"shape": case.frames[part, 1:], "type": case.frames[part].astype(np.int32)}
-    frames |= {"none": case.frames[:0], "positions": case.frames[:7]}
-    where = {one: values[part] for one, values in case.positions.items()}
+    frames = {name: case.frames[part].astype(kind) for name, kind in (("type", "i4"), ("byte order", ">u2"))}
+    frames |= {"shape": case.frames[part, 1:], "none": case.frames[:0], "positions": case.frames[:7]}
+    where = {one: values[part] for one, values in case.given.items()}
     if wrong == "positions" and not where:
         return
     with pytest.raises(io.InputError):
         operation.push(frames[wrong], **where)
     assert operation.count == 6
+    if operation.passes == 1:
+        case.push(operation, slice(6, None))
+        assert_same(operation.result(), whole(name))
+
+
+LIVE = ["live Strokes", "live LastTurn", "live MovingNormals", "live Slip"]
+
+
+@pytest.mark.parametrize("name", [*ONCE.args[1], *LIVE])
+def test_each_answer_beside_pushes_is_that_of_a_single_thread(name):
+    case = CASES[name.removeprefix("live ")]
+    slow = case.kind.__name__ in ("Slip", "LastTurn")
+
+    def make():
+        return LiveOperation(case.source(), case.make()) if name in LIVE else case.make()
+
+    parts = [slice(start, start + 2) for start in range(0, len(case.frames), 2)]
+    alone, shared, start, done = make(), make(), threading.Barrier(3), threading.Event()
+    known = {None}
+    for part in parts:
+        case.push(alone, part)
+        known |= set() if slow else {content(answer(alone))}
+
+    def push():
+        start.wait()
+        try:
+            for part in parts:
+                case.push(shared, part)
+        finally:
+            done.set()
+
+    def look_on():
+        seen = []
+        start.wait()
+        for _ in range(10 if slow else 10**6):
+            if done.is_set():
+                break
+            found = answer(shared)
+            seen = [*seen[:2], *seen[-2:], (found, content(found))]
+            assert slow or seen[-1][1] in known
+            if found:
+                assert (shared.maps(0.0) if name in LIVE else shared.room) is not None
+        return seen
+
+    with ThreadPoolExecutor(3) as pool:
+        pushing, *looking = pool.submit(push), pool.submit(look_on), pool.submit(look_on)
+        pushing.result()
+        seen = [one for each in looking for one in each.result()]
+    assert content(shared.result()) == content(alone.result())
+    assert all(content(found) == before for found, before in seen)  # nothing wrote to them later
 
 
 def test_every_operation_has_a_case():
@@ -132,3 +303,15 @@ def test_every_operation_has_a_case():
     kinds = {one for one in operations if one.push is not engine.Operation.push}
     bases = {base for kind in kinds for base in kind.__mro__[1:]}
     assert kinds - bases <= {case.kind for case in CASES.values()}
+
+
+def test_every_class_that_is_pushed_to_is_thread_safe():
+    public = {
+        one
+        for one in engine_classes()
+        if not one.__name__.startswith("_")
+        if callable(getattr(one, "push", None)) and callable(getattr(one, "result", None))
+    }
+    inside = {"NormalWindow", "WarmStartIntegrator", "StackSums", "TurnSums", "WindowSums"}
+    # Those are used by one operation each, under its lock.
+    assert {one.__name__ for one in public if not issubclass(one, ThreadSafe)} <= inside

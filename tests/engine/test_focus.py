@@ -112,19 +112,6 @@ def test_a_missing_sample_is_left_out_and_a_missing_pixel_invalid():
     assert found.status[25, 30] == 1
 
 
-def test_frames_that_come_one_by_one_give_the_same():
-    frames = noisy(textured(), 2.0, 0).clip(0, 255).astype(np.uint8)
-    whole = engine.focus.find_focus(frames, TRAVEL, noise=2.0)
-    focus = engine.focus.Focus(noise=2.0)
-    focus.push(frames[3:9], travel=TRAVEL[3:9])
-    result = engine.run(list(frames), focus, travel=TRAVEL)  # which resets it
-    np.testing.assert_array_equal(result.height, whole.height)
-    np.testing.assert_array_equal(result.height_sigma, whole.height_sigma)
-    np.testing.assert_array_equal(result.status, whole.status)
-    np.testing.assert_array_equal(result.sharpness, whole.sharpness)
-    assert result.declaration("status").codes[3] == "peak at an end"
-
-
 FRAMES = textured().astype(np.float32)
 
 

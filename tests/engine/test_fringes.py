@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from mirrorskin import engine, io
+from mirrorskin import io
 from mirrorskin.engine.fringes import Fringes, decode_gray, fit_fringes, unwrap_frequencies, unwrap_gray
 
 TURN = 2 * np.pi
@@ -60,26 +60,6 @@ def test_mean_and_modulation_are_those_encoded():
     fringes = fit_fringes(shown(FIELD, UNEVEN), UNEVEN)
     np.testing.assert_allclose(fringes.mean, 100, rtol=1e-5)
     np.testing.assert_allclose(fringes.modulation, 40, rtol=1e-5)
-
-
-def test_frames_that_come_one_by_one_give_the_same():
-    frames = shown(TURN * FIELD, UNEVEN, 2, "uint8")
-    whole = fit_fringes(frames, UNEVEN)
-    result = engine.run(list(frames), Fringes, phase=UNEVEN)
-    np.testing.assert_allclose(result.phase, whole.phase, atol=1e-6)
-    np.testing.assert_allclose(result.phase_sigma, whole.phase_sigma, rtol=1e-4)
-    assert result.process["noise"] == pytest.approx(whole.process["noise"], rel=1e-4)
-
-
-def test_an_operation_that_was_reset_has_forgotten():
-    fringes = Fringes(noise=1)
-    fringes.push(shown(FIELD + 1, EVEN), phase=EVEN)
-    fringes.reset()
-    fringes.push(shown(FIELD, UNEVEN), phase=UNEVEN)
-    found = fringes.result()
-    np.testing.assert_allclose(found.phase, FIELD, atol=3e-6)
-    expected = fit_fringes(shown(FIELD, UNEVEN), UNEVEN, noise=1)
-    np.testing.assert_allclose(found.phase_sigma, expected.phase_sigma, rtol=1e-4)
 
 
 def test_a_frame_of_weight_0_is_left_out_and_weights_are_inverse_variances():

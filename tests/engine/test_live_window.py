@@ -12,7 +12,6 @@ from mirrorskin.io import InputError
 SHAPE, WINDOW = (21, 13, 29), 8
 PHASE = phases(SHAPE[0])
 MAPS = "normals", "normals_sigma", "contact", "mean", "cosine", "sine", "residual"
-CUTS = ([21], [1] * 21, [3, 14, 4], [7, 1, 13], [8, 13])
 
 
 def make(dtype="uint8", device=None, **other):
@@ -48,19 +47,6 @@ def test_normals_are_bit_by_bit_those_of_the_windows_frames(device, dtype):
     )
     assert np.mean(exact.contact) > 0.3
     same(operation.result(), exact)
-
-
-@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
-def test_cuts_do_not_matter_when_noise_and_tilt_are_told_from_the_frames(dtype):
-    frames, found = turn_frames(SHAPE, dtype), []
-    for cuts in CUTS:
-        operation = make(dtype, tilt="estimate")
-        push(operation, frames, cuts)
-        found.append((operation.result(), operation.window.correlation()))
-    for normals, wave in found[1:]:
-        same(normals, found[0][0])
-        assert normals.process == found[0][0].process
-        same(wave, found[0][1], MAPS[3:])
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
@@ -121,16 +107,6 @@ def test_normals_with_ends_and_a_scale_of_each_pixel_go_round_the_ring_too():
             frames[last], PHASE[last], tilt=TILT, zenith_gain=gains, zenith_offset=offset, **known
         ),
     )
-
-
-def test_a_reset_forgets_all():
-    frames = turn_frames(SHAPE)
-    operation, fresh = make(), make()
-    push(operation, frames[::-1], [21])
-    operation.reset()
-    for one in (operation, fresh):
-        push(one, frames, [21])
-    same(operation.result(), fresh.result())
 
 
 def test_a_window_that_is_not_full_has_no_normals():

@@ -94,18 +94,6 @@ def test_a_lamp_that_goes_round_is_the_correlation_of_a_rotation():
     np.testing.assert_allclose(found.residual, wave.residual, rtol=1e-3)
 
 
-def test_frames_that_come_one_by_one_give_the_same():
-    frames, lamps = lit(round_lamps(0.4), "uint8", 2), round_lamps(0.4)
-    whole = photometric_stereo(frames, light=lamps, shadow=8)
-    stereo = PhotometricStereo(light=lamps, shadow=8)
-    stereo.push(frames[:5])
-    result = engine.run(list(frames), stereo)  # which resets it
-    np.testing.assert_array_equal(result.normals, whole.normals)
-    np.testing.assert_array_equal(result.normals_sigma, whole.normals_sigma)
-    np.testing.assert_array_equal(result.albedo, whole.albedo)
-    assert result.process["light"] == "map given"
-
-
 def test_a_lamp_is_needed_for_each_frame_and_no_more():
     stereo = PhotometricStereo(light=LAMPS)
     stereo.push(FRAMES[:6])

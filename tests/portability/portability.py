@@ -45,8 +45,8 @@ VECTORS = "normals or axial"
 UNOPTIMISED = {"OCLGRIND_BUILD_OPTIONS": "-cl-opt-disable -Dalways_inline=noinline"}
 # Tests on few pixels that still reach all kernels and types.
 SMALL = (
-    "odd_sizes or references_of_each_pixel or used_again or is_light or touch_only or (reading and 127)"
-    " or kernels_do_as_the_reference or sums_agree_with or gradients_agree_with"
+    "odd_sizes or references_of_each_pixel or used_again or is_light or (read_all and 127)"
+    " or (triad_all and 127) or displacement_ or pose_equations or pose_gradient"
 )
 
 

@@ -7,6 +7,7 @@ import inspect
 import pkgutil
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -22,10 +23,10 @@ from mirrorskin.engine.photometric import PhotometricStereo, photometric_stereo
 from mirrorskin.engine.press.growth import Growth
 from mirrorskin.engine.press.levels import Levels
 from mirrorskin.engine.rotation.last_turn import LastTurn
-from mirrorskin.io import Header
+from mirrorskin.io import Header, Result
 from mirrorskin.io.types import body_axes
 
-COUNT, SHAPE, PIXEL = 48, (24, 32), 0.05
+COUNT, SHAPE, PIXEL = 48, (23, 31), 0.05
 TRAVEL = np.linspace(0, 1.2, COUNT)
 STROKES = 0.6 - 0.6 * np.cos(0.3 * np.arange(COUNT))
 DITHER = 0.6 + 0.03 * np.cos(0.7 * np.arange(COUNT))
@@ -71,6 +72,12 @@ class Case:
     function: Callable[..., Any] | None = None
     motion: str = "vertical"
     header: Mapping[str, Any] = field(default_factory=dict)
+    weights: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+
+    @property
+    def given(self) -> Mapping[str, NDArray[np.float64]]:
+        """What is pushed with the frames."""
+        return {**self.positions, **self.weights}
 
     def make(self, **options: Any) -> engine.Operation:
         """Return the operation."""
@@ -84,10 +91,20 @@ class Case:
 
     def push(self, operation: engine.Operation, part: slice) -> None:
         """Push some of the frames."""
-        where = {name: values[part] for name, values in self.positions.items()}
+        where = {name: values[part] for name, values in self.given.items()}
         operation.push(self.frames[part], **where)
 
+    def whole(self, **options: Any) -> Result:
+        """Return the result of all frames in one push."""
+        operation = self.make(**options)
+        for number in range(operation.passes):
+            if number:
+                operation.next_pass()
+            self.push(operation, slice(None))
+        return operation.result()
 
+
+WEIGHTS = {"frame_weights": np.where(np.arange(COUNT) % 7 == 2, 0.0, 1 + 0.5 * np.cos(np.arange(COUNT)))}
 ON_TRAVEL, ON_PHASE = {"travel": TRAVEL}, {"phase": PHASE}
 LEVELS = {"dark": 20.0, "bright": 230.0}
 ROTATION: dict[str, Any] = {"motion": "axial"}
@@ -112,6 +129,9 @@ CASES = {
     "Correlate of a window": Case(
         engine.Correlate, TURNS, ON_PHASE, {"window_frames": 8}, engine.correlate, **ROTATION
     ),
+    "Correlate with weights": Case(
+        engine.Correlate, TURNS, ON_PHASE, {}, engine.correlate, weights=WEIGHTS, **ROTATION
+    ),
     "Normals": Case(
         engine.Normals, TURNS, ON_PHASE, {"tilt": TILT, "noise": NOISE, **SENSOR}, engine.estimate_normals,
         **ROTATION,
@@ -119,8 +139,11 @@ CASES = {
     "Normals of each turn": Case(
         engine.Normals, TURNS, ON_PHASE, {"tilt": "estimate", "per_turn": True, **SENSOR}, **ROTATION
     ),
+    "Normals with weights": Case(
+        engine.Normals, TURNS, ON_PHASE, {"tilt": TILT, **SENSOR}, weights=WEIGHTS, **ROTATION
+    ),
     "Normals of a window": Case(
-        engine.Normals, TURNS, ON_PHASE, {"tilt": TILT, "window_frames": 8, **SENSOR}, **ROTATION
+        engine.Normals, TURNS, ON_PHASE, {"tilt": "estimate", "window_frames": 8, **SENSOR}, **ROTATION
     ),
     "LastTurn": Case(
         LastTurn, TURNS, ON_PHASE, {"tilt": TILT, "window_frames": 8, **SENSOR}, **ROTATION
@@ -133,14 +156,20 @@ CASES = {
         engine.slip.Slip, SKIN, {"displacement": SLIDE},
         {"pixel_size": PIXEL, "contact": np.ones(SKIN.shape[1:])}, motion="horizontal",
     ),
+    "Slip of each frame": Case(
+        engine.slip.Slip, SKIN, {"displacement": SLIDE},
+        {"pixel_size": PIXEL, "contact": np.ones(SKIN.shape[1:]), "per_frame": True}, motion="horizontal",
+    ),
     "Fringes": Case(Fringes, TURNS, ON_PHASE, {}, fit_fringes, **ROTATION),
+    "Fringes with weights": Case(
+        Fringes, TURNS, ON_PHASE, {"noise": 1.0}, fit_fringes, weights=WEIGHTS, **ROTATION
+    ),
     "PhotometricStereo": Case(
         PhotometricStereo, TURNS, {}, {"light": LAMPS}, photometric_stereo, **ROTATION
     ),
 }  # fmt: skip
 CUTS = {
     "one by one": lambda count: [slice(k, k + 1) for k in range(count)],
-    "unevenly": lambda count: [
-        slice(*ends) for ends in ((0, 1), (1, 4), (4, 5), (5, count - 1), (count - 1, count))
-    ],
+    "unevenly": lambda count: [slice(*ends) for ends in pairwise((0, 1, 4, 5, count - 1, count))],
+    "in halves": lambda count: [slice(0, count // 2), slice(count // 2, count)],
 }

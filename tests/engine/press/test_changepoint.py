@@ -295,22 +295,6 @@ def test_a_saturated_sample_is_light_and_pixels_without_references_are_invalid(d
     assert_near(found, numpy_change(frames, travel, 20, bright, **options), travel)
 
 
-@pytest.mark.parametrize("levels", [LEVELS["uint8"], {}], ids=["known", "unknown"])
-def test_results_on_the_way_change_nothing_and_a_search_can_be_used_again(device, levels):
-    search = ChangePoint(noise=1.5, device=device, **levels)
-    known = {"noise": 1.5, "device": device, **levels}
-    for seed in (7, 8):
-        frames, travel = stroke("uint8", 20, (9, 13), seed=seed)
-        search.reset()
-        for number in range(20 if levels else 0):
-            search.push(frames[number : number + 1], travel=travel[number : number + 1])
-            if number:
-                so_far = slice(number + 1)
-                assert_equal(search.result(), find_change_point(frames[so_far], travel[so_far], **known))
-        if not levels:
-            assert_equal(search_in_blocks(search, frames, travel), find_change_point(frames, travel, **known))
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [

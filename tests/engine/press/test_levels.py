@@ -72,19 +72,15 @@ def test_one_threshold_gives_bounds_too(press, found):
     np.testing.assert_array_equal(one.slope_min > 0, found.slope_min >= np.float32(STEPS[1]))
 
 
-def test_blocks_make_no_difference_and_invalid_pixels_have_no_bounds():
+def test_invalid_pixels_have_no_bounds():
     frames = np.zeros((6, 1, 4), np.float32)
     frames[3:, 0] = [0, 0.3, 0.9, np.nan]
-    travel = 0.1 * np.arange(6)
     options = {"thresholds": [0.2, 0.8], "inclinations": [0.25, 0.5], "dark": 0, "bright": 1, "noise": 0.01}
-    whole, parts = Levels(**options), Levels(**options)
-    whole.push(frames, travel=travel)
-    for frame, at in zip(frames, travel, strict=True):
-        parts.push(frame[np.newaxis], travel=[at])
-    for search in (whole, parts):
-        found = search.result()
-        np.testing.assert_array_equal(found.slope_min, np.array([[0, 0.25, 0.5, np.nan]], np.float32))
-        np.testing.assert_array_equal(found.slope_max, np.array([[0.25, 0.5, np.nan, np.nan]], np.float32))
+    search = Levels(**options)
+    search.push(frames, travel=0.1 * np.arange(6))
+    found = search.result()
+    np.testing.assert_array_equal(found.slope_min, np.array([[0, 0.25, 0.5, np.nan]], np.float32))
+    np.testing.assert_array_equal(found.slope_max, np.array([[0.25, 0.5, np.nan, np.nan]], np.float32))
 
 
 @pytest.mark.parametrize(

@@ -425,21 +425,6 @@ def test_the_whole_range_of_float32(device, broken):
         np.testing.assert_array_equal(find_onset(zeros, np.arange(4.0), **options).frame, [[2, 2]])
 
 
-@pytest.mark.parametrize("event", EVENTS)
-def test_results_on_the_way_change_nothing_and_a_search_can_be_used_again(device, event):
-    known = {"dark": None, "bright": 220, "noise": 1.5, "event": event, "device": device}
-    search = Onset(**known)
-    for seed in (7, 8):
-        frames, travel = stroke("uint8", 30, (9, 13), event, seed=seed)
-        for number in range(30):
-            so_far = slice(number + 1)
-            search.push(frames[number : number + 1], travel=travel[number : number + 1])
-            if number:
-                assert_equal(search.result(), find_onset(frames[so_far], travel[so_far], **known))
-        np.testing.assert_array_equal(search.pushed("travel"), travel)
-        search.reset()
-
-
 def test_nothing_is_left_of_the_press_before(device):
     """A run that is open from the first frame on once took the last surely dark frame of another press."""
     before = np.full((40, 1, 1), 117, np.uint8)

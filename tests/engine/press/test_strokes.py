@@ -107,20 +107,6 @@ def test_samples_on_the_way_are_averaged_by_inverse_variance():
     assert 0.85 < np.mean((error / found.onset.height_sigma[inner]) ** 2) < 1.1
 
 
-def test_the_same_frames_give_the_same_result_however_they_are_cut(device):
-    travel = UNEVEN[:60]
-    frames = made_press(travel, DEPTH[:9, :13])
-    whole = strokes_of(frames, travel, device=device)
-    for blocks in (range(1, 60), [7, 8, 9, 17, 40]):
-        parts = strokes_of(frames, travel, blocks, device=device)
-        for name in ("onset", "release"):
-            for field in ("height", "height_sigma", "status", "frame"):
-                ours, theirs = (getattr(getattr(one, name), field) for one in (whole, parts))
-                np.testing.assert_array_equal(ours, theirs)
-        np.testing.assert_array_equal(whole.onset.strokes, parts.onset.strokes)
-        assert whole.onset.process["strokes"] == parts.onset.process["strokes"]
-
-
 def test_one_stroke_is_the_press_bit_by_bit():
     travel = np.linspace(0, 1.2, 30)
     frames = made_press(travel, DEPTH)
@@ -150,15 +136,6 @@ def test_a_rest_before_a_stroke_up_is_no_stroke():
     assert chi_square(found.onset, -DEPTH) < 1.5
     np.testing.assert_array_equal(found.onset.height, same.onset.height)
     assert np.all(np.diff(travel)[found.onset.frame[DEPTH > 0.2] - 1] > 0)
-
-
-def test_a_search_that_was_reset_remembers_nothing():
-    frames = made_press(UNEVEN, DEPTH)
-    search = engine.press.Strokes(dark=DARK, bright=BRIGHT)
-    search.push(255 - frames, travel=UNEVEN)
-    search.reset()
-    search.push(frames, travel=UNEVEN)
-    np.testing.assert_array_equal(search.result().height, strokes_of(frames, UNEVEN).onset.height)
 
 
 @pytest.fixture(scope="module")

@@ -116,27 +116,6 @@ def test_frames_count_by_their_weights(device, dtype, weights):
         assert found.process["frames"] == (8 if weight is None else np.count_nonzero(weight))
 
 
-@pytest.mark.parametrize(
-    ("dtype", "weights"), [("uint8", "late"), ("uint16", "all"), ("uint16", "missing"), ("float32", "uneven")]
-)
-def test_blocks_make_no_difference(device, dtype, weights):
-    phase = PHASES["turns"][:40]
-    frames, weight = swing(dtype, phase), None if WEIGHTS[weights] is None else 5 * WEIGHTS[weights]
-    lent = np.zeros(frames.nbytes + 64, np.uint8)[: frames.nbytes].view(dtype).reshape(frames.shape)
-    lent[:] = frames
-    for window in (None, 13):
-        found = []
-        for cuts in ([], [1, 2, 3, 5, 8, 13, 21, 34], [8, 9, 23, 24]):
-            operation = Correlate(window_frames=window, device=device)
-            found.append(push(operation, frames, phase, weight, cuts).result())
-            same(found[0], found[-1])
-            same(operation.result(), found[-1])
-            operation.reset()
-            with pytest.raises(InputError, match="none have been pushed"):
-                operation.result()
-            same(push(operation, lent, phase, weight, cuts, lent=True).result(), found[0])
-
-
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_a_window_forgets_what_has_left_it(device, dtype):
     phase = 0.7 * np.arange(150.0)

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import rotations
-from rotations import EIGHTHS, TILT, UNEVEN, Setup
+from rotations import EIGHTHS, TILT, Setup
 
 from mirrorskin.engine import Normals, estimate_normals
 from mirrorskin.io import InputError
@@ -70,25 +70,6 @@ def close(one, other, share=0.02):
     np.testing.assert_array_equal(one.contact, other.contact)
 
 
-@pytest.mark.parametrize(
-    ("dtype", "per_turn"), [("uint8", False), ("uint16", False), ("uint16", True), ("float32", False)]
-)
-def test_blocks_make_no_difference(device, dtype, per_turn):
-    setup = replace(SETUP, dtype=dtype, gain=3.6, noise=1.0, offset=12.0, phase=UNEVEN)
-    given = {"per_turn": per_turn, "noise": None, "device": device}
-    count = 21 if dtype == "uint16" else 24  # an incomplete turn, of one type
-    frames, phase = frames_of(setup, 3)[:count], phases(setup, 3)[:count]
-    whole = push(estimator_of(setup=setup, **given), frames, phase).result()
-    assert (whole.process["turns"], whole.process["frames"]) == (3, count)
-    assert np.isfinite(whole.normals_sigma).all()
-    for cuts in (range(1, count), [15]):
-        same(push(estimator_of(setup=setup, **given), frames, phase, cuts).result(), whole)
-    little = estimator_of(setup=setup, memory_limit=1, longest=8, **given)
-    same(push(little, frames, phase, [5, 18]).result(), whole)
-    every_other = np.repeat(frames, 2, axis=2)[:, :, ::2]
-    same(push(estimator_of(setup=setup, **given), every_other, phase, [5]).result(), whole)
-
-
 @pytest.mark.parametrize("kept", [[0, 4], []])
 def test_blocks_make_no_difference_where_the_first_turn_determines_nothing(device, kept):
     frames, phase, weights = frames_of(turns=3), phases(SETUP, 3), np.ones(24)
@@ -111,21 +92,6 @@ def test_frames_may_be_written_into_the_room(device):
         estimator.push(room, phase=phase[part], frame_weights=weights[part])
         start = part.stop
     same(estimator.result(), elsewhere)
-
-
-@pytest.mark.parametrize("given", [{"noise": None}, {"per_turn": True}, {"memory_limit": 1, "longest": 8}])
-def test_a_result_changes_nothing_and_a_reset_forgets(device, given):
-    frames, phase, weights = frames_of(turns=3), phases(SETUP, 3), np.ones(24)
-    weights[[2, 17]] = 0
-    whole = push(estimator_of(device, **given), frames, phase, weights=weights).result()
-    estimator = push(estimator_of(device, **given), frames[:, ::-1], phase + 1)
-    estimator.reset()
-    for start in range(0, 24, 3):
-        part = slice(start, start + 3)
-        push(estimator, frames[part], phase[part], weights=weights[part])
-        if start >= 3:
-            same(estimator.result(), estimator.result())
-    same(estimator.result(), whole)
 
 
 def test_turns_are_averaged_by_inverse_variance_or_given_alone(device):

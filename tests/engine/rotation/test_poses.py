@@ -125,22 +125,6 @@ def test_more_than_a_window_of_frames_is_joined():
     assert np.mean(((found.slope - slope) / found.slope_sigma) ** 2) == pytest.approx(1, abs=0.06)
 
 
-def test_the_same_frames_give_the_same_result_however_they_are_cut(device):
-    axes = body_axes(PHASE, GROWING)
-    frames = shown(axes)[:, :7, :9]
-    pose = np.column_stack([axes, PRESS])
-    results = []
-    for cuts in ([], [1, 2, 9, 30]):
-        estimator = engine.rotation.MovingNormals(longest=24, noise=NOISE, device=device, **SCALE)
-        for part in np.split(FRAME, cuts):
-            estimator.push(frames[part], pose=pose[part])
-            if len(part) > 5:
-                estimator.result()
-        results.append(estimator.result())
-    np.testing.assert_array_equal(results[0].normals, results[1].normals)
-    np.testing.assert_array_equal(results[0].contact, results[1].contact)
-
-
 @pytest.mark.parametrize(
     ("where", "line"),
     [

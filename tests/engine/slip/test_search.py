@@ -147,23 +147,6 @@ def test_contact_is_estimated_if_it_is_not_given(slid):
     assert stuck[0] == pytest.approx(stuck[1], rel=0.15)
 
 
-def test_blocks_make_no_difference_and_a_result_changes_nothing(slid):
-    frames, places = slide()
-    operation = search(per_frame=True)
-    for part in np.split(np.arange(20), [1, 4, 11]):
-        operation.push(frames[part], displacement=places[part])
-        if part[-1] == 10:
-            operation.result()
-    found = operation.result()
-    np.testing.assert_array_equal(found.slip_onset, slid[0].slip_onset)
-    np.testing.assert_array_equal(found.displacement[-1], slid[0].displacement)
-    assert found.displacement.shape == (20, *SHAPE, 2)
-    assert np.nanmax(np.abs(found.displacement[0])) == 0
-    operation.reset()
-    operation.push(frames, displacement=places)
-    np.testing.assert_array_equal(operation.result().slip_onset, slid[0].slip_onset)
-
-
 def test_skin_that_sticks_does_so_to_the_end():
     frames = np.stack([SPECKLE.frame(SHAPE, -0.4 * k, 0, NOISE, k) for k in range(8)])
     operation = search()
