@@ -5,16 +5,17 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import h5py
 import hdf5plugin
 import numpy as np
 import pytest
+from commands import Ended, done, refused
 from stacks import MadeUp, random_stack, record, sphere
 
 from mirrorskin import io
-from mirrorskin.cli import main as command_line
 
 PHASE = np.arange(8) * np.pi / 4
 GIVEN = ["--motion", "vertical", "--travel-step", "0.1mm"]
@@ -30,34 +31,11 @@ def folder(tmp_path, monkeypatch):
     return home
 
 
-def run(monkeypatch, capfd, *words):
-    """Run the command line in this process; return its exit code and what it said."""
-    monkeypatch.setattr(sys, "argv", ["mirrorskin", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        command_line.main()
-    return ended.value.code or 0, *capfd.readouterr()
-
-
-def process(*words, **settings):
+def process(*words, command=("-m", "mirrorskin.cli.main"), **settings):
     """Run the command line as a user does."""
-    command = [sys.executable, "-m", "mirrorskin.cli.main", *words]
+    command = [sys.executable, *command, *words]
     done = subprocess.run(command, capture_output=True, check=False, **settings)
-    return done.returncode, done.stdout.decode(errors="replace"), done.stderr.decode(errors="replace")
-
-
-def files():
-    return {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()}
-
-
-def assert_refused(ended, words, before):
-    code, out, said = ended
-    assert code == 2, said
-    assert out == ""
-    assert words in said
-    assert said.startswith("mirrorskin: ")
-    assert said.count("\n") == 1
-    assert "Traceback" not in said
-    assert files() == before
+    return Ended(done.returncode, done.stdout.decode(errors="replace"), done.stderr.decode(errors="replace"))
 
 
 def change(name, value=None):
@@ -192,12 +170,11 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_reconstruct_refuses_in_one_line(monkeypatch, capfd, case):
-    make, options, words = CASES[case]
+def test_reconstruct_refuses_in_one_line(case):
+    make, options, said = CASES[case]
     make()
-    before = files()
     name = [] if case == "an input with a long name" else ["bad.h5"]
-    assert_refused(run(monkeypatch, capfd, "reconstruct", *name, *options), words, before)
+    refused(said, "reconstruct", *name, *options)
 
 
 @pytest.mark.parametrize(
@@ -213,8 +190,7 @@ def test_reconstruct_refuses_in_one_line(monkeypatch, capfd, case):
 )
 def test_a_process_ends_with_one_line(make, words, said):
     make()
-    before = files()
-    assert_refused(process(*words), said, before)
+    refused(said, *words, run=process)
 
 
 @pytest.mark.parametrize(
@@ -238,47 +214,40 @@ def test_a_process_ends_with_one_line(make, words, said):
         (stack(), ["simulate", "vertical", "--object", "bad.h5", "-o", "bad.h5"], "bad.h5 is the input"),
     ],
 )
-def test_other_commands_refuse_in_one_line(monkeypatch, capfd, make, words, said):
+def test_other_commands_refuse_in_one_line(make, words, said):
     make()
-    before = files()
-    assert_refused(run(monkeypatch, capfd, *words), said, before)
+    refused(said, *words)
 
 
-def test_a_result_of_another_size_is_not_scored(monkeypatch, capfd):
+def test_a_result_of_another_size_is_not_scored():
     twin = sphere()
     record(twin, Path("truth.h5"), truth=twin.truth)
     io.save_result(io.Result(height=np.zeros((4, 7), np.float32)), "bad.h5")
-    before = files()
-    assert_refused(
-        run(monkeypatch, capfd, "score", "bad.h5", "--truth", "truth.h5"), "not of one stack", before
-    )
+    refused("not of one stack", "score bad.h5 --truth truth.h5")
 
 
-def test_a_recording_without_the_truth_is_not_scored(monkeypatch, capfd):
+def test_a_recording_without_the_truth_is_not_scored():
     record(sphere(), Path("blind.h5"))
     a_result()
-    before = files()
-    assert_refused(
-        run(monkeypatch, capfd, "score", "bad.h5", "--truth", "blind.h5"), "holds no truth", before
-    )
+    refused("holds no truth", "score bad.h5 --truth blind.h5")
 
 
-def test_references_may_be_unknown_at_some_pixels(monkeypatch, capfd):
+def test_references_may_be_unknown_at_some_pixels():
     dark = np.full((5, 7), 16, np.float32)
     dark[2, 3] = np.nan
     change(f"{DETECTOR}/dark", dark)()
-    assert run(monkeypatch, capfd, "reconstruct", "bad.h5")[0] == 0
+    done("reconstruct bad.h5")
     result = io.open_result("bad-result.h5")
     assert result.status[2, 3] == 0
     assert np.count_nonzero(result.status == 0) == 1
 
 
 @pytest.mark.parametrize("name", ["five yen.h5", "Münze 五円.h5"])
-def test_any_name_will_do(monkeypatch, capfd, name):
+def test_any_name_will_do(name):
     record(sphere(), Path(name))
-    assert run(monkeypatch, capfd, "reconstruct", name)[0] == 0
+    done("reconstruct", name)
     result = name.replace(".h5", "-result.h5")
-    assert run(monkeypatch, capfd, "info", result)[0] == 0
+    done("info", result)
     assert io.open_result(result).process["source"] == name
 
 
@@ -300,8 +269,6 @@ main()
 def test_a_full_disk_is_one_line():
     # A limit to the size of files stands for the full disk; kernels that are built keep within it.
     words = ["simulate", "vertical", "--size", "700x200", "--references", "exact", "-o", "press.h5"]
-    command = [sys.executable, "-c", FULL, *words]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert_refused(
-        (done.returncode, done.stdout, done.stderr), "press.h5 could not be written: File too large", {}
+    refused(
+        "press.h5 could not be written: File too large", *words, run=partial(process, command=("-c", FULL))
     )

@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 import pytest
 from batches import BAD, half_written, missing, press, rotation
-from commands import run
+from commands import refused, run
 
 from mirrorskin import io
 from mirrorskin.cli.main import main
@@ -22,13 +22,6 @@ from mirrorskin.engine.batch.jobs import make_jobs
 from mirrorskin.engine.batch.work import Outcome
 
 SOUND = {"press.h5": press, "turn.h5": rotation}
-
-
-@pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
-    """Work in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 def results(place="out"):
@@ -156,13 +149,13 @@ def test_json_tells_of_every_file():
     assert (second["state"], second["message"]) == ("failed", "b.h5: no such file")
 
 
-def test_half_written_files_of_the_killed_are_removed(folder):
+def test_half_written_files_of_the_killed_are_removed(tmp_path):
     presses("mon/x.h5", "tue/x.h5")
     for place in ("out", "out/mon"):
         Path(place).mkdir()
         Path(place, ".mirrorskin-abc.part").write_bytes(b"half")
     run("batch", "**/*.h5", "-o", "out")
-    assert not half_written(folder)
+    assert not half_written(tmp_path)
 
 
 class Terminal(streams.StringIO):
@@ -210,16 +203,13 @@ def test_a_terminal_shows_a_table(monkeypatch):
         ),
     ],
 )
-def test_a_wrong_call_is_one_line_and_makes_nothing(folder, words, said):
+def test_a_wrong_call_is_one_line_and_makes_nothing(tmp_path, words, said):
     presses("a.h5")
-    code, out, line = run("batch", *words)
-    assert (code, out) == (2, "")
-    assert said in line
-    assert line.count("\n") == 1
-    assert [path.name for path in folder.iterdir()] == ["a.h5"]
+    refused(said, "batch", *words)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
 
 
-def test_ctrl_c_leaves_whole_results_and_says_how_to_go_on(folder):
+def test_ctrl_c_leaves_whole_results_and_says_how_to_go_on(tmp_path):
     presses("a.h5")
     for number in range(300):
         Path(f"{number:03}.h5").symlink_to("a.h5")
@@ -232,7 +222,7 @@ def test_ctrl_c_leaves_whole_results_and_says_how_to_go_on(folder):
         rest, said = child.communicate(timeout=60)
     assert child.returncode in (130, -signal.SIGINT)  # the last may come when the program has ended already
     assert first.split(" in ")[0] == "done: 000.h5"
-    assert not half_written(folder)
+    assert not half_written(tmp_path)
     found = results()
     assert 1 <= len(found) < 300
     assert all(io.open_result(f"out/{name}").height is not None for name in found)

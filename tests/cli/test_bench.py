@@ -74,8 +74,7 @@ def test_the_package_s_table_is_the_default(made_up):
         (["compare", "table.json"], "unexpected extra argument"),
     ],
 )
-def test_bad_input_gets_one_line_and_nothing_is_written(tmp_path, monkeypatch, made_up, words, said):
-    monkeypatch.chdir(tmp_path)
+def test_bad_input_gets_one_line_and_nothing_is_written(tmp_path, made_up, words, said):
     (tmp_path / "other.json").write_text("{}", encoding="utf-8")
     save(run(case("onset", row("mirrorskin", 1.0))), tmp_path / "table.json")
     before = sorted(path.name for path in tmp_path.iterdir())

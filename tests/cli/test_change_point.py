@@ -5,7 +5,7 @@ import json
 import h5py
 import numpy as np
 import pytest
-from commands import run
+from commands import done, refused
 
 from mirrorskin import io
 
@@ -14,8 +14,7 @@ FRAMES[8:, :, 1:] = 200
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def folder(tmp_path):
     with h5py.File(tmp_path / "press.h5", "w") as file:
         file["frames"] = FRAMES
     return tmp_path
@@ -35,9 +34,7 @@ GIVEN = [
 
 @pytest.mark.parametrize("levels", [["--dark", 20, "--bright", 200], ["--dark", 20], []])
 def test_the_method_reaches_the_engine(folder, levels):
-    done = run(*GIVEN, *levels, "--json")
-    assert done.code == 0, done.said
-    told = json.loads(done.out)
+    told = json.loads(done(*GIVEN, *levels, "--json").out)
     assert told["process"]["method"] == "change-point"
     kernels = {record["name"] for record in told["profile"]}
     passes = {"changepoint_scan"} if len(levels) == 4 else {"changepoint_sum", "changepoint_split"}
@@ -57,7 +54,5 @@ def test_the_method_reaches_the_engine(folder, levels):
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(folder, words, said):
-    done = run(*GIVEN, *words)
-    assert done.code == 2
-    assert said in done.said
+    refused(said, *GIVEN, *words)
     assert not (folder / "press-result.h5").exists()

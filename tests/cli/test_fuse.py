@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from commands import run
+from commands import done, refused, run
 from stacks import record
 
 from mirrorskin import engine, hw, io
@@ -50,27 +50,15 @@ def kept(tmp_path_factory):
 
 
 @pytest.fixture(autouse=True)
-def folder(kept, tmp_path, monkeypatch):
+def folder(kept, tmp_path):
     for file in kept.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
-    monkeypatch.chdir(tmp_path)
 
 
 def fuse(*words, names=("press.h5", "turn.h5")):
     """Return the result, and how the command ended."""
-    ended = run("fuse", *names, "-o", "out.h5", *words)
-    assert ended.code == 0, ended.said
+    ended = done("fuse", *names, "-o", "out.h5", *words)
     return io.open_result("out.h5"), ended
-
-
-def refused(*words, names=("press.h5", "turn.h5"), code=2):
-    """Return the line of a call that is refused, and writes nothing."""
-    before = {path: path.read_bytes() for path in Path().iterdir()}
-    ended = run("fuse", *names, *words)
-    assert (ended.code, ended.out) == (code, "")
-    assert ended.said.count("\n") == 1
-    assert {path: path.read_bytes() for path in Path().iterdir()} == before
-    return ended.said.removeprefix("mirrorskin: ").rstrip("\n")
 
 
 def foreign(name, stack):
@@ -148,14 +136,14 @@ def test_what_other_people_s_files_do_not_say_is_given():
 
 def test_a_rotation_whose_pivot_is_unknown_is_not_registered():
     without("turn.h5", "entry/instrument/stage/pivot")
-    assert "pivot" in refused()
+    refused("pivot", "fuse press.h5 turn.h5")
     fuse("--no-register")
 
 
 def test_a_rotation_without_a_gain_is_refused_and_it_can_be_given():
     scale = zenith_scale()
     without("turn.h5", f"{DETECTOR}/zenith_gain", f"{DETECTOR}/zenith_offset")
-    line = refused()
+    line = refused("", "fuse press.h5 turn.h5")
     assert "turn.h5" in line
     assert "gain" in line
     fuse(*scale)
@@ -172,7 +160,7 @@ def test_both_are_read_as_a_calibration_says():
     np.testing.assert_array_equal(told.calibration.references.bright, bright)
     np.testing.assert_allclose(told.height, plain.height, atol=1e-4)
     io.save_calibration(io.Calibration(io.CameraId("other", shape, np.dtype("uint8"))), "cal.h5")
-    assert "other" in refused("--calibration", "cal.h5")
+    refused("other", "fuse press.h5 turn.h5", "--calibration", "cal.h5")
 
 
 GRIDS = {
@@ -185,7 +173,7 @@ GRIDS = {
 def test_grids_that_differ_are_refused_with_both(kind):
     changes, words = GRIDS[kind]
     record(turn(**changes), Path("other.h5"))
-    line = refused(names=("press.h5", "other.h5"))
+    line = refused("", "fuse press.h5 other.h5")
     for word in ("press.h5", "other.h5", *words):
         assert word in line
 
@@ -194,19 +182,19 @@ def test_grids_that_differ_are_refused_with_both(kind):
     "names", [("press.h5", "press.h5"), ("turn.h5", "turn.h5"), ("turn.h5", "press.h5")], ids="-".join
 )
 def test_a_recording_of_the_other_motion_is_refused(names):
-    line = refused(names=names)
+    line = refused("", "fuse", *names)
     assert "a vertical one and an axial one" in line or "give the press first" in line
     assert any(name in line for name in names)
 
 
 def test_a_result_is_no_recording():
     io.save_result(io.Result(height=np.zeros(SHAPE, np.float32)), "out.h5")
-    assert "out.h5 is a result" in refused(names=("press.h5", "out.h5"))
+    refused("out.h5 is a result", "fuse", *("press.h5", "out.h5"))
 
 
 @pytest.mark.parametrize("name", ["press.h5", "turn.h5"])
 def test_neither_input_is_overwritten(name):
-    assert "is the input" in refused("-o", name)
+    refused("is the input", "fuse press.h5 turn.h5", "-o", name)
 
 
 REFUSED = {
@@ -222,14 +210,14 @@ REFUSED = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_bad_input_is_one_line(case):
     words, names, said_of = REFUSED[case]
-    line = refused(*words, names=names or ("press.h5", "turn.h5"))
+    line = refused("", "fuse", *(names or ("press.h5", "turn.h5")), *words)
     assert said_of in line
 
 
 def test_pixels_of_unknown_size_are_refused_and_can_be_given():
     for name in ("press.h5", "turn.h5"):
         without(name, f"{DETECTOR}/x_pixel_size", f"{DETECTOR}/y_pixel_size")
-    assert "pixel size" in refused()
+    refused("pixel size", "fuse press.h5 turn.h5")
     fuse("--pixel-size", "0.25mm")
 
 
@@ -238,4 +226,5 @@ def test_a_surface_that_was_not_found_is_one_line_and_no_file(monkeypatch):
         raise engine.NotConverged("the residual is 0.3 after 100 iterations: allow more")
 
     monkeypatch.setattr("mirrorskin.engine.fusion.fuse_recordings", fails)
-    assert refused(code=1) == "the residual is 0.3 after 100 iterations: allow more"
+    line = "the residual is 0.3 after 100 iterations: allow more"
+    assert refused(line, "fuse press.h5 turn.h5", code=1) == line

@@ -295,8 +295,7 @@ def test_a_turn_that_is_cut_short_says_that_there_is_no_result(fake, tmp_path):
         (["axial", "--rock", "--press", "1mm", "--speed", "5deg/s"], "zenith_gain"),
     ],
 )
-def test_what_cannot_be_is_one_clear_line(fake, monkeypatch, tmp_path, words, told):
-    monkeypatch.chdir(tmp_path)
+def test_what_cannot_be_is_one_clear_line(fake, words, told):
     done = fake.run(*words)
     assert isinstance(done.exception, io.InputError)
     assert told in str(done.exception)

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from commands import run
+from commands import refused, run
 from height_maps import cap, places, result_of
 
 from mirrorskin import io
@@ -25,14 +25,6 @@ def told(*words):
     ended = run("measure", *words, "--json")
     assert (ended.code, ended.said) == (0, "")
     return json.loads(ended.out)
-
-
-def refused(*words):
-    """Return the line of a call that is refused."""
-    ended = run("measure", *words)
-    assert (ended.code, ended.out) == (2, "")
-    assert ended.said.count("\n") == 1
-    return ended.said
 
 
 def test_numbers_are_printed_with_uncertainty_and_unit(ball):
@@ -85,19 +77,19 @@ def test_one_turn_of_several_is_measured(tmp_path):
     io.save_result(one.assign(height=np.stack([height, height - 1])), path)
     first, second = (told(path, "--turn", n)["quantities"]["highest point"]["value"] for n in (0, 1))
     assert first - second == pytest.approx(1)
-    assert "choose one with --turn" in refused(path)
-    assert "none of turn 2" in refused(path, "--turn", "2")
+    refused("choose one with --turn", "measure", path)
+    refused("none of turn 2", "measure", path, "--turn", "2")
 
 
 def test_what_cannot_be_measured_is_told_in_a_line(ball, tmp_path):
     result = io.open_result(ball)
     io.save_result(result.assign(x=None, y=None), tmp_path / "unsized.h5")
-    assert "reconstruct it again with --pixel-size" in refused(tmp_path / "unsized.h5")
+    refused("reconstruct it again with --pixel-size", "measure", tmp_path / "unsized.h5")
     io.save_result(io.Result(azimuth=np.zeros(SHAPE, np.float32)), tmp_path / "wave.h5")
-    assert "has no heights" in refused(tmp_path / "wave.h5")
-    assert "--region" in refused(ball, "--region", "0,0,100x100")
-    assert "a unit is needed" in refused(ball, "--cutoff", "0.8")
-    assert "too long for this surface" in refused(ball, "--cutoff", "1m")
-    assert "--section" in refused(ball, "--section", "0mm,0mm")
-    assert "--form" in refused(ball, "--form", "cube")
-    assert "no such file" in refused(tmp_path / "none.h5").lower()
+    refused("has no heights", "measure", tmp_path / "wave.h5")
+    refused("--region", "measure", ball, "--region", "0,0,100x100")
+    refused("a unit is needed", "measure", ball, "--cutoff", "0.8")
+    refused("too long for this surface", "measure", ball, "--cutoff", "1m")
+    refused("--section", "measure", ball, "--section", "0mm,0mm")
+    refused("--form", "measure", ball, "--form", "cube")
+    refused("no such file", "measure", tmp_path / "none.h5")

@@ -71,8 +71,7 @@ def odd_texts(path):
     ],
     ids=lambda words: " ".join(words[:2]).encode("ascii", "replace").decode().replace("\x1b", ""),
 )
-def test_no_message_controls_the_terminal(tmp_path, monkeypatch, words):
-    monkeypatch.chdir(tmp_path)
+def test_no_message_controls_the_terminal(tmp_path, words):
     odd = odd_texts(tmp_path / f"odd{ESCAPE}.h5")
     Path("pictures").mkdir()
     for name in ("frame1.png", "frame2.png", f"other{ESCAPE}.png"):

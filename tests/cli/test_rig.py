@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from commands import run
+from commands import refused, run
 from served_rig import allow_delays
 
 from mirrorskin.cli import rig as command
@@ -52,7 +52,6 @@ MACHINE = {24: 600.0, 25: 3000.0, 26: 10.0, 27: 0.3, 132: 10.0} | dict.fromkeys(
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     """Work in a folder with a film of 100 s, and look at things for a shorter time than a user does."""
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(check, "_PERIOD", 0.4)
     allow_delays(monkeypatch)
     picture = np.arange(0, 96, 2, dtype=np.uint8).tobytes()
@@ -125,11 +124,8 @@ def test_what_failed_is_told_in_a_line_and_nothing_is_moved(controller):
 def test_what_soft_limits_do_not_allow_is_refused_before_anything_moves(controller):
     port = controller(home=True, s20=1.0)
     before = port.machine.position()
-    ended = run("rig", "check", "rig.toml", "--move")
-    assert ended.code == 2
-    assert re.fullmatch(
-        r"mirrorskin: stage .*: stage.pitch.limits are -5 to 5 .* allow -\d+ to 0: .*\n", ended.said
-    )
+    said = refused("", "rig", "check", "rig.toml", "--move")
+    assert re.fullmatch(r"stage .*: stage.pitch.limits are -5 to 5 .* allow -\d+ to 0: .*", said)
     assert port.machine.position() == before
 
 
@@ -139,9 +135,7 @@ def test_a_stage_is_moved_by_hand_within_its_limits(controller):
     assert (ended.code, ended.said) == (0, "")
     assert ended.out.startswith("rig: travel -4.500 mm, pitch 0.000 deg")
     assert machine.position() == pytest.approx({"X": -1.0, "Y": -1.0, "Z": -1.5})
-    ended = run("rig", "jog", "rig.toml", "travel", "--by", "-1mm")
-    assert (ended.code, ended.said.count("\n")) == (2, 1)
-    assert "beyond the axis" in ended.said
+    refused("beyond the axis", "rig", "jog", "rig.toml", "travel", "--by", "-1mm")
     assert run("rig", "jog", "rig.toml", "twist", "--by", "1deg").said.startswith(
         "mirrorskin: rig.toml has no [stage.twist]"
     )
@@ -162,10 +156,8 @@ def test_a_leaning_stage_is_lifted_upright(controller):
 def test_an_alarm_is_ended_only_by_unlocking(controller):
     port = controller()
     port.alarm(9)
-    ended = run("rig", "lift", "rig.toml")
-    assert (ended.code, ended.said.count("\n")) == (2, 1)
-    assert "locked" in ended.said
-    assert "'mirrorskin rig unlock'" in ended.said
+    said = refused("locked", "rig", "lift", "rig.toml")
+    assert "'mirrorskin rig unlock'" in said
     assert port.machine.state == "Alarm"
     assert run("rig", "unlock", "rig.toml").code == 0
     assert port.machine.state == "Idle"
@@ -177,9 +169,7 @@ def test_a_hold_of_someone_else_is_left_alone(controller):
     time.sleep(0.05)
     port.machine.receive(b"!")
     time.sleep(0.2)
-    ended = run("rig", "check", "rig.toml")
-    assert (ended.code, ended.said.count("\n")) == (2, 1)
-    assert "in the state hold" in ended.said
+    refused("in the state hold", "rig", "check", "rig.toml")
     assert port.machine.state == "Hold:0"
 
 
@@ -193,18 +183,15 @@ def test_a_stage_with_switches_is_homed_by_hand(controller):
 def test_a_missing_camera_is_bad_input_and_the_stage_is_told_of_all_the_same(controller):
     controller(changes=[("film.y4m", "none.y4m")])
     ended = run("rig", "check", "rig.toml")
-    assert ended.code == 2
+    assert (ended.code, ended.said.count("\n")) == (2, 1)
     assert "none.y4m" in ended.said
-    assert ended.said.count("\n") == 1
     assert "firmware" in ended.out
 
 
 def test_a_missing_port_is_bad_input(folder):
     (folder / "rig.toml").write_text(RIG.format(port="/dev/nowhere", home="true"))
     begun = time.monotonic()
-    ended = run("rig", "check", "rig.toml", "--json")
-    assert (ended.code, ended.out, ended.said.count("\n")) == (2, "", 1)
-    assert "/dev/nowhere" in ended.said
+    refused("/dev/nowhere", "rig", "check", "rig.toml", "--json")
     assert time.monotonic() - begun < 60
 
 

@@ -59,9 +59,8 @@ modulus = "0.2MPa"
 
 
 @pytest.fixture
-def settings(tmp_path, monkeypatch):
+def settings(tmp_path):
     """Read settings of a text, from a file that is called b.toml."""
-    monkeypatch.chdir(tmp_path)
 
     def read(text):
         (tmp_path / "b.toml").write_text(text, encoding="utf-8")

@@ -6,6 +6,8 @@ import contextlib
 import dataclasses
 import io
 import sys
+from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 from unittest import mock
 
@@ -24,16 +26,42 @@ class Ended(NamedTuple):
     said: str
 
 
-def run(*words: object) -> Ended:
-    """Run the command line with these words, in the working directory."""
+def run(line: object, *words: object) -> Ended:
+    """Run the command line with the words of a line and further words, in the working directory."""
     out, said = io.StringIO(), io.StringIO()
-    given = mock.patch.object(sys, "argv", ["mirrorskin", *map(str, words)])
+    given = mock.patch.object(sys, "argv", ["mirrorskin", *str(line).split(), *map(str, words)])
     with given, contextlib.redirect_stdout(out), contextlib.redirect_stderr(said):
         try:
             main()
         except SystemExit as ended:
             code = ended.code or 0
     return Ended(code, out.getvalue(), said.getvalue())
+
+
+def done(line: object, *words: object) -> Ended:
+    """Run the command line, which must succeed."""
+    ended = run(line, *words)
+    assert ended.code == 0, ended.said
+    return ended
+
+
+def refused(said: str, *words: object, run: Callable[..., Ended] = run, code: int = 2) -> str:
+    """Run the command line, which must refuse in one line that says so and write nothing; return the line."""
+    before = _files()
+    ended = run(*words)
+    assert (ended.code, ended.out) == (code, ""), ended
+    assert said in ended.said
+    assert ended.said.startswith("mirrorskin: ")
+    assert ended.said.count("\n") == 1
+    assert _files() == before
+    return ended.said.removeprefix("mirrorskin: ").rstrip("\n")
+
+
+def _files() -> dict[Path, tuple[int, int]]:
+    """Return size and time of each file below the working directory, which must not be the repository."""
+    assert not Path("pyproject.toml").exists(), "work in a temporary folder"
+    found = {path: path.lstat() for path in Path().rglob("*") if not path.is_dir()}
+    return {path: (stat.st_size, stat.st_mtime_ns) for path, stat in found.items()}
 
 
 def small_presses() -> dict[str, demo.Press]:

@@ -2,7 +2,7 @@ import json
 
 import numpy as np
 import pytest
-from commands import run
+from commands import refused, run
 from stacks import ball, record
 
 from mirrorskin import io
@@ -63,7 +63,4 @@ def test_a_picture_is_drawn(folder, tmp_path):
     ],
 )
 def test_what_cannot_be_is_refused_in_a_line(folder, words, message):
-    ended = check(folder, *words)
-    assert ended.code == 2
-    assert message in ended.said
-    assert len(ended.said.splitlines()) == 1
+    refused(message, folder, *words, run=check)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from calibrations import a_calibration
-from commands import run
+from commands import done, run
 from stacks import MadeUp, record
 
 from mirrorskin import io
@@ -26,8 +26,7 @@ DOTTED = (30 + 0.7 * paint_board(Dots(7, 6, 1.0), 25.4 * PER_MM)).astype(np.uint
 
 
 @pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def here():
     cv2.imwrite("a.png", SHOWN)
 
 
@@ -86,14 +85,6 @@ def test_pictures_may_have_fewer_bits_than_the_camera():
     assert (known.camera.name, known.camera.dtype) == ("lab", np.uint16)
 
 
-def refused(ended):
-    assert ended.code == 2
-    assert ended.out == ""
-    assert ended.said.startswith("mirrorskin: ")
-    assert ended.said.count("\n") == 1
-    return ended.said
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -120,8 +111,7 @@ def test_what_is_no_picture_of_the_board_is_refused(words, said, tmp_path):
 
 
 def test_a_board_is_painted_in_its_true_size():
-    ended = run("calibrate", "board", "--board", CHARUCO, "-o", "board.png", "--dpi", "508")
-    assert ended.code == 0, ended.said
+    ended = done("calibrate", "board", "--board", CHARUCO, "-o", "board.png", "--dpi", "508")
     assert "18.00 x 14.00 mm" in ended.out
     data = Path("board.png").read_bytes()
     at = data.index(b"pHYs") + 4

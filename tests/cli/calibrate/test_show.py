@@ -7,7 +7,7 @@ import sys
 
 import pytest
 from calibrations import a_calibration
-from commands import run
+from commands import done, run
 
 from mirrorskin import io
 from mirrorskin.cli.calibrate import show
@@ -29,8 +29,7 @@ def saved(tmp_path):
 
 
 def test_a_calibration_is_told_in_a_table(saved):
-    ended = run("calibrate", "show", saved)
-    assert ended.code == 0, ended.said
+    ended = done("calibrate", "show", saved)
     head, *lines = ended.out.splitlines()
     assert head.split() == ["part", "what", "value", "standard", "error", "unit"]
     assert {line.split()[0] for line in lines} == {
@@ -76,7 +75,6 @@ def test_machines_get_numbers_and_how_they_came_about(saved):
 def test_pictures_go_into_a_folder(tmp_path):
     path, folder = tmp_path / "cal.h5", tmp_path / "pictures"
     io.save_calibration(a_calibration(only=("precession",)), path)
-    ended = run("calibrate", "show", path, "-o", folder)
-    assert ended.code == 0, ended.said
+    ended = done("calibrate", "show", path, "-o", folder)
     assert ended.out.endswith(f"{folder}: tilt.png\n")
     assert [one.name for one in folder.iterdir()] == ["tilt.png"]
