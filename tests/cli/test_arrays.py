@@ -61,15 +61,15 @@ def test_a_region_of_an_array_is_that_part_of_the_picture():
 
 
 def test_an_imported_array_is_a_recording(stack):
-    assert run("import", "ball.npy", "--motion", "vertical", *STEPS, *SIZE, "-o", "rec.h5").code == 0
+    assert run("import ball.npy --motion vertical", *STEPS, *SIZE, "-o", "rec.h5").code == 0
     np.testing.assert_array_equal(heights("rec.h5", "--dark", 0, "--bright", 255), stack[1].height)
 
 
 def test_a_batch_keeps_what_was_made_of_an_array_until_the_array_changes():
-    assert "1 done" in run("batch", "ball.npz", "-o", "out").out
-    assert "1 kept" in run("batch", "ball.npz", "-o", "out").out
+    assert "1 done" in run("batch ball.npz -o out").out
+    assert "1 kept" in run("batch ball.npz -o out").out
     np.savez("ball.npz", frames=np.load("ball.npy") // 2, travel=TRAVEL, dark=0.0, bright=255.0)
-    assert "1 done" in run("batch", "ball.npz", "-o", "out").out
+    assert "1 done" in run("batch ball.npz -o out").out
 
 
 @pytest.mark.parametrize(
@@ -126,11 +126,11 @@ def test_an_array_that_cannot_be_used_is_refused_in_a_line(words, said):
 
 
 def test_what_an_array_or_an_archive_holds_is_told():
-    assert run("info", "ball.npy").out.split("\n")[1].split(maxsplit=1)[1] == "12 x 12 x 16, uint8"
-    told = json.loads(run("info", "ball.npz", "--json").out)
+    assert run("info ball.npy").out.split("\n")[1].split(maxsplit=1)[1] == "12 x 12 x 16, uint8"
+    told = json.loads(run("info ball.npz --json").out)
     assert (told["travel"], told["dark"]) == ("12, float64", "one number, float64")
     Path("cut.npz").write_bytes(Path("ball.npz").read_bytes()[:700])
-    assert run("info", "cut.npz").said.startswith("mirrorskin: cut.npz is not a NumPy array")
+    assert run("info cut.npz").said.startswith("mirrorskin: cut.npz is not a NumPy array")
 
 
 def test_an_import_without_the_pixel_size_says_what_needs_it():
@@ -192,7 +192,7 @@ def test_levels_that_nobody_gave_are_named():
 
 def test_the_line_of_a_file_in_a_batch_names_levels_that_nobody_gave():
     Path("batch.toml").write_text('[stack]\ntravel-step = "0.1mm"\npixel-size = "0.4mm"\n')
-    out = run("batch", "ball.npy", "-o", "out", "--settings", "batch.toml").out
+    out = run("batch ball.npy -o out --settings batch.toml").out
     assert "; no dark and bright given: estimated as " in out
 
 
@@ -208,5 +208,5 @@ def test_a_batch_takes_the_travel_of_a_file():
 
 def test_levels_that_the_frames_do_not_show_are_warned_of():
     np.save("dark.npy", np.full((4, 5, 6), 12, np.uint8))
-    said = run("reconstruct", "dark.npy", *STEPS, *SIZE, "-o", "out.h5").said
+    said = run("reconstruct dark.npy", *STEPS, *SIZE, "-o", "out.h5").said
     assert "the range of the frames' type is taken, and heights may be wrong" in said

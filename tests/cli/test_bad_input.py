@@ -123,11 +123,7 @@ CASES = {
         "the link travel leads to /gone",
     ),
     "dangling dark": (change(f"{DETECTOR}/dark", h5py.SoftLink("/gone")), [], "the link dark leads to /gone"),
-    "infinite travel": (
-        change(f"{STAGE}/travel", [*range(7), np.inf]),
-        [],
-        "inf at",
-    ),
+    "infinite travel": (change(f"{STAGE}/travel", [*range(7), np.inf]), [], "inf at"),
     "travel in words": (
         change(f"{STAGE}/travel", ["a"] * 8),
         [],

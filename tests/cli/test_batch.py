@@ -53,24 +53,24 @@ def test_bad_recordings_of_every_kind_are_told_and_the_rest_is_done():
 
 def test_what_is_finished_is_kept_until_the_settings_change():
     presses("a.h5", "b.h5")
-    assert run("batch", "a.h5", "-o", "out").code == 0
+    assert run("batch a.h5 -o out").code == 0
     first = Path("out/a-result.h5").read_bytes()
-    code, out, _ = run("batch", "a.h5", "b.h5", "-o", "out")
+    code, out, _ = run("batch a.h5 b.h5 -o out")
     assert (code, out.splitlines()[0]) == (0, "kept: a.h5")
     assert "1 done, 1 kept, 0 failed" in out
     assert Path("out/a-result.h5").read_bytes() == first
     Path("batch.toml").write_text("[press]\nthreshold = 0.3\n")
-    assert "2 done, 0 kept" in run("batch", "a.h5", "b.h5", "-o", "out", "--settings", "batch.toml").out
+    assert "2 done, 0 kept" in run("batch a.h5 b.h5 -o out --settings batch.toml").out
     assert io.open_result("out/a-result.h5").process["threshold"] == 0.3
 
 
-@pytest.mark.parametrize("place", [["--workers", "2"], ["--scheduler", "tcp://127.0.0.1:1"], []])
+@pytest.mark.parametrize("place", ["--workers 2", "--scheduler tcp://127.0.0.1:1", ""])
 def test_where_nothing_is_to_do_no_worker_and_no_device_is_asked_for(monkeypatch, place):
     presses("a.h5")
-    run("batch", "a.h5", "-o", "out")
+    run("batch a.h5 -o out")
     monkeypatch.setattr(cluster, "run_cluster", None)
     monkeypatch.setattr(local, "default_devices", None)
-    ended = run("batch", "a.h5", "no.h5", "-o", "out", *place)
+    ended = run(f"batch a.h5 no.h5 -o out {place}")
     assert "0 done, 1 kept, 1 failed" in ended.out
 
 
@@ -86,9 +86,9 @@ def test_the_shards_of_a_batch_are_the_whole_of_it_and_name_results_alike():
 def test_patterns_are_understood_when_quoted():
     presses("a.h5", "b.h5", "deep/er/c.h5", "deep/d.nxs")
     Path("e.h5").mkdir()
-    assert "2 done" in run("batch", "*.h5", "-o", "one").out
-    assert "3 done" in run("batch", "**/*.h5", "-o", "two").out
-    assert "2 done" in run("batch", "deep/**", "-o", "three").out
+    assert "2 done" in run("batch *.h5 -o one").out
+    assert "3 done" in run("batch **/*.h5 -o two").out
+    assert "2 done" in run("batch deep/** -o three").out
     assert "2 done" in run("batch", str(Path("[ab].h5").absolute()), "b.h5", "-o", "four").out
     assert results("three") == ["c-result.h5", "d-result.h5"]
 
@@ -97,16 +97,16 @@ def test_remedies_are_those_of_a_batch():
     foreign = {"x": np.zeros((8, 5, 7), np.uint8), "y": np.zeros((8, 5, 7), np.uint8)}
     with h5py.File("a.h5", "w") as file:
         file.update(foreign)
-    assert "choose with dataset in [stack] of --settings" in run("batch", "a.h5", "-o", "out").out
+    assert "choose with dataset in [stack] of --settings" in run("batch a.h5 -o out").out
     Path("batch.toml").write_text('[stack]\ndataset = "x"\n')
-    said = run("batch", "a.h5", "-o", "out", "--settings", "batch.toml").out
+    said = run("batch a.h5 -o out --settings batch.toml").out
     assert "give motion in [stack] of --settings, one of vertical" in said
 
 
 def test_a_motion_that_contradicts_a_file_fails_it():
     presses("a.h5")
     Path("batch.toml").write_text('[stack]\nmotion = "axial"\n')
-    said = run("batch", "a.h5", "-o", "out", "--settings", "batch.toml").out
+    said = run("batch a.h5 -o out --settings batch.toml").out
     assert "a.h5 states the motion vertical, but motion in [stack] of --settings is axial" in said
 
 
@@ -133,7 +133,7 @@ def test_a_name_that_is_no_text_is_shown_as_well_as_can_be(monkeypatch, encoding
 def test_json_tells_of_every_file():
     presses("a.h5")
     missing(Path("b.h5"))
-    code, out, said = run("batch", "a.h5", "b.h5", "-o", "out", "--json")
+    code, out, said = run("batch a.h5 b.h5 -o out --json")
     told = json.loads(out)
     assert (code, said) == (1, "")
     assert {name: told[name] for name in ("output", "done", "kept", "failed", "bytes")} == {
@@ -154,7 +154,7 @@ def test_half_written_files_of_the_killed_are_removed(tmp_path):
     for place in ("out", "out/mon"):
         Path(place).mkdir()
         Path(place, ".mirrorskin-abc.part").write_bytes(b"half")
-    run("batch", "**/*.h5", "-o", "out")
+    run("batch **/*.h5 -o out")
     assert not half_written(tmp_path)
 
 
@@ -184,28 +184,25 @@ def test_a_terminal_shows_a_table(monkeypatch):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["x*.h5", "-o", "out"], "x*.h5: no file matches"),
-        (["a.h5", "-o", "no/out"], "there is no folder no: make it first"),
-        (["a.h5", "-o", "a.h5"], "a.h5 is no folder"),
-        (["a.h5", "-o", "/proc/out"], "/proc/out cannot be made"),
-        (["a.h5"], "-o"),
-        (["-o", "out"], "FILE..."),
-        (["a.h5", "-o", "out", "--memory", "5"], "a unit is needed"),
-        (["a.h5", "-o", "out", "--workers", "0"], "--workers"),
-        (["a.h5", "-o", "out", "--shard", "3/2"], "--shard 3/2: a part and the number of parts is needed"),
-        (["no.h5", "-o", "out"], "no.h5: no such file"),
-        (["a.h5", "-o", "out", "--workers", "2", "--device", "0"], "--device and --workers"),
-        (["a.h5", "-o", "out", "--workers", "2", "--scheduler", "tcp://x:1"], "--workers and --scheduler"),
-        (["a.h5", "-o", "out", "--settings", "no.toml"], "no.toml: no such file"),
-        (
-            ["a.h5", "out-result.h5", "out-result.nxs", "out-result.h5.h5", "-o", "out"],
-            "would be the result of two",
-        ),
+        ("x*.h5 -o out", "x*.h5: no file matches"),
+        ("a.h5 -o no/out", "there is no folder no: make it first"),
+        ("a.h5 -o a.h5", "a.h5 is no folder"),
+        ("a.h5 -o /proc/out", "/proc/out cannot be made"),
+        ("a.h5", "-o"),
+        ("-o out", "FILE..."),
+        ("a.h5 -o out --memory 5", "a unit is needed"),
+        ("a.h5 -o out --workers 0", "--workers"),
+        ("a.h5 -o out --shard 3/2", "--shard 3/2: a part and the number of parts is needed"),
+        ("no.h5 -o out", "no.h5: no such file"),
+        ("a.h5 -o out --workers 2 --device 0", "--device and --workers"),
+        ("a.h5 -o out --workers 2 --scheduler tcp://x:1", "--workers and --scheduler"),
+        ("a.h5 -o out --settings no.toml", "no.toml: no such file"),
+        ("a.h5 out-result.h5 out-result.nxs out-result.h5.h5 -o out", "would be the result of two"),
     ],
 )
 def test_a_wrong_call_is_one_line_and_makes_nothing(tmp_path, words, said):
     presses("a.h5")
-    refused(said, "batch", *words)
+    refused(said, f"batch {words}")
     assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
 
 
@@ -236,8 +233,8 @@ def test_ctrl_c_leaves_whole_results_and_says_how_to_go_on(tmp_path):
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["--workers", "3"], {"address": None, "workers": 3}),
-        (["--scheduler", "tcp://node1:8786"], {"address": "tcp://node1:8786", "workers": None}),
+        ("--workers 3", {"address": None, "workers": 3}),
+        ("--scheduler tcp://node1:8786", {"address": "tcp://node1:8786", "workers": None}),
     ],
 )
 def test_a_cluster_is_given_the_same_jobs(monkeypatch, words, expected):
@@ -250,7 +247,7 @@ def test_a_cluster_is_given_the_same_jobs(monkeypatch, words, expected):
 
     monkeypatch.setattr(cluster, "run_cluster", run_cluster)
     presses("a.h5", "b.h5")
-    code, out, _ = run("batch", "a.h5", "b.h5", "-o", "out", "--memory", "1MB", *words)
+    code, out, _ = run(f"batch a.h5 b.h5 -o out --memory 1MB {words}")
     assert (code, out.splitlines()[0]) == (0, "done: a.h5 in 0.5 s, 0 MB/s: well")
     assert given == [(make_jobs([Path("a.h5"), Path("b.h5")], Path("out")), 10**6, expected)]
 

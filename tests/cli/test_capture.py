@@ -313,19 +313,7 @@ def test_a_port_that_is_missing_is_one_line(emulated, tmp_path):
     file = tmp_path / "rig.toml"
     text = re.sub(r'port = ".*"', f'port = "{tmp_path}/none"', emulated[1].read_text())
     file.write_text(text.replace('bright = "bright.npy"', ""))
-    refused(
-        "none",
-        "capture",
-        "vertical",
-        "--rig",
-        file,
-        "-o",
-        tmp_path / "a.h5",
-        "--stop",
-        "1mm",
-        "--step",
-        "1mm",
-    )
+    refused("none", "capture vertical --rig", file, "-o", tmp_path / "a.h5", "--stop", "1mm", "--step", "1mm")
 
 
 def test_a_stage_that_is_said_to_home_and_does_not_is_refused(emulated, tmp_path):
@@ -333,12 +321,12 @@ def test_a_stage_that_is_said_to_home_and_does_not_is_refused(emulated, tmp_path
     other = file.with_name("home.toml")
     other.write_text(file.read_text().replace("home = false", "home = true"))
     words = ("--rig", other, "-o", tmp_path / "a.h5", "--stop", "1mm", "--step", "1mm")
-    refused("set $22=1, or home = false", "capture", "vertical", *words)
+    refused("set $22=1, or home = false", "capture vertical", *words)
     assert not rig.machine.moving()
 
 
 def test_contact_is_found_and_the_zero_told(emulated):
-    ended = done("rig", "probe", emulated[1], "--from", "-1mm", "--step", "0.2mm")
+    ended = done("rig probe", emulated[1], "--from", "-1mm", "--step", "0.2mm")
     found = re.search(
         r"first contact at a travel of (\S+) mm, give or take 0.1 mm; .* set zero = (\S+) in", ended.out
     )
@@ -349,6 +337,6 @@ def test_contact_is_found_and_the_zero_told(emulated):
 
 
 def test_contact_from_the_start_is_refused(emulated):
-    ended = run("rig", "probe", emulated[1], "--from", "2.5mm", "--step", "0.1mm")
+    ended = run("rig probe", emulated[1], "--from", "2.5mm", "--step", "0.1mm")
     assert ended.code == 1
     assert "no contact between travels of 2.5 and 3 mm" in ended.said

@@ -85,24 +85,24 @@ def test_it_is_told_how_it_came_about():
 
 def test_a_recording_of_a_rotation_knows_its_phases_and_one_of_a_press_is_told_them():
     record(MadeUp(random_stack(), io.Header("axial"), phase=np.array(UNEVEN)), Path("turn.h5"))
-    assert run("correlate", "turn.h5").code == 0
+    assert run("correlate turn.h5").code == 0
     assert run("correlate", theirs(), "--phases", "phases.txt").code == 0
     own, given = (io.open_result(f"{name}-correlation.h5").cosine for name in ("turn", "theirs"))
     np.testing.assert_array_equal(own, given)
     record(sphere(), Path("press.h5"))
-    assert run("correlate", "press.h5", "--phase-step", "45deg").code == 0
-    assert "--phase-step" in run("correlate", "press.h5").said
+    assert run("correlate press.h5 --phase-step 45deg").code == 0
+    assert "--phase-step" in run("correlate press.h5").said
 
 
 def test_pictures_are_imported_with_their_phases():
     for number, frame in enumerate(random_stack()):
         cv2.imwrite(f"light{number}.png", frame)
     words = ["--motion", "axial", "--phases", "phases.txt"]
-    assert run("import", ".", *words, "-o", "lights.h5").code == 0
+    assert run("import .", *words, "-o", "lights.h5").code == 0
     with io.open_recording("lights.h5") as recording:
         np.testing.assert_allclose(recording.phase, UNEVEN)
     Path("phases.txt").write_text("1deg 2deg 3deg")
-    ended = run("import", ".", *words, "-o", "no.h5")
+    ended = run("import .", *words, "-o", "no.h5")
     assert ended == (2, "", "mirrorskin: phases.txt lists 3 phases for 8 frames: one a frame is needed\n")
 
 
@@ -140,7 +140,7 @@ def test_bad_input_is_one_line(case):
     Path("seven.txt").write_text(PHASES.rpartition(" ")[0])
     Path("number.txt").write_text("0deg\n45\n90deg")
     before = set(Path().iterdir())
-    refused(said_of, "correlate", "theirs.h5", *words)
+    refused(said_of, "correlate theirs.h5", *words)
     assert set(Path().iterdir()) == before
 
 

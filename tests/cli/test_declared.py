@@ -107,7 +107,7 @@ def test_a_text_that_cannot_be_read_is_refused_with_an_example(term, text, messa
 
 
 def test_help_of_reconstruct_names_the_motions_of_an_option():
-    text = " ".join(run("reconstruct", "--help").out.split())
+    text = " ".join(run("reconstruct --help").out.split())
     assert "--hold FRAMES Press: consecutive" in text
     assert "--tilt ANGLE|estimate Rotation: half-angle" in text
     assert "--contact RES.h5 Slide, twist: where" in text

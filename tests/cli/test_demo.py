@@ -41,7 +41,7 @@ def shown(tmp_path_factory):
         patch.setattr(demo, "PRESSES", small_presses())
         patch.setattr(demo, "TURN", small_turn())
         patch.setattr(canvas, "_DPI", 40)
-        ended = run("demo", "-o", folder)
+        ended = run("demo -o", folder)
     assert ended.code == 0, ended.said
     assert [step.split(":")[0] for step in ended.said.splitlines()] == [f"{n} of 4" for n in range(1, 5)]
     return ended.out.splitlines(), folder
@@ -112,7 +112,7 @@ def cells(row):
 def test_json_has_the_scores_of_each_figure_and_method(small, tmp_path, monkeypatch):
     for figure in ("height", "normal", "surface"):
         monkeypatch.setattr(view, f"{figure}_figure", lambda *given, **style: None)
-    scores = json.loads(run("demo", "-o", tmp_path, "--json").out)
+    scores = json.loads(run("demo -o", tmp_path, "--json").out)
     assert list(scores) == list(FIGURES)
     assert list(scores["fig6"]) == list(PRESSED)
     assert 0 < scores["fig6"]["sub-frame"]["height"]["rms"] < scores["fig6"]["eq. 4"]["height"]["rms"]
@@ -124,11 +124,11 @@ def test_json_has_the_scores_of_each_figure_and_method(small, tmp_path, monkeypa
 
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):
     (tmp_path / "file").touch()
-    said = refused("the folder cannot be created", "demo", "-o", tmp_path / "file" / "demo")
+    said = refused("the folder cannot be created", "demo -o", tmp_path / "file" / "demo")
     assert "Choose another with -o" in said
 
 
 def test_without_matplotlib_nothing_is_computed(tmp_path, monkeypatch):
     monkeypatch.setattr("mirrorskin.view.canvas.find_spec", lambda name: None)
-    refused("pip install 'mirrorskin", "demo", "-o", tmp_path / "demo")
+    refused("pip install 'mirrorskin", "demo -o", tmp_path / "demo")
     assert not (tmp_path / "demo").exists()

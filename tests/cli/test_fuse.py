@@ -83,7 +83,7 @@ def without(name, *lost):
 
 
 def test_a_press_and_a_rotation_become_one_surface():
-    ended = run("fuse", "press.h5", "turn.h5")
+    ended = run("fuse press.h5 turn.h5")
     assert (ended.code, ended.said) == (0, "")
     result = io.open_result("press-fused.h5")
     answered = np.count_nonzero(np.isfinite(result.height))
@@ -97,10 +97,10 @@ def test_a_press_and_a_rotation_become_one_surface():
     assert np.sqrt(np.nanmean(error**2)) < 0.05
     assert abs(error[SHAPE[0] // 2, SHAPE[1] // 2]) < 0.05  # at the top, which neither saw
     assert result.filled[SHAPE[0] // 2, SHAPE[1] // 2] == 1
-    told = run("info", "press-fused.h5").out
+    told = run("info press-fused.h5").out
     assert "map height" in told
     assert "map filled" in told
-    assert "height RMS error" in run("score", "press-fused.h5", "--truth", "press.h5").out
+    assert "height RMS error" in run("score press-fused.h5 --truth press.h5").out
 
 
 def test_json_tells_the_engine_s_surface_and_where_it_came_from():

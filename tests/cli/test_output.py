@@ -47,7 +47,7 @@ ESCAPE = "\x1b]0;owned\x07\x1b[2J\x9b31m\u202e"
 
 def odd_texts(path):
     """Write a recording in whose texts and names codes stand that control terminals."""
-    assert run("simulate", "vertical", "--size", "8x8", "--frames", "4", "-o", path).code == 0
+    assert run("simulate vertical --size 8x8 --frames 4 -o", path).code == 0
     with h5py.File(path, "r+") as file:
         del file["entry/title"]
         file["entry/title"] = f"a{ESCAPE}\nkind  result"

@@ -115,13 +115,7 @@ def test_vectors_have_as_many_lengths_as_are_needed(read, text, millimetres):
 
 @pytest.mark.parametrize(
     ("text", "millimetres_per_newton"),
-    [
-        ("0.01mm/N", 0.01),
-        ("10um/N", 0.01),
-        (" 0.01 mm / N ", 0.01),
-        ("0mm/N", 0.0),
-        ("-1e-5m/N", -0.01),
-    ],
+    [("0.01mm/N", 0.01), ("10um/N", 0.01), (" 0.01 mm / N ", 0.01), ("0mm/N", 0.0), ("-1e-5m/N", -0.01)],
 )
 def test_compliance_is_in_millimetres_a_newton(text, millimetres_per_newton):
     assert compliance(text) == pytest.approx(millimetres_per_newton, rel=1e-12)

@@ -22,28 +22,28 @@ def folder(tmp_path):
 
 def test_a_page_lies_beside_its_result_unless_a_place_is_given(folder, monkeypatch):
     monkeypatch.setattr(contents, "pictures_of", lambda *_: [])  # which take longest
-    ended = run("report", "res.h5", "--section=-0.3mm,0mm:0.3mm,0mm")
+    ended = run("report res.h5 --section=-0.3mm,0mm:0.3mm,0mm")
     assert (ended.code, ended.said) == (0, "")
     assert ended.out.startswith("res-report.html: ")
     assert ended.out.count("\n") == 1
     page = (folder / "res-report.html").read_text(encoding="utf-8")
     assert "<title>res.h5</title>" in page
     assert "section length" in page
-    assert run("report", "res.h5", "-o", "other.html").code == 0
+    assert run("report res.h5 -o other.html").code == 0
     assert "section length" not in (folder / "other.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["res.h5", "-o", "res.h5"], "is the input"),
-        (["nothing.h5"], "nothing.h5"),
-        (["res.h5", "-o", "nowhere/page.html"], "no folder nowhere"),
-        (["res.h5", "--turn", "0"], "leave --turn out"),
-        (["res.h5", "--section", "1,2"], "--section"),
-        (["no-size.h5", "--section", "0mm,0mm:1mm,0mm"], "--pixel-size"),
+        ("res.h5 -o res.h5", "is the input"),
+        ("nothing.h5", "nothing.h5"),
+        ("res.h5 -o nowhere/page.html", "no folder nowhere"),
+        ("res.h5 --turn 0", "leave --turn out"),
+        ("res.h5 --section 1,2", "--section"),
+        ("no-size.h5 --section 0mm,0mm:1mm,0mm", "--pixel-size"),
     ],
 )
 def test_what_cannot_be_done_is_one_line_and_leaves_nothing(folder, words, said):
-    refused(said, "report", *words)
+    refused(said, f"report {words}")
     assert {path.name for path in folder.iterdir()} == {"res.h5", "no-size.h5"}

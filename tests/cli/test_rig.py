@@ -83,7 +83,7 @@ def controller(folder):
 def test_a_sound_rig_is_told_in_a_table_and_nothing_moves(controller):
     machine = controller().machine
     before = machine.position()
-    ended = run("rig", "check", "rig.toml")
+    ended = run("rig check rig.toml")
     assert (ended.code, ended.said) == (0, "")
     assert machine.position() == before
     assert ended.out.split("\n")[0].split() == ["part", "what", "found", "remedy"]
@@ -98,7 +98,7 @@ def test_a_sound_rig_is_told_in_a_table_and_nothing_moves(controller):
 
 def test_a_rig_that_homes_and_moves_is_told_in_json_and_ends_where_it_homed(controller):
     machine = controller(home=True).machine
-    ended = run("rig", "check", "rig.toml", "--move", "--json")
+    ended = run("rig check rig.toml --move --json")
     told = json.loads(ended.out)
     assert (ended.code, ended.said, told["sound"], told["rig"]) == (0, "", True, "rig")
     moves = {one["what"]: one["found"] for one in told["findings"] if one["part"] == "move"}
@@ -111,7 +111,7 @@ def test_a_rig_that_homes_and_moves_is_told_in_json_and_ends_where_it_homed(cont
 def test_what_failed_is_told_in_a_line_and_nothing_is_moved(controller):
     port = controller(home=True, s22=0.0)
     before = port.machine.position()
-    ended = run("rig", "check", "rig.toml", "--move")
+    ended = run("rig check rig.toml --move")
     assert ended.code == 1
     assert ended.said.startswith(
         "mirrorskin: rig.toml: stage, homing ($22): off: the file asks for homing; set stage.home"
@@ -124,19 +124,19 @@ def test_what_failed_is_told_in_a_line_and_nothing_is_moved(controller):
 def test_what_soft_limits_do_not_allow_is_refused_before_anything_moves(controller):
     port = controller(home=True, s20=1.0)
     before = port.machine.position()
-    said = refused("", "rig", "check", "rig.toml", "--move")
+    said = refused("", "rig check rig.toml --move")
     assert re.fullmatch(r"stage .*: stage.pitch.limits are -5 to 5 .* allow -\d+ to 0: .*", said)
     assert port.machine.position() == before
 
 
 def test_a_stage_is_moved_by_hand_within_its_limits(controller):
     machine = controller().machine
-    ended = run("rig", "jog", "rig.toml", "travel", "--by", "0.5mm")
+    ended = run("rig jog rig.toml travel --by 0.5mm")
     assert (ended.code, ended.said) == (0, "")
     assert ended.out.startswith("rig: travel -4.500 mm, pitch 0.000 deg")
     assert machine.position() == pytest.approx({"X": -1.0, "Y": -1.0, "Z": -1.5})
-    refused("beyond the axis", "rig", "jog", "rig.toml", "travel", "--by", "-1mm")
-    assert run("rig", "jog", "rig.toml", "twist", "--by", "1deg").said.startswith(
+    refused("beyond the axis", "rig jog rig.toml travel --by -1mm")
+    assert run("rig jog rig.toml twist --by 1deg").said.startswith(
         "mirrorskin: rig.toml has no [stage.twist]"
     )
 
@@ -148,7 +148,7 @@ def test_a_leaning_stage_is_lifted_upright(controller):
     while port.machine.position()["X"] != 1.0:
         assert time.monotonic() < end
         time.sleep(0.01)
-    ended = run("rig", "lift", "rig.toml")
+    ended = run("rig lift rig.toml")
     assert (ended.code, ended.said) == (0, "")
     assert ended.out.startswith("rig: travel -5.000 mm, pitch 0.000 deg, roll 0.000 deg")
 
@@ -156,10 +156,10 @@ def test_a_leaning_stage_is_lifted_upright(controller):
 def test_an_alarm_is_ended_only_by_unlocking(controller):
     port = controller()
     port.alarm(9)
-    said = refused("locked", "rig", "lift", "rig.toml")
+    said = refused("locked", "rig lift rig.toml")
     assert "'mirrorskin rig unlock'" in said
     assert port.machine.state == "Alarm"
-    assert run("rig", "unlock", "rig.toml").code == 0
+    assert run("rig unlock rig.toml").code == 0
     assert port.machine.state == "Idle"
 
 
@@ -169,20 +169,20 @@ def test_a_hold_of_someone_else_is_left_alone(controller):
     time.sleep(0.05)
     port.machine.receive(b"!")
     time.sleep(0.2)
-    refused("in the state hold", "rig", "check", "rig.toml")
+    refused("in the state hold", "rig check rig.toml")
     assert port.machine.state == "Hold:0"
 
 
 def test_a_stage_with_switches_is_homed_by_hand(controller):
     machine = controller(home=True).machine
-    assert run("rig", "unlock", "rig.toml").out.endswith("locked: home it with 'mirrorskin rig home'\n")
-    assert run("rig", "home", "rig.toml").code == 0
+    assert run("rig unlock rig.toml").out.endswith("locked: home it with 'mirrorskin rig home'\n")
+    assert run("rig home rig.toml").code == 0
     assert machine.position() == pytest.approx({"X": -0.3, "Y": -0.3, "Z": -0.3})
 
 
 def test_a_missing_camera_is_bad_input_and_the_stage_is_told_of_all_the_same(controller):
     controller(changes=[("film.y4m", "none.y4m")])
-    ended = run("rig", "check", "rig.toml")
+    ended = run("rig check rig.toml")
     assert (ended.code, ended.said.count("\n")) == (2, 1)
     assert "none.y4m" in ended.said
     assert "firmware" in ended.out
@@ -191,7 +191,7 @@ def test_a_missing_camera_is_bad_input_and_the_stage_is_told_of_all_the_same(con
 def test_a_missing_port_is_bad_input(folder):
     (folder / "rig.toml").write_text(RIG.format(port="/dev/nowhere", home="true"))
     begun = time.monotonic()
-    refused("/dev/nowhere", "rig", "check", "rig.toml", "--json")
+    refused("/dev/nowhere", "rig check rig.toml --json")
     assert time.monotonic() - begun < 60
 
 
@@ -214,12 +214,12 @@ def test_on_a_terminal_the_table_has_colours(folder, monkeypatch):
 
 
 def test_a_new_rig_file_can_be_loaded_and_is_never_written_over_another(folder):
-    ended = run("rig", "new", "-o", "mine.toml")
+    ended = run("rig new -o mine.toml")
     assert (ended.code, ended.said) == (0, "")
     assert "mirrorskin rig check mine.toml" in ended.out
     assert load_rig("mine.toml").stage.limits.press == 2.0
     before = (folder / "mine.toml").read_bytes()
-    ended = run("rig", "new", "-o", "mine.toml")
+    ended = run("rig new -o mine.toml")
     assert (ended.code, ended.said) == (
         2,
         "mirrorskin: mine.toml exists and is not replaced: choose another name with -o\n",

@@ -56,7 +56,7 @@ def errors(result):
 
 def test_a_rotation_becomes_normals_that_are_scored():
     turn()
-    ended = run("reconstruct", "turn.h5")
+    ended = run("reconstruct turn.h5")
     assert (ended.code, ended.said) == (0, "")
     result = io.open_result("turn-result.h5")
     assert ended.out.startswith("turn-result.h5: normals at 99 of 99 pixels, zenith from ")
@@ -66,12 +66,12 @@ def test_a_rotation_becomes_normals_that_are_scored():
     assert ended.out.count("\n") == 1
     assert np.max(errors(result)) < 2
     assert result.x is not None
-    score = json.loads(run("score", "turn-result.h5", "--truth", "turn.h5", "--json").out)
+    score = json.loads(run("score turn-result.h5 --truth turn.h5 --json").out)
     assert {"normal", "contact", "edges"} <= set(score)
     assert score["normal"]["answered"] == 99
     assert score["normal"]["rms"] < 0.5
-    assert "normal RMS error" in run("score", "turn-result.h5", "--truth", "turn.h5").out
-    assert "map normals" in run("info", "turn-result.h5").out
+    assert "normal RMS error" in run("score turn-result.h5 --truth turn.h5").out
+    assert "map normals" in run("info turn-result.h5").out
 
 
 def rise(radius):
@@ -91,8 +91,8 @@ def test_the_normals_become_heights_in_millimetres():
     assert np.all(result.component == 0)
     np.testing.assert_array_equal(result.offset_unknown, [1])
     assert np.all(result.height_sigma > 0)
-    assert "map component" in run("info", "out.h5").out
-    assert "height" in json.loads(run("score", "out.h5", "--truth", "turn.h5", "--json").out)
+    assert "map component" in run("info out.h5").out
+    assert "height" in json.loads(run("score out.h5 --truth turn.h5 --json").out)
 
 
 def test_without_a_pixel_size_there_are_no_heights_and_a_line_says_why():
@@ -113,7 +113,7 @@ def test_a_surface_that_was_not_found_is_one_line_and_no_file(monkeypatch):
     turn()
     monkeypatch.setattr("mirrorskin.engine.rotation.normals_to_height.integrate", fails)
     before = set(Path().iterdir())
-    ended = run("reconstruct", "turn.h5")
+    ended = run("reconstruct turn.h5")
     line = "mirrorskin: turn.h5: the residual is 0.3 after 100 iterations: allow more\n"
     assert (ended.code, ended.out, ended.said) == (1, "", line)
     assert set(Path().iterdir()) == before
@@ -178,7 +178,7 @@ def test_without_a_gain_there_is_no_zenith_and_a_line_says_why():
     assert not {"zenith", "normals", "normals_sigma"} & set(result.maps())
     np.testing.assert_allclose(np.cos(result.azimuth - AZIMUTH), 1, atol=0.01)
     json.loads(reconstruct("--json")[1].out)
-    score = json.loads(run("score", "out.h5", "--truth", "turn.h5", "--json").out)
+    score = json.loads(run("score out.h5 --truth turn.h5 --json").out)
     assert "normal" not in score
     assert score["azimuth"]["rms"] < 5
 
@@ -212,7 +212,7 @@ FOR = {"--modulus": "presses, slides and twists"}
 @pytest.mark.parametrize("option", PRESS)
 def test_options_of_a_press_are_refused_for_a_rotation(option):
     turn()
-    told = refused("", "reconstruct", "turn.h5", option, *PRESS[option])
+    told = refused("", "reconstruct turn.h5", option, *PRESS[option])
     # Of a pair of opposites the first is named.
     name = option.replace("--no-", "--")
     assert told == f"{name} applies to {FOR.get(name, 'presses')} only; turn.h5 is a rotation. Remove it"
@@ -223,14 +223,14 @@ def test_options_of_a_rotation_are_refused_for_a_press(option):
     record(sphere(), Path("press.h5"))
     Path("phases.txt").write_text("1deg")
     Path("turn.h5").touch()
-    told = refused("", "reconstruct", "press.h5", option, *ROTATION[option])
+    told = refused("", "reconstruct press.h5", option, *ROTATION[option])
     assert told == f"{option} applies to rotations only; press.h5 is a press. Remove it"
 
 
 @pytest.mark.parametrize("motion", ["horizontal", "twist"])
 def test_a_motion_without_a_method_is_refused_whatever_the_options(motion):
     record(sphere(), Path("press.h5"))
-    refused(motion, "reconstruct", "press.h5", "--motion", motion, "--threshold", "0.3")
+    refused(motion, "reconstruct press.h5 --motion", motion, "--threshold", "0.3")
 
 
 CASES = {
@@ -266,12 +266,12 @@ def test_bad_input_is_one_line(case):
     Path("seven.txt").write_text("0deg 45deg 90deg 135deg 180deg 225deg 270deg")
     io.save_result(io.Result(zenith=np.zeros(SHAPE, np.float32)), "flat.h5")
     io.save_result(io.Result(height=np.zeros((2, 3), np.float32)), "small.h5")
-    refused(said_of, "reconstruct", "turn.h5", *words)
+    refused(said_of, "reconstruct turn.h5", *words)
 
 
 def test_two_phases_half_a_turn_apart_are_a_body_that_rocks():
     turn()
-    ended = done("reconstruct", "turn.h5", "--phase-step", "180deg", "-o", "rocked.h5")
+    ended = done("reconstruct turn.h5 --phase-step 180deg -o rocked.h5")
     assert "slope at" in ended.out
     assert io.open_result("rocked.h5").normals is None
 
@@ -280,4 +280,4 @@ def test_two_frames_are_no_rotation():
     with h5py.File("two.h5", "w") as file:
         file["frames"] = np.zeros((2, *SHAPE), np.uint8)
     words = ["--motion", "axial", "--phase-step", "45deg", "--tilt", "2.5deg", "--zenith-gain", "4/deg"]
-    refused("2 different phases", "reconstruct", "two.h5", *words)
+    refused("2 different phases", "reconstruct two.h5", *words)

@@ -92,10 +92,7 @@ def test_files_of_one_name_are_two_modules():
 def test_counts_are_written_without_a_unit(text):
     refused(
         f"--level {text}: a number of counts is needed, without a unit",
-        "run",
-        "mine_of_a_test:Light",
-        "press.h5",
-        "--level",
+        "run mine_of_a_test:Light press.h5 --level",
         text,
     )
 
@@ -182,9 +179,9 @@ def test_declared_options_arrive_in_their_unit_and_in_the_process():
     assert json.loads(run(*DEEP, "--tilt", "estimate", "--json").out)["process"]["tilt"] == "estimate"
 
 
-@pytest.mark.parametrize("words", [["--help"], ["press.h5", "--help"]])
+@pytest.mark.parametrize("words", ["--help", "press.h5 --help"])
 def test_help_shows_the_options_of_the_class(words):
-    ended = run("run", "mine_of_a_test.py:Deep", *words)
+    ended = run(f"run mine_of_a_test.py:Deep {words}")
     assert (ended.code, ended.said) == (0, "")
     text = " ".join(ended.out.split())
     assert "--travel-offset LENGTH Added to each travel. [default: 0mm]" in text
@@ -246,7 +243,7 @@ def test_built_in_operations_and_methods_run_as_in_python(name, recordings):
 
 def test_what_a_module_itself_lacks_is_not_hidden():
     with pytest.raises(ModuleNotFoundError, match="no_such_module_at_all"):
-        run("run", "lost_of_a_test:Light", "press.h5")
+        run("run lost_of_a_test:Light press.h5")
 
 
 def test_what_the_page_says_runs():

@@ -57,11 +57,11 @@ def test_what_a_sensor_is_calibrated_with_is_all_there(sample):
 
 
 def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
-    refused("cannot be created", "sample", "pictures", "-o", tmp_path / "none" / "frames")
+    refused("cannot be created", "sample pictures -o", tmp_path / "none" / "frames")
 
 
 def test_a_name_that_is_no_video_is_refused_in_one_line(tmp_path, capfd):
-    refused("ends in .avi", "sample", "video", "-o", tmp_path / "press.txt")
+    refused("ends in .avi", "sample video -o", tmp_path / "press.txt")
     assert capfd.readouterr().err == ""  # nor does OpenCV print anything
 
 
@@ -77,7 +77,7 @@ def score(sample):
 
 def test_the_stack_s_heights_are_right_without_more_options(sample, score):
     sample("stack", "theirs.h5")
-    assert run("reconstruct", "theirs.h5", "--dataset", "/raw/images", *KNOWN, "-o", "heights.h5").code == 0
+    assert run("reconstruct theirs.h5 --dataset /raw/images", *KNOWN, "-o", "heights.h5").code == 0
     score("heights.h5")
 
 
@@ -85,5 +85,5 @@ def test_the_stack_s_heights_are_right_without_more_options(sample, score):
 def test_heights_of_imported_frames_are_right_without_more_options(name, file, sample, score):
     sample(name, file)
     assert run("import", file, "-o", "press.h5", *KNOWN).code == 0
-    assert run("reconstruct", "press.h5").code == 0
+    assert run("reconstruct press.h5").code == 0
     score("press-result.h5")

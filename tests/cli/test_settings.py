@@ -266,10 +266,7 @@ class Band(engine.Operation):
             "[operation]\nclass = 'mirrorskin.engine:ChangePoint'\nthreshold = 0",
             "b.toml: operation.threshold 0.0: a change-point needs a share",
         ),
-        (
-            "[operation]\nclass = 'mine.py:Band'\nlow = 2.0",
-            "b.toml: operation: a band needs low below high",
-        ),
+        ("[operation]\nclass = 'mine.py:Band'\nlow = 2.0", "b.toml: operation: a band needs low below high"),
         (
             "[operation]\nclass = 'mirrorskin.engine:Onset'\n[press]\nhold = 2",
             "b.toml: press is not known: there are stack, operation",

@@ -62,16 +62,8 @@ def test_strokes_go_up_and_down_as_far_as_the_steps_would():
         "vertical", "--travel-start", "0.5mm", "--travel-step", "0.2mm", "--strokes", "2", "--frames", "5"
     )
     np.testing.assert_allclose(found.travel, 0.5 + 0.8 * np.array([0, 0.5, 1, 0.5, 0]), atol=1e-12)
-    refused(
-        "--strokes applies to presses only; this is a rotation",
-        "simulate",
-        "axial",
-        "--strokes",
-        "3",
-        "-o",
-        "a.h5",
-    )
-    refused("leave --release out", "simulate", "vertical", "--strokes", "3", "--release", "-o", "a.h5")
+    refused("--strokes applies to presses only; this is a rotation", "simulate axial --strokes 3 -o a.h5")
+    refused("leave --release out", "simulate vertical --strokes 3 --release -o a.h5")
 
 
 def test_a_body_rocks_or_spirals_as_it_is_told():
@@ -106,8 +98,8 @@ def test_an_object_lies_where_it_is_shifted_to(contact):
     for name in ("height", "zenith", "azimuth", "contact"):
         moved = getattr(shifted, name)[down:, right:]
         np.testing.assert_allclose(moved, getattr(centred, name)[:-down, :-right], atol=1e-5, err_msg=name)
-    refused("2 lengths are needed", "simulate", "vertical", "--object-shift", "1mm", "-o", "a.h5")
-    refused("larger than the sensor", "simulate", "vertical", "--object-shift", "50mm,0mm", "-o", "a.h5")
+    refused("2 lengths are needed", "simulate vertical --object-shift 1mm -o a.h5")
+    refused("larger than the sensor", "simulate vertical --object-shift 50mm,0mm -o a.h5")
 
 
 @pytest.mark.parametrize("contact", ["conform", "elastic"])
@@ -147,7 +139,7 @@ def test_elastic_contact_knows_where_the_sheet_slips(motion):
 
 def documented():
     """Return the defaults that --help tells, by option."""
-    code, out, _ = run("simulate", "--help")
+    code, out, _ = run("simulate --help")
     assert code == 0
     entries = re.split(r"\n\s+(?=--|-o)", out)
     found = {}
@@ -208,7 +200,7 @@ def test_without_options_the_field_is_the_documented_one(asked, monkeypatch):
         raise io.InputError("enough is known")
 
     monkeypatch.setattr(hw, "Twin", refuse)
-    refused("enough is known", "simulate", "vertical", "-o", "a.h5")
+    refused("enough is known", "simulate vertical -o a.h5")
     rows, columns = asked[0]["shape"]
     assert f"{columns}x{rows}" == told["--size"] == "480x480"
     assert asked[0]["pixel_size"] == (0.025, 0.025)
@@ -434,12 +426,12 @@ def test_what_cannot_be_is_refused_in_one_line(case):
 
 def test_a_refusal_leaves_the_recording_that_was_there():
     Path("a.h5").write_bytes(b"as it was")
-    refused("tilt", "simulate", "axial", *SMALL, "--tilt", "0deg", "-o", "a.h5", "--overwrite")
+    refused("tilt", "simulate axial", *SMALL, "--tilt", "0deg", "-o", "a.h5", "--overwrite")
 
 
 def test_an_input_is_not_overwritten_but_a_name_is_no_input():
     picture("wall.png")
-    refused("is the input", "simulate", "vertical", *WALL, "--pattern", "wall.png", "-o", "wall.png")
+    refused("is the input", "simulate vertical", *WALL, "--pattern", "wall.png", "-o", "wall.png")
     Path("sphere").mkdir()
     for again in ([], ["--overwrite"]):
         words = ("simulate", "vertical", *SMALL, "--frames", "2", *EXACT, "-o", "sphere/a.h5")
@@ -540,8 +532,8 @@ def test_frames_are_packed_as_asked(packing):
 @pytest.mark.parametrize("motion", ["horizontal", "twist"])
 def test_slides_and_twists_tell_their_motion_and_press(motion):
     assert run("simulate", motion, *SMALL, "--frames", "3", *EXACT, "-o", "a.h5").code == 0
-    facts = done("info", "a.h5")
+    facts = done("info a.h5")
     assert re.search(rf"motion +{motion}\n", facts.out)
     assert re.search(r"press +1 mm\n", facts.out)
     io.save_result(io.Result(height=np.zeros((4, 7), np.float32)), "r.h5")
-    refused("not of one stack", "score", "r.h5", "--truth", "a.h5")
+    refused("not of one stack", "score r.h5 --truth a.h5")

@@ -71,10 +71,7 @@ def test_a_slide_agrees_with_the_truth(slide, found):
     assert json.loads(ended.out)["slip"]["unit"] == "mm"
 
 
-@pytest.mark.parametrize(
-    ("motion", "words"),
-    [("horizontal", "--friction 0.5"), ("twist", "--friction 0.8")],
-)
+@pytest.mark.parametrize(("motion", "words"), [("horizontal", "--friction 0.5"), ("twist", "--friction 0.8")])
 def test_skin_at_coarse_pixels_is_not_told_to_slip_before_it_does(motion, words, tmp_path):
     path = tmp_path / "coarse.h5"
     scene = SCENE.replace("64x64", "96x96").replace("--friction 0.6", words).split()

@@ -38,7 +38,7 @@ def test_presses_of_an_object_wider_than_the_field_become_all_of_it():
     for number, along in enumerate((0.0, 1.13, -1.06)):
         shift = f"--object-shift={along}mm,0.07mm"
         words = "--object", "wide.npy", *field.split(), shift, "-o", f"{number}.h5"
-        assert run("simulate", "vertical", *words).code == 0
+        assert run("simulate vertical", *words).code == 0
         assert run("reconstruct", f"{number}.h5").code == 0
     done("stitch", *(f"{number}-result.h5" for number in range(3)), "-o", "whole.h5")
     whole = io.open_result("whole.h5")

@@ -20,7 +20,7 @@ UNBUFFERED = pytest.mark.parametrize("unbuffered", ["", "1"])
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     path = tmp_path_factory.mktemp("streams") / "press.h5"
-    assert run("simulate", "vertical", "--size", "8x8", "--frames", "4", "-o", path).code == 0
+    assert run("simulate vertical --size 8x8 --frames 4 -o", path).code == 0
     return path
 
 

@@ -92,7 +92,7 @@ def connected(settings: RigSettings) -> socket.socket:
     ],
 )
 def test_what_cannot_be_served_is_refused(words: tuple[str, ...], told: str, tmp_path: Path) -> None:
-    refused(told, "twin", "serve", "-o", tmp_path / "rig", *SMALL, *words)
+    refused(told, "twin serve -o", tmp_path / "rig", *SMALL, *words)
     assert not (tmp_path / "rig").exists()
 
 

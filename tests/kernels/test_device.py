@@ -130,10 +130,7 @@ def test_arguments_are_named_and_numbers_become_what_the_source_says(device):
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        (
-            {"words": None, "size": 1},
-            r"missing: \['count'\]; unknown: \['size'\]; it takes",
-        ),
+        ({"words": None, "size": 1}, r"missing: \['count'\]; unknown: \['size'\]; it takes"),
         ({"words": 1, "count": 1}, "words takes an array"),
         ({"words": None, "count": 0.5}, "count cannot be 0.5"),
         ({"words": None, "count": 2**31}, "count cannot be 2147483648"),

@@ -501,11 +501,7 @@ def lit(found, expected, values):
 @case("wall_light", {"wall": WALLS}, checks={"light": lit})
 def _(wall):
     """Return mirrors of any zenith and azimuth, many of them flat, at places some of which are outside."""
-    (kind, gap, lamps, oblique), rng, pixels = (
-        wall,
-        np.random.default_rng(1),
-        1500,
-    )  # more than a tile
+    (kind, gap, lamps, oblique), rng, pixels = (wall, np.random.default_rng(1), 1500)  # more than a tile
     rows, both = np.repeat(rng.random((12, 1)), 5, axis=1), rng.random((9, 14))
     both = np.pad(np.pad(both, ((1, 1), (0, 0)), "edge"), ((0, 0), (1, 1)), "wrap")
     table = np.full((3, 3), 0.75), rows, both, np.ones((3, 3))

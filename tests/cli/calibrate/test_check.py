@@ -30,7 +30,7 @@ def save(path, shape=SHAPE):
 
 
 def check(folder, *words):
-    return run("calibrate", "check", folder / "press.h5", "--calibration", folder / "cal.h5", *words)
+    return run("calibrate check", folder / "press.h5", "--calibration", folder / "cal.h5", *words)
 
 
 def test_the_errors_left_are_told_in_a_table(folder):

@@ -57,7 +57,7 @@ def quick(monkeypatch):
 
 
 def test_a_ball_becomes_a_gel_in_the_file_and_is_told_in_a_line():
-    ended = done("calibrate", "elastic", "ball.h5", "--ball", "4mm", "-o", "cal.h5")
+    ended = done("calibrate elastic ball.h5 --ball 4mm -o cal.h5")
     assert ended.out.startswith("cal.h5: bright from ")
     assert len(ended.out.splitlines()) == 1
     assert "curvature: not determined by the presses" in ended.said
@@ -69,7 +69,7 @@ def test_a_ball_becomes_a_gel_in_the_file_and_is_told_in_a_line():
     assert calibration.process["elastic.pixel_size_x"] == pytest.approx(
         calibration.process["elastic.pixel_size_y"]
     )
-    again = run("calibrate", "elastic", "ball.h5", "--ball", "4mm", "-o", "cal.h5", "--json")
+    again = run("calibrate elastic ball.h5 --ball 4mm -o cal.h5 --json")
     told = json.loads(again.out)
     assert told["gel"]["threshold"] == pytest.approx(calibration.gel.threshold)
     assert told["balls"][0]["pixels"] > 200
@@ -78,17 +78,17 @@ def test_a_ball_becomes_a_gel_in_the_file_and_is_told_in_a_line():
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        ([], "no recordings"),
-        (["ball.h5", "--rig", "rig.toml"], "leave one of them out"),
-        (["ball.h5", "--press", "1mm"], "--press applies to presses on a rig"),
-        (["ball.h5", "--sheet", "-1mm"], "--sheet -1mm: a thickness must not be negative"),
-        (["turn.h5"], "axial motion"),
-        (["none.h5"], "none.h5"),
+        ("", "no recordings"),
+        ("ball.h5 --rig rig.toml", "leave one of them out"),
+        ("ball.h5 --press 1mm", "--press applies to presses on a rig"),
+        ("ball.h5 --sheet -1mm", "--sheet -1mm: a thickness must not be negative"),
+        ("turn.h5", "axial motion"),
+        ("none.h5", "none.h5"),
     ],
 )
 def test_what_cannot_be_learned_from_is_refused_in_a_line(words, complaint):
     Path("rig.toml").touch()
-    refused(complaint, "calibrate", "elastic", *words, "--ball", "4mm", "-o", "cal.h5")
+    refused(complaint, f"calibrate elastic {words} --ball 4mm -o cal.h5")
 
 
 def test_a_rig_presses_the_ball_at_each_place(monkeypatch):
@@ -101,7 +101,7 @@ def test_a_rig_presses_the_ball_at_each_place(monkeypatch):
     monkeypatch.setattr(inputs, "take", take)
     Path("rig.toml").touch()
     words = ["--rig", "rig.toml", "--places", "2", "--press", "0.9mm", "--travel-step", "0.05mm"]
-    ended = run("calibrate", "elastic", "--ball", "4mm", "-o", "cal.h5", *words)
+    ended = run("calibrate elastic --ball 4mm -o cal.h5", *words)
     assert "stop here" in ended.said
     assert [place.name for place in asked] == ["elastic-1", "elastic-2"]
     assert asked[0].plan == VerticalPlan(0.0, 0.9, step=0.05)

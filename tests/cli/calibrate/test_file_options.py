@@ -136,7 +136,7 @@ def test_a_wrong_calibration_is_refused_by_reconstruct(known, change, said):
     save(**known)
     if change is not None:
         change(Path("cal.h5"))
-    refused(said.format("press.h5"), "reconstruct", "press.h5", "-o", "out.h5", "--calibration", "cal.h5")
+    refused(said.format("press.h5"), "reconstruct press.h5 -o out.h5 --calibration cal.h5")
     assert not Path("out.h5").exists()
 
 
@@ -157,7 +157,7 @@ def test_the_calibration_is_not_overwritten():
     press()
     save()
     before = Path("cal.h5").read_bytes()
-    refused("is the input", "reconstruct", "press.h5", "-o", "cal.h5", "--calibration", "cal.h5")
+    refused("is the input", "reconstruct press.h5 -o cal.h5 --calibration cal.h5")
     assert Path("cal.h5").read_bytes() == before
 
 

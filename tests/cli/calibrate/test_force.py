@@ -47,51 +47,51 @@ def here(folder, tmp_path):
 
 def test_presses_and_a_scale_become_a_modulus_that_reconstruct_uses(folder):
     presses = [f"press-{number}.h5" for number in range(3)]
-    ended = done("calibrate", "force", *presses, "--readings", "scale.csv", "-o", "cal.h5")
+    ended = done("calibrate force", *presses, "--readings", "scale.csv", "-o", "cal.h5")
     assert ended.out.startswith("cal.h5: modulus ")
     assert "held-out forces wrong by" in ended.out
     known = io.open_calibration("cal.h5")
     assert known.stiffness.modulus == pytest.approx(MODULUS, rel=0.03)
     assert known.process["force.sources"] == ", ".join(presses)
-    ended = run("reconstruct", "press-1.h5", "--calibration", "cal.h5", "-o", "a.h5")
+    ended = run("reconstruct press-1.h5 --calibration cal.h5 -o a.h5")
     result = io.open_result("a.h5")
     assert "force 0." in ended.out
-    told = run("info", "a.h5").out
+    told = run("info a.h5").out
     assert "force_sigma" in told
     assert "MPa of the calibration" in told
     assert result.force == pytest.approx(folder[1][1], rel=0.03)
     words = [word for force in folder[1] for word in ("--force", f"{1000 * force}mN")]
-    again = run("calibrate", "force", *presses, *words, "--force-sigma", "1mN", "-o", "cal.h5", "--json")
+    again = run("calibrate force", *presses, *words, "--force-sigma", "1mN", "-o", "cal.h5", "--json")
     told = json.loads(again.out)
     assert told["stiffness"]["modulus"] == pytest.approx(known.stiffness.modulus, rel=0.01)
     assert [one["recording"] for one in told["presses"]] == presses
-    shown = run("calibrate", "show", "cal.h5").out
+    shown = run("calibrate show cal.h5").out
     assert "modulus" in shown
     assert "kPa" in shown
 
 
 def test_a_modulus_can_be_given(folder):
-    run("reconstruct", "press-1.h5", "--calibration", "cal.h5", "--modulus", "120kPa", "-o", "a.h5")
+    run("reconstruct press-1.h5 --calibration cal.h5 --modulus 120kPa -o a.h5")
     assert io.open_result("a.h5").force == pytest.approx(folder[1][1], rel=0.03)
-    refused("calibrate elastic first", "reconstruct", "press-1.h5", "--modulus", "120kPa", "-o", "b.h5")
+    refused("calibrate elastic first", "reconstruct press-1.h5 --modulus 120kPa -o b.h5")
     assert not Path("b.h5").exists()
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ([], "either as --force, one per recording, or as --readings"),
-        (["--force", "1N", "--readings", "scale.csv"], "either as --force"),
-        (["--force", "1N", "--force", "2N"], "1 recordings and 2 times --force"),
-        (["--force", "1mm"], "force"),
-        (["--force", "-1N"], "a force above 0 is needed; write e.g. 1.5N"),
-        (["--readings", "none.csv"], "none.csv: no such file"),
-        (["--readings", "other.csv"], "other.csv has no line for press-0.h5"),
-        (["--readings", "bad.csv"], "is not a force: write REC.h5,newtons"),
-        (["--force", "1N", "-o", "new.h5"], "new.h5 has no gel"),
+        ("", "either as --force, one per recording, or as --readings"),
+        ("--force 1N --readings scale.csv", "either as --force"),
+        ("--force 1N --force 2N", "1 recordings and 2 times --force"),
+        ("--force 1mm", "force"),
+        ("--force -1N", "a force above 0 is needed; write e.g. 1.5N"),
+        ("--readings none.csv", "none.csv: no such file"),
+        ("--readings other.csv", "other.csv has no line for press-0.h5"),
+        ("--readings bad.csv", "is not a force: write REC.h5,newtons"),
+        ("--force 1N -o new.h5", "new.h5 has no gel"),
     ],
 )
 def test_a_wrong_call_is_one_line(words, said):
     Path("other.csv").write_text("press-9.h5,1.0\n")
     Path("bad.csv").write_text("name,newtons\npress-0.h5,much\n")
-    refused(said, "calibrate", "force", "press-0.h5", "-o", "cal.h5", *words)
+    refused(said, f"calibrate force press-0.h5 -o cal.h5 {words}")

@@ -31,9 +31,7 @@ def scene(tmp_path_factory):
 
 
 def references(scene, path, *words, dark="dark.h5", bright="bright.h5"):
-    return run(
-        "calibrate", "references", "--dark", scene / dark, "--bright", scene / bright, "-o", path, *words
-    )
+    return run("calibrate references --dark", scene / dark, "--bright", scene / bright, "-o", path, *words)
 
 
 def test_a_dark_and_a_bright_recording_become_references(scene, tmp_path):
@@ -95,7 +93,7 @@ def test_a_camera_whose_dark_level_is_cut_off_is_told(scene, tmp_path):
 def test_a_call_that_cannot_be_is_one_line(scene, tmp_path, monkeypatch, words, said):
     monkeypatch.chdir(scene)
     Path("rig.toml").touch()
-    refused(said, "calibrate", "references", "-o", tmp_path / "cal.h5", *words)
+    refused(said, "calibrate references -o", tmp_path / "cal.h5", *words)
     assert not (tmp_path / "cal.h5").exists()
 
 
@@ -111,7 +109,7 @@ def test_a_rig_is_asked_for_the_dark_and_for_the_ball_at_each_place(scene, tmp_p
     monkeypatch.setattr(inputs, "still_plan", lambda rig, travel=None: travel)
     Path("rig.toml").touch()
     words = ("--rig", "rig.toml", "--rolled", "--press", "1.5mm", "--places", "3", "--frames", "7")
-    done("calibrate", "references", "-o", tmp_path / "cal.h5", *words)
+    done("calibrate references -o", tmp_path / "cal.h5", *words)
     assert [place.name for place in asked] == ["dark", "bright-1", "bright-2", "bright-3"]
     assert [place.plan for place in asked] == [None, 1.5, 1.5, 1.5]
     assert all(place.frames == 4 for place in asked)

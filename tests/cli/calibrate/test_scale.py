@@ -36,7 +36,7 @@ def recorded(frames, path="rec.h5", camera="lab"):
 
 
 def calibrate(*words):
-    return run("calibrate", "scale", *words)
+    return run("calibrate scale", *words)
 
 
 def test_a_picture_becomes_a_lens_in_a_file():
@@ -111,7 +111,7 @@ def test_what_is_no_picture_of_the_board_is_refused(words, said, tmp_path):
 
 
 def test_a_board_is_painted_in_its_true_size():
-    ended = done("calibrate", "board", "--board", CHARUCO, "-o", "board.png", "--dpi", "508")
+    ended = done("calibrate board --board", CHARUCO, "-o", "board.png", "--dpi", "508")
     assert "18.00 x 14.00 mm" in ended.out
     data = Path("board.png").read_bytes()
     at = data.index(b"pHYs") + 4

@@ -29,7 +29,7 @@ def saved(tmp_path):
 
 
 def test_a_calibration_is_told_in_a_table(saved):
-    ended = done("calibrate", "show", saved)
+    ended = done("calibrate show", saved)
     head, *lines = ended.out.splitlines()
     assert head.split() == ["part", "what", "value", "standard", "error", "unit"]
     assert {line.split()[0] for line in lines} == {
@@ -58,7 +58,7 @@ def test_a_terminal_gets_a_table_without_repeated_words(saved, monkeypatch):
 
 
 def test_machines_get_numbers_and_how_they_came_about(saved):
-    told = json.loads(run("calibrate", "show", saved, "--json").out)
+    told = json.loads(run("calibrate show", saved, "--json").out)
     by_name = {(one["part"], one["what"]): one for one in told["numbers"]}
     assert by_name["tilt", "pivot z"] == {
         "part": "tilt",
@@ -75,6 +75,6 @@ def test_machines_get_numbers_and_how_they_came_about(saved):
 def test_pictures_go_into_a_folder(tmp_path):
     path, folder = tmp_path / "cal.h5", tmp_path / "pictures"
     io.save_calibration(a_calibration(only=("precession",)), path)
-    ended = done("calibrate", "show", path, "-o", folder)
+    ended = done("calibrate show", path, "-o", folder)
     assert ended.out.endswith(f"{folder}: tilt.png\n")
     assert [one.name for one in folder.iterdir()] == ["tilt.png"]

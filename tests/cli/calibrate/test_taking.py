@@ -59,7 +59,7 @@ def test_each_place_is_asked_for_and_becomes_a_recording_beside_the_calibration(
 def test_who_does_not_press_enter_takes_nothing(rig_file, tmp_path, enter):
     enter(0)
     words = ("--rig", rig_file, "-o", tmp_path / "cal.h5", "--frames", "2")
-    ended = run("calibrate", "references", *words)
+    ended = run("calibrate references", *words)
     assert ended.code == 130
     assert not list(tmp_path.iterdir())
 
@@ -88,7 +88,7 @@ def test_references_are_taken_until_their_noise_is_as_stated(rig_file, tmp_path,
     _record_flat_field(bright)
     path = tmp_path / "cal.h5"
     words = ("--rig", rig_file, "--bright", bright, "-o", path, "--noise", "0.45", "--frames", "4", "--json")
-    ended = done("calibrate", "references", *words)
+    ended = done("calibrate references", *words)
     told = json.loads(ended.out)
     assert told["dark"]["frames"] > 4
     assert told["dark"]["sigma"] <= 0.45

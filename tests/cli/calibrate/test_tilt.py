@@ -61,7 +61,7 @@ def header(press, **known):
 
 
 def tilt(*words):
-    return run("calibrate", "tilt", "-o", "cal.h5", "--ball", "4mm", *words)
+    return run("calibrate tilt -o cal.h5 --ball 4mm", *words)
 
 
 def test_a_flat_and_a_ball_become_a_precession_in_a_file():

@@ -53,7 +53,7 @@ def response():
 
 def calibrate(*words, presses=5):
     names = [f"place-{number}.h5" for number in range(1, presses + 1)]
-    return run("calibrate", "zenith", *names, "-o", "cal.h5", "--ball", "4mm", *words)
+    return run("calibrate zenith", *names, "-o", "cal.h5", "--ball", "4mm", *words)
 
 
 def test_a_response_is_added_to_a_calibration(folder, fitted):
