@@ -41,82 +41,12 @@ SOLVED: Tolerance = (0.0, 1e-4)  # mm: the integration's own tolerance
 SIGMA: Tolerance = (1e-2, 1e-7)
 FITTED: Tolerance = (1e-5, 1e-7)  # what least squares in double precision settle at
 NORMAL: Tolerance = (1e-5, 2e-6)  # of unit vectors in single precision
+ONSET = {"height": HEIGHT, "height_sigma": HEIGHT, "process": FITTED}
 SMALL = (19, 26)
 
 
-def onset_maps(found: io.Result) -> Answer:
-    """Return what a search for an onset finds."""
-    return {
-        "height": found.height,
-        "sigma": found.height_sigma,
-        "status": found.status,
-        "frame": found.frame,
-        "noise": found.process["noise"],
-    }
-
-
-def wave_maps(found: io.Result) -> Answer:
-    """Return what a correlation finds."""
-    return {
-        "mean": found.mean,
-        "cosine": found.cosine,
-        "sine": found.sine,
-        "residual": found.residual,
-        "frames": found.process["frames"],
-        "modulation": found.modulation,
-        "azimuth": found.azimuth,
-    }
-
-
-def normal_maps(found: io.Result) -> Answer:
-    """Return what an estimate of normals finds."""
-    process = found.process
-    return {
-        "vectors": found.normals,
-        "sigma": found.normals_sigma,
-        "contact": found.contact,
-        "mean": found.mean,
-        "cosine": found.cosine,
-        "sine": found.sine,
-        "residual": found.residual,
-        "numbers": np.array([process["noise"], process["shot_noise"], process["tilt"]]),
-        "counts": np.array([process["turns"], process["frames"]]),
-        "zenith": found.zenith,
-    }
-
-
-def surface_maps(found: io.Result) -> Answer:
-    """Return the maps of an integration, without the number of iterations."""
-    return {
-        "height": found.height,
-        "sigma": found.height_sigma,
-        "component": found.component,
-        "offset_unknown": found.offset_unknown.astype(bool),
-        "filled": found.filled,
-        "edges": found.edges,
-        "converged": found.process["integration_converged"],
-        "method": found.process["integration"],
-        "invalid": found.process["integration_invalid"],
-    }
-
-
-def fused_maps(found: io.Result) -> Answer:
-    """Return what a fusion finds; it raises an exception if it does not converge."""
-    return {
-        "height": found.height,
-        "sigma": found.height_sigma,
-        "component": found.component,
-        "offset_unknown": found.offset_unknown.astype(bool),
-        "filled": found.filled,
-        "edges": found.edges,
-        "converged": True,
-        "method": found.process["integration"],
-        "invalid": 0,
-    }
-
-
 def result_maps(found: io.Result) -> Answer:
-    """Return what a reconstruction tells, and with what it was made."""
+    """Return all maps of a result, its axes, and how it was made."""
     known = {"process": dict(found.process), "offset_unknown": found.offset_unknown}
     return {**found.maps(), "x": found.x, "y": found.y, **known}
 
@@ -172,39 +102,39 @@ def onset_of(dtype: str, **options: Any) -> Answer:
     """Find the onset with the levels of each pixel."""
     frames, travel = press(dtype)
     dark, bright = level_maps(dtype, frames.shape[1:])
-    return onset_maps(engine.find_onset(frames, travel, dark=dark, bright=bright, **options))
+    return result_maps(engine.find_onset(frames, travel, dark=dark, bright=bright, **options))
 
 
-@case(height=HEIGHT, sigma=HEIGHT)
+@case(**ONSET)
 def find_onset_uint8() -> Answer:
     return onset_of("uint8")
 
 
-@case(height=HEIGHT, sigma=HEIGHT)
+@case(**ONSET)
 def find_onset_uint16() -> Answer:
     return onset_of("uint16")
 
 
-@case(height=HEIGHT, sigma=HEIGHT)
+@case(**ONSET)
 def find_onset_float32() -> Answer:
     return onset_of("float32")
 
 
-@case(height=HEIGHT, sigma=HEIGHT)
+@case(**ONSET)
 def find_onset_with_one_level_for_all() -> Answer:
     frames, travel = press("uint8", (48, 64), 24)
     dark, bright = LEVELS["uint8"]
     wide = engine.find_onset(frames, travel, dark=dark, bright=bright)
     bright_only = engine.find_onset(frames, travel, bright=bright)
-    return named(both=onset_maps(wide), bright=onset_maps(bright_only))
+    return named(both=result_maps(wide), bright=result_maps(bright_only))
 
 
-@case(height=HEIGHT, sigma=HEIGHT)
+@case(**ONSET)
 def find_onset_as_printed() -> Answer:
     return onset_of("uint8", subframe=False)
 
 
-@case(height=HEIGHT, sigma=HEIGHT)
+@case(**ONSET)
 def find_onset_options() -> Answer:
     return named(
         hold=onset_of("uint8", hold=4),
@@ -213,44 +143,44 @@ def find_onset_options() -> Answer:
     )
 
 
-@case(height=HEIGHT, sigma=HEIGHT)
+@case(**ONSET)
 def find_onset_of_a_release() -> Answer:
     answers = {}
     for dtype in LEVELS:
         frames, travel = press(dtype, seed=4)
         low, high = level_maps(dtype, frames.shape[1:])
         back = np.ascontiguousarray(frames[::-1])
-        answers[dtype] = onset_maps(
+        answers[dtype] = result_maps(
             engine.find_onset(back, travel[::-1], dark=low, bright=high, event="release")
         )
     return named(**answers)
 
 
-@case(height=HEIGHT, sigma=HEIGHT)
+@case(**ONSET)
 def find_onset_of_missing_samples() -> Answer:
     frames, travel = press("float32", seed=5)
     frames[pick(frames.shape, 0.002, 6)] = np.nan
     dark, bright = LEVELS["float32"]
-    return onset_maps(engine.find_onset(frames, travel, dark=dark, bright=bright))
+    return result_maps(engine.find_onset(frames, travel, dark=dark, bright=bright))
 
 
-@case(height=HEIGHT, sigma=HEIGHT)
+@case(**ONSET)
 def find_onset_block_by_block() -> Answer:
     frames, travel = press("uint8")
     dark, bright = level_maps("uint8", frames.shape[1:])
     search = engine.Onset(dark=dark, bright=bright)
     for block in blocks(frames, [1, 1, 3, 2, 7], travel=travel):
         push_block(search, block)
-    return onset_maps(search.result())
+    return result_maps(search.result())
 
 
 def change_of(dtype: str, **options: Any) -> Answer:
     """Find the change-point of a press."""
     frames, travel = press(dtype, seed=8)
-    return onset_maps(engine.find_change_point(frames, travel, **options))
+    return result_maps(engine.find_change_point(frames, travel, **options))
 
 
-@case(height=HEIGHT, sigma=HEIGHT)
+@case(**ONSET)
 def find_change_point_of_known_levels() -> Answer:
     known = {
         dtype: dict(zip(("dark", "bright"), level_maps(dtype, (37, 53)), strict=True)) for dtype in LEVELS
@@ -258,23 +188,23 @@ def find_change_point_of_known_levels() -> Answer:
     return named(**{dtype: change_of(dtype, **levels) for dtype, levels in known.items()})
 
 
-@case(height=HEIGHT, sigma=HEIGHT)
+@case(**ONSET)
 def find_change_point_of_unknown_levels() -> Answer:
     return named(**{dtype: change_of(dtype) for dtype in LEVELS})
 
 
-@case(height=HEIGHT, sigma=HEIGHT)
+@case(**ONSET)
 def find_change_point_of_a_release() -> Answer:
     frames, travel = press("uint8", seed=9)
     back, up = np.ascontiguousarray(frames[::-1]), travel[::-1]
     dark, bright = LEVELS["uint8"]
     return named(
-        known=onset_maps(engine.find_change_point(back, up, dark=dark, bright=bright, event="release")),
-        unknown=onset_maps(engine.find_change_point(back, up, hold=3, event="release")),
+        known=result_maps(engine.find_change_point(back, up, dark=dark, bright=bright, event="release")),
+        unknown=result_maps(engine.find_change_point(back, up, hold=3, event="release")),
     )
 
 
-@case(height=HEIGHT, sigma=HEIGHT)
+@case(**ONSET)
 def find_change_point_block_by_block() -> Answer:
     frames, travel = press("uint16", seed=8)
     search = engine.ChangePoint()
@@ -284,7 +214,7 @@ def find_change_point_block_by_block() -> Answer:
     search.next_pass()
     for block in cut:
         push_block(search, block)
-    return onset_maps(search.result())
+    return result_maps(search.result())
 
 
 @case(HEIGHT)
@@ -332,21 +262,21 @@ def reconstruct_a_press_with_a_gel() -> Answer:
 # A rotation.
 
 
-@case()
+@case(azimuth=(1e-5, 1e-4))
 def correlate_even_phases() -> Answer:
-    return named(**{d: wave_maps(engine.correlate(turn(d)[0], EIGHTHS)) for d in LEVELS})
+    return named(**{d: result_maps(engine.correlate(turn(d)[0], EIGHTHS)) for d in LEVELS})
 
 
-@case()
+@case(azimuth=(1e-5, 1e-4))
 def correlate_uneven_phases() -> Answer:
-    return named(**{d: wave_maps(engine.correlate(turn(d, phase=UNEVEN)[0], UNEVEN)) for d in LEVELS})
+    return named(**{d: result_maps(engine.correlate(turn(d, phase=UNEVEN)[0], UNEVEN)) for d in LEVELS})
 
 
-@case()
+@case(azimuth=(1e-5, 1e-4))
 def correlate_weights_and_missing_samples() -> Answer:
     frames = turn("float32", phase=UNEVEN)[0]
     frames[pick(frames.shape, 0.002, 3)] = np.nan
-    return wave_maps(engine.correlate(frames, UNEVEN, frame_weights=[1, 1, 0, 2, 1, 0.5, 1, 1]))
+    return result_maps(engine.correlate(frames, UNEVEN, frame_weights=[1, 1, 0, 2, 1, 0.5, 1, 1]))
 
 
 def long_turn(dtype: str) -> tuple[Any, Any]:
@@ -355,7 +285,7 @@ def long_turn(dtype: str) -> tuple[Any, Any]:
     return turn(dtype, (33, 47), phase)[0], phase
 
 
-@case()
+@case(azimuth=(1e-5, 1e-4))
 def correlate_block_by_block() -> Answer:
     answers = {}
     for dtype in LEVELS:
@@ -363,11 +293,11 @@ def correlate_block_by_block() -> Answer:
         operation = engine.Correlate()
         for block in blocks(frames, [3, 1, 8, 5], phase=phase):
             push_block(operation, block)
-        answers[dtype] = wave_maps(operation.result())
+        answers[dtype] = result_maps(operation.result())
     return named(**answers)
 
 
-@case()
+@case(azimuth=(1e-5, 1e-4))
 def correlate_a_sliding_window() -> Answer:
     answers = {}
     for dtype in LEVELS:
@@ -375,21 +305,15 @@ def correlate_a_sliding_window() -> Answer:
         operation = engine.Correlate(window_frames=10)
         for number, block in enumerate(blocks(frames, [4, 9, 1, 3], phase=phase)):
             push_block(operation, block)
-            answers[f"{dtype}_{number}"] = wave_maps(operation.result())
+            answers[f"{dtype}_{number}"] = result_maps(operation.result())
     return named(**answers)
 
 
-@case(phase=NORMAL, sigma=(1e-4, 1e-7))
+@case(phase=NORMAL, phase_sigma=(1e-4, 1e-7), process=FITTED)
 def fit_fringes() -> Answer:
-    answers = {}
-    for dtype in LEVELS:
-        found = engine.fringes.fit_fringes(turn(dtype, SMALL, UNEVEN)[0], UNEVEN)
-        answers[dtype] = {
-            **{name: found[name] for name in ("phase", "mean", "modulation", "residual")},
-            "sigma": found.phase_sigma,
-            "noise": found.process["noise"],
-        }
-    return named(**answers)
+    return named(
+        **{d: result_maps(engine.fringes.fit_fringes(turn(d, SMALL, UNEVEN)[0], UNEVEN)) for d in LEVELS}
+    )
 
 
 @case(height=HEIGHT, height_sigma=SIGMA, sharpness=FITTED)
@@ -399,15 +323,19 @@ def find_focus() -> Answer:
     answers = {}
     for dtype in LEVELS:
         found = engine.focus.find_focus(counted(texture * sharp, dtype), travel, noise=0.01)
-        answers[dtype] = {
-            name: getattr(found, name) for name in ("height", "height_sigma", "status", "sharpness")
-        }
+        answers[dtype] = result_maps(found)
     return named(**answers)
 
 
-@case(normals=NORMAL, normals_sigma=SIGMA, albedo=FITTED, albedo_sigma=SIGMA, residual=(1e-3, 1e-6))
+@case(
+    normals=NORMAL,
+    normals_sigma=SIGMA,
+    albedo=FITTED,
+    albedo_sigma=SIGMA,
+    residual=(1e-3, 1e-6),
+    process=FITTED,
+)
 def photometric_stereo() -> Answer:
-    known = ("normals", "normals_sigma", "albedo", "albedo_sigma", "residual", "samples", "noise")
     _, along_x, along_y = dome(SMALL)
     normal = np.stack([-along_x, -along_y, np.ones(SMALL)]) / np.sqrt(1 + along_x**2 + along_y**2)
     light = np.stack([0.7 * np.cos(EIGHTHS), 0.7 * np.sin(EIGHTHS), np.full(8, 0.714)], axis=1)
@@ -416,7 +344,7 @@ def photometric_stereo() -> Answer:
     answers = {}
     for dtype, (dark, _) in LEVELS.items():
         found = engine.photometric.photometric_stereo(counted(share, dtype), light=light, dark=dark)
-        answers[dtype] = {name: {**found, **found.process}[name] for name in known}
+        answers[dtype] = result_maps(found)
     return named(**answers)
 
 
@@ -426,10 +354,10 @@ def normals_of(dtype: str = "uint16", phase: Any = EIGHTHS, **options: Any) -> A
     made = {"noise": made.pop("noise_of", 1.0), **made}
     frames, gain, offset = turn(dtype, phase=phase, **made)
     known = {"tilt": TILT, "zenith_gain": gain, "zenith_offset": offset}
-    return normal_maps(engine.estimate_normals(frames, phase, **known, **options))
+    return result_maps(engine.estimate_normals(frames, phase, **known, **options))
 
 
-ROTATION = {"vectors": NORMAL, "sigma": (1e-4, 1e-7), "zenith": NORMAL}
+ROTATION = {"normals": NORMAL, "normals_sigma": (1e-4, 1e-7), "zenith": NORMAL, "azimuth": (1e-5, 1e-4)}
 
 
 @case(FITTED, **ROTATION)
@@ -464,11 +392,11 @@ def estimate_normals_where_contact_is_lost() -> Answer:
     return normals_of("uint8", lost=True, shape=(48, 64))
 
 
-@case(FITTED, **ROTATION, numbers=(1e-4, 1e-7))
+@case(FITTED, **ROTATION, process=(1e-4, 1e-7))
 def estimate_normals_and_the_tilt() -> Answer:
     frames, gain, offset = turn("uint16")
     known = {"tilt": "estimate", "zenith_gain": gain, "zenith_offset": offset}
-    return normal_maps(engine.estimate_normals(frames, EIGHTHS, **known))
+    return result_maps(engine.estimate_normals(frames, EIGHTHS, **known))
 
 
 @case(FITTED, **ROTATION)
@@ -479,7 +407,7 @@ def estimate_normals_block_by_block() -> Answer:
         operation = engine.Normals(tilt=TILT, zenith_gain=3400.0, zenith_offset=150.0, per_turn=per_turn)
         for block in blocks(frames, [5, 1, 9, 3], phase=phase):
             push_block(operation, block)
-        answers["each" if per_turn else "mean"] = normal_maps(operation.result())
+        answers["each" if per_turn else "mean"] = result_maps(operation.result())
     return named(**answers)
 
 
@@ -574,10 +502,10 @@ def integrated(shape: tuple[int, int], **options: Any) -> Answer:
     _, along_x, along_y = dome(shape)
     random = np.random.default_rng(3)
     along_x, along_y = (slope + random.normal(0, 0.01, shape) for slope in (along_x, along_y))
-    return surface_maps(engine.integrate(along_x, along_y, PIXEL, **options))
+    return result_maps(engine.integrate(along_x, along_y, PIXEL, **options))
 
 
-SURFACE = {"height": SOLVED, "sigma": SIGMA}
+SURFACE = {"height": SOLVED, "height_sigma": SIGMA, "process": (1e-3, 1e-6)}
 
 
 def disc(shape: tuple[int, int]) -> Any:
@@ -646,7 +574,7 @@ def integrate_missing_slopes() -> Answer:
     shape = (39, 50)
     along_x, along_y = dome(shape)[1:]
     along_x = np.where(pick(shape, 0.03, 13), np.nan, along_x)
-    return surface_maps(engine.integrate(along_x, along_y, PIXEL))
+    return result_maps(engine.integrate(along_x, along_y, PIXEL))
 
 
 @case(**SURFACE)
@@ -656,8 +584,8 @@ def integrate_robustly() -> Answer:
     x, y = places(shape)
     along_x = along_x + np.where((np.abs(x - 0.5) < 0.03) & (y > 0), 5.0, 0.0)
     return named(
-        ridge=surface_maps(engine.integrate(along_x, along_y, PIXEL, robust=True)),
-        bare=surface_maps(
+        ridge=result_maps(engine.integrate(along_x, along_y, PIXEL, robust=True)),
+        bare=result_maps(
             engine.integrate(along_x, along_y, PIXEL, robust=True, bilateral_sharpness=4.0, sigma=False)
         ),
         dome=integrated((37, 49), robust=True, mask=disc((37, 49))),
@@ -672,7 +600,7 @@ def integrate_live() -> Answer:
         along_x, along_y = dome(shape, 0.2 + 0.05 * number)[1:]
         mask = disc(shape) if number else np.ones(shape, bool)
         integrator.push(along_x, along_y, mask=mask, tolerance=1e-5)
-        answers[f"frame_{number}"] = surface_maps(integrator.result())
+        answers[f"frame_{number}"] = result_maps(integrator.result())
     return named(**answers)
 
 
@@ -685,8 +613,8 @@ def integrate_several() -> Answer:
         np.stack(part) + random.normal(0, 0.01, (3, *shape)) for part in zip(*slopes, strict=True)
     )
     return named(
-        whole=surface_maps(engine.integrate(along_x, along_y, PIXEL)),
-        masked=surface_maps(engine.integrate(along_x, along_y, PIXEL, mask=disc(shape))),
+        whole=result_maps(engine.integrate(along_x, along_y, PIXEL)),
+        masked=result_maps(engine.integrate(along_x, along_y, PIXEL, mask=disc(shape))),
     )
 
 
@@ -701,9 +629,9 @@ def fuse() -> Answer:
     counts = counted((travel[:, None, None] > starts).astype(float), "uint8")
     onset = engine.find_onset(counts, travel, dark=LEVELS["uint8"][0], bright=LEVELS["uint8"][1], noise=1.0)
     return named(
-        whole=fused_maps(engine.fuse(onset, normals, PIXEL)),
-        masked=fused_maps(engine.fuse(onset, normals, PIXEL, mask=disc(shape))),
-        robust=fused_maps(engine.fuse(onset, normals, PIXEL, robust=True)),
+        whole=result_maps(engine.fuse(onset, normals, PIXEL)),
+        masked=result_maps(engine.fuse(onset, normals, PIXEL, mask=disc(shape))),
+        robust=result_maps(engine.fuse(onset, normals, PIXEL, robust=True)),
     )
 
 
