@@ -9,7 +9,8 @@ from commands import run
 
 from mirrorskin.cli import declared
 from mirrorskin.cli.declared import Term, term_of, terms_of
-from mirrorskin.engine.options import Configured, option
+from mirrorskin.engine import option
+from mirrorskin.engine.options import Configured
 from mirrorskin.io import InputError
 
 COPY = Path(declared.__file__).with_suffix(".json")

@@ -24,10 +24,9 @@ from mirrorskin.cli.status import Board, Newest, summary
 from mirrorskin.engine.live import SHOWN, Latency, Status
 from mirrorskin.engine.running import load_operation
 from mirrorskin.engine.streaming import push_block
+from mirrorskin.hw import HardwareError, Position
 from mirrorskin.hw import rig_file as file
-from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig import rig
-from mirrorskin.hw.stage import Position
 from mirrorskin.kernels.errors import DeviceError
 
 SHAPE, SHAPED = (24, 32), (48, 56)

@@ -13,10 +13,10 @@ from commands import refused, run
 from served_rig import allow_delays
 
 from mirrorskin.cli import rig as command
+from mirrorskin.hw import load_rig
 from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
 from mirrorskin.hw.rig import check
 from mirrorskin.hw.rig.check import Finding
-from mirrorskin.hw.rig_file import load_rig
 
 RIG = """
 [stage]

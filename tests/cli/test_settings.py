@@ -10,7 +10,7 @@ import pytest
 from mirrorskin import io
 from mirrorskin.cli.settings import read_settings
 from mirrorskin.engine.batch.jobs import Plan
-from mirrorskin.io.selection import Region
+from mirrorskin.io import Region
 
 EVERYTHING = """
 [stack]

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from mirrorskin import engine
-from mirrorskin.engine.live.status import STAGES, Monitor
+from mirrorskin.engine.live import STAGES
+from mirrorskin.engine.live.status import Monitor
 from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError
 

@@ -21,12 +21,15 @@ from golden import Answer, case
 from scenes import EIGHTHS, TILT, dome, places, turn
 
 from mirrorskin import engine, hw, io
-from mirrorskin.engine.calibration.board import Dots
-from mirrorskin.engine.calibration.lens import calibrate_lens
-from mirrorskin.engine.calibration.references import measure_references
-from mirrorskin.engine.calibration.tilt import fit_precession
-from mirrorskin.engine.calibration.tilt_tracks import BallTrack, PlateTrack
-from mirrorskin.engine.calibration.wall import fit_zenith
+from mirrorskin.engine.calibration import (
+    BallTrack,
+    Dots,
+    PlateTrack,
+    calibrate_lens,
+    fit_precession,
+    fit_zenith,
+    measure_references,
+)
 from mirrorskin.engine.live import LiveOperation
 from mirrorskin.engine.streaming import push_block
 from mirrorskin.engine.undistort import undistort

@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from mirrorskin.engine.live.status import SHOWN, Latency, Status, Update
+from mirrorskin.engine.live import SHOWN, Latency, Status, Update
 from mirrorskin.io import InputError
 from mirrorskin.view import live, viewer
 

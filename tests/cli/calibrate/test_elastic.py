@@ -11,7 +11,7 @@ from stacks import record
 from mirrorskin import io
 from mirrorskin.cli.calibrate import inputs
 from mirrorskin.engine.calibration import gel as gel_module
-from mirrorskin.hw.rig.plans import VerticalPlan
+from mirrorskin.hw import VerticalPlan
 from mirrorskin.hw.twin import Axial, Camera, Sphere, Twin, Vertical
 
 

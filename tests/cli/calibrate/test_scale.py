@@ -14,8 +14,7 @@ from stacks import MadeUp, record
 
 from mirrorskin import io
 from mirrorskin.cli.calibrate.scale import board_command, command
-from mirrorskin.engine.calibration.board import Charuco, Dots, paint_board
-from mirrorskin.engine.calibration.lens import calibrate_lens
+from mirrorskin.engine.calibration import Charuco, Dots, calibrate_lens, paint_board
 from mirrorskin.io.calibration.source import size_facts
 
 CHARUCO = "charuco:7x5:2mm:1.5mm"

@@ -13,8 +13,8 @@ from stacks import record
 
 from mirrorskin import io
 from mirrorskin.cli.calibrate import inputs
+from mirrorskin.hw import AxialPlan, VerticalPlan
 from mirrorskin.hw.rig import rig as rigs
-from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
 
 SHAPE = (12, 16)
 

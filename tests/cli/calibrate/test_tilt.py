@@ -13,7 +13,7 @@ from stacks import MadeUp, record
 from mirrorskin import io
 from mirrorskin.cli.calibrate import inputs
 from mirrorskin.cli.calibrate.tilt import warnings
-from mirrorskin.hw.rig.plans import AxialPlan
+from mirrorskin.hw import AxialPlan
 from mirrorskin.hw.twin import Axial, Body, Twin
 
 SHAPE = (64, 64)

@@ -9,10 +9,10 @@ import pytest
 from batches import BAD, half_written, press, rotation
 
 from mirrorskin import engine, io
+from mirrorskin.engine import NotConverged
 from mirrorskin.engine.batch import work
 from mirrorskin.engine.batch.jobs import Job, Plan
 from mirrorskin.engine.batch.work import run_job
-from mirrorskin.engine.errors import NotConverged
 from mirrorskin.kernels.errors import DeviceMemoryError
 
 

@@ -7,11 +7,9 @@ import pytest
 from contact_theory import paraboloid, pushed, traction_response
 
 from mirrorskin import io
-from mirrorskin.engine.force.normal import find_force
-from mirrorskin.engine.force.tangential import find_tangential_force
-from mirrorskin.engine.slip.displacement import find_displacement
-from mirrorskin.hw.twin import Body, Camera, Horizontal, Sphere, Twin
-from mirrorskin.hw.twin.texture import SheetTexture
+from mirrorskin.engine.force import find_force, find_tangential_force
+from mirrorskin.engine.slip import find_displacement
+from mirrorskin.hw.twin import Body, Camera, Horizontal, SheetTexture, Sphere, Twin
 
 MODULUS, PIXEL = 0.1, 0.05
 SHEAR = MODULUS / 3

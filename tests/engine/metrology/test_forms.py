@@ -6,7 +6,7 @@ from height_maps import cap, places
 from scipy import ndimage
 
 from mirrorskin import io
-from mirrorskin.engine.metrology.forms import fit_plane, fit_sphere
+from mirrorskin.engine.metrology import fit_plane, fit_sphere
 
 SHAPE, SIZE = (39, 51), (0.11, 0.13)
 NAN = np.nan

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from mirrorskin.engine.metrology.quantity import Quantity
+from mirrorskin.engine.metrology import Quantity
 
 NAN = float("nan")
 

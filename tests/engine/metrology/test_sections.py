@@ -5,7 +5,7 @@ import pytest
 from height_maps import cap, places, result_of
 
 from mirrorskin import engine, io
-from mirrorskin.engine.metrology.sections import section, step_height
+from mirrorskin.engine.metrology import section, step_height
 
 SIZE = (0.1, 0.25)
 SHAPE = (21, 33)

@@ -5,7 +5,7 @@ import pytest
 from height_maps import places
 
 from mirrorskin import io
-from mirrorskin.engine.metrology.texture import roughness
+from mirrorskin.engine.metrology import roughness
 
 NAN = np.nan
 

@@ -6,7 +6,7 @@ import pytest
 from stacks import ball
 
 from mirrorskin import engine
-from mirrorskin.engine.press.holes import fill_holes
+from mirrorskin.engine.press import fill_holes
 from mirrorskin.engine.press.membrane import stretch
 from mirrorskin.io import InputError
 

@@ -11,7 +11,7 @@ from commands import run
 from stacks import record
 
 from mirrorskin import engine, io
-from mirrorskin.engine.press.levels import Levels
+from mirrorskin.engine.press import Levels
 from mirrorskin.hw.twin import Camera, Sphere, Twin, Vertical
 
 HEIGHT, RADIUS = 40.0, 17.5  # of the twin's wall, mm

@@ -17,9 +17,7 @@ from mirrorskin.engine.live import LiveOperation
 from mirrorskin.engine.rotation.registration import Registered, Sight
 from mirrorskin.engine.rotation.rotation import FirstTurn
 from mirrorskin.engine.streaming import push_block
-from mirrorskin.hw.twin.body import Body
-from mirrorskin.hw.twin.camera import Camera
-from mirrorskin.hw.twin.movement import Axial
+from mirrorskin.hw.twin import Axial, Body, Camera
 
 SHAPE, PIXEL, PRESS = (68, 71), 0.085, 0.7
 PIVOT = (0.3, -0.2, 4.0)
