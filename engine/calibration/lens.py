@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.calibration.board import FEWEST, Board, Charuco
 from mirrorskin.engine.calibration.levels import mad_sigma
-from mirrorskin.engine.calibration.marks import Marks, centre_marks, find_marks, stretch_contrast
+from mirrorskin.engine.calibration.marks import Marks, centre_marks, find_marks, scale_contrast
 from mirrorskin.engine.undistort import distorted, picture_places
 from mirrorskin.io import InputError, Lens
 
@@ -104,7 +104,7 @@ def locate_marks(picture: NDArray[Any], board: Board, name: str) -> Marks:
     rough = find_marks(picture, board, name)
     fit = CameraFit([rough])
     _check_kind(rough, board, fit)
-    stretched, marks = stretch_contrast(picture, name), rough
+    stretched, marks = scale_contrast(picture, name), rough
     for _ in range(_ROUNDS):
         count = len(marks.board)
         adjacent = KDTree(marks.board).query(board.marks())[0] < _ADJACENT * board.pitch
