@@ -24,7 +24,7 @@ _FEWEST_YET = 6  # marks that are needed before all are predicted
 _LEAST_REACH, _MOST_REACH = 2.5, 12.0  # pixels: radius around a corner in which it is centred
 _FAR = 0.2  # pitches: greatest distance of a mark from its predicted place
 _OFF, _OFF_SHARE = 0.6, 3e-4  # greatest RMS residual of a picture: pixels, or share of its diagonal
-_MARKER = 0.1  # greatest relative difference of the markers' size from the specified one
+_MARKER = 0.15  # greatest relative difference of the markers' size from the specified one; blur shrinks them
 
 _PLANE = 8  # parameters of the homography; then those of the distortion, then the pose of each other board
 _LENS = _PLANE + 5
