@@ -96,7 +96,7 @@ def command(
     from mirrorskin import io
     from mirrorskin.engine.calibration.lens import calibrate_lens
     from mirrorskin.io.calibration.source import outdated
-    from mirrorskin.io.calibration.types import GROUPS
+    from mirrorskin.io.calibration.types import PARTS
 
     kind, paths = board_of(board), list(pictures or [])
     if not paths and rig is None:
@@ -119,7 +119,7 @@ def command(
     )
     calibration = io.update_calibration(output, fit.lens, camera, process)
     _report(output, fit, paths, as_json)
-    old = [GROUPS[part] for part, _ in outdated(calibration, fit.lens.pixel_size)]
+    old = [PARTS[part].command for part, _ in outdated(calibration, fit.lens.pixel_size)]
     if old:
         click.echo(f"learn {', '.join(old)} again: made with another pixel size", err=True)
 
