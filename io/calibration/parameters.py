@@ -114,7 +114,13 @@ class Parameter:
 
 
 def parameter(
-    kind: Kind, text: str, unit: str = "", *, dtype: DTypeLike = None, default: Any = MISSING, **options: Any
+    kind: Kind,
+    text: str,
+    unit: str = "",
+    *,
+    dtype: DTypeLike | None = None,
+    default: Any = MISSING,
+    **options: Any,
 ) -> Any:
     """Declare a parameter in the body of a part, by the fields of `Parameter`.
 
