@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.arrays import NUMPY_SUFFIXES, list_arrays
 from mirrorskin.io.calibration.file import MARK as CALIBRATION_MARK
-from mirrorskin.io.calibration.file import open_calibration, words_of
+from mirrorskin.io.calibration.file import open_calibration
 from mirrorskin.io.calibration.types import PARTS, Calibration
 from mirrorskin.io.layout import MARK, TRUTH_MAPS
 from mirrorskin.io.recording import Recording, open_recording
@@ -148,7 +148,7 @@ def _calibration(calibration: Calibration) -> dict[str, str]:
         if part is None:
             facts[kind.command] = "none"
         else:
-            facts |= {f"{kind.command}.{field}": said for field, said in words_of(part).items()}
+            facts |= {f"{row.part}.{row.what}": row.text for row in part.rows()}
     return facts | {
         name: f"{value:.4g}" if isinstance(value, float) else str(value)
         for name, value in calibration.process.items()

@@ -33,7 +33,6 @@ ENTRY, CARRIED = "/entry", "/entry/calibration"
 """Group of the calibration in a calibration file, and of the copy in recordings and results."""
 
 _AGAIN = "calibrate again"
-_FEW = 16  # numbers that are printed individually
 
 
 def open_calibration(path: str | Path) -> Calibration:
@@ -286,41 +285,3 @@ def _read_field(file: Hdf5File, node: Node, how: Parameter, sizes: dict[str, int
     if how.valid is not None and not how.valid(value):
         raise InputError(f"{file.where(node)} is {value}, which is invalid: {_AGAIN}")
     return value
-
-
-# --- words --------------------------------------------------------------------------------------------------
-
-
-def words_of(part: Part) -> dict[str, str]:
-    """Return each field of a part as text: numbers with units, angles in degrees, maps by their median."""
-    how = parameters(part)
-    words = {name: _words(getattr(part, name), one, how) for name, one in how.items()}
-    return {name: said for name, said in words.items() if said is not None}
-
-
-def _words(value: Any, how: Parameter, others: dict[str, Parameter]) -> str | None:
-    if value is None or (how.kind == "mapping" and not value):
-        return None
-    if how.kind in ("text", "integer"):
-        return str(value)
-    if how.kind == "names":
-        return ", ".join(value)
-    if how.kind == "mapping":
-        return ", ".join(f"{name} {_number_words(one, unit_of(name, others))}" for name, one in value.items())
-    if how.flags:
-        return ", ".join(f"{np.count_nonzero(value & bit)} {name}" for name, bit in how.flags.items())
-    if how.kind == "map":
-        known = value[np.isfinite(value)]
-        lacking = f"; {value.size - known.size} pixels unknown" if known.size < value.size else ""
-        median = _number_words(np.median(known), how.unit) if known.size else "no valid pixel"
-        return f"{median} (median{lacking})"
-    if np.size(value) > _FEW:
-        return f"{' x '.join(map(str, np.shape(value)))} numbers"
-    return _number_words(value, how.unit)
-
-
-def _number_words(value: Any, unit: str) -> str:
-    if unit == "rad":
-        value, unit = np.degrees(value), "deg"
-    numbers = ", ".join(f"{one:.5g}" for one in np.ravel(value))
-    return f"{numbers} {unit}" if unit else numbers

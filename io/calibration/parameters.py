@@ -142,6 +142,12 @@ class Row(NamedTuple):
     sigma: float = math.nan  # standard error; NaN if unknown
     unit: str = ""
 
+    @property
+    def text(self) -> str:
+        """Value, standard error and unit, such as ``2.2918 ± 0.0057 deg``."""
+        _, _, value, sigma, unit = self.cells()
+        return " ".join(filter(None, (value, f"± {sigma}" if sigma else "", unit)))
+
     def cells(self) -> tuple[str, str, str, str, str]:
         """Return part, quantity, value, standard error and unit as text, with the significant digits only."""
         if isinstance(self.value, str | int):

@@ -43,7 +43,7 @@ def test_one_declaration_reaches_files_tables_and_docstrings(worn, tmp_path):
     rows = {row.what: row.cells()[2:] for row in calibration.rows() if row.part == "elastic"}
     assert rows["wear x"] == ("1", "", "um")
     assert rows["wear y"] == ("2.00", "0.10", "um")
-    assert io.describe(tmp_path / "cal.h5")["elastic.wear"] == "0.001, 0.002 mm"
+    assert io.describe(tmp_path / "cal.h5")["elastic.wear y"] == "2.00 ± 0.10 um"
     assert "wear : (float, float), mm\n    Depth of the wear along x and y.\n" in f"{Worn.__doc__}\n"
 
 
