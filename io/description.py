@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.arrays import NUMPY_SUFFIXES, list_arrays
 from mirrorskin.io.calibration.file import MARK as CALIBRATION_MARK
-from mirrorskin.io.calibration.file import open_calibration, words_of
-from mirrorskin.io.calibration.types import GROUPS, Calibration
+from mirrorskin.io.calibration.file import open_calibration
+from mirrorskin.io.calibration.types import PARTS, Calibration
 from mirrorskin.io.layout import MARK, TRUTH_MAPS
 from mirrorskin.io.recording import Recording, open_recording
 from mirrorskin.io.result import Result
@@ -141,14 +141,14 @@ def _carried(calibration: Calibration | None) -> dict[str, str]:
 
 def _calibration(calibration: Calibration) -> dict[str, str]:
     facts = {"camera": str(calibration.camera)}
-    for name in GROUPS:
+    for name, kind in PARTS.items():
         part = calibration.parts().get(name)
         if part is None and name == "stiffness":
             continue  # shown only where it exists, which is rare
         if part is None:
-            facts[GROUPS[name]] = "none"
+            facts[kind.command] = "none"
         else:
-            facts |= {f"{GROUPS[name]}.{field}": said for field, said in words_of(part).items()}
+            facts |= {f"{row.part}.{row.what}": row.text for row in part.rows()}
     return facts | {
         name: f"{value:.4g}" if isinstance(value, float) else str(value)
         for name, value in calibration.process.items()

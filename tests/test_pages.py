@@ -81,19 +81,14 @@ def test_all_that_is_in_a_result_is_described(tmp_path, per_turn):
     assert found <= named("formats.md")
 
 
-def test_the_tables_of_maps_are_those_of_the_declarations():
-    page = (DOCS / "formats.md").read_text(encoding="utf-8")
-    made = runpy.run_path(str(DOCS / "site/map_tables.py"))
-    assert made["with_tables"](page) == page, "python docs/site/map_tables.py writes them"
-
-
-def test_the_tables_of_operations_and_options_are_those_of_the_declarations(monkeypatch):
+@pytest.mark.parametrize("script", ["map_tables", "option_tables"])
+def test_the_tables_of_maps_parameters_operations_and_options_are_those_of_the_declarations(
+    script, monkeypatch
+):
     monkeypatch.syspath_prepend(DOCS / "site")
-    made = runpy.run_path(str(DOCS / "site/option_tables.py"))
+    made = runpy.run_path(str(DOCS / f"site/{script}.py"))
     for page, text in made["pages"]().items():
-        assert (DOCS / page).read_text(encoding="utf-8") == text, (
-            "python docs/site/option_tables.py writes them"
-        )
+        assert (DOCS / page).read_text(encoding="utf-8") == text, f"python docs/site/{script}.py writes them"
 
 
 def test_references_are_measured_from_arrays(tmp_path, monkeypatch):

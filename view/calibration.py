@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.undistort import distorted
 from mirrorskin.io import Calibration, InputError
-from mirrorskin.io.calibration.types import BITS, GROUPS, Lens, Precession, References
+from mirrorskin.io.calibration.parameters import Part, parameters
+from mirrorskin.io.calibration.types import BITS, Lens, Precession, References
 from mirrorskin.io.types import Floats
 from mirrorskin.view.canvas import (
     check_drawing,
@@ -61,6 +62,13 @@ def draw_pixels(
     axes.set(title=f"{title}\n{summary}{blue}", xlabel="column (px)", ylabel="row (px)")
 
 
+def draw_parameter(axes: Axes, part: Part, name: str, colours: str = SEQUENTIAL) -> None:
+    """Draw a map of a calibration, with the text and in the unit that are declared."""
+    one = parameters(part)[name]
+    values = getattr(part, name) * one.factor
+    draw_pixels(axes, values, one.text.partition(";")[0], one.shown_unit, colours)
+
+
 _COLOURS = {
     "sound": "0.9",
     "hot": "tab:red",
@@ -76,11 +84,11 @@ def draw_references(references: References) -> Figure:
     figure = new_sheet(17, 8.2)
     axes = figure.subplots(2, 3)
     light = references.bright - references.dark
-    draw_pixels(axes[0, 0], references.dark, "dark: without light", "counts")
-    draw_pixels(axes[0, 1], references.bright, "bright: in full light", "counts")
+    draw_parameter(axes[0, 0], references, "dark")
+    draw_parameter(axes[0, 1], references, "bright")
     draw_pixels(axes[0, 2], light, "light: bright less dark", "counts")
-    draw_pixels(axes[1, 0], references.dark_sigma, "standard error of dark", "counts", ERROR)
-    draw_pixels(axes[1, 1], references.bright_sigma, "standard error of bright", "counts", ERROR)
+    draw_parameter(axes[1, 0], references, "dark_sigma", ERROR)
+    draw_parameter(axes[1, 1], references, "bright_sigma", ERROR)
     _draw_defects(axes[1, 2], references.defects)
     return figure
 
@@ -333,7 +341,7 @@ def calibration_figures(calibration: Calibration, folder: Path) -> list[Path]:
         raise InputError(f"{folder} cannot be made: {error.strerror}; name another folder with -o") from error
     written = []
     for name, part in calibration.parts().items():
-        path = folder / f"{GROUPS[name]}.png"
-        save_figure(draw[name](part), f"{Path(calibration.name).name}: {GROUPS[name]}", path)
+        path = folder / f"{part.command}.png"
+        save_figure(draw[name](part), f"{Path(calibration.name).name}: {part.command}", path)
         written.append(path)
     return written

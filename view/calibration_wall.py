@@ -13,7 +13,7 @@ from mirrorskin.engine.press.elastic import threshold_at
 from mirrorskin.engine.rotation.response import shade
 from mirrorskin.io import Gel, Stiffness, WallResponse
 from mirrorskin.io.types import Floats
-from mirrorskin.view.calibration import draw_pixels, new_sheet
+from mirrorskin.view.calibration import draw_parameter, new_sheet
 from mirrorskin.view.canvas import explain_colours
 from mirrorskin.view.colours import DIVERGING, ERROR, MISSING
 
@@ -71,9 +71,8 @@ def draw_response(response: WallResponse) -> Figure:
     polar.set_title("zenith of half brightness, by azimuth")
     _draw_shade(figure.add_subplot(grid[0, 2]), response)
     zenith, azimuth = (figure.add_subplot(grid[1, column]) for column in range(2))
-    draw_pixels(zenith, np.degrees(response.zenith_sigma), "standard error of zenith", "deg", ERROR)
-    title = "standard error of azimuth times sin(zenith)"
-    draw_pixels(azimuth, np.degrees(response.azimuth_sigma), title, "deg", ERROR)
+    draw_parameter(zenith, response, "zenith_sigma", ERROR)
+    draw_parameter(azimuth, response, "azimuth_sigma", ERROR)
     _draw_correlation(figure.add_subplot(grid[1, 2]), response)
     return figure
 

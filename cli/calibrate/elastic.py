@@ -7,12 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import click
-
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import inputs
 from mirrorskin.cli.groups import Argument, Option
-from mirrorskin.cli.stack import STACK, stack_options
+from mirrorskin.cli.stack import STACK
 
 if TYPE_CHECKING:
     from mirrorskin.engine.calibration.gel import BallOnset, GelFit
@@ -45,33 +43,24 @@ def command(
     from mirrorskin.cli.quantity import length
     from mirrorskin.engine.calibration.gel import fit_gel
 
-    paths = list(presses or [])
     radius, thickness = length(ball, "--ball") / 2, length(sheet, "--sheet")
     if thickness < 0:
         raise io.InputError(f"--sheet {sheet}: a thickness must not be negative")
-    calibration = inputs.check_call(output, paths, rig, press=press, settle=settle, overwrite=overwrite)
-    if rig is not None:
+
+    def balls() -> list[inputs.Place]:
         from mirrorskin.hw.rig.plans import VerticalPlan
 
-        plan = VerticalPlan(
-            stack.pop("travel_start", 0.0),
-            length(press or _PRESS, "--press"),
-            step=stack.pop("travel_step", _STEP),
-        )
+        start, step = stack.pop("travel_start", 0.0), stack.pop("travel_step", _STEP)
+        plan = VerticalPlan(start, length(press or _PRESS, "--press"), step=step)
         prompt = "put the ball at place {} of {}, near the middle of the field"
-        balls = inputs.at_each("elastic", prompt, places, plan)
-        paths = inputs.take(rig, output, balls, settle, overwrite)
-    with inputs.open_all(paths, stack_options(stack), calibration, output) as (sources, camera):
-        fit = fit_gel([_onset(source, calibration, radius, device) for source in sources], sheet=thickness)
-        process = inputs.process_of(
-            sources[0],
-            sources=paths,
-            ball=ball,
-            sheet=sheet,
-            undetermined=", ".join(fit.undetermined) or "nothing",
-        )
-    io.update_calibration(output, fit.gel, camera, process)
-    _report(output, fit, as_json)
+        return inputs.at_each("elastic", prompt, places, plan)
+
+    def fit(sources: list[Source], calibration: Calibration | None, paths: list[Path]) -> inputs.Learned:
+        onsets = [_onset(source, calibration, radius, device) for source in sources]
+        return _learned(fit_gel(onsets, sheet=thickness), {"sources": paths, "ball": ball, "sheet": sheet})
+
+    capture = inputs.Capture(rig, balls, settle, overwrite)
+    inputs.learn(output, presses or [], fit, stack, as_json, capture, press=press)
 
 
 def _onset(source: Source, calibration: Calibration | None, radius: float, device: str | None) -> BallOnset:
@@ -91,14 +80,8 @@ def _onset(source: Source, calibration: Calibration | None, radius: float, devic
     return ball_onset(result, plain, radius)
 
 
-def _report(output: Path, fit: GelFit, as_json: bool) -> None:
-    from mirrorskin.cli.output import print_json
-
-    gel = fit.gel
-    if as_json:
-        print_json({"output": str(output), "gel": gel, "balls": fit.places, "undetermined": fit.undetermined})
-        return
-    sigma = gel.sigma
+def _learned(fit: GelFit, facts: dict[str, Any]) -> inputs.Learned:
+    gel, sigma = fit.gel, fit.gel.sigma
     parts = [
         f"bright from {math.degrees(gel.threshold):.2f} ± {math.degrees(sigma['threshold']):.2f} deg",
         *(
@@ -109,9 +92,11 @@ def _report(output: Path, fit: GelFit, as_json: bool) -> None:
         f"contact at a travel of {gel.travel_zero:.3f} ± {sigma['travel_zero']:.3f} mm",
         f"residual {gel.error:.3f} mm",
     ]
-    click.echo(f"{output}: {', '.join(parts)}")
-    for name in fit.undetermined:
-        click.echo(
-            f"{name}: not determined by the presses, left at 0; press deeper, at more places or larger balls",
-            err=True,
-        )
+    remedy = "not determined by the presses, left at 0; press deeper, at more places or larger balls"
+    return inputs.Learned(
+        gel,
+        facts | {"undetermined": ", ".join(fit.undetermined) or "nothing"},
+        {"gel": gel, "balls": fit.places, "undetermined": fit.undetermined},
+        ", ".join(parts),
+        [f"{name}: {remedy}" for name in fit.undetermined],
+    )

@@ -6,15 +6,14 @@ import csv
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import click
-
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import inputs
 from mirrorskin.cli.groups import Argument, Option
-from mirrorskin.cli.stack import STACK, stack_options
+from mirrorskin.cli.stack import STACK
 
 if TYPE_CHECKING:
     from mirrorskin.engine.calibration.force import StiffnessFit
+    from mirrorskin.io import Calibration, Source
 
 _REMEDY = "write REC.h5,newtons, one line per press"
 
@@ -46,20 +45,19 @@ def command(
 
     newtons = _forces(presses, force or [], readings)
     sigma = 0.0 if force_sigma is None else newtons_of(force_sigma, "--force-sigma")
-    calibration = inputs.check_call(output, presses, None)
-    if calibration is None or calibration.gel is None:
-        raise io.InputError(
-            f"{output} has no gel, which is needed to compute loads: run calibrate elastic first"
-        )
-    with inputs.open_all(presses, stack_options(stack), calibration, output) as (sources, camera):
+
+    def fit(sources: list[Source], calibration: Calibration | None, paths: list[Path]) -> inputs.Learned:
+        if calibration is None or calibration.gel is None:
+            raise io.InputError(
+                f"{output} has no gel, which is needed to compute loads: run calibrate elastic first"
+            )
         measured = []
         for source, value in zip(sources, newtons, strict=True):
             with progress("pressing", source.shape[0]) as show:
                 measured.append(known_press(source, calibration, value, sigma, device=device, progress=show))
-        fit = fit_stiffness(measured, calibration.gel)
-        process = inputs.process_of(sources[0], sources=presses, forces=str(newtons))
-    io.update_calibration(output, fit.stiffness, camera, process)
-    _report(output, presses, fit, as_json)
+        return _learned(fit_stiffness(measured, calibration.gel), paths, newtons)
+
+    inputs.learn(output, presses, fit, stack, as_json)
 
 
 def _forces(presses: list[Path], texts: list[str], readings: Path | None) -> list[float]:
@@ -102,25 +100,19 @@ def _table(path: Path) -> dict[str, float]:
     return table
 
 
-def _report(output: Path, presses: list[Path], fit: StiffnessFit, as_json: bool) -> None:
-    from mirrorskin.cli.output import print_json
-
-    stiffness = fit.stiffness
-    if as_json:
-        columns = map(str, presses), fit.residual.tolist(), fit.held_out.tolist(), fit.sigma.tolist()
-        keys = "recording", "residual", "held_out", "sigma"
-        each = [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
-        names = "modulus", "modulus_sigma", "gel_shift", "scatter", "error"
-        parameters = {name: getattr(stiffness, name) for name in names}
-        print_json({"output": str(output), "stiffness": parameters, "presses": each})
-        return
+def _learned(fit: StiffnessFit, presses: list[Path], newtons: list[float]) -> inputs.Learned:
+    stiffness, several = fit.stiffness, fit.stiffness.presses > 1
+    columns = map(str, presses), fit.residual.tolist(), fit.held_out.tolist(), fit.sigma.tolist()
+    keys = "recording", "residual", "held_out", "sigma"
+    each = [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
+    names = "modulus", "modulus_sigma", "gel_shift", "scatter", "error"
     modulus, sigma = 1000 * stiffness.modulus, 1000 * stiffness.modulus_sigma
-    held_out, plural = "", "es" if stiffness.presses > 1 else ""
-    if plural:
-        held_out = f", held-out forces wrong by {100 * stiffness.error:.2g} % RMS"
-    else:
-        click.echo("one press leaves no force to check by: give several, of different depths", err=True)
-    click.echo(
-        f"{output}: modulus {modulus:.4g} ± {sigma:.2g} kPa from {stiffness.presses} press{plural},"
-        f" scatter {100 * stiffness.scatter:.2g} %{held_out}"
+    held_out = f", held-out forces wrong by {100 * stiffness.error:.2g} % RMS" if several else ""
+    return inputs.Learned(
+        stiffness,
+        {"sources": presses, "forces": str(newtons)},
+        {"stiffness": {name: getattr(stiffness, name) for name in names}, "presses": each},
+        f"modulus {modulus:.4g} ± {sigma:.2g} kPa from {stiffness.presses} press{'es' if several else ''},"
+        f" scatter {100 * stiffness.scatter:.2g} %{held_out}",
+        [] if several else ["one press leaves no force to check by: give several, of different depths"],
     )

@@ -1,9 +1,9 @@
-"""Recordings for a part of a calibration: named ones, or ones that are captured on a rig."""
+"""What the commands that calibrate a part have in common: recordings, the file, the report."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -12,11 +12,13 @@ import click
 
 from mirrorskin.cli import scans
 from mirrorskin.cli.groups import Option
+from mirrorskin.cli.stack import stack_options
 
 if TYPE_CHECKING:
     from mirrorskin.cli.stack import StackOptions
     from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
     from mirrorskin.io import Calibration, CameraId, Source
+    from mirrorskin.io.calibration.parameters import Part
     from mirrorskin.io.types import ProcessValue
 
 TILT, _PHASE_STEP = "2.5deg", "45deg"
@@ -129,6 +131,69 @@ def process_of(source: Source | None = None, **facts: ProcessValue | list[Path])
         for name, value in facts.items()
     }
     return {**signature(), **texts, **({} if size is None else size_facts(size))}
+
+
+class Capture(NamedTuple):
+    """How recordings are captured, if a rig is given."""
+
+    rig: Path | None = None
+    places: Callable[[], list[Place]] = list  # called with a rig only; may remove options of the stack
+    settle: str | None = None
+    overwrite: bool = False
+
+
+class Learned(NamedTuple):
+    """A part of a calibration, and what is reported of it."""
+
+    part: Part
+    facts: Mapping[str, ProcessValue | list[Path]]  # provenance
+    numbers: Mapping[str, Any]  # printed with --json
+    line: str  # printed otherwise
+    notes: Sequence[str] = ()  # printed to standard error
+
+
+def learn(
+    output: Path,
+    presses: Sequence[Path],
+    fit: Callable[[list[Source], Calibration | None, list[Path]], Learned],
+    stack: dict[str, Any],
+    as_json: bool,
+    capture: Capture | None = None,
+    plates: Sequence[Path] = (),
+    **options: str | None,
+) -> None:
+    """Fit a part to recordings, add it to a calibration, and report it.
+
+    Presses are named or captured with a rig, which ``options`` need; plates are always named. ``fit`` gets
+    all recordings, open, and the paths of the presses, which come first. ``stack`` describes the recordings.
+    """
+    capture = capture or Capture()
+    needs_rig = options | {"settle": capture.settle, "overwrite": capture.overwrite}
+    calibration = check_call(output, presses, capture.rig, plates, **needs_rig)
+    paths = list(presses)
+    if capture.rig is not None:
+        paths = take(capture.rig, output, capture.places(), capture.settle, capture.overwrite)
+    with open_all([*paths, *plates], stack_options(stack), calibration, output) as (sources, camera):
+        learned = fit(sources, calibration, paths)
+        process = process_of(sources[0], **learned.facts)
+    save(output, camera, learned, process, as_json)
+
+
+def save(
+    output: Path, camera: CameraId, learned: Learned, process: dict[str, ProcessValue], as_json: bool
+) -> Calibration:
+    """Add a part to a calibration, and report it."""
+    from mirrorskin import io
+    from mirrorskin.cli.output import print_json
+
+    calibration = io.update_calibration(output, learned.part, camera, process)
+    if as_json:
+        print_json({"output": str(output), **learned.numbers})
+    else:
+        click.echo(f"{output}: {learned.line}")
+    for note in learned.notes:
+        click.echo(note, err=True)
+    return calibration
 
 
 # --- on a rig -----------------------------------------------------------------------------------------------

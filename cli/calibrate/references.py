@@ -8,8 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import click
-
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import inputs
 from mirrorskin.cli.groups import Option
@@ -82,8 +80,7 @@ def command(
         **{f"dark_{key}": value for key, value in {"sources": darks, **asdict(measured.dark)}.items()},
         **{f"bright_{key}": value for key, value in {"sources": brights, **asdict(measured.bright)}.items()},
     )
-    io.update_calibration(output, measured.references, camera, process)
-    _report(output, measured, as_json)
+    inputs.save(output, camera, _learned(measured), process, as_json)
 
 
 def _check_call(
@@ -173,33 +170,27 @@ def _missing(measured: Measured, noise: float | None, refuse: bool) -> dict[str,
     return missing
 
 
-def _report(output: Path, measured: Measured, as_json: bool) -> None:
+def _learned(measured: Measured) -> inputs.Learned:
     import numpy as np
 
-    from mirrorskin.cli.output import print_json
     from mirrorskin.io.calibration.types import BITS
 
     references = measured.references
     defects = {name: int(np.count_nonzero(references.defects & bit)) for name, bit in BITS.items()}
     levels = {"dark": measured.dark, "bright": measured.bright}
-    if as_json:
-        print_json({"output": str(output), **levels, "defects": defects})
-    else:
-        parts = []
-        for name, level in levels.items():
-            drift = f", drift {level.drift:+.2g}" if np.isfinite(level.drift) else ""
-            parts.append(
-                f"{name} {float(np.nanmedian(getattr(references, name))):.2f} ± {level.sigma:.2g} counts"
-                f" ({level.frames} frames of noise {level.noise:.3g}{drift})"
-            )
-        counts = ", ".join(f"{count} {name}" for name, count in defects.items())
-        click.echo(f"{output}: {'; '.join(parts)}; {counts}")
+    parts, notes = [], []
     for name, level in levels.items():
+        drift = f", drift {level.drift:+.2g}" if np.isfinite(level.drift) else ""
+        parts.append(
+            f"{name} {float(np.nanmedian(getattr(references, name))):.2f} ± {level.sigma:.2g} counts"
+            f" ({level.frames} frames of noise {level.noise:.3g}{drift})"
+        )
         if abs(level.drift) > level.sigma:
-            click.echo(f"{name} drifts by {level.drift:+.2g} counts: let camera and lamps warm up", err=True)
+            notes.append(f"{name} drifts by {level.drift:+.2g} counts: let camera and lamps warm up")
         if level.clipped:
-            click.echo(
+            notes.append(
                 f"{name}: {level.clipped} pixels have samples at the end of the scale; their means were"
-                f" corrected; better {_REMEDIES[name]}",
-                err=True,
+                f" corrected; better {_REMEDIES[name]}"
             )
+    parts.append(", ".join(f"{count} {name}" for name, count in defects.items()))
+    return inputs.Learned(references, {}, {**levels, "defects": defects}, "; ".join(parts), notes)

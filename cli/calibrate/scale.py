@@ -96,7 +96,7 @@ def command(
     from mirrorskin import io
     from mirrorskin.engine.calibration.lens import calibrate_lens
     from mirrorskin.io.calibration.source import outdated
-    from mirrorskin.io.calibration.types import GROUPS
+    from mirrorskin.io.calibration.types import PARTS
 
     kind, paths = board_of(board), list(pictures or [])
     if not paths and rig is None:
@@ -117,9 +117,8 @@ def command(
         worst=fit.worst,
         corner_sigma=fit.corner_sigma,
     )
-    calibration = io.update_calibration(output, fit.lens, camera, process)
-    _report(output, fit, paths, as_json)
-    old = [GROUPS[part] for part, _ in outdated(calibration, fit.lens.pixel_size)]
+    calibration = inputs.save(output, camera, _learned(fit, paths), process, as_json)
+    old = [PARTS[part].command for part, _ in outdated(calibration, fit.lens.pixel_size)]
     if old:
         click.echo(f"learn {', '.join(old)} again: made with another pixel size", err=True)
 
@@ -151,23 +150,20 @@ def _read(paths: Sequence[Path], output: Path) -> tuple[list[tuple[str, NDArray[
     return [(str(path), picture) for path, picture in zip(paths, pictures, strict=True)], camera
 
 
-def _report(output: Path, fit: LensFit, paths: Sequence[Path], as_json: bool) -> None:
-    from mirrorskin.cli.output import print_json
-
+def _learned(fit: LensFit, paths: Sequence[Path]) -> inputs.Learned:
     lens, size = fit.lens, fit.lens.pixel_size[0]
-    if as_json:
-        each = [
-            {"source": str(path), "marks": marks, "error": error}
-            for path, marks, error in zip(paths, fit.marks, fit.errors, strict=True)
-        ]
-        sizes = {"pixel_size": size, "pixel_size_sigma": size * lens.scale_sigma}
-        errors = {"error": lens.error, "worst": fit.worst, "corner_sigma": fit.corner_sigma}
-        rest = {"distortion": lens.distortion.tolist(), "pictures": each}
-        print_json({"output": str(output), **sizes, **errors, **rest})
-        return
-    click.echo(
-        f"{output}: {1000 * size:.4f} ± {1000 * size * lens.scale_sigma:.2g} µm a pixel"
+    each = [
+        {"source": str(path), "marks": marks, "error": error}
+        for path, marks, error in zip(paths, fit.marks, fit.errors, strict=True)
+    ]
+    sizes = {"pixel_size": size, "pixel_size_sigma": size * lens.scale_sigma}
+    errors = {"error": lens.error, "worst": fit.worst, "corner_sigma": fit.corner_sigma}
+    return inputs.Learned(
+        lens,
+        {},
+        {**sizes, **errors, "distortion": lens.distortion.tolist(), "pictures": each},
+        f"{1000 * size:.4f} ± {1000 * size * lens.scale_sigma:.2g} µm a pixel"
         f" ({lens.scale_sigma:.2%}); residual of {sum(fit.marks)} marks in {len(paths)}"
         f" picture{'s' if len(paths) > 1 else ''} {lens.error:.3f} pixels RMS, {fit.worst:.2f} at most;"
-        f" standard error of the map near its corners {fit.corner_sigma:.2g} pixels"
+        f" standard error of the map near its corners {fit.corner_sigma:.2g} pixels",
     )

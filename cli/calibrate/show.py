@@ -13,7 +13,7 @@ from mirrorskin.cli import options
 from mirrorskin.cli.groups import Argument, Option
 
 if TYPE_CHECKING:
-    from mirrorskin.view.calibration_table import Row
+    from mirrorskin.io.calibration.parameters import Row
 
 _HEAD = "part", "what", "value", "standard error", "unit"
 _NUMBERS = "value", "standard error"
@@ -34,12 +34,11 @@ def command(
     from mirrorskin.cli.output import print_json
     from mirrorskin.view import check_drawing
     from mirrorskin.view.calibration import calibration_figures
-    from mirrorskin.view.calibration_table import calibration_table
 
     if output is not None:
         check_drawing()
     parts = io.open_calibration(calibration)
-    rows = calibration_table(parts)
+    rows = list(parts.rows())
     pictures = [] if output is None else calibration_figures(parts, output)
     if as_json:
         print_json(

@@ -7,13 +7,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import click
-
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import inputs
 from mirrorskin.cli.declared import declared
 from mirrorskin.cli.groups import Argument, Option
-from mirrorskin.cli.stack import STACK, stack_options
+from mirrorskin.cli.stack import STACK
 
 if TYPE_CHECKING:
     from mirrorskin.engine.calibration.brightness import Brightness
@@ -53,26 +51,21 @@ def command(
     **stack: Annotated[Any, STACK.only("phase_step", "phases", "pixel_size"), _RESPONSE],
 ) -> None:
     """Determine half-angle, phase offset, direction, ellipticity and pivot, with their standard errors."""
-    from mirrorskin import io
     from mirrorskin.cli.output import progress
     from mirrorskin.cli.quantity import angle, length
     from mirrorskin.engine.calibration.tilt import fit_precession
     from mirrorskin.engine.calibration.tilt_tracks import track_ball, track_plate
 
-    paths, flats, wedges = list(balls or []), list(flat or []), list(wedge or [])
-    radius = length(ball, "--ball") / 2
+    flats, wedges, radius = flat or [], wedge or [], length(ball, "--ball") / 2
     response = stack.pop("zenith_gain", None), stack.pop("zenith_offset", None)
-    calibration = inputs.check_call(
-        output, paths, rig, [*flats, *wedges], press=press, tilt=tilt, settle=settle, overwrite=overwrite
-    )
-    if rig is not None:
+
+    def turns() -> list[inputs.Place]:
         half_angle = None if tilt is None else angle(tilt, "--tilt")
         plan = inputs.turn_plan(press, half_angle, stack.get("phase_step"), "0.5mm")
-        turns = inputs.at_each("tilt", inputs.BALL, places, plan)
-        paths = inputs.take(rig, output, turns, settle, overwrite)
-        stack = {}
-    every = [*paths, *flats, *wedges]
-    with inputs.open_all(every, stack_options(stack), calibration, output) as (sources, camera):
+        stack.clear()
+        return inputs.at_each("tilt", inputs.BALL, places, plan)
+
+    def fit(sources: list[Source], calibration: Calibration | None, paths: list[Path]) -> inputs.Learned:
         light = _brightness(sources[0], calibration, *response)
         tracks, plates = [], []
         with progress("following", len(sources)) as show:
@@ -82,17 +75,13 @@ def command(
                 else:
                     plates.append(track_plate(source, number <= len(paths) + len(flats), light))
                 show(number)
-        fit = fit_precession(tracks, plates, depth_sigma=light.depth_sigma)
+        found = fit_precession(tracks, plates, depth_sigma=light.depth_sigma)
         named = {"sources": paths, "flats": flats, "wedges": wedges}
-        process = inputs.process_of(
-            sources[0],
-            ball=ball,
-            assumptions="; ".join(fit.notes),
-            **{name: files for name, files in named.items() if files},
-            **{f"residual_{name}": value for name, value in fit.residual.items()},
-        )
-    io.update_calibration(output, fit.precession, camera, process)
-    _report(output, fit, as_json)
+        return _learned(found, {"ball": ball, **{name: files for name, files in named.items() if files}})
+
+    capture = inputs.Capture(rig, turns, settle, overwrite)
+    plates = [*flats, *wedges]
+    inputs.learn(output, balls or [], fit, stack, as_json, capture, plates, press=press, tilt=tilt)
 
 
 def _brightness(
@@ -123,9 +112,7 @@ def _brightness(
         return LinearBrightness.of_header(header, shape)
 
 
-def _report(output: Path, fit: PrecessionFit, as_json: bool) -> None:
-    from mirrorskin.cli.output import print_json
-
+def _learned(fit: PrecessionFit, facts: dict[str, Any]) -> inputs.Learned:
     precession = fit.precession
     numbers = {
         **{name: getattr(precession, name) for name in ("tilt", "phase_offset", "ellipticity", "major_axis")},
@@ -136,11 +123,7 @@ def _report(output: Path, fit: PrecessionFit, as_json: bool) -> None:
     values = {name: value * unit[name] for name, value in numbers.items()}
     errors = {name: precession.sigma[name] * unit[name] for name in numbers if name in precession.sigma}
     notes = [*fit.notes, *warnings(precession)]
-    if as_json:
-        each = {name: {"value": value, "sigma": errors.get(name)} for name, value in values.items()}
-        head = {"output": str(output), "direction": precession.direction}
-        print_json({**head, **each, "residual": fit.residual, "notes": notes})
-        return
+    each = {name: {"value": value, "sigma": errors.get(name)} for name, value in values.items()}
 
     def text(name: str, digits: int, unit: str = "") -> str:
         if not math.isfinite(values[name]):
@@ -148,13 +131,16 @@ def _report(output: Path, fit: PrecessionFit, as_json: bool) -> None:
         return f"{values[name]:.{digits}f} ± {errors[name]:.2g}{unit}"
 
     sense = "counter-clockwise" if precession.direction > 0 else "clockwise"
-    click.echo(
-        f"{output}: half-angle {text('tilt', 4, ' deg')}, {sense} from {text('phase_offset', 3, ' deg')},"
+    residuals = {f"residual_{name}": value for name, value in fit.residual.items()}
+    return inputs.Learned(
+        precession,
+        {**facts, "assumptions": "; ".join(fit.notes), **residuals},
+        {"direction": precession.direction, **each, "residual": fit.residual, "notes": notes},
+        f"half-angle {text('tilt', 4, ' deg')}, {sense} from {text('phase_offset', 3, ' deg')},"
         f" ellipticity {text('ellipticity', 4)}, pivot at "
-        + ", ".join(f"{axis} {text(f'pivot_{axis}', 3, ' mm')}" for axis in "xyz")
+        + ", ".join(f"{axis} {text(f'pivot_{axis}', 3, ' mm')}" for axis in "xyz"),
+        [f"note: {note}" for note in notes],
     )
-    for note in notes:
-        click.echo(f"note: {note}", err=True)
 
 
 def warnings(precession: Precession) -> Iterator[str]:

@@ -11,7 +11,7 @@ import click
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import inputs
 from mirrorskin.cli.groups import Argument, Option
-from mirrorskin.cli.stack import STACK, stack_options
+from mirrorskin.cli.stack import STACK
 
 if TYPE_CHECKING:
     from mirrorskin.io import Calibration, Precession, Source, WallResponse
@@ -55,21 +55,19 @@ def command(
     **stack: Annotated[Any, STACK.only("tilt", "phase_step", "pixel_size")],
 ) -> None:
     """Learn brightness as a function of position and normal, from a ball pressed all over the field."""
-    from mirrorskin import io
     from mirrorskin.cli.output import progress
     from mirrorskin.cli.quantity import length
     from mirrorskin.engine.calibration.wall import fit_zenith
 
-    paths = list(presses or [])
     radius = length(ball, "--ball") / 2
     body = length(body_radius, "--body-radius"), length(body_height, "--body-height")
-    calibration = inputs.check_call(output, paths, rig, press=press, settle=settle, overwrite=overwrite)
-    if rig is not None:
+
+    def balls() -> list[inputs.Place]:
         turn = stack.pop("tilt", None), stack.pop("phase_step", None)
         plan = inputs.turn_plan(press, *turn, "0.4mm for 4 mm")
-        balls = inputs.at_each("zenith", inputs.BALL, places, plan)
-        paths = inputs.take(rig, output, balls, settle, overwrite)
-    with inputs.open_all(paths, stack_options(stack), calibration, output) as (sources, camera):
+        return inputs.at_each("zenith", inputs.BALL, places, plan)
+
+    def fit(sources: list[Source], calibration: Calibration | None, paths: list[Path]) -> inputs.Learned:
         with progress("fitting", len(sources)) as show:
             response = fit_zenith(
                 sources,
@@ -80,10 +78,11 @@ def command(
                 body=body,
                 progress=show,
             )
-        sizes = {"body_radius": body[0], "body_height": body[1]}
-        process = inputs.process_of(sources[0], sources=paths, ball=ball, **sizes)
-    io.update_calibration(output, response, camera, process)
-    _report(output, response, as_json)
+        facts = {"sources": paths, "ball": ball, "body_radius": body[0], "body_height": body[1]}
+        return _learned(response, facts)
+
+    capture = inputs.Capture(rig, balls, settle, overwrite)
+    inputs.learn(output, presses or [], fit, stack, as_json, capture, press=press)
 
 
 def _precession(calibration: Calibration, source: Source) -> Precession | None:
@@ -103,32 +102,28 @@ def _precession(calibration: Calibration, source: Source) -> Precession | None:
     return None
 
 
-def _report(output: Path, response: WallResponse, as_json: bool) -> None:
+def _learned(response: WallResponse, facts: dict[str, Any]) -> inputs.Learned:
     import numpy as np
-
-    from mirrorskin.cli.output import print_json
 
     errors = dict(zip(response.parameters, np.sqrt(np.diag(response.covariance)).tolist(), strict=True))
     sigma = np.degrees(response.zenith_sigma[np.isfinite(response.zenith_sigma)])
     middle, worst = (float(np.median(sigma)), float(sigma.max())) if sigma.size else (np.nan, np.nan)
     most = float(np.degrees(response.error))
-    if middle > _DOUBTFUL:
-        click.echo(
-            f"depth not determined, standard deviation of zenith {middle:.2g} deg: press less, so that the"
-            " contact ends within the part that shows the wall",
-            err=True,
-        )
-    if as_json:
-        place = *response.axis, response.sight[0], *response.lamps
-        values = response.radius, response.rim, *place, response.scatter
-        each = zip(_PRINTED, values, strict=True)
-        found = {name: {"value": value, "sigma": errors[name]} for name, value in each}
-        degrees = {"zenith_sigma_median": middle, "zenith_sigma_worst": worst, "residual_on_balls": most}
-        print_json({"output": str(output), "pattern": response.pattern, "found": found, "degrees": degrees})
-        return
-    click.echo(
-        f"{output}: wall {response.radius:.2f} ± {errors['radius']:.2g} mm from the axis and"
+    place = *response.axis, response.sight[0], *response.lamps
+    values = zip(_PRINTED, (response.radius, response.rim, *place, response.scatter), strict=True)
+    found = {name: {"value": value, "sigma": errors[name]} for name, value in values}
+    degrees = {"zenith_sigma_median": middle, "zenith_sigma_worst": worst, "residual_on_balls": most}
+    doubt = (
+        f"depth not determined, standard deviation of zenith {middle:.2g} deg: press less, so that the"
+        " contact ends within the part that shows the wall"
+    )
+    return inputs.Learned(
+        response,
+        facts,
+        {"pattern": response.pattern, "found": found, "degrees": degrees},
+        f"wall {response.radius:.2f} ± {errors['radius']:.2g} mm from the axis and"
         f" {response.rim:.1f} ± {errors['rim']:.2g} mm high (noise alone), axis at {response.axis[0]:.2f},"
         f" {response.axis[1]:.2f} mm; standard deviation of zenith {middle:.2g} deg ({worst:.2g} at most),"
-        f" residual on the balls at most {most:.2g} deg"
+        f" residual on the balls at most {most:.2g} deg",
+        [doubt] if middle > _DOUBTFUL else [],
     )

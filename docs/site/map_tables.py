@@ -1,6 +1,7 @@
-"""The tables of maps and of status codes in docs/formats.md, from their declarations.
+"""The tables of maps, status codes and parameters in docs/formats.md and docs/calibration.md.
 
-``python docs/site/map_tables.py`` (in the environment) writes them into the page; a test compares them.
+``python docs/site/map_tables.py`` (in the environment) writes them into the pages, from the
+declarations; a test compares them.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from mirrorskin.io import Map
+from mirrorskin.io.calibration.parameters import Parameter, parameters
+from mirrorskin.io.calibration.types import PARTS
 from mirrorskin.io.maps import (
     TABLE,
     TWIST,
@@ -25,7 +28,20 @@ from mirrorskin.io.maps import (
     status_of,
 )
 
-PAGE = Path(__file__).resolve().parents[1] / "formats.md"
+DOCS = Path(__file__).resolve().parents[1]
+_STORED = {"text": "text", "names": "text", "integer": "i8", "integers": "i8"}
+_CAMERA = (
+    ["`camera/name`", "text", "", "name in the rig file; empty if unknown"],
+    ["`camera/shape`", "(2,)", "", "H, W"],
+    ["`camera/dtype`", "text", "", "`uint8`, `uint16` or `float32`"],
+)
+_PROCESS = [
+    "`process/PART.NAME`",
+    "any",
+    "",
+    "provenance of a part: `tilt.program`, `zenith.sources` and so on; `zenith`, `tilt`, `elastic` and"
+    " `force` include the pixel size used: `pixel_size_x`, `pixel_size_y`, mm",
+]
 
 _LEADING = {"pixels": "H, W", "frames": "T,", "pieces": "components,", "none": ""}
 _STATUS: dict[str, type[IntEnum]] = {
@@ -38,16 +54,35 @@ _STATUS: dict[str, type[IntEnum]] = {
 }
 
 
-def tables() -> dict[str, str]:
-    """Return the tables by their first cell."""
+def tables() -> dict[str, dict[str, str]]:
+    """Return the tables by page and first cell."""
     rows = [_row(name, one) for name, one in TABLE.items()]
     legends = [status_of(codes).codes for codes in _STATUS.values()]
     codes = sorted({code for legend in legends for code in legend})
     meanings = ([str(code), *(legend.get(code, "") for legend in legends)] for code in codes)
+    stored = [
+        _stored(f"{kind.command}/{name}", one)
+        for kind in PARTS.values()
+        for name, one in parameters(kind).items()
+    ]
     return {
-        "map": as_table(["map", "shape, type", "unit", "undefined", "content"], rows),
-        "code": as_table(["code", *_STATUS], meanings),
+        "formats.md": {
+            "map": as_table(["map", "shape, type", "unit", "undefined", "content"], rows),
+            "code": as_table(["code", *_STATUS], meanings),
+        },
+        "calibration.md": {
+            "dataset": as_table(["dataset", "shape, type", "unit", "content"], [*_CAMERA, *stored, _PROCESS])
+        },
     }
+
+
+def _stored(name: str, one: Parameter) -> list[str]:
+    """Return the row of a parameter of a calibration."""
+    dtype = {"text": "text", "names": "text", "integer": "i8", "integers": "i8"}.get(
+        one.kind, one.dtype.str[1:]
+    )
+    place = f"`{name}/NAME`" if one.kind == "mapping" else f"`{name}`"
+    return [f"{place} *" if one.optional else place, f"{one.size} {dtype}".strip(), one.unit, one.text]
 
 
 def _row(name: str, one: Map) -> list[str]:
@@ -69,14 +104,19 @@ def as_table(head: list[str], rows: Iterable[list[str]]) -> str:
     return "".join(f"| {' | '.join(cells)} |\n".replace("  ", " ").replace("  ", " ") for cells in lines)
 
 
-def with_tables(page: str) -> str:
-    """Return the page with its current tables."""
-    for first, table in tables().items():
-        found = re.findall(rf"^\| {first} \|.*\n(?:\|.*\n)+", page, flags=re.MULTILINE)
-        assert len(found) == 1, f"{PAGE} has {len(found)} tables whose first cell is {first}"
-        page = page.replace(found[0], table)
-    return page
+def pages() -> dict[str, str]:
+    """Return the pages with their current tables, by name."""
+    made = {}
+    for name, current in tables().items():
+        page = (DOCS / name).read_text(encoding="utf-8")
+        for first, table in current.items():
+            found = re.findall(rf"^\| {first} \|.*\n(?:\|.*\n)+", page, flags=re.MULTILINE)
+            assert len(found) == 1, f"{name} has {len(found)} tables whose first cell is {first}"
+            page = page.replace(found[0], table)
+        made[name] = page
+    return made
 
 
 if __name__ == "__main__":
-    PAGE.write_text(with_tables(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    for name, page in pages().items():
+        (DOCS / name).write_text(page, encoding="utf-8")

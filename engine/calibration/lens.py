@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.calibration.board import FEWEST, Board, Charuco
-from mirrorskin.engine.calibration.marks import Marks, centre_marks, find_marks, stretch_contrast
+from mirrorskin.engine.calibration.marks import Marks, centre_marks, find_marks, scale_contrast
 from mirrorskin.engine.undistort import distorted, picture_places
 from mirrorskin.io import InputError, Lens
 from mirrorskin.kernels import least_squares
@@ -25,7 +25,7 @@ _FEWEST_YET = 6  # marks that are needed before all are predicted
 _LEAST_REACH, _MOST_REACH = 2.5, 12.0  # pixels: radius around a corner in which it is centred
 _FAR = 0.2  # pitches: greatest distance of a mark from its predicted place
 _OFF, _OFF_SHARE = 0.6, 3e-4  # greatest RMS residual of a picture: pixels, or share of its diagonal
-_MARKER = 0.1  # greatest relative difference of the markers' size from the specified one
+_MARKER = 0.15  # greatest relative difference of the markers' size from the specified one; blur shrinks them
 
 _PLANE = 8  # parameters of the homography; then those of the distortion, then the pose of each other board
 _LENS = _PLANE + 5
@@ -105,7 +105,7 @@ def locate_marks(picture: NDArray[Any], board: Board, name: str) -> Marks:
     rough = find_marks(picture, board, name)
     fit = CameraFit([rough])
     _check_kind(rough, board, fit)
-    stretched, marks = stretch_contrast(picture, name), rough
+    stretched, marks = scale_contrast(picture, name), rough
     for _ in range(_ROUNDS):
         count = len(marks.board)
         adjacent = KDTree(marks.board).query(board.marks())[0] < _ADJACENT * board.pitch

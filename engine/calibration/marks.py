@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,17 +14,28 @@ from mirrorskin.engine.calibration.board import Board, Charuco, Dots
 from mirrorskin.io import InputError
 
 Doubles = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
 
 _SATURATED = 0.3  # share of saturated pixels above which a message names them as the reason
 _LEAST_DOT = 9.0  # pixels: least area of a dot
+_RANGE = 0.5, 99.5  # percentiles between which a picture's contrast is measured
+_LEAST_MARKER = 12.0  # pixels: least side of a marker
 _FEWEST_MARKERS = 3  # of a picture
 _ENOUGH = 0.5  # share of a board's markers with which sharpened pictures are not searched
+_SAME_BOARD = 0.7  # share of the markers of a clear picture that lie on one plane
+_OFF_PLANE = 0.35  # greatest distance of a marker's corner from the plane of others, as a share of its side
+_OFF_GRID = 0.25  # the same of a dot, as a share of the pitch
+_MOST_BLOBS = 2  # blobs among which dots are searched, per dot
+_DARK = 25.0  # brightness, at a contrast of 255, below which details are not divided by it
+_LIGHT = 16  # parts of a picture's longer side within which the light is assumed to be even
 
 _BLUR = 1.0  # pixels, standard deviation
 _STEPS = 20  # Gauss-Newton steps, at most
 _CONVERGED = 1e-4  # pixels: size of the last step
 _STEP, _SHIFT = 0.25, 0.6  # longest step, and longest distance from the start, as shares of the radius
 _SPACING, _FEWEST_SAMPLES, _MOST_SAMPLES = 1.5, 6, 24  # pixels between samples along a radius; their number
+_UNEVEN = 8.0  # F ratio of the light's slopes and of their noise above which the picture is corrected
 _ASYMMETRIC = 0.3  # greatest share of the variance around a mark that is asymmetric
 _FAINT = 3.0  # counts, at a contrast of 255: least standard deviation around a mark
 
@@ -40,25 +51,25 @@ class Marks:
     radius: float = 0.0  # of dots, mm; 0 for corners
 
 
-def stretch_contrast(picture: NDArray[Any], name: str) -> Doubles:
-    """Scale a picture so that its 0.5 % and 99.5 % quantiles are 0 and 255."""
+def scale_contrast(picture: NDArray[Any], name: str) -> Doubles:
+    """Scale a picture so that its 0.5 % and 99.5 % quantiles differ by 255; 0 stays 0."""
     samples = np.asarray(picture, np.float64)
     if not np.isfinite(samples).all():
         raise InputError(f"{name} has samples that are not finite: take the picture again")
-    low, high = np.percentile(samples, [0.5, 99.5])
+    low, high = np.percentile(samples, _RANGE)
     if high <= low:
         raise InputError(_not_found(picture, name, "shows nothing: its brightness is the same everywhere"))
-    return np.asarray((samples - low) * (255 / (high - low)))
+    return np.asarray(samples * (255 / (high - low)))
 
 
 def find_marks(picture: NDArray[Any], board: Board, name: str) -> Marks:
     """Find the corners of a ChArUco board's markers (four each, marker by marker), or dots, approximately."""
-    grey = np.clip(np.rint(stretch_contrast(picture, name)), 0, 255).astype(np.uint8)
+    scaled = np.asarray(scale_contrast(picture, name), np.float32)
     if isinstance(board, Dots):
-        positions = _find_dots(grey, board)
+        positions = _find_dots(scaled, board)
     else:
-        positions = _find_markers(_sharpened(grey), board)
-        if positions is None and _find_markers(iter([(1, grey[:, ::-1].copy())]), board):
+        positions = _find_markers(_marker_pictures(scaled), board)
+        if positions is None and _find_markers([(1, _as_bytes(scaled[:, ::-1]))], board):
             raise InputError(f"{name} shows {board} in a mirror: turn the board over, or flip the picture")
     if positions is None:
         raise InputError(_not_found(picture, name, f"shows no board {board}"))
@@ -72,94 +83,151 @@ def _not_found(picture: NDArray[Any], name: str, problem: str) -> str:
     return f"{name} {problem}: is all of it in the picture, sharp and evenly lit, and is it of that kind?"
 
 
-def _find_markers(
-    pictures: Iterator[tuple[int, NDArray[np.uint8]]], board: Charuco
-) -> tuple[Doubles, Doubles] | None:
-    """Return the corners of the markers in the (scale, picture) that has most of them."""
+def _as_bytes(samples: NDArray[Any]) -> Bytes:
+    """Return a picture whose 0.5 % and 99.5 % quantiles are 0 and 255."""
+    low, high = np.percentile(samples, _RANGE)
+    shown = np.clip(np.rint((samples - low) * (255 / max(high - low, 1e-9))), 0, 255)
+    return np.asarray(shown, np.uint8)
+
+
+def _band(scaled: Singles, fine: float, coarse: float) -> Singles:
+    """Return details between two widths, pixels, relative to the brightness around them."""
     import cv2
 
-    most = max(_detect_markers(pictures, board), key=lambda detected: len(detected[1]), default=None)
-    if most is None:
-        return None
-    dictionary, numbers, corners = most
-    places = corners.reshape(-1, 2)
-    width, height = board.size
-    candidates = []
-    for legacy in (False, True):
-        layout = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square, board.marker, dictionary)
-        layout.setLegacyPattern(legacy)
-        points = np.array(layout.getObjPoints(), np.float64)[numbers, :, :2].reshape(-1, 2)
-        # OpenCV's origin is the board's upper left corner, with y down; here it is the middle, with y up.
-        candidates.append(np.stack([points[:, 0] - width / 2, height / 2 - points[:, 1]], axis=1))
-    return min(candidates, key=lambda points: _plane_error(points, places)), places
+    near, far = (cv2.GaussianBlur(scaled, (0, 0), width) for width in (fine, coarse))
+    return np.asarray((near - far) / np.maximum(far, _DARK), np.float32)
 
 
-def _detect_markers(
-    pictures: Iterator[tuple[int, NDArray[np.uint8]]], board: Charuco
-) -> Iterator[tuple[Any, NDArray[np.intp], Doubles]]:
-    """Yield dictionaries with the numbers and corners, (n, 4, 2), of their markers in (scale, picture)s."""
-    import cv2
+def _find_markers(pictures: Iterable[tuple[int, Bytes]], board: Charuco) -> tuple[Doubles, Doubles] | None:
+    """Return the corners of the markers in (scale, picture)s that lie on one plane.
 
-    dictionaries = board.dictionaries()
+    If the first picture shows many markers, most of them in another arrangement, all of these are returned.
+    """
+    seen: dict[int, list[tuple[Doubles, Doubles]]] = {}  # by layout: corners on the board, and their places
+    families = [(dictionary, _layouts(board, dictionary)) for dictionary in board.dictionaries()]
+    best: tuple[Doubles, Doubles] | None = None
     for scale, picture in pictures:
-        for dictionary in dictionaries:
-            corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(picture)
-            seen = np.empty(0, np.intp) if numbers is None else np.array(numbers, np.intp).ravel()
-            on_board = np.flatnonzero(seen < board.markers)
-            if on_board.size < _FEWEST_MARKERS:
-                continue
-            places = np.array(corners, np.float64).reshape(-1, 4, 2)[on_board]
-            yield dictionary, seen[on_board], (places + 0.5) / scale - 0.5
-            if on_board.size > _ENOUGH * board.columns * board.rows / 2:
-                return
-            dictionaries = [dictionary]
+        for family in families:
+            numbers, places = _detect_markers(picture, family[0], board.markers)
+            for layout in family[1]:
+                markers = seen.setdefault(id(layout), [])
+                markers.append((layout[numbers], (places + 0.5) / scale - 0.5))
+                planar = _on_one_plane(markers)
+                if planar is not None and (best is None or len(planar[0]) > len(best[0])):
+                    best, families = planar, [family]
+        if best is not None and len(best[0]) > 4 * _ENOUGH * board.markers:
             break
+    points, places = max((markers[0] for markers in seen.values()), key=lambda pair: len(pair[0]))
+    consistent = 0 if best is None else len(best[0]) // 4
+    if len(points) > max(_ENOUGH * board.markers, consistent / _SAME_BOARD):
+        return points.reshape(-1, 2), places.reshape(-1, 2)
+    return best
 
 
-def _sharpened(grey: NDArray[np.uint8]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Yield (scale, picture): the picture, then enlarged and sharpened ones, which show blurred markers."""
+def _layouts(board: Charuco, dictionary: Any) -> list[Doubles]:
+    """Return the corners of all markers, (n, 4, 2), on the present and on the former boards of OpenCV."""
     import cv2
 
-    yield 1, grey
-    for amount in (3.0, 8.0):
-        fine = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.0)
-        sharp = fine + amount * (fine - cv2.GaussianBlur(fine, (0, 0), 2.0))
-        large = cv2.resize(sharp, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
-        yield 2, np.clip(large, 0, 255).astype(np.uint8)
+    layouts = []
+    for legacy in (False, True):
+        one = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square, board.marker, dictionary)
+        one.setLegacyPattern(legacy)
+        corners = np.array(one.getObjPoints(), np.float64)[..., :2]
+        # OpenCV's origin is the board's upper left corner, with y down; here it is the middle, with y up.
+        layouts.append((corners - np.array(board.size) / 2) * [1, -1])
+    return layouts
 
 
-def _plane_error(points: Doubles, places: Doubles) -> float:
-    """Return the median distance, pixels, of points of a plane from their places, after a homography."""
+def _detect_markers(picture: Bytes, dictionary: Any, count: int) -> tuple[NDArray[np.intp], Doubles]:
+    """Return the numbers of markers below a count, and their corners, (n, 4, 2); some are wrong."""
     import cv2
 
-    plane, _ = cv2.findHomography(points, places, cv2.LMEDS)
+    settings = cv2.aruco.DetectorParameters()
+    settings.minMarkerPerimeterRate = 4 * _LEAST_MARKER / max(picture.shape)
+    settings.adaptiveThreshWinSizeMax, settings.adaptiveThreshWinSizeStep = 63, 20
+    settings.adaptiveThreshConstant = 3
+    settings.polygonalApproxAccuracyRate = 0.06
+    settings.perspectiveRemovePixelPerCell, settings.perspectiveRemoveIgnoredMarginPerCell = 8, 0.25
+    settings.errorCorrectionRate = 1.0
+    corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary, settings).detectMarkers(picture)
+    known = np.empty(0, np.intp) if numbers is None else np.array(numbers, np.intp).ravel()
+    places = np.array(corners, np.float64).reshape(-1, 4, 2)
+    return known[known < count], places[known < count]
+
+
+def _on_one_plane(markers: list[tuple[Doubles, Doubles]]) -> tuple[Doubles, Doubles] | None:
+    """Return the corners of the markers that a homography maps to their places; None if there are too few."""
+    import cv2
+
+    points, places = (np.concatenate(parts) for parts in zip(*markers, strict=True))
+    if len(points) < _FEWEST_MARKERS:
+        return None
+    side = float(np.median(np.linalg.norm(places - np.roll(places, 1, axis=1), axis=2)))
+    plane, _ = cv2.findHomography(points.reshape(-1, 2), places.reshape(-1, 2), cv2.RANSAC, _OFF_PLANE * side)
     if plane is None:
-        return float("inf")
-    seen = cv2.perspectiveTransform(points[np.newaxis], plane)[0]
-    return float(np.median(np.hypot(*(seen - places).T)))
+        return None
+    errors = np.linalg.norm(cv2.perspectiveTransform(points, plane) - places, axis=2).max(axis=1)
+    order = np.argsort(errors)
+    first = np.unique(points[order, 0], axis=0, return_index=True)[1]  # the best of each marker
+    good = order[first][errors[order[first]] < _OFF_PLANE * side]
+    if len(good) < _FEWEST_MARKERS:
+        return None
+    return points[good].reshape(-1, 2), places[good].reshape(-1, 2)
 
 
-def _find_dots(grey: NDArray[np.uint8], board: Dots) -> tuple[Doubles, Doubles] | None:
+def _marker_pictures(scaled: Singles) -> Iterator[tuple[int, Bytes]]:
+    """Yield (scale, picture): the picture, then evenly lit, enlarged and sharpened ones."""
+    import cv2
+
+    yield 1, _as_bytes(scaled)
+    even = _band(scaled, 0.5, max(scaled.shape) / _LIGHT)
+    for fine, amount in ((1.0, 3.0), (1.5, 8.0), (2.0, 8.0)):
+        smooth = cv2.GaussianBlur(even, (0, 0), fine)
+        sharp = smooth + amount * (smooth - cv2.GaussianBlur(smooth, (0, 0), 2 * fine))
+        yield 2, _as_bytes(cv2.resize(sharp, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC))
+
+
+def _find_dots(scaled: Singles, board: Dots) -> tuple[Doubles, Doubles] | None:
     """Return the dots of a grid, dark or bright, in the order of the board."""
     import cv2
 
+    count, points = board.columns * board.rows, board.marks()
     settings = cv2.SimpleBlobDetector_Params()  # type: ignore[attr-defined]
-    settings.minArea, settings.maxArea = _LEAST_DOT, grey.size / (board.columns * board.rows)
+    settings.minArea, settings.maxArea = _LEAST_DOT, scaled.size / count
     if settings.maxArea <= settings.minArea:  # fewer pixels than the dots need
         return None
     settings.minDistBetweenBlobs = 3.0
     detector = cv2.SimpleBlobDetector_create(settings)  # type: ignore[attr-defined]
-    for picture in (grey, 255 - grey):
+    for picture in _dot_pictures(scaled, math.sqrt(settings.maxArea)):
+        blobs = np.array([blob.pt for blob in detector.detect(picture)], np.float32).reshape(-1, 1, 2)
+        if not count <= len(blobs) <= _MOST_BLOBS * count:
+            continue
         for flags in (cv2.CALIB_CB_SYMMETRIC_GRID, cv2.CALIB_CB_SYMMETRIC_GRID | cv2.CALIB_CB_CLUSTERING):
-            complete, centres = cv2.findCirclesGrid(
-                picture, (board.columns, board.rows), flags=flags, blobDetector=detector
+            complete, centres = cv2.findCirclesGrid(  # type: ignore[call-overload]  # None: places of blobs
+                blobs, (board.columns, board.rows), flags, None, cv2.CirclesGridFinderParameters()
             )
-            if complete:
-                places, points = np.array(centres, np.float64).reshape(-1, 2), board.marks()
-                fit = np.linalg.lstsq(np.column_stack([points, np.ones(len(points))]), places, rcond=None)[0]
+            if not complete:
+                continue
+            places = np.array(centres, np.float64).reshape(-1, 2)
+            plane, _ = cv2.findHomography(points, places, cv2.LMEDS)
+            if plane is None:
+                continue
+            errors = cv2.perspectiveTransform(points[np.newaxis], plane)[0] - places
+            steps = np.diff(places.reshape(board.rows, board.columns, 2), axis=1)
+            if np.hypot(*errors.T).max() < _OFF_GRID * np.median(np.linalg.norm(steps, axis=2)):
                 # Rows run against y: otherwise OpenCV numbered the grid as in a mirror.
-                return points * [-1, 1] if np.linalg.det(fit[:2]) > 0 else points, places
+                return points * [1 if np.linalg.det(plane) < 0 else -1, 1], places
     return None
+
+
+def _dot_pictures(scaled: Singles, pitch: float) -> Iterator[Bytes]:
+    """Yield the picture, then evenly lit and smoother ones, each with dark and with bright dots."""
+    yield from (grey := _as_bytes(scaled), 255 - grey)
+    width = 2.0
+    while width == 2.0 or width < pitch / 8:
+        band = _as_bytes(_band(scaled, width, 3 * width))
+        yield from (band, 255 - band)
+        width *= 1.5
 
 
 # --- centring -----------------------------------------------------------------------------------------------
@@ -172,6 +240,9 @@ def centre_marks(picture: NDArray[Any], starts: Doubles, radius: float) -> tuple
     found by Gauss-Newton steps with the weights (1 - d^2 / radius^2)^2. The picture is interpolated by cubic
     splines after a slight blur, because splines oscillate next to a sharp edge.
 
+    Light that increases to one side moves such a centre. From the asymmetries around all marks, the light is
+    estimated as the exponential of a quadratic polynomial, by which the picture is divided.
+
     ``picture`` has a contrast of about 255, ``starts`` are columns and rows, (n, 2), and ``radius`` is the
     circle's, pixels. Returned are the places, and whether there is such a centre near the start, with the
     whole circle in the picture.
@@ -179,19 +250,50 @@ def centre_marks(picture: NDArray[Any], starts: Doubles, radius: float) -> tuple
     from scipy import ndimage
 
     blurred = ndimage.gaussian_filter(np.asarray(picture, np.float64), _BLUR, mode="mirror")
-    smooth = ndimage.spline_filter(blurred, order=3)
-    offsets, weights = _half_disc(radius)
-    places = np.array(starts, np.float64)
+    disc = _half_disc(radius)
+    places, inside, light = np.array(starts, np.float64), np.ones(len(starts), bool), np.ones_like(blurred)
+    for last in (False, True):
+        smooth = ndimage.spline_filter(blurred / light, order=3)
+        places, still = _centre(smooth, places, *disc, radius)
+        near = np.hypot(*(places - starts).T) <= _SHIFT * radius
+        inside = np.all((places >= radius) & (places <= np.array(picture.shape[::-1]) - 1 - radius), axis=1)
+        found = still & near & inside & _is_symmetric(smooth, places, *disc)
+        if last or not found.any():
+            break
+        light = _light(smooth, places[found], *disc)
+    return places, found
+
+
+def _centre(
+    smooth: Doubles, places: Doubles, offsets: Doubles, weights: Doubles, radius: float
+) -> tuple[Doubles, NDArray[np.bool_]]:
+    """Return centres of symmetry near places, and which of the iterations converged."""
     step = np.full_like(places, np.inf)
     for _ in range(_STEPS):
-        step = _gauss_newton_step(smooth, places, offsets, weights, radius)
-        places += step
+        step = _gauss_newton_step(smooth, places, offsets, weights)
+        length = np.hypot(*step.T)[:, np.newaxis]
+        step *= np.minimum(1, _STEP * radius / np.maximum(length, 1e-12))
+        places = places + step
         if np.abs(step).max(initial=0) < _CONVERGED:
             break
-    still = np.abs(step).max(axis=1) < 10 * _CONVERGED
-    near = np.hypot(*(places - starts).T) <= _SHIFT * radius
-    inside = np.all((places >= radius) & (places <= np.array(picture.shape[::-1]) - 1 - radius), axis=1)
-    return places, still & near & inside & _is_symmetric(smooth, places, offsets, weights)
+    return places, np.abs(step).max(axis=1) < 10 * _CONVERGED
+
+
+def _light(smooth: Doubles, places: Doubles, offsets: Doubles, weights: Doubles) -> Doubles:
+    """Return the light of all pixels, as far as it makes marks asymmetric; 1 if that is insignificant."""
+    slopes = -_gauss_newton_step(smooth, places, offsets, weights, light=True)[:, 2:] / 2
+    rows, columns = smooth.shape
+    (x, y), one, zero = (places - [columns / 2, rows / 2]).T, np.ones(len(places)), np.zeros(len(places))
+    terms = np.hstack([[one, zero, x, y, zero], [zero, one, zero, x, y]]).T
+    measured = slopes.T.ravel()
+    solution = np.linalg.lstsq(terms, measured, rcond=None)[0]
+    explained = float(np.sum((terms @ solution) ** 2)) / len(solution)
+    free = len(measured) - len(solution)
+    if free < 1 or explained < _UNEVEN * float(np.sum((measured - terms @ solution) ** 2)) / free:
+        return np.ones_like(smooth)
+    across, down, xx, xy, yy = solution
+    x, y = np.arange(columns) - columns / 2, (np.arange(rows) - rows / 2)[:, np.newaxis]
+    return np.asarray(np.exp(across * x + down * y + xx * x**2 / 2 + xy * x * y + yy * y**2 / 2))
 
 
 def _half_disc(radius: float) -> tuple[Doubles, Doubles]:
@@ -205,16 +307,18 @@ def _half_disc(radius: float) -> tuple[Doubles, Doubles]:
 
 
 def _gauss_newton_step(
-    smooth: Doubles, places: Doubles, offsets: Doubles, weights: Doubles, radius: float
+    smooth: Doubles, places: Doubles, offsets: Doubles, weights: Doubles, light: bool = False
 ) -> Doubles:
+    """Return the step of each place; with the light, also minus twice its relative slopes."""
     ahead, behind = places[:, np.newaxis] + offsets, places[:, np.newaxis] - offsets
-    residual = _interpolate(smooth, ahead) - _interpolate(smooth, behind)
+    forward, backward = _interpolate(smooth, ahead), _interpolate(smooth, behind)
     slope = _gradient(smooth, ahead) - _gradient(smooth, behind)
-    normal = np.einsum("m,nmi,nmj->nij", weights, slope, slope) + 1e-9 * np.eye(2)
-    pull = np.einsum("m,nmi,nm->ni", weights, slope, residual)
-    step = -np.linalg.solve(normal, pull[..., np.newaxis])[..., 0]
-    length = np.hypot(*step.T)[:, np.newaxis]
-    return np.asarray(step * np.minimum(1, _STEP * radius / np.maximum(length, 1e-12)))
+    if light:
+        mean = (forward + backward)[..., np.newaxis] / 2
+        slope = np.concatenate([slope, mean * offsets], axis=-1)
+    normal = np.einsum("m,nmi,nmj->nij", weights, slope, slope) + 1e-9 * np.eye(slope.shape[-1])
+    pull = np.einsum("m,nmi,nm->ni", weights, slope, forward - backward)
+    return np.asarray(-np.linalg.solve(normal, pull[..., np.newaxis])[..., 0])
 
 
 def _is_symmetric(smooth: Doubles, places: Doubles, offsets: Doubles, weights: Doubles) -> NDArray[np.bool_]:

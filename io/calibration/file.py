@@ -1,12 +1,12 @@
 """Calibration files, and the copies in recordings and results: read, write, replace one part.
 
-The layout is declared by the fields of the parts; see ``types.kept``.
+The layout follows from the parameters that the parts declare.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import MISSING, fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.atomic import Item, fixed_text, process_items, write_file, write_item
+from mirrorskin.io.calibration.parameters import Parameter, Part, parameters, unit_of
 from mirrorskin.io.calibration.source import check_camera
 from mirrorskin.io.calibration.types import (
-    BITS,
-    GROUPS,
-    KINDS,
+    PARTS,
     Calibration,
     CameraId,
-    Part,
-    Stored,
-    stored,
-    unit_of,
 )
 from mirrorskin.io.hdf5 import Hdf5File, Node, read_process
 from mirrorskin.io.types import FRAME_DTYPES, InputError, ProcessValue
@@ -37,9 +32,7 @@ MARK, VERSION = "mirrorskin_calibration", 1
 ENTRY, CARRIED = "/entry", "/entry/calibration"
 """Group of the calibration in a calibration file, and of the copy in recordings and results."""
 
-_SIGNALS = {"references": "bright", "zenith": "zenith_sigma"}  # maps that viewers show by default
 _AGAIN = "calibrate again"
-_FEW = 16  # numbers that are printed individually
 
 
 def open_calibration(path: str | Path) -> Calibration:
@@ -127,8 +120,8 @@ def update_calibration(
             before = _read(file, ENTRY, str(path))
         check_camera(before, camera, "this", "name another file with -o")
         before = replace(before, camera=camera) if camera.name else before
-    name = next(name for name, kind in KINDS.items() if isinstance(part, kind))
-    command = GROUPS[name]
+    name = next(name for name, kind in PARTS.items() if isinstance(part, kind))
+    command = part.command
     facts = {key: value for key, value in before.process.items() if not key.startswith(f"{command}.")}
     facts |= {f"{command}.{key.removeprefix(f'{command}.')}": value for key, value in (process or {}).items()}
     changed: dict[str, Any] = {name: part}
@@ -148,13 +141,13 @@ def write_calibration(file: h5py.File, calibration: Calibration, place: str) -> 
 
 def calibration_items(calibration: Calibration, place: str) -> Iterator[Item]:
     """Yield the objects of a calibration in the group ``place``."""
-    parts = [GROUPS[name] for name in calibration.parts()]
-    maps = [name for name in parts if name in _SIGNALS]
+    signals = {part.command: part.signal for part in calibration.parts().values()}
+    maps = [name for name, signal in signals.items() if signal]
     default = {"default": maps[0]} if maps else {}
     kind = "NXentry" if place == ENTRY else "NXcollection"
     yield Item(place, None, {"NX_class": kind, MARK: VERSION, **default})
-    for name in ("camera", *parts):
-        signal = {"signal": _SIGNALS[name]} if name in _SIGNALS else {}
+    for name, shown in {"camera": "", **signals}.items():
+        signal = {"signal": shown} if shown else {}
         yield Item(f"{place}/{name}", None, {"NX_class": "NXdata" if signal else "NXcollection", **signal})
     yield Item(f"{place}/process", None, {"NX_class": "NXprocess"})
     yield from _datasets(calibration, place)
@@ -171,15 +164,15 @@ def _datasets(calibration: Calibration, place: str) -> Iterator[Item]:
     yield Item(f"{place}/camera/name", fixed_text(camera.name), {})
     yield Item(f"{place}/camera/shape", np.asarray(camera.shape, np.int64), {})
     yield Item(f"{place}/camera/dtype", fixed_text(np.dtype(camera.dtype).name), {})
-    for name, part in calibration.parts().items():
-        yield from _part_items(part, f"{place}/{GROUPS[name]}", camera)
+    for part in calibration.parts().values():
+        yield from _part_items(part, f"{place}/{part.command}", camera)
     yield from process_items(f"{place}/process", calibration.process)
 
 
 def _part_items(part: Part, place: str, camera: CameraId) -> Iterator[Item]:
     """Yield the objects of a part; ValueError if it does not fit the camera or is inconsistent."""
     sizes = _sizes_of(camera)
-    how = stored(part)
+    how = parameters(part)
     for name, one in how.items():
         value = getattr(part, name)
         if value is None:
@@ -196,22 +189,22 @@ def _part_items(part: Part, place: str, camera: CameraId) -> Iterator[Item]:
         yield Item(f"{place}/{name}", values, image | _units(one.unit))
 
 
-def _values_of(value: Any, how: Stored) -> NDArray[Any]:
+def _values_of(value: Any, how: Parameter) -> NDArray[Any]:
     if how.kind in ("text", "names"):
         return fixed_text(value)
     integer = how.kind in ("integer", "integers")
     return np.ascontiguousarray(value, np.int64 if integer else how.dtype).reshape(np.shape(value))
 
 
-def _units(unit: str | None) -> dict[str, str]:
-    return {} if unit is None else {"units": unit}
+def _units(unit: str) -> dict[str, str]:
+    return {"units": unit} if unit else {}
 
 
 def _sizes_of(camera: CameraId) -> dict[str, int]:
     return dict(zip(("rows", "columns"), camera.shape, strict=True))
 
 
-def _shape_of(how: Stored, shape: tuple[int, ...], sizes: dict[str, int]) -> tuple[int, ...]:
+def _shape_of(how: Parameter, shape: tuple[int, ...], sizes: dict[str, int]) -> tuple[int, ...]:
     """Return the required shape of an array; sizes that occur for the first time are taken from its shape."""
     there = (*shape, *[0] * len(how.shape))
     return tuple(
@@ -233,9 +226,9 @@ def _read(file: Hdf5File, place: str, name: str) -> Calibration:
             f"{file.path} holds a calibration of {kind} layout, {version}, where {VERSION} is read: {remedy}"
         )
     camera = _read_camera(file, f"{place}/camera")
-    found = {one: file.find(f"{place}/{group}") for one, group in GROUPS.items()}
+    found = {one: file.find(f"{place}/{kind.command}") for one, kind in PARTS.items()}
     parts: dict[str, Any] = {
-        one: _read_part(file, node, KINDS[one], camera) for one, node in found.items() if node is not None
+        one: _read_part(file, node, PARTS[one], camera) for one, node in found.items() if node is not None
     }
     return Calibration(camera, **parts, process=read_process(file, f"{place}/process"), name=name)
 
@@ -252,18 +245,18 @@ def _read_camera(file: Hdf5File, place: str) -> CameraId:
 
 
 def _read_part(file: Hdf5File, group: Node, kind: type[Part], camera: CameraId) -> Part:
-    """Read one part; fields with a default may be missing."""
-    sizes, how, values = _sizes_of(camera), stored(kind), dict[str, Any]()
-    for one in fields(kind):
-        node = file.walk(group, one.name)
+    """Read one part; parameters with a default may be missing."""
+    sizes, how, values = _sizes_of(camera), parameters(kind), dict[str, Any]()
+    for name, one in how.items():
+        node = file.walk(group, name)
         if node is not None:
-            values[one.name] = _read_field(file, node, how[one.name], sizes)
-        elif one.default is MISSING and one.default_factory is MISSING:
-            raise InputError(f"{file.where(group)} has no {one.name}: {_AGAIN}")
+            values[name] = _read_field(file, node, one, sizes)
+        elif not one.optional:
+            raise InputError(f"{file.where(group)} has no {name}: {_AGAIN}")
     return kind(**values)
 
 
-def _read_field(file: Hdf5File, node: Node, how: Stored, sizes: dict[str, int]) -> Any:
+def _read_field(file: Hdf5File, node: Node, how: Parameter, sizes: dict[str, int]) -> Any:
     value: Any
     if how.kind == "text":
         value = str(file.value(node))
@@ -280,7 +273,7 @@ def _read_field(file: Hdf5File, node: Node, how: Stored, sizes: dict[str, int]) 
         }
     else:
         shape = _shape_of(how, getattr(node, "shape", None) or (), sizes)
-        value = file.read(node, shape, unit=how.unit, remedy=_AGAIN).astype(how.dtype, copy=False)
+        value = file.read(node, shape, unit=how.unit or None, remedy=_AGAIN).astype(how.dtype, copy=False)
         if how.kind == "array" and not np.isfinite(value).all():
             raise InputError(f"{file.where(node)} has numbers that are not finite: {_AGAIN}")
         if how.kind in ("integer", "integers") and not np.isfinite(value).all():
@@ -292,41 +285,3 @@ def _read_field(file: Hdf5File, node: Node, how: Stored, sizes: dict[str, int]) 
     if how.valid is not None and not how.valid(value):
         raise InputError(f"{file.where(node)} is {value}, which is invalid: {_AGAIN}")
     return value
-
-
-# --- words --------------------------------------------------------------------------------------------------
-
-
-def words_of(part: Part) -> dict[str, str]:
-    """Return each field of a part as text: numbers with units, angles in degrees, maps by their median."""
-    how = stored(part)
-    words = {name: _words(getattr(part, name), one, how) for name, one in how.items()}
-    return {name: said for name, said in words.items() if said is not None}
-
-
-def _words(value: Any, how: Stored, others: dict[str, Stored]) -> str | None:
-    if value is None or (how.kind == "mapping" and not value):
-        return None
-    if how.kind in ("text", "integer"):
-        return str(value)
-    if how.kind == "names":
-        return ", ".join(value)
-    if how.kind == "mapping":
-        return ", ".join(f"{name} {_number_words(one, unit_of(name, others))}" for name, one in value.items())
-    if how.kind == "map" and how.unit is None:  # flags
-        return ", ".join(f"{np.count_nonzero(value & bit)} {name}" for name, bit in BITS.items())
-    if how.kind == "map":
-        known = value[np.isfinite(value)]
-        lacking = f"; {value.size - known.size} pixels unknown" if known.size < value.size else ""
-        median = _number_words(np.median(known), how.unit) if known.size else "no valid pixel"
-        return f"{median} (median{lacking})"
-    if np.size(value) > _FEW:
-        return f"{' x '.join(map(str, np.shape(value)))} numbers"
-    return _number_words(value, how.unit)
-
-
-def _number_words(value: Any, unit: str | None) -> str:
-    if unit == "rad":
-        value, unit = np.degrees(value), "deg"
-    numbers = ", ".join(f"{one:.5g}" for one in np.ravel(value))
-    return f"{numbers} {unit}" if unit else numbers

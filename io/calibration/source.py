@@ -11,19 +11,16 @@ from typing import Any, Self, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.calibration.types import GROUPS, Calibration, CameraId, Precession, stored
+from mirrorskin.io.calibration.parameters import parameters
+from mirrorskin.io.calibration.types import PARTS, Calibration, CameraId, Precession
 from mirrorskin.io.selection import Region
 from mirrorskin.io.types import Block, Floats, Header, InputError, LiveSource, Source
 
 Size = tuple[float, float]
 
-SIZED = ("zenith", "precession", "gel", "stiffness")
+SIZED = tuple(name for name, kind in PARTS.items() if kind.motion)
 """The parts whose lengths depend on the pixel size."""
 
-_MEASURED: Mapping[str, tuple[str, ...]] = {
-    "axial": ("zenith", "precession"),
-    "vertical": ("gel", "stiffness"),
-}
 _SAME_SIZE = 1e-3  # relative difference allowed between pixel sizes: below the accuracy of calibrated lengths
 _SAME_TILT = 1.25  # allowed ratio of a rotation's half-angle and the calibrated one
 
@@ -44,7 +41,7 @@ def outdated(
     """Yield the parts that were made with another pixel size, as far as it is recorded, and that size."""
     there = calibration.parts()
     for part in parts:
-        facts = [calibration.process.get(f"{GROUPS[part]}.{fact}") for fact in size_facts(pixel_size)]
+        facts = [calibration.process.get(f"{PARTS[part].command}.{fact}") for fact in size_facts(pixel_size)]
         sizes = [float(fact) for fact in facts if isinstance(fact, float | int)]
         if part in there and len(sizes) == 2 and differ((sizes[0], sizes[1]), pixel_size):
             yield part, (sizes[0], sizes[1])
@@ -61,8 +58,8 @@ def check_sizes(
             for x, y in (before, cast(Size, pixel_size))
         )
         raise InputError(
-            f"{calibration.name or 'the calibration'}: calibrate {GROUPS[part]} again: it was made with"
-            f" pixels of {next(sizes)}, {says} {next(sizes)}"
+            f"{calibration.name or 'the calibration'}: calibrate {PARTS[part].command} again: it was made"
+            f" with pixels of {next(sizes)}, {says} {next(sizes)}"
         )
 
 
@@ -98,7 +95,7 @@ def cropped(calibration: Calibration, region: Region, pixel_size: Size | None) -
     parts: dict[str, Any] = {}
     for name, part in calibration.parts().items():
         changed: dict[str, Any] = {}
-        for field, how in stored(part).items():
+        for field, how in parameters(part).items():
             value = getattr(part, field)
             if how.kind == "map" and value is not None:
                 changed[field] = np.ascontiguousarray(value[region.slices])
@@ -230,7 +227,8 @@ class Calibrated:
 
     def _check_sizes(self, known: Size | None) -> None:
         size = known if self.whole.lens is None else self.whole.lens.pixel_size
-        check_sizes(self.whole, size, self.name, _MEASURED[self.motion])
+        used = [name for name in SIZED if PARTS[name].motion == self.motion]
+        check_sizes(self.whole, size, self.name, used)
 
     def _movement(self, own: Header, precession: Precession) -> dict[str, Any]:
         """Return tilt and pivot of the precession; undetermined values are those of the source."""

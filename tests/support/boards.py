@@ -134,10 +134,12 @@ def photograph(
     dtype=np.uint8,
     fine=3,
     counts=(30, 210),
+    light=None,
 ):
     """Take a picture of a board that lies turned by an angle (degrees) and moved (x, y) mm on the sheet.
 
     ``counts`` of black and white, and ``noise``, are of 8 bits; samples of 16 have 257 times as many.
+    ``light`` is a factor of each pixel.
     """
     rows, columns = view.shape
     reach = 6  # pixels around, that blur brings in
@@ -145,17 +147,35 @@ def photograph(
     x, y = view.sheet(*np.meshgrid(across, down))
     angle, dx, dy = pose
     c, s = cos(radians(angle)), sin(radians(angle))
-    light = paint(c * (x - dx) + s * (y - dy), c * (y - dy) - s * (x - dx))
-    light = light.reshape(rows + 2 * reach, fine, columns + 2 * reach, fine).mean((1, 3))
+    seen = paint(c * (x - dx) + s * (y - dy), c * (y - dy) - s * (x - dx))
+    seen = seen.reshape(rows + 2 * reach, fine, columns + 2 * reach, fine).mean((1, 3))
     # The mean over a pixel is a blur of its own; a Gauss over means differs from one over rays by little.
-    light = (
-        ndimage.gaussian_filter(light, blur)[reach:-reach, reach:-reach]
+    seen = (
+        ndimage.gaussian_filter(seen, blur)[reach:-reach, reach:-reach]
         if blur
-        else light[reach:-reach, reach:-reach]
+        else seen[reach:-reach, reach:-reach]
     )
-    samples = counts[0] + (counts[1] - counts[0]) * light
+    samples = counts[0] + (counts[1] - counts[0]) * seen
+    if light is not None:
+        samples = samples * light
     samples = samples + noise * np.random.default_rng(seed).standard_normal(samples.shape)
     if np.dtype(dtype).kind == "f":
         return samples.astype(dtype)
     most = np.iinfo(dtype).max
     return np.clip(np.rint(samples * (most / 255)), 0, most).astype(dtype)
+
+
+def marks_in(view, board, pose):
+    """The places, (n, 2), of a board's marks in the picture of `photograph`."""
+    turn, right, up = pose
+    x, y = board.marks().T
+    c, s = cos(radians(turn)), sin(radians(turn))
+    return np.stack(view.place(c * x - s * y + right, s * x + c * y + up), axis=1)
+
+
+def uneven_light(shape):
+    """Light that falls to 36 % in one corner."""
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    x, y = x / shape[1] - 0.3, y / shape[0] - 0.4
+    light = (0.88 - 0.4 * x) * (1 - 0.5 * (x * x + y * y))
+    return light / light.max()

@@ -8,8 +8,8 @@ import pytest
 from calibrations import a_calibration, a_lens, a_precession, a_response
 
 from mirrorskin import io
+from mirrorskin.io.calibration.parameters import Row
 from mirrorskin.view.calibration import calibration_figures, draw_lens, draw_precession, draw_references
-from mirrorskin.view.calibration_table import Row, calibration_table
 from mirrorskin.view.calibration_wall import draw_gel, draw_response
 
 
@@ -128,7 +128,7 @@ def test_a_gel_is_drawn_with_its_threshold(curvature):
 
 
 def test_numbers_are_in_the_units_people_speak_of():
-    rows = {(row.part, row.what): row for row in calibration_table(a_calibration())}
+    rows = {(row.part, row.what): row for row in a_calibration().rows()}
     assert rows["camera", "name"].value == "left"
     assert rows["camera", "columns of a frame"].value == 7
     assert rows["references", "dead"].value == 1

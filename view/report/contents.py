@@ -99,9 +99,8 @@ def _calibration_of(result: Result) -> list[tuple[str, ...]]:
     """Return the table of the calibration in a result, if there is one."""
     if result.calibration is None:
         return []
-    from mirrorskin.view.calibration_table import calibration_table
 
-    return [row.cells() for row in calibration_table(result.calibration)]
+    return [row.cells() for row in result.calibration.rows()]
 
 
 def _origin(process: Mapping[str, object]) -> str:

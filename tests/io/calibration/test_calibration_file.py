@@ -219,11 +219,14 @@ def test_a_calibration_is_described(saved):
     facts = io.describe(saved)
     assert facts["kind"] == "calibration"
     assert facts["camera"] == "'left', 7 x 5, uint8"
-    assert facts["references.dark"].endswith("counts (median; 1 pixels unknown)")
-    assert facts["references.defects"] == "0 hot, 1 dead, 0 saturated"
-    assert facts["scale.pixel_size"] == "0.5, 0.6 mm"
-    assert facts["tilt.tilt"] == "2.2918 deg"
-    assert facts["tilt.sigma"] == "pivot_z 0.3 mm, tilt 0.0057296 deg"
+    assert facts["references.dark"].endswith(" counts")
+    assert [facts[f"references.{name}"] for name in ("hot", "dead", "saturated")] == [
+        f"{count} pixels" for count in (0, 1, 0)
+    ]
+    assert facts["scale.pixel size along y"].startswith("600")
+    assert facts["tilt.half-angle"] == "2.2918 ± 0.0057 deg"
+    assert facts["tilt.pivot z"] == "12.00 ± 0.30 mm"
+    assert facts["tilt.phase offset"] == "17.1887 deg"
     assert facts["tilt.frames"] == "8"
 
 

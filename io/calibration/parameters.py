@@ -1,0 +1,243 @@
+"""Parameters of a calibration that are declared once.
+
+The layout of files, docstrings, the tables of ``calibrate show`` and of the documentation, and titles of
+figures are derived from the declaration.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+import textwrap
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, Field, dataclass, field, fields
+from typing import Any, ClassVar, Literal, NamedTuple, TypeVar, dataclass_transform
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from mirrorskin.io.units import ratio
+
+Kind = Literal["map", "array", "number", "integer", "numbers", "integers", "text", "names", "mapping"]
+
+_SHOWN = {"rad": "deg", "pixel": "px", "MPa": "kPa"}  # units of tables and figures, unless one is declared
+_FACTORS = {"%": 100.0, "px": 1.0, "deg": math.degrees(1)}  # of units that `ratio` does not convert
+_TYPES = {
+    "number": "float",
+    "integer": "int",
+    "text": "str",
+    "names": "tuple of str",
+    "mapping": "mapping of str to float",
+}
+_COLUMNS = 100  # of the lines of a docstring
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """The declaration of a parameter.
+
+    Attributes
+    ----------
+    kind : str
+        A "map" has one value per pixel of the camera, and is cropped with the picture. "numbers", "integers"
+        and "names" are tuples. A "mapping" contains numbers by name, in a group of its own; each has the unit
+        of the parameter of its name, with or without a component.
+    text : str
+        What the parameter is: a phrase without a full stop. Titles of figures end at its first semicolon.
+    unit : str
+        Unit in memory and in files; empty for none.
+    title : str or None
+        Name in tables, by default the parameter's; empty if it is not shown, as are vectors without names of
+        components. ``{}`` is replaced by the name of the component, which otherwise follows.
+    shown_unit : str
+        Unit of tables and figures, by default degrees for radians and kPa for MPa.
+    components : tuple of str
+        Names of the components of "numbers" or an "array".
+    shape : tuple
+        Shape; letters are sizes that the parameters of a part share.
+    dtype : dtype
+        Type of a map, by default float32, or of an array, by default float64.
+    valid : callable, optional
+        Whether a value in a file is accepted.
+    place : bool
+        Whether the first two numbers are relative to the picture's centre.
+    convert : callable, optional
+        Returns what tables show of the value.
+    flags : mapping of str to int
+        Bits of a map that are counted.
+    optional : bool
+        Whether a file may lack it: it has a default.
+    """
+
+    kind: Kind
+    text: str
+    unit: str = ""
+    title: str | None = None
+    shown_unit: str = ""
+    components: Sequence[str] = ()
+    shape: tuple[int | str, ...] = ()
+    dtype: np.dtype[Any] = np.dtype(np.float64)  # noqa: RUF009
+    valid: Callable[[Any], bool] | None = None
+    place: bool = False
+    convert: Callable[[Any], Any] | None = None
+    flags: Mapping[str, int] = field(default_factory=dict)
+    optional: bool = False
+
+    def __post_init__(self) -> None:
+        own = (len(self.components),) if self.components else ()
+        object.__setattr__(self, "shape", ("rows", "columns") if self.kind == "map" else self.shape or own)
+        if not self.components and self.kind not in ("map", "number", "integer", "text"):
+            object.__setattr__(self, "title", "")
+        object.__setattr__(self, "shown_unit", self.shown_unit or _SHOWN.get(self.unit, self.unit))
+
+    @property
+    def factor(self) -> float:
+        """Factor from values to tables and figures."""
+        return _FACTORS.get(self.shown_unit) or ratio(self.unit, self.shown_unit)
+
+    @property
+    def size(self) -> str:
+        """The shape as text, such as ``(H, W)``; empty for a single value."""
+        if self.kind == "map":
+            return "(H, W)"
+        return str(self.shape).replace("'", "") if self.shape else ""
+
+    def described(self) -> str:
+        """Return the type in Python and the unit, such as ``(float, float), mm``."""
+        if self.kind in ("map", "array"):
+            kind = f"ndarray, {self.size}, {self.dtype.name}"
+        elif self.kind in ("numbers", "integers"):
+            kind = f"({', '.join([_TYPES[self.kind[:-1]]] * int(self.shape[0]))})"
+        else:
+            kind = _TYPES[self.kind]
+        return f"{kind}, {self.unit}" if self.unit else kind
+
+
+def parameter(
+    kind: Kind,
+    text: str,
+    unit: str = "",
+    *,
+    dtype: DTypeLike | None = None,
+    default: Any = MISSING,
+    **options: Any,
+) -> Any:
+    """Declare a parameter in the body of a part, by the fields of `Parameter`.
+
+    Without a default, a file must contain it: declare one if older files are still to be read.
+    """
+    stored = np.dtype(dtype or (np.float32 if kind == "map" else np.float64))
+    one = Parameter(kind, text, unit, dtype=stored, optional=default is not MISSING, **options)
+    if callable(default):
+        return field(default_factory=default, metadata={"parameter": one})
+    return field(default=default, metadata={"parameter": one})
+
+
+class Row(NamedTuple):
+    """A number of a calibration, in the units of tables."""
+
+    part: str  # as its command is called
+    what: str
+    value: float | int | str
+    sigma: float = math.nan  # standard error; NaN if unknown
+    unit: str = ""
+
+    @property
+    def text(self) -> str:
+        """Value, standard error and unit, such as ``2.2918 ± 0.0057 deg``."""
+        _, _, value, sigma, unit = self.cells()
+        return " ".join(filter(None, (value, f"± {sigma}" if sigma else "", unit)))
+
+    def cells(self) -> tuple[str, str, str, str, str]:
+        """Return part, quantity, value, standard error and unit as text, with the significant digits only."""
+        if isinstance(self.value, str | int):
+            return self.part, self.what, str(self.value), "", self.unit
+        if not math.isfinite(self.value):
+            return self.part, self.what, "unknown", "", self.unit
+        if not (math.isfinite(self.sigma) and self.sigma > 0):
+            return self.part, self.what, f"{self.value:.6g}", "", self.unit
+        digits = max(0, 1 - math.floor(math.log10(self.sigma)))
+        value, sigma = (f"{number:.{digits}f}" for number in (self.value, self.sigma))
+        return self.part, self.what, value, sigma, self.unit
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """Base of the parts of a calibration."""
+
+    command: ClassVar[str]
+    """Name of the part's group in files, and of the command that calibrates it."""
+
+    signal: ClassVar[str] = ""
+    """The map that viewers show by default."""
+
+    motion: ClassVar[str] = ""
+    """Motion of the recordings that determine the part, if its lengths depend on the pixel size."""
+
+    def standard_errors(self) -> Mapping[str, float]:
+        """Return standard errors by the names of parameters; of a vector, with the name of the component."""
+        errors: Mapping[str, float] = getattr(self, "sigma", {})
+        return errors
+
+    def rows(self) -> Iterator[Row]:
+        """Yield the numbers of tables; of maps, the medians."""
+        errors = self.standard_errors()
+        for name, one in parameters(self).items():
+            title = name.replace("_", " ") if one.title is None else one.title
+            value = getattr(self, name)
+            if not title or value is None:
+                continue
+            if one.flags:
+                for flag, bit in one.flags.items():
+                    yield Row(self.command, flag, int(np.count_nonzero(value & bit)), math.nan, "pixels")
+                continue
+            if one.convert is not None:
+                value = one.convert(value)
+            elif one.kind == "map":
+                value = median(value)
+            named = one.components or ("",)
+            for component, number in zip(named, value if one.components else (value,), strict=True):
+                what = title.format(component) if "{}" in title else f"{title} {component}".rstrip()
+                if isinstance(number, str | int):
+                    yield Row(self.command, what, number)
+                    continue
+                factor = 1.0 if one.convert is not None else one.factor
+                sigma = errors.get(f"{name}_{component}" if component else name, math.nan) * factor
+                yield Row(self.command, what, float(number) * factor, sigma, one.shown_unit)
+
+
+T = TypeVar("T", bound=Part)
+
+
+def median(values: Any) -> float:
+    """Return the median of the pixels that have a value; NaN if there are none."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else math.nan
+
+
+@dataclass_transform(eq_default=False, frozen_default=True, field_specifiers=(parameter,))
+def part(cls: type[T]) -> type[T]:
+    """Make a dataclass of a class whose attributes are declared by `parameter`."""
+    made = dataclass(frozen=True, slots=True, eq=False)(cls)
+    lines = ["Attributes", "----------"]
+    for name, one in parameters(made).items():
+        text = f"{one.text[:1].upper()}{one.text[1:]}."
+        lines += [f"{name} : {one.described()}", textwrap.indent(textwrap.fill(text, _COLUMNS), "    ")]
+    made.__doc__ = "\n\n".join([inspect.cleandoc(made.__doc__ or ""), "\n".join(lines)])
+    return made
+
+
+def parameters(of: Any) -> dict[str, Parameter]:
+    """Return the declarations of a part, or of its class, by name."""
+    return {one.name: _declared(one) for one in fields(of)}
+
+
+def _declared(one: Field[Any]) -> Parameter:
+    declared: Parameter = one.metadata["parameter"]
+    return declared
+
+
+def unit_of(name: str, declared: Mapping[str, Parameter]) -> str:
+    """Return the unit of a parameter by its name, with or without the name of a component."""
+    one = declared.get(name) or declared.get(name.rpartition("_")[0])
+    return "" if one is None else one.unit
