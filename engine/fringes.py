@@ -19,7 +19,7 @@ from mirrorskin.engine.options import option
 from mirrorskin.engine.rotation.correlation import Correlate
 from mirrorskin.engine.rotation.design_matrix import Doubles, check_weights, fit_matrix
 from mirrorskin.io import InputError, Map, Result
-from mirrorskin.io.arguments import checked
+from mirrorskin.io.arguments import as_array, as_array_or_number, check_number, checked
 from mirrorskin.io.maps import TABLE
 from mirrorskin.io.types import FRAME_DTYPES
 
@@ -167,7 +167,7 @@ fit_fringes = phase_function(
 )
 
 
-@checked
+@checked(frequency=as_array_or_number, start=check_number)
 def unwrap_frequencies(fringes: Sequence[Maps], frequency: ArrayLike, *, start: float = 0.0) -> Result:
     """Unwrap fringes of several frequencies, each from the next coarser one.
 
@@ -234,7 +234,7 @@ def unwrap_frequencies(fringes: Sequence[Maps], frequency: ArrayLike, *, start: 
     return _unwrapped(phases[-1], whole, sigmas[-1], risk)
 
 
-@checked
+@checked(frames=as_array, threshold=as_array_or_number, noise=as_array_or_number)
 def decode_gray(frames: NDArray[Any], threshold: ArrayLike, *, noise: ArrayLike) -> Result:
     """Read the number of a pixel's stripe from pictures of a reflected binary (Gray) code.
 
@@ -288,7 +288,7 @@ def decode_gray(frames: NDArray[Any], threshold: ArrayLike, *, noise: ArrayLike)
     return Result(stripe=stripe, risk=_probability(risk), declarations=_STRIPES)
 
 
-@checked
+@checked(width=check_number, start=check_number)
 def unwrap_gray(fringes: Maps, stripes: Maps, *, width: float = np.pi, start: float = 0.0) -> Result:
     """Unwrap fringes by the numbers of stripes that are narrower than a fringe.
 

@@ -22,7 +22,7 @@ from mirrorskin.engine.rotation.steps import Integration
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Motion, Result, Source, pixel_axes
-from mirrorskin.io.arguments import checked
+from mirrorskin.io.arguments import as_array_or_number, check_count, check_flag, checked
 from mirrorskin.io.result import absolute_heights
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.device import Device, open_device
@@ -34,7 +34,7 @@ _PASSES = 3  # over the axial frames, at most
 _STILL = 0.02  # pixels that points may move between the last two passes
 
 
-@checked
+@checked(pixel_size=as_array_or_number, mask=as_array_or_number, robust=check_flag)
 def fuse(
     heights: Maps,
     normals: Maps,
@@ -153,7 +153,7 @@ def _check_shapes(heights: Result, normals: Result, mask: ArrayLike | None) -> M
     return np.ones((rows, columns), bool) if mask is None else np.asarray(mask) != 0
 
 
-@checked
+@checked(register=check_flag, robust=check_flag, memory_limit=check_count)
 def fuse_recordings(
     vertical: Source,
     axial: Source,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.inputs import Maps, as_result
 from mirrorskin.io import InputError, Result, Truth
-from mirrorskin.io.arguments import checked
+from mirrorskin.io.arguments import check_kind, checked
 from mirrorskin.io.maps import SlipStatus
 from mirrorskin.io.result import map_shape
 from mirrorskin.io.types import UNDISTORTED
@@ -253,7 +253,7 @@ class Score:
         }
 
 
-@checked
+@checked(truth=check_kind(Truth))
 def score(result: Maps, truth: Truth) -> Score:
     """Compare the maps of a result with the truth.
 

@@ -1,11 +1,10 @@
-"""Check and convert the arguments of public functions, according to their annotations."""
+"""Check and convert the arguments of public functions."""
 
 from __future__ import annotations
 
 import functools
 import inspect
 import os
-import re
 from collections.abc import Callable
 from numbers import Real
 from typing import Any, ParamSpec, TypeVar
@@ -15,29 +14,19 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.types import InputError
 
-_ARRAYS = ("ArrayLike", "NDArray", "Floats", "Doubles", "Mask")
-
 P = ParamSpec("P")
 R = TypeVar("R")
+Check = Callable[[str, Any], Any]
+"""Function of an argument's name and value that returns the value, perhaps converted; or InputError."""
 
 
-def checked(function: Callable[P, R]) -> Callable[P, R]:
-    """Check the arguments of a function against its annotations, and convert array-likes to arrays.
-
-    Arguments annotated ``ArrayLike`` or ``NDArray`` may be lists and the like; they are converted to arrays
-    and must hold numbers. Masked values become NaN (frames of integers then become float32), or 0 in maps of
-    integers, such as contact. For ``float``, ``int``, ``bool``, a path, ``Result`` and ``Truth`` the type
-    must match. Other annotations are not checked.
-
-    Raises
-    ------
-    InputError
-        An argument has another type; the message names it.
+def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Return a decorator that checks arguments, each by a function; None is valid where it is the default.
 
     Examples
     --------
-    >>> @checked
-    ... def mean(values: ArrayLike, weight: float = 1.0) -> float:
+    >>> @checked(values=as_array, weight=check_number)
+    ... def mean(values, weight=1.0):
     ...     return weight * float(np.nanmean(values))
     >>> mean([1, 2, 6]), mean(np.ma.masked_array([1.0, 5.0], [False, True]))
     (3.0, 1.0)
@@ -46,50 +35,34 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
     ...
     mirrorskin.io.types.InputError: values is 'none': numbers are needed
     """
-    checks = []
-    for index, parameter in enumerate(inspect.signature(function).parameters.values()):
-        kinds = [part.strip() for part in str(parameter.annotation).split("|")]
-        check = _check_of(kinds)
-        if check is not None:
-            checks.append((index, parameter.name, check, "None" in kinds))
 
-    @functools.wraps(function)
-    def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        places: list[Any] = list(args)
-        for index, name, check, optional in checks:
-            if index < len(places):
-                if places[index] is not None or not optional:
-                    places[index] = check(name, places[index])
-            elif name in kwargs and (kwargs[name] is not None or not optional):
-                kwargs[name] = check(name, kwargs[name])
-        return function(*places, **kwargs)
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        parameters = list(inspect.signature(function).parameters.values())
+        places = {one.name: index for index, one in enumerate(parameters)}
+        optional = {one.name for one in parameters if one.default is None}
+        known = [(places[name], name, check) for name, check in checks.items()]
 
-    return call
+        @functools.wraps(function)
+        def call(*args: P.args, **kwargs: P.kwargs) -> R:
+            given: list[Any] = list(args)
+            for index, name, check in known:
+                if index < len(given):
+                    if given[index] is not None or name not in optional:
+                        given[index] = check(name, given[index])
+                elif name in kwargs and (kwargs[name] is not None or name not in optional):
+                    kwargs[name] = check(name, kwargs[name])
+            return function(*given, **kwargs)
 
+        return call
 
-def _check_of(kinds: list[str]) -> Callable[[str, Any], Any] | None:
-    """Return a function that checks an argument of some annotation, given as source text split at "|"."""
-    first = kinds[0].split("[")[0]
-    if first in _ARRAYS:
-        words = [kind for kind in kinds[1:] if kind not in ("None", "float")]
-        if not words:
-            return _as_array_or_number if first == "ArrayLike" else as_array
-        if all(kind.startswith("Literal") for kind in words):
-            return functools.partial(_as_array_or_word, set(re.findall(r"[\w-]+", " ".join(words))))
-        return None
-    if kinds in (["float"], ["float", "None"]):
-        return _check_number
-    if kinds in (["int"], ["int", "None"]):
-        return _check_count
-    if kinds == ["bool"]:
-        return check_flag
-    if first in ("Result", "Truth") and len(kinds) == 1:
-        return functools.partial(_check_kind, first)
-    return _check_path if kinds == ["str", "Path"] else None
+    return decorate
 
 
 def as_array(name: str, value: Any) -> NDArray[Any]:
-    """Return an argument as an array of numbers; see `checked`. An array is returned unchanged."""
+    """Return an argument as an array of numbers; an array of numbers is returned unchanged.
+
+    Masked values become NaN (frames of integers then become float32), or 0 in maps of integers.
+    """
     if type(value) is np.ndarray and value.dtype.kind in "buif":
         return value
     masked = isinstance(value, np.ma.MaskedArray)
@@ -109,22 +82,21 @@ def as_array(name: str, value: Any) -> NDArray[Any]:
     return np.where(mask, array.dtype.type(0), array)
 
 
-def _as_array_or_number(name: str, value: Any) -> Any:
+def as_array_or_number(name: str, value: Any) -> Any:
+    """Return an argument as an array of numbers, or unchanged if it is a number."""
     return value if isinstance(value, Real) else as_array(name, value)
 
 
-def _as_array_or_word(words: set[str], name: str, value: Any) -> Any:
-    return value if isinstance(value, str) and value in words else _as_array_or_number(name, value)
-
-
-def _check_number(name: str, value: Any) -> Any:
+def check_number(name: str, value: Any) -> Any:
+    """Return a number, or raise InputError if it is something else."""
     scalar = isinstance(value, np.ndarray | np.generic) and not value.ndim and value.dtype.kind in "buif"
     if not (scalar or isinstance(value, Real)):
         raise InputError(f"{name} is {shown(value)}: a number is needed")
     return value
 
 
-def _check_count(name: str, value: Any) -> Any:
+def check_count(name: str, value: Any) -> Any:
+    """Return a whole number, or raise InputError if it is something else."""
     if not hasattr(value, "__index__") or isinstance(value, bool | np.ndarray):
         raise InputError(f"{name} is {shown(value)}: a whole number is needed")
     return value
@@ -137,13 +109,19 @@ def check_flag(name: str, value: Any) -> bool:
     return bool(value)
 
 
-def _check_kind(kind: str, name: str, value: Any) -> Any:
-    if not any(one.__name__ == kind for one in type(value).__mro__):
-        raise InputError(f"{name} is {shown(value)}: a mirrorskin.io.{kind} is needed")
-    return value
+def check_kind(kind: type) -> Check:
+    """Return a function that refuses an argument of another class of `mirrorskin.io`."""
+
+    def check(name: str, value: Any) -> Any:
+        if not isinstance(value, kind):
+            raise InputError(f"{name} is {shown(value)}: a mirrorskin.io.{kind.__name__} is needed")
+        return value
+
+    return check
 
 
-def _check_path(name: str, value: Any) -> Any:
+def check_path(name: str, value: Any) -> Any:
+    """Return a path, or raise InputError if it is something else."""
     if not isinstance(value, str | os.PathLike):
         raise InputError(f"{name} is {shown(value)}: a path is needed")
     return value

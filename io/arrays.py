@@ -8,19 +8,26 @@ import os
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from io import BytesIO
+from io import BufferedReader, BytesIO
 from pathlib import Path
-from typing import IO, Any, Literal, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io.fingerprint import State, check_unchanged, modified, state_of
 from mirrorskin.io.layout import COMPLETE, POSITIONS
-from mirrorskin.io.os_errors import MAX_UNPACKED_BYTES, check_regular, check_unpacked, open_regular
+from mirrorskin.io.os_errors import (
+    MAX_UNPACKED_BYTES,
+    as_input_error,
+    check_regular,
+    check_unpacked,
+    open_regular,
+)
 from mirrorskin.io.positions import Positions, along, check_finite
 from mirrorskin.io.recording import Recording, cut_out
 from mirrorskin.io.selection import Region
+from mirrorskin.io.stack import RawFrames
 from mirrorskin.io.types import FRAME_DTYPES, MOTIONS, Block, Header, InputError, Motion, block_memory
 
 NUMPY_SUFFIXES = (".npy", ".npz")
@@ -36,7 +43,8 @@ class ArrayRecording(Recording):
 
     Parameters
     ----------
-    frames : ndarray, (T, H, W), uint8, uint16 or float32
+    frames : ndarray or RawFrames, (T, H, W), uint8, uint16 or float32
+        An array, or frames of one in a file, which are read when they are used.
     positions : mapping
         ``travel``, mm, (T,), ``phase`` or ``twist``, radians, (T,), or ``displacement``, mm, (T, 2).
     header : mapping
@@ -68,7 +76,6 @@ class ArrayRecording(Recording):
     displacement: None
     twist: None
     tilt: None
-    truth: None
     used: None
     dropped: None
     state: str
@@ -76,7 +83,7 @@ class ArrayRecording(Recording):
 
     def __init__(
         self,
-        frames: NDArray[Any],
+        frames: NDArray[Any] | RawFrames,
         positions: Mapping[str, ArrayLike | Positions | None],
         header: Mapping[str, Any],
         motion: Motion | None = None,
@@ -85,7 +92,7 @@ class ArrayRecording(Recording):
         name: str = "the array of frames",
         origins: Mapping[Path, State] | None = None,
     ) -> None:
-        if frames.ndim != 3 or len(frames) < 2 or 0 in frames.shape:
+        if len(frames.shape) != 3 or frames.shape[0] < 2 or 0 in frames.shape:
             raise InputError(f"{name} has shape {frames.shape}: frames, (T, H, W), at least 2, are needed")
         if frames.dtype not in FRAME_DTYPES:
             raise InputError(
@@ -97,9 +104,9 @@ class ArrayRecording(Recording):
         cut = cut_out(name, self.full_shape, wanted, region)
         self.region, self.origin, self.first_frame = cut.region, cut.region.origin, cut.frames[0]
         self.which: str = f"{cut.frames[0]}:{cut.frames[1]}"
-        self._frames = frames[slice(*cut.frames), *cut.region.slices]
-        self.shape: tuple[int, int, int] = self._frames.shape[0], self._frames.shape[1], self._frames.shape[2]
-        self.dtype: np.dtype[Any] = self._frames.dtype
+        self._frames = frames
+        self.shape: tuple[int, int, int] = (cut.frames[1] - cut.frames[0], *cut.region.shape)
+        self.dtype: np.dtype[Any] = frames.dtype.newbyteorder("=")
         self.time = self.travel = self.phase = self.displacement = self.twist = self.tilt = None
         given = along(positions[series], self.full_shape[0])
         assert given is not None
@@ -112,31 +119,49 @@ class ArrayRecording(Recording):
         if size is not None and not all(1e-9 < one < 1e6 for one in size):
             raise InputError(f"{name}: pixel size {size} mm: give one above zero: 1e-9 to 1e6")
         self.header: Header = Header(self.motion, **{"title": self.path.stem, **header, **known})
-        self.truth, self.used, self.dropped, self.state = None, None, None, COMPLETE
+        self.used, self.dropped, self.state = None, None, COMPLETE
         self.storage, self._next, self._hash = "one piece", 0, ""
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
-        """Return the next frames as a view of the array, at most as many as ``out`` holds."""
-        return self.lend(len(block_memory(out, self.shape, self.dtype)))
+        """Return the next frames, at most as many as ``out`` holds: a view of the array, or in ``out``."""
+        out = block_memory(out, self.shape, self.dtype)
+        if not isinstance(self._frames, RawFrames):
+            return self.lend(len(out))
+        out = out[: self.shape[0] - self._next]
+        return self._block(self._part(self._next, out)) if len(out) else None
 
     def lend(self, most: int) -> Block | None:
-        """Return the next frames as a view of the array, at most ``most``; None at the end."""
-        frames = self._frames[self._next : self._next + most]
-        return self._block(frames, lent=False) if len(frames) else None
+        """Return the next frames as a view of the array, at most ``most``; None at the end, or of a file."""
+        if isinstance(self._frames, RawFrames):
+            return None
+        start = self.first_frame + self._next
+        stop = min(start + most, self.first_frame + self.shape[0])
+        frames = self._frames[start:stop, *self.region.slices]
+        return self._block(frames) if len(frames) else None
 
     def frame(self, number: int) -> NDArray[Any]:
         """Return one frame, (H, W)."""
-        frame: NDArray[Any] = self._frames[number]
+        frame: NDArray[Any] = self._part(number, np.empty((1, *self.shape[1:]), self.dtype))[0]
         return frame
+
+    def _part(self, start: int, out: NDArray[Any]) -> NDArray[Any]:
+        """Return frames: a view of the array, or read into ``out``."""
+        start += self.first_frame
+        if not isinstance(self._frames, RawFrames):
+            return self._frames[start : start + len(out), *self.region.slices]
+        span = start, start + len(out)
+        with as_input_error(f"{self.name}: frames {start} to {span[1] - 1} cannot be read"):
+            self._frames.fetch((span, self.region.rows, self.region.columns), out)
+        return out
 
     def fingerprint(self) -> str:
         """Return a SHA-256 of the array's shape and type, and of 4 KiB of each 4 MiB of its frames."""
         check_unchanged(self._files)
         if not self._hash:
-            frames = self._frames
             digest = hashlib.sha256(f"{self.full_shape} {self.dtype} {self.which} {self.region}".encode())
-            for frame in frames[:: max(1, _HASH_INTERVAL // frames[0].nbytes)]:
-                flat = np.ascontiguousarray(frame).reshape(-1).view(np.uint8)
+            step = max(1, _HASH_INTERVAL // (math.prod(self.shape[1:]) * self.dtype.itemsize))
+            for number in range(0, self.shape[0], step):
+                flat = np.ascontiguousarray(self.frame(number)).reshape(-1).view(np.uint8)
                 for start in range(0, len(flat), _HASH_INTERVAL):
                     digest.update(flat[start : start + _HASH_LENGTH].tobytes())
             self._hash = digest.hexdigest()
@@ -149,10 +174,12 @@ class ArrayRecording(Recording):
     def carried(self) -> None:
         """None: an array contains no calibration."""
 
+    truth = carried
+
     @property
     def how(self) -> str:
         """How the frames are read."""
-        return "where they lie"
+        return "directly" if isinstance(self._frames, RawFrames) else "where they lie"
 
     @property
     def modified(self) -> str:
@@ -161,7 +188,10 @@ class ArrayRecording(Recording):
 
     def close(self) -> None:
         """Release the frames."""
-        self._frames = self._frames[:0]
+        if isinstance(self._frames, RawFrames):
+            self._frames.close()
+        else:
+            self._frames = self._frames[:0]
 
 
 @contextmanager
@@ -230,26 +260,43 @@ def _head_of(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> _Head:
 
 def read_array(path: Path) -> NDArray[Any]:
     """Read an array of numbers written by ``numpy.save``."""
-    array = map_array(path)
-    check_unpacked(array.nbytes, str(path), "give a smaller array")
-    return np.array(array)
-
-
-def map_array(path: Path) -> NDArray[Any]:
-    """Map the array of numbers in a ``.npy`` file into memory; InputError if there is none."""
     with _naming(path), open_regular(path) as file:
-        head, size = _read_head(file), os.fstat(file.fileno()).st_size
-        if head.dtype.kind not in "buif":
-            raise ValueError(f"it holds {head.dtype}")
-        if head.size + head.nbytes > size:
-            raise ValueError(f"it states {head.nbytes} bytes of values and has {size - head.size}")
-        if not head.nbytes:
-            return np.empty(head.shape, head.dtype)
-        # np.memmap is annotated for files opened for reading and writing.
-        opened: Any = file
-        order: Literal["C", "F"] = "F" if head.fortran_order else "C"
-        values: NDArray[Any] = np.memmap(opened, head.dtype, "r", head.size, head.shape, order)
-        return values
+        head = _number_head(file)
+        check_unpacked(head.nbytes, str(path), "give a smaller array")
+        return _read_values(file, head)
+
+
+def _open_frames(path: Path) -> NDArray[Any] | RawFrames:
+    """Open the array of numbers in a ``.npy`` file as frames; they are read when they are used."""
+    with open_regular(path) as file:
+        head = _number_head(file)
+        if head.fortran_order or len(head.shape) != 3:
+            return _read_values(file, head)
+        frames, rows, columns = head.shape
+        return RawFrames(os.dup(file.fileno()), head.size, (frames, rows, columns), head.dtype)
+
+
+def _number_head(file: BufferedReader) -> _Head:
+    """Read the header of an array of numbers that is complete."""
+    head, size = _read_head(file), os.fstat(file.fileno()).st_size
+    if head.dtype.kind not in "buif":
+        raise ValueError(f"it holds {head.dtype}")
+    if head.size + head.nbytes > size:
+        raise ValueError(f"it states {head.nbytes} bytes of values and has {size - head.size}")
+    return head
+
+
+def _read_values(file: IO[bytes], head: _Head) -> NDArray[Any]:
+    values = np.empty(math.prod(head.shape), head.dtype)
+    file.seek(head.size)
+    read: Any = file  # IO lacks readinto
+    rest = values.view(np.uint8).data if values.size else memoryview(b"")
+    while rest:
+        count = read.readinto(rest[:_PIECE])
+        if not count:
+            raise ValueError("it was cut off")
+        rest = rest[count:]
+    return values.reshape(head.shape, order="F" if head.fortran_order else "C")
 
 
 def _read_members(
@@ -270,19 +317,11 @@ def _read_members(
 
 
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, head: _Head) -> NDArray[Any]:
-    values = np.empty(math.prod(head.shape), head.dtype)
-    data = values.view(np.uint8).data if values.size else memoryview(b"")
     with archive.open(member) as opened:
-        opened.read(head.size)
-        for start in range(0, len(data), _PIECE):
-            piece = data[start : start + _PIECE]
-            found = opened.read(len(piece))
-            if len(found) != len(piece):
-                raise ValueError(f"{member.filename} was cut off")
-            piece[:] = found
+        values = _read_values(opened, head)
         if opened.read(1):
             raise ValueError(f"{member.filename} has bytes after its values")
-    return values.reshape(head.shape, order="F" if head.fortran_order else "C")
+    return values
 
 
 def open_array(
@@ -306,7 +345,7 @@ def open_array(
         check_regular(path)
         origins = {path: state_of(path.stat())}
         if path.suffix.lower() == ".npy":
-            frames: NDArray[Any] = map_array(path)
+            frames = _open_frames(path)
         else:
             with open_regular(path) as file, zipfile.ZipFile(file) as archive:
                 members = _members(archive)

@@ -41,18 +41,11 @@ _OTHER_FORMATS = {  # suffixes that a result cannot have, with the command that 
     **dict.fromkeys(("jpg", "jpeg", "npy", "avi", "mp4", "json", "toml"), ""),
 }
 
-_LARGE = 4096  # bytes of a dataset that is not cached with the layout of its file
-_MOST_LAYOUTS = 16  # cached layouts
-
-_TEXT, _ONE = h5py.string_dtype(), h5py.h5s.create(h5py.h5s.SCALAR)
-_STORED_TEXT = h5py.h5t.py_create(_TEXT, logical=True)
+_TEXT = h5py.string_dtype()
 _UNDATED, _WITH_GROUPS = h5py.h5p.create(h5py.h5p.DATASET_CREATE), h5py.h5p.create(h5py.h5p.LINK_CREATE)
 _UNDATED.set_obj_track_times(False)
 _WITH_GROUPS.set_create_intermediate_group(True)
 _WITH_GROUPS.set_char_encoding(h5py.h5t.CSET_UTF8)
-
-# Frames start at a page boundary, so that the mapped file can be processed without a copy.
-_ALIGNED = {"alignment_threshold": 1 << 20, "alignment_interval": 4096}
 
 
 def check_output(
@@ -138,7 +131,7 @@ class NewHdf5(Closing):
     def __init__(self, path: Path, descriptor: int) -> None:
         self._path = path
         self._disk = _Disk(descriptor, "w+b", closefd=False)
-        self.root: Any = h5py.File(self._disk, "w", libver=VERSIONS, **_ALIGNED)
+        self.root: Any = h5py.File(self._disk, "w", libver=VERSIONS)
 
     def check(self) -> None:
         """Raise InputError if the disk did not accept everything written so far."""
@@ -165,7 +158,7 @@ def new_file(path: Path, replaces: Replaces = "derived") -> Iterator[int]:
     with new_part(path) as (part, descriptor):
         yield descriptor
         with as_input_error(f"{path} could not be written", MAKE_ROOM):
-            complete_part(part, descriptor)
+            synchronise(descriptor)
             _rename(part, path, replaces)
 
 
@@ -186,13 +179,10 @@ def new_part(path: Path) -> Iterator[tuple[Path, int]]:
             os.close(descriptor)  # locked until it has its final name
 
 
-def complete_part(part: Path, descriptor: int) -> None:
-    """Synchronise a file to the disk, and set the access rights of the process's umask."""
+def synchronise(descriptor: int) -> None:
+    """Synchronise a file to the disk."""
     os.fsync(descriptor)
     os.close(os.dup(descriptor))  # some file systems report only on closing that the disk is full
-    mask = os.umask(0)
-    os.umask(mask)
-    part.chmod(0o666 & ~mask)
 
 
 def link_new(part: Path, target: Path) -> None:
@@ -280,7 +270,7 @@ _tidy = functools.cache(remove_leftovers)
 def _make(part: Path) -> int:
     """Create a file that is locked while it is open, and return its descriptor."""
     while True:
-        descriptor = os.open(part, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        descriptor = os.open(part, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         with suppress(OSError):  # a file system without locks
             fcntl.flock(descriptor, fcntl.LOCK_EX)
         if os.fstat(descriptor).st_nlink:  # otherwise it was removed as a leftover before it was locked
@@ -365,60 +355,31 @@ class Item(NamedTuple):
     attributes: Mapping[str, Any]
 
 
-def write_item(root: h5py.Group, item: Item) -> int | None:
-    """Write an object; return the offset of a dataset's values in the file if they are contiguous.
-
-    For small datasets this takes a fifth of the time of h5py's high-level interface.
-    """
-    if item.values is None:
-        root.require_group(item.name).attrs.update(item.attributes)
-        return None
+def write_item(root: h5py.Group, item: Item) -> None:
+    """Write an object; for small datasets in a fifth of the time of h5py's high-level interface."""
     if isinstance(item.values, str):
         root[item.name] = h5py.SoftLink(item.values)
-        return None
+        return
+    if item.values is None:
+        root.require_group(item.name).attrs.update(item.attributes)
+        return
     values = np.asarray(item.values, order="C")
     kind, space = h5py.h5t.py_create(values.dtype, logical=True), h5py.h5s.create_simple(values.shape)
     node = h5py.h5d.create(root.id, item.name.encode(), kind, space, _UNDATED, _WITH_GROUPS)
     if values.size:
         node.write(h5py.h5s.ALL, h5py.h5s.ALL, values, kind)
-    for name, attribute in item.attributes.items():
-        if isinstance(attribute, str):
-            h5py.h5a.create(node, name.encode(), _STORED_TEXT, _ONE).write(np.array(attribute, _TEXT))
-        else:
-            stored = np.asarray(attribute)
-            kind, space = h5py.h5t.py_create(stored.dtype, logical=True), h5py.h5s.create_simple(stored.shape)
-            h5py.h5a.create(node, name.encode(), kind, space).write(stored)
-    place: int | None = node.get_offset()
-    return place
+    for name, value in item.attributes.items():
+        # Texts of any length: programs that read NeXus, such as silx, expect them.
+        stored = np.asarray(value, _TEXT if isinstance(value, str) else None)
+        kind, space = h5py.h5t.py_create(stored.dtype, logical=True), h5py.h5s.create_simple(stored.shape)
+        h5py.h5a.create(node, name.encode(), kind, space).write(stored)
 
 
 def write_file(path: Path, items: Iterable[Item], replaces: Replaces = "derived") -> None:
-    """Write a file with these objects, which appears complete or not at all.
-
-    The layout that HDF5 chooses for given names, shapes, types and attributes is cached. The next file that
-    differs in values only has the same bytes except for these, and is written in a tenth of the time.
-    """
-    items = list(items)
-    arrays = [np.asarray(item.values, order="C") for item in items if isinstance(item.values, np.ndarray)]
-    kinds = [
-        (item.values.shape, item.values.dtype.str) if isinstance(item.values, np.ndarray) else item.values
-        for item in items
-    ]
-    likeness = repr([(item.name, kind, item.attributes) for item, kind in zip(items, kinds, strict=True)])
-    layout = _layouts.get(likeness)
-    writing = as_input_error(f"{path} could not be written", MAKE_ROOM, OSError)
-    with new_file(path, replaces) as descriptor, writing:
-        if layout is not None:
-            layout.write(descriptor, arrays)
-            return
-        with NewHdf5(path, descriptor) as new:
-            places = [write_item(new.root, item) for item in items]
-        own = [
-            place for place, item in zip(places, items, strict=True) if isinstance(item.values, np.ndarray)
-        ]
-        if len(_layouts) >= _MOST_LAYOUTS:
-            _layouts.clear()
-        _layouts[likeness] = _Layout.of(descriptor, own, arrays)
+    """Write a file with these objects, which appears complete or not at all."""
+    with new_hdf5(path, replaces) as new, as_input_error(f"{path} could not be written", MAKE_ROOM, OSError):
+        for item in items:
+            write_item(new.root, item)
 
 
 def fixed_text(text: str | Sequence[str]) -> NDArray[Any]:
@@ -438,36 +399,3 @@ def process_items(place: str, process: Mapping[str, ProcessValue]) -> Iterator[I
     for name, value in process.items():
         values = fixed_text(value) if isinstance(value, str) else np.asarray(value)
         yield Item(f"{place}/{name}", values, {})
-
-
-class _Layout(NamedTuple):
-    """The layout of a file: its bytes except for large datasets, and the offsets of its datasets."""
-
-    pieces: list[tuple[int, bytes]]
-    places: list[int | None]
-
-    @classmethod
-    def of(cls, descriptor: int, places: list[int | None], arrays: Sequence[NDArray[Any]]) -> _Layout:
-        """Read the layout of a file whose datasets have the given offsets."""
-        known = [(at, at + one.nbytes) for at, one in zip(places, arrays, strict=True) if at is not None]
-        large = sorted((start, end) for start, end in known if end - start >= _LARGE)
-        starts, ends = [0, *(end for _, end in large)], [start for start, _ in large]
-        gaps = zip(starts, [*ends, os.fstat(descriptor).st_size], strict=True)
-        return cls([(start, os.pread(descriptor, end - start, start)) for start, end in gaps], places)
-
-    def write(self, descriptor: int, arrays: Sequence[NDArray[Any]]) -> None:
-        """Write a file with other values."""
-        for start, piece in self.pieces:
-            _write(descriptor, memoryview(piece), start)
-        for at, values in zip(self.places, arrays, strict=True):
-            if at is not None:
-                _write(descriptor, values.reshape(-1).view(np.uint8).data, at)
-
-
-def _write(descriptor: int, data: memoryview, place: int) -> None:
-    while data:
-        count = os.pwrite(descriptor, data, place)
-        data, place = data[count:], place + count
-
-
-_layouts: dict[str, _Layout] = {}

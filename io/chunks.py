@@ -1,6 +1,7 @@
-"""Frames in chunks: their offsets in a file, reading without HDF5, and decoding by several threads.
+"""Datasets in chunks, which several threads decode.
 
-Chunks are decoded outside HDF5's lock, with the C libraries of hdf5plugin and h5py, and zlib.
+Chunks are decoded outside HDF5's lock, with the C libraries of hdf5plugin and h5py, and zlib, and to no more
+bytes than a chunk has: HDF5's own filters have no such limit.
 """
 
 from __future__ import annotations
@@ -11,21 +12,20 @@ import itertools
 import math
 import os
 import struct
-import weakref
 import zlib
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.hdf5 import chunks_of
-from mirrorskin.io.selection import Place, Region, Span
+from mirrorskin.io.os_errors import as_input_error
+from mirrorskin.io.selection import Span
 
 Bytes = NDArray[np.uint8]
 Codec = Callable[[Bytes, Bytes], None]
@@ -35,101 +35,39 @@ _SIZE, _POINTER = ctypes.c_size_t, ctypes.c_void_p
 _WORD, _HEAD = struct.Struct(">I"), struct.Struct(">QI")
 
 
-class ChunkIndex(NamedTuple):
-    """The chunks of a dataset: their shape, and their positions in arrays with one element per chunk."""
-
-    shape: tuple[int, int, int]  # samples
-    offsets: NDArray[np.int64]  # bytes, in the file
-    sizes: NDArray[np.int64]  # bytes, as stored
-    filter_masks: NDArray[np.int64]  # bits of the filters that were not applied to a chunk
-
-    def contiguous_offset(self, shape: tuple[int, int, int]) -> int | None:
-        """Return the offset of raw chunks of whole frames if they are stored contiguously, else None."""
-        offsets, sizes = self.offsets.ravel(), self.sizes.ravel()
-        if self.shape[1:] != shape[1:] or np.any(np.diff(offsets) != sizes[:-1]):
-            return None
-        return int(offsets[0])
-
-
-def chunk_index(dataset: h5py.Dataset, shape: tuple[int, int, int], size: int) -> ChunkIndex | str:
-    """Return the positions of the chunks of the first frames in a file of ``size`` bytes, or why not.
-
-    OSError or ValueError: chunks are missing, or outside the file.
-    """
-    if dataset.file.userblock_size:
-        return "user block"  # versions of HDF5 disagree about the origin of offsets
-    chunks = chunks_of(dataset)
-    grid = tuple(-(-n // c) for n, c in zip(shape, dataset.chunks, strict=True))
-    places = np.array([chunk.chunk_offset for chunk in chunks], np.int64) // dataset.chunks
-    values = np.array([(chunk.byte_offset, chunk.size, chunk.filter_mask) for chunk in chunks], np.int64)
-    wanted = np.all(places < grid, axis=1)
-    index = np.full((3, *grid), -1, np.int64)
-    index[:, *places[wanted].T] = values[wanted].T
-    offsets, sizes, masks = index
-    if np.any(offsets < 0):
-        raise ValueError("(chunks are missing)")
-    if np.any(offsets + sizes > size):
-        raise OSError("truncated: a chunk lies behind the end")
-    # Chunks that are partly outside the dataset may have skipped its filters, which HDF5 does not report.
-    # Such chunks have the size of raw ones.
-    edge = np.zeros(grid, bool)
-    for axis, (n, c) in enumerate(zip(shape, dataset.chunks, strict=True)):
-        if n % c:
-            np.moveaxis(edge, axis, 0)[-1] = True
-    raw = math.prod(dataset.chunks) * dataset.dtype.itemsize
-    if dataset.id.get_create_plist().get_nfilters() and np.any(edge & (sizes == raw) & (masks == 0)):
-        return "raw chunks at the edge"
-    return ChunkIndex(dataset.chunks, offsets, sizes, masks)
-
-
 class Chunks:
     """A chunked dataset that several threads read and unpack, one chunk after the other.
 
-    A chunk of whole frames that are all needed is unpacked directly into the output; of other chunks the
-    needed part is copied. The file descriptor is closed at the latest with the last reference to this object.
+    A chunk that is needed as a whole and is contiguous in the output is unpacked directly into it; of other
+    chunks the needed part is copied. ``name`` returns the name of some rows of the dataset for messages.
     """
 
-    length: int
-
     def __init__(
-        self,
-        file: int,
-        place: Place,
-        frames: int,
-        dtype: np.dtype[Any],
-        index: ChunkIndex,
-        codecs: list[Codec],
-        threads: int,
+        self, dataset: h5py.h5d.DatasetID, codecs: list[Codec], name: Callable[[int, int], str], threads: int
     ) -> None:
-        self.length, self._shape, self._dtype = index.shape[0], index.shape, dtype
-        self._size = math.prod(index.shape) * dtype.itemsize
+        self._dataset, self._codecs, self._name, self._threads = dataset, codecs, name, threads
+        self.shape: tuple[int, ...] = dataset.get_create_plist().get_chunk()
+        self._whole, self._dtype = dataset.shape, dataset.dtype
+        self._size = math.prod(self.shape) * self._dtype.itemsize
+        self.length: int = self.shape[0]
         self.scratch_bytes: int = threads * self._size
         by = "one thread" if threads == 1 else f"{threads} threads"
         self.how: str = f"chunks {'decoded' if codecs else 'read'} by {by}"
-        self._frames, self._file, self._place = frames, file, place
-        self._index, self._codecs, self._threads = index, codecs, threads
-        self._close_file = weakref.finalize(self, os.close, file)
         self._pools: dict[int, ThreadPoolExecutor] = {}  # by process, because threads do not survive a fork
-        self._buffers: list[dict[str, Bytes]] = []  # scratch buffers, reused by one thread at a time
+        self._buffers: list[Bytes] = []  # scratch buffers, each used by one thread at a time
 
-    def lend(self, start: int, stop: int) -> None:
-        """Return None: chunks have to be read."""
-
-    def fetch(self, frames: Span, region: Region, out: NDArray[Any]) -> None:
-        """Write a part into ``out``; every chunk of it is decoded once."""
-        spans = frames, region.rows, region.columns
-        ranges = [range(a // c, -(-b // c)) for (a, b), c in zip(spans, self._shape, strict=True)]
+    def fetch(self, spans: Sequence[Span], out: NDArray[Any]) -> None:
+        """Write a part, one span for each axis, into ``out``; every chunk of it is decoded once."""
+        ranges = [range(a // c, -(-b // c)) for (a, b), c in zip(spans, self.shape, strict=True)]
         work = deque(itertools.product(*ranges))
 
         def take_chunks() -> None:
-            buffers: dict[str, Bytes] = self._buffers.pop() if self._buffers else {}
             try:
                 with suppress(IndexError):  # no chunk is left
                     while True:
-                        self._fetch_chunk(work.popleft(), spans, out, buffers)
+                        self._fetch_chunk(work.popleft(), spans, out)
             finally:
                 work.clear()  # after an error, so that the other threads stop, too
-                self._buffers.append(buffers)
 
         helpers: list[Future[None]] = []
         try:
@@ -145,79 +83,86 @@ class Chunks:
             helper.result()
 
     def close(self) -> None:
-        """Close the file."""
+        """End the threads."""
         pool = self._pools.pop(os.getpid(), None)
         if pool is not None:
             pool.shutdown()
-        self._file = -1  # the number may be reused for another file
-        self._close_file()
 
-    def _fetch_chunk(
-        self, position: tuple[int, ...], spans: tuple[Span, ...], out: NDArray[Any], buffers: dict[str, Bytes]
-    ) -> None:
+    def _fetch_chunk(self, position: tuple[int, ...], spans: Sequence[Span], out: NDArray[Any]) -> None:
         """Write the part of a chunk that is in these spans."""
         source, target = [], []
-        for p, c, (start, stop) in zip(position, self._shape, spans, strict=True):
+        for p, c, (start, stop) in zip(position, self.shape, spans, strict=True):
             first, last = max(p * c, start), min((p + 1) * c, stop)
             source.append(slice(first - p * c, last - p * c))
             target.append(slice(first - start, last - start))
         wanted = out[*target]
         first = position[0] * self.length
-        with self._place.reading(first, min(first + self.length, self._frames)):
-            if wanted.shape == self._shape and wanted.flags.c_contiguous:
-                self._decode(position, wanted.reshape(-1).view(np.uint8), buffers)
-            else:
-                unpacked = _buffer(buffers, "unpacked", self._size)
-                self._decode(position, unpacked, buffers)
-                wanted[...] = unpacked.view(self._dtype).reshape(self._shape)[*source]
+        with as_input_error(lambda: self._name(first, min(first + self.length, spans[0][1]))):
+            if wanted.shape == self.shape and wanted.flags.c_contiguous and wanted.dtype == self._dtype:
+                self._decode(position, wanted.reshape(-1).view(np.uint8))
+                return
+            buffer = self._buffers.pop() if self._buffers else np.empty(self._size, np.uint8)
+            self._decode(position, buffer)
+            wanted[...] = buffer.view(self._dtype).reshape(self.shape)[*source]
+            self._buffers.append(buffer)
 
-    def _decode(self, position: tuple[int, ...], out: Bytes, buffers: dict[str, Bytes]) -> None:
-        offset, size = int(self._index.offsets[position]), int(self._index.sizes[position])
-        if not self._codecs:
-            _read(self._file, offset, out)
-            return
-        packed = _buffer(buffers, "packed", size)
-        _read(self._file, offset, packed)
-        decode(self._codecs, int(self._index.filter_masks[position]), packed, out)
-
-
-def _buffer(buffers: dict[str, Bytes], name: str, size: int) -> Bytes:
-    if name not in buffers or buffers[name].size < size:
-        buffers[name] = np.empty(size + size // 8, np.uint8)
-    return buffers[name][:size]
-
-
-def _read(file: int, offset: int, out: Bytes) -> None:
-    done = 0
-    while done < out.size:
-        count = os.preadv(file, [out[done:].data], offset + done)
-        if not count:
-            raise OSError("truncated: the file became shorter")
-        done += count
+    def _decode(self, position: tuple[int, ...], out: Bytes) -> None:
+        corner = tuple(p * c for p, c in zip(position, self.shape, strict=True))
+        mask, stored = self._dataset.read_direct_chunk(corner)
+        packed = np.frombuffer(stored, np.uint8)
+        try:
+            decode(self._codecs, mask, packed, out)
+        except ValueError:
+            # Chunks that are partly outside the dataset may have skipped its filters, as HDF5 does not say.
+            at_edge = any(a + c > n for a, c, n in zip(corner, self.shape, self._whole, strict=True))
+            if not at_edge or mask or packed.size != out.size:
+                raise
+            out[...] = packed
 
 
-def find_codecs(dataset: h5py.Dataset) -> list[Codec] | str:
-    """Return the functions that undo a dataset's filters, in the order of writing, or an unknown name."""
-    plist = dataset.id.get_create_plist()
-    codecs, count = [], plist.get_nfilters()
-    for index, (code, _, values, name) in enumerate(map(plist.get_filter, range(count))):
+def find_codecs(dataset: h5py.h5d.DatasetID) -> list[Codec] | str:
+    """Return the functions that undo a dataset's filters, in the order of writing, or why there are none."""
+    plist = dataset.get_create_plist()
+    filters = [plist.get_filter(index) for index in range(plist.get_nfilters())]
+    codecs: list[Codec] = []
+    for code, _, values, name in filters:
         try:
             codecs.append(_MAKERS[code](values))
         except (OSError, AttributeError, LookupError):  # a missing or different library, or an unknown filter
             return name.decode(errors="replace").split(";")[0].strip() or str(code)
-        if code != h5py.h5z.FILTER_SHUFFLE and index < count - 1:
-            return "packed twice"  # the size between the two is unknown
+    codes = [code for code, *_ in filters]
+    if codes and codes[-1] == h5py.h5z.FILTER_FLETCHER32:
+        codes.pop()
+    if any(code != h5py.h5z.FILTER_SHUFFLE for code in codes[:-1]):
+        return "packed twice"  # the size between the two is unknown
+    cut = plist.get_layout() == h5py.h5d.CHUNKED and np.any(np.mod(dataset.shape, plist.get_chunk()))
+    if cut and len(codecs) == 1 and codes == [h5py.h5z.FILTER_SHUFFLE]:
+        return "perhaps raw at the edge"  # nothing in such a chunk shows whether it was shuffled
     return codecs
 
 
 def decode(codecs: list[Codec], filter_mask: int, packed: Bytes, out: Bytes) -> None:
     """Unpack a chunk."""
-    steps = [codec for bit, codec in enumerate(codecs) if not filter_mask >> bit & 1] or [_shuffle((1,))]
+    steps = [codec for bit, codec in enumerate(codecs) if not filter_mask >> bit & 1]
+    if steps and steps[-1] is _check_sum:
+        steps.pop()
+        packed, stored = packed[:-4], packed[-4:]
+        _check_sum(packed, stored)
+    steps = steps or [_shuffle((1,))]
     for codec in steps[:0:-1]:
         between = np.empty_like(out)
         codec(packed, between)
         packed = between
     steps[0](packed, out)
+
+
+def _check_sum(packed: Bytes, stored: Bytes) -> None:
+    """Refuse data that differ from their checksum, Fletcher's of 32 bits, as HDF5 stores it."""
+    words = np.append(packed, np.zeros(packed.size % 2, np.uint8)).view(">u2").astype(np.int64)
+    sums = words.sum(), (np.arange(words.size, 0, -1) % 65535 * words).sum()
+    low, high = (int(one - 1) % 65535 + 1 if one else 0 for one in sums)
+    if stored.tobytes() != (high << 16 | low).to_bytes(4, "little"):
+        raise ValueError("(the checksum of a chunk is wrong)")
 
 
 def _shuffle(values: tuple[int, ...]) -> Codec:
@@ -314,6 +259,7 @@ _MAKERS: dict[int, Callable[[tuple[int, ...]], Codec]] = {
     h5py.h5z.FILTER_SHUFFLE: _shuffle,
     h5py.h5z.FILTER_DEFLATE: _deflate,
     h5py.h5z.FILTER_LZF: _lzf,
+    h5py.h5z.FILTER_FLETCHER32: lambda _values: _check_sum,
     32008: _bitshuffle,
     32001: _blosc,
 }

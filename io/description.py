@@ -11,7 +11,7 @@ from mirrorskin.io.arrays import NUMPY_SUFFIXES, list_arrays
 from mirrorskin.io.calibration.file import MARK as CALIBRATION_MARK
 from mirrorskin.io.calibration.file import open_calibration
 from mirrorskin.io.calibration.types import PARTS, Calibration
-from mirrorskin.io.layout import MARK, TRUTH_MAPS
+from mirrorskin.io.layout import MARK
 from mirrorskin.io.recording import Recording, open_recording
 from mirrorskin.io.result import Result
 from mirrorskin.io.result_file import MARK as RESULT_MARK
@@ -93,9 +93,7 @@ def _recording(recording: Recording) -> dict[str, str]:
     facts |= _carried(recording.carried)
     for name in ("dark", "bright"):
         facts[f"{name} reference"] = _counts(getattr(header, name), "counts")
-    truth = recording.truth
-    known = [] if truth is None else [name for name in TRUTH_MAPS if getattr(truth, name) is not None]
-    facts["truth"] = ", ".join(known) or "none"
+    facts["truth"] = ", ".join(recording.truth_maps) or "none"
     return facts
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zipfile
-from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Literal
 
@@ -34,6 +33,7 @@ _VIDEOS = (
 _USER_BLOCK = 512  # bytes; HDF5's signature is at 0, or at this value times a power of two
 _KINDS = {"recording": "a recording", "calibration": "a calibration", "result": "a result"}
 _CALIBRATION = _KINDS["calibration"]
+_RESULT, _RECORDING = b"mirrorskin_result", b"mirrorskin_recording"
 
 
 def check_replaced(path: Path, replaces: Replaces) -> None:
@@ -52,8 +52,12 @@ def check_replaced(path: Path, replaces: Replaces) -> None:
 
 def _was_result(path: Path) -> bool:
     """Return whether a damaged HDF5 file was a result, which can be computed again."""
-    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
-        return content.find(b"mirrorskin_result") >= 0 and content.find(b"mirrorskin_recording") < 0
+    with path.open("rb") as file:
+        before, marks = b"", set[bytes]()
+        while piece := file.read(1 << 20):
+            marks |= {mark for mark in (_RESULT, _RECORDING) if mark in before + piece}
+            before = piece[-len(_RECORDING) :]
+    return marks == {_RESULT}
 
 
 def _is_exported(path: Path) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import pictures
-from mirrorskin.io.arguments import checked
+from mirrorskin.io.arguments import check_flag, check_kind, check_path, checked
 from mirrorskin.io.atomic import write_new
 from mirrorskin.io.frames import MCAP_SUFFIX
 from mirrorskin.io.mesh import Mesh, face_vectors, normals_around, surface_mesh
@@ -39,7 +39,7 @@ _METRE = 1e-3  # m per mm
 _NO_DATA = 42113  # GDAL's tag for the value of holes
 
 
-@checked
+@checked(result=check_kind(Result), path=check_path, points=check_flag)
 def export_result(
     result: Result,
     path: str | Path,

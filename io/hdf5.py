@@ -8,7 +8,6 @@ import re
 import struct
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -16,6 +15,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io.chunks import Chunks, find_codecs
 from mirrorskin.io.os_errors import MAX_UNPACKED_BYTES, as_input_error, is_flagged
 from mirrorskin.io.types import Closing, InputError, ProcessValue
 from mirrorskin.io.units import conversion_factor
@@ -153,9 +153,8 @@ class Hdf5File(Closing):
         unit: str | None = None,
         remedy: str = "",
         rows: int | None = None,
-        mapped: bool = False,
     ) -> NDArray[Any]:
-        """Read numbers after checking that they are stored; ``mapped``: they are read when they are used."""
+        """Read numbers, converted to a unit, after checking that they are stored."""
         remedy = remedy and f": {remedy}"
         with as_input_error(lambda: self.where(node)):
             if not isinstance(node, h5py.Dataset) or node.id.dtype.kind not in "iufb":
@@ -166,9 +165,7 @@ class Hdf5File(Closing):
         if shape not in shapes:
             needed = " or ".join(map(str, dict.fromkeys(shapes)))
             raise InputError(f"{self.where(node)} has shape {shape} where {needed} is needed{remedy}")
-        values = self._map(node) if mapped else None
-        if values is None:
-            values = self.load(node, rows)
+        values = self.load(node, rows)
         stated = None if unit is None else self._attribute_of(node, "units")
         given = unit if stated is None else str(stated or unit)
         if given is None or unit is None or given == unit:
@@ -180,18 +177,23 @@ class Hdf5File(Closing):
 
         Every dataset but the frames is read by this method, including single texts.
         """
-        check_storage(self, node, frames=rows)
+        check_storage(self, node, frames=rows, values=True)
         with as_input_error(lambda: self.where(node)):
-            return self._values(node.id, rows)
+            packed = node.id.get_offset() is None and node.id.get_create_plist().get_nfilters()
+            return self._unpack(node.id, rows) if packed else self._values(node.id, rows)
 
-    def _map(self, node: h5py.Dataset) -> NDArray[Any] | None:
-        """Map a contiguous dataset into memory; None for any other."""
-        check_storage(self, node)
-        with as_input_error(lambda: self.where(node)):
-            offset = node.id.get_offset()
-            if offset is None or not node.dtype.isnative or not node.size:
-                return None
-            return np.memmap(node.file.filename, node.dtype, "r", offset, node.shape)
+    def _unpack(self, node: h5py.h5d.DatasetID, rows: int | None) -> NDArray[Any]:
+        """Read a packed dataset, or its first rows, without the filters of HDF5, which have no limit."""
+        codecs, kind = find_codecs(node), node.dtype
+        if isinstance(codecs, str) or kind.hasobject:
+            packing = codecs if isinstance(codecs, str) else "texts of any length"
+            raise _only_frames(self.where(h5py.Dataset(node)), packing)
+        shape = node.shape if rows is None else (rows, *node.shape[1:])
+        chunks = Chunks(node, codecs, lambda *_: self.where(h5py.Dataset(node)), 1)
+        self.spend(math.prod(shape) * kind.itemsize, 0 if shape == chunks.shape else chunks.scratch_bytes)
+        values: NDArray[Any] = np.empty(shape, kind)
+        chunks.fetch([(0, n) for n in shape], values)
+        return values
 
     def value(self, node: Node) -> Any:
         """Read a single text or number, alone or in an array of one."""
@@ -285,15 +287,16 @@ class Hdf5File(Closing):
         # Many texts may refer to the same bytes.
         return int(math.prod(node.shape)) * self._longest_text[name]
 
-    def spend(self, size: int) -> None:
-        """Count the bytes of values that are read; InputError above `VALUES_LIMIT`."""
+    def spend(self, size: int, scratch: int = 0) -> None:
+        """Count the bytes of values that are read; InputError above `VALUES_LIMIT`, with scratch memory."""
         self._spent += size
-        if self._spent <= VALUES_LIMIT:  # the usual case
+        needed = self._spent + scratch
+        if needed <= VALUES_LIMIT:  # the usual case
             return
         most = max(self.memory_limit or 0, self.root.id.get_filesize(), VALUES_LIMIT)
-        if self._spent > most:
+        if needed > most:
             raise InputError(
-                f"{self.path}: values other than frames take at least {self._spent / 1e6:.4g} MB in memory; "
+                f"{self.path}: values other than frames take at least {needed / 1e6:.4g} MB in memory; "
                 f"at most {most / 1e6:.4g} MB are read. Copy only what is needed, or raise --memory"
             )
 
@@ -323,6 +326,13 @@ class Hdf5File(Closing):
         if target is None:
             raise InputError(f"{self.where(node)}: the link {part} leads to {link.path}, which is not there")
         return target
+
+
+def _only_frames(where: str, packing: str) -> InputError:
+    """Return the error for values in a packing that only HDF5 can undo, which is valid for frames only."""
+    return InputError(
+        f"{where} is packed with {packing}, which is supported for frames only: use 'h5repack -f GZIP=1'"
+    )
 
 
 def _open(group: h5py.Group, name: bytes) -> Node:
@@ -376,9 +386,9 @@ def _open_file(path: Path, real: str) -> h5py.File:
 
 
 _HEAP = re.compile(rb"GCOL\x01\0\0\0")  # its signature, version and reserved bytes
-_HEAD = 16  # bytes at the start of a heap, and of each of its objects
+_HEAD = struct.Struct("<8sQ")  # the start of a heap; each of its objects starts with as many bytes
 _BULK = 1 << 16  # bytes; larger datasets are not searched for heaps
-_SMALL = 1 << 20  # bytes; smaller files are searched completely, which is faster than finding their datasets
+_PIECE = 1 << 20  # bytes searched at once; smaller files are searched completely
 
 
 def _check_heaps(file: h5py.File) -> int:
@@ -387,25 +397,27 @@ def _check_heaps(file: h5py.File) -> int:
     ValueError if a heap of such texts does not end: HDF5 would never return from reading it. See "Global
     Heap" in the HDF5 file format specification.
     """
-    longest = 0
-    with Path(file.filename).open("rb") as opened, mmap(opened.fileno(), 0, access=ACCESS_READ) as data:
-        start = 0
-        bulk = sorted(_bulk(file)) if len(data) > _SMALL else ()
-        for stop, after in (*bulk, (len(data), len(data))):
-            for heap in _HEAP.finditer(data, start, stop):
-                longest = max(longest, _check_heap(data, heap.start()))
-            start = after
+    longest, at = 0, 0
+    with Path(file.filename).open("rb", buffering=0) as opened:
+        size = os.fstat(opened.fileno()).st_size
+        bulk = sorted(_bulk(file)) if size > _PIECE else ()
+        for stop, after in (*bulk, (size, size)):
+            while at < stop:
+                piece = os.pread(opened.fileno(), min(_PIECE, stop - at) + _HEAD.size, at)
+                for heap in _HEAP.finditer(piece):
+                    longest = max(longest, _check_heap(opened.fileno(), at + heap.start(), size))
+                at += _PIECE
+            at = after
     return longest
 
 
-def _check_heap(data: mmap, start: int) -> int:
-    """Return the size in bytes of the longest object of a heap."""
-    longest = 0
-    _, size = struct.unpack_from("<8sQ", data, start)
-    at, stop = start + _HEAD, min(start + size, len(data))
-    while at + _HEAD <= stop:
-        index, length = struct.unpack_from("<H6xQ", data, at)
-        step = length if index == 0 else _HEAD + -(-length // 8) * 8
+def _check_heap(file: int, at: int, size: int) -> int:
+    """Return the size in bytes of the longest object of a heap in a file."""
+    longest, stop = 0, min(at + _HEAD.unpack(os.pread(file, _HEAD.size, at))[1], size)
+    at += _HEAD.size
+    while at + _HEAD.size <= stop:
+        index, length = struct.unpack("<H6xQ", os.pread(file, _HEAD.size, at))
+        step = length if index == 0 else _HEAD.size + -(-length // 8) * 8
         if not 0 < step <= stop - at:
             raise ValueError("a heap of texts that does not end")
         longest = max(longest, length if index else 0)
@@ -469,8 +481,10 @@ def _address(node: Node) -> int:
 _VIRTUAL_DEEP = 4
 
 
-def check_storage(file: Hdf5File, dataset: h5py.Dataset, depth: int = 0, frames: int | None = None) -> None:
-    """Refuse a dataset that HDF5 cannot read, or would replace by fill values."""
+def check_storage(
+    file: Hdf5File, dataset: h5py.Dataset, depth: int = 0, frames: int | None = None, values: bool = False
+) -> None:
+    """Refuse a dataset, of frames or other values, that HDF5 cannot read or would replace by fill values."""
     if depth > _VIRTUAL_DEEP:
         where = file.where(dataset)
         raise InputError(f"{where}: virtual datasets are nested too deeply; copy the frames into one dataset")
@@ -483,10 +497,12 @@ def check_storage(file: Hdf5File, dataset: h5py.Dataset, depth: int = 0, frames:
             held = h5py.h5i.get_file_id(dataset.id).get_filesize() - offset
         elif dataset.chunks and not dataset.is_virtual:
             _check_filters(dataset, file.where(dataset), file.memory_limit)
+            if values and depth and _filters(dataset):
+                raise _only_frames(file.where(dataset), "filters in a virtual dataset")
             claimed = math.prod(-(-n // c) for n, c in zip(shape, dataset.chunks, strict=True))
             held, unit = dataset.id.get_num_chunks(), "chunks"
         else:
-            held = _bytes_held(file, dataset, depth)
+            held = _bytes_held(file, dataset, depth, values)
     if held < claimed:
         raise InputError(
             f"{file.where(dataset)} claims {claimed} {unit} and its file holds {held}: it was cut short; "
@@ -537,10 +553,10 @@ def _check_filters(dataset: h5py.Dataset, where: str, memory_limit: int | None) 
         )
 
 
-def _bytes_held(file: Hdf5File, dataset: h5py.Dataset, depth: int) -> int:
+def _bytes_held(file: Hdf5File, dataset: h5py.Dataset, depth: int, values: bool) -> int:
     """Return the stored size of a dataset in other files, in the object header, or not yet allocated."""
     if dataset.is_virtual:
-        elements = sum(_mapped(file, dataset, part, depth) for part in dataset.virtual_sources())
+        elements = sum(_mapped(file, dataset, part, depth, values) for part in dataset.virtual_sources())
         return elements * int(dataset.dtype.itemsize)
     if dataset.external:
         what = f"the raw storage of {dataset.name}"
@@ -565,14 +581,14 @@ def virtual_source(file: Hdf5File, dataset: h5py.Dataset, part: Any) -> h5py.Dat
     return source
 
 
-def _mapped(file: Hdf5File, dataset: h5py.Dataset, part: Any, depth: int) -> int:
+def _mapped(file: Hdf5File, dataset: h5py.Dataset, part: Any, depth: int, values: bool) -> int:
     """Return the number of elements of a virtual dataset that one of its sources contains."""
     source = virtual_source(file, dataset, part)
     if source.external:  # HDF5 would look for them in the working directory
         raise InputError(
             f"{file.where(dataset)} has sources in raw files, {source.name}; copy the frames into one dataset"
         )
-    check_storage(file, source, depth + 1)
+    check_storage(file, source, depth + 1, values=values)
     selected = part.src_space
     if selected.get_select_type() == h5py.h5s.SEL_ALL:
         return min(int(part.vspace.get_select_npoints()), int(source.size))

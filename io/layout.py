@@ -178,14 +178,19 @@ class Layout:
 
     def truth(self) -> Truth | None:
         """Read the truth of a simulation, if there is one."""
+        nodes = self.truth_nodes()
+        return Truth(**{name: self._known(name, node) for name, node in nodes.items()}) if nodes else None
+
+    def truth_nodes(self) -> dict[str, Node]:
+        """Return the contents of the truth, by name; InputError if it is incomplete."""
+        if self._find(TRUTH) is None:
+            return {}
         found = {name: self._find(f"{TRUTH}/{name}") for name in TRUTH_MAPS}
         present = {name: node for name, node in found.items() if node is not None}
-        if not present:
-            return None
         missing = [f.name for f in fields(Truth) if f.default is MISSING and f.name not in present]
-        if missing:
+        if present and missing:
             raise InputError(f"{self._file.path}: {TRUTH} has no {', '.join(missing)}: simulate it again")
-        return Truth(**{name: self._known(name, node) for name, node in present.items()})
+        return present
 
     def _known(self, name: str, node: Node) -> NDArray[Any]:
         """Read one part of the truth: a series, or a map."""
@@ -195,7 +200,7 @@ class Layout:
             return forces[slice(*self._part.frames)].astype(np.float64, copy=False)
         if name == "displacement":
             shape = (self._count, *self._frame, 2)
-            maps = self._file.read(node, shape, unit=unit, mapped=True)
+            maps = self._file.read(node, shape, unit=unit)
             return maps[slice(*self._part.frames), *self._part.region.slices].astype(np.float32, copy=False)
         values = self._file.read(node, self._frame, unit=unit)[self._part.region.slices]
         return np.ascontiguousarray(values, np.uint8 if name in ("contact", "slip") else np.float32)

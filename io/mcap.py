@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io.arguments import checked
+from mirrorskin.io.arguments import check_path, checked
 from mirrorskin.io.atomic import MAKE_ROOM, new_file
 from mirrorskin.io.export import check_heights, points_of
 from mirrorskin.io.frames import FrameSequence
@@ -126,7 +126,7 @@ class _File:
         self._writer.finish()  # type: ignore[no-untyped-call]
 
 
-@checked
+@checked(path=check_path)
 def save_messages(given: Result | Recording, path: str | Path) -> str:
     """Write a result or a recording as ROS 2 messages to an MCAP file, which appears complete or not at all.
 

@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io.arguments import checked
+from mirrorskin.io.arguments import check_count, check_flag, check_number, check_path, checked
 from mirrorskin.io.calibration.file import carried_by
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.fingerprint import check_unchanged, fingerprint, modified, origins
@@ -56,8 +56,8 @@ class Recording(Closing):
         Seconds, millimetres and radians.
     displacement : ndarray, (T, 2), float64, or None
         Millimetres.
-    truth : Truth or None
-        Ground truth of a simulation.
+    truth_maps : list of str
+        Names of the values in the truth.
     region : Region
         The part of the picture.
     origin : (int, int)
@@ -82,7 +82,6 @@ class Recording(Closing):
     name: str
     dataset: str
     header: Header
-    truth: Truth | None
     shape: tuple[int, int, int]
     dtype: np.dtype[Any]
     region: Region
@@ -110,12 +109,12 @@ class Recording(Closing):
         cut: Selection,
         header: Header,
         positions: Mapping[str, Floats | None],
-        truth: Truth | None,
+        layout: Layout,
         state: RecordingState,
         live: bool = False,
     ) -> None:
         self.path, self.name, self.dataset = file.path, str(file.path), str(dataset.name)
-        self.header, self.motion, self.truth = header, header.motion, truth
+        self.header, self.motion, self._layout = header, header.motion, layout
         self.shape, self.dtype = stack.shape, stack.dtype
         self.region, self.origin, self.first_frame = cut.region, cut.region.origin, cut.frames[0]
         self.full_shape: tuple[int, int, int] = (state.count, *_shape(dataset)[1:])
@@ -128,6 +127,7 @@ class Recording(Closing):
         self._origins = file.origins() if isinstance(file, ZarrFile) else origins(file, dataset)
         self.read_ahead = isinstance(file, ZarrFile)
         self._stack, self._next = stack, 0
+        self.truth_maps: list[str] = list(layout.truth_nodes())
 
     def __repr__(self) -> str:
         from mirrorskin.io.notebook import recording_as_text
@@ -145,25 +145,15 @@ class Recording(Closing):
         start = self._next
         if start >= self.shape[0]:
             return None
-        frames = self._stack.read(start, out)
-        return self._block(frames, lent=not np.may_share_memory(frames, out))
+        return self._block(self._stack.read(start, out))
 
-    def lend(self, most: int) -> Block | None:
-        """Return the next frames without a copy, at most ``most``.
-
-        None at the end, and where frames have to be read. The pages of the frames belong to the system's
-        cache, which reclaims them when it needs memory.
-        """
-        frames = self._stack.lend(self._next, most) if self._next < self.shape[0] else None
-        return None if frames is None else self._block(frames, lent=True)
-
-    def _block(self, frames: NDArray[Any], lent: bool) -> Block:
+    def _block(self, frames: NDArray[Any]) -> Block:
         """Advance past the next frames, and return them as a block."""
         here = slice(self._next, self._next + len(frames))
         self._next = here.stop
         series = {name: getattr(self, name) for name in SERIES}
         known = {name: values[here] for name, values in series.items() if values is not None}
-        return Block(frames, here.start, **known, origin=self.origin, lent=lent)
+        return Block(frames, here.start, **known, origin=self.origin)
 
     def frame(self, number: int) -> NDArray[Any]:
         """Return one frame, (H, W); the position of reading does not change."""
@@ -206,6 +196,11 @@ class Recording(Closing):
         return np.flatnonzero(np.concatenate(found) != expected)
 
     @functools.cached_property
+    def truth(self) -> Truth | None:
+        """Ground truth of a simulation; it is read when it is first used."""
+        return self._layout.truth()
+
+    @functools.cached_property
     def carried(self) -> Calibration | None:
         """The copy of a calibration in the recording, for the whole picture; it is not applied here."""
         return carried_by(self._file)
@@ -226,7 +221,14 @@ class Recording(Closing):
         self._file.close()
 
 
-@checked
+@checked(
+    path=check_path,
+    tilt=check_number,
+    threads=check_count,
+    memory_limit=check_count,
+    live=check_flag,
+    override_motion=check_flag,
+)
 def open_recording(
     path: str | Path,
     *,
@@ -306,7 +308,7 @@ def open_recording(
         cut = cut_out(str(path), shape, frames, region)
         layout = Layout(file, ours, shape, cut)
         header = layout.header(motion, tilt, pixel_size, override_motion)
-        state, truth, numbers = state.of(slice(*cut.frames)), layout.truth(), np.arange(*cut.frames)
+        state, numbers = state.of(slice(*cut.frames)), np.arange(*cut.frames)
         if live:
             chosen = _used(str(path), state, travel, phase)
             state, positions = state.of(chosen), layout.live(header.motion, chosen)
@@ -316,7 +318,7 @@ def open_recording(
             positions = layout.positions(header.motion, along(given, shape[0]))
         opened = file.frames(stack) if isinstance(file, ZarrFile) else None
         frames_of = Stack(stack, str(path), shape[0], numbers, cut.region, memory_limit, threads, opened)
-        recording = Recording(file, stack, frames_of, cut, header, positions, truth, state, live)
+        recording = Recording(file, stack, frames_of, cut, header, positions, layout, state, live)
         opening.pop_all()  # the recording closes the file from now on
     return recording
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.arguments import checked
+from mirrorskin.io.arguments import check_kind, check_path, checked
 from mirrorskin.io.atomic import Item, fixed_text, process_items, write_file
 from mirrorskin.io.calibration.file import CARRIED, calibration_items, carried_by
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape, read_process
@@ -44,7 +44,7 @@ _AXES = dict.fromkeys("xy", Map(unit="mm", dtype="float64"))
 _LAYOUT = 2  # of the files written here; in layout 1 maps were not declared, and some had other names
 
 
-@checked
+@checked(result=check_kind(Result), path=check_path)
 def save_result(result: Result, path: str | Path) -> None:
     """Write a result; the file appears complete or not at all.
 
@@ -126,7 +126,7 @@ def _plot(result: Result) -> dict[str, Any]:
     return plot
 
 
-@checked
+@checked(path=check_path)
 def open_result(path: str | Path) -> Result:
     """Read a result.
 

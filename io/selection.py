@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
-from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.types import InputError
 
 Span = tuple[int, int]  # first and end
@@ -131,7 +129,7 @@ class Place:
     path: str
     dataset: str
 
-    def reading(self, start: int, stop: int) -> AbstractContextManager[None]:
-        """Return a context that names the frames ``start`` to ``stop`` in errors of reading them."""
+    def name(self, start: int, stop: int) -> str:
+        """Return the name of the frames ``start`` to ``stop - 1`` in errors of reading them."""
         frames = f"frame {start}" if stop == start + 1 else f"frames {start} to {stop - 1}"
-        return as_input_error(f"{self.path}: {frames} of {self.dataset} cannot be read")
+        return f"{self.path}: {frames} of {self.dataset} cannot be read"

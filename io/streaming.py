@@ -25,9 +25,9 @@ from mirrorskin.io.atomic import (
     MAKE_ROOM,
     VERSIONS,
     check_output,
-    complete_part,
     link_new,
     new_part,
+    synchronise,
 )
 from mirrorskin.io.calibration.file import size_of
 from mirrorskin.io.calibration.types import Calibration
@@ -291,7 +291,7 @@ class StreamRecorder(TeeSource[LiveSource]):
             opening.push(file)
             self._append(file, block)
             file.publish()
-            complete_part(part, descriptor)
+            synchronise(descriptor)
             self.file = self._name(part)
             opening.pop_all()  # the caller closes it from now on
         return file

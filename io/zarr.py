@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 import secrets
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.atomic import fixed_text
 from mirrorskin.io.fingerprint import State, state_of
-from mirrorskin.io.hdf5 import VALUES_LIMIT, Hdf5File, Node, Shape
+from mirrorskin.io.hdf5 import VALUES_LIMIT, Hdf5File, Shape
 from mirrorskin.io.layout import CHECKSUM, STACK
-from mirrorskin.io.selection import Place, Region, Span
+from mirrorskin.io.selection import Place, Span
 from mirrorskin.io.types import Closing, InputError
 from mirrorskin.io.url import Url, is_zarr, path_of
 from mirrorskin.io.zarr_errors import MissingChunkError, naming
@@ -150,18 +150,6 @@ class ZarrFile(Hdf5File):
             self.spend(sum(len(text) for text in values.flat))
         return values if early is None or rows is None else values[:rows]
 
-    def read(
-        self,
-        node: Node,
-        *shapes: Shape,
-        unit: str | None = None,
-        remedy: str = "",
-        rows: int | None = None,
-        mapped: bool = False,
-    ) -> NDArray[Any]:
-        """Read numbers; they cannot be mapped."""
-        return super().read(node, *shapes, unit=unit, remedy=remedy, rows=rows)
-
     def check_frames(self, stack: h5py.Dataset, count: int) -> None:
         """Refuse frames that are missing, or in chunks too large for memory."""
         one, where = self.arrays[str(stack.name)], self.where(stack)
@@ -246,14 +234,9 @@ class ZarrFrames(Closing):
         self.scratch_bytes = AT_ONCE * math.prod(array.chunks) * array.dtype.itemsize
         self._array, self._place = array, place
 
-    def lend(self, start: int, stop: int) -> None:
-        """Return None: frames have to be read."""
-
-    def fetch(self, frames: Span, region: Region, out: NDArray[Any]) -> None:
+    def fetch(self, spans: Sequence[Span], out: NDArray[Any]) -> None:
         """Write a part into ``out``, a C-contiguous array."""
         from zarr.core.buffer.cpu import NDBuffer
 
-        what = f"{self._place.path}: frames {frames[0]} to {frames[1] - 1} of {self._place.dataset}"
-        with naming(f"{what} cannot be read"):
-            room = NDBuffer.from_numpy_array(out)
-            self._array.get_basic_selection((slice(*frames), *region.slices), out=room)
+        with naming(self._place.name(*spans[0])):
+            self._array.get_basic_selection(tuple(slice(*span) for span in spans), out=NDBuffer(out))

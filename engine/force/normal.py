@@ -13,7 +13,7 @@ from mirrorskin.engine.inputs import Maps, as_result, pixel_size_of
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.press.halfspace import HalfSpace, Pressed, load_gradient, press
 from mirrorskin.io import InputError, Result, pixel_axes
-from mirrorskin.io.arguments import checked
+from mirrorskin.io.arguments import as_array_or_number, check_number, checked
 
 if TYPE_CHECKING:
     from mirrorskin.engine.press.elastic import PressFit
@@ -22,7 +22,15 @@ if TYPE_CHECKING:
 _BEYOND = 0.01  # largest share of the load outside of the picture
 
 
-@checked
+@checked(
+    travel=check_number,
+    pixel_size=as_array_or_number,
+    modulus=check_number,
+    sigma=as_array_or_number,
+    travel_sigma=check_number,
+    modulus_sigma=check_number,
+    compliance=check_number,
+)
 def find_force(
     height: Maps,
     travel: float | None = None,

@@ -15,7 +15,7 @@ from mirrorskin.engine.inputs import Maps, as_result, pixel_size_of
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.press.halfspace import spectrum_of
 from mirrorskin.io import InputError, Result, pixel_axes
-from mirrorskin.io.arguments import checked
+from mirrorskin.io.arguments import as_array_or_number, check_count, check_number, checked
 from mirrorskin.kernels.conjugate_gradients import Face, conjugate_gradients
 
 Doubles = NDArray[np.float64]
@@ -30,7 +30,15 @@ _LEAST_KNOWN = 0.8  # smallest share of the contact with a displacement
 _DAMPING = 1e-4, 1e4  # range of the damping, relative to the compliance of the contact as a whole
 
 
-@checked
+@checked(
+    pixel_size=as_array_or_number,
+    modulus=check_number,
+    contact=as_array_or_number,
+    normal_pressure=as_array_or_number,
+    sigma=as_array_or_number,
+    window_size=check_count,
+    modulus_sigma=check_number,
+)
 def find_tangential_force(
     displacement: Maps,
     pixel_size: ArrayLike | None = None,

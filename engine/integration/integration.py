@@ -21,7 +21,7 @@ from mirrorskin.engine.integration.validation import (
 )
 from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError, Result, pixel_axes
-from mirrorskin.io.arguments import checked
+from mirrorskin.io.arguments import as_array_or_number, checked
 from mirrorskin.kernels.device import Device, open_device
 
 # Pixels up to which the device keeps the memory of the last call, about 100 bytes per pixel: allocation takes
@@ -30,7 +30,18 @@ _LARGEST_CACHED = 2**23
 _OUTSIDE = {"height": np.nan, "height_sigma": np.nan, "component": -1, "filled": 0, "edges": 0}
 
 
-@checked
+@checked(
+    dz_dx=as_array_or_number,
+    dz_dy=as_array_or_number,
+    pixel_size=as_array_or_number,
+    normals=as_array_or_number,
+    mask=as_array_or_number,
+    slope_weights=as_array_or_number,
+    edges=as_array_or_number,
+    known_heights=as_array_or_number,
+    known_height_weights=as_array_or_number,
+    initial_heights=as_array_or_number,
+)
 def integrate(
     dz_dx: ArrayLike | None = None,
     dz_dy: ArrayLike | None = None,

@@ -19,7 +19,7 @@ from mirrorskin.engine.metrology.sections import Point, along, step_height
 from mirrorskin.engine.metrology.sections import section as cut
 from mirrorskin.engine.metrology.texture import roughness
 from mirrorskin.io import InputError, Region, Result
-from mirrorskin.io.arguments import checked
+from mirrorskin.io.arguments import as_array_or_number, check_number, checked
 
 FormName = Literal["plane", "sphere", "none"]
 
@@ -49,7 +49,7 @@ class Measures:
     notes: list[str]
 
 
-@checked
+@checked(pixel_size=as_array_or_number, cutoff=check_number)
 def measure(
     result: Maps,
     *,

@@ -12,7 +12,7 @@ from mirrorskin.engine.inputs import Maps, as_result
 from mirrorskin.engine.pose.fit import Equations, PairFit
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import Doubles, Motion
-from mirrorskin.io.arguments import checked
+from mirrorskin.io.arguments import as_array_or_number, checked
 from mirrorskin.kernels.device import Device, open_device
 
 _SHARE = 1e-3  # component of an undetermined direction above which the parameter is undetermined
@@ -93,7 +93,7 @@ IDENTITY = Pose(np.zeros(3), np.zeros(3), np.zeros((6, 6)), 1.0, 0, np.zeros((0,
 """No motion, without errors."""
 
 
-@checked
+@checked(pixel_size=as_array_or_number)
 def estimate_pose(
     first: Maps,
     second: Maps,

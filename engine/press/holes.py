@@ -14,7 +14,7 @@ from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.press.membrane import stretch
 from mirrorskin.engine.press.spline import Spline, fit_within
 from mirrorskin.io import InputError
-from mirrorskin.io.arguments import checked
+from mirrorskin.io.arguments import as_array_or_number, check_number, checked
 
 Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -45,7 +45,14 @@ _WORK = 40.0  # limit of the work, in small surfaces; further holes get membrane
 _EXACT = 0.01  # pixel sizes: least half-width of an interval
 
 
-@checked
+@checked(
+    height=as_array_or_number,
+    sigma=as_array_or_number,
+    pixel_size=as_array_or_number,
+    above=as_array_or_number,
+    steepest=check_number,
+    deepest=check_number,
+)
 def fill_holes(
     height: ArrayLike,
     sigma: ArrayLike,

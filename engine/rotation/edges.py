@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import InputError
-from mirrorskin.io.arguments import checked
+from mirrorskin.io.arguments import as_array, checked
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device, open_device
 from mirrorskin.kernels.edges import COARSE, FINE, MARGIN, NEAR, Limits, Pass, pairs
@@ -28,7 +28,7 @@ LIMITS = Limits(
 _SHORTER = 4  # run time of the longest kernel over that of the others, about
 
 
-@checked
+@checked(normals=as_array, normals_sigma=as_array, contact=as_array)
 def find_edges(
     normals: NDArray[np.float32],
     normals_sigma: NDArray[np.float32],

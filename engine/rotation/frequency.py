@@ -11,7 +11,7 @@ from scipy import optimize
 
 from mirrorskin.engine.rotation.design_matrix import Doubles, basis
 from mirrorskin.io import InputError, Source
-from mirrorskin.io.arguments import checked
+from mirrorskin.io.arguments import as_array, as_array_or_number, checked
 
 _FEWEST = 8  # least number of frames
 _PIXELS, _SAMPLES = 4096, 2**22  # largest numbers of pixels and of samples that are used
@@ -29,7 +29,7 @@ class Frequency(NamedTuple):
     sigma: float
 
 
-@checked
+@checked(samples=as_array, time=as_array_or_number)
 def estimate_frequency(samples: NDArray[Any], time: ArrayLike) -> Frequency:
     """Estimate the common frequency of all pixels, whose amplitudes and phases differ.
 

@@ -15,7 +15,7 @@ from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.slip.tracking import GRADIENT_NOISE, NodeField, Tracker, invert_symmetric
 from mirrorskin.io import InputError, Result, pixel_axes
-from mirrorskin.io.arguments import checked
+from mirrorskin.io.arguments import as_array, as_array_or_number, check_count, check_number, checked
 from mirrorskin.io.maps import TABLE, DisplacementStatus, status_of
 from mirrorskin.kernels.device import Device, open_device
 
@@ -37,7 +37,14 @@ _LAPLACIAN_NOISE = 4 * 20 / 24**2  # noise of the squared bias, two standard dev
 _LEAST_TEXTURED = 0.1  # smallest share of windows with texture; edges of light give as many on a clear sheet
 
 
-@checked
+@checked(
+    reference=as_array,
+    frames=as_array,
+    pixel_size=as_array_or_number,
+    window_size=check_count,
+    window_step=check_count,
+    noise=check_number,
+)
 def find_displacement(
     reference: NDArray[Any],
     frames: NDArray[Any],

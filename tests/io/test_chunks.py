@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import gc
 import os
 import subprocess
 import sys
@@ -13,7 +12,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from fetching import GIVEN, ONLY_HDF5, PACKINGS, compressible, count_unpacked, ours, theirs, write
+from fetching import ONLY_HDF5, PACKINGS, compressible, count_unpacked, ours, theirs, write
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -72,9 +71,10 @@ def test_chunks_at_the_edge_may_be_raw(tmp_path, packing):
     with h5py.File(tmp_path / "a.h5", "w", libver="latest") as file:
         space = h5py.h5s.create_simple(SHAPE)
         h5py.Dataset(h5py.h5d.create(file.id, b"x", h5py.h5t.NATIVE_UINT16, space, made))[...] = frames
-    found, how = ours(tmp_path / "a.h5", 4)
+    found, how = ours(tmp_path / "a.h5", 4, threads=2)
     np.testing.assert_array_equal(found, frames)
-    assert how == "through HDF5 (raw chunks at the edge)"
+    alone = "through HDF5 (perhaps raw at the edge)"  # nothing in such a chunk shows whether it was shuffled
+    assert how == (alone if packing == "shuffle" else "chunks decoded by 2 threads")
 
 
 @pytest.mark.parametrize(
@@ -153,10 +153,10 @@ def test_an_interrupt_leaves_no_thread_writing(tmp_path, monkeypatch):
     path = write(tmp_path / "a.h5", compressible((30, 50, 70), "u2"), (1, 50, 70), PACKINGS["bitshuffle"])
     decode = Chunks._decode
 
-    def interrupted(self, position, out, room):
+    def interrupted(self, position, out):
         if position[0] == 20:
             raise KeyboardInterrupt
-        decode(self, position, out, room)
+        decode(self, position, out)
 
     monkeypatch.setattr(Chunks, "_decode", interrupted)
     with io.open_recording(path, motion="horizontal", threads=3) as recording:
@@ -186,36 +186,10 @@ def test_long_chunks_are_unpacked_once(tmp_path, monkeypatch, chunks, packing, l
         frames, how = ours(path, 3, memory_limit=limit, threads=2, **part)
         np.testing.assert_array_equal(frames, theirs(path, **part))
         assert set(counts.values()) == {1}
-        alive = 1 if chunks[0] == 24 else 2
-        kept = alive * (min(chunks[0], len(frames)) * frames[0].nbytes + 64)
+        kept = min(chunks[0], len(frames)) * frames[0].nbytes
         chunk = 2 * int(np.prod(chunks))
         threads = 1 if packing == "blosc2" or limit < 8 * chunk else 2
         assert how == ("unpacked into memory" if kept + threads * chunk <= limit else "unpacked to disk")
-
-
-@pytest.mark.parametrize("limit", [60 * FRAME, 8 * FRAME])
-def test_kept_frames_may_be_held_on_to(tmp_path, limit):
-    path = write(tmp_path / "a.h5", compressible(LONG, "u2"), (8, 13, 17), BITSHUFFLE)
-    held = []
-    with io.open_recording(path, **GIVEN, memory_limit=limit) as recording:
-        out = np.empty((3, 13, 17), "u2")
-        while (block := recording.read(out)) is not None:
-            assert block.lent
-            held.append(block.frames)
-    del recording
-    gc.collect()
-    np.testing.assert_array_equal(np.concatenate(held), theirs(path))
-
-
-def test_memory_is_used_again_when_nobody_looks_at_it(tmp_path):
-    path = write(tmp_path / "a.h5", compressible(LONG, "u2"), (8, 13, 17), BITSHUFFLE)
-    with io.open_recording(path, **GIVEN) as recording:
-        out, places = np.empty((4, 13, 17), "u2"), []
-        while (block := recording.read(out)) is not None:
-            places.append(block.frames.ctypes.data)
-            del block
-    step = 4 * FRAME
-    assert places == [places[0], places[0] + step] * 3
 
 
 def test_a_full_disk_is_told(tmp_path, monkeypatch):

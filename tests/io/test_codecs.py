@@ -18,7 +18,7 @@ def packed_chunk(path, packing, dtype="u2", shape=(2, 31, 37)):
     frames = compressible(shape, dtype) // 5 * 5
     write(path, frames, shape, packing)
     with h5py.File(path) as file:
-        found = chunks.find_codecs(file["x"])
+        found = chunks.find_codecs(file["x"].id)
         mask, data = file["x"].id.read_direct_chunk((0, 0, 0))
     assert mask == 0
     return np.frombuffer(data, "u1").copy(), frames, found
@@ -85,11 +85,11 @@ def test_damage_and_noise_are_refused_or_give_something(tmp_path, packing):
 def test_what_is_not_known_is_named(tmp_path, packing):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         stack = file.create_dataset("x", (4, 5, 7), "u2", chunks=(1, 5, 7), **ONLY_HDF5[packing])
-        assert isinstance(chunks.find_codecs(stack), str)
+        assert isinstance(chunks.find_codecs(stack.id), str)
 
 
 def test_a_library_that_is_not_there_leaves_it_to_hdf5(tmp_path, monkeypatch):
     monkeypatch.setattr(chunks, "_plugin", lambda name: str(tmp_path / name))
     with h5py.File(tmp_path / "a.h5", "w") as file:
         stack = file.create_dataset("x", (4, 5, 7), "u2", chunks=(1, 5, 7), **hdf5plugin.Bitshuffle())
-        assert chunks.find_codecs(stack) == "bitshuffle"
+        assert chunks.find_codecs(stack.id) == "bitshuffle"

@@ -146,17 +146,6 @@ def test_the_twin_s_recording_is_the_twin(tmp_path):
             assert getattr(recording.header, name) == getattr(twin.header, name)
 
 
-def test_raw_frames_begin_with_a_page(tmp_path):
-    stack = random_stack("float32", (4, 600, 700))
-    header = io.Header("vertical", dark=np.ones((600, 700), "f4"))
-    path = record(MadeUp(stack, header, travel=TRAVEL[:4]), tmp_path / "a.h5")
-    with h5py.File(path) as file:
-        assert file["entry/data/frames"].id.get_offset() % 4096 == 0
-    with io.open_recording(path) as recording:
-        assert recording.read().frames.ctypes.data % 4096 == 0
-    assert path.stat().st_size < stack.nbytes + header.dark.nbytes + 40_000
-
-
 @pytest.mark.parametrize(
     ("error", "compression"),
     [

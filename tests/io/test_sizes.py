@@ -1,19 +1,24 @@
 """Files of kilobytes that state gigabytes: refused by what they state, before memory is taken."""
 
 import io as memory
+import resource
 import struct
 import tracemalloc
 import zipfile
 import zlib
 
+import h5py
+import hdf5plugin
 import numpy as np
 import pytest
 import tifffile
+from numcodecs import blosc
 from PIL import Image as pil  # noqa: N813
 
 from mirrorskin import io
 from mirrorskin.io import os_errors
 from mirrorskin.io.arrays import read_array
+from mirrorskin.io.hdf5 import Hdf5File
 from mirrorskin.io.pictures import count_pages, decode_grey, read_picture
 
 POSITIONS = {"motion": "vertical", "travel": io.Steps(0.1)}
@@ -231,3 +236,59 @@ def test_interlaced_pngs_are_read(columns):
     ).shape == (rows, columns)
     with pytest.raises(io.InputError, match="it is not one picture"):
         decode_grey(png_of([(b"IHDR", head), (b"IDAT", zlib.compress(bytes(size - 1)))]), "an image")
+
+
+@pytest.mark.parametrize(
+    ("packing", "bomb"),
+    [
+        ({"compression": "gzip"}, zlib.compress(bytes(1 << 26))),
+        ({"compression": "gzip", "shuffle": True}, zlib.compress(bytes(1 << 26))),
+        (hdf5plugin.Blosc(), blosc.compress(bytes(1 << 26), b"lz4", 5)),
+        (hdf5plugin.Bitshuffle(), struct.pack(">QI", 1 << 26, 4096) + bytes(1000)),
+    ],
+)
+def test_packed_values_take_no_more_memory_than_they_state(tmp_path, packing, bomb):
+    """HDF5's own filters would unpack all 64 MiB of a chunk that states 1000 bytes."""
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        values = file.create_dataset("entry/x", (3000,), "u1", chunks=(1000,), **packing)
+        for start in range(0, 3000, 1000):
+            values.id.write_direct_chunk((start,), bomb)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with Hdf5File(path) as file, pytest.raises(io.InputError, match="/entry/x: it is damaged"):
+        file.read(file.find("/entry/x"), (3000,))
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 16 << 10
+
+
+@pytest.mark.parametrize("packing", [hdf5plugin.LZ4(), hdf5plugin.BZip2(), {"scaleoffset": 0}])
+def test_values_that_only_hdf5_unpacks_are_refused(tmp_path, packing):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("x", data=np.arange(3000), chunks=(1000,), **packing)
+    with Hdf5File(tmp_path / "a.h5") as file, pytest.raises(io.InputError, match="supported for frames only"):
+        file.read(file.find("/x"), (3000,))
+
+
+@pytest.mark.parametrize(
+    "packing", [{"compression": "gzip", "fletcher32": True, "shuffle": True}, {"lzf": 1}]
+)
+def test_packed_values_are_what_hdf5_gives(tmp_path, packing):
+    packing = {"compression": "lzf"} if "lzf" in packing else packing
+    values = np.random.default_rng(0).normal(size=(13, 17))
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("x", data=values, chunks=(4, 17), maxshape=(None, 17), **packing)
+        file.create_dataset("big", data=values.astype(">f4"), chunks=(5, 6), **packing)
+    with Hdf5File(tmp_path / "a.h5") as file:
+        np.testing.assert_array_equal(file.read(file.find("/x"), values.shape), values)
+        np.testing.assert_array_equal(file.read(file.find("/x"), (6, 17), rows=6), values[:6])
+        np.testing.assert_array_equal(file.read(file.find("/big"), values.shape), values.astype("f4"))
+
+
+def test_packed_values_of_a_virtual_dataset_are_refused(tmp_path):
+    with h5py.File(tmp_path / "part.h5", "w") as file:
+        file.create_dataset("x", data=np.arange(30), compression="gzip")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        layout = h5py.VirtualLayout((30,), int)
+        layout[:] = h5py.VirtualSource("part.h5", "x", (30,))
+        file.create_virtual_dataset("x", layout)
+    with Hdf5File(tmp_path / "a.h5") as file, pytest.raises(io.InputError, match="supported for frames only"):
+        file.read(file.find("/x"), (30,))

@@ -126,7 +126,6 @@ def failing(kind: str, number: int = -1) -> Iterator[Calls]:
     calls = Calls(make, number, lasting)
     device._open.cache_clear()  # devices are opened and kernels made anew
     memory.free()
-    atomic._layouts.clear()
     with pytest.MonkeyPatch.context() as patch:
         watch(calls, patch)
         yield calls

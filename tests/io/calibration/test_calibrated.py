@@ -237,7 +237,7 @@ def test_a_recording_that_is_written_while_frames_come_carries_a_copy(tmp_path, 
     with io.open_recording(path) as recording:
         assert_same(recording.carried, a_calibration())
         assert recording.state == "complete"
-        assert (recording.how == "mapped") == (compression == "raw")
+        assert recording.how.startswith("chunks read") == (compression == "raw")
         np.testing.assert_array_equal(read_all(recording, 7).frames, frames_of(np.arange(20)))
         np.testing.assert_array_equal(recording.phase, feed.positions()["phase"])
 
