@@ -1,0 +1,98 @@
+"""A serial port in memory whose other end is a script, on the clock of the test."""
+
+from __future__ import annotations
+
+import math
+
+import serial
+
+from mirrorskin.hw.grbl.report_times import SLICE
+
+
+class ScriptedPort:
+    """Stands in for an open port; a subclass is the machine behind it.
+
+    It may be ``silent``, or ``gone`` as when its plug is pulled, and be told what to ``say``.
+    """
+
+    timeout = SLICE
+
+    def __init__(self, clock):
+        self.clock = clock
+        self.bytes = bytearray()  # all that was written
+        self.silent = self.gone = self.closed = False
+        self._out, self._change = bytearray(), clock.condition()
+
+    def take(self, data):
+        """Take what was written."""
+        raise NotImplementedError
+
+    def advance(self):
+        """Do what has become due, and return the seconds until the next thing is."""
+        return math.inf
+
+    @property
+    def in_waiting(self):
+        self._present()
+        self.advance()
+        return len(self._out)
+
+    def read(self, size=1):
+        end = self.clock.now() + self.timeout
+        with self._change:
+            while True:
+                self._present()
+                due, left = self.advance(), end - self.clock.now()
+                if self._out or left <= 0:
+                    data = bytes(self._out[:size])
+                    del self._out[:size]
+                    return data
+                self._change.wait(min(due, left))
+
+    def write(self, data):
+        self._present()
+        self.advance()
+        self.bytes += data
+        self.take(data)
+        self.advance()
+        self._wake()
+        return len(data)
+
+    def flush(self):
+        pass
+
+    def open(self):
+        self.closed = False
+        return self
+
+    def close(self):
+        self.closed = True
+
+    def unplug(self):
+        self.gone = True
+        self._wake()
+
+    def say(self, *lines):
+        self.inject("".join(f"{line}\r\n" for line in lines).encode("latin-1"))
+
+    def inject(self, data):
+        if not self.silent:
+            self._out += data
+            self._wake()
+
+    def until(self, condition, seconds=60.0):
+        """Let time pass until something is so, to a millisecond."""
+        end = self.clock.now() + seconds
+        while not condition():
+            assert self.clock.now() < end, "it never came to be so"
+            self.clock.sleep(0.001)
+
+    def _present(self):
+        if self.gone:
+            raise serial.SerialException("device reports readiness to read but returned no data")
+        if self.closed:
+            raise TypeError("an integer is required")
+
+    def _wake(self):
+        with self._change:
+            self._change.notify_all()
