@@ -40,8 +40,8 @@ def _default_interrupt():
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers():
-    """One more than there are cores, as tests of hardware wait for clocks."""
-    return (os.cpu_count() or 1) + 1
+    """As many as there are cores: hardly any test waits."""
+    return os.cpu_count() or 1
 
 
 def pytest_configure(config):

@@ -180,11 +180,12 @@ class EmulatedRig:
         return Position(**{name: axis.value(at_machine[axis.letter]) for name, axis in self._axes.items()})
 
     def open_stage(self, settings: StageSettings, unlock: bool = False) -> GrblStage:
-        """Open the emulated stage; see `mirrorskin.hw.rig.rig.open_stage`."""
-        return GrblStage(settings, self.port.open(), unlock=unlock, clock=self.clock)
+        """Open the emulated stage, or another one if its port is another; see ``rig.open_stage``."""
+        port = self.port.open() if settings.port == self.port.url else None
+        return GrblStage(settings, port, unlock=unlock, clock=self.clock)
 
     def open_camera(self, settings: CameraSettings) -> TwinCamera:
-        """Begin anew with the emulated camera, and return it; see `mirrorskin.hw.rig.rig.open_camera`."""
+        """Begin anew with the emulated camera, and return it; see ``rig.open_camera``."""
         self.camera.close()
         self.camera = self._make_camera()
         return self.camera

@@ -237,7 +237,7 @@ def test_a_camera_that_is_lost_ends_it_with_its_own_complaint(fake, tmp_path):
     assert output.exists()
 
 
-@pytest.mark.real_time
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["device lost", "no resources", "allocation", "read"])
 def test_a_call_that_fails_stops_the_stage_and_keeps_what_there_is(fake, tmp_path, kind):
     words = [*PRESS, "--record"]

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from mirrorskin.hw.rig import check, rig
+from mirrorskin.hw.emulator.rig import EmulatedRig
+from mirrorskin.hw.rig import check
+from mirrorskin.hw.rig import rig as rigs
 from mirrorskin.hw.simulated_clock import SimulatedClock
 
 
@@ -20,13 +24,30 @@ def simulate(
     open_camera: Callable[..., Any] | None = None,
 ) -> None:
     """Let commands open what the rig file says, or what these open, on a simulated clock."""
-    stage = open_stage or functools.partial(rig.open_stage, clock=clock)
-    camera = open_camera or functools.partial(rig.open_camera, clock=clock)
+    stage = open_stage or functools.partial(rigs.open_stage, clock=clock)
+    camera = open_camera or functools.partial(rigs.open_camera, clock=clock)
     both = {"clock": clock, "open_stage": stage, "open_camera": camera}
-    patch.setattr(rig, "open_rig", functools.partial(rig.open_rig, **both))
+    patch.setattr(rigs, "open_rig", functools.partial(rigs.open_rig, **both))
     patch.setattr(check, "check_rig", functools.partial(check.check_rig, **both))
-    patch.setattr(rig, "open_stage", stage)
-    patch.setattr(rig, "open_camera", camera)
+    patch.setattr(rigs, "open_stage", stage)
+    patch.setattr(rigs, "open_camera", camera)
+
+
+@contextmanager
+def simulated_rig(
+    folder: Path, shape: tuple[int, int], rate: float, delay: float, **scene: Any
+) -> Iterator[tuple[EmulatedRig, Path]]:
+    """Run an emulated rig on simulated time, give it and its file, and let commands open it."""
+    clock = SimulatedClock()
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        EmulatedRig(shape=shape, pixel_size=0.2, rate=rate, delay=delay, clock=clock, **scene) as rig,
+    ):
+        simulate(patch, clock, rig.open_stage, rig.open_camera)
+        file = rig.write(folder, "0")
+        text = file.read_text().replace("[camera]", f"[camera]\ndelay = {delay}\ndark = 16")
+        file.write_text(text.replace("report_rate = 20.0", "report_rate = 50.0"))
+        yield rig, file
 
 
 def on_clock(clock: SimulatedClock) -> dict[str, Any]:
