@@ -230,7 +230,7 @@ def test_a_full_disk_leaves_no_half_a_rig_file(tmp_path):
         "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (500, 500));"
         "from mirrorskin.cli.main import main; main()"
     )
-    words = [sys.executable, "-c", code, "rig", "new", "-o", "mine.toml"]
+    words = [sys.executable, "-B", "-c", code, "rig", "new", "-o", "mine.toml"]  # half a module would stay
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == (
