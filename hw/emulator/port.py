@@ -22,8 +22,7 @@ from mirrorskin.io.types import Closing
 
 _CHUNK = 4096  # bytes read or written at once
 _BACKLOG = 65536  # bytes of replies that nobody reads, before more are lost
-_NOISE = 256  # random bytes that are sent without a break
-_IDLE = 0.5  # seconds after which the thread looks round even if nothing is due
+_LOOK = 0.05  # seconds after which the threads of a port look whether it was closed
 
 
 class GrblMachine:
@@ -111,102 +110,6 @@ class GrblMachine:
         return self._controller
 
 
-class GrblPort(Closing):
-    """A pseudo-terminal that a controller answers on, right in time; a context manager.
-
-    Open ``url`` as any serial port. A thread moves the bytes; it sleeps until some come or the machine has
-    something to say. The port stays there when a host closes it, and there is no reset when one opens it, as
-    on boards without that line. The machine's clock must be that of the computer.
-
-    Every fault may be called from any thread, also in the middle of a move. The machine outlives the port.
-    """
-
-    def __init__(self, machine: GrblMachine) -> None:
-        self.machine = machine
-        self._lock = threading.Lock()
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self.url: str = os.ttyname(self._slave)
-        self._pipe = [*os.pipe()]  # wakes the thread
-        os.set_blocking(self._pipe[1], False)
-        self._sending, self._noise = bytearray(), bytearray()
-        self._silent = self._closing = False
-        self._thread = threading.Thread(target=self._run, name="emulated controller", daemon=True)
-        self._thread.start()
-
-    def open(self) -> serial.Serial:
-        """Open the port as its host."""
-        return open_port(self.url, 115200, self.url)
-
-    def close(self) -> None:
-        """Take the port away; the machine goes on with its commands."""
-        self._closing = True
-        self._wake()
-        self._thread.join()
-        with self._lock:
-            for end in self._pipe:
-                os.close(end)
-            self._pipe = []
-
-    def silence(self) -> None:
-        """Answer nothing any more; the machine goes on, and still hears."""
-        self._silent = True
-        self._wake()
-
-    def garble(self, count: int, seed: int = 0) -> None:
-        """Send random bytes as fast as they are taken; replies come among them."""
-        with self._lock:
-            self._noise += random.Random(seed).randbytes(count)
-        self._wake()
-
-    def alarm(self, code: int) -> None:
-        """Raise an alarm in the machine."""
-        self.machine.alarm(code)
-        self._wake()
-
-    def unplug(self) -> None:
-        """Pull the cable that feeds the board, too: the port vanishes, and the axes stop dead."""
-        self.machine.cut_power()
-        self._closing = True
-        self._wake()
-        self._thread.join()
-
-    def _wake(self) -> None:
-        with self._lock, contextlib.suppress(BlockingIOError):
-            if self._pipe:
-                os.write(self._pipe[1], b"!")
-
-    def _run(self) -> None:
-        try:
-            while not self._closing:
-                self._step()
-        finally:
-            os.close(self._master)
-            os.close(self._slave)
-
-    def _step(self) -> None:
-        """Send what has been said, wait until there is something to do, and hear."""
-        due = self.machine.next_event()  # before collecting: what becomes due meanwhile is not slept over
-        said = self.machine.take()
-        if not self._silent and len(self._sending) + len(said) <= _BACKLOG:
-            self._sending += said
-        with self._lock:  # replies first, then a little of the noise
-            for waiting, most in ((self._sending, _CHUNK), (self._noise, _NOISE)):
-                with contextlib.suppress(BlockingIOError):
-                    if waiting:
-                        del waiting[: os.write(self._master, bytes(waiting[:most]))]
-            writers = [self._master] if self._sending or self._noise else []
-        wait = due - SYSTEM.now()
-        wait = min(max(wait, 0.0), _IDLE) if math.isfinite(wait) else _IDLE
-        readable, _, _ = select.select([self._master, self._pipe[0]], writers, [], wait)
-        if self._pipe[0] in readable:
-            os.read(self._pipe[0], _CHUNK)
-        if self._master in readable:
-            with contextlib.suppress(BlockingIOError):
-                self.machine.receive(os.read(self._master, _CHUNK))
-
-
 class GrblLine(Closing):
     """A serial port in memory that a controller answers on, by the machine's clock; a context manager.
 
@@ -237,9 +140,10 @@ class GrblLine(Closing):
     @property
     def in_waiting(self) -> int:
         """Bytes that can be read."""
-        self._check()
-        self._collect()
-        return len(self._coming)
+        with self._change:
+            self._check()
+            self._collect()
+            return len(self._coming)
 
     def read(self, size: int = 1) -> bytes:
         """Wait for bytes, for the timeout at most, and return those that are there."""
@@ -299,9 +203,64 @@ class GrblLine(Closing):
         for reply in replies:
             self._count["said"] += 1
             came = self.said(self._count["said"], bytes(reply) + b"\n")
-            if not self._silent:
+            if not self._silent and len(self._coming) < _BACKLOG:
                 self._coming += came
 
     def _wake(self) -> None:
         with self._change:
             self._change.notify_all()
+
+
+class GrblPort(GrblLine):
+    """A pseudo-terminal that a controller answers on, right in time; a context manager.
+
+    Open ``url`` as any serial port. Two threads move the bytes between the terminal and the line in memory.
+    The port stays there when a host closes it, and there is no reset when one opens it, as on boards without
+    that line. The machine's clock must be that of the computer.
+    """
+
+    def __init__(self, machine: GrblMachine) -> None:
+        super().__init__(machine)
+        self.timeout = _LOOK
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.url = os.ttyname(self._slave)
+        self._closing = False
+        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._hear, self._say)]
+        for thread in self._threads:
+            thread.start()
+
+    def open(self) -> serial.Serial:
+        """Open the port as its host."""
+        return open_port(self.url, 115200, self.url)
+
+    def close(self) -> None:
+        """Take the port away; the machine goes on with its commands."""
+        if self._closing:
+            return
+        self._closing = True
+        self._wake()
+        for thread in self._threads:
+            thread.join()
+        os.close(self._master)
+        os.close(self._slave)
+
+    def unplug(self) -> None:
+        """Pull the cable that feeds the board, too: the port vanishes, and the axes stop dead."""
+        super().unplug()
+        self.close()
+
+    def _hear(self) -> None:
+        while not self._closing:
+            if select.select([self._master], [], [], _LOOK)[0]:
+                with contextlib.suppress(OSError):  # nothing there after all, or it is unplugged
+                    self.write(os.read(self._master, _CHUNK))
+
+    def _say(self) -> None:
+        said = b""
+        while not self._closing:
+            with contextlib.suppress(OSError):
+                said = said or self.read(_CHUNK)
+                if said and select.select([], [self._master], [], _LOOK)[1]:
+                    said = said[os.write(self._master, said) :]

@@ -114,7 +114,7 @@ class EmulatedRig:
     '/dev/pts/3'
     """
 
-    port: GrblPort | GrblLine
+    port: GrblLine
     camera: TwinCamera
 
     def __init__(
