@@ -6,7 +6,7 @@ import math
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,9 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from mirrorskin.hw.emulator.rig import EmulatedRig
+from mirrorskin.hw.rig.plans import VerticalPlan
+from mirrorskin.hw.rig.rig import Rig
+from mirrorskin.hw.rig.sweep import SweepScan
 from mirrorskin.hw.rig_file import load_rig
 from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.hw.stage import Position
@@ -196,3 +199,21 @@ def test_a_picture_of_someone_else_is_kept(tmp_path: Path) -> None:
 def test_a_rig_that_cannot_be_leaves_nothing_running(running) -> None:
     with pytest.raises(InputError, match="delay"):
         running(delay=-1.0)
+
+
+@pytest.mark.parametrize(("every", "late"), [(2, math.inf), (7, 0.05)])
+def test_a_sweep_with_nth_frames_lost_or_late_knows_where_the_body_was(running, clock, every, late) -> None:
+    rig = running(delay=0.02)
+    rig.camera.lateness = lambda number: late if number % every == 0 else 0.0
+    camera = structs.replace(rig.settings.camera, delay=0.02, dark=16.0)
+    told = replace(rig.settings, camera=camera)
+    with Rig(rig.open_stage(told.stage), rig.camera, told, clock) as opened:
+        with SweepScan(opened, VerticalPlan(0.0, 1.0, speed=1.0)) as scan:
+            while scan.read(np.empty((8, *SMALL["shape"]), np.uint8)) is not None:
+                pass
+        number, arrival = (np.concatenate(one) for one in zip(*scan._frames, strict=True))
+        sound = np.flatnonzero(number % every)[0]  # a frame in time
+        exposed = arrival[sound] - 0.02 + (number - number[sound]) / SMALL["rate"]
+        true = np.array([rig.where(float(at)).travel for at in exposed])
+    assert abs(scan.positions()["travel"] - true).max() < (0.005 if late == math.inf else late)
+    assert (scan.dropped > 0) == (late == math.inf)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from commands import run
 from fake_marlin import FakeMarlin
+from line_faults import CHANGES, outcomes
 from rig_fakes import FakeCamera, settings
 
 from mirrorskin import io
@@ -16,6 +17,7 @@ from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig, open_stage
 from mirrorskin.hw.rig.scan import StepScan
 from mirrorskin.hw.rig.sweep import SweepScan
+from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.hw.stage import Position
 
 RIG = settings((4, 4), delay=0.0, dark=5.0)
@@ -233,6 +235,32 @@ def test_other_steps_than_the_rig_file_s_are_refused(line):
     travel = msgspec.structs.replace(STAGE.travel, steps=400.0)
     with pytest.raises(io.InputError, match=r"M92 Z is 200 steps where the rig file has 400: it goes 0\.5"):
         MarlinStage(msgspec.structs.replace(STAGE, travel=travel), line, clock=line.clock)
+
+
+def go(**faults):
+    """Move there and back through a line with faults, and return what went wrong."""
+    line, error = FakeMarlin(SimulatedClock()), None
+    vars(line).update(faults)
+    try:
+        with MarlinStage(STAGE, line, clock=line.clock) as stage:
+            stage.home()
+            for travel in (-0.4, -0.1):
+                stage.move(Position(travel))
+                assert stage.wait().position.travel == pytest.approx(travel, abs=0.021)
+                assert line.place()["Z"] == pytest.approx(travel, abs=0.021)
+    except (HardwareError, io.InputError) as failed:
+        error = failed
+        assert "\n" not in str(error)
+    assert line.clock.threads == []
+    line.clock.sleep(1.0)
+    assert not line.moving
+    return error
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("way", ["said", "heard"])
+def test_each_reply_and_byte_may_fail_once(way, change):
+    assert None in outcomes(go, way, change, least=30), "some of it does not matter"
 
 
 RIG_FILE = """

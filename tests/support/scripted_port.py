@@ -12,7 +12,8 @@ from mirrorskin.hw.grbl.report_times import SLICE
 class ScriptedPort:
     """Stands in for an open port; a subclass is the machine behind it.
 
-    It may be ``silent``, or ``gone`` as when its plug is pulled, and be told what to ``say``.
+    It may be ``silent``, or ``gone`` as when its plug is pulled, and be told what to ``say``. As with
+    `GrblLine`, ``heard`` and ``said`` may change any byte from the host and any reply, by their numbers.
     """
 
     timeout = SLICE
@@ -21,6 +22,8 @@ class ScriptedPort:
         self.clock = clock
         self.bytes = bytearray()  # all that was written
         self.silent = self.gone = self.closed = False
+        self.heard = self.said = lambda number, what: what
+        self._count = {"heard": 0, "said": 0}
         self._out, self._change = bytearray(), clock.condition()
 
     def take(self, data):
@@ -53,7 +56,7 @@ class ScriptedPort:
         self._present()
         self.advance()
         self.bytes += data
-        self.take(data)
+        self.take(b"".join(self._passed("heard", bytes([byte])) for byte in data))
         self.advance()
         self._wake()
         return len(data)
@@ -73,7 +76,7 @@ class ScriptedPort:
         self._wake()
 
     def say(self, *lines):
-        self.inject("".join(f"{line}\r\n" for line in lines).encode("latin-1"))
+        self.inject(b"".join(self._passed("said", f"{line}\r\n".encode("latin-1")) for line in lines))
 
     def inject(self, data):
         if not self.silent:
@@ -86,6 +89,10 @@ class ScriptedPort:
         while not condition():
             assert self.clock.now() < end, "it never came to be so"
             self.clock.sleep(0.001)
+
+    def _passed(self, way, what):
+        self._count[way] += 1
+        return getattr(self, way)(self._count[way], what)
 
     def _present(self):
         if self.gone:
