@@ -5,53 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from types import TracebackType
 from typing import Protocol
-
-
-class Event(Protocol):
-    """As ``threading.Event``."""
-
-    def is_set(self) -> bool:
-        """Return whether it was set."""
-
-    def set(self) -> None:
-        """Set it, and wake who waits."""
-
-    def wait(self, timeout: float | None = None) -> bool:
-        """Wait until it is set, for some seconds at most; return whether it is."""
-
-
-class Condition(Protocol):
-    """As ``threading.Condition`` with its lock, which the thread that has it may take again."""
-
-    def __enter__(self) -> bool: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
-    ) -> None: ...
-
-    def wait(self, timeout: float | None = None) -> bool:
-        """Wait for a notification without the lock, for some seconds at most; return whether one came."""
-
-    def notify(self, n: int = 1) -> None:
-        """Wake some of those that wait."""
-
-    def notify_all(self) -> None:
-        """Wake all that wait."""
-
-
-class Thread(Protocol):
-    """As ``threading.Thread``."""
-
-    def start(self) -> None:
-        """Begin to work."""
-
-    def join(self, timeout: float | None = None) -> None:
-        """Wait until it has ended, for some seconds at most."""
-
-    def is_alive(self) -> bool:
-        """Return whether it has begun and not ended."""
 
 
 class Clock(Protocol):
@@ -67,13 +21,13 @@ class Clock(Protocol):
     def sleep(self, seconds: float, /) -> None:
         """Let some seconds pass."""
 
-    def event(self) -> Event:
+    def event(self) -> threading.Event:
         """Make an event."""
 
-    def condition(self) -> Condition:
-        """Make a condition, which is also a lock."""
+    def condition(self) -> threading.Condition:
+        """Make a condition, which is also a lock that its thread may take again."""
 
-    def thread(self, work: Callable[[], object], name: str, daemon: bool = False) -> Thread:
+    def thread(self, work: Callable[[], object], name: str, daemon: bool = False) -> threading.Thread:
         """Make a thread, which may wait with this clock's means; it is yet to be started."""
 
 
@@ -85,7 +39,7 @@ class SystemClock:
     event = staticmethod(threading.Event)
     condition = staticmethod(threading.Condition)
 
-    def thread(self, work: Callable[[], object], name: str, daemon: bool = False) -> Thread:
+    def thread(self, work: Callable[[], object], name: str, daemon: bool = False) -> threading.Thread:
         """Make a thread; see `Clock.thread`."""
         return threading.Thread(target=work, name=name, daemon=daemon)
 

@@ -8,6 +8,9 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import TracebackType
+from typing import TypeVar
+
+T = TypeVar("T")
 
 _POLLS = 1_000_000  # looks at the time without a wait, after which nobody will ever wait
 
@@ -156,42 +159,36 @@ class SimulatedClock:
         self._tasks[ident] = task
         self._waiting.append(task)
 
-    def _end(self, ident: int) -> None:
-        """Let a thread that runs take part no more."""
-        del self._tasks[ident]
+    def _end(self) -> None:
+        """Let the thread that runs take part no more."""
+        del self._tasks[threading.get_ident()]
         if self._waiting:
             self._choose().gate.release()
 
 
-class SimulatedEvent:
-    """A `mirrorskin.hw.clock.Event` of a simulated clock."""
+class SimulatedEvent(threading.Event):
+    """An event of a simulated clock."""
 
-    def __init__(self, clock: SimulatedClock) -> None:
-        self._clock, self._set = clock, False
-
-    def is_set(self) -> bool:
-        """Return whether it was set."""
-        return self._set
-
-    def set(self) -> None:
-        """Set it."""
-        self._set = True
+    def __init__(self, clock: SimulatedClock, what: str = "an event") -> None:
+        super().__init__()
+        self._clock, self._what = clock, what
 
     def wait(self, timeout: float | None = None) -> bool:
         """Wait until it is set, for some seconds at most; return whether it is."""
-        if not self._set:
-            self._clock._wait(self.is_set, timeout, "an event")
-        return self._set
+        if not self.is_set():
+            self._clock._wait(self.is_set, timeout, self._what)
+        return self.is_set()
 
 
-class SimulatedCondition:
-    """A `mirrorskin.hw.clock.Condition` of a simulated clock."""
+class SimulatedCondition(threading.Condition):
+    """A condition of a simulated clock; notifications wake in the order of waiting."""
 
     def __init__(self, clock: SimulatedClock) -> None:
+        super().__init__()
         self._clock = clock
         self._owner: int | None = None
         self._depth = 0
-        self._waiters: deque[SimulatedEvent] = deque()
+        self._sleepers: deque[SimulatedEvent] = deque()
 
     def __enter__(self) -> bool:
         self._take(1)
@@ -208,25 +205,31 @@ class SimulatedCondition:
         """Wait for a notification without the lock, for some seconds at most; return whether one came."""
         if self._owner != threading.get_ident():
             raise RuntimeError("who waits for a condition must have its lock")
-        waiter, depth = SimulatedEvent(self._clock), self._depth
-        self._waiters.append(waiter)
+        woken, depth = SimulatedEvent(self._clock, "a notification"), self._depth
+        self._sleepers.append(woken)
         self._owner, self._depth = None, 0
         try:
-            self._clock._wait(waiter.is_set, timeout, "a notification")
+            return woken.wait(timeout)
         finally:
-            if not waiter.is_set():
-                self._waiters.remove(waiter)
+            if not woken.is_set():
+                self._sleepers.remove(woken)
             self._take(depth)
-        return waiter.is_set()
+
+    def wait_for(self, predicate: Callable[[], T], timeout: float | None = None) -> T:
+        """Wait until something is so, for some seconds at most; return what it is then."""
+        end = math.inf if timeout is None else self._clock.now() + timeout
+        while not (found := predicate()) and (left := end - self._clock.now()) > 0:
+            self.wait(left)
+        return found
 
     def notify(self, n: int = 1) -> None:
-        """Wake some of those that wait, in the order in which they began to."""
-        for waiter in [self._waiters.popleft() for _ in range(min(n, len(self._waiters)))]:
-            waiter.set()
+        """Wake some of those that wait."""
+        for woken in [self._sleepers.popleft() for _ in range(min(n, len(self._sleepers)))]:
+            woken.set()
 
     def notify_all(self) -> None:
         """Wake all that wait."""
-        self.notify(len(self._waiters))
+        self.notify(len(self._sleepers))
 
     def _take(self, depth: int) -> None:
         me = threading.get_ident()
@@ -236,32 +239,33 @@ class SimulatedCondition:
         self._depth += depth
 
 
-class SimulatedThread:
-    """A `mirrorskin.hw.clock.Thread` of a simulated clock: a thread that runs when it is its turn."""
+class SimulatedThread(threading.Thread):
+    """A thread of a simulated clock, which runs when it is its turn, and keeps no program from ending."""
 
     def __init__(self, clock: SimulatedClock, work: Callable[[], object], name: str) -> None:
+        super().__init__(name=name, daemon=True)
         self._clock, self._work, self._task = clock, work, _Task(name)
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-        self._ended = SimulatedEvent(clock)
+        self._over = SimulatedEvent(clock, f"the end of {name}")
 
     def start(self) -> None:
         """Begin to work, when the others wait."""
-        self._thread.start()
-        self._clock._begin(self._task, self._thread.ident)
+        super().start()
+        self._clock._begin(self._task, self.ident)
 
-    def join(self, timeout: float | None = None) -> None:
-        """Wait until it has ended, for some seconds at most."""
-        if self._ended.wait(timeout):
-            self._thread.join()
-
-    def is_alive(self) -> bool:
-        """Return whether it has begun and not ended."""
-        return self._thread.ident is not None and not self._ended.is_set()
-
-    def _run(self) -> None:
+    def run(self) -> None:
+        """Work, in turns with the others."""
         self._task.gate.acquire()
         try:
             self._work()
         finally:
-            self._ended.set()
-            self._clock._end(threading.get_ident())
+            self._over.set()
+            self._clock._end()
+
+    def join(self, timeout: float | None = None) -> None:
+        """Wait until it has ended, for some seconds at most."""
+        if self._over.wait(timeout):
+            super().join()
+
+    def is_alive(self) -> bool:
+        """Return whether it has begun and not ended."""
+        return super().is_alive() and not self._over.is_set()

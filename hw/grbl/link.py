@@ -12,7 +12,7 @@ from typing import TypeVar
 
 import serial
 
-from mirrorskin.hw.clock import Clock, Condition
+from mirrorskin.hw.clock import Clock
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.grbl.moves import Command
 from mirrorskin.hw.grbl.replies import (
@@ -160,7 +160,7 @@ class Link:
     ) -> None:
         self.error: HardwareError | None = None  # what went wrong, first of all
         self.clock = clock
-        self.lock: Condition = clock.condition()
+        self.lock: threading.Condition = clock.condition()
         self.window: Window = Window()
         self.noise: Noise = Noise()
         self.seen: TimedStatus | None = None  # the newest report
