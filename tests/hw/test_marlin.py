@@ -9,6 +9,7 @@ from commands import run
 from fake_marlin import FakeMarlin
 from line_faults import CHANGES, outcomes
 from rig_fakes import FakeCamera, settings
+from simulated import write_film_rig
 
 from mirrorskin import io
 from mirrorskin.hw.errors import HardwareError
@@ -272,13 +273,6 @@ press = 2.0
 letter = "Z"
 limits = [-5.0, 3.0]
 speed = 8.0
-[camera]
-source = "film.y4m"
-size = [8, 6]
-rate = 50
-stall = 5
-dark = 0
-delay = 0
 """
 
 
@@ -287,9 +281,7 @@ def capture(line, simulated, tmp_path, monkeypatch):
     """Run commands on a rig file: the controller is the fake one, and the camera a film of 200 s."""
     monkeypatch.setattr("mirrorskin.hw.marlin.stage.open_port", lambda *_: line.open())
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "rig.toml").write_text(RIG_FILE)
-    film = b"YUV4MPEG2 W8 H6 F50:1 Ip A1:1 Cmono\n" + (b"FRAME\n" + bytes(range(48))) * 10_000
-    (tmp_path / "film.y4m").write_bytes(film)
+    write_film_rig(tmp_path, RIG_FILE)
     return lambda words: run("capture", "vertical", *words.split(), "--rig", "rig.toml", "-o", "press.h5")
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from commands import run
 from rig_fakes import FakeCamera, settings
-from simulated import on_clock
+from simulated import on_clock, write_film_rig
 
 from mirrorskin import io
 from mirrorskin.hw.errors import HardwareError
@@ -182,13 +182,6 @@ press = 2.0
 letter = "Z"
 limits = [-10.0, 3.0]
 speed = 50.0
-[camera]
-source = "film.y4m"
-size = [8, 6]
-rate = 50
-stall = 5
-dark = 0
-delay = 0
 """
 
 
@@ -198,9 +191,7 @@ def folder(line, simulated, tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, "my_stage", raising=False)
     monkeypatch.setattr(sys, "path", [*sys.path])
     (tmp_path / "my_stage.py").write_text(EXAMPLE.replace("import threading\nimport time\n", ""))
-    (tmp_path / "rig.toml").write_text(RIG)
-    film = b"YUV4MPEG2 W8 H6 F50:1 Ip A1:1 Cmono\n" + (b"FRAME\n" + bytes(range(48))) * 10_000
-    (tmp_path / "film.y4m").write_bytes(film)
+    write_film_rig(tmp_path, RIG)
     for name, module in on_clock(simulated).items():  # in the place of the modules that it imports
         monkeypatch.setattr(builtins, name, module, raising=False)
     return tmp_path

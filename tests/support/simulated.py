@@ -50,6 +50,23 @@ def simulated_rig(
         yield rig, file
 
 
+FILM = """
+[camera]
+source = "film.y4m"
+size = [8, 6]
+rate = 50
+dark = 0
+delay = 0
+"""
+
+
+def write_film_rig(folder: Path, stage: str) -> None:
+    """Write a rig file whose camera is a film of 200 s."""
+    (folder / "rig.toml").write_text(stage + FILM)
+    frame = b"FRAME\n" + bytes(range(0, 96, 2))
+    (folder / "film.y4m").write_bytes(b"YUV4MPEG2 W8 H6 F50:1 Ip A1:1 Cmono\n" + frame * 10_000)
+
+
 def on_clock(clock: SimulatedClock) -> dict[str, Any]:
     """Return what stands in for the modules ``time`` and ``threading`` in a user's class."""
     return {
