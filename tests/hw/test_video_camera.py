@@ -59,6 +59,20 @@ def play_out(opened: VideoCamera, timeout: float) -> None:
         opened.take(10, timeout)
 
 
+@pytest.fixture
+def open_camera(clock):
+    """Open cameras and films on simulated time, and close them in the end."""
+    opened = []
+
+    def open_it(source=0, shape=SMALL, dtype=BYTE, **more) -> VideoCamera:
+        opened.append(VideoCamera(settings(str(source), shape, dtype, **more), 50, clock))
+        return opened[-1]
+
+    yield open_it
+    for one in opened:
+        one.close()
+
+
 def wait_until(clock: Clock, holds: Callable[[], bool]) -> None:
     deadline = clock.now() + SOON
     while not holds():
@@ -81,49 +95,47 @@ def write_y4m(path, frames: np.ndarray, rate: int) -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_a_grey_file_is_exact_to_its_end(clock, tmp_path, dtype) -> None:
+def test_a_grey_file_is_exact_to_its_end(open_camera, tmp_path, dtype) -> None:
     frames = noise(40, dtype=dtype)
     write_y4m(tmp_path / "film.y4m", frames, 400)
-    opened = VideoCamera(settings(str(tmp_path / "film.y4m"), SMALL, dtype), 50, clock)
+    opened = open_camera(tmp_path / "film.y4m", dtype=dtype)
     pixels, numbers = take(opened, 40)
     with pytest.raises(HardwareError, match=r"film.y4m has ended after 40 frames$"):
         opened.take(1, SOON)
     assert "has ended" in str(opened.error)
     counts = opened.counts
-    opened.close()
     np.testing.assert_array_equal(pixels, frames)
     assert numbers.tolist() == list(range(40))
     assert (counts.frames, counts.dropped, counts.reconnects) == (40, 0, 0)
 
 
-def test_a_file_plays_at_its_own_rate(clock, tmp_path) -> None:
+def test_a_file_plays_at_its_own_rate(open_camera, clock, tmp_path) -> None:
     write_y4m(tmp_path / "film.y4m", noise(20), 50)
     begun = clock.now()
-    opened = VideoCamera(settings(str(tmp_path / "film.y4m"), SMALL), 50, clock)
+    opened = open_camera(tmp_path / "film.y4m")
     with pytest.raises(HardwareError, match="has ended"):
         play_out(opened, SOON)
-    opened.close()
     assert opened.latest - begun == pytest.approx(19 / 50)
 
 
-def test_a_file_of_another_size_is_refused(tmp_path) -> None:
+def test_a_file_of_another_size_is_refused(open_camera, tmp_path) -> None:
     write_y4m(tmp_path / "film.y4m", noise(2), 50)
     with pytest.raises(InputError, match="32 x 24, and 640 x 480 is asked for"):
-        VideoCamera(settings(str(tmp_path / "film.y4m")))
+        open_camera(tmp_path / "film.y4m", SHAPE)
 
 
-def test_no_file_no_device_and_no_video_are_refused(tmp_path, monkeypatch) -> None:
+def test_no_file_no_device_and_no_video_are_refused(open_camera, tmp_path, monkeypatch) -> None:
     with pytest.raises(InputError, match="there is no such file"):
-        VideoCamera(settings(str(tmp_path / "none.avi")))
+        open_camera(tmp_path / "none.avi")
     (tmp_path / "text.avi").write_text("no film")
     with pytest.raises(InputError, match="cannot be opened: it is damaged, or no video"):
-        VideoCamera(settings(str(tmp_path / "text.avi")))
+        open_camera(tmp_path / "text.avi")
     monkeypatch.setattr(video, "_DEVICES", tmp_path)
     with pytest.raises(InputError, match="there is no such device; no camera is connected"):
-        VideoCamera(settings(3))
+        open_camera(3)
     (tmp_path / "video0").touch()
     with pytest.raises(InputError, match=r"there is no such device; there are .*video0$"):
-        VideoCamera(settings("3"))
+        open_camera("3")
 
 
 class Driver:
@@ -186,22 +198,10 @@ def driver(clock, tmp_path, monkeypatch):
     (tmp_path / "video0").touch()
     monkeypatch.setattr(video, "_DEVICES", tmp_path)
     monkeypatch.setattr(video.cv2, "VideoCapture", made)
-    return made
-
-
-@pytest.fixture
-def open_camera(driver, clock):
-    opened = []
-
-    def open_it(source=0, shape=SMALL, dtype=BYTE, slots=50, **more) -> VideoCamera:
-        opened.append(VideoCamera(settings(source, shape, dtype, **more), slots, clock))
-        return opened[-1]
-
-    yield open_it
-    driver.begins.set()
-    driver.give(None)
-    for one in opened:
-        one.close()
+    yield made
+    made.begins.set()
+    made.give(None)
+    clock.sleep(1.0)
 
 
 def test_a_camera_is_given_what_is_asked_for(driver, open_camera, caplog) -> None:
@@ -297,13 +297,13 @@ def test_a_camera_that_waits_for_a_trigger_is_not_lost(driver, open_camera) -> N
     assert (driver.opened, opened.counts.reconnects) == (1, 0)
 
 
-def test_a_film_cannot_be_triggered(tmp_path) -> None:
+def test_a_film_cannot_be_triggered(open_camera, tmp_path) -> None:
     write_y4m(tmp_path / "film.y4m", noise(2), 50)
     with pytest.raises(InputError, match=r"film\.y4m cannot be triggered: leave camera\.trigger out$"):
-        VideoCamera(settings(str(tmp_path / "film.y4m"), SMALL, trigger="coolant"))
+        open_camera(tmp_path / "film.y4m", trigger="coolant")
 
 
-def test_the_input_of_a_trigger_is_not_ours_to_set(open_camera) -> None:
+def test_the_input_of_a_trigger_is_not_ours_to_set(driver, open_camera) -> None:
     with pytest.raises(
         InputError, match=r"video0: its input is set by its own tools; leave trigger_input out$"
     ):
@@ -353,33 +353,30 @@ def write_mjpeg(path, *pictures: np.ndarray) -> None:
     path.write_bytes(b"".join(cv2.imencode(".jpg", picture)[1].tobytes() for picture in pictures))
 
 
-def test_a_stream_that_changes_its_size_is_not_scaled(clock, tmp_path) -> None:
+def test_a_stream_that_changes_its_size_is_not_scaled(open_camera, tmp_path) -> None:
     smooth = cv2.resize(noise(1)[0], (64, 48))
     write_mjpeg(tmp_path / "film.mjpg", *[smooth] * 3, cv2.resize(smooth, (128, 96)))
-    opened = VideoCamera(settings(str(tmp_path / "film.mjpg"), (48, 64)), 50, clock)
+    opened = open_camera(tmp_path / "film.mjpg", (48, 64))
     take(opened, 3)
     with pytest.raises(HardwareError, match="128 x 96 uint8, and 64 x 48 uint8 is asked for"):
         opened.take(1, SOON)
-    opened.close()
 
 
-def test_a_jpeg_gives_its_luma(clock, tmp_path) -> None:
+def test_a_jpeg_gives_its_luma(open_camera, tmp_path) -> None:
     colours = cv2.resize(np.random.default_rng(1).integers(0, 255, (6, 8, 3), np.uint8), (64, 48))
     write_mjpeg(tmp_path / "film.mjpg", *[colours] * 2)
-    opened = VideoCamera(settings(str(tmp_path / "film.mjpg"), (48, 64)), 50, clock)
+    opened = open_camera(tmp_path / "film.mjpg", (48, 64))
     luma = cv2.cvtColor(colours, cv2.COLOR_BGR2GRAY).astype(int)
     assert np.abs(take(opened, 1)[0][0] - luma).mean() < 3  # what the packing costs
-    opened.close()
 
 
-def test_a_jpeg_that_is_cut_short_is_not_made_up(clock, tmp_path) -> None:
+def test_a_jpeg_that_is_cut_short_is_not_made_up(open_camera, tmp_path) -> None:
     whole = cv2.imencode(".jpg", noise(1, (48, 64))[0])[1].tobytes()
     (tmp_path / "film.mjpg").write_bytes(2 * whole + whole[: len(whole) // 2])
-    opened = VideoCamera(settings(str(tmp_path / "film.mjpg"), (48, 64)), 50, clock)
+    opened = open_camera(tmp_path / "film.mjpg", (48, 64))
     take(opened, 2)
     with pytest.raises(HardwareError, match="a picture cannot be decoded"):
         opened.take(1, SOON)
-    opened.close()
 
 
 def test_a_driver_that_hangs_while_it_opens_does_not_hang_us(driver, open_camera, clock) -> None:
@@ -388,8 +385,6 @@ def test_a_driver_that_hangs_while_it_opens_does_not_hang_us(driver, open_camera
     with pytest.raises(InputError, match=r"gave no picture within 7 s"):
         open_camera()
     assert clock.now() - begun == pytest.approx(10.0)  # with 3 s for its end
-    driver.begins.set()
-    clock.sleep(1.0)
 
 
 def test_a_driver_that_hangs_does_not_hang_the_closing(driver, open_camera, clock, caplog) -> None:
@@ -401,8 +396,6 @@ def test_a_driver_that_hangs_does_not_hang_the_closing(driver, open_camera, cloc
     assert "does not let go" in caplog.text
     with pytest.raises(HardwareError, match="is closed"):
         play_out(opened, SOON)
-    driver.give(None)
-    clock.sleep(1.0)
 
 
 def test_the_rate_is_that_of_the_newest_frames_whatever_their_jitter() -> None:
