@@ -44,6 +44,8 @@ def test_a_condition_hands_over_a_value_and_its_lock_is_taken_twice(any_clock):
         while not values:
             assert condition.wait(30.0)
         assert not condition.wait(0.01)
+        assert condition.wait_for(lambda: sum(values), 30.0) == 5
+        assert not condition.wait_for(lambda: len(values) > 1, 0.01)
 
 
 def test_a_thread_can_be_waited_for_and_has_a_name(any_clock):
