@@ -5,14 +5,13 @@ On the emulator always, and on a real firmware as well with `make test-hardware 
 
 import pytest
 from firmware import PROGRAM, is_hal
-from rig_faults import FAULTS, FIRMWARE_ONLY, HAL_SETTINGS, LATE, SETTINGS, try_capture
+from rig_faults import AFTERWARDS, FAULTS, FIRMWARE_ONLY, HAL_SETTINGS, LATE, SETTINGS, try_capture
 
 SOON = 1.0  # seconds in which a firmware's stage stops on a busy machine
 PRESS = 7.0  # seconds, of a whole one
 HAL = is_hal(PROGRAM)
-# Those that end with what was under way, or of which some go on: nothing asked the stage to stop before.
 # GRBL takes a stored offset after the lines before it, grblHAL one that is not stored.
-AFTERWARDS = {"G92 by another program" if HAL else "G10 by another program", "move by another program"}
+AFTERWARDS = AFTERWARDS | {"G92 by another program" if HAL else "G10 by another program"}
 SETTINGS = SETTINGS | HAL_SETTINGS if HAL else SETTINGS
 firmware = pytest.mark.skipif(PROGRAM is None, reason="make test-hardware GRBL=PATH gives the program")
 

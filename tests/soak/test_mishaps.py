@@ -14,7 +14,7 @@ ATTEMPTS = 5  # a machine that is busy with other things may be too late for the
 def test_the_stage_stops_and_what_was_taken_is_kept(what, seed, tmp_path):
     start = time.monotonic()
     path = tmp_path / "cut.h5"
-    outcome = mishaps.capture_with(mishaps.INSIDE[what], seed, path)
+    outcome = mishaps.capture_with(what, seed, path)
     state = mishaps.state_of(path)
     assert not outcome.moved_at
     if outcome.happened:

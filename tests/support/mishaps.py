@@ -6,13 +6,13 @@ import random
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from msgspec import structs
+from rig_faults import AFTERWARDS, FAULTS, FIRMWARE_ONLY
 
 from mirrorskin import io
 from mirrorskin.hw.clock import SYSTEM, Clock
@@ -38,8 +38,6 @@ ON_THE_WAY = 0.3
 _START = 30.0
 _LATEST = 3.0  # seconds after the first move that a mishap comes
 
-Mishap = Callable[[EmulatedRig, int], None]
-
 
 class Outcome(NamedTuple):
     """What came of a capture that met with a mishap."""
@@ -50,14 +48,7 @@ class Outcome(NamedTuple):
     happened: bool  # whether it came before the capture's end
 
 
-INSIDE: dict[str, Mishap] = {
-    "serial silence": lambda rig, seed: rig.port.silence(),
-    "garbage": lambda rig, seed: rig.port.garble(100_000, seed),
-    "unplugged": lambda rig, seed: rig.port.unplug(),
-    "camera stalls": lambda rig, seed: rig.camera.stall(),
-    "camera lost": lambda rig, seed: rig.camera.lose(),
-    "Ctrl-C": lambda rig, seed: rig.clock.interrupt(),
-}
+INSIDE = [name for name in FAULTS if name not in FIRMWARE_ONLY | AFTERWARDS | {"none"}]
 """What happens within a process."""
 
 
@@ -73,8 +64,8 @@ def make_plan(chance: random.Random) -> Plan:
     return AxialPlan(1.0, np.radians(2.5), turns=2.0, rate=1.0)
 
 
-def capture_with(mishap: Mishap, seed: int, path: Path) -> Outcome:
-    """Capture on simulated time, let a mishap come at a random moment in some move, and tell how it ended."""
+def capture_with(fault: str, seed: int, path: Path) -> Outcome:
+    """Capture on simulated time, let a fault come at a random moment of a move, and tell how it ended."""
     chance, error, clock, came = random.Random(seed), None, SimulatedClock(), list[float]()
     with make_rig(seed, 60.0, clock) as emulated:
         settings = emulated.settings
@@ -89,7 +80,7 @@ def capture_with(mishap: Mishap, seed: int, path: Path) -> Outcome:
                 pass
             if not over.is_set():
                 came.append(clock.now())
-                mishap(emulated, seed)
+                FAULTS[fault][0](emulated)
 
         thread = clock.thread(trouble, "trouble")
         thread.start()
@@ -102,7 +93,7 @@ def capture_with(mishap: Mishap, seed: int, path: Path) -> Outcome:
         over.set()
         thread.join()
         at = came[0] if came else ended
-        soon = at + SOON + (ON_THE_WAY if mishap is INSIDE["camera stalls"] else 0)
+        soon = at + SOON + (ON_THE_WAY if fault == "camera stalls" else 0)
         clock.sleep(max(0.0, soon - ended))
         return Outcome(error, emulated.machine.moving(soon), ended - at, bool(came))
 

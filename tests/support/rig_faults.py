@@ -48,6 +48,7 @@ def _says(words: bytes) -> Callable[[EmulatedRig], None]:
 def _interrupt(emulated: EmulatedRig) -> None:
     if isinstance(emulated.clock, SimulatedClock):
         emulated.clock.interrupt()
+        return
     os.kill(os.getpid(), signal.SIGINT)
     threading.Event().wait(LATE)
 
@@ -79,6 +80,9 @@ FIRMWARE_ONLY = {
     "G10 by another program",
 }
 """What the emulator does not know."""
+
+AFTERWARDS = {"move by another program"}
+"""Those that end with what was under way: nothing asked the stage to stop before."""
 
 SETTINGS: dict[str, tuple[dict[int, float], str]] = {
     "reports in inches ($13=1)": ({13: 1}, "set $13=0"),
