@@ -11,8 +11,8 @@ from typing import Protocol
 class Clock(Protocol):
     """What time it is, and the means to wait.
 
-    A lock that is held while its thread waits must be a condition of the clock. Locks for a few statements
-    may be those of ``threading``.
+    A lock that is held while its thread waits must be a condition of the clock. Other locks, for a few
+    statements, may be plain ones.
     """
 
     def now(self) -> float:
