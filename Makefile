@@ -18,13 +18,13 @@ LOWEST := build/lowest
 demo: $(READY)
 	@$(BIN)/mirrorskin demo -o demo --overwrite
 
-# A process for each core, each with files of its own. Types are checked meanwhile, as some tests wait for clocks.
+# A process for each core, each with files of its own. Types are checked meanwhile.
 test: lint
 	@$(MAKE) --no-print-directory types & types=$$!
 	$(PYTEST) -m 'not slow'
 	wait $$types
 
-# What 'make test' leaves out: captures that go by the clock, with nothing beside them; the second work shape of
+# What 'make test' leaves out: a few captures in real time, with nothing beside them; the second work shape of
 # every device, statistics over many draws, recordings of full size, batches that are killed, the documentation,
 # and reports in a real browser.
 test-all: $(READY)

@@ -10,6 +10,7 @@ from .rig.rig import Rig, open_rig
 from .rig.scan import StepScan
 from .rig.sweep import SweepScan
 from .rig_file import load_rig
+from .simulated_clock import SimulatedClock
 from .stage import Limits, Position
 from .twin import Live, Twin
 from .video import VideoCamera
@@ -27,6 +28,7 @@ __all__ = [
     "Position",
     "Rig",
     "RockPlan",
+    "SimulatedClock",
     "StepScan",
     "SweepScan",
     "ThreadedCamera",

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from mirrorskin.hw.camera import Counts, Frames
+from mirrorskin.hw.clock import SYSTEM, Clock
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.ring import Ring, usual_slots
 from mirrorskin.io.types import Closing
@@ -37,6 +38,8 @@ class ThreadedCamera(Closing):
         Frames a second, if it is known.
     slots : int, optional
         Frames that may wait; see ``mirrorskin.hw.ring.usual_slots``.
+    clock : Clock
+        What frames' times are on, and readers wait by.
     """
 
     shape: tuple[int, int]
@@ -49,11 +52,13 @@ class ThreadedCamera(Closing):
         dtype: DTypeLike,
         rate: float | None = None,
         slots: int | None = None,
+        clock: Clock = SYSTEM,
     ) -> None:
         self.name = name
         self.shape, self.dtype = shape, np.dtype(dtype)
         slots = usual_slots(shape, dtype, rate) if slots is None else slots
-        self._ring = Ring(shape, dtype, slots, name)
+        self.clock = clock
+        self._ring = Ring(shape, dtype, slots, name, clock)
         self._counter = FrameCounter()
         self._number = 0
         self._reconnects = 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time as clock
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from mirrorskin.hw.clock import SYSTEM, Clock
 from mirrorskin.hw.reopened import READ_TIMEOUT, ReopenedCamera, warn_of_other
 from mirrorskin.hw.rig_file import GENICAM, CameraSettings
 from mirrorskin.io import InputError
@@ -43,6 +43,8 @@ class GenicamCamera(ReopenedCamera):
         serial number, IP or MAC address, or Aravis' name for it.
     slots : int, optional
         Frames that may wait; see ``mirrorskin.hw.ring.usual_slots``.
+    clock : Clock
+        What it waits by; Aravis itself goes by the computer's.
 
     Raises
     ------
@@ -57,9 +59,9 @@ class GenicamCamera(ReopenedCamera):
     (1, 480, 640)
     """
 
-    def __init__(self, settings: CameraSettings, slots: int | None = None) -> None:
+    def __init__(self, settings: CameraSettings, slots: int | None = None, clock: Clock = SYSTEM) -> None:
         self._aravis, self._failure = load_aravis()
-        super().__init__(f"camera {str(settings.source).rstrip(':')}", settings, slots)
+        super().__init__(f"camera {str(settings.source).rstrip(':')}", settings, slots, clock)
         self._start()
 
     def _read_until_lost(self, timeout: float) -> str:
@@ -83,14 +85,14 @@ class GenicamCamera(ReopenedCamera):
 
     def _read(self, stream: Any) -> None:
         """Put frames into the ring until there are none for 2 s."""
-        times, last, silent_since = DeviceClock(), None, clock.monotonic()
+        times, last, silent_since = DeviceClock(), None, self.clock.now()
         dtype = self.dtype.newbyteorder("<")
         patience = READ_TIMEOUT if self._settings.trigger is None else math.inf
-        while not self._stop.is_set() and clock.monotonic() - silent_since < patience:
+        while not self._stop.is_set() and self.clock.now() - silent_since < patience:
             buffer = stream.timeout_pop_buffer(round(1e6 * _LOOK))
             if buffer is None:
                 continue
-            now = clock.monotonic()
+            now = self.clock.now()
             if buffer.get_status() == self._aravis.BufferStatus.SUCCESS:
                 number, pixels = buffer.get_frame_id(), self._slot()
                 pixels[:] = np.frombuffer(buffer.get_data(), dtype, pixels.size).reshape(pixels.shape)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import logging
 import math
-import threading
-import time as clock
 
 from mirrorskin.hw.camera import Frames
 from mirrorskin.hw.camera_thread import ThreadedCamera
+from mirrorskin.hw.clock import SYSTEM, Clock
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig_file import CameraSettings
 from mirrorskin.io import InputError
@@ -38,19 +37,23 @@ class ReopenedCamera(ThreadedCamera):
     settings : CameraSettings
     slots : int, optional
         Frames that may wait; see ``mirrorskin.hw.ring.usual_slots``.
+    clock : Clock
+        What it waits by.
     """
 
     _returns = True  # whether it is opened again after a loss
 
-    def __init__(self, name: str, settings: CameraSettings, slots: int | None = None) -> None:
+    def __init__(
+        self, name: str, settings: CameraSettings, slots: int | None = None, clock: Clock = SYSTEM
+    ) -> None:
         self._settings = settings
-        super().__init__(name, settings.shape, settings.dtype, settings.rate, slots)
+        super().__init__(name, settings.shape, settings.dtype, settings.rate, slots, clock)
         self._lost: float | None = None  # since when
         self._pause = _PAUSES[0]
         self._refusal: InputError | None = None
-        self._ready, self._stop = threading.Event(), threading.Event()
+        self._ready, self._stop = clock.event(), clock.event()
         # A driver may hang: the program's end must not wait for that.
-        self._thread = threading.Thread(target=self._drain, name=self.name, daemon=True)
+        self._thread = clock.thread(self._drain, self.name, daemon=True)
 
     def _read_until_lost(self, timeout: float) -> str:
         """Open the source within so many seconds, and until ``_stop`` fill slots and call ``_arrived``.
@@ -91,7 +94,7 @@ class ReopenedCamera(ThreadedCamera):
             lost = self._lost
             if lost is None or self.error is not None:
                 raise
-            away = clock.monotonic() - lost
+            away = self.clock.now() - lost
             raise HardwareError(f"{self.name} was lost {away:.1f} s ago and is not back yet") from error
 
     def close(self) -> None:
@@ -133,7 +136,7 @@ class ReopenedCamera(ThreadedCamera):
 
     def _wait_for_return(self, why: str) -> float:
         """Wait before a lost camera is tried again, or give it up; return the seconds left to try."""
-        left = self._was_lost(why) + PATIENCE - clock.monotonic()
+        left = self._was_lost(why) + PATIENCE - self.clock.now()
         if left <= 0:
             self._fail(f"{why}: it was lost, and not back within {PATIENCE:.3g} s; see its cable and power")
             self._stop.set()
@@ -144,10 +147,10 @@ class ReopenedCamera(ThreadedCamera):
     def _was_lost(self, why: str) -> float:
         """Log that the camera is lost, if that is news, and return since when it is."""
         if self._lost is None and not self._stop.is_set():
-            self._lost = clock.monotonic()
+            self._lost = self.clock.now()
             message = "%s: it was lost after %d frames, and is tried again for %.3g s"
             _log.warning(message, why, self._number, PATIENCE)
-        return self._lost or clock.monotonic()
+        return self._lost or self.clock.now()
 
     def _came_back(self, time: float) -> int:
         """Log that the camera is back, and return how many frames it would have given meanwhile."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import mmap
-import threading
-import time as clock
 from collections import deque
 from typing import Any
 
@@ -13,6 +11,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from mirrorskin.hw.camera import Frames
+from mirrorskin.hw.clock import SYSTEM, Clock
 from mirrorskin.hw.errors import HardwareError
 
 MEMORY = 64_000_000  # bytes that a ring takes, where nothing else is said
@@ -41,7 +40,12 @@ class Ring:
     """
 
     def __init__(
-        self, shape: tuple[int, int], dtype: DTypeLike, slots: int, name: str = "the camera"
+        self,
+        shape: tuple[int, int],
+        dtype: DTypeLike,
+        slots: int,
+        name: str = "the camera",
+        clock: Clock = SYSTEM,
     ) -> None:
         if slots < 1:
             raise ValueError(f"a ring has at least 1 slot, not {slots}")
@@ -63,7 +67,8 @@ class Ring:
         self._returned: deque[range] = deque()
         self._writing = 0
         self._free[0] = False
-        self._came = threading.Condition()
+        self._clock = clock
+        self._came = clock.condition()
 
     def slot(self) -> NDArray[Any]:
         """Return the place for the next frame, (H, W); it stays the same until ``put``."""
@@ -130,11 +135,11 @@ class Ring:
         return range(first, stop)
 
     def _wait(self, timeout: float) -> None:
-        deadline = clock.monotonic() + timeout
+        deadline = self._clock.now() + timeout
         while not self._waiting:
             if self.error is not None:
                 raise self.error.with_traceback(None)  # it would keep what earlier takers held
-            left = deadline - clock.monotonic()
+            left = deadline - self._clock.now()
             if left <= 0:
                 raise HardwareError(
                     f"{self.name} gave no frame for {timeout:.3g} s: see whether it runs, and its cable"

@@ -6,7 +6,6 @@ import logging
 import math
 import os
 import re
-import time as clock
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.hw.clock import SYSTEM, Clock
 from mirrorskin.hw.reopened import OPEN_TIMEOUT, READ_TIMEOUT, ReopenedCamera, warn_of_other
 from mirrorskin.hw.rig_file import CameraSettings
 from mirrorskin.io import InputError
@@ -57,6 +57,8 @@ class VideoCamera(ReopenedCamera):
     settings : CameraSettings
     slots : int, optional
         Frames that may wait; see ``mirrorskin.hw.ring.usual_slots``.
+    clock : Clock
+        What it waits by; OpenCV itself goes by the computer's.
 
     Raises
     ------
@@ -70,7 +72,7 @@ class VideoCamera(ReopenedCamera):
     (1, 480, 640)
     """
 
-    def __init__(self, settings: CameraSettings, slots: int | None = None) -> None:
+    def __init__(self, settings: CameraSettings, slots: int | None = None, clock: Clock = SYSTEM) -> None:
         self._source = find_source(settings.source)
         if settings.trigger is not None and self._source.kind != "device":
             raise InputError(f"{self._source.name} cannot be triggered: leave camera.trigger out")
@@ -80,7 +82,7 @@ class VideoCamera(ReopenedCamera):
             )
         self._returns = self._source.kind != "file"
         self._repeats = _Repeats()
-        super().__init__(self._source.name, settings, slots)
+        super().__init__(self._source.name, settings, slots, clock)
         self._start()
 
     def _drain(self) -> None:
@@ -88,15 +90,15 @@ class VideoCamera(ReopenedCamera):
             super()._drain()
 
     def _read_until_lost(self, timeout: float) -> str:
-        capture = Capture(self._source, self._settings, timeout)
+        capture = Capture(self._source, self._settings, self.clock, timeout)
         self._opened()
-        pace = _Pace(capture.period) if self._source.kind == "file" else None
+        pace = _Pace(self.clock, capture.period) if self._source.kind == "file" else None
         try:
             while not self._stop.is_set():
-                began = clock.monotonic()
+                began = self.clock.now()
                 time = capture.grab()
                 if time is None:
-                    waited = clock.monotonic() - began > _WAITED * READ_TIMEOUT
+                    waited = self.clock.now() - began > _WAITED * READ_TIMEOUT
                     if waited and self._settings.trigger is not None:
                         continue
                     break
@@ -105,8 +107,8 @@ class VideoCamera(ReopenedCamera):
                 if self._repeats.frozen(slot):
                     return f"{self.name} gives the same picture again and again"
                 if pace is not None:
-                    self._stop.wait(pace.due(capture.position) - clock.monotonic())
-                    time = clock.monotonic()
+                    self._stop.wait(pace.due(capture.position) - self.clock.now())
+                    time = self.clock.now()
                 self._arrived(time)
         finally:
             capture.release()
@@ -142,15 +144,15 @@ class _Repeats:
 class _Pace:
     """When the pictures of a file that begins to play now are due."""
 
-    def __init__(self, period: float) -> None:
-        self._period = period
+    def __init__(self, clock: Clock, period: float) -> None:
+        self._clock, self._period = clock, period
         self._start: float | None = None
         self._position = 0.0
 
     def due(self, position: float) -> float:
         """Return when a picture is due, monotonic seconds, from its position in the file."""
         if self._start is None:
-            self._start = clock.monotonic() - position
+            self._start = self._clock.now() - position
         elif not position > self._position:  # some files do not say
             position = self._position + self._period
         self._position = position
@@ -160,8 +162,14 @@ class _Pace:
 class Capture:
     """One connection to a camera, a stream or a file: opened as asked, and read until it is lost."""
 
-    def __init__(self, source: VideoSource, settings: CameraSettings, timeout: float = OPEN_TIMEOUT) -> None:
-        self._source, self._settings = source, settings
+    def __init__(
+        self,
+        source: VideoSource,
+        settings: CameraSettings,
+        clock: Clock,
+        timeout: float = OPEN_TIMEOUT,
+    ) -> None:
+        self._source, self._settings, self._clock = source, settings, clock
         self._video = _open(source, timeout)
         self._picture: NDArray[Any] | None = None
         self._trusts = source.kind == "device"
@@ -181,7 +189,7 @@ class Capture:
         """Wait for the next picture, and return when it arrived, monotonic seconds; None: there is none."""
         if not self._video.grab():
             return None
-        now = clock.monotonic()
+        now = self._clock.now()
         if self._trusts:
             # V4L2 says when the driver had it, on this clock if the driver is a good one.
             stamp = float(self._video.get(cv2.CAP_PROP_POS_MSEC)) / 1000
@@ -221,7 +229,7 @@ class Capture:
     def _skip_backlog(self) -> None:
         """Forget the pictures that waited while the stream was opened: when they were taken is not known."""
         period = 1 / (self._settings.rate or self._declared)
-        begun = before = clock.monotonic()
+        begun = before = self._clock.now()
         waited = 0
         while (time := self.grab()) is not None and time - begun < _LONGEST_BACKLOG:
             # One alone can be a decoder's start.

@@ -7,7 +7,9 @@ import os
 import signal
 
 import pytest
+from simulated import simulate
 
+from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels.device import Device, list_devices
 from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT
@@ -38,8 +40,8 @@ def _default_interrupt():
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers():
-    """One more than there are cores, as tests of hardware wait for clocks."""
-    return (os.cpu_count() or 1) + 1
+    """As many as there are cores: hardly any test waits."""
+    return os.cpu_count() or 1
 
 
 def pytest_configure(config):
@@ -82,3 +84,18 @@ def small_device(device):
     limit = device.max_allocation
     yield device
     device.max_allocation = limit
+
+
+@pytest.fixture
+def clock():
+    """A clock that jumps from event to event; no thread of it is left when the test ends."""
+    made = SimulatedClock()
+    yield made
+    assert made.threads == []
+
+
+@pytest.fixture
+def simulated(clock, monkeypatch):
+    """Let commands open rigs, stages and cameras on simulated time."""
+    simulate(monkeypatch, clock)
+    return clock

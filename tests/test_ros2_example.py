@@ -7,7 +7,7 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
-from rig_fakes import FakeCamera, FakeStage, settings, spreading
+from rig_fakes import fake_rig, spreading
 
 from mirrorskin import hw
 
@@ -54,15 +54,13 @@ def published(monkeypatch):
     return said
 
 
-def test_a_press_is_published(published, monkeypatch):
-    stage = FakeStage()
-    camera = FakeCamera(stage.position, spreading(SHAPE), rate=60.0)
-    told = settings(SHAPE, pixel_size=(0.05, 0.05), delay=0.0, rate=60.0)
-    monkeypatch.setattr(hw, "load_rig", lambda _path: told)
-    monkeypatch.setattr(hw, "open_rig", lambda told: hw.Rig(stage, camera, told))
+def test_a_press_is_published(published, clock, monkeypatch):
+    rig = fake_rig(spreading(SHAPE), clock, rate=60.0, told={"pixel_size": (0.05, 0.05), "rate": 60.0})
+    monkeypatch.setattr(hw, "load_rig", lambda _path: rig.settings)
+    monkeypatch.setattr(hw, "open_rig", lambda told: rig)
     runpy.run_path(str(NODE))["main"]("rig.toml", 1.0)
     assert published["destroyed"]
-    assert stage.closed
+    assert rig.stage.closed
     pictures, heights, (cloud,) = (published[topic] for topic in ("camera/image", "height", "surface"))
     assert {(one.height, one.width, one.encoding) for one in pictures} == {(*SHAPE, "mono8")}
     last = np.frombuffer(heights[-1].data, "<f4").reshape(SHAPE)

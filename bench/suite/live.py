@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from mirrorskin.cli.bench.records import Case, Target
 from mirrorskin.engine import Press, Rotation
 from mirrorskin.engine.live import RAISED, LiveOperation, Loop, Status, Update
+from mirrorskin.hw.clock import SYSTEM, Clock
 from mirrorskin.io import Block, Header
 from mirrorskin.io.types import Closing, Floats
 from mirrorskin.kernels.device import Device
@@ -55,13 +56,12 @@ class Paced(Closing):
         count: int,
         *,
         slots: int = _SLOTS,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], object] = time.sleep,
+        clock: Clock = SYSTEM,
     ) -> None:
         self.header, self.motion = header, header.motion
         self.shape, self.dtype = (count, *frames.shape[1:]), frames.dtype
         self._frames, self._order, self._places = frames, order, places
-        self._rate, self._clock, self._sleep = rate, clock, sleep
+        self._rate, self._clock = rate, clock
         self._ring = shared_memory((slots, *frames.shape[1:]), frames.dtype)
         self._start: float | None = None
         self._given = 0
@@ -70,7 +70,7 @@ class Paced(Closing):
 
     def now(self) -> float:
         """Return the seconds since the first frame was due."""
-        return 0.0 if self._start is None else self._clock() - self._start
+        return 0.0 if self._start is None else self._clock.now() - self._start
 
     def positions(self) -> Mapping[str, Floats]:
         """Return the positions of all frames read so far."""
@@ -103,10 +103,10 @@ class Paced(Closing):
     def _wait(self) -> int:
         """Wait until the next frame is due, and return the number of frames due by then."""
         if self._start is None:
-            self._start = self._clock()
+            self._start = self._clock.now()
         early = self._given / self._rate - self.now()
         if early > 0:
-            self._sleep(early)
+            self._clock.sleep(early)
         due = max(self._given + 1, int(self.now() * self._rate) + 1)
         return min(int(self.shape[0]), due)
 

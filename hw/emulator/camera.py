@@ -5,15 +5,16 @@ from __future__ import annotations
 import itertools
 import math
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.hw.camera_thread import ThreadedCamera
+from mirrorskin.hw.clock import SYSTEM, Clock
 from mirrorskin.hw.stage import Position
 from mirrorskin.hw.twin import Twin
 from mirrorskin.hw.twin.movement import Pose, Twist, pose_at_lean, pose_at_press
@@ -51,9 +52,10 @@ class TwinCamera(ThreadedCamera):
     With a `trigger`, which tells when a line went on, off, on, ..., a frame is exposed from each time that it
     goes on, and none else.
 
-    `where` gives the body's `Position` at a past time of `time.monotonic`; the twin's movement only bounds
+    `where` gives the body's `Position` at a past time of the `clock`; the twin's movement only bounds
     how far it may go. `delay` and `jitter` are seconds; the body turns about `pivot`, mm from the centre of
-    the undeformed sheet.
+    the undeformed sheet. ``lateness`` gives by how many seconds the frame of a number is later than that; inf
+    of one that is lost.
     """
 
     def __init__(
@@ -66,21 +68,23 @@ class TwinCamera(ThreadedCamera):
         seed: int = 0,
         pivot: tuple[float, float, float] = (0.0, 0.0, 0.0),
         trigger: Callable[[], list[float]] | None = None,
+        clock: Clock = SYSTEM,
     ) -> None:
         rate = twin.frame_rate
         for name, value in (("delay", delay), ("jitter", jitter)):
             if not 0 <= value < math.inf:
                 raise InputError(f"{name} {value} of the emulated camera cannot be: give seconds, 0 or more")
-        super().__init__(twin.name, twin.shape[1:], twin.dtype, rate)
+        super().__init__(twin.name, twin.shape[1:], twin.dtype, rate, clock=clock)
         self._twin, self._where, self._pivot = twin, where, pivot
         self._trigger = trigger
         self._rate, self._delay, self._jitter = rate, delay, jitter
         self._random = np.random.default_rng(seed)
         self._in_transit: deque[_Frame] = deque()
-        self._change = threading.Condition()
-        self._stalled, self._ended = threading.Event(), threading.Event()
+        self._change = clock.condition()
+        self._stalled, self._ended = threading.Event(), clock.event()
+        self.lateness: Callable[[int], float] = lambda number: 0.0
         self._threads = [
-            threading.Thread(target=self._report_failure, args=(work,), name=f"{self.name}: {name}")
+            clock.thread(partial(self._report_failure, work), f"{self.name}: {name}")
             for name, work in (("exposes", self._expose), ("delivers", self._deliver))
         ]
         for thread in self._threads:
@@ -120,10 +124,11 @@ class TwinCamera(ThreadedCamera):
             arrival = max(
                 exposure_end, last, middle + self._delay + self._jitter * self._random.standard_normal()
             )
+            arrival += self.lateness(number)
             if self._wait_until(exposure_end):
                 return
-            late = self._trigger is None and time.monotonic() > arrival + period
-            if self._stalled.is_set() or late:
+            late = self._trigger is None and self.clock.now() > arrival + period
+            if self._stalled.is_set() or late or arrival == math.inf:
                 lost += 1
             else:
                 pixels = self._render(middle, number)
@@ -135,7 +140,7 @@ class TwinCamera(ThreadedCamera):
     def _exposures(self, period: float) -> Iterator[float]:
         """Yield the middle of each exposure, some of them before their time."""
         if self._trigger is None:
-            start = time.monotonic()
+            start = self.clock.now()
             yield from (start + number * period for number in itertools.count())
             return
         seen = 0
@@ -158,7 +163,8 @@ class TwinCamera(ThreadedCamera):
         missed = 0
         while True:
             with self._change:
-                self._change.wait_for(lambda: self._in_transit or self._ended.is_set())
+                while not (self._in_transit or self._ended.is_set()):
+                    self._change.wait()
                 if self._ended.is_set():
                     return
                 frame = self._in_transit.popleft()
@@ -173,4 +179,4 @@ class TwinCamera(ThreadedCamera):
 
     def _wait_until(self, due: float) -> bool:
         """Wait for a time, and return whether the camera was closed meanwhile."""
-        return self._ended.wait(max(0.0, due - time.monotonic()))
+        return self._ended.wait(max(0.0, due - self.clock.now()))

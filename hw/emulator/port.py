@@ -8,17 +8,21 @@ import os
 import random
 import select
 import threading
-import time
 import tty
 from collections.abc import Callable, Mapping
+from typing import Any
 
+import serial
+
+from mirrorskin.hw.clock import SYSTEM, Clock
 from mirrorskin.hw.emulator.controller import Controller
+from mirrorskin.hw.grbl.link import open_port
+from mirrorskin.hw.grbl.report_times import SLICE
 from mirrorskin.io.types import Closing
 
 _CHUNK = 4096  # bytes read or written at once
 _BACKLOG = 65536  # bytes of replies that nobody reads, before more are lost
-_NOISE = 256  # random bytes that are sent without a break
-_IDLE = 0.5  # seconds after which the thread looks round even if nothing is due
+_LOOK = 0.05  # seconds after which the threads of a port look whether it was closed
 
 
 class GrblMachine:
@@ -37,14 +41,14 @@ class GrblMachine:
         *,
         axes: str = "XYZ",
         start: Mapping[str, float] | None = None,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Clock = SYSTEM,
         memory: float = 600.0,
     ) -> None:
         self.axes = axes
         place = tuple(float((start or {}).get(letter, 0.0)) for letter in axes)
-        self._clock = clock
+        self.clock = clock
         self._lock = threading.RLock()
-        self._controller = Controller(axes, settings or {}, place, clock(), memory)
+        self._controller = Controller(axes, settings or {}, place, clock.now(), memory)
 
     def receive(self, data: bytes) -> None:
         """Take bytes from the host, now."""
@@ -65,20 +69,20 @@ class GrblMachine:
         """Return where the axes truly are at a time on the clock, by default now: mm or degrees, as homed."""
         with self._lock:
             planner = self._current().planner
-            place = planner.place(self._clock() if at is None else at)
+            place = planner.place(self.clock.now() if at is None else at)
         return dict(zip(self.axes, place, strict=True))
 
     def moving(self, at: float | None = None) -> bool:
         """Return whether the axes move at a time on the clock, by default now."""
         with self._lock:
             planner = self._current().planner
-            return planner.moving(self._clock() if at is None else at)
+            return planner.moving(self.clock.now() if at is None else at)
 
     def speed(self, at: float | None = None) -> float:
         """Return the speed along the path at a time on the clock, by default now; units/s."""
         with self._lock:
             planner = self._current().planner
-            return planner.speed(self._clock() if at is None else at)
+            return planner.speed(self.clock.now() if at is None else at)
 
     def switched(self, line: str) -> list[float]:
         """Return when coolant or spindle went on, off, on, ... on the clock; it is off at first."""
@@ -102,53 +106,78 @@ class GrblMachine:
             self._current().die()
 
     def _current(self) -> Controller:
-        self._controller.advance(self._clock())
+        self._controller.advance(self.clock.now())
         return self._controller
 
 
-class GrblPort(Closing):
-    """A pseudo-terminal that a controller answers on, right in time; a context manager.
+class GrblLine(Closing):
+    """A serial port in memory that a controller answers on, by the machine's clock; a context manager.
 
-    Open ``url`` as any serial port. A thread moves the bytes; it sleeps until some come or the machine has
-    something to say. The port stays there when a host closes it, and there is no reset when one opens it, as
-    on boards without that line. The machine's clock must be ``time.monotonic``.
+    It is a host's end as well: it has what drivers use of ``serial.Serial``, and ``open`` returns it. Any
+    byte and any reply can be made to fail: ``heard`` gets the number of each byte from the host and the byte,
+    ``said`` those of each reply (a line with its end); what they return takes its place. They count from 1.
 
-    Every fault may be called from any thread, also in the middle of a move. The machine outlives the port.
+    Every fault may come at any time. The machine outlives the line.
     """
 
     def __init__(self, machine: GrblMachine) -> None:
-        self.machine = machine
-        self._lock = threading.Lock()
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self.url: str = os.ttyname(self._slave)
-        self._pipe = [*os.pipe()]  # wakes the thread
-        os.set_blocking(self._pipe[1], False)
-        self._sending, self._noise = bytearray(), bytearray()
-        self._silent = self._closing = False
-        self._thread = threading.Thread(target=self._run, name="emulated controller", daemon=True)
-        self._thread.start()
+        self.machine, self._clock = machine, machine.clock
+        self.url: str = "line in memory"
+        self.timeout: float | None = SLICE
+        self.heard: Callable[[int, bytes], bytes] = lambda number, byte: byte
+        self.said: Callable[[int, bytes], bytes] = lambda number, reply: reply
+        self._count = {"heard": 0, "said": 0}
+        self._coming, self._reply = bytearray(), bytearray()
+        self._silent = self._gone = False
+        self._change = self._clock.condition()
+
+    def open(self) -> Any:
+        """Return the host's end; what came before is forgotten."""
+        self._collect()
+        self._coming.clear()
+        return self
+
+    @property
+    def in_waiting(self) -> int:
+        """Bytes that can be read."""
+        with self._change:
+            self._check()
+            self._collect()
+            return len(self._coming)
+
+    def read(self, size: int = 1) -> bytes:
+        """Wait for bytes, for the timeout at most, and return those that are there."""
+        end = self._clock.now() + (math.inf if self.timeout is None else self.timeout)
+        with self._change:
+            while not self.in_waiting and (left := end - self._clock.now()) > 0:
+                self._change.wait(min(left, max(0.0, self.machine.next_event() - self._clock.now())))
+            data = bytes(self._coming[:size])
+            del self._coming[:size]
+        return data
+
+    def write(self, data: bytes) -> int:
+        """Send bytes to the controller, which has them at once."""
+        self._check()
+        for byte in data:
+            self._count["heard"] += 1
+            self.machine.receive(self.heard(self._count["heard"], bytes([byte])))
+        self._wake()
+        return len(data)
+
+    def flush(self) -> None:
+        """Do nothing: all that is written is sent at once."""
 
     def close(self) -> None:
-        """Take the port away; the machine goes on with its commands."""
-        self._closing = True
-        self._wake()
-        self._thread.join()
-        with self._lock:
-            for end in self._pipe:
-                os.close(end)
-            self._pipe = []
+        """Leave the line; the machine goes on with its commands."""
+        self._coming.clear()
 
     def silence(self) -> None:
         """Answer nothing any more; the machine goes on, and still hears."""
         self._silent = True
-        self._wake()
 
     def garble(self, count: int, seed: int = 0) -> None:
-        """Send random bytes as fast as they are taken; replies come among them."""
-        with self._lock:
-            self._noise += random.Random(seed).randbytes(count)
+        """Send random bytes; replies come after them."""
+        self._coming += random.Random(seed).randbytes(count)
         self._wake()
 
     def alarm(self, code: int) -> None:
@@ -157,42 +186,81 @@ class GrblPort(Closing):
         self._wake()
 
     def unplug(self) -> None:
-        """Pull the cable that feeds the board, too: the port vanishes, and the axes stop dead."""
+        """Pull the cable that feeds the board, too: the line is gone, and the axes stop dead."""
         self.machine.cut_power()
-        self._closing = True
+        self._gone = True
         self._wake()
-        self._thread.join()
+
+    def _check(self) -> None:
+        if self._gone:
+            raise serial.SerialException("device reports readiness to read but returned no data")
+
+    def _collect(self) -> None:
+        """Take what the machine has said."""
+        self._reply += self.machine.take()
+        *replies, rest = self._reply.split(b"\n")
+        self._reply = rest
+        for reply in replies:
+            self._count["said"] += 1
+            came = self.said(self._count["said"], bytes(reply) + b"\n")
+            if not self._silent and len(self._coming) < _BACKLOG:
+                self._coming += came
 
     def _wake(self) -> None:
-        with self._lock, contextlib.suppress(BlockingIOError):
-            if self._pipe:
-                os.write(self._pipe[1], b"!")
+        with self._change:
+            self._change.notify_all()
 
-    def _run(self) -> None:
-        try:
-            while not self._closing:
-                self._step()
-        finally:
-            os.close(self._master)
-            os.close(self._slave)
 
-    def _step(self) -> None:
-        """Send what has been said, wait until there is something to do, and hear."""
-        due = self.machine.next_event()  # before collecting: what becomes due meanwhile is not slept over
-        said = self.machine.take()
-        if not self._silent and len(self._sending) + len(said) <= _BACKLOG:
-            self._sending += said
-        with self._lock:  # replies first, then a little of the noise
-            for waiting, most in ((self._sending, _CHUNK), (self._noise, _NOISE)):
-                with contextlib.suppress(BlockingIOError):
-                    if waiting:
-                        del waiting[: os.write(self._master, bytes(waiting[:most]))]
-            writers = [self._master] if self._sending or self._noise else []
-        wait = due - time.monotonic()
-        wait = min(max(wait, 0.0), _IDLE) if math.isfinite(wait) else _IDLE
-        readable, _, _ = select.select([self._master, self._pipe[0]], writers, [], wait)
-        if self._pipe[0] in readable:
-            os.read(self._pipe[0], _CHUNK)
-        if self._master in readable:
-            with contextlib.suppress(BlockingIOError):
-                self.machine.receive(os.read(self._master, _CHUNK))
+class GrblPort(GrblLine):
+    """A pseudo-terminal that a controller answers on, right in time; a context manager.
+
+    Open ``url`` as any serial port. Two threads move the bytes between the terminal and the line in memory.
+    The port stays there when a host closes it, and there is no reset when one opens it, as on boards without
+    that line. The machine's clock must be that of the computer.
+    """
+
+    def __init__(self, machine: GrblMachine) -> None:
+        super().__init__(machine)
+        self.timeout = _LOOK
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.url = os.ttyname(self._slave)
+        self._closing = False
+        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._hear, self._say)]
+        for thread in self._threads:
+            thread.start()
+
+    def open(self) -> serial.Serial:
+        """Open the port as its host."""
+        return open_port(self.url, 115200, self.url)
+
+    def close(self) -> None:
+        """Take the port away; the machine goes on with its commands."""
+        if self._closing:
+            return
+        self._closing = True
+        self._wake()
+        for thread in self._threads:
+            thread.join()
+        os.close(self._master)
+        os.close(self._slave)
+
+    def unplug(self) -> None:
+        """Pull the cable that feeds the board, too: the port vanishes, and the axes stop dead."""
+        super().unplug()
+        self.close()
+
+    def _hear(self) -> None:
+        while not self._closing:
+            if select.select([self._master], [], [], _LOOK)[0]:
+                with contextlib.suppress(OSError):  # nothing there after all, or it is unplugged
+                    self.write(os.read(self._master, _CHUNK))
+
+    def _say(self) -> None:
+        said = b""
+        while not self._closing:
+            with contextlib.suppress(OSError):
+                said = said or self.read(_CHUNK)
+                if said and select.select([], [self._master], [], _LOOK)[1]:
+                    said = said[os.write(self._master, said) :]

@@ -18,10 +18,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.hw.clock import SYSTEM, Clock
 from mirrorskin.hw.emulated_file import Emulator
 from mirrorskin.hw.emulator.camera import TwinCamera, pose_at
-from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
+from mirrorskin.hw.emulator.port import GrblLine, GrblMachine, GrblPort
 from mirrorskin.hw.emulator.server import FrameServer
+from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.hw.rig_file import (
     CameraSettings,
     Line,
@@ -100,6 +102,8 @@ class EmulatedRig:
     machine : GrblMachine, optional
         Another controller with the settings ``MACHINE``, where its axes begin at 0; the rig lacks
         the axes that it lacks.
+    clock : Clock
+        With a `SimulatedClock` nobody waits; the controller then is behind a line in memory, not a terminal.
     **scene
         Shape, pixel size, pattern, contact, optics and device: as for `Twin`.
 
@@ -110,7 +114,7 @@ class EmulatedRig:
     '/dev/pts/3'
     """
 
-    port: GrblPort
+    port: GrblLine
     camera: TwinCamera
 
     def __init__(
@@ -126,6 +130,7 @@ class EmulatedRig:
         trigger: Line | None = None,
         home: bool = False,
         machine: GrblMachine | None = None,
+        clock: Clock = SYSTEM,
         **scene: Any,
     ) -> None:
         self._levels = replace(camera or Camera(), frame_rate=rate, seed=seed)
@@ -137,21 +142,30 @@ class EmulatedRig:
         start = {axis.letter: axis.zero for axis in self._axes.values()}
         start[self._axes["travel"].letter] += _LIFT
         self.machine: GrblMachine = machine or GrblMachine(
-            {**MACHINE, 20: home, 22: home}, axes=_AXES, start=start
+            {**MACHINE, 20: home, 22: home}, axes=_AXES, start=start, clock=clock
         )
         self._make_camera = functools.partial(
-            TwinCamera, self._seen, self.where, delay=delay, jitter=jitter, seed=seed, pivot=pivot
+            TwinCamera,
+            self._seen,
+            self.where,
+            delay=delay,
+            jitter=jitter,
+            seed=seed,
+            pivot=pivot,
+            clock=clock,
         )
         if trigger is not None:
             switched = functools.partial(self.machine.switched, trigger)
             self._make_camera = functools.partial(self._make_camera, trigger=switched)
+        self.clock = clock
         self._leaving = ExitStack()
 
     def __enter__(self) -> Self:
         with ExitStack() as entering:
-            self.port = entering.enter_context(GrblPort(self.machine))
+            self.port = GrblPort(self.machine) if self.clock is SYSTEM else GrblLine(self.machine)
+            entering.enter_context(self.port)
             self.camera = self._make_camera()
-            entering.callback(self.camera.close)
+            entering.callback(lambda: self.camera.close())
             self._leaving = entering.pop_all()
         return self
 
@@ -161,9 +175,20 @@ class EmulatedRig:
         self._leaving.close()
 
     def where(self, at: float) -> Position:
-        """Return where the body truly is at a time of `time.monotonic`."""
+        """Return where the body truly is at a time of the clock."""
         at_machine = self.machine.position(at)
         return Position(**{name: axis.value(at_machine[axis.letter]) for name, axis in self._axes.items()})
+
+    def open_stage(self, settings: StageSettings, unlock: bool = False) -> GrblStage:
+        """Open the emulated stage, or another one if its port is another; see ``rig.open_stage``."""
+        port = self.port.open() if settings.port == self.port.url else None
+        return GrblStage(settings, port, unlock=unlock, clock=self.clock)
+
+    def open_camera(self, settings: CameraSettings) -> TwinCamera:
+        """Begin anew with the emulated camera, and return it; see ``rig.open_camera``."""
+        self.camera.close()
+        self.camera = self._make_camera()
+        return self.camera
 
     def twin(self, movement: Movement) -> Twin:
         """Make the same scene as a twin that is rendered directly; its references are `references`."""

@@ -6,13 +6,13 @@ import errno
 import math
 import os
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
 import serial
 
+from mirrorskin.hw.clock import Clock
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.grbl.moves import Command
 from mirrorskin.hw.grbl.replies import (
@@ -156,9 +156,11 @@ class Link:
         name: str,
         settings: StageSettings,
         on_report: Callable[[TimedStatus], None],
+        clock: Clock,
     ) -> None:
         self.error: HardwareError | None = None  # what went wrong, first of all
-        self.lock: threading.Condition = threading.Condition()
+        self.clock = clock
+        self.lock: threading.Condition = clock.condition()
         self.window: Window = Window()
         self.noise: Noise = Noise()
         self.seen: TimedStatus | None = None  # the newest report
@@ -178,14 +180,13 @@ class Link:
         self._replies: list[Reply] = []
         self._refused: Refusal | None = None
         self._active = False
-        self._heard = time.monotonic()  # when it was last listened to
+        self._heard = self.clock.now()  # when it was last listened to
         self._last_line = -math.inf  # when a line was last sent or answered
         self.stopping: Stopping = Stopping()
         self._deaf = False  # what comes is noise, and was reported as such
         self._closing = False
         self._threads = [
-            threading.Thread(target=work, name=f"{name} {work.__name__.strip('_')}")
-            for work in (self._read, self._poll)
+            clock.thread(work, f"{name} {work.__name__.strip('_')}") for work in (self._read, self._poll)
         ]
         for thread in self._threads:
             thread.start()
@@ -241,14 +242,14 @@ class Link:
 
     def until(self, ready: Callable[[], T | None], timeout: float, what: str) -> T:
         """Wait until `ready` gives something; HardwareError if something goes wrong, or it takes too long."""
-        end = time.monotonic() + timeout
+        end = self.clock.now() + timeout
         with self.lock:
             while True:
                 self._check()
                 result = ready()
                 if result is not None:
                     return result
-                left = end - time.monotonic()
+                left = end - self.clock.now()
                 if left <= 0:
                     raise HardwareError(f"{self._name}: did not {what} within {timeout:.3g} s")
                 self.lock.wait(min(left, _SLICE))
@@ -256,7 +257,7 @@ class Link:
     def restart(self, timeout: float) -> None:
         """Hold the machine, reset it, and forget what it said before."""
         self.send(HOLD)
-        time.sleep(self.stopping.holding)
+        self.clock.sleep(self.stopping.holding)
         self.banner = None
         self.send(RESET)
         self.until(lambda: self.banner, timeout, "start anew")
@@ -268,7 +269,7 @@ class Link:
             self.send(HOLD)
         if self.error is None:
             self.error = HardwareError(f"{self._name}: {why}")
-        self.stopping.begin(time.monotonic())
+        self.stopping.begin(self.clock.now())
         if self.patience is not None:  # homing heeds nothing but a reset
             self.send(RESET)
 
@@ -285,10 +286,10 @@ class Link:
             return
         if self._active and self._moving():
             self.halt("the stage was closed in motion")
-        end = time.monotonic() + 2 * self.stopping.longest
+        end = self.clock.now() + 2 * self.stopping.longest
         try:
-            while self.stopping.begun and not self.stopping.over and time.monotonic() < end:
-                time.sleep(_TICK)
+            while self.stopping.begun and not self.stopping.over and self.clock.now() < end:
+                self.clock.sleep(_TICK)
         finally:  # also after another Ctrl-C
             self._closing = True
             for thread in self._threads:
@@ -301,16 +302,16 @@ class Link:
 
     def _read(self) -> None:
         while not self._closing:
-            began = time.monotonic()
+            began = self.clock.now()
             try:
                 data = self._port.read(min(max(1, self._port.in_waiting), _CHUNK))
             except Exception as error:  # as in send
                 self._unplugged(error)
                 return
             if self._deaf:
-                time.sleep(_TICK)  # a flood must not take the others' time
+                self.clock.sleep(_TICK)  # a flood must not take the others' time
             else:
-                self._hear(data, began, time.monotonic())
+                self._hear(data, began, self.clock.now())
 
     def _unplugged(self, error: Exception) -> None:
         if self._closing:
@@ -378,7 +379,7 @@ class Link:
             if self._active and not self.stopping.begun:
                 self.halt("it answered a line that nobody here sent: let no other program speak to it")
             return
-        self._last_line = time.monotonic()
+        self._last_line = self.clock.now()
         self.rests = 0
         self._refused = refusal
         if refusal is not None and self._active:
@@ -386,8 +387,8 @@ class Link:
         self._pump()
 
     def _pump(self) -> None:
-        while self.error is None and (data := self.window.next(time.monotonic())) is not None:
-            self._last_line = time.monotonic()
+        while self.error is None and (data := self.window.next(self.clock.now())) is not None:
+            self._last_line = self.clock.now()
             try:
                 self._port.write(data)
             except Exception as error:  # as in send
@@ -395,8 +396,8 @@ class Link:
 
     def _poll(self) -> None:
         while not self._closing:
-            time.sleep(_TICK)
-            now = time.monotonic()
+            self.clock.sleep(_TICK)
+            now = self.clock.now()
             with self.lock:
                 if now - self._heard > _STUCK:
                     self._check_answers(now)
@@ -406,13 +407,13 @@ class Link:
                 self._times.period = self._poll_period()
                 ask = self._times.due(now) and not self.gone
                 if ask:
-                    self._times.ask(time.monotonic())
+                    self._times.ask(self.clock.now())
             if ask:
                 if self.stopping.begun and not self.stopping.resetting:  # lest one was lost, or undone
                     self.send(HOLD)
                 self.send(ASK)
                 with self.lock:
-                    self._times.sent(time.monotonic())
+                    self._times.sent(self.clock.now())
             if not threading.main_thread().is_alive():  # the program ended and left us
                 if not self.stopping.begun:
                     self.halt("the program ended")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 import re
-import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from mirrorskin.hw.clock import SYSTEM, Clock
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.grbl.link import HOLDING, RESET, Link, TimedStatus, open_port
 from mirrorskin.hw.grbl.moves import Axes, Command
@@ -79,6 +79,8 @@ class GrblStage(Closing):
     unlock : bool
         Whether to end an alarm, a hold or an open door that was there before, and to bear a pressed switch:
         for a person who looked at the machine.
+    clock : Clock
+        What it waits by.
 
     Raises
     ------
@@ -96,7 +98,12 @@ class GrblStage(Closing):
     """
 
     def __init__(
-        self, settings: StageSettings, port: serial.Serial | None = None, *, unlock: bool = False
+        self,
+        settings: StageSettings,
+        port: serial.Serial | None = None,
+        *,
+        unlock: bool = False,
+        clock: Clock = SYSTEM,
     ) -> None:
         self.name: str = f"stage {settings.port}"
         self.limits: Limits = settings.limits
@@ -112,7 +119,7 @@ class GrblStage(Closing):
         self._due = 0.0
         self._ramp = 0.0  # seconds that a move takes longer because it speeds up and slows down
         opened = open_port(settings.port, settings.baud, self.name) if port is None else port
-        self._link = Link(opened, self.name, settings, self._on_report)
+        self._link = Link(opened, self.name, settings, self._on_report, clock)
         try:
             self._controller = self._open(unlock)
         except BaseException:
@@ -242,7 +249,7 @@ class GrblStage(Closing):
         """
         self._destination()
         if timeout is None:
-            timeout = 1.25 * max(0.0, self._due - time.monotonic()) + self._settings.timeout
+            timeout = 1.25 * max(0.0, self._due - self._link.clock.now()) + self._settings.timeout
         with self._guarded():
             return self._link.until(self._arrived, timeout, "come to rest")
 
@@ -406,8 +413,8 @@ class GrblStage(Closing):
             with self._link.lock:
                 number = self._link.enqueue(*commands) + int(not commands[0].duration)
                 self._target = target
-            self._due = max(self._due, time.monotonic()) + duration
-            left = self._due - time.monotonic()
+            self._due = max(self._due, self._link.clock.now()) + duration
+            left = self._due - self._link.clock.now()
             self._link.until(
                 lambda: self._link.window.done >= number or None,
                 1.25 * left + self._settings.timeout,

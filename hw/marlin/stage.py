@@ -9,12 +9,12 @@ import operator
 import re
 import statistics
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, NoReturn
 
+from mirrorskin.hw.clock import SYSTEM, Clock
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.grbl.link import close_port, open_port
 from mirrorskin.hw.grbl.moves import Axes
@@ -62,6 +62,8 @@ class MarlinStage(Closing):
         Where it is plugged in, its axes and limits.
     port : serial.Serial, optional
         What to speak through instead of opening ``settings.port``; it is closed with the stage.
+    clock : Clock
+        What it waits by.
 
     Raises
     ------
@@ -77,14 +79,17 @@ class MarlinStage(Closing):
     1.0
     """
 
-    def __init__(self, settings: StageSettings, port: serial.Serial | None = None) -> None:
+    def __init__(
+        self, settings: StageSettings, port: serial.Serial | None = None, *, clock: Clock = SYSTEM
+    ) -> None:
         self.name: str = f"stage {settings.port}"
         self.limits: Limits = settings.limits
         self.error: HardwareError | None = None
         self.axes: Axes = Axes(settings, self.name, "G1")
         self._settings = settings
         self._port = open_port(settings.port, settings.baud, self.name) if port is None else port
-        self._lock, self._ended = threading.RLock(), threading.Event()
+        self.clock = clock
+        self._lock, self._ended = clock.condition(), clock.event()
         self._splitter, self._noise = Splitter(), Noise()
         self._number: int | None = None  # of the last line; None as long as nobody knows who is there
         self._trips: deque[float] = deque([0.0], maxlen=15)
@@ -100,7 +105,7 @@ class MarlinStage(Closing):
             if isinstance(error, HardwareError):
                 raise InputError(str(error)) from error
             raise
-        self._thread = threading.Thread(target=self._watch, name=f"{self.name}: watch")
+        self._thread = clock.thread(self._watch, f"{self.name}: watch")
         self._thread.start()
 
     def check_way(self, start: Position, place: Position, speed: float | None) -> NoReturn:
@@ -139,21 +144,21 @@ class MarlinStage(Closing):
                 if command is not None:
                     length = self.axes.distance(*way)
                     path = Trapezoid(length, length / command.duration, self._acceleration)
-                    self._due = max(self._due or 0.0, time.monotonic()) + path.duration
-                    self._ask(command.line, self._settings.timeout + self._due - time.monotonic())
+                    self._due = max(self._due or 0.0, self.clock.now()) + path.duration
+                    self._ask(command.line, self._settings.timeout + self._due - self.clock.now())
                     self._check()  # a stop that came just before the line was for nothing
 
     def wait(self, timeout: float | None = None) -> Report:
         """Wait until the body rests where it was sent, and return the report of it; see ``Stage.wait``."""
-        began = time.monotonic()
+        began = self.clock.now()
         due = max(began, self._due or began)
         limit = 0.25 * (due - began) + self._settings.timeout if timeout is None else began + timeout - due
         with self._guarded():
-            while (left := due - time.monotonic()) > 0:  # no line pends, so that a stop is heeded at once
+            while (left := due - self.clock.now()) > 0:  # no line pends, so that a stop is heeded at once
                 self._check()
-                if timeout is not None and time.monotonic() - began > timeout:
+                if timeout is not None and self.clock.now() - began > timeout:
                     self._fail(f"did not come to rest within {timeout:g} s")
-                time.sleep(min(left, _TICK))
+                self.clock.sleep(min(left, _TICK))
             with self._lock:
                 self._ask("M400", limit)
                 self._due = None
@@ -206,8 +211,8 @@ class MarlinStage(Closing):
 
     def _greet(self) -> str:
         """Ask who is there until it answers, and return the name of its firmware."""
-        until, heard = time.monotonic() + _BOOT, False
-        while time.monotonic() < until:
+        until, heard = self.clock.now() + _BOOT, False
+        while self.clock.now() < until:
             self._write("M115")
             for line in self._listen(_KNOCK, lambda line: "FIRMWARE_NAME:" in line):
                 heard = True
@@ -225,8 +230,8 @@ class MarlinStage(Closing):
 
     def _listen(self, seconds: float, enough: Callable[[str], bool]) -> Iterator[str]:
         """Yield the lines that come in some seconds, or until one is enough."""
-        until = time.monotonic() + seconds
-        while time.monotonic() < until:
+        until = self.clock.now() + seconds
+        while self.clock.now() < until:
             for line in self._read():
                 yield line
                 if enough(line):
@@ -260,13 +265,13 @@ class MarlinStage(Closing):
 
     def _locate(self) -> Report:
         """Ask where it is, at rest, and keep the report."""
-        asked = time.monotonic()
+        asked = self.clock.now()
         said = next((line for line in self._ask("M114") if line.startswith("X:")), "")
         places = {letter: float(value) for letter, value in _PLACE.findall(said.partition("Count")[0])}
         missing = sorted(set(self.axes.letters.values()) - set(places))
         if missing:
             raise HardwareError(f"{self.name}: the controller has no axis {missing[0]}; correct the rig file")
-        report = Report((asked + time.monotonic()) / 2, self.axes.place(places), "idle")
+        report = Report((asked + self.clock.now()) / 2, self.axes.place(places), "idle")
         self._reports.append(report)
         return report
 
@@ -296,23 +301,23 @@ class MarlinStage(Closing):
                 if re.match(r"ok\b", text):
                     self._fail("it answered a line that nobody here sent: let no other program speak to it")
             self._write(self._numbered(line))
-            asked = heard = time.monotonic()
+            asked = heard = self.clock.now()
             limit, said = self._settings.timeout if timeout is None else timeout, list[str]()
             while True:
-                late = time.monotonic() - heard > limit  # before what came meanwhile is read
+                late = self.clock.now() - heard > limit  # before what came meanwhile is read
                 for text in self._read():
                     if re.match(r"ok\b", text):
-                        self._trips.append(time.monotonic() - asked)
+                        self._trips.append(self.clock.now() - asked)
                         return [*said, text[2:].strip()]  # some answer in the same line
                     if not lenient:
                         self._judge(text, line)
                     if lenient or "busy:" in text:  # anything else may come without end
-                        heard, late = time.monotonic(), False
+                        heard, late = self.clock.now(), False
                     if "busy:" in text:
                         limit = _BUSY
                     said.append(text)
                 self._check()
-                if late or time.monotonic() - asked > max(limit, _HOMING):
+                if late or self.clock.now() - asked > max(limit, _HOMING):
                     self._fail(
                         "it no longer answers; the stage may move on: look at the plug, and switch it off"
                     )
@@ -343,7 +348,7 @@ class MarlinStage(Closing):
             data = self._port.read(max(1, self._port.in_waiting))
         except Exception as error:  # pyserial raises many kinds on a port that is gone
             self._lost(error)
-        now, lines = time.monotonic(), []
+        now, lines = self.clock.now(), []
         for line, _ in self._splitter.feed(data, now):
             text = line.decode("ascii", "replace").strip()
             if text.isascii() and text.replace("\t", " ").isprintable():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import time
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.hw.camera import Camera, Counts
+from mirrorskin.hw.clock import SYSTEM, Clock
 from mirrorskin.hw.rig.rig import longest_wait, open_camera, open_stage
 from mirrorskin.hw.rig.trigger import Trigger
 from mirrorskin.hw.rig_file import Axis, CameraSettings, RigSettings, StageSettings
@@ -61,6 +61,7 @@ def check_rig(
     move: bool = False,
     open_stage: Callable[[StageSettings], Stage] = open_stage,
     open_camera: Callable[[CameraSettings], Camera] = open_camera,
+    clock: Clock = SYSTEM,
 ) -> Generator[Finding, None, None]:
     """Open the stage and the camera, and yield what is found, one thing at a time.
 
@@ -71,12 +72,12 @@ def check_rig(
     """
     sound = True
     with closing(open_stage(settings.stage)) as stage:
-        for finding in check_stage(stage, settings.stage):
+        for finding in check_stage(stage, settings.stage, clock):
             sound &= finding.verdict != "failed"
             yield finding
         with _logged_warnings() as logged, closing(open_camera(settings.camera)) as camera:
             looked = check_camera if settings.camera.trigger is None else partial(check_trigger, stage)
-            yield from looked(camera, settings.camera)
+            yield from looked(camera, settings.camera, clock)
         yield from (
             Finding("camera", "message", line, "warning", "correct [camera] in the rig file, or the camera")
             for line in logged
@@ -106,13 +107,13 @@ def _logged_warnings() -> Iterator[list[str]]:
 # The stage at rest: what it says of itself, against what the rig file says of it
 
 
-def check_stage(stage: Stage, settings: StageSettings) -> Iterator[Finding]:
+def check_stage(stage: Stage, settings: StageSettings, clock: Clock = SYSTEM) -> Iterator[Finding]:
     """Look at a stage that was opened, for about a second; nothing moves."""
     yield Finding("stage", "firmware", getattr(stage, "firmware", settings.firmware))
     report = stage.report()
     yield _state(report, settings)
     yield _position(report, stage, settings)
-    yield from _reports(stage, settings)
+    yield from _reports(stage, settings, clock)
     if settings.firmware == "grbl":
         yield from _controller(stage, settings)
     if not getattr(stage, "homing_stops", True):
@@ -222,9 +223,9 @@ def _arcs(pitch: Axis, roll: Axis) -> Finding:
     return _rated("stage", "arcs", f"in {pitch.letter} and {roll.letter}", remedy)
 
 
-def _reports(stage: Stage, settings: StageSettings) -> Iterator[Finding]:
+def _reports(stage: Stage, settings: StageSettings, clock: Clock) -> Iterator[Finding]:
     """Measure how often reports come, and how long one takes."""
-    times, asked = _listen(stage, settings), settings.report_rate
+    times, asked = _listen(stage, settings, clock), settings.report_rate
     if len(times) < 2:
         yield Finding("stage", "reports", "none", "failed", "none came; look at the line and at stage.baud")
         return
@@ -243,34 +244,34 @@ def _wait(part: str, what: str, longest: float, limit: float, key: str) -> Findi
     return _rated(part, what, f"{longest * 1e3:.1f} ms, of {limit * 1e3:.0f} ms that a move bears", remedy)
 
 
-def _listen(stage: Stage, settings: StageSettings) -> list[float]:
+def _listen(stage: Stage, settings: StageSettings, clock: Clock) -> list[float]:
     """Return the times of the reports of a second, or of the first two."""
-    begun = time.monotonic()
-    time.sleep(_PERIOD)
+    begun = clock.now()
+    clock.sleep(_PERIOD)
     while len(times := [report.time for report in stage.history(begun)]) < 2:
         stage.report()  # raises if it is lost
-        if time.monotonic() > begun + _PERIOD + settings.timeout + 2 / settings.report_rate:
+        if clock.now() > begun + _PERIOD + settings.timeout + 2 / settings.report_rate:
             break
-        time.sleep(_POLL)
+        clock.sleep(_POLL)
     return times
 
 
 # The camera: its frames, their rate, and how much light they have
 
 
-def check_camera(camera: Camera, settings: CameraSettings) -> Iterator[Finding]:
+def check_camera(camera: Camera, settings: CameraSettings, clock: Clock = SYSTEM) -> Iterator[Finding]:
     """Look at a camera that was opened, for about a second."""
     rows, columns = camera.shape
     yield Finding("camera", "pictures", f"{columns} x {rows} {camera.dtype.name}")
     camera.take(1, _FRAME_TIMEOUT)
     camera.flush()
-    before, dropped, end = camera.counts, 0, time.monotonic() + _PERIOD
+    before, dropped, end = camera.counts, 0, clock.now() + _PERIOD
     times: list[float] = []
     while True:
         frames = camera.take(_BATCH, _FRAME_TIMEOUT)
         dropped += frames.dropped
         times += frames.time.tolist()
-        if time.monotonic() >= end:
+        if clock.now() >= end:
             break
     after = camera.counts
     yield _rate(after, settings)
@@ -281,11 +282,13 @@ def check_camera(camera: Camera, settings: CameraSettings) -> Iterator[Finding]:
     yield _brightness(frames.pixels[-1].copy())
 
 
-def check_trigger(stage: Stage, camera: Camera, settings: CameraSettings) -> Iterator[Finding]:
+def check_trigger(
+    stage: Stage, camera: Camera, settings: CameraSettings, clock: Clock = SYSTEM
+) -> Iterator[Finding]:
     """Trigger a camera that was opened, at rest."""
     rows, columns = camera.shape
     yield Finding("camera", "pictures", f"{columns} x {rows} {camera.dtype.name}")
-    trigger = Trigger(stage, camera, settings, lambda: None)
+    trigger = Trigger(stage, camera, settings, lambda: None, clock)
     frames = [trigger.expose() for _ in range(_TRIGGERED)]
     trigger.check(wait=True)
     found = f"{_TRIGGERED} frames, at most {1e3 * trigger.longest:.0f} ms after '{settings.trigger}' went on"

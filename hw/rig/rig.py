@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import inspect
 import math
-import threading
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from types import TracebackType
 from typing import cast
 
 from mirrorskin.hw.camera import Camera, Frames
+from mirrorskin.hw.clock import SYSTEM, Clock
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig.trigger import Trigger
 from mirrorskin.hw.rig_file import CameraSettings, RigSettings, StageSettings
@@ -40,13 +39,13 @@ class Move:
     began: float
     ended: float
 
-    def __init__(self, stage: Stage, began: float, timed: bool, reconnects: int) -> None:
-        self._stage, self.timed, self.reconnects = stage, timed, reconnects
+    def __init__(self, stage: Stage, clock: Clock, began: float, timed: bool, reconnects: int) -> None:
+        self._stage, self._clock, self.timed, self.reconnects = stage, clock, timed, reconnects
         self.began, self.ended = began, math.inf  # when it was known to rest, seconds of time.monotonic
         self.error: Exception | None = None  # why it did not come to its end
         self.rest: Report | None = None  # where it came to rest
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._wait, name=f"{stage.name}: waits")
+        self._over = clock.event()
+        self._thread = clock.thread(self._wait, f"{stage.name}: waits")
         self._thread.start()
 
     @property
@@ -68,7 +67,7 @@ class Move:
         except Exception as error:  # handed to whoever reads; see Rig.check
             self._stage.stop()
             self.error = error
-        self.ended = time.monotonic()
+        self.ended = self._clock.now()
         self._over.set()
 
 
@@ -93,17 +92,17 @@ class Rig(Closing):
     camera: Camera
     settings: RigSettings
 
-    def __init__(self, stage: Stage, camera: Camera, settings: RigSettings) -> None:
-        self.stage, self.camera, self.settings = stage, camera, settings
+    def __init__(self, stage: Stage, camera: Camera, settings: RigSettings, clock: Clock = SYSTEM) -> None:
+        self.stage, self.camera, self.settings, self.clock = stage, camera, settings, clock
         self.name: str = settings.name
         self._move: Move | None = None
         self._fault: HardwareError | None = None
         self.trigger: Trigger | None = None  # what takes frames one by one, if the rig file says so
         if settings.camera.trigger is not None:
-            self.trigger = Trigger(stage, camera, settings.camera, self.check)
+            self.trigger = Trigger(stage, camera, settings.camera, self.check, clock)
         self._looked = -math.inf  # when the guard last did
-        self._closing = threading.Event()
-        self._guard = threading.Thread(target=self._watch, name=f"{self.name}: guard")
+        self._closing = clock.event()
+        self._guard = clock.thread(self._watch, f"{self.name}: guard")
         self._guard.start()
 
     @property
@@ -139,9 +138,9 @@ class Rig(Closing):
         self.check()
         if self.trigger is None and self.camera.latest == -math.inf:
             self.take(1)  # a camera that is still starting is not missed later
-        began, reconnects = time.monotonic(), self.camera.counts.reconnects
+        began, reconnects = self.clock.now(), self.camera.counts.reconnects
         move()
-        self._move = Move(self.stage, began, timed, reconnects)
+        self._move = Move(self.stage, self.clock, began, timed, reconnects)
         return self._move
 
     def end(self, move: Move) -> Report:
@@ -149,7 +148,7 @@ class Rig(Closing):
         while not move.join(_SLICE):
             self.check()
         while move.timed and self._looked < move.ended and self._guard.is_alive():
-            time.sleep(_TICK)
+            self.clock.sleep(_TICK)
         self.check()
         if move.rest is None:
             raise HardwareError(f"{self.stage.name} did not say where it came to rest: look at its cable")
@@ -166,14 +165,14 @@ class Rig(Closing):
         """
         if self.trigger is not None:
             return self.trigger.expose()
-        until = time.monotonic() + _PATIENCE
+        until = self.clock.now() + _PATIENCE
         while True:
             self.check()
             try:
                 return self.camera.take(most, _SLICE + 2 * self.period)
             except HardwareError:
                 self.check()
-                if self.camera.error is not None or time.monotonic() > until:
+                if self.camera.error is not None or self.clock.now() > until:
                     raise
 
     def close(self) -> None:
@@ -201,10 +200,10 @@ class Rig(Closing):
 
     def _watch(self) -> None:
         """Guard: stop the stage when something is wrong while it moves."""
-        looked, seen, silence, last = self._move, -math.inf, 0.0, time.monotonic()
+        looked, seen, silence, last = self._move, -math.inf, 0.0, self.clock.now()
         while not self._closing.wait(_TICK):
             # A guard that woke late means a busy machine, on which the camera's thread may be late as well.
-            passed, last = time.monotonic() - last, time.monotonic()
+            passed, last = self.clock.now() - last, self.clock.now()
             move, latest = self._move, self.camera.latest
             paused = passed > _PAUSE and move is not None and move.timed and move.ended > last - passed
             if move is None or (move.over and not paused):
@@ -252,23 +251,24 @@ def _paused(seconds: float) -> HardwareError:
     )
 
 
-def open_stage(settings: StageSettings, unlock: bool = False) -> Stage:
+def open_stage(settings: StageSettings, unlock: bool = False, clock: Clock = SYSTEM) -> Stage:
     """Open the stage that a rig file describes, of whatever firmware.
 
     With `unlock`, a GRBL controller's alarm, hold or open door is ended; InputError for others, which have
-    none, and if there is no such class or stage, or it is not what the file says.
+    none, and if there is no such class or stage, or it is not what the file says. A stage of
+    the user's own class has a clock of its own.
     """
     firmware = settings.firmware
     if firmware == "grbl":
         from mirrorskin.hw.grbl.stage import GrblStage
 
-        return GrblStage(settings, unlock=unlock)
+        return GrblStage(settings, unlock=unlock, clock=clock)
     if unlock:
         raise InputError(f"stage {settings.port}: only GRBL is unlocked; switch this one off and on")
     if firmware == "marlin":
         from mirrorskin.hw.marlin.stage import MarlinStage
 
-        return MarlinStage(settings)
+        return MarlinStage(settings, clock=clock)
     return _open_own(settings)
 
 
@@ -296,7 +296,25 @@ def _open_own(settings: StageSettings) -> Stage:
     return cast("Stage", stage)
 
 
-def open_rig(settings: RigSettings, steps: bool = False) -> Rig:
+def open_camera(settings: CameraSettings, clock: Clock = SYSTEM) -> Camera:
+    """Open the camera that a rig file describes; InputError if it is not there, or not what the file says."""
+    if settings.genicam:
+        from mirrorskin.hw.genicam import GenicamCamera
+
+        return GenicamCamera(settings, clock=clock)
+    from mirrorskin.hw.video import VideoCamera
+
+    return VideoCamera(settings, clock=clock)
+
+
+def open_rig(
+    settings: RigSettings,
+    steps: bool = False,
+    *,
+    clock: Clock = SYSTEM,
+    open_stage: Callable[[StageSettings], Stage] = open_stage,
+    open_camera: Callable[[CameraSettings], Camera] = open_camera,
+) -> Rig:
     """Open the stage and the camera that a rig file describes, and wait for the first frame.
 
     With a trigger in the rig file there is none yet: `steps` promises that only a ``StepScan`` follows.
@@ -316,7 +334,7 @@ def open_rig(settings: RigSettings, steps: bool = False) -> Rig:
         opening.callback(stage.close)
         if settings.stage.home:
             stage.home()
-        rig = Rig(stage, camera, settings)
+        rig = Rig(stage, camera, settings, clock)
         opening.pop_all()
     return rig
 
@@ -327,14 +345,3 @@ def untriggered(settings: RigSettings) -> InputError:
         f"{settings.path}: camera.trigger takes frames of a capture in steps, and of nothing else: give"
         " --step or --phase-step, or leave it out"
     )
-
-
-def open_camera(settings: CameraSettings) -> Camera:
-    """Open the camera that a rig file describes; InputError if it is not there, or not what the file says."""
-    if settings.genicam:
-        from mirrorskin.hw.genicam import GenicamCamera
-
-        return GenicamCamera(settings)
-    from mirrorskin.hw.video import VideoCamera
-
-    return VideoCamera(settings)

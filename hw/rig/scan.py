@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import time
 from collections.abc import Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -88,7 +87,7 @@ class Scan(Closing):
 
     def now(self) -> float:
         """Return the seconds since the first frame was asked for, the scale of ``Block.time``."""
-        return 0.0 if self._origin is None else time.monotonic() - self._origin
+        return 0.0 if self._origin is None else self.rig.clock.now() - self._origin
 
     def positions(self) -> Mapping[str, Floats]:
         """Return the positions of all frames so far; see ``LiveSource``."""
@@ -104,7 +103,7 @@ class Scan(Closing):
             return None
         if self._origin is None:
             _ = self.header
-            self._origin = time.monotonic()
+            self._origin = self.rig.clock.now()
         block = self._next(1 if out is None else len(out), self._origin)
         if block is None:
             self._complete = True
@@ -161,7 +160,10 @@ class Scan(Closing):
         if isinstance(self.plan, HorizontalPlan | TwistPlan):
             while self.rig.trigger is None and self.rig.take(1).time[-1] < rests + self.plan.wait:
                 pass
-            _sleep_until(rests + self.plan.wait)
+            self._sleep_until(rests + self.plan.wait)
+
+    def _sleep_until(self, due: float) -> None:
+        self.rig.clock.sleep(max(0.0, due - self.rig.clock.now()))
 
     def _known(self) -> Header:
         """Return what is known before anything moves."""
@@ -257,7 +259,7 @@ class StepScan(Scan):
         self._left = self.frames
         if self.rig.trigger is not None:
             self._since = -math.inf
-            _sleep_until(rest.time + self.settle)
+            self._sleep_until(rest.time + self.settle)
             return
         camera = self.rig.settings.camera
         delay = camera.delay or 0.0
@@ -275,10 +277,6 @@ class StepScan(Scan):
             if new < len(taken.time):
                 first = self._left == self.frames
                 return taken.pixels[new:], taken.time[new:], 0 if first else taken.dropped
-
-
-def _sleep_until(due: float) -> None:
-    time.sleep(max(0.0, due - time.monotonic()))
 
 
 def _check_there(rest: Report, place: Position, name: str) -> None:

@@ -195,7 +195,8 @@ def even_times(number: ArrayLike, arrival: ArrayLike, window: int = 25) -> Float
 
 def _with_lost_frames(number: Floats, arrival: Floats) -> Floats:
     """Count frames that nobody noticed were lost: from a gap on, all frames are whole periods late."""
-    period = float(np.median(np.diff(arrival) / np.diff(number)))
+    step = min(_NEAR, len(number) // 2)  # jitter hardly counts over some frames
+    period = float(np.median((arrival[step:] - arrival[:-step]) / (number[step:] - number[:-step])))
     late = arrival - period * (number - number[0])
     counted = number.copy()
     for gap in np.flatnonzero(np.diff(late) > _LOST_FRAME_GAP * period) + 1:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from contextlib import suppress
 
 from mirrorskin.hw.camera import Camera, Frames
+from mirrorskin.hw.clock import Clock
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig_file import CameraSettings
 from mirrorskin.hw.stage import Stage
@@ -32,16 +32,17 @@ class Trigger:
         With the line to switch as ``trigger``.
     check : callable
         Raises what went wrong with the rig, if anything did.
+    clock : Clock
     """
 
     def __init__(
-        self, stage: Stage, camera: Camera, settings: CameraSettings, check: Callable[[], None]
+        self, stage: Stage, camera: Camera, settings: CameraSettings, check: Callable[[], None], clock: Clock
     ) -> None:
         switch = getattr(stage, "switch", None)
         if switch is None:
             raise InputError(f"{stage.name}: camera.trigger needs a GRBL controller; leave it out")
         self._switch, self._line = switch, settings.trigger
-        self._camera, self._check = camera, check
+        self._camera, self._check, self._clock = camera, check, clock
         self._patience = _PATIENCE + (settings.exposure or 0.0) + (settings.delay or 0.0)
         self._before: int | None = None  # frames that had come before the first trigger
         self._given = 0
@@ -53,7 +54,7 @@ class Trigger:
         if self._before is None:
             self._camera.flush()
             self._before = self._camera.counts.frames
-        began = time.monotonic()
+        began = self._clock.now()
         try:
             self._switch(self._line, True)
             frames = self._take()
@@ -61,13 +62,13 @@ class Trigger:
             with suppress(HardwareError):  # of a stage that was stopped, which switches the line off
                 self._switch(self._line, False)
         self._given += 1
-        self.longest = max(self.longest, time.monotonic() - began)
+        self.longest = max(self.longest, self._clock.now() - began)
         return frames
 
     def check(self, wait: bool = False) -> None:
         """HardwareError if there were more frames than triggers; `wait` for one that is on its way."""
         if wait:
-            time.sleep(self.longest)
+            self._clock.sleep(self.longest)
         self._check()
         if self._before is None:
             return
@@ -79,7 +80,7 @@ class Trigger:
             )
 
     def _take(self) -> Frames:
-        until = time.monotonic() + self._patience
+        until = self._clock.now() + self._patience
         while True:
             self._check()
             try:
@@ -87,7 +88,7 @@ class Trigger:
             except HardwareError:
                 if self._camera.error is not None:
                     raise
-                if time.monotonic() > until:
+                if self._clock.now() > until:
                     raise HardwareError(
                         f"{self._camera.name} gave no frame within {self._patience:.3g} s of its trigger: see"
                         f" the controller's line '{self._line}', its wiring, and the camera's triggered mode"

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.hw.clock import SYSTEM, Clock
 from mirrorskin.hw.twin.twin import Twin
 from mirrorskin.io.types import Block, Closing, Header, InputError
 
@@ -29,8 +28,8 @@ class Live(Closing):
         It is rewound.
     rate : float, optional
         Frames a second; the twin's camera's own otherwise.
-    clock, sleep : callable
-        Tell the seconds, and let some pass.
+    clock : Clock
+        What it waits by.
 
     Attributes
     ----------
@@ -51,14 +50,7 @@ class Live(Closing):
 
     rewindable = False
 
-    def __init__(
-        self,
-        twin: Twin,
-        rate: float | None = None,
-        *,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], object] = time.sleep,
-    ) -> None:
+    def __init__(self, twin: Twin, rate: float | None = None, clock: Clock = SYSTEM) -> None:
         rate = twin.frame_rate if rate is None else rate
         if not (math.isfinite(rate) and rate > 0):
             raise InputError(f"{twin.name}: {rate} frames a second cannot be: give more than 0")
@@ -68,7 +60,6 @@ class Live(Closing):
         twin.rewind()
         self._rate = rate
         self._clock = clock
-        self._sleep = sleep
         self._start: float | None = None
         self._given = 0
 
@@ -96,9 +87,9 @@ class Live(Closing):
     def _wait(self) -> int:
         """Wait until the next frame is due, and return how many are by then."""
         if self._start is None:
-            self._start = self._clock()
-        early = self._start + self._given / self._rate - self._clock()
+            self._start = self._clock.now()
+        early = self._start + self._given / self._rate - self._clock.now()
         if early > 0:
-            self._sleep(early)
-        passed = self._clock() - self._start
+            self._clock.sleep(early)
+        passed = self._clock.now() - self._start
         return min(self.shape[0], max(self._given + 1, math.floor(passed * self._rate) + 1))

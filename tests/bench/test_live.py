@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from live_frames import Clock, paced, phases, turn_frames, turn_header
+from live_frames import paced, phases, turn_frames, turn_header
 from suite.live import Ran, judge_press, judge_rotation
 
 from mirrorskin.engine.live import RAISED, Latency, Status, Update
+from mirrorskin.hw.simulated_clock import SimulatedClock
 
 SHAPE = (20, 5, 7)
 
@@ -26,12 +27,12 @@ def test_targets_are_judged_by_what_was_counted():
 
 
 def test_frames_come_when_they_are_due_and_those_that_wait_come_together():
-    clock, frames, phase = Clock(), turn_frames(SHAPE), phases(SHAPE[0])
+    clock, frames, phase = SimulatedClock(), turn_frames(SHAPE), phases(SHAPE[0])
     source = paced(frames, turn_header(), phase, 10.0, clock)
     room = np.empty((8, *SHAPE[1:]), np.uint8)
     block = source.read(room)
     assert (block.index, len(block.frames), block.lent) == (0, 1, True)
-    clock.now += 0.45
+    clock.sleep(0.45)
     block = source.read(room)
     assert (block.index, len(block.frames), block.dropped) == (1, 4, 0)
     np.testing.assert_array_equal(block.frames, frames[1:5])
@@ -42,12 +43,12 @@ def test_frames_come_when_they_are_due_and_those_that_wait_come_together():
 
 
 def test_what_a_late_reader_loses_is_told():
-    clock, frames = Clock(), turn_frames(SHAPE)
+    clock, frames = SimulatedClock(), turn_frames(SHAPE)
     source = paced(frames, turn_header(), phases(SHAPE[0]), 10.0, clock, slots=4)
     room, given = np.empty((8, *SHAPE[1:]), np.uint8), []
     lost = 0
     source.read(room)
-    clock.now += 1.0
+    clock.sleep(1.0)
     while (block := source.read(room)) is not None:
         lost += block.dropped
         given += range(block.index, block.index + len(block.frames))

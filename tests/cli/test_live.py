@@ -1,4 +1,4 @@
-"""``mirrorskin live`` on a rig of fakes, in real time."""
+"""``mirrorskin live`` on a rig of fakes, on simulated time."""
 
 import math
 import re
@@ -14,8 +14,7 @@ from growing import Feed, stream
 from injected_faults import failing
 from mcap.reader import make_reader
 from mishaps import state_of
-from rig_fakes import FakeCamera, FakeStage, settings, spreading
-from served_rig import allow_delays
+from rig_fakes import fake_rig, settings, spreading
 from speckle import Speckle
 
 from mirrorskin import engine, io
@@ -51,13 +50,8 @@ def slanted(shape=SHAPE):
     return picture
 
 
-@pytest.fixture(autouse=True)
-def patience(monkeypatch):
-    allow_delays(monkeypatch)
-
-
 @pytest.fixture
-def fake(monkeypatch, tmp_path):
+def fake(clock, monkeypatch, tmp_path):
     """A rig whose file is read and which is opened without hardware; its stage and camera."""
 
     class Fake:
@@ -67,9 +61,9 @@ def fake(monkeypatch, tmp_path):
             self.path = tmp_path / "rig.toml"
 
         def open(self, told):
-            self.stage = FakeStage()
-            self.camera = FakeCamera(self.stage.position, self.picture, rate=60.0)
-            return rig.Rig(self.stage, self.camera, told)
+            opened = fake_rig(self.picture, clock, rate=60.0)
+            opened.settings, self.stage, self.camera = told, opened.stage, opened.camera
+            return opened
 
         def run(self, *words):
             return CliRunner().invoke(app, [*words, "--rig", str(self.path)])
@@ -174,25 +168,22 @@ def test_rocking_is_told_recorded_and_kept_and_repeated(fake, tmp_path):
     np.testing.assert_array_equal(again.slope_sigma, result.slope_sigma)
 
 
-def test_ctrl_c_stops_the_stage_and_keeps_what_there_is(fake, tmp_path):
+def test_ctrl_c_stops_the_stage_and_keeps_what_there_is(fake, clock, tmp_path):
     record, output = tmp_path / "rec.h5", tmp_path / "res.h5"
 
     def interrupt():
-        deadline = time.monotonic() + 60
-        while time.monotonic() < deadline and not (hasattr(fake, "stage") and fake.stage.moving()):
-            time.sleep(0.005)
-        while time.monotonic() < deadline and fake.stage.position().travel < 0.1:
-            time.sleep(0.005)
-        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+        while not (hasattr(fake, "stage") and fake.stage.position().travel >= 0.1):
+            clock.sleep(0.005)
+        clock.interrupt()
 
-    thread = threading.Thread(target=interrupt)
+    thread = clock.thread(interrupt, "interrupts")
     thread.start()
     words = ["vertical", "--stop", "1.5mm", "--speed", "0.1mm/s", "--record", str(record), "-o", str(output)]
     done = fake.run(*words)
     thread.join()
     assert done.exit_code != 0
     assert "cut short" in done.output
-    assert fake.stage.position().travel < 1.5, "it was stopped on its way"
+    assert 0.1 <= fake.stage.position().travel < 0.11, "it was stopped on its way"
     assert 0 < io.open_result(output).process["frames"] == counted(done.output)[1]
     with io.open_recording(record) as recording:
         assert recording.state.startswith("cut short")
@@ -245,7 +236,7 @@ def test_a_camera_that_is_lost_ends_it_with_its_own_complaint(fake, tmp_path):
     assert output.exists()
 
 
-@pytest.mark.real_time
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["device lost", "no resources", "allocation", "read"])
 def test_a_call_that_fails_stops_the_stage_and_keeps_what_there_is(fake, tmp_path, kind):
     words = [*PRESS, "--record"]

@@ -1,14 +1,15 @@
-"""The live loop's policy, on a clock that stands still unless someone works."""
+"""The live loop's policy, on simulated time."""
 
 import math
 from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from live_frames import Clock, paced, turn_header
+from live_frames import paced, turn_header
 
 from mirrorskin.engine.live import PUSHED, RAISED, SHOWN, UPDATED, WAITED, Loop
 from mirrorskin.engine.live.status import Monitor
+from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.io import InputError
 
 COUNT, RATE = 40, 100.0
@@ -20,7 +21,7 @@ PLACES = 0.1 * np.arange(COUNT)
 class Slow:
     """An operation for which each push and update takes a time of its own."""
 
-    clock: Clock
+    clock: SimulatedClock
     push_time: float = 0.0
     update_time: float = 0.0
     every: int = 1
@@ -36,10 +37,10 @@ class Slow:
     def push(self, frames, *, phase, lent):
         assert np.array_equal(phase, PLACES[frames[:, 0, 0]])
         self.pushed += frames[:, 0, 0].tolist()
-        self.clock.now += self.push_time
+        self.clock.sleep(self.push_time)
 
     def maps(self, seconds):
-        self.clock.now += self.update_time
+        self.clock.sleep(self.update_time)
         self.updates.append(len(self.pushed))
         return {"height": np.zeros((2, 3), np.float32)}
 
@@ -48,7 +49,7 @@ class Slow:
 
 
 def make(slots=64, **how):
-    clock = Clock()
+    clock = SimulatedClock()
     return paced(FRAMES, turn_header(), PLACES, RATE, clock, slots), Slow(clock, **how)
 
 

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from live_frames import PIXEL, Clock, paced, press_frames, press_header, turn_header
+from live_frames import PIXEL, paced, press_frames, press_header, turn_header
 from suite.scenes import references
 
 from mirrorskin.engine import Press, find_onset
 from mirrorskin.engine.live import LiveOperation, Loop
+from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.io import InputError
 
 SHAPE = (30, 17, 23)
@@ -68,7 +69,7 @@ def test_holes_are_filled_in_the_result_and_it_says_how_it_came_about():
 
 def test_a_whole_run_uses_each_frame():
     frames = press_frames(SHAPE)
-    source = paced(frames, press_header(), TRAVEL, 1000.0, Clock())
+    source = paced(frames, press_header(), TRAVEL, 1000.0, SimulatedClock())
     live = LiveOperation(source, Press(fill=False))
     assert Loop(source, live).run().used == SHAPE[0]
     np.testing.assert_array_equal(live.result().height, find_onset(frames, TRAVEL).height)

@@ -5,7 +5,7 @@ import threading
 
 import numpy as np
 import pytest
-from live_frames import PIXEL, Clock, paced, phases, press_header, turn_frames, turn_header
+from live_frames import PIXEL, paced, phases, press_header, turn_frames, turn_header
 from suite.scenes import SCALES, TILT
 
 from mirrorskin.engine import Correlate, Rotation, estimate_normals, find_edges, integrate
@@ -13,6 +13,7 @@ from mirrorskin.engine.integration.warm_start import WarmStartIntegrator
 from mirrorskin.engine.live import LiveOperation, Loop
 from mirrorskin.engine.rotation.last_turn import choose_window
 from mirrorskin.engine.rotation.normals_to_height import find_slopes
+from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.io import InputError, open_result, save_result
 
 SHAPE, WINDOW = (24, 40, 52), 8
@@ -190,7 +191,7 @@ def test_what_warming_leaves_behind_is_nothing():
 
 def test_a_whole_run_uses_each_frame():
     frames = turn_frames(SHAPE)
-    source = paced(frames, turn_header(), PHASE, 100.0, Clock())
+    source = paced(frames, turn_header(), PHASE, 100.0, SimulatedClock())
     live = LiveOperation(source, Rotation(window_frames=WINDOW, noise=NOISE))
     status = Loop(source, live).run()
     assert (status.used, status.updates) == (SHAPE[0], SHAPE[0])

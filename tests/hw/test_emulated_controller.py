@@ -1,4 +1,4 @@
-"""The emulated controller obeys and moves as GRBL 1.1 and mechanics say, by a clock that the test turns."""
+"""The emulated controller obeys and moves as GRBL 1.1 and mechanics say."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from mirrorskin.hw.emulator.port import GrblMachine
+from mirrorskin.hw.simulated_clock import SimulatedClock
 
 RATE, ACCELERATION = 30.0, 500.0  # the defaults, mm/s and mm/s^2
 BANNER = ["", "Grbl 1.1h ['$' for help]"]
@@ -22,12 +23,16 @@ class Bench:
     """A controller on a table: lines in, lines out."""
 
     def __init__(self, settings: dict[int, float] | None = None, **options) -> None:
-        self.now = 1000.0
-        self.machine = GrblMachine(settings, clock=lambda: self.now, **options)
+        self._clock = SimulatedClock()
+        self.machine = GrblMachine(settings, clock=self._clock, **options)
         self.greeting = self.hear()
 
+    @property
+    def now(self) -> float:
+        return self._clock.now()
+
     def wait(self, seconds: float) -> None:
-        self.now += seconds
+        self._clock.sleep(seconds)
 
     def hear(self) -> list[str]:
         return self.machine.take().decode("ascii").splitlines()
@@ -48,7 +53,7 @@ class Bench:
         """Let the time pass until nothing is due any more; return how long it took."""
         began = self.now
         while (due := self.machine.next_event()) < float("inf"):
-            self.now = max(self.now, due)
+            self.wait(max(0.0, due - self.now))
         return self.now - began
 
     def place(self, at: float | None = None) -> tuple[float, ...]:

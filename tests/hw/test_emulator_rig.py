@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import math
-import os
-import select
-import threading
-import time
 import tomllib
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import astuple
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import astuple, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,48 +16,44 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from mirrorskin.hw.emulator.rig import EmulatedRig
+from mirrorskin.hw.rig.plans import VerticalPlan
+from mirrorskin.hw.rig.rig import Rig
+from mirrorskin.hw.rig.sweep import SweepScan
 from mirrorskin.hw.rig_file import load_rig
+from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.hw.stage import Position
 from mirrorskin.hw.twin import Axial, Camera, Horizontal, SheetTexture, Sphere, Twin, Twist, Vertical
 from mirrorskin.io import InputError
 
-PATIENCE = 20.0  # seconds, for a busy machine
 SMALL: dict[str, Any] = {"shape": (31, 42), "pixel_size": 0.3, "rate": 100.0}
 
 
-@contextmanager
-def say(rig: EmulatedRig) -> Iterator[Any]:
-    """Open the port by hand; nothing of the project's own serial code is asked."""
-    line = os.open(rig.port.url, os.O_RDWR | os.O_NOCTTY)
-
-    def command(words: str) -> str:
-        os.write(line, f"{words}\n".encode())
-        heard = b""
-        until = time.monotonic() + PATIENCE
-        while b"ok" not in heard and b"error" not in heard:
-            assert time.monotonic() < until
-            if select.select([line], [], [], 0.1)[0]:
-                heard += os.read(line, 1000)
-        return heard.decode()
-
-    try:
-        yield command
-    finally:
-        os.close(line)
+@pytest.fixture
+def running(clock: SimulatedClock) -> Iterator[Callable[..., EmulatedRig]]:
+    """Make rigs that run until the test ends."""
+    with ExitStack() as stack:
+        yield lambda *objects, **scene: stack.enter_context(
+            EmulatedRig(*objects, clock=clock, **{**SMALL, **scene})
+        )
 
 
-def rest(rig: EmulatedRig) -> None:
-    until = time.monotonic() + PATIENCE
-    while rig.machine.moving() or rig.machine.state != "Idle":
-        assert time.monotonic() < until
-        time.sleep(0.005)
+def command(rig: EmulatedRig, words: str) -> str:
+    """Send a line by hand, wait until it is answered and all rests, and return the answer."""
+    line = rig.port.open()
+    line.write(f"{words}\n".encode())
+    heard = b""
+    while b"ok" not in heard and b"error" not in heard:
+        heard += line.read(1000)
+    while rig.machine.moving() or rig.machine.state not in ("Idle", "Alarm"):
+        rig.clock.sleep(0.005)
+    return heard.decode()
 
 
 def newest(rig: EmulatedRig) -> tuple[int, NDArray[Any]]:
     """Return a frame that was exposed from now on."""
-    now = time.monotonic()
+    now = rig.clock.now()
     while True:
-        frames = rig.camera.take(1, PATIENCE)
+        frames = rig.camera.take(1, 1.0)
         if frames.time[0] - 0.011 > now:
             return int(frames.number[0]), frames.pixels[0].copy()
 
@@ -73,95 +65,81 @@ def direct(twin: Twin, number: int) -> NDArray[Any]:
     return block.frames[0]
 
 
-def test_what_the_stage_does_is_what_the_camera_sees() -> None:
-    before = threading.active_count()
-    with EmulatedRig(**SMALL) as rig, say(rig) as command:
-        assert rig.where(time.monotonic()) == Position(-4.0, 0.0, 0.0)
-        _, lifted = newest(rig)
-        assert lifted.max() < 30
-        command("G21 G90 G1 Z-5.25 F900")  # 4 mm down are at the object
-        rest(rig)
-        number, pressed = newest(rig)
-        assert pressed.max() > 200
-        np.testing.assert_array_equal(pressed, direct(rig.twin(Vertical(np.full(number + 1, 1.25))), number))
-    assert threading.active_count() == before
+def test_what_the_stage_does_is_what_the_camera_sees(running, clock) -> None:
+    rig = running()
+    assert rig.where(clock.now()) == Position(-4.0, 0.0, 0.0)
+    _, lifted = newest(rig)
+    assert lifted.max() < 30
+    command(rig, "G21 G90 G1 Z-5.25 F900")  # 4 mm down are at the object
+    number, pressed = newest(rig)
+    assert pressed.max() > 200
+    np.testing.assert_array_equal(pressed, direct(rig.twin(Vertical(np.full(number + 1, 1.25))), number))
 
 
-def test_pitch_and_roll_are_the_lean_of_a_precession() -> None:
+def test_pitch_and_roll_are_the_lean_of_a_precession(running, clock) -> None:
     pivot = (0.5, -0.2, 3.0)
-    with EmulatedRig(pattern="linear", pivot=pivot, **SMALL) as rig, say(rig) as command:
-        command("G21 G90 G1 X1.5 Y-2 Z-5 F2000")
-        rest(rig)
-        number, seen = newest(rig)
-        phase, tilt = math.atan2(-2.0, 1.5), math.radians(2.5)
-        place = rig.where(time.monotonic())
-        assert (place.travel, place.tilt, place.phase) == pytest.approx((1.0, tilt, phase))
-        there = Axial(np.full(number + 1, phase), tilt, 1.0, pivot)
-        assert np.mean(seen != direct(rig.twin(there), number)) < 0.001  # the angles are rounded
+    rig = running(pattern="linear", pivot=pivot)
+    command(rig, "G21 G90 G1 X1.5 Y-2 Z-5 F2000")
+    number, seen = newest(rig)
+    phase, tilt = math.atan2(-2.0, 1.5), math.radians(2.5)
+    place = rig.where(clock.now())
+    assert (place.travel, place.tilt, place.phase) == pytest.approx((1.0, tilt, phase))
+    there = Axial(np.full(number + 1, phase), tilt, 1.0, pivot)
+    assert np.mean(seen != direct(rig.twin(there), number)) < 0.001  # the angles are rounded
 
 
-def test_x_y_and_twist_are_those_of_the_twins_movements() -> None:
-    with EmulatedRig("coin", pattern="linear", **SMALL) as rig, say(rig) as command:
-        command("G21 G90 G1 Z-5 A0.6 B-0.3 F2000")
-        rest(rig)
-        number, seen = newest(rig)
-        slide = Horizontal(np.tile((0.6, -0.3), (number + 1, 1)), 1.0)
-        np.testing.assert_array_equal(seen, direct(rig.twin(slide), number))
-        command("A0 B0 C30 F2000")
-        rest(rig)
-        number, turned = newest(rig)
-        twist = Twist(np.full(number + 1, math.radians(30)), 1.0)
-        assert np.mean(turned != direct(rig.twin(twist), number)) < 0.001  # the angle is rounded
-        assert np.any(turned != seen)
+def test_x_y_and_twist_are_those_of_the_twins_movements(running) -> None:
+    rig = running("coin", pattern="linear")
+    command(rig, "G21 G90 G1 Z-5 A0.6 B-0.3 F2000")
+    number, seen = newest(rig)
+    slide = Horizontal(np.tile((0.6, -0.3), (number + 1, 1)), 1.0)
+    np.testing.assert_array_equal(seen, direct(rig.twin(slide), number))
+    command(rig, "G1 A0 B0 C30 F2000")
+    number, turned = newest(rig)
+    twist = Twist(np.full(number + 1, math.radians(30)), 1.0)
+    assert np.mean(turned != direct(rig.twin(twist), number)) < 0.001  # the angle is rounded
+    assert np.any(turned != seen)
 
 
-def test_friction_drags_the_skin_and_its_texture_along() -> None:
+def test_friction_drags_the_skin_and_its_texture_along(running) -> None:
     scene: dict[str, Any] = {"shape": (40, 50), "pixel_size": 0.15, "rate": 30.0, "contact": "elastic"}
-    texture = SheetTexture("flakes", 0.5)
-    with EmulatedRig(Sphere(8.0), texture=texture, **scene) as rig, say(rig) as command:
-        command("G21 G90 G1 Z-4.4 F600")
-        rest(rig)
-        _, pressed = newest(rig)
-        command("A0.2 F60")
-        rest(rig)
-        number, seen = newest(rig)
-        slide = Horizontal(np.tile((0.2, 0.0), (number + 1, 1)), 0.4)
-        expected = direct(rig.twin(slide), number).astype(int)
+    rig = running(Sphere(8.0), texture=SheetTexture("flakes", 0.5), **scene)
+    command(rig, "G21 G90 G1 Z-4.4 F600")
+    _, pressed = newest(rig)
+    command(rig, "A0.2 F60")
+    number, seen = newest(rig)
+    slide = Horizontal(np.tile((0.2, 0.0), (number + 1, 1)), 0.4)
+    expected = direct(rig.twin(slide), number).astype(int)
     assert abs(seen - expected).mean() < 0.3
     assert abs(seen.astype(int) - pressed).mean() > 3
 
 
-def test_an_arc_goes_round_at_the_tilt() -> None:
-    with EmulatedRig(**SMALL) as rig, say(rig) as command:
-        begun = time.monotonic()
-        command("G21 G90 G17 G1 X2 F2400")
-        command("G3 X-2 Y0 I-2 J0 F2400")
-        rest(rig)
-        places = [rig.where(float(at)) for at in np.linspace(begun, time.monotonic(), 300)]
-        assert places[-1].phase == pytest.approx(math.pi)
-        round_it = [place for place in places if place.phase > 0.1]
-        assert len(round_it) > 5
-        assert [place.tilt for place in round_it] == pytest.approx(
-            [math.radians(2.0)] * len(round_it), rel=2e-3
-        )
+def test_an_arc_goes_round_at_the_tilt(running, clock) -> None:
+    rig, begun = running(), clock.now()
+    command(rig, "G21 G90 G17 G1 X2 F2400")
+    command(rig, "G3 X-2 Y0 I-2 J0 F2400")
+    places = [rig.where(float(at)) for at in np.linspace(begun, clock.now(), 300)]
+    assert places[-1].phase == pytest.approx(math.pi)
+    round_it = [place for place in places if place.phase > 0.1]
+    assert len(round_it) > 5
+    assert [place.tilt for place in round_it] == pytest.approx([math.radians(2.0)] * len(round_it), rel=2e-3)
 
 
-def test_a_rig_that_homes_is_locked_until_it_has_and_knows_its_place_then() -> None:
-    with EmulatedRig(home=True, **SMALL) as rig, say(rig) as command:
-        assert rig.machine.state == "Alarm"
-        assert rig.where(time.monotonic()) == Position(-4.0, 0.0, 0.0)
-        assert "error" in command("G1 X1 F100")
-        assert "ok" in command("$H")
-        assert "ok" in command("G21 G90 G53 G1 X-10 Y-10 Z-6 A-2.5 B-2.5 C-50 F2000")
-        rest(rig)
-        place = rig.where(time.monotonic())
-        assert astuple(place) == pytest.approx((1.0, 0.0, 0.0, 0.0, 0.0, 0.0), abs=1e-9)
+def test_a_rig_that_homes_is_locked_until_it_has_and_knows_its_place_then(running, clock) -> None:
+    rig = running(home=True)
+    assert rig.machine.state == "Alarm"
+    assert rig.where(clock.now()) == Position(-4.0, 0.0, 0.0)
+    assert "error" in command(rig, "G1 X1 F100")
+    assert "ok" in command(rig, "$H")
+    assert "ok" in command(rig, "G21 G90 G53 G1 X-10 Y-10 Z-6 A-2.5 B-2.5 C-50 F2000")
+    place = rig.where(clock.now())
+    assert astuple(place) == pytest.approx((1.0, 0.0, 0.0, 0.0, 0.0, 0.0), abs=1e-9)
 
 
 @pytest.mark.parametrize("home", [False, True])
-def test_all_places_that_the_settings_allow_lie_on_the_axes(home: bool) -> None:
-    with EmulatedRig(home=home, **SMALL) as rig:
-        stage = rig.settings.stage
+def test_all_places_that_the_settings_allow_lie_on_the_axes(running, home: bool) -> None:
+    rig = running(home=home)
+    stage = rig.settings.stage
     assert stage.port == rig.port.url
     for axis in stage.axes.values():
         ends = [axis.zero + axis.direction * value for value in axis.limits]
@@ -218,8 +196,24 @@ def test_a_picture_of_someone_else_is_kept(tmp_path: Path) -> None:
     assert (tmp_path / "bright.npy").read_bytes() == b"mine"
 
 
-def test_a_rig_that_cannot_be_leaves_nothing_running() -> None:
-    before = threading.active_count()
-    with pytest.raises(InputError, match="delay"), EmulatedRig(delay=-1.0, **SMALL):
-        pass
-    assert threading.active_count() == before
+def test_a_rig_that_cannot_be_leaves_nothing_running(running) -> None:
+    with pytest.raises(InputError, match="delay"):
+        running(delay=-1.0)
+
+
+@pytest.mark.parametrize(("every", "late"), [(2, math.inf), (7, 0.05)])
+def test_a_sweep_with_nth_frames_lost_or_late_knows_where_the_body_was(running, clock, every, late) -> None:
+    rig = running(delay=0.02)
+    rig.camera.lateness = lambda number: late if number % every == 0 else 0.0
+    camera = structs.replace(rig.settings.camera, delay=0.02, dark=16.0)
+    told = replace(rig.settings, camera=camera)
+    with Rig(rig.open_stage(told.stage), rig.camera, told, clock) as opened:
+        with SweepScan(opened, VerticalPlan(0.0, 1.0, speed=1.0)) as scan:
+            while scan.read(np.empty((8, *SMALL["shape"]), np.uint8)) is not None:
+                pass
+        number, arrival = (np.concatenate(one) for one in zip(*scan._frames, strict=True))
+        sound = np.flatnonzero(number % every)[0]  # a frame in time
+        exposed = arrival[sound] - 0.02 + (number - number[sound]) / SMALL["rate"]
+        true = np.array([rig.where(float(at)).travel for at in exposed])
+    assert abs(scan.positions()["travel"] - true).max() < (0.005 if late == math.inf else late)
+    assert (scan.dropped > 0) == (late == math.inf)

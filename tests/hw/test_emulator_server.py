@@ -15,45 +15,25 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mirrorskin.hw.camera import Counts, Frames
+from mirrorskin.hw.camera_thread import ThreadedCamera
 from mirrorskin.hw.emulator.server import FrameServer
-from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.ring import Ring
 from mirrorskin.io import InputError
 
 PATIENCE = 20.0  # seconds, for a busy machine
 
 
-class Tape:
+class Tape(ThreadedCamera):
     """A camera of random pictures, each marked with its number, that runs as fast as it is told."""
 
-    name = "tape"
-    latest = -np.inf
-
     def __init__(self, shape: tuple[int, int], dtype: Any, period: float) -> None:
-        self.shape, self.dtype = shape, np.dtype(dtype)
-        self._ring = Ring(shape, dtype, 64, self.name)
+        super().__init__("tape", shape, dtype, slots=64)
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, args=(period,))
         self._thread.start()
 
-    @property
-    def counts(self) -> Counts:
-        return Counts()
-
-    @property
-    def error(self) -> HardwareError | None:
-        return self._ring.error
-
-    def take(self, most: int, timeout: float) -> Frames:
-        return self._ring.take(most, timeout)
-
-    def flush(self) -> None:
-        self._ring.flush()
-
     def lose(self) -> None:
         self._ended.set()
-        self._ring.fail(HardwareError("the tape tore"))
+        self._fail("the tape tore")
 
     def close(self) -> None:
         self._ended.set()
@@ -62,8 +42,8 @@ class Tape:
     def _run(self, period: float) -> None:
         number = 0
         while not self._ended.wait(period):
-            self._ring.slot()[:] = picture(number, self.shape, self.dtype)
-            self._ring.put(time.monotonic(), number)
+            self._slot()[:] = picture(number, self.shape, self.dtype)
+            self._put(time.monotonic())
             number += 1
 
 

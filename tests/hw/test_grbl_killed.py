@@ -19,6 +19,7 @@ from mirrorskin.hw.emulator.motion import BLOCKS
 from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
 from mirrorskin.hw.grbl.moves import PIECE, Axes
 from mirrorskin.hw.grbl.replies import AHEAD, Window
+from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.hw.stage import Position
 
 SETTINGS = dict.fromkeys((110, 111, 112), 6000) | dict.fromkeys((120, 121, 122), 100)
@@ -35,22 +36,21 @@ def axes() -> Axes:
 
 
 class Played:
-    """A controller on a clock of its own that is sent some commands as the stage sends them."""
+    """A controller that is sent some commands as the stage sends them."""
 
     def __init__(self, commands, silent_at=math.inf):
-        self.now, self.farthest = 0.0, 0.0
-        self.machine = GrblMachine(SETTINGS, clock=lambda: self.now)
+        clock = SimulatedClock(0.0)
+        self.machine = GrblMachine(SETTINGS, clock=clock)
         window = Window()
         for one in commands:
             window.add(one.line, one.duration, one.ramp)
-        while window.busy or self.machine.moving():
-            while self.now < silent_at and (data := window.next(self.now)) is not None:
+        while (window.busy or self.machine.moving()) and clock.now() <= silent_at + 10:
+            while clock.now() < silent_at and (data := window.next(clock.now())) is not None:
                 self.machine.receive(data)
             for _ in range(self.machine.take().count(b"ok")):
                 window.answer()
-            self.now += 0.005
-            if self.now > silent_at + 10:
-                break
+            clock.sleep(0.005)
+        self.now = clock.now()
 
     def places(self):
         times = np.arange(0, self.now, 0.01)
@@ -116,7 +116,7 @@ def test_a_host_that_is_killed_leaves_a_stage_that_soon_rests():
     machine = GrblMachine(SETTINGS)
     with GrblPort(machine) as port:
         words = [sys.executable, "-c", HOST, port.url]
-        with subprocess.Popen(words, env={"PYTHONPATH": str(support)}) as host:
+        with subprocess.Popen(words, env={"PYTHONPATH": f"{support}:{':'.join(sys.path)}"}) as host:
             until = time.monotonic() + PATIENCE
             while machine.position()["Z"] < 0.1:
                 assert host.poll() is None

@@ -1,4 +1,4 @@
-"""Frames that come when they are due, on a clock that the tests wind."""
+"""Frames that come when they are due."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mirrorskin.hw import Live, Twin
+from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.hw.twin import Axial, Vertical
 from mirrorskin.io import InputError
 
@@ -13,25 +14,10 @@ COUNT, RATE = 40, 20.0
 TRAVEL = 0.05 * np.arange(COUNT)
 
 
-class Clock:
-    """Time that passes only when someone sleeps or works."""
-
-    def __init__(self) -> None:
-        self.now = 1000.0
-        self.slept: list[float] = []
-
-    def __call__(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        self.slept.append(seconds)
-        self.now += seconds
-
-
-def make_live(rate: float | None = RATE) -> tuple[Live, Clock]:
+def make_live(rate: float | None = RATE) -> tuple[Live, SimulatedClock]:
     twin = Twin(object="sphere", shape=(13, 17), pixel_size=0.4, movement=Vertical(TRAVEL))
-    clock = Clock()
-    return Live(twin, rate, clock=clock, sleep=clock.sleep), clock
+    clock = SimulatedClock()
+    return Live(twin, rate, clock), clock
 
 
 def all_frames() -> np.ndarray:
@@ -48,7 +34,7 @@ def test_frames_come_at_the_set_rate_and_are_the_twins() -> None:
         while (block := live.read()) is not None:
             assert (block.dropped, len(block.frames)) == (0, 1)
             frames.append(block.frames[0].copy())
-            times.append(clock.now)
+            times.append(clock.now())
     np.testing.assert_allclose(np.diff(times), 1 / RATE)
     np.testing.assert_array_equal(frames, all_frames())
 
@@ -56,7 +42,7 @@ def test_frames_come_at_the_set_rate_and_are_the_twins() -> None:
 def test_a_late_reader_loses_the_oldest_frames_and_is_told() -> None:
     live, clock = make_live()
     live.read()
-    clock.now += 20 / RATE
+    clock.sleep(20 / RATE)
     block = live.read(np.empty((20, *live.shape[1:]), live.dtype))
     assert block is not None
     assert (block.dropped, block.index, len(block.frames)) == (12, 13, 8)
@@ -66,7 +52,7 @@ def test_a_late_reader_loses_the_oldest_frames_and_is_told() -> None:
 def test_after_the_last_frame_there_is_none_however_late_it_is() -> None:
     live, clock = make_live()
     live.read()
-    clock.now += 1000.0
+    clock.sleep(1000.0)
     block = live.read(np.empty((COUNT, *live.shape[1:]), live.dtype))
     assert block is not None
     assert (block.index, len(block.frames)) == (COUNT - 8, 8)
@@ -91,15 +77,15 @@ def test_frames_of_other_movements_are_passed_over_too_and_told_apart() -> None:
         movement = Axial(np.arange(COUNT) * 2 * np.pi / 10, 0.1, 1.0)
         return Twin(object="sphere", shape=(13, 17), pixel_size=0.4, movement=movement)
 
-    twin, clock = make(), Clock()
-    live = Live(twin, RATE, clock=clock, sleep=clock.sleep)
+    twin, clock = make(), SimulatedClock()
+    live = Live(twin, RATE, clock)
     assert (live.name, live.motion, live.shape, live.dtype) == (twin.name, "axial", twin.shape, twin.dtype)
     assert live.header is twin.header
     whole = make().read(np.empty(twin.shape, twin.dtype))
     assert whole is not None
     indexes = []
     for late in (0.0, 14.2, 0.1, 3.3, 500.0):
-        clock.now += late / RATE
+        clock.sleep(late / RATE)
         block = live.read(np.empty((9, *live.shape[1:]), live.dtype))
         assert block is not None
         here = np.arange(block.index, block.index + len(block.frames))

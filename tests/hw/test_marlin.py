@@ -1,7 +1,5 @@
 """A stage behind a controller that speaks as Marlin goes in steps, and stops on faults."""
 
-import threading
-import time
 from dataclasses import replace
 
 import msgspec
@@ -9,8 +7,9 @@ import numpy as np
 import pytest
 from commands import run
 from fake_marlin import FakeMarlin
+from line_faults import CHANGES, outcomes
 from rig_fakes import FakeCamera, settings
-from served_rig import allow_delays
+from simulated import write_film_rig
 
 from mirrorskin import io
 from mirrorskin.hw.errors import HardwareError
@@ -19,39 +18,36 @@ from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig, open_stage
 from mirrorskin.hw.rig.scan import StepScan
 from mirrorskin.hw.rig.sweep import SweepScan
+from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.hw.stage import Position
 
 RIG = settings((4, 4), delay=0.0, dark=5.0)
 STAGE = msgspec.structs.replace(RIG.stage, firmware="marlin", x=None, y=None, twist=None)
 RIG = replace(RIG, stage=STAGE)  # travel is Z, pitch and roll are X and Y
-SOON = 30.0  # seconds: a limit for a busy machine
-
-
-@pytest.fixture(autouse=True)
-def patience(monkeypatch):
-    allow_delays(monkeypatch)
+SOON = 1.0  # seconds in which everything that happens in motion is noticed
 
 
 @pytest.fixture
-def line():
-    return FakeMarlin()
+def line(clock):
+    return FakeMarlin(clock)
 
 
 @pytest.fixture
 def stage(line):
-    with MarlinStage(STAGE, line) as stage:
+    with MarlinStage(STAGE, line, clock=line.clock) as stage:
         stage.home()
         yield stage
     assert line.closed
 
 
-def test_steps_are_recorded(stage, line, tmp_path):
+def test_steps_are_recorded(stage, line, clock, tmp_path):
     camera = FakeCamera(
-        lambda at: Position(line.now()["Z"]),
+        clock,
+        lambda at: Position(line.place()["Z"]),
         lambda place: np.full((4, 4), 20 + 100 * (place.travel > 0.25), np.uint8),
         rate=50.0,
     )
-    rig = Rig(stage, camera, RIG)
+    rig = Rig(stage, camera, RIG, clock)
     with (
         rig,
         io.StreamRecorder(StepScan(rig, VerticalPlan(0.0, 0.5, step=0.25)), tmp_path / "p.h5") as recorder,
@@ -73,8 +69,9 @@ def test_it_goes_no_faster_than_the_controller(stage, line):
 
 
 @pytest.mark.parametrize("plan", [VerticalPlan(0.0, 0.5, speed=0.5), AxialPlan(1.0, 0.04, turns=1, rate=0.5)])
-def test_sweeps_and_turns_are_refused(stage, plan):
-    rig = Rig(stage, FakeCamera(lambda at: Position(), lambda place: np.zeros((4, 4), np.uint8)), RIG)
+def test_sweeps_and_turns_are_refused(stage, clock, plan):
+    camera = FakeCamera(clock, lambda at: Position(), lambda place: np.zeros((4, 4), np.uint8))
+    rig = Rig(stage, camera, RIG, clock)
     with rig, pytest.raises(io.InputError, match=r"does not tell where it is while it \w+; go in steps"):
         SweepScan(rig, plan)
 
@@ -82,17 +79,13 @@ def test_sweeps_and_turns_are_refused(stage, plan):
 def begin_slow(stage):
     """Begin a move of twenty seconds, and let it go on for a while."""
     stage.move(Position(-5.0), speed=0.25)
-    time.sleep(0.3)
+    stage.clock.sleep(0.3)
 
 
 def rests_on_its_way(line):
     """Wait until it rests, and return whether that is before the end of the move."""
-    until = time.monotonic() + SOON
-    while line.moving:
-        assert time.monotonic() < until
-        time.sleep(0.005)
-        line.in_waiting  # noqa: B018 - lets the controller go on
-    return -5.0 < line.now()["Z"] < 0.0
+    line.until(lambda: not line.moving, SOON)
+    return -5.0 < line.place()["Z"] <= 0.0
 
 
 def test_a_refused_speed_stops_nothing(stage):
@@ -103,9 +96,9 @@ def test_a_refused_speed_stops_nothing(stage):
 
 
 @pytest.mark.parametrize("emergency", [True, False])
-def test_a_stop_in_motion_comes_at_once(emergency):
-    line = FakeMarlin(emergency, home=(0.0, 0.0, 0.0))
-    with MarlinStage(STAGE, line) as stage:
+def test_a_stop_in_motion_comes_at_once(clock, emergency):
+    line = FakeMarlin(clock, emergency)
+    with MarlinStage(STAGE, line, clock=clock) as stage:
         stage.home()
         begin_slow(stage)
         stage.stop()
@@ -118,7 +111,7 @@ def test_a_stop_in_motion_comes_at_once(emergency):
     ("fault", "message"),
     [
         (lambda line: setattr(line, "silent", True), "no longer answers"),
-        (lambda line: line.pull(), "the line is lost"),
+        (lambda line: line.unplug(), "the line is lost"),
         (lambda line: line.say("start"), "was reset; it has lost its place"),
         (lambda line: line.say("ok"), "answered a line that nobody here sent"),
         (lambda line: line.say(*["\x01\xe9\x7f" * 40] * 5), "what it says is garbled"),
@@ -131,26 +124,22 @@ def test_faults_in_motion_stop_it(stage, line, fault, message):
     fault(line)
     with pytest.raises(HardwareError, match=message):
         stage.wait()
-    assert line.pulled or rests_on_its_way(line)
+    assert line.gone or rests_on_its_way(line)
 
 
-def test_ctrl_c_in_motion_stops_it(stage, line, monkeypatch):
+@pytest.mark.parametrize("at", [0.0, 0.004, 0.37, 3.0])
+def test_ctrl_c_in_motion_stops_it(stage, line, clock, at):
     begin_slow(stage)
-
-    def interrupted(_seconds):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr("mirrorskin.hw.marlin.stage.time.sleep", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            stage.wait()
+    clock.later(at, clock.interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        stage.wait()
     assert rests_on_its_way(line)
 
 
-def test_homing_is_stopped_by_killing_the_controller(line):
+def test_homing_is_stopped_by_killing_the_controller(line, clock):
     line.homing = 100.0
-    with MarlinStage(STAGE, line) as stage:
-        threading.Timer(0.2, stage.stop).start()
+    with MarlinStage(STAGE, line, clock=clock) as stage:
+        clock.later(0.2, stage.stop)
         with pytest.raises(HardwareError, match="was stopped"):
             stage.home()
         assert line.killed
@@ -164,48 +153,46 @@ def test_a_place_that_the_controller_clips_is_noticed(stage, line):
 
 
 @pytest.mark.parametrize(
-    ("instead", "message", "boot"),
+    ("instead", "message"),
     [
-        ({"M115": "FIRMWARE_NAME:Klipper FIRMWARE_VERSION:v0.12"}, "it is Klipper, not Marlin", SOON),
-        ({"M115": "Grbl 1.1h ['$' for help]"}, "what answers is not Marlin", 2.0),
-        ({"M27": "SD printing byte 12/34\nok"}, "prints from its card", SOON),
-        ({"M114": "X:0.00 Y:0.00 E:0.00\nok"}, "has no axis Z", SOON),
-        ({"M503": "nothing\nok", "G90": "Error:checksum mismatch"}, "answers G90 with 'Error:checksum", SOON),
+        ({"M115": "FIRMWARE_NAME:Klipper FIRMWARE_VERSION:v0.12"}, "it is Klipper, not Marlin"),
+        ({"M115": "Grbl 1.1h ['$' for help]"}, "what answers is not Marlin"),
+        ({"M115": ""}, "nothing answers within 12 s"),
+        ({"M27": "SD printing byte 12/34\nok"}, "prints from its card"),
+        ({"M114": "X:0.00 Y:0.00 E:0.00\nok"}, "has no axis Z"),
+        ({"M503": "nothing\nok", "G90": "Error:checksum mismatch"}, "answers G90 with 'Error:checksum"),
     ],
 )
-def test_what_is_no_stage_is_refused(line, monkeypatch, instead, message, boot):
-    monkeypatch.setattr("mirrorskin.hw.marlin.stage._BOOT", boot)
+def test_what_is_no_stage_is_refused(line, clock, instead, message):
     line.instead = instead
     with pytest.raises(io.InputError, match=message):
-        MarlinStage(STAGE, line)
+        MarlinStage(STAGE, line, clock=clock)
     assert line.closed
 
 
-def test_the_rig_file_chooses_it(line, monkeypatch):
-    monkeypatch.setattr("mirrorskin.hw.marlin.stage.open_port", lambda *_: line)
-    stage = open_stage(STAGE)
+def test_the_rig_file_chooses_it(line, clock, monkeypatch):
+    monkeypatch.setattr("mirrorskin.hw.marlin.stage.open_port", lambda *_: line.open())
+    stage = open_stage(STAGE, clock=clock)
     stage.close()
     assert stage.firmware == "Marlin 2.1.2 (Nov 24 2026)"
     with pytest.raises(io.InputError, match="only GRBL is unlocked"):
         open_stage(STAGE, unlock=True)
 
 
-def test_chatter_without_an_answer_is_silence(stage, line):
+def test_chatter_without_an_answer_is_silence(stage, line, clock):
     begin_slow(stage)
-    line.silent, told = True, threading.Event()
+    line.silent, told = True, clock.event()
 
     def chatter():
         while not told.wait(0.02):
             line.chat("T:20.0 /0.0")
 
-    talk = threading.Thread(target=chatter)
+    talk = clock.thread(chatter, "chatter")
     talk.start()
-    try:
-        with pytest.raises(HardwareError, match="no longer answers"):
-            stage.wait()
-    finally:
-        told.set()
-        talk.join()
+    with pytest.raises(HardwareError, match="no longer answers"):
+        stage.wait()
+    told.set()
+    talk.join()
     assert rests_on_its_way(line)
 
 
@@ -239,9 +226,7 @@ def test_a_wait_ends_in_time(stage, line):
 
 def test_who_else_moves_it_is_noticed(stage, line):
     line.put(0.5)
-    until = time.monotonic() + SOON
-    while stage.error is None and time.monotonic() < until:
-        time.sleep(0.005)
+    line.until(lambda: stage.error, SOON)
     with pytest.raises(HardwareError, match=r"rests 0\.5 mm .* let nobody else move it"):
         stage.report()
 
@@ -250,7 +235,33 @@ def test_other_steps_than_the_rig_file_s_are_refused(line):
     line.instead = {"M503": "echo:  M92 X80.00 Y80.00 Z200.00\nok"}
     travel = msgspec.structs.replace(STAGE.travel, steps=400.0)
     with pytest.raises(io.InputError, match=r"M92 Z is 200 steps where the rig file has 400: it goes 0\.5"):
-        MarlinStage(msgspec.structs.replace(STAGE, travel=travel), line)
+        MarlinStage(msgspec.structs.replace(STAGE, travel=travel), line, clock=line.clock)
+
+
+def go(**faults):
+    """Move there and back through a line with faults, and return what went wrong."""
+    line, error = FakeMarlin(SimulatedClock()), None
+    vars(line).update(faults)
+    try:
+        with MarlinStage(STAGE, line, clock=line.clock) as stage:
+            stage.home()
+            for travel in (-0.4, -0.1):
+                stage.move(Position(travel))
+                assert stage.wait().position.travel == pytest.approx(travel, abs=0.021)
+                assert line.place()["Z"] == pytest.approx(travel, abs=0.021)
+    except (HardwareError, io.InputError) as failed:
+        error = failed
+        assert "\n" not in str(error)
+    assert line.clock.threads == []
+    line.clock.sleep(1.0)
+    assert not line.moving
+    return error
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("way", ["said", "heard"])
+def test_each_reply_and_byte_may_fail_once(way, change):
+    assert None in outcomes(go, way, change, least=30), "some of it does not matter"
 
 
 RIG_FILE = """
@@ -262,24 +273,15 @@ press = 2.0
 letter = "Z"
 limits = [-5.0, 3.0]
 speed = 8.0
-[camera]
-source = "film.y4m"
-size = [8, 6]
-rate = 50
-stall = 5
-dark = 0
-delay = 0
 """
 
 
 @pytest.fixture
-def capture(line, tmp_path, monkeypatch):
+def capture(line, simulated, tmp_path, monkeypatch):
     """Run commands on a rig file: the controller is the fake one, and the camera a film of 200 s."""
-    monkeypatch.setattr("mirrorskin.hw.marlin.stage.open_port", lambda *_: line)
+    monkeypatch.setattr("mirrorskin.hw.marlin.stage.open_port", lambda *_: line.open())
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "rig.toml").write_text(RIG_FILE)
-    film = b"YUV4MPEG2 W8 H6 F50:1 Ip A1:1 Cmono\n" + (b"FRAME\n" + bytes(range(48))) * 10_000
-    (tmp_path / "film.y4m").write_bytes(film)
+    write_film_rig(tmp_path, RIG_FILE)
     return lambda words: run("capture", "vertical", *words.split(), "--rig", "rig.toml", "-o", "press.h5")
 
 
@@ -300,7 +302,7 @@ def test_a_sweep_is_refused_before_it_homes(capture, line):
     assert "Marlin does not tell where it is while it moves; go in steps" in ended.said
 
 
-@pytest.mark.parametrize("fault", [lambda line: line.pull(), lambda line: setattr(line, "silent", True)])
+@pytest.mark.parametrize("fault", [lambda line: line.unplug(), lambda line: setattr(line, "silent", True)])
 def test_a_fault_ends_the_capture_with_a_line(capture, line, fault):
 
     def noticed(said):

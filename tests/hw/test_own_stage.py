@@ -1,15 +1,15 @@
 """The stage of docs/stages.md, in front of a controller that is made up, moves a rig and stops on faults."""
 
+import builtins
 import re
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from commands import run
 from rig_fakes import FakeCamera, settings
-from served_rig import allow_delays
+from simulated import on_clock, write_film_rig
 
 from mirrorskin import io
 from mirrorskin.hw.errors import HardwareError
@@ -30,7 +30,8 @@ EXAMPLE = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), r
 class Controller:
     """Goes evenly to where it is sent, and answers each line; in the place of a serial port."""
 
-    def __init__(self):
+    def __init__(self, clock):
+        self.clock = clock
         self.way = [(0.0, -1.0, 0.0), (0.0, -1.0, 0.0)]  # time, travel; speed of what began last
         self.answers, self.silent, self.stopped, self.closed = [], False, 0, False
         self.instead = {}  # a command to what it is answered instead
@@ -40,7 +41,7 @@ class Controller:
         return b if at >= t1 else a + (b - a) * max(0.0, at - t0) / (t1 - t0)
 
     def write(self, data):
-        now, words = time.monotonic(), data.decode().split()
+        now, words = self.clock.now(), data.decode().split()
         if words[0] == "MOVE":
             here, there, speed = self.travel(now), float(words[1]), float(words[2])
             self.way = [(now, here, speed), (now + abs(there - here) / speed, there, speed)]
@@ -59,18 +60,20 @@ class Controller:
         self.closed = True
 
 
-@pytest.fixture(autouse=True)
-def patience(monkeypatch):
-    allow_delays(monkeypatch)
+@pytest.fixture
+def line(clock, monkeypatch):
+    """A controller behind every port."""
+    made = Controller(clock)
+    monkeypatch.setattr("serial.serial_for_url", lambda *_words, **_named: made)
+    return made
 
 
 @pytest.fixture
-def lab(monkeypatch):
+def lab(line, clock, monkeypatch):
     """The page's class, opened on a controller."""
-    line = Controller()
-    monkeypatch.setattr("serial.serial_for_url", lambda *_words, **_named: line)
     made = {"__name__": __name__}
     exec(EXAMPLE, made)
+    made |= on_clock(clock)
     stage = made["LabStage"](STAGE)
     yield stage, line
     stage.close()
@@ -79,11 +82,12 @@ def lab(monkeypatch):
 
 def rig_of(stage, line):
     camera = FakeCamera(
+        line.clock,
         lambda at: Position(line.travel(at)),
         lambda place: np.full((4, 4), 20 + 100 * (place.travel > 0.25), np.uint8),
         rate=50.0,
     )
-    return Rig(stage, camera, settings((4, 4), delay=0.0, dark=5.0))
+    return Rig(stage, camera, settings((4, 4), delay=0.0, dark=5.0), line.clock)
 
 
 def test_steps_and_sweeps_are_recorded(lab, tmp_path):
@@ -178,27 +182,18 @@ press = 2.0
 letter = "Z"
 limits = [-10.0, 3.0]
 speed = 50.0
-[camera]
-source = "film.y4m"
-size = [8, 6]
-rate = 50
-stall = 5
-dark = 0
-delay = 0
 """
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
+def folder(line, simulated, tmp_path, monkeypatch):
     """A rig file, the page's class beside it, a film of 200 s, and the controller behind the port."""
-    line = Controller()
-    monkeypatch.setattr("serial.serial_for_url", lambda *_words, **_named: line)
     monkeypatch.delitem(sys.modules, "my_stage", raising=False)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    (tmp_path / "my_stage.py").write_text(EXAMPLE)
-    (tmp_path / "rig.toml").write_text(RIG)
-    film = b"YUV4MPEG2 W8 H6 F50:1 Ip A1:1 Cmono\n" + (b"FRAME\n" + bytes(range(48))) * 10_000
-    (tmp_path / "film.y4m").write_bytes(film)
+    (tmp_path / "my_stage.py").write_text(EXAMPLE.replace("import threading\nimport time\n", ""))
+    write_film_rig(tmp_path, RIG)
+    for name, module in on_clock(simulated).items():  # in the place of the modules that it imports
+        monkeypatch.setattr(builtins, name, module, raising=False)
     return tmp_path
 
 

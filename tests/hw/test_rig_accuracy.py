@@ -1,32 +1,27 @@
 """Captures on the emulated rig are as good as what the twin renders directly at the same places."""
 
 import math
-import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from msgspec import structs
-from served_rig import allow_delays
 
 from mirrorskin import engine
 from mirrorskin.hw.emulator.rig import EmulatedRig
-from mirrorskin.hw.grbl.stage import GrblStage
-from mirrorskin.hw.rig import delay as delays
 from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.scan import StepScan
 from mirrorskin.hw.rig.sweep import SweepScan
+from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.hw.twin import Axial, Vertical
 from mirrorskin.io.types import Block, Closing
 
-pytestmark = pytest.mark.real_time
+pytestmark = pytest.mark.slow
 
 TILT = math.radians(2.5)
 DELAY = 0.05
-NEAR_DELAY = pytest.approx(DELAY, abs=0.005)  # within 2 ms where nothing else runs; see test_delay.py
-ATTEMPTS = 3  # a machine that is busy with other things may be too late for the emulators
+NEAR_DELAY = pytest.approx(DELAY, abs=0.002)
 PLANS = {
     "vertical, steps": VerticalPlan(0.0, 1.0, step=0.25),
     "vertical, continuous": VerticalPlan(0.0, 1.0, speed=1.0),
@@ -68,10 +63,13 @@ def capture(plan, seed):
     optics["pattern"] = "uniform" if plan.motion == "vertical" else "linear"
     # Steps need few frames, and no delay that is measured.
     rate, known = (10.0, {"dark": 16.0, "delay": DELAY}) if plan.in_steps else (20.0, {"dark": 16.0})
-    with EmulatedRig("sphere", **optics, rate=rate, delay=DELAY, jitter=0.003, seed=seed) as emulated:
+    clock = SimulatedClock()
+    with EmulatedRig(
+        "sphere", **optics, rate=rate, delay=DELAY, jitter=0.003, seed=seed, clock=clock
+    ) as emulated:
         settings = emulated.settings
         settings = replace(settings, camera=structs.replace(settings.camera, **known))
-        with Rig(GrblStage(settings.stage), emulated.camera, settings) as rig:
+        with Rig(emulated.open_stage(settings.stage), emulated.camera, settings, clock) as rig:
             frames, numbers, take = [], {}, rig.take
 
             def noted(most):
@@ -84,7 +82,7 @@ def capture(plan, seed):
                 room = np.empty((16, *scan.shape[1:]), scan.dtype)
                 while (block := scan.read(room)) is not None:
                     frames.append(replace(block, frames=block.frames.copy()))
-                origin = time.monotonic() - scan.now()
+                origin = clock.now() - scan.now()
             (places,) = scan.positions().values()
         is_axial = isinstance(plan, AxialPlan)
         movement = Axial(places, plan.tilt, plan.press) if is_axial else Vertical(places)
@@ -102,19 +100,8 @@ def errors(source, truth):
 
 @pytest.fixture(scope="module")
 def compared():
-    """RMS errors of heights and normals, captured and rendered; captures run together: they mostly wait."""
-    with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(len(PLANS)) as pool:
-        allow_delays(patch)
-        patch.setattr(delays, "_SECONDS", 1.0)
-        patch.setattr(delays, "_FRAMES", 20)
-        patch.setattr(delays, "_LONGEST_DELAY", 0.1)
-        tasks = {name: pool.submit(capture, plan, seed) for seed, (name, plan) in enumerate(PLANS.items())}
-        captures = {name: task.result() for name, task in tasks.items()}
-        for name, plan in PLANS.items():
-            for seed in range(1, ATTEMPTS):
-                if plan.in_steps or captures[name][2].delay.seconds == NEAR_DELAY:
-                    break
-                captures[name] = capture(plan, len(PLANS) * seed)
+    """RMS errors of heights and normals, captured and rendered."""
+    captures = {name: capture(plan, seed) for seed, (name, plan) in enumerate(PLANS.items())}
     found = {}
     for name, (captured, numbers, scan, twin) in captures.items():
         rendered = np.empty_like(captured.frames)

@@ -45,26 +45,11 @@ RIG = RigSettings(Path("r.toml"), "r", STAGE, CAMERA)
 ABLE = {22: 1.0, 112: 300.0, 110: 1200.0, 111: 1200.0, 132: 13.0, 130: 9.0, 131: 9.0}
 
 
-class Clock:
-    """Time that passes when somebody waits."""
-
-    now = 100.0
-
-    def monotonic(self):
-        return self.now
-
-    def sleep(self, seconds):
-        self.now += seconds
-
-
 @pytest.fixture(autouse=True)
-def clock(monkeypatch):
-    """Wait without waiting."""
-    clock = Clock()
-    monkeypatch.setattr("mirrorskin.hw.rig.check.time", clock)
+def shared(clock, monkeypatch):
+    """Let stage and camera have the clock."""
     monkeypatch.setattr(Stage, "clock", clock)
     monkeypatch.setattr(Camera, "clock", clock)
-    return clock
 
 
 class Stage:
@@ -83,10 +68,10 @@ class Stage:
         self.did = []
 
     def report(self):
-        return Report(self.clock.now, self._position, self._state)
+        return Report(self.clock.now(), self._position, self._state)
 
     def history(self, since):
-        times = np.arange(since, self.clock.now, self._every)
+        times = np.arange(since, self.clock.now(), self._every)
         return [Report(float(at), self._position, self._state) for at in times]
 
     def home(self):
@@ -120,7 +105,7 @@ class Camera:
         self.clock.sleep(self._every)
         lost, self._lost = (self._lost, 0) if self.counts.frames else (0, self._lost)
         self.counts = replace(self.counts, frames=self.counts.frames + 1, **self._after)
-        return Frames(self._picture[None], np.zeros(1, np.int64), np.array([self.clock.now]), lost)
+        return Frames(self._picture[None], np.zeros(1, np.int64), np.array([self.clock.now()]), lost)
 
     def flush(self):
         pass
@@ -130,11 +115,11 @@ class Camera:
 
 
 def look(stage, settings=STAGE):
-    return {one.what: one for one in check_stage(stage, settings)}
+    return {one.what: one for one in check_stage(stage, settings, stage.clock)}
 
 
 def film(camera, **settings):
-    return {one.what: one for one in check_camera(camera, structs.replace(CAMERA, **settings))}
+    return {one.what: one for one in check_camera(camera, structs.replace(CAMERA, **settings), camera.clock)}
 
 
 def test_a_stage_that_is_as_its_file_says_is_sound():
@@ -334,7 +319,13 @@ def test_a_picture_of_floats_may_have_pixels_that_are_no_numbers():
 
 
 def opened(stage, camera, move=False):
-    return check_rig(RIG, move=move, open_stage=lambda settings: stage, open_camera=lambda settings: camera)
+    return check_rig(
+        RIG,
+        move=move,
+        open_stage=lambda settings: stage,
+        open_camera=lambda settings: camera,
+        clock=Stage.clock,
+    )
 
 
 @pytest.mark.parametrize("move", [False, True])
@@ -353,7 +344,7 @@ def test_the_stage_is_closed_when_the_camera_is_not_there_or_is_lost():
 
     stage = Stage()
     with pytest.raises(InputError, match="camera 0 is not there"):
-        list(check_rig(RIG, open_stage=lambda settings: stage, open_camera=refuse))
+        list(check_rig(RIG, open_stage=lambda settings: stage, open_camera=refuse, clock=Stage.clock))
     assert stage.did == ["close"]
 
     class Lost(Camera):
@@ -399,7 +390,9 @@ def test_what_hardware_warns_of_is_found_and_not_printed_besides(caplog):
         log.warning("camera 0: gain %g was asked for, the camera set %g", 2, 3)
         return Talking()
 
-    findings = list(check_rig(RIG, open_stage=lambda settings: Stage(), open_camera=open_camera))
+    findings = list(
+        check_rig(RIG, open_stage=lambda settings: Stage(), open_camera=open_camera, clock=Stage.clock)
+    )
     assert [one.found for one in findings if one.verdict != "ok"] == [
         "camera 0: gain 2 was asked for, the camera set 3"
     ]

@@ -136,3 +136,12 @@ def test_frames_that_were_lost_unnoticed_are_noticed(jitter):
     arrival = np.maximum.accumulate(shown / 30 + jitter * random.standard_normal(len(shown)))
     error = even_times(np.arange(len(shown)), arrival) - shown / 30
     assert abs(error).max() < 0.6 * jitter
+
+
+def test_jitter_is_seldom_taken_for_lost_frames():
+    random, number = np.random.default_rng(0), np.arange(400)
+    off = []
+    for _ in range(100):
+        arrival = np.maximum.accumulate(number / 100 + 0.0025 * random.standard_normal(400))
+        off.append(abs(even_times(number, arrival, 400) - number / 100).max())
+    assert np.count_nonzero(np.array(off) > 0.002) < 10, "a frame that counts as lost makes 5 ms"

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 from firmware import PROGRAM, Firmware, is_hal
-from scripted_grbl import ScriptedGrbl, stage_settings
+from scripted_grbl import ScriptedGrbl
 from transcript import REST, SETTINGS, play, read
 
 from mirrorskin.hw.emulator.port import GrblMachine
 from mirrorskin.hw.grbl.replies import parse
-from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.hw.rig_file import TwistAxis
+from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.io import InputError
 
 GRBL, HAL = (read(Path(__file__).with_name(name)) for name in ("grbl-1.1h.txt", "grblhal-1.1f.txt"))
@@ -20,14 +20,9 @@ LATE = 0.2  # seconds: between looks at whether it rests, and of a program on a 
 
 
 def emulated():
-    """Play the requests by a clock of their own."""
-    now = 0.0
-
-    def sleep(seconds):
-        nonlocal now
-        now += seconds
-
-    return list(play(GrblMachine(SETTINGS, clock=lambda: now), lambda: now, sleep))
+    """Play the requests on simulated time."""
+    clock = SimulatedClock()
+    return list(play(GrblMachine(SETTINGS, clock=clock), clock))
 
 
 @pytest.fixture(scope="module", params=["emulator", *(["firmware"] if PROGRAM else [])])
@@ -85,24 +80,29 @@ def test_the_driver_reads_every_line(played):
     assert [line for one in played for line in one.said if parse(line.encode()) is None] == []
 
 
-def hal(**answers):
-    """A controller that tells of itself what grblHAL does."""
-    told = {one.sent: "\r\n".join(one.said) for one in HAL if one.sent in ("$I", "$$")}
-    return ScriptedGrbl(answers=told | answers)
+@pytest.fixture
+def hal(opened, clock):
+    """Open a controller that tells of itself what grblHAL does."""
+
+    def open_hal(settings=(), **answers):
+        told = {one.sent: "\r\n".join(one.said) for one in HAL if one.sent in ("$I", "$$")}
+        return opened(ScriptedGrbl(clock, answers=told | answers), **dict(settings))[0]
+
+    return open_hal
 
 
-def test_the_driver_knows_grblhal():
-    with GrblStage(stage_settings(), hal()) as stage:
-        assert stage.firmware == "grblHAL 1.1f.20260817"
-        assert stage.parameters[110] == 1200
+def test_the_driver_knows_grblhal(hal):
+    stage = hal()
+    assert stage.firmware == "grblHAL 1.1f.20260817"
+    assert stage.parameters[110] == 1200
 
 
-def test_axes_that_grblhal_calls_otherwise_are_missed():
+def test_axes_that_grblhal_calls_otherwise_are_missed(hal):
     told = "[VER:1.1f.20260817:]\r\n[AXS:6:XYZUVW]\r\n[FIRMWARE:grblHAL]\r\nok"
     with pytest.raises(InputError, match="no axis C"):
-        GrblStage(stage_settings(twist=TwistAxis(letter="C", limits=(-9, 9), speed=9.0)), hal(**{"$I": told}))
+        hal({"twist": TwistAxis(letter="C", limits=(-9, 9), speed=9.0)}, **{"$I": told})
 
 
-def test_feeds_of_linear_axes_alone_are_refused():
+def test_feeds_of_linear_axes_alone_are_refused(hal):
     with pytest.raises(InputError, match=r"set \$701=0"):
-        GrblStage(stage_settings(), hal(**{"$$": "$701=1\r\nok"}))
+        hal(**{"$$": "$701=1\r\nok"})

@@ -1,11 +1,8 @@
 from __future__ import annotations
 
-import queue
 import re
 import socket
 import sys
-import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -15,17 +12,19 @@ import cv2
 import numpy as np
 import pytest
 
-from mirrorskin.hw import reopened, video
+from mirrorskin.hw import video
 from mirrorskin.hw.camera_thread import FrameCounter
+from mirrorskin.hw.clock import SYSTEM, Clock
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig_file import CameraSettings
+from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.hw.video import VideoCamera, to_grey
 from mirrorskin.io import InputError
 
 SHAPE = (480, 640)
 SMALL = (24, 32)
 BYTE = np.dtype(np.uint8)
-SOON = 20.0  # seconds, that nothing here takes on the slowest machine
+SOON = 20.0  # seconds, that nothing here takes
 
 
 def settings(source, shape=SHAPE, dtype=BYTE, **more) -> CameraSettings:
@@ -60,11 +59,25 @@ def play_out(opened: VideoCamera, timeout: float) -> None:
         opened.take(10, timeout)
 
 
-def wait_until(holds: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + SOON
+@pytest.fixture
+def open_camera(clock):
+    """Open cameras and films on simulated time, and close them in the end."""
+    opened = []
+
+    def open_it(source=0, shape=SMALL, dtype=BYTE, **more) -> VideoCamera:
+        opened.append(VideoCamera(settings(str(source), shape, dtype, **more), 50, clock))
+        return opened[-1]
+
+    yield open_it
+    for one in opened:
+        one.close()
+
+
+def wait_until(clock: Clock, holds: Callable[[], bool]) -> None:
+    deadline = clock.now() + SOON
     while not holds():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+        assert clock.now() < deadline
+        clock.sleep(0.01)
 
 
 def test_where_nobody_sends_there_is_no_camera() -> None:
@@ -82,68 +95,73 @@ def write_y4m(path, frames: np.ndarray, rate: int) -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_a_grey_file_is_exact_to_its_end(tmp_path, dtype) -> None:
+def test_a_grey_file_is_exact_to_its_end(open_camera, tmp_path, dtype) -> None:
     frames = noise(40, dtype=dtype)
     write_y4m(tmp_path / "film.y4m", frames, 400)
-    opened = VideoCamera(settings(str(tmp_path / "film.y4m"), SMALL, dtype), slots=50)
+    opened = open_camera(tmp_path / "film.y4m", dtype=dtype)
     pixels, numbers = take(opened, 40)
     with pytest.raises(HardwareError, match=r"film.y4m has ended after 40 frames$"):
         opened.take(1, SOON)
     assert "has ended" in str(opened.error)
     counts = opened.counts
-    opened.close()
     np.testing.assert_array_equal(pixels, frames)
     assert numbers.tolist() == list(range(40))
     assert (counts.frames, counts.dropped, counts.reconnects) == (40, 0, 0)
 
 
-def test_a_file_plays_at_its_own_rate(tmp_path) -> None:
+def test_a_file_plays_at_its_own_rate(open_camera, clock, tmp_path) -> None:
     write_y4m(tmp_path / "film.y4m", noise(20), 50)
-    begun = time.monotonic()
-    opened = VideoCamera(settings(str(tmp_path / "film.y4m"), SMALL), slots=50)
+    begun = clock.now()
+    opened = open_camera(tmp_path / "film.y4m")
     with pytest.raises(HardwareError, match="has ended"):
         play_out(opened, SOON)
-    opened.close()
-    assert opened.latest - begun >= 19 / 50
+    assert opened.latest - begun == pytest.approx(19 / 50)
 
 
-def test_a_file_of_another_size_is_refused(tmp_path) -> None:
+def test_a_file_of_another_size_is_refused(open_camera, tmp_path) -> None:
     write_y4m(tmp_path / "film.y4m", noise(2), 50)
     with pytest.raises(InputError, match="32 x 24, and 640 x 480 is asked for"):
-        VideoCamera(settings(str(tmp_path / "film.y4m")))
+        open_camera(tmp_path / "film.y4m", SHAPE)
 
 
-def test_no_file_no_device_and_no_video_are_refused(tmp_path, monkeypatch) -> None:
+def test_no_file_no_device_and_no_video_are_refused(open_camera, tmp_path, monkeypatch) -> None:
     with pytest.raises(InputError, match="there is no such file"):
-        VideoCamera(settings(str(tmp_path / "none.avi")))
+        open_camera(tmp_path / "none.avi")
     (tmp_path / "text.avi").write_text("no film")
     with pytest.raises(InputError, match="cannot be opened: it is damaged, or no video"):
-        VideoCamera(settings(str(tmp_path / "text.avi")))
+        open_camera(tmp_path / "text.avi")
     monkeypatch.setattr(video, "_DEVICES", tmp_path)
     with pytest.raises(InputError, match="there is no such device; no camera is connected"):
-        VideoCamera(settings(3))
+        open_camera(3)
     (tmp_path / "video0").touch()
     with pytest.raises(InputError, match=r"there is no such device; there are .*video0$"):
-        VideoCamera(settings("3"))
+        open_camera("3")
 
 
 class Driver:
     """A V4L2 camera without hardware, in the place of OpenCV's VideoCapture."""
 
-    def __init__(self) -> None:
-        self.pictures: queue.Queue[np.ndarray | None] = queue.Queue()
+    def __init__(self, clock: SimulatedClock) -> None:
+        self.clock, self._change = clock, clock.condition()
+        self._pictures: list[np.ndarray | None] = []
         self.refuses: set[int] = set()
         self.there = True
         self.opened = 0
-        self.begins = threading.Event()
+        self.begins = clock.event()
         self.begins.set()
         self.values: dict[int, float] = {}
         self.stamp = 0.0
         self._picture: np.ndarray | None = None
 
+    def give(self, *pictures: np.ndarray | None) -> None:
+        """Let the next pictures come; None is a loss."""
+        with self._change:
+            self._pictures += pictures
+            self._change.notify_all()
+
     def __call__(self, target, backend, parameters) -> Driver:
         assert backend == cv2.CAP_V4L2
-        assert self.begins.wait(SOON)
+        self.begins.wait()
         self.opened += 1
         return self
 
@@ -161,7 +179,10 @@ class Driver:
         return self.values.get(code, 0.0)
 
     def grab(self) -> bool:
-        self._picture = self.pictures.get(timeout=SOON)
+        with self._change:
+            while not self._pictures:
+                self._change.wait()
+            self._picture = self._pictures.pop(0)
         return self._picture is not None
 
     def retrieve(self, _out) -> tuple[bool, np.ndarray | None]:
@@ -172,30 +193,19 @@ class Driver:
 
 
 @pytest.fixture
-def driver(tmp_path, monkeypatch):
-    made = Driver()
+def driver(clock, tmp_path, monkeypatch):
+    made = Driver(clock)
     (tmp_path / "video0").touch()
     monkeypatch.setattr(video, "_DEVICES", tmp_path)
     monkeypatch.setattr(video.cv2, "VideoCapture", made)
-    return made
-
-
-@pytest.fixture
-def open_camera(driver):
-    opened = []
-
-    def open_it(**more) -> VideoCamera:
-        opened.append(VideoCamera(settings(0, SMALL, **more)))
-        return opened[-1]
-
-    yield open_it
-    driver.pictures.put(None)
-    for one in opened:
-        one.close()
+    yield made
+    made.begins.set()
+    made.give(None)
+    clock.sleep(1.0)
 
 
 def test_a_camera_is_given_what_is_asked_for(driver, open_camera, caplog) -> None:
-    driver.pictures.put(noise(1)[0])
+    driver.give(noise(1)[0])
     open_camera(fourcc="Y16", exposure=0.004, gain=3.0, rate=60.0)
     assert driver.values == {
         cv2.CAP_PROP_FOURCC: cv2.VideoWriter.fourcc(*"Y16 "),
@@ -214,7 +224,7 @@ def test_what_a_camera_does_not_take_is_told(driver, open_camera, caplog) -> Non
     driver.refuses = {cv2.CAP_PROP_FOURCC, cv2.CAP_PROP_EXPOSURE, cv2.CAP_PROP_GAIN, cv2.CAP_PROP_FPS}
     driver.values[cv2.CAP_PROP_FPS] = 30.0
     driver.values[cv2.CAP_PROP_FOURCC] = cv2.VideoWriter.fourcc(*"MJPG")
-    driver.pictures.put(noise(1)[0])
+    driver.give(noise(1)[0])
     open_camera(fourcc="GREY", exposure=0.004, gain=3.0, rate=60.0)
     told = " / ".join(record.getMessage() for record in caplog.records)
     assert "rate 60 Hz was asked for, the camera set 30" in told
@@ -228,46 +238,46 @@ def test_what_a_camera_does_not_take_is_told(driver, open_camera, caplog) -> Non
     [(np.zeros((24, 30), np.uint8), "30 x 24 uint8"), (np.zeros(SMALL, np.uint16), "32 x 24 uint16")],
 )
 def test_a_first_frame_of_another_size_or_type_is_refused(driver, open_camera, picture, what) -> None:
-    driver.pictures.put(picture)
+    driver.give(picture)
     with pytest.raises(InputError, match=f"{what}, and 32 x 24 uint8 is asked for"):
         open_camera()
 
 
 def test_a_camera_that_opens_and_gives_nothing_is_refused(driver, open_camera) -> None:
-    driver.pictures.put(None)
+    driver.give(None)
     with pytest.raises(InputError, match=r"video0 gives no picture$"):
         open_camera()
 
 
 def test_the_drivers_time_is_taken_if_it_is_of_this_clock(driver, open_camera) -> None:
-    driver.stamp = time.monotonic()
-    driver.pictures.put(noise(1)[0])
+    driver.stamp = driver.clock.now()
+    driver.give(noise(1)[0])
     opened = open_camera()
     assert opened.take(1, SOON).time[0] == pytest.approx(driver.stamp, abs=1e-9)
 
 
 @pytest.mark.parametrize("ahead", [-3600.0, 5.0])
 def test_a_drivers_time_of_another_clock_is_not_taken(driver, open_camera, ahead) -> None:
-    begun = time.monotonic()
+    begun = driver.clock.now()
     driver.stamp = begun + ahead
-    driver.pictures.put(noise(1)[0])
+    driver.give(noise(1)[0])
     opened = open_camera()
-    assert begun <= opened.take(1, SOON).time[0] <= time.monotonic()
+    assert opened.take(1, SOON).time[0] == begun
 
 
 def test_a_camera_that_is_lost_comes_back(driver, open_camera, caplog) -> None:
     first, second = noise(2)
-    driver.pictures.put(first)
+    driver.give(first)
     opened = open_camera()
     opened.take(1, SOON)
     driver.there = False
-    driver.pictures.put(None)
-    wait_until(lambda: "was lost after 1 frames" in caplog.text)
+    driver.give(None)
+    wait_until(driver.clock, lambda: "was lost after 1 frames" in caplog.text)
     with pytest.raises(HardwareError, match="was lost"):
         opened.take(1, 0.0)
     assert opened.error is None
     driver.there = True
-    driver.pictures.put(second)
+    driver.give(second)
     frames = opened.take(1, SOON)
     np.testing.assert_array_equal(frames.pixels[0], second)
     assert (frames.number.tolist(), frames.dropped) == ([2], 1)
@@ -277,39 +287,37 @@ def test_a_camera_that_is_lost_comes_back(driver, open_camera, caplog) -> None:
     assert ["was lost after 1 frames" in told[0], "is back after" in told[1]] == [True, True]
 
 
-def test_a_camera_that_waits_for_a_trigger_is_not_lost(driver, open_camera, monkeypatch) -> None:
-    monkeypatch.setattr(video, "READ_TIMEOUT", 0.1)
+def test_a_camera_that_waits_for_a_trigger_is_not_lost(driver, open_camera) -> None:
     opened = open_camera(trigger="coolant")
     assert opened.latest == -np.inf
-    time.sleep(0.3)  # what OpenCV waits, without a picture
-    driver.pictures.put(None)
-    driver.pictures.put(noise(1)[0])
+    driver.clock.sleep(2.0)  # what OpenCV waits, without a picture
+    driver.give(None)
+    driver.give(noise(1)[0])
     assert opened.take(1, SOON).number.tolist() == [0]
     assert (driver.opened, opened.counts.reconnects) == (1, 0)
 
 
-def test_a_film_cannot_be_triggered(tmp_path) -> None:
+def test_a_film_cannot_be_triggered(open_camera, tmp_path) -> None:
     write_y4m(tmp_path / "film.y4m", noise(2), 50)
     with pytest.raises(InputError, match=r"film\.y4m cannot be triggered: leave camera\.trigger out$"):
-        VideoCamera(settings(str(tmp_path / "film.y4m"), SMALL, trigger="coolant"))
+        open_camera(tmp_path / "film.y4m", trigger="coolant")
 
 
-def test_the_input_of_a_trigger_is_not_ours_to_set(open_camera) -> None:
+def test_the_input_of_a_trigger_is_not_ours_to_set(driver, open_camera) -> None:
     with pytest.raises(
         InputError, match=r"video0: its input is set by its own tools; leave trigger_input out$"
     ):
         open_camera(trigger="coolant", trigger_input="Line0")
 
 
-def test_a_camera_that_does_not_come_back_is_given_up(driver, open_camera, monkeypatch) -> None:
-    monkeypatch.setattr(reopened, "PATIENCE", 0.3)
-    driver.pictures.put(noise(1)[0])
+def test_a_camera_that_does_not_come_back_is_given_up(driver, open_camera) -> None:
+    driver.give(noise(1)[0])
     opened = open_camera()
     opened.take(1, SOON)
     driver.there = False
-    driver.pictures.put(None)
-    wait_until(lambda: opened.error is not None)
-    with pytest.raises(HardwareError, match=r"was lost, and not back within 0.3 s"):
+    driver.give(None)
+    wait_until(driver.clock, lambda: opened.error is not None)
+    with pytest.raises(HardwareError, match=r"was lost, and not back within 10 s"):
         opened.take(1, SOON)
     assert driver.opened > 2
 
@@ -318,16 +326,16 @@ def feed(driver, opened, pictures) -> None:
     """Let the camera have pictures one by one, each of them taken, after a first."""
     opened.take(1, SOON)
     for picture in pictures:
-        driver.pictures.put(picture)
+        driver.give(picture)
         opened.take(1, SOON)
 
 
 def test_a_camera_that_gives_one_picture_again_and_again_is_lost(driver, open_camera, caplog) -> None:
     pictures = noise(20)
-    driver.pictures.put(pictures[0])
+    driver.give(pictures[0])
     opened = open_camera()
     feed(driver, opened, [*pictures[1:], *[pictures[-1]] * 4])
-    driver.pictures.put(pictures[-1])
+    driver.give(pictures[-1])
     with pytest.raises(HardwareError, match="was lost"):
         opened.take(1, 0.3)
     assert "gives the same picture again and again" in caplog.records[0].getMessage()
@@ -335,7 +343,7 @@ def test_a_camera_that_gives_one_picture_again_and_again_is_lost(driver, open_ca
 
 def test_pictures_without_noise_may_be_alike(driver, open_camera) -> None:
     pictures = noise(20)
-    driver.pictures.put(pictures[0])
+    driver.give(pictures[0])
     opened = open_camera()
     feed(driver, opened, [pictures[0], *pictures[1:], *[pictures[-1]] * 20])
     assert opened.counts.frames == 41
@@ -345,54 +353,46 @@ def write_mjpeg(path, *pictures: np.ndarray) -> None:
     path.write_bytes(b"".join(cv2.imencode(".jpg", picture)[1].tobytes() for picture in pictures))
 
 
-def test_a_stream_that_changes_its_size_is_not_scaled(tmp_path) -> None:
+def test_a_stream_that_changes_its_size_is_not_scaled(open_camera, tmp_path) -> None:
     smooth = cv2.resize(noise(1)[0], (64, 48))
     write_mjpeg(tmp_path / "film.mjpg", *[smooth] * 3, cv2.resize(smooth, (128, 96)))
-    opened = VideoCamera(settings(str(tmp_path / "film.mjpg"), (48, 64)), slots=50)
+    opened = open_camera(tmp_path / "film.mjpg", (48, 64))
     take(opened, 3)
     with pytest.raises(HardwareError, match="128 x 96 uint8, and 64 x 48 uint8 is asked for"):
         opened.take(1, SOON)
-    opened.close()
 
 
-def test_a_jpeg_gives_its_luma(tmp_path) -> None:
+def test_a_jpeg_gives_its_luma(open_camera, tmp_path) -> None:
     colours = cv2.resize(np.random.default_rng(1).integers(0, 255, (6, 8, 3), np.uint8), (64, 48))
     write_mjpeg(tmp_path / "film.mjpg", *[colours] * 2)
-    opened = VideoCamera(settings(str(tmp_path / "film.mjpg"), (48, 64)), slots=50)
+    opened = open_camera(tmp_path / "film.mjpg", (48, 64))
     luma = cv2.cvtColor(colours, cv2.COLOR_BGR2GRAY).astype(int)
     assert np.abs(take(opened, 1)[0][0] - luma).mean() < 3  # what the packing costs
-    opened.close()
 
 
-def test_a_jpeg_that_is_cut_short_is_not_made_up(tmp_path) -> None:
+def test_a_jpeg_that_is_cut_short_is_not_made_up(open_camera, tmp_path) -> None:
     whole = cv2.imencode(".jpg", noise(1, (48, 64))[0])[1].tobytes()
     (tmp_path / "film.mjpg").write_bytes(2 * whole + whole[: len(whole) // 2])
-    opened = VideoCamera(settings(str(tmp_path / "film.mjpg"), (48, 64)), slots=50)
+    opened = open_camera(tmp_path / "film.mjpg", (48, 64))
     take(opened, 2)
     with pytest.raises(HardwareError, match="a picture cannot be decoded"):
         opened.take(1, SOON)
-    opened.close()
 
 
-def test_a_driver_that_hangs_while_it_opens_does_not_hang_us(driver, open_camera, monkeypatch) -> None:
-    monkeypatch.setattr(reopened, "_FIRST_FRAME", 0.2)
-    monkeypatch.setattr(reopened, "_CLOSING", 0.2)
-    driver.begins.clear()
-    begun = time.monotonic()
-    with pytest.raises(InputError, match=r"gave no picture within 0.2 s"):
+def test_a_driver_that_hangs_while_it_opens_does_not_hang_us(driver, open_camera, clock) -> None:
+    driver.begins = clock.event()
+    begun = clock.now()
+    with pytest.raises(InputError, match=r"gave no picture within 7 s"):
         open_camera()
-    assert time.monotonic() - begun < SOON / 2
-    driver.begins.set()
-    driver.pictures.put(None)
+    assert clock.now() - begun == pytest.approx(10.0)  # with 3 s for its end
 
 
-def test_a_driver_that_hangs_does_not_hang_the_closing(driver, open_camera, monkeypatch, caplog) -> None:
-    monkeypatch.setattr(reopened, "_CLOSING", 0.2)
-    driver.pictures.put(noise(1)[0])
+def test_a_driver_that_hangs_does_not_hang_the_closing(driver, open_camera, clock, caplog) -> None:
+    driver.give(noise(1)[0])
     opened = open_camera()
-    begun = time.monotonic()
+    begun = clock.now()
     opened.close()
-    assert time.monotonic() - begun < SOON / 2
+    assert clock.now() - begun == pytest.approx(3.0)
     assert "does not let go" in caplog.text
     with pytest.raises(HardwareError, match="is closed"):
         play_out(opened, SOON)
@@ -474,7 +474,7 @@ def test_the_camera_of_the_documentation_works(monkeypatch) -> None:
     made: dict[str, Any] = {}
     exec(example, made)
     with made["VendorCamera"]("40123456") as opened:
-        wait_until(lambda: opened.error is not None)
+        wait_until(SYSTEM, lambda: opened.error is not None)
         before, after = opened.take(9, SOON), opened.take(9, SOON)
         with pytest.raises(HardwareError, match=r"^camera 40123456 failed: the cable is out$"):
             opened.take(1, SOON)

@@ -7,18 +7,14 @@ import pytest
 import soak
 
 ATTEMPTS = 5  # a machine that is busy with other things may be too late for the emulators
-pytestmark = pytest.mark.real_time
 
 
 @pytest.mark.parametrize("seed", soak.seeds())
 @pytest.mark.parametrize("what", mishaps.INSIDE)
 def test_the_stage_stops_and_what_was_taken_is_kept(what, seed, tmp_path):
     start = time.monotonic()
-    for attempt in range(ATTEMPTS):
-        path = tmp_path / f"cut{attempt}.h5"
-        outcome = mishaps.capture_with(mishaps.INSIDE[what], seed, path)
-        if not outcome.moved_at:
-            break
+    path = tmp_path / "cut.h5"
+    outcome = mishaps.capture_with(what, seed, path)
     state = mishaps.state_of(path)
     assert not outcome.moved_at
     if outcome.happened:
@@ -42,6 +38,7 @@ def served(tmp_path_factory):
         yield rig, file
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("seed", soak.seeds())
 @pytest.mark.parametrize("what", ["SIGKILL", "SIGTERM", "disk full"])
 def test_a_capture_that_ends_leaves_a_recording_that_opens(what, seed, served, tmp_path):

@@ -1,23 +1,24 @@
-"""A controller that speaks as Marlin 2 does, in real time, in the place of a serial port.
+"""A controller that speaks as Marlin 2 does, in the place of a serial port.
 
 Written after the firmware's documentation of its G-codes: lines wait for moves where the firmware's do.
 """
 
 import functools
+import math
 import operator
 import re
-import threading
-import time
+
+from scripted_port import ScriptedPort
 
 _WORDS = re.compile(r"([A-Z])(-?\d+\.?\d*)?")
 
 
-class FakeMarlin:
-    """Goes evenly to where it is sent; `now` gives the coordinates, `log` the lines that it took."""
+class FakeMarlin(ScriptedPort):
+    """Goes evenly to where it is sent; `place` gives the coordinates, `log` the lines that it took."""
 
-    def __init__(self, emergency=True, home=(0.0, 0.0, 0.0), letters="XYZ"):
+    def __init__(self, clock, emergency=True, home=(0.0, 0.0, 0.0), letters="XYZ"):
+        super().__init__(clock)
         self.emergency, self.letters, self.log = emergency, letters, []
-        self.silent = self.closed = self.pulled = False
         self.instead = {}  # a code to what is said instead of its answer
         self.ends = 0.0  # soft limit, below which it clips places; 0 for none
         self.homing = 0.0  # seconds that it takes
@@ -25,88 +26,52 @@ class FakeMarlin:
         self.noise = str  # what becomes of the words on their way
         self._number = 0  # of the last line
         self._home = dict(zip(letters, home, strict=True))
-        self._legs = [(0.0, 0.0, dict.fromkeys(letters, 20.0), dict.fromkeys(letters, 20.0))]
-        self._out, self._lock = bytearray(), threading.Condition()
+        start = dict.fromkeys(letters, 20.0)
+        self._legs = [(clock.now(), 0.0, start, start)]
         self._pending = []  # lines, the first of which may be waiting for the end of a move
         self._free = 0.0  # when that is over
-        self.timeout = 0.02
 
-    # As a port
-
-    @property
-    def in_waiting(self):
-        if self.pulled:
-            raise OSError("no such device")
-        with self._lock:
-            self._work()
-            return len(self._out)
-
-    def read(self, size):
-        until = time.monotonic() + self.timeout
-        while not self.in_waiting and time.monotonic() < until:
-            time.sleep(0.001)
-        with self._lock:
-            data = bytes(self._out[:size])
-            del self._out[:size]
-        return data
-
-    def write(self, data):
-        with self._lock:
-            self._work()
-            for line in self.noise(data.decode()).split("\n"):
-                if line and not self.killed:
-                    self._take(line)
-            self._work()
-
-    def pull(self):
-        self.pulled = True
-
-    def flush(self):
-        pass
-
-    def close(self):
-        self.closed = True
-
-    def say(self, *lines):
-        if not self.silent:
-            self.chat(*lines)
+    def take(self, data):
+        for line in self.noise(data.decode()).split("\n"):
+            if line and not self.killed:
+                self._hear(line)
 
     def chat(self, *lines):
         """Say lines that answer nothing, also while it is silent otherwise."""
-        with self._lock:
-            self._out += "".join(f"{line}\n" for line in lines).encode("latin-1")
+        silent, self.silent = self.silent, False
+        self.say(*lines)
+        self.silent = silent
 
-    # As a machine
-
-    def now(self):
+    def place(self):
         """Return where it is, by letter."""
-        at = time.monotonic()
-        for began, duration, a, b in reversed(self._legs):
-            if at >= began:
-                part = 1.0 if at >= began + duration else (at - began) / duration
-                return {letter: a[letter] + part * (b[letter] - a[letter]) for letter in a}
-        raise AssertionError("before the first")
+        at = self.clock.now()
+        began, duration, a, b = next(leg for leg in reversed(self._legs) if leg[0] <= at)
+        part = 1.0 if at >= began + duration else (at - began) / duration
+        return {letter: a[letter] + part * (b[letter] - a[letter]) for letter in a}
 
     def put(self, value):
         """Move all axes, as by its display."""
-        place = dict.fromkeys(self.letters, value)
-        self._legs.append((time.monotonic(), 0.0, place, place))
+        self._stand(dict.fromkeys(self.letters, value))
 
     @property
     def moving(self):
-        began, duration, _, _ = self._legs[-1]
-        return time.monotonic() < began + duration
+        return self.clock.now() < self._end
 
-    def _take(self, line):
+    @property
+    def _end(self):
+        return self._legs[-1][0] + self._legs[-1][1]
+
+    def _stand(self, place):
+        self._legs.append((self.clock.now(), 0.0, place, place))
+
+    def _hear(self, line):
         if line.startswith("N"):
             text, _, check = line.rpartition("*")
             number, line = text[1:].split(" ", 1)
             right = int(check) == functools.reduce(operator.xor, text.encode())
             if not right or (int(number) != self._number + 1 and not line.startswith("M110")):
-                self.say(
-                    f"Error:{'Line Number' if right else 'checksum mismatch'}, Last Line: {self._number}"
-                )
-                self.say(f"Resend: {self._number + 1}", "ok")
+                what = "Line Number" if right else "checksum mismatch"
+                self.say(f"Error:{what}, Last Line: {self._number}", f"Resend: {self._number + 1}", "ok")
                 return
             self._number = int(number)
         code = line.partition(" ")[0]
@@ -116,22 +81,21 @@ class FakeMarlin:
         self._pending.append(line)
 
     def _halt(self):
-        here = self.now()
-        self._legs.append((time.monotonic(), 0.0, here, here))
+        self._stand(self.place())
         self._free = 0.0
 
-    def _work(self):
-        while self._pending and time.monotonic() >= self._free:
+    def advance(self):
+        while self._pending and self.clock.now() >= self._free:
             line = self._pending[0]
             code = re.match(r"[GM]\d+", line)[0]
-            began, duration, _, last = self._legs[-1]
-            if code in ("M400", "M114") and time.monotonic() < began + duration:
-                self._free = began + duration
-                return
+            if code in ("M400", "M114") and self.moving:
+                self._free = self._end
+                break
             self._pending.pop(0)
             self.log.append(line)
-            for said in [self.instead[code]] if code in self.instead else self._answer(code, line, last):
-                self.say(said)
+            last = self._legs[-1][3]
+            self.say(*([self.instead[code]] if code in self.instead else self._answer(code, line, last)))
+        return max(0.0, self._free - self.clock.now()) if self._pending else math.inf
 
     def _answer(self, code, line, last):
         words = {letter: float(value) for letter, value in _WORDS.findall(line[len(code) :]) if value}
@@ -141,12 +105,11 @@ class FakeMarlin:
                 if self.ends:
                     place = {letter: max(value, self.ends) for letter, value in place.items()}
                 length = sum((place[letter] - last[letter]) ** 2 for letter in last) ** 0.5
-                began, duration, _, _ = self._legs[-1]
-                begins = max(time.monotonic(), began + duration)
+                begins = max(self.clock.now(), self._end)
                 self._legs.append((begins, 60 * length / words["F"], last, place))
             case "G28":
-                self._legs.append((time.monotonic(), self.homing, last, self._home))
-                self._free = time.monotonic() + self.homing
+                self._legs.append((self.clock.now(), self.homing, last, self._home))
+                self._free = self.clock.now() + self.homing
                 self._pending.insert(0, "M400")  # whose ok ends it
                 return ["echo:busy: processing"]
             case "M115":
@@ -156,8 +119,7 @@ class FakeMarlin:
                     "ok",
                 ]
             case "M114":
-                here = self.now()
-                told = " ".join(f"{letter}:{value:.2f}" for letter, value in here.items())
+                told = " ".join(f"{letter}:{value:.2f}" for letter, value in self.place().items())
                 return [f"{told} E:0.00 Count X:0 Y:0 Z:0", "ok"]
             case "M503":
                 return ["echo:  M203 X50.00 Y50.00 Z8.00 E25.00", "echo:  M201 X500 Y500 Z100", "ok"]

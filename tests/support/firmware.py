@@ -19,6 +19,7 @@ import tty
 from collections.abc import Mapping
 from pathlib import Path
 
+from mirrorskin.hw.clock import SYSTEM
 from mirrorskin.io.types import Closing
 
 PROGRAM = os.environ.get("GRBL")
@@ -40,6 +41,8 @@ def is_hal(program: str | None) -> bool:
 
 class Firmware(Closing):
     """A controller that is a process, with the face of `GrblMachine`."""
+
+    clock = SYSTEM
 
     def __init__(self, program: str, folder: Path, settings: Mapping[int, float]) -> None:
         self._ended, self._lock = threading.Event(), threading.Lock()

@@ -1,4 +1,4 @@
-"""Frames for live work, and a source of them on a clock that tests wind."""
+"""Frames for live work, and a source of them on simulated time."""
 
 from __future__ import annotations
 
@@ -10,22 +10,10 @@ from numpy.typing import NDArray
 from suite import scenes
 from suite.live import Paced
 
+from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.io import Block, Header
 
 PIXEL = 0.05
-
-
-class Clock:
-    """Time that passes only when someone sleeps or works."""
-
-    def __init__(self) -> None:
-        self.now = 1000.0
-
-    def __call__(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        self.now += seconds
 
 
 def press_frames(shape: tuple[int, int, int], dtype: str = "uint8") -> NDArray[Any]:
@@ -61,10 +49,9 @@ def paced(
     header: Header,
     places: NDArray[np.float64],
     rate: float = 100.0,
-    clock: Clock | None = None,
+    clock: SimulatedClock | None = None,
     slots: int = 64,
 ) -> Paced:
-    ticks = clock or Clock()
     return Paced(
         frames,
         lambda number: number,
@@ -73,8 +60,7 @@ def paced(
         rate,
         len(frames),
         slots=slots,
-        clock=ticks,
-        sleep=ticks.sleep,
+        clock=clock or SimulatedClock(),
     )
 
 

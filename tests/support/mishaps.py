@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-import os
 import random
-import signal
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable
-from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from msgspec import structs
+from rig_faults import AFTERWARDS, FAULTS, FIRMWARE_ONLY
 
 from mirrorskin import io
+from mirrorskin.hw.clock import SYSTEM, Clock
 from mirrorskin.hw.emulator.rig import EmulatedRig
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.sweep import SweepScan
+from mirrorskin.hw.simulated_clock import SimulatedClock
 
 SOON = 0.2
 """Seconds within which a stage must rest after a mishap."""
@@ -39,9 +36,7 @@ ON_THE_WAY = 0.3
 """Seconds more that a camera may be silent where it does not matter when frames came: 3 times ``stall``."""
 
 _START = 30.0
-_LATEST = 1.5  # seconds after the first move that a mishap comes
-
-Mishap = Callable[[EmulatedRig, int], None]
+_LATEST = 3.0  # seconds after the first move that a mishap comes
 
 
 class Outcome(NamedTuple):
@@ -53,20 +48,13 @@ class Outcome(NamedTuple):
     happened: bool  # whether it came before the capture's end
 
 
-INSIDE: dict[str, Mishap] = {
-    "serial silence": lambda rig, seed: rig.port.silence(),
-    "garbage": lambda rig, seed: rig.port.garble(100_000, seed),
-    "unplugged": lambda rig, seed: rig.port.unplug(),
-    "camera stalls": lambda rig, seed: rig.camera.stall(),
-    "camera lost": lambda rig, seed: rig.camera.lose(),
-    "Ctrl-C": lambda rig, seed: os.kill(os.getpid(), signal.SIGINT),
-}
+INSIDE = [name for name in FAULTS if name not in FIRMWARE_ONLY | AFTERWARDS | {"none"}]
 """What happens within a process."""
 
 
-def make_rig(seed: int, rate: float) -> EmulatedRig:
+def make_rig(seed: int, rate: float, clock: Clock = SYSTEM) -> EmulatedRig:
     """Return an emulated rig with a small picture."""
-    return EmulatedRig("sphere", shape=(120, 160), pixel_size=0.08, rate=rate, seed=seed)
+    return EmulatedRig("sphere", shape=(120, 160), pixel_size=0.08, rate=rate, seed=seed, clock=clock)
 
 
 def make_plan(chance: random.Random) -> Plan:
@@ -76,33 +64,38 @@ def make_plan(chance: random.Random) -> Plan:
     return AxialPlan(1.0, np.radians(2.5), turns=2.0, rate=1.0)
 
 
-def capture_with(mishap: Mishap, seed: int, path: Path) -> Outcome:
-    """Capture, let a mishap come at a random moment in some move, and tell how it ended."""
-    chance, error = random.Random(seed), None
-    with ExitStack() as stack:
-        emulated = stack.enter_context(make_rig(seed, rate=60.0))
-        emulated.camera.take(1, _START)
+def capture_with(fault: str, seed: int, path: Path) -> Outcome:
+    """Capture on simulated time, let a fault come at a random moment of a move, and tell how it ended."""
+    chance, error, clock, came = random.Random(seed), None, SimulatedClock(), list[float]()
+    with make_rig(seed, 60.0, clock) as emulated:
         settings = emulated.settings
         settings = replace(settings, camera=structs.replace(settings.camera, delay=0.0))
-        over = threading.Event()
-        trouble = _Trouble(emulated, mishap, seed, chance.uniform(0, _LATEST), over)
+        delay, over = chance.uniform(0, _LATEST), clock.event()
+
+        def trouble() -> None:
+            while not emulated.machine.moving() and not over.wait(0.001):
+                pass
+            over.wait(delay)
+            while not emulated.machine.moving() and not over.wait(0.001):  # in mid-move
+                pass
+            if not over.is_set():
+                came.append(clock.now())
+                FAULTS[fault][0](emulated)
+
+        thread = clock.thread(trouble, "trouble")
+        thread.start()
         try:
-            with Rig(GrblStage(settings.stage), emulated.camera, settings) as rig:
-                trouble.start()
+            with Rig(emulated.open_stage(settings.stage), emulated.camera, settings, clock) as rig:
                 _drain(rig, make_plan(chance), path)
-                over.set()
         except (HardwareError, io.InputError, KeyboardInterrupt) as caught:
             error = caught
-        ended = time.monotonic()
-        with suppress(KeyboardInterrupt):  # if it came after all was done
-            over.set()
-            trouble.join()
-        happened = trouble.at is not None and trouble.at < ended and error is not None
-        at = trouble.at or ended
-        soon = at + SOON + (ON_THE_WAY if mishap is INSIDE["camera stalls"] else 0)
-        while time.monotonic() < soon:
-            time.sleep(0.01)
-        return Outcome(error, emulated.machine.moving(soon), ended - at, happened)
+        ended = clock.now()
+        over.set()
+        thread.join()
+        at = came[0] if came else ended
+        soon = at + SOON + (ON_THE_WAY if fault == "camera stalls" else 0)
+        clock.sleep(max(0.0, soon - ended))
+        return Outcome(error, emulated.machine.moving(soon), ended - at, bool(came))
 
 
 def _drain(rig: Rig, plan: Plan, path: Path) -> None:
@@ -110,29 +103,6 @@ def _drain(rig: Rig, plan: Plan, path: Path) -> None:
         room = np.empty((8, *recorder.shape[1:]), recorder.dtype)
         while recorder.read(room) is not None:
             pass
-
-
-class _Trouble(threading.Thread):
-    """Waits for a first move, and so many seconds longer; then it happens."""
-
-    def __init__(
-        self, rig: EmulatedRig, mishap: Mishap, seed: int, delay: float, over: threading.Event
-    ) -> None:
-        super().__init__(name="trouble")
-        self.at: float | None = None
-        self._rig, self._mishap, self._seed, self._delay, self._over = rig, mishap, seed, delay, over
-
-    def run(self) -> None:
-        deadline = time.monotonic() + _START
-        while not self._rig.machine.moving() and time.monotonic() < deadline:
-            time.sleep(0.002)
-        if self._over.wait(self._delay):
-            return
-        while not self._rig.machine.moving() and not self._over.is_set():  # in mid-move
-            time.sleep(0.002)
-        if not self._over.is_set():
-            self.at = time.monotonic()
-            self._mishap(self._rig, self._seed)
 
 
 class Child:

@@ -1,10 +1,8 @@
-"""A stage and a camera that do what they are told, in real time, with neither threads nor a twin."""
+"""A stage and a camera that do what they are told, with neither threads nor a twin."""
 
 from __future__ import annotations
 
 import math
-import threading
-import time
 from collections.abc import Callable
 from dataclasses import astuple
 from pathlib import Path
@@ -15,6 +13,7 @@ from mirrorskin.hw.camera import Counts, Frames
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.grbl.moves import Axes
 from mirrorskin.hw.rig.plans import Trapezoid
+from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig_file import (
     CameraSettings,
     RigSettings,
@@ -24,6 +23,7 @@ from mirrorskin.hw.rig_file import (
     TravelAxis,
     TwistAxis,
 )
+from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.hw.stage import Limits, Position, Report
 
 LIMITS = Limits((-5.0, 3.0), 0.1, 2.0, (-1.0, 1.0), (-1.0, 1.0), (-0.5, 0.5))
@@ -57,20 +57,19 @@ class FakeStage:
     axes = Axes(settings().stage, name)
     check_way, check_turns = axes.check_way, axes.check_turns
 
-    def __init__(self, limits=LIMITS, acceleration=100.0, late=0.0, seed=0):
-        self.limits = limits
+    def __init__(self, clock, limits=LIMITS, acceleration=100.0, late=0.0, seed=0):
+        self.clock, self.limits = clock, limits
         self.error = None
         self.stops, self.closed = [], False
         self.moves = []
         self._acceleration = acceleration
         self._late, self._random = late, np.random.default_rng(seed)
-        self._start = time.monotonic()
+        self._start = self.clock.now()
         self._reports = []
-        self._lock = threading.Lock()
         self._legs = [(self._start, None, lambda way: Position(-1.0, 0.0, 0.0))]
 
     def position(self, at=None):
-        at = time.monotonic() if at is None else at
+        at = self.clock.now() if at is None else at
         if self.stops:
             at = min(at, self.stops[0])
         began, path, place = [leg for leg in self._legs if leg[0] <= at or leg is self._legs[0]][-1]
@@ -78,7 +77,7 @@ class FakeStage:
 
     def moving(self):
         began, path, _ = self._legs[-1]
-        return not self.stops and path is not None and time.monotonic() < began + path.duration
+        return not self.stops and path is not None and self.clock.now() < began + path.duration
 
     def move(self, place, speed=None):
         self.follow([place], speed)
@@ -108,32 +107,29 @@ class FakeStage:
 
     def wait(self, timeout=None):
         began, path, _ = self._legs[-1]
-        while path is not None and time.monotonic() < began + path.duration + PERIOD / 2:
-            time.sleep(0.002)
+        while path is not None and self.clock.now() < began + path.duration + PERIOD / 2:
+            self.clock.sleep(0.002)
             if self.error is not None:
                 raise self.error
             if self.stops:
                 raise HardwareError("fake stage was stopped")
-        return Report(time.monotonic(), self.position(), "idle")
+        return Report(self.clock.now(), self.position(), "idle")
 
     def report(self):
         if self.error is not None:
             raise self.error
-        return Report(time.monotonic(), self.position(), "run" if self.moving() else "idle")
+        return Report(self.clock.now(), self.position(), "run" if self.moving() else "idle")
 
     def history(self, since=-math.inf):
-        with self._lock:
-            while (due := self._start + len(self._reports) * PERIOD) < time.monotonic() - 0.002:
-                place = self.position(due)
-                told = due + float(
-                    np.clip(self._late * self._random.standard_normal(), -PERIOD / 3, PERIOD / 3)
-                )
-                rounded = np.round(astuple(place), 6)
-                self._reports.append(Report(told, Position(*map(float, rounded)), "run"))
-            return [report for report in self._reports if since < report.time]
+        while (due := self._start + len(self._reports) * PERIOD) < self.clock.now() - 0.002:
+            place = self.position(due)
+            told = due + float(np.clip(self._late * self._random.standard_normal(), -PERIOD / 3, PERIOD / 3))
+            rounded = np.round(astuple(place), 6)
+            self._reports.append(Report(told, Position(*map(float, rounded)), "run"))
+        return [report for report in self._reports if since < report.time]
 
     def stop(self):
-        self.stops.append(time.monotonic())
+        self.stops.append(self.clock.now())
 
     def close(self):
         self.closed = True
@@ -141,7 +137,7 @@ class FakeStage:
     def _add(self, length, speed, place):
         path = Trapezoid(length, speed, self._acceleration * speed)
         began, last, _ = self._legs[-1]
-        begins = max(time.monotonic() + 0.01, began + (0.0 if last is None else last.duration))
+        begins = max(self.clock.now() + 0.01, began + (0.0 if last is None else last.duration))
         self._legs = [*self._legs, (begins, path, place)]
 
 
@@ -153,6 +149,7 @@ class FakeCamera:
 
     def __init__(
         self,
+        clock,
         where: Callable[[float], Position],
         picture: Callable[[Position], np.ndarray],
         rate=200.0,
@@ -160,11 +157,11 @@ class FakeCamera:
         jitter=0.0,
         seed=0,
     ):
-        self._where, self._picture = where, picture
+        self.clock, self._where, self._picture = clock, where, picture
         self.shape = picture(Position()).shape
         self._rate, self._delay, self._jitter = rate, delay, jitter
         self._random = np.random.default_rng(seed)
-        self._start = time.monotonic()
+        self._start = self.clock.now()
         self._next, self._last, self._dropped = 0, -math.inf, 0
         self._silent = math.inf
         self.reconnects = 0
@@ -177,28 +174,28 @@ class FakeCamera:
 
     @property
     def latest(self):
-        now = min(time.monotonic(), self._silent)
+        now = min(self.clock.now(), self._silent)
         return self._start + math.floor((now - self._start) * self._rate) / self._rate
 
     def stall(self):
-        self._silent = time.monotonic()
+        self._silent = self.clock.now()
 
     def lose(self):
         self.error = HardwareError("fake camera was lost: look at its cable")
         self.stall()
 
     def flush(self):
-        self._next = max(self._next, math.ceil((time.monotonic() - self._start - self._delay) * self._rate))
+        self._next = max(self._next, math.ceil((self.clock.now() - self._start - self._delay) * self._rate))
 
     def take(self, most, timeout):
         if self.error is not None:
             raise self.error
-        until = time.monotonic() + timeout
+        until = self.clock.now() + timeout
         due = self._start + self._next / self._rate + self._delay
-        while time.monotonic() < min(due + 4 * self._jitter, until):
-            time.sleep(0.001)
-        count = math.floor((min(time.monotonic(), self._silent) - due) * self._rate) + 1
+        self.clock.sleep(max(0.0, min(due + 4 * self._jitter, until) - self.clock.now()))
+        count = math.floor((min(self.clock.now(), self._silent) - due) * self._rate + 1e-6) + 1
         if count < 1:
+            self.clock.sleep(max(0.0, until - self.clock.now()))
             raise HardwareError("fake camera: no frame")
         number = np.arange(self._next, self._next + min(most, count))
         self._next += len(number)
@@ -211,6 +208,14 @@ class FakeCamera:
 
     def close(self):
         self.closed = True
+
+
+def fake_rig(picture, clock=None, *, late=0.0, seed=0, delay=0.0, told=None, **camera):
+    """Open a rig of both on a simulated clock; what its file says of the camera is `told`."""
+    clock = clock or SimulatedClock()
+    stage = FakeStage(clock, late=late, seed=seed)
+    eye = FakeCamera(clock, stage.position, picture, delay=delay, seed=seed, **camera)
+    return Rig(stage, eye, settings(eye.shape, **{"delay": delay, **(told or {})}), clock)
 
 
 def spreading(shape=(32, 32), steepness=0.05):

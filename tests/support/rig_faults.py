@@ -1,7 +1,7 @@
 """What goes wrong on a rig while it captures, and how that ends; run, it prints a table.
 
-``python tests/support/rig_faults.py [PROGRAM ...]`` has every fault on the emulated controller, and on each
-real firmware whose program is given.
+``python tests/support/rig_faults.py [PROGRAM ...]`` has every fault on the emulated controller, on simulated
+time, and on each real firmware whose program is given.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import signal
 import sys
 import tempfile
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -25,12 +24,13 @@ from firmware import Firmware, is_hal
 from msgspec import structs
 
 from mirrorskin import io
+from mirrorskin.hw.clock import SYSTEM
 from mirrorskin.hw.emulator.rig import MACHINE, EmulatedRig
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.hw.rig.plans import VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.sweep import SweepScan
+from mirrorskin.hw.simulated_clock import SimulatedClock
 
 LATE = 5.0
 """Seconds after which everybody must have been told."""
@@ -46,6 +46,9 @@ def _says(words: bytes) -> Callable[[EmulatedRig], None]:
 
 
 def _interrupt(emulated: EmulatedRig) -> None:
+    if isinstance(emulated.clock, SimulatedClock):
+        emulated.clock.interrupt()
+        return
     os.kill(os.getpid(), signal.SIGINT)
     threading.Event().wait(LATE)
 
@@ -77,6 +80,9 @@ FIRMWARE_ONLY = {
     "G10 by another program",
 }
 """What the emulator does not know."""
+
+AFTERWARDS = {"move by another program"}
+"""Those that end with what was under way: nothing asked the stage to stop before."""
 
 SETTINGS: dict[str, tuple[dict[int, float], str]] = {
     "reports in inches ($13=1)": ({13: 1}, "set $13=0"),
@@ -114,12 +120,15 @@ class TooBusyError(Exception):
 def _rig(controller: str, folder: Path, changed: Mapping[int, float]) -> Iterator[EmulatedRig]:
     """Run the twin on the "emulator", or on a firmware's program, with some settings changed."""
     with ExitStack() as stack:
-        machine = None
+        machine, clock = None, SYSTEM
         if controller == "emulator":
             assert not changed
+            clock = SimulatedClock()
         else:
             machine = stack.enter_context(Firmware(controller, folder, {**MACHINE, 20: 0, 22: 0, **changed}))
-        emulated = EmulatedRig(shape=_SHAPE, pixel_size=0.2, rate=50.0, delay=0.01, machine=machine)
+        emulated = EmulatedRig(
+            shape=_SHAPE, pixel_size=0.2, rate=50.0, delay=0.01, machine=machine, clock=clock
+        )
         stack.enter_context(emulated).camera.take(1, 30.0)
         yield emulated
 
@@ -129,37 +138,38 @@ def capture(
 ) -> Ending:
     """Press slowly on the "emulator" or a firmware's program, and have a fault after some frames.
 
-    Emulators that are late, where other programs have the processors, are borne if the fault is another.
+    A firmware that is late, where other programs have the processors, is borne if the fault is another.
     """
     at, error, path = None, None, folder / "cut.h5"
     with _rig(controller, folder, changed) as emulated:
-        settings = emulated.settings
+        settings, clock = emulated.settings, emulated.clock
         stage = structs.replace(settings.stage, travel=structs.replace(settings.stage.travel, steps=_STEPS))
         if controller == "emulator":
             stage = settings.stage
         camera = structs.replace(settings.camera, delay=0.01, dark=16.0)
-        if not fault.startswith("camera"):
+        if controller != "emulator" and not fault.startswith("camera"):
             camera = structs.replace(camera, stall=LATE)
-        if fault not in _SILENT:
+        if controller != "emulator" and fault not in _SILENT:
             stage = structs.replace(stage, silence=LATE)
         try:
-            with Rig(GrblStage(stage), emulated.camera, replace(settings, camera=camera, stage=stage)) as rig:
+            told = replace(settings, camera=camera, stage=stage)
+            with Rig(emulated.open_stage(stage), emulated.camera, told, clock) as rig:
                 scan = SweepScan(rig, VerticalPlan(0.0, 3.0, speed=0.6))
                 with io.StreamRecorder(scan, path) as recorder:
                     room = np.empty((4, *scan.shape[1:]), scan.dtype)
                     while recorder.read(room) is not None:
                         if at is None and recorder.count > 8:
-                            at = time.monotonic()
+                            at = clock.now()
                             FAULTS[fault][0](emulated)
         except (HardwareError, io.InputError, KeyboardInterrupt) as caught:
             error = caught
-        told = time.monotonic()
+        told = clock.now()
         if changed and at is None:
             return Ending(error, 0.0, 0.0, 0, "")
         if at is None:
             raise TooBusyError(str(error))
-        time.sleep(0.3)
-        moved = [one - at for one in np.arange(at, time.monotonic(), 0.01) if emulated.machine.moving(one)]
+        clock.sleep(0.3)
+        moved = [one - at for one in np.arange(at, clock.now(), 0.01) if emulated.machine.moving(one)]
     with io.open_recording(path) as recording:
         count, state = recording.shape[0], recording.state
     return Ending(error, max(moved, default=0.0), told - at, count, state)

@@ -1,32 +1,17 @@
-"""A GRBL controller in memory: crude motion in real time, a log of all it was sent, and faults."""
+"""A GRBL controller in memory: crude motion, a log of all it was sent, and faults."""
 
 from __future__ import annotations
 
 import math
 import re
-import threading
-import time
 
-import serial
+from scripted_port import ScriptedPort
 
-from mirrorskin.hw.grbl.report_times import SLICE
 from mirrorskin.hw.rig_file import StageSettings, TiltAxis, TravelAxis
 
 SLOTS = 4
-SETTINGS = {
-    13: 0,
-    20: 1,
-    21: 0,
-    22: 0,
-    110: 6000,
-    111: 6000,
-    112: 6000,
-    25: 3000,
-    130: 100,
-    131: 100,
-    132: 100,
-}
-FULL = 256
+SETTINGS = {13: 0, 20: 1, 21: 0, 22: 0, 25: 3000} | dict.fromkeys((110, 111, 112), 6000)
+SETTINGS |= dict.fromkeys((130, 131, 132), 100)
 
 
 def stage_settings(**changes):
@@ -35,8 +20,7 @@ def stage_settings(**changes):
         "port": "in memory",
         "baud": 115200,
         "home": False,
-        "timeout": 30.0,
-        "silence": 5.0,  # for a busy machine
+        "timeout": 2.0,
         "report_rate": 100.0,
         "travel": TravelAxis(letter="Z", direction=-1, zero=10.0, limits=(-5.0, 6.0), speed=20.0),
         "pitch": TiltAxis(letter="X", zero=30.0, limits=(-5.0, 5.0), speed=100.0),
@@ -47,10 +31,11 @@ def stage_settings(**changes):
     return StageSettings(**(given | changes))
 
 
-class ScriptedGrbl:
-    """Stands in for an open serial port, with the controller behind it."""
+class ScriptedGrbl(ScriptedPort):
+    """An open serial port with the controller behind it."""
 
-    def __init__(self, place=(30.0, 40.0, 10.0), offset=(1.0, 2.0, 3.0), settings=(), **behaviour):
+    def __init__(self, clock, place=(30.0, 40.0, 10.0), offset=(1.0, 2.0, 3.0), settings=(), **behaviour):
+        super().__init__(clock)
         self.place, self.offset = list(place), list(offset)
         self.settings = SETTINGS | dict(settings)
         self.work = behaviour.get("work", False)  # reports work coordinates
@@ -59,89 +44,75 @@ class ScriptedGrbl:
         self.answers = dict(behaviour.get("answers", {}))  # a line to what it is answered instead
         self.state = behaviour.get("state", "Idle")
         self.pins = behaviour.get("pins", "")  # switches that are pressed
-        self.lines, self.bytes, self.fill = [], bytearray(), 0
-        self.silent = self.gone = self.closed = False
+        self.lines, self.fill = [], 0
         self.on_move = None
-        self._rest, self._buffer, self._plan, self._reports = "", [], [], 0
-        self._out, self._last, self._feed = bytearray(), time.monotonic(), 1.0
-        self._lock = threading.RLock()
+        self.plan = []  # moves: where to, and how many seconds are left
+        self._rest, self._buffer, self._reports = "", [], 0
+        self._last, self._feed = clock.now(), 1.0
         self.held_at = self.reset_at = None
 
-    # The port
-
-    @property
-    def in_waiting(self):
-        self._present()
-        with self._lock:
-            return len(self._out)
-
-    def read(self, size=1):
-        end = time.monotonic() + SLICE
-        while time.monotonic() < end:
-            self._present()
-            with self._lock:
-                self._advance()
-                if self._out:
-                    data = bytes(self._out[:size])
-                    del self._out[:size]
-                    return data
-            time.sleep(0.002)
-        return b""
-
-    def write(self, data):
-        self._present()
-        with self._lock:
-            self._advance()
-            for byte in data.decode("latin1"):
-                self.bytes += byte.encode("latin1")
-                {"?": self._tell, "!": self._hold, "\x18": self.reset}.get(
-                    byte, lambda b=byte: self._take(b)
-                )()
-            self._advance()
-        return len(data)
-
-    def close(self):
-        self.closed = True
-
-    def _present(self):
-        if self.gone:
-            raise serial.SerialException("device reports readiness to read but returned no data")
-        if self.closed:
-            raise TypeError("an integer is required")
-
-    # The controller
-
-    def say(self, text):
-        self.inject(text.encode() + b"\r\n")
-
-    def inject(self, data):
-        with self._lock:
-            if not self.silent:
-                self._out += data
+    def take(self, data):
+        for byte in data.decode("latin1"):
+            {"?": self._tell, "!": self.hold, "\x18": self.reset}.get(byte, lambda b=byte: self._hear(b))()
 
     def moving(self):
-        with self._lock:
-            return self.state == "Run"
+        return self.state == "Run"
 
     def reset(self):
-        self.reset_at = self.reset_at or time.monotonic()
+        self.reset_at = self.reset_at or self.clock.now()
         lost = self.state == "Run"
-        self._rest, self._buffer, self._plan, self._reports = "", [], [], 0
-        self.say(f"\r\nGrbl {self.version} ['$' for help]")
-        if lost:
-            self.say("ALARM:3")
+        self._rest, self._buffer, self.plan, self._reports = "", [], [], 0
+        self.say("", f"Grbl {self.version} ['$' for help]", *["ALARM:3"] * lost)
         self.state = "Alarm" if lost else "Idle"
 
     def alarm(self, code):
-        with self._lock:
-            self._plan.clear()
-            self.state = "Alarm"
-            self.say(f"ALARM:{code}")
+        self.plan.clear()
+        self.state = "Alarm"
+        self.say(f"ALARM:{code}")
 
-    def _hold(self):
-        self.held_at = self.held_at or time.monotonic()
+    def hold(self):
+        self.held_at = self.held_at or self.clock.now()
         if self.state in ("Run", "Idle"):
             self.state = "Hold:0"
+
+    def advance(self):
+        now = self.clock.now()
+        left, self._last = now - self._last, now
+        while self.plan and left > 0 and self.state in ("Idle", "Run"):
+            self.state = "Run"
+            target, duration = self.plan[0]
+            part = min(left, duration)
+            left -= part
+            for k in range(3):
+                self.place[k] += (target[k] - self.place[k]) * (part / duration if duration else 1)
+            self.plan[0] = target, duration - part
+            if duration - part <= 1e-9:
+                self.plan.pop(0)
+        if not self.plan and self.state == "Run":
+            self.state = "Idle"
+        while self._buffer and len(self.plan) < SLOTS and not self.state.startswith("Hold"):
+            line = self._buffer.pop(0)
+            self.lines.append(line)
+            self.run(line)
+        return self.plan[0][1] if self.plan and self.moving() else math.inf
+
+    def run(self, line):
+        """Answer a line."""
+        if line in self.answers:
+            self.say(self.answers[line])
+            return
+        if line == "$$":
+            self.say(*(f"${number}={value}" for number, value in self.settings.items()))
+        elif line == "$I":
+            self.say(f"[VER:{self.version}.20190825:]", f"[OPT:V,15,{self.size}]")
+        elif line in ("$X", "$H"):
+            self.state = "Idle"
+        elif self.state == "Alarm":
+            self.say("error:9")
+            return
+        elif re.match(r"(G53)?G[123](?!\d)", line):
+            self._move(line)
+        self.say("ok")
 
     def _tell(self):
         at = [p - o for p, o in zip(self.place, self.offset, strict=True)] if self.work else self.place
@@ -152,7 +123,7 @@ class ScriptedGrbl:
             text += f"|WCO:{_numbers(self.offset)}"
         self.say(text + ">")
 
-    def _take(self, byte):
+    def _hear(self, byte):
         if byte != "\n":
             self._rest += byte
         else:
@@ -160,56 +131,16 @@ class ScriptedGrbl:
             self._rest = ""
         self.fill = max(self.fill, sum(len(line) + 1 for line in self._buffer) + len(self._rest))
 
-    def _advance(self):
-        now = time.monotonic()
-        left = now - self._last
-        self._last = now
-        while self._plan and left > 0 and self.state in ("Idle", "Run"):
-            self.state = "Run"
-            target, duration = self._plan[0]
-            part = min(left, duration)
-            left -= part
-            for k in range(3):
-                self.place[k] += (target[k] - self.place[k]) * (part / duration if duration else 1)
-            self._plan[0] = target, duration - part
-            if duration - part <= 1e-9:
-                self._plan.pop(0)
-        if not self._plan and self.state == "Run":
-            self.state = "Idle"
-        while self._buffer and len(self._plan) < SLOTS and not self.state.startswith("Hold"):
-            line = self._buffer.pop(0)
-            self.lines.append(line)
-            self._run(line)
-
-    def _run(self, line):
-        if line in self.answers:
-            self.say(self.answers[line])
-            return
-        if line == "$$":
-            for number, value in self.settings.items():
-                self.say(f"${number}={value}")
-        elif line == "$I":
-            self.say(f"[VER:{self.version}.20190825:]")
-            self.say(f"[OPT:V,15,{self.size}]")
-        elif line in ("$X", "$H"):
-            self.state = "Idle"
-        elif self.state == "Alarm":
-            self.say("error:9")
-            return
-        elif re.match(r"(G53)?G[123](?!\d)", line):
-            self._move(line)
-        self.say("ok")
-
     def _move(self, line):
         words = {word[0]: float(word[1:]) for word in re.findall(r"[A-Z]-?[\d.]+", line)}
         self._feed = words.get("F", self._feed)
-        start = self._plan[-1][0] if self._plan else self.place
+        start = self.plan[-1][0] if self.plan else self.place
         offset = (0.0, 0.0, 0.0) if line.startswith("G53") else self.offset
         target = [words.get(x, start[k] - offset[k]) + offset[k] for k, x in enumerate("XYZ")]
         length = math.dist(start, target)
         if "I" in words:
             length = math.pi * math.hypot(words["I"], words["J"])
-        self._plan.append((target, max(length / self._feed * 60, 1e-6)))
+        self.plan.append((target, max(length / self._feed * 60, 1e-6)))
         self.state = "Run"
         if self.on_move:
             self.on_move()

@@ -9,12 +9,14 @@ from __future__ import annotations
 import re
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 from firmware import Firmware
+
+from mirrorskin.hw.clock import SYSTEM, Clock
+from mirrorskin.hw.emulator.port import GrblMachine
 
 SETTINGS = {20: 0, 22: 0} | {
     base + axis: value for base, value in ((100, 250.0), (110, 1200.0), (120, 200.0)) for axis in range(3)
@@ -44,23 +46,21 @@ class Exchange(NamedTuple):
     seconds: float
 
 
-def play(
-    machine: Firmware, now: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep
-) -> Iterator[Exchange]:
+def play(machine: Firmware | GrblMachine, clock: Clock = SYSTEM) -> Iterator[Exchange]:
     """Send the requests, each when the one before is done with."""
-    listen(machine, now, sleep, lambda lines, quiet: quiet > _QUIET)
+    listen(machine, clock, lambda lines, quiet: quiet > _QUIET)
     for request in REQUESTS:
-        began = now()
+        began = clock.now()
         if request == REST:
             said: list[str] = []
             while not said or not re.match("<(Idle|Hold:0)", said[-1]):
-                sleep(_POLL)
+                clock.sleep(_POLL)
                 machine.receive(b"?")
-                said = listen(machine, now, sleep, lambda lines, _: bool(lines))
-            yield Exchange(request, said[-1:], now() - began)
+                said = listen(machine, clock, lambda lines, _: bool(lines))
+            yield Exchange(request, said[-1:], clock.now() - began)
             continue
         if request == WAIT:
-            sleep(_QUIET)
+            clock.sleep(_QUIET)
             yield Exchange(request, [], _QUIET)
             continue
         machine.receive(_BYTES.get(request) or (b"?" if request == "?" else f"{request}\n".encode()))
@@ -68,30 +68,28 @@ def play(
             last = "Grbl" if request == RESET else ""
             said = listen(
                 machine,
-                now,
-                sleep,
+                clock,
                 lambda lines, quiet, last=last: quiet > _QUIET and last in " ".join(lines),
             )
         elif request == "?":
-            said = listen(machine, now, sleep, lambda lines, _: bool(lines))
+            said = listen(machine, clock, lambda lines, _: bool(lines))
         else:
-            said = listen(machine, now, sleep, lambda lines, _: re.match("ok|error", (lines or [""])[-1]))
-        yield Exchange(request, said, now() - began)
+            said = listen(machine, clock, lambda lines, _: re.match("ok|error", (lines or [""])[-1]))
+        yield Exchange(request, said, clock.now() - began)
 
 
 def listen(
-    machine: Firmware,
-    now: Callable[[], float],
-    sleep: Callable[[float], None],
+    machine: Firmware | GrblMachine,
+    clock: Clock,
     done: Callable[[list[str], float], object],
 ) -> list[str]:
     """Return the lines that it says until that is all."""
-    heard, since, end = "", now(), now() + _LONGEST
-    while not done([line for line in heard.split("\r\n")[:-1] if line], now() - since):
-        assert now() < end, heard
-        sleep(0.002)
+    heard, since, end = "", clock.now(), clock.now() + _LONGEST
+    while not done([line for line in heard.split("\r\n")[:-1] if line], clock.now() - since):
+        assert clock.now() < end, heard
+        clock.sleep(0.002)
         if more := machine.take().decode():
-            heard, since = heard + more, now()
+            heard, since = heard + more, clock.now()
     return [line for line in heard.split("\r\n")[:-1] if line]
 
 

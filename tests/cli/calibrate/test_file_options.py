@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from calibrations import a_calibration, assert_same
 from commands import done, refused
-from rig_fakes import FakeCamera, FakeStage, settings, spreading
+from rig_fakes import fake_rig, settings, spreading
 from rotations import TILT, Setup, between, direction, expose
 from stacks import MadeUp, record
 
@@ -165,16 +165,12 @@ def test_the_calibration_is_not_overwritten():
 
 
 @pytest.fixture
-def fake(monkeypatch):
+def fake(clock, monkeypatch):
     """A rig whose file is read and which is opened without hardware; its own references are wrong."""
     known = {"pixel_size": (0.05, 0.05), "delay": 0.0, "rate": 60.0, "name": "left", "bright": 255.0}
 
-    def opened(told, in_steps=False):
-        stage = FakeStage()
-        return rig.Rig(stage, FakeCamera(stage.position, spreading(SHAPE), rate=60.0), told)
-
     monkeypatch.setattr(file, "load_rig", lambda path: settings(SHAPE, **known))
-    monkeypatch.setattr(rig, "open_rig", opened)
+    monkeypatch.setattr(rig, "open_rig", lambda *_: fake_rig(spreading(SHAPE), clock, rate=60.0, told=known))
     Path("rig.toml").touch()
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from commands import done, run
 from reference_frames import expose, source
-from served_rig import served_rig
+from simulated import simulated_rig
 from stacks import record
 
 from mirrorskin import io
@@ -22,7 +22,7 @@ SHAPE = (12, 16)
 @pytest.fixture(scope="module")
 def rig_file(tmp_path_factory):
     """The rig's file; its emulators run as long as the tests of this module."""
-    with served_rig(tmp_path_factory.mktemp("rig"), SHAPE, rate=60.0, delay=0.01) as served:
+    with simulated_rig(tmp_path_factory.mktemp("rig"), SHAPE, rate=60.0, delay=0.01) as served:
         yield served[1]
 
 
