@@ -314,7 +314,8 @@ def fit(
     Parameters
     ----------
     residuals : function
-        Returns the residuals, (n,), for parameters, (k,).
+        Returns the residuals, (n,), for parameters, (k,). It must not change while the fit is used, because
+        derivatives are computed when they are needed.
     start : array_like, (k,)
     jacobian : function, optional
         Returns the residuals' derivatives, (n, k); by default forward differences.
