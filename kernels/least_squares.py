@@ -194,15 +194,16 @@ def _step(
     """Return the step within the bounds; parameters are scaled to a curvature of 1."""
     scale = _scale(matrix)
     scaled = matrix * np.outer(scale, scale) + _RIDGE * np.eye(len(matrix))
-    if bounds is None:
-        return np.asarray(solve(scaled, right * scale) * scale)
-    from scipy.optimize import lsq_linear
+    step: Doubles = solve(scaled, right * scale)
+    if bounds is not None:
+        low, high = ((bound - parameters) / scale for bound in bounds)
+        if np.any((step < low) | (step > high)):
+            from scipy.optimize import lsq_linear
 
-    root = np.linalg.cholesky(scaled)
-    low, high = ((bound - parameters) / scale for bound in bounds)
-    low, high = np.minimum(low, -_RIDGE), np.maximum(high, _RIDGE)
-    step = lsq_linear(root.T, np.linalg.solve(root, right * scale), (low, high), method="bvls").x
-    return np.asarray(np.clip(step, low, high) * scale)
+            root = np.linalg.cholesky(scaled)
+            limits = np.minimum(low, -_RIDGE), np.maximum(high, _RIDGE)
+            step = lsq_linear(root.T, np.linalg.solve(root, right * scale), limits, method="bvls").x
+    return np.asarray(step * scale)
 
 
 def inverse(matrix: Doubles) -> Doubles:
@@ -313,7 +314,8 @@ def fit(
     Parameters
     ----------
     residuals : function
-        Returns the residuals, (n,), for parameters, (k,).
+        Returns the residuals, (n,), for parameters, (k,). It must not change while the fit is used, because
+        derivatives are computed when they are needed.
     start : array_like, (k,)
     jacobian : function, optional
         Returns the residuals' derivatives, (n, k); by default forward differences.

@@ -272,11 +272,10 @@ def _fit(model: _Model, start: Doubles, scale: Doubles, rounds: int) -> _Fit:
         found = least_squares.fit(
             functools.partial(model.residuals, start=start), parameters, noise=error, loss=_LOSS
         )
-        parameters = found.parameters
+        covariance, parameters = found.covariance(), found.parameters.copy()
+        spread = np.einsum("nk,kl,nl->n", found.jacobian, covariance, found.jacobian)
         if parameters[0] < 0:  # the same lean with a positive tilt
             parameters[:2] = -parameters[0], parameters[1] + math.pi
-        covariance = found.covariance()
-        spread = np.einsum("nk,kl,nl->n", found.jacobian, covariance, found.jacobian)
         freedom = (1 - found.information * spread)[: len(kinds)]
         residuals = model.residuals(parameters, start)[: len(kinds)]
         before, scale = scale, _scales(residuals, freedom, kinds, scale)

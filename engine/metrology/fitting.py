@@ -28,6 +28,7 @@ Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 _Frame = tuple[Doubles, Doubles]
 
+_DAMPING = 1e-9  # of the first step: forms are nearly linear in their parameters
 _CONVERGED = 1e-12  # largest relative decrease of the sum of squares by the last step
 _SINGULAR = 1e-14  # smallest eigenvalue of normal equations with columns of length 1
 _FAR = 5.0  # standard deviations, estimated from the median distance, beyond which points are outliers
@@ -204,6 +205,7 @@ def _minimise(
     found = least_squares.descend(
         functools.partial(_Sums, form, points, weight),
         parameters,
+        damping=least_squares.Damping(first=_DAMPING),
         tolerance=_CONVERGED,
         rounding=rounding**2 * weight.size,
     )
