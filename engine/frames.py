@@ -96,10 +96,14 @@ def noise_of_residual(residual: NDArray[Any], freedom: ArrayLike) -> float:
     The residuals have n degrees of freedom each, scalar or a map. Their median is that of sqrt(chi^2 / n), in
     the approximation of Wilson and Hilferty (PNAS 17, 1931).
     """
-    degrees = np.broadcast_to(np.asarray(freedom, np.float64), residual.shape)
+    degrees = np.asarray(freedom)
     known = (degrees > 0) & np.isfinite(residual)
-    ratio = (1 - 2 / (9 * degrees[known])) ** 1.5
-    return float(np.median(residual[known] / ratio)) if known.any() else float("nan")
+    if not known.any():
+        return math.nan
+    if degrees.ndim:
+        degrees = degrees[known]
+    ratio = (1 - 2 / (9 * np.maximum(degrees, 1).astype(residual.dtype))) ** 1.5
+    return float(np.median(residual[known] / ratio))
 
 
 def reference_maps(

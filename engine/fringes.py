@@ -112,18 +112,20 @@ class Fringes(Operation):
                 raise InputError(
                     "3 frames leave no residual to estimate the noise from: specify noise, counts"
                 )
-            strong = modulation >= np.nanmedian(modulation)
+            strong = modulation >= np.median(modulation[np.isfinite(modulation)])
             noise = np.asarray(noise_of_residual(fit.residual[strong], freedom))
         else:
             noise = self._noise
         matrix = fit_matrix(self.pushed("phase")[used], weights[used])
-        (cc, cs), (_, ss) = (matrix @ (matrix / weights[used]).T)[1:, 1:]
-        cosine, sine = np.cos(phase, dtype=np.float64), np.sin(phase, dtype=np.float64)
-        spread = noise * np.sqrt(cc * sine**2 - 2 * cs * sine * cosine + ss * cosine**2)
-        still = modulation == 0
+        (cc, cs), (_, ss) = ((matrix @ (matrix / weights[used]).T)[1:, 1:]).tolist()
+        # sin p = sine / modulation, and so for the cosine; without modulation there is no error bound.
+        variance = (cc * fit.sine - 2 * cs * fit.cosine) * fit.sine + ss * fit.cosine * fit.cosine
+        square = modulation * modulation
+        spread = np.full(square.shape, np.inf, np.float32)
+        np.divide(noise.astype(np.float32) * np.sqrt(variance), square, out=spread, where=square != 0)
         maps = {
             "phase": phase,
-            "phase_sigma": np.where(still, np.inf, spread / np.where(still, 1, modulation)),
+            "phase_sigma": spread,
             "mean": fit.mean,
             "modulation": modulation,
             "residual": fit.residual,

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 Doubles = NDArray[np.float64]
 
-_LEAST_PIVOT = 1e-3  # relative pivot of the lamps' directions below which they count as coplanar
-
 
 class PhotometricStereo(Operation):
     """Normals and albedo of a matt surface under one distant lamp after the other (Woodham 1980).
@@ -116,7 +114,8 @@ class PhotometricStereo(Operation):
         darks = _map("dark", 0.0 if self.dark is None else self.dark, shape)
         self._darks, self._dark_step = self.device.given("darks", darks.ravel()), int(darks.ndim > 0)
         self._add = self.device.kernel("lambert", "lambert_add", FRAME=C_TYPES[dtype.name])
-        self._triangle = self.device.array("triangle", (11, *shape), np.float32)
+        self._solve = self.device.kernel("lambert", "lambert_normals", FRAME=C_TYPES[dtype.name])
+        self._triangle = self.device.array("triangle", (11, *shape), np.float32, zeroed=False)
 
     def clear(self) -> None:
         """Do nothing: the first frame overwrites the sums."""
@@ -151,35 +150,20 @@ class PhotometricStereo(Operation):
 
     def result(self) -> dict[str, Any]:
         """Return normals and albedo of the frames so far."""
-        triangle = self._triangle.download().astype(np.float64)
-        r00, r01, r02, r03, r11, r12, r13, r22, r23, rest, used = triangle
-        freedom = used - 3
-        size = np.sqrt(r00**2 + r01**2 + r02**2 + r11**2 + r12**2 + r22**2)
-        determined = np.minimum(np.minimum(r00, r11), r22) > _LEAST_PIVOT * size
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            residual = np.sqrt(rest / np.where(freedom > 0, freedom, np.nan))
-            # The triangle's inverse, whose product with its transpose is the covariance for noise 1.
-            a, d, f = 1 / r00, 1 / r11, 1 / r22
-            b, e = -r01 * a * d, -r12 * d * f
-            c = -(r01 * e + r02 * f) * a
-            vector = np.stack([a * r03 + b * r13 + c * r23, d * r13 + e * r23, f * r23], axis=-1)
-            albedo = np.linalg.norm(vector, axis=-1)
-            normals = vector / albedo[..., None]
-            x, y, z = np.moveaxis(normals, -1, 0)
-            radial = (a * x) ** 2 + (b * x + d * y) ** 2 + (c * x + e * y + f * z) ** 2
-            whole = a**2 + b**2 + c**2 + d**2 + e**2 + f**2
-            noise = noise_of_residual(residual, freedom) if self._noise is None else self._noise
-            normals_sigma, albedo_sigma = noise * np.sqrt(whole - radial) / albedo, noise * np.sqrt(radial)
-        answered = determined & np.isfinite(albedo) & (albedo > 0)
-        normals[~answered] = normals_sigma[~answered] = albedo[~answered] = albedo_sigma[~answered] = np.nan
-        maps = {
-            "normals": normals,
-            "normals_sigma": normals_sigma,
-            "albedo": albedo,
-            "albedo_sigma": albedo_sigma,
-            "residual": residual,
-            "samples": used,
-        }
+        names = ("normals_spread", "albedo", "albedo_spread", "residual")
+        arrays = {name: self.device.array(name, self.shape, np.float32, zeroed=False) for name in names}
+        arrays["normals"] = self.device.array("normals", (*self.shape, 3), np.float32, zeroed=False)
+        arrays["samples"] = self.device.array("samples", self.shape, np.int32, zeroed=False)
+        pixels, moved = self.shape[0] * self.shape[1], sum(array.nbytes for array in arrays.values())
+        self._solve(
+            -(-pixels // self.device.layout.tile), pixels=pixels, triangle=self._triangle, **arrays,
+            moved=moved + self._triangle.nbytes,
+        )  # fmt: skip
+        maps = {name: array.detach() for name, array in arrays.items()}
+        residual, samples = maps["residual"], maps["samples"]
+        noise = noise_of_residual(residual, samples - 3) if self._noise is None else self._noise
+        for name in ("normals", "albedo"):
+            maps[f"{name}_sigma"] = maps.pop(f"{name}_spread") * np.float32(noise)
         return maps if np.ndim(noise) or np.isnan(noise) else maps | {"noise": float(noise)}
 
     def finish(self) -> Result:

@@ -51,3 +51,37 @@ __kernel void lambert_add(
             R(10) += seen;
         }
 }
+
+#define LEAST_PIVOT 1e-3f
+
+__kernel void lambert_normals(
+    const int pixels, MAP triangle, OUT normals, OUT normals_spread, OUT albedo, OUT albedo_spread, OUT residual,
+    __global int *restrict samples)
+{
+    const int low = get_global_id(0) * TILE, end = min(pixels, low + TILE);
+    const size_t plane = pixels;
+    for (int p = low; p < end; ++p) {
+        const float r00 = R(0), r01 = R(1), r02 = R(2), r11 = R(4), r12 = R(5), r22 = R(7), freedom = R(10) - 3;
+        const float size = sqrt(r00 * r00 + r01 * r01 + r02 * r02 + r11 * r11 + r12 * r12 + r22 * r22);
+        // The triangle's inverse, whose product with its transpose is the covariance for noise 1.
+        const float a = 1 / r00, d = 1 / r11, f = 1 / r22, b = -r01 * a * d, e = -r12 * d * f;
+        const float c = -(r01 * e + r02 * f) * a;
+        float x = a * R(3) + b * R(6) + c * R(8), y = d * R(6) + e * R(8), z = f * R(8);
+        const float length = sqrt(x * x + y * y + z * z);
+        const int answered = LESSER(LESSER(r00, r11), r22) > LEAST_PIVOT * size && length > 0 && length < INFINITY;
+        x /= length;
+        y /= length;
+        z /= length;
+        const float first = a * x, second = b * x + d * y, third = c * x + e * y + f * z;
+        const float radial = first * first + second * second + third * third;
+        const float whole = a * a + b * b + c * c + d * d + e * e + f * f;
+        normals[3 * p] = answered ? x : NAN;
+        normals[3 * p + 1] = answered ? y : NAN;
+        normals[3 * p + 2] = answered ? z : NAN;
+        normals_spread[p] = answered ? sqrt(whole - radial) / length : NAN;
+        albedo[p] = answered ? length : NAN;
+        albedo_spread[p] = answered ? sqrt(radial) : NAN;
+        residual[p] = freedom > 0 ? sqrt(R(9) / freedom) : NAN;
+        samples[p] = R(10);
+    }
+}

@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
+LEAST_PIVOT = 1e-3
+"""Relative pivot of the lamps' directions below which they count as coplanar."""
+
 _PLACES = np.triu_indices(4)
 
 
@@ -46,3 +49,38 @@ def lambert_add(frames: Array, lights: Array, fresh: bool, darks: Array, shadow:
     triangle[:10] = after[:, *_PLACES].T
     triangle[9] **= 2
     triangle[10] += seen.sum(axis=0)
+
+
+def lambert_normals(triangle: Array, normals: Array, normals_spread: Array, albedo: Array,
+                    albedo_spread: Array, residual: Array, samples: Array) -> None:  # fmt: skip
+    """Solve the fits that triangles, (11, P), hold.
+
+    Parameters
+    ----------
+    triangle : as of `lambert_add`
+    normals : (P, 3), unit vectors; NaN, as ``albedo``, where the lamps that count are coplanar
+    normals_spread, albedo_spread : (P,), standard deviations for samples with noise of deviation 1
+    albedo : (P,)
+    residual : (P,), standard deviation of a sample; NaN unless more than three count
+    samples : (P,), number of samples that counted
+    """
+    r00, r01, r02, r03, r11, r12, r13, r22, r23, rest, used = triangle.astype(np.float64)
+    size = np.sqrt(r00**2 + r01**2 + r02**2 + r11**2 + r12**2 + r22**2)
+    freedom = used - 3
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        residual[:] = np.sqrt(rest / np.where(freedom > 0, freedom, np.nan))
+        a, d, f = 1 / r00, 1 / r11, 1 / r22
+        b, e = -r01 * a * d, -r12 * d * f
+        c = -(r01 * e + r02 * f) * a
+        vector = np.stack([a * r03 + b * r13 + c * r23, d * r13 + e * r23, f * r23], axis=-1)
+        length = np.linalg.norm(vector, axis=-1)
+        answered = np.minimum(np.minimum(r00, r11), r22) > LEAST_PIVOT * size
+        answered &= (length > 0) & np.isfinite(length)
+        normals[:] = np.where(answered[:, np.newaxis], vector / length[:, np.newaxis], np.nan)
+        x, y, z = normals.T
+        radial = (a * x) ** 2 + (b * x + d * y) ** 2 + (c * x + e * y + f * z) ** 2
+        whole = a**2 + b**2 + c**2 + d**2 + e**2 + f**2
+        normals_spread[:] = np.sqrt(whole - radial) / length
+        albedo_spread[:] = np.sqrt(radial)
+    albedo[:] = np.where(answered, length, np.nan)
+    samples[:] = used

@@ -237,7 +237,7 @@ class _Sums:
             mean=mean,
             cosine=cosine,
             sine=sine,
-            modulation=lambda: np.hypot(cosine, sine),
+            modulation=lambda: np.sqrt(cosine * cosine + sine * sine),
             azimuth=lambda: np.where(
                 (cosine == 0) & (sine == 0), np.float32(np.nan), np.arctan2(sine, cosine)
             ),
