@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,6 +14,7 @@ from mirrorskin.engine.operation import Operation
 from mirrorskin.io import Block, InputError, Source
 
 Progress = Callable[[int], None]
+Reader = Callable[[Source, Operation, int], Iterator[Block]]
 
 
 class Receiver(Protocol):
@@ -31,9 +33,9 @@ def feed(
 ) -> None:
     """Push frames of a source into an operation, once or twice.
 
-    A device that shares the host's memory computes on frames where they were read or are mapped. For a device
-    with its own memory, and for compressed frames in Zarr, the next frames are read and decoded while earlier
-    ones are copied and processed.
+    A device that shares the host's memory computes on frames where they were read or are mapped. A device
+    with its own memory gets them from where they are mapped; other frames for it, and compressed ones in
+    Zarr, are read and decoded while earlier ones are copied and processed.
 
     Parameters
     ----------
@@ -92,13 +94,13 @@ def push_block(operation: Receiver, block: Block, part: slice = slice(None)) -> 
     operation.push(block.frames[part], **given, lent=block.lent)
 
 
-def _reader(source: Source, operation: Operation) -> Callable[[Source, Operation, int], Iterator[Block]]:
+def _reader(source: Source, operation: Operation) -> Reader:
     """Return how frames are read for an operation."""
     if not operation.on_device:
         return _read_in_place
-    if not operation.device.info.shares_memory or getattr(source, "read_ahead", False):
-        return _read_ahead
-    return _lent_or_read if operation.long_blocks else _read_in_place
+    ahead = not operation.device.info.shares_memory or getattr(source, "read_ahead", False)
+    read = _read_ahead if ahead else _read_in_place
+    return partial(_lent_or_read, read=read) if operation.long_blocks else read
 
 
 def _read_in_place(source: Source, operation: Operation, count: int) -> Iterator[Block]:
@@ -111,7 +113,7 @@ def _read_in_place(source: Source, operation: Operation, count: int) -> Iterator
         count -= len(block.frames)
 
 
-def _lent_or_read(source: Source, operation: Operation, count: int) -> Iterator[Block]:
+def _lent_or_read(source: Source, operation: Operation, count: int, *, read: Reader) -> Iterator[Block]:
     """Use frames where they are mapped, as many at once as possible, as long as the source allows it."""
     lend: Callable[[int], Block | None] = getattr(source, "lend", lambda most: None)
     frame_size = math.prod(source.shape[1:]) * source.dtype.itemsize
@@ -119,7 +121,8 @@ def _lent_or_read(source: Source, operation: Operation, count: int) -> Iterator[
     while count > 0 and (block := lend(min(count, most))) is not None:
         yield block
         count -= len(block.frames)
-    yield from _read_in_place(source, operation, count)
+    if count > 0:
+        yield from read(source, operation, count)
 
 
 def _read_ahead(source: Source, operation: Operation, count: int) -> Iterator[Block]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -55,14 +55,21 @@ class Staged:
 
 
 class _Maps(dict[str, Array]):
-    """Arrays by name; one that was detached is created again when it is used."""
+    """Arrays by name; one that was taken out is created again when it is used."""
 
-    def __init__(self, make: Callable[[str], Array], names: Iterable[str]) -> None:
-        super().__init__((name, make(name)) for name in names)
-        self._make = make
+    def __init__(
+        self, device: Device, kinds: Mapping[str, DTypeLike | Planes], shape: tuple[int, int], stride: int
+    ) -> None:
+        super().__init__()
+        self._device, self._kinds, self._shape, self._stride = device, kinds, shape, stride
+        for name in kinds:
+            self[name]
 
     def __missing__(self, name: str) -> Array:
-        array = self[name] = self._make(name)
+        kind, shape = self._kinds[name], self._shape
+        if isinstance(kind, Planes):
+            kind, shape = kind.dtype, (kind.count, self._stride)
+        array = self[name] = self._device.array(name, shape, kind, zeroed=False)
         return array
 
 
@@ -96,7 +103,7 @@ class Band:
         least: int,
     ) -> None:
         self._shape = shape = (rows.stop - rows.start, columns)
-        self._device, self._kinds, self._dtype = device, maps, dtype
+        self._device, self._dtype = device, dtype
         self.rows, self.pixels = rows, shape[0] * shape[1]
         word = _LINE // dtype.itemsize
         self.stride: int = -(-self.pixels // word) * word
@@ -104,7 +111,7 @@ class Band:
             raise DeviceMemoryError(
                 f"kernels number pixels to {_MOST_PIXELS}; {self.pixels} are too many at once"
             )
-        self.maps: dict[str, Array] = _Maps(self._make, maps)
+        self.maps: dict[str, Array] = _Maps(device, maps, shape, self.stride)
         self._most = device.max_allocation // (self.pixels * dtype.itemsize)  # frames in one buffer
         if self._most < least:
             raise DeviceMemoryError(f"{device.info.title} has no room for {least} frames")
@@ -128,14 +135,14 @@ class Band:
         self._park()
 
     def write(self, name: str, values: ArrayLike, plane: int | None = None) -> None:
-        """Fill a map, or one of several planes, from the host; a single number fills all of it."""
+        """Fill a map, or one of several planes; a number, broadcast or not, is set on the device."""
         array, values = self.maps[name], np.asarray(values)
         parked = not (self._resident or self._only or array.is_shared)
         if not parked:
             self._keep_resident()
         self._blank.discard(name)
-        if plane is None and values.ndim == 0 and not parked:
-            array.fill(values.item())
+        if plane is None and not any(values.strides) and not parked:
+            array.fill(values.flat[0].item())
         elif array.is_shared or parked:
             if plane is not None and self._resident:
                 array.download()  # the other planes
@@ -149,15 +156,15 @@ class Band:
         """Return a plane, (stride,), without its padding, (rows, W)."""
         return plane[: self.pixels].reshape(self._shape)
 
-    def fetch(self, parts: Mapping[str, int | slice], keep: bool = False) -> list[NDArray[Any]]:
+    def fetch(self, parts: Mapping[str, int | slice], keep: Collection[str] = ()) -> list[NDArray[Any]]:
         """Wait once, and return planes or rows of maps, (count, stride) or (rows, W).
 
-        They are copies if ``keep``; otherwise the maps are blank afterwards, and memory that is shared with
-        the device is returned as it is.
+        They are copies of the maps to ``keep``. The other maps are blank afterwards, and memory that they
+        share with the device is returned as it is.
         """
         with self.resident():
-            maps = self.maps if keep else {name: self.maps.pop(name) for name in parts}
-            return fetch([(maps[name], rows) for name, rows in parts.items()], keep)
+            maps = [(self.maps[name] if name in keep else self.maps.pop(name), parts[name]) for name in parts]
+            return fetch(maps, [name in keep for name in parts])
 
     @contextmanager
     def resident(self) -> Iterator[None]:
@@ -217,12 +224,6 @@ class Band:
         part = frames[: self._places[0].shape[0]]
         self._places[0].write(part)
         return Staged(self._places[0], slice(start, start + len(part)))
-
-    def _make(self, name: str) -> Array:
-        kind = self._kinds[name]
-        if isinstance(kind, Planes):
-            return self._device.array(name, (kind.count, self.stride), kind.dtype, zeroed=False)
-        return self._device.array(name, self._shape, kind, zeroed=False)
 
     def _park(self) -> None:
         for name, array in self.maps.items():

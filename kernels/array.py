@@ -332,15 +332,19 @@ class Array:
                 self.last_use = None
 
 
-def fetch(parts: Sequence[tuple[Array, int | slice]], keep: bool = False) -> list[NDArray[Any]]:
-    """Return rows of several arrays, for which the device is waited for once.
+def fetch(parts: Sequence[tuple[Array, int | slice]], keep: Sequence[bool] = ()) -> list[NDArray[Any]]:
+    """Return rows of several arrays of a device, for which it is waited for once.
 
-    Unless ``keep``, the arrays are no longer of use, and nothing is copied where memory is shared.
+    ``keep`` says of each whether the array stays of use; by default, none does. Where memory is shared, rows
+    of the others are no copies.
     """
-    device = parts[0][0]._device
+    keep = keep or [False] * len(parts)
+    device, reads, after = parts[0][0]._device, [], []
     if parts[0][0].is_shared:
-        return [array.read(rows) if keep else array.detach()[rows] for array, rows in parts]
-    reads, results, after = [], [], []
+        return [
+            array.read(rows) if kept else array.detach()[rows]
+            for (array, rows), kept in zip(parts, keep, strict=True)
+        ]
     try:
         with waiting:
             for array, rows in parts:
@@ -351,10 +355,10 @@ def fetch(parts: Sequence[tuple[Array, int | slice]], keep: bool = False) -> lis
             device.transfers.download(device, reads, device.queue, after)
     except cl.Error as error:
         raise failed(device, f"copy {', '.join(array.name for array, _ in parts)}", error) from error
-    results = [out for _, out in reads]
-    for array in () if keep else {id(array): array for array, _ in parts}.values():
-        array.discard()
-    return results
+    for (array, _), kept in zip(parts, keep, strict=True):
+        if not kept:
+            array.discard()
+    return [out for _, out in reads]
 
 
 def _empty(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:

@@ -42,7 +42,8 @@ _log = logging.getLogger("mirrorskin.kernels")
 _opening = threading.Lock()
 _numbers = itertools.count()  # of buffers that were arguments of kernels
 _opened: list[Device] = []
-_KINDS = ("gpu", "cpu")  # in the order in which they are taken
+_left_out: set[cl.Device] = set()  # those that failed where others could be taken
+_KINDS = ("gpu", "cpu", "other")  # in the order in which they are taken
 _PLACE = re.compile(r"(\w+\.clh?|<kernel>):(\d+):(\d+):\s*(?:fatal )?(?:error:)?\s*(.+)")
 _INSTALL = "install a GPU's OpenCL driver, or on x86-64 Linux 'pip install pocl-binary-distribution'"
 
@@ -95,7 +96,9 @@ def open_device(choice: str | Device | None = None) -> Device:
     ----------
     choice : str, Device or None
         A number of ``list_devices``, ``"gpu"``, ``"cpu"``, or a part of the platform's and device's
-        names. None takes what ``PYOPENCL_CTX`` names, else the first GPU, else the first CPU.
+        names. None takes what ``PYOPENCL_CTX`` names, else the best GPU that works, else the best CPU. The
+        best of a kind is one with its own memory, then the one with the largest product of compute units and
+        memory.
 
     Raises
     ------
@@ -116,8 +119,10 @@ def open_device(choice: str | Device | None = None) -> Device:
         *others, last = _choose(choice)
         for device in others:
             try:
-                return _open(device)
+                if device not in _left_out:
+                    return _open(device)
             except DeviceError as error:
+                _left_out.add(device)
                 _log.warning("%s is left out: %s", _describe(device).title, error)
         return _open(last)
 
@@ -606,8 +611,8 @@ def _choose(choice: str | None) -> list[cl.Device]:
         return _default(devices)
     matches = _matching(choice, devices)
     titles = {_describe(device).title for device in matches}
-    if len(titles) == 1 or (titles and choice.casefold().strip() in _KINDS):
-        return matches
+    if len(titles) == 1 or (titles and choice.casefold().strip() in _KINDS[:2]):
+        return _best_first(matches)
     known = "; ".join(f"{i} = {_describe(d).title}" for i, d in enumerate(devices))
     problem = "no such device" if not matches else "more than one device answers to that"
     reason = None if matches else embedded.why_no_device()
@@ -620,7 +625,7 @@ def _matching(choice: str, devices: list[cl.Device]) -> list[cl.Device]:
     if choice.isdecimal():
         return devices[int(choice) : int(choice) + 1]
     wanted = choice.casefold().strip()
-    if wanted in _KINDS:
+    if wanted in _KINDS[:2]:
         return [device for device in devices if _describe(device).kind == wanted]
     return [device for device in devices if wanted and wanted in _describe(device).title.casefold()]
 
@@ -632,9 +637,17 @@ def _default(devices: list[cl.Device]) -> list[cl.Device]:
         except (cl.Error, RuntimeError, ValueError, IndexError) as error:
             named = os.environ["PYOPENCL_CTX"]
             raise UnknownDeviceError(f"PYOPENCL_CTX={named!r} names no device: {error}") from error
-    kinds = [_describe(device).kind for device in devices]
-    best = next(kind for kind in (*_KINDS, "other") if kind in kinds)
-    return [device for device, kind in zip(devices, kinds, strict=True) if kind == best]
+    return _best_first(devices)
+
+
+def _best_first(devices: list[cl.Device]) -> list[cl.Device]:
+    """Sort devices: GPUs before CPUs, memory of their own before the host's, then by size."""
+
+    def rank(device: cl.Device) -> tuple[int, bool, int]:
+        info = _describe(device)
+        return _KINDS.index(info.kind), info.shares_memory, -info.compute_units * info.memory
+
+    return sorted(devices, key=rank)
 
 
 @functools.cache

@@ -80,7 +80,7 @@ class Limits:
         self._device.finish()
 
     def _count(self, limit: str, shape: Shape) -> int:
-        return len(self._data.host) // shape.lanes // _RUNS[limit]
+        return self._data.shape[0] // shape.lanes // _RUNS[limit]
 
 
 class Arithmetic:
@@ -98,7 +98,7 @@ class Arithmetic:
 
     def works(self) -> dict[str, Work]:
         """Return the works to be timed."""
-        operations = len(self._data.host) * self._steps
+        operations = self._data.shape[0] * self._steps
         return {
             _name("multiply-add", shape): Work(partial(self._run, shape), operations=operations)
             for shape in self._shapes
@@ -110,7 +110,7 @@ class Arithmetic:
 
     def _run(self, shape: Shape) -> None:
         kernel = self._device.kernel("limits", "multiply_all", **shape.macros)
-        count = len(self._data.host) // shape.lanes
+        count = self._data.shape[0] // shape.lanes
         numbers: dict[str, Any] = {"count": count, "steps": self._steps, "factor": 0.5, "summand": 1.0}
         kernel(shape.items(count), numbers=self._data, **numbers, moved=0)
         self._device.finish()

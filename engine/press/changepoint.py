@@ -66,11 +66,13 @@ class ChangePoint(PressOperation):
         # A release is a change from bright to dark: its first level is the bright one.
         self._level = 1 - self.threshold if self._release else self.threshold
         self._travel: list[float] = []
-        self._start = np.zeros(shape, np.int32)
+        self._start: ArrayLike = 0
         if self.passes == 1:
             references = reference_pair(self.dark, self.bright, shape, dtype)
             first, second = reversed(references) if self._release else references
-            self._start = np.where(np.isnan(first), INVALID, 0).astype(np.int32)
+            if not any(first.strides + second.strides):  # the same references at all pixels
+                first, second = first[0, 0], second[0, 0]
+            self._start = np.where(np.isnan(first), INVALID, 0)
             self._fill(dark=np.nan_to_num(first), gain=1 / np.where(np.isnan(first), 1, second - first))
         self.clear()
 
@@ -94,10 +96,9 @@ class ChangePoint(PressOperation):
         self._travel.clear()
         self._noise.reset()
         self._weight: Array | None = None
-        zeros = np.zeros(self.shape, np.int32)
-        self._fill(start=self._start, excess=zeros, below=zeros, since=zeros)
+        self._fill(start=self._start, excess=0, below=0, since=0)
         if self.passes == 2:
-            self._fill(total=zeros, total_rest=zeros)
+            self._fill(total=0, total_rest=0)
 
     def start_second_pass(self) -> None:
         """Prepare for the same frames once more, to find each pixel's best split."""
@@ -115,12 +116,12 @@ class ChangePoint(PressOperation):
             band.write("mean_rest", mean - mean.astype(np.float32))
             band.write("start", np.where(np.isfinite(mean), 0, INVALID))
             for name in ("total", "total_rest", "score"):
-                band.write(name, np.zeros_like(mean))
+                band.write(name, 0)
 
     def push(self, frames: NDArray[Any], *, travel: ArrayLike, lent: bool = False) -> None:
         """Take in the next frames, (n, H, W), and the travel of each, (n,) mm."""
         first = len(self._travel)
-        if self._weight is not None and first + len(frames) >= len(self._weight.host):
+        if self._weight is not None and first + len(frames) >= self._weight.shape[0]:
             raise InputError("the second pass has more frames than the first. Push the same frames twice")
         last = self._travel[-1:]
         self._travel.extend(check_travel(travel, len(frames), "travel", after=last, falls=self._release))
@@ -183,8 +184,9 @@ class ChangePoint(PressOperation):
                 **maps,
                 moved=sum(array.nbytes for array in maps.values()),
             )
-            (start,) = band.fetch({"start": slice(None)}, keep=True)
-            return [*band.fetch(dict.fromkeys(("height", "sigma", "status"), slice(None))), start]
+            return band.fetch(
+                dict.fromkeys(("height", "sigma", "status", "start"), slice(None)), keep=["start"]
+            )
 
     def _travel_pairs(self) -> Array:
         """Copy the travel to the device as (T, 2) floats, whose sums have the precision of float64."""
@@ -197,10 +199,9 @@ class ChangePoint(PressOperation):
     def _estimate_levels(self, band: Band, noise: float) -> None:
         """Compute the levels from the best splits, where they are significant."""
         count = len(self._travel)
-        with band.resident():
-            score, mean, start = (
-                band.maps[name].download().astype(np.float64) for name in ("score", "mean", "start")
-            )
+        names = "score", "mean", "start"
+        maps = band.fetch(dict.fromkeys(names, slice(None)), keep=names)
+        score, mean, start = (values.astype(np.float64) for values in maps)
         changed = score**2 * count / 2 > (_EVIDENCE + np.log(count)) * noise**2
         split = np.where(changed, start, 1)
         rest = np.sqrt((count - split) / split)
@@ -211,10 +212,10 @@ class ChangePoint(PressOperation):
         for name, values in (("excess", excess), ("below", start), ("dark", dark), ("gain", gain)):
             band.write(name, values)
 
-    def _fill(self, **maps: NDArray[Any]) -> None:
+    def _fill(self, **maps: ArrayLike) -> None:
         for band in self._bands:
             for name, values in maps.items():
-                band.write(name, values[band.rows])
+                band.write(name, np.broadcast_to(values, self.shape)[band.rows])
 
     @property
     def _sign(self) -> int:

@@ -220,7 +220,8 @@ class Crossing:
 
     def _band_maps(self, band: Band, last: bool) -> list[NDArray[Any]]:
         """Return height, sigma, status and frame of a band's rows."""
-        answers, status, frame = band.fetch({"answers": slice(None), "status": 0, "times": 0}, keep=not last)
+        parts: dict[str, int | slice] = {"answers": slice(None), "status": 0, "times": 0}
+        answers, status, frame = band.fetch(parts, keep=() if last else parts)
         return [band.picture(plane) for plane in (*answers, status, frame)]
 
     def reset(self, noise: float | None = None) -> None:

@@ -208,10 +208,10 @@ class _Sums:
         maps = {**maps, **dict.fromkeys(_FIT.values(), np.float32)}
         self.bands: list[Band] = cut_into_bands(device, shape, dtype, maps, length, least)
         self._length = length
-        self._place = device.array("place", (_BATCH,), np.int32)
-        self._steps = device.array("basis", (3 * _BATCH,), np.int32)
-        self._floats = device.array("basis", (3 * _BATCH,), np.float32)
-        self._fit = device.array("fit", (28,), np.float32)
+        self._place = device.array("place", (_BATCH,), np.int32, zeroed=False)
+        self._steps = device.array("basis", (3 * _BATCH,), np.int32, zeroed=False)
+        self._floats = device.array("basis", (3 * _BATCH,), np.float32, zeroed=False)
+        self._fit = device.array("fit", (28,), np.float32, zeroed=False)
 
     @cached_property
     def room(self) -> NDArray[Any]:

@@ -280,7 +280,7 @@ class NormalsOperation(SensorOptions, Operation):
     def _copy_maps(self, band: Band) -> dict[str, NDArray[Any]]:
         """Return copies of a band's maps, including their padding."""
         names = self._kernel_maps
-        return dict(zip(names, band.fetch(dict.fromkeys(names, slice(None)), keep=True), strict=True))
+        return dict(zip(names, band.fetch(dict.fromkeys(names, slice(None)), keep=names), strict=True))
 
     def _take_maps(self) -> list[NDArray[Any]]:
         """Return the maps of all rows in the order of `_kernel_maps`, without a copy."""

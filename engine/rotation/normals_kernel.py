@@ -195,7 +195,7 @@ class NormalKernel:
         self._tables.claim()
         for fit, place in self._places.items():
             self._tables.host[place, :, : fit.table.shape[1]] = fit.table
-        self._tables.upload()
+        self._tables.upload(len(self._places))
 
     def run(
         self,

@@ -101,7 +101,7 @@ class NormalWindow:
         """Wait for a map of the last estimate, and return a copy, (H, W) or (H, W, 3)."""
         parts = []
         for band in self.bands:
-            (planes,) = band.fetch({name: slice(None)}, keep=True)
+            (planes,) = band.fetch({name: slice(None)}, keep=[name])
             parts.append(self._without_padding(band, planes))
         return join_rows(parts)
 
@@ -137,7 +137,7 @@ class NormalWindow:
         order = np.roll(np.arange(self.length), -self._sums.oldest)
         step, before, parts = thinning(self._shape), 0, []
         for band in self.bands:
-            (ring,) = band.fetch({"ring": slice(None)}, keep=True)
+            (ring,) = band.fetch({"ring": slice(None)}, keep=["ring"])
             parts.append(ring[:, -before % step : band.pixels : step][order])
             before += band.pixels
         return np.concatenate(parts, axis=1)

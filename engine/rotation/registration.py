@@ -142,16 +142,16 @@ class Registered(DerivedSource):
     def _resample(self) -> None:
         """Resample the frame on the device."""
         rows, columns = self.shape[1:]
-        tile, size = self.device.layout.tile, self._registered.host.nbytes
+        tile, size = self.device.layout.tile, self._registered.nbytes
         items = rows * -(-columns // tile)
         common: dict[str, Any] = {"rows": rows, "columns": columns, **self._maps}
         pad, interpolate, resample = (
             self.device.kernel("registration", f"registration_{name}", **self._macros)
             for name in ("admit", "mend", "resample")
         )
-        pad(items, **common, frame=self._frame, moved=self._frame.host.nbytes + size)
+        pad(items, **common, frame=self._frame, moved=self._frame.nbytes + size)
         if self._places is not None:
-            count, padded = len(self._places.host), self._maps["padded"]
+            count, padded = self._places.shape[0], self._maps["padded"]
             interpolate(-(-count // tile), count=count, places=self._places, padded=padded, moved=36 * count)
         resample(
             items,

@@ -247,12 +247,12 @@ class Wall:
             plane[:] = values
         self._sheet.upload()
         body, pixels = self._body, self._light.host.size
-        rows, columns = self._table.host.shape
+        rows, columns = self._table.shape
         lean = body.asymmetry_azimuth
         self._device.kernel("wall", "wall_light", **self._macros)(
             -(-pixels // self._device.layout.tile),
             pixels=pixels,
-            samples=len(self._rays.host),
+            samples=self._rays.shape[0],
             rows=rows - 2,
             columns=columns - 2,
             sheet=self._sheet,
@@ -268,7 +268,7 @@ class Wall:
             asymmetry_x=body.asymmetry * math.cos(lean),
             asymmetry_y=body.asymmetry * math.sin(lean),
             light=self._light,
-            moved=sum(array.host.nbytes for array in (self._sheet, self._places, self._light)),
+            moved=sum(array.nbytes for array in (self._sheet, self._places, self._light)),
         )
         return self._light.download().copy()
 

@@ -50,6 +50,52 @@ def test_without_any_device_the_remedy_is_named(monkeypatch):
         open_device()
 
 
+@pytest.fixture
+def machine(monkeypatch):
+    """A machine with several devices: names of those that cannot be opened."""
+    info = replace(list_devices()[0], platform="maker")
+    devices = {
+        "small card": replace(info, kind="gpu", shares_memory=False, compute_units=10, memory=2**33),
+        "integrated": replace(info, kind="gpu", shares_memory=True, compute_units=99, memory=2**36),
+        "processor": replace(info, kind="cpu", shares_memory=True, compute_units=8, memory=2**34),
+        "large card": replace(info, kind="gpu", shares_memory=False, compute_units=132, memory=2**36),
+    }
+    broken = set()
+
+    def opened(name):
+        if name in broken:
+            raise DeviceError(f"{name} cannot be used")
+        return name
+
+    monkeypatch.delenv("PYOPENCL_CTX", raising=False)
+    monkeypatch.setattr(device_layer, "_opened", [])
+    monkeypatch.setattr(device_layer, "_left_out", set())
+    monkeypatch.setattr(device_layer, "_find", lambda: list(devices))
+    monkeypatch.setattr(device_layer, "_describe", lambda name: replace(devices[name], name=name))
+    monkeypatch.setattr(device_layer, "_open", opened)
+    return broken
+
+
+def test_the_best_device_that_works_is_opened(machine, caplog):
+    for best in ("large card", "small card", "integrated", "processor"):
+        assert open_device() == open_device() == best
+        machine.add(best)
+    with pytest.raises(DeviceError, match="processor cannot be used"):
+        open_device()
+    left_out = [record.getMessage() for record in caplog.records]
+    assert left_out == [
+        f"maker: {name} is left out: {name} cannot be used"
+        for name in ("large card", "small card", "integrated")
+    ]
+
+
+def test_a_device_that_is_named_is_not_replaced(machine):
+    machine |= {"large card", "small card", "integrated"}
+    for name in ("large card", "gpu"):
+        with pytest.raises(DeviceError, match="cannot be used"):
+            open_device(name)
+
+
 def test_a_kernel_that_does_not_compile_is_quoted(device):
     with pytest.raises(DeviceError, match=r"limits.cl line \d+ does not compile") as caught:
         device.kernel("limits", "read_all", get_global_id="1", **MACROS)
@@ -216,7 +262,7 @@ def test_parts_of_several_arrays_are_waited_for_once(device):
     arrays = [device.given(name, np.full((3, 4), n), np.int32) for n, name in enumerate("abc")]
     for keep in (True, False):
         device.profile.clear()
-        found = fetch([(arrays[0], slice(None)), (arrays[1], 2), (arrays[2], slice(1, 3))], keep)
+        found = fetch([(arrays[0], slice(None)), (arrays[1], 2), (arrays[2], slice(1, 3))], [keep] * 3)
         assert [part.shape for part in found] == [(3, 4), (4,), (2, 4)]
         assert [int(part.max()) for part in found] == [int(part.min()) for part in found] == [0, 1, 2]
         records = [record for record in device.profile.records() if record.kind == "download"]
