@@ -549,6 +549,7 @@ ELSEWHERE = {
     "displacement": "kernels/test_displacement.py",
     "edges": "kernels/test_edges.py",
     "focus": "kernels/test_focus.py",
+    "lambert": "kernels/test_lambert.py",
     "links": "kernels/test_links.py",
     "multigrid": "kernels/test_multigrid.py",
     "normals": "kernels/test_normals.py",
