@@ -66,10 +66,12 @@ class _Maps(dict[str, Array]):
             self[name]
 
     def __missing__(self, name: str) -> Array:
-        kind, shape = self._kinds[name], self._shape
+        kind = self._kinds[name]
         if isinstance(kind, Planes):
-            kind, shape = kind.dtype, (kind.count, self._stride)
-        array = self[name] = self._device.array(name, shape, kind, zeroed=False)
+            array = self._device.array(name, (kind.count, self._stride), kind.dtype, zeroed=False)
+        else:
+            array = self._device.array(name, self._shape, kind, zeroed=False)
+        self[name] = array
         return array
 
 

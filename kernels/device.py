@@ -133,7 +133,8 @@ def free_memory() -> None:
     Arrays that the engine works in and the maps that it returns lie in memory that is used again once nobody
     refers to it: its pages need not be made anew. No more than `mirrorskin.kernels.memory.KEPT`, 512 MB, is
     kept while nobody uses it, besides the solver of the last call of `mirrorskin.engine.integrate`: some 100
-    bytes a pixel, of pictures up to 8 Mpx.
+    bytes a pixel, of pictures up to 8 Mpx. On a device with its own memory, at most an eighth of that is kept
+    as well, and 48 MB of the host's memory for copies.
 
     Examples
     --------

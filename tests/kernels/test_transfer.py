@@ -5,10 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from injected_faults import lost
 
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels import transfer
 from mirrorskin.kernels.array import fetch
+from mirrorskin.kernels.errors import DeviceError
 
 
 @pytest.fixture
@@ -50,7 +52,7 @@ def test_values_may_be_overwritten_as_soon_as_they_were_written(opened):
     assert [set(array.read().ravel().tolist()) for array in arrays] == [{number} for number in range(20)]
 
 
-def test_threads_share_the_staging_buffers(opened):
+def test_threads_share_the_staging_buffers_while_they_are_freed(opened):
     def work(number):
         for step in range(20):
             arrays = [opened.given("values", np.full(n, number + step), np.int32) for n in (5, 3000, 40)]
@@ -59,7 +61,10 @@ def test_threads_share_the_staging_buffers(opened):
         return number
 
     with ThreadPoolExecutor(4) as pool:
-        assert list(pool.map(work, range(0, 400, 100))) == [0, 100, 200, 300]
+        answers = pool.map(work, range(0, 400, 100))
+        for _ in range(20):
+            opened.free()
+        assert list(answers) == [0, 100, 200, 300]
 
 
 def test_device_memory_is_kept_until_it_is_freed(opened):
@@ -73,3 +78,19 @@ def test_device_memory_is_kept_until_it_is_freed(opened):
     opened.free()
     assert allocations() == 2
     assert opened.given("values", np.arange(3000), np.int32).read()[-1] == 2999
+
+
+def test_staging_buffers_that_are_lost_to_an_error_are_replaced(opened, monkeypatch):
+    array = opened.given("values", np.arange(30_000), np.int32)
+    wait, failures = opened.profile.wait, iter(range(5))
+
+    def fail(name, event):
+        wait(name, event)
+        if name == "values" and next(failures, None) is not None:
+            raise lost()
+
+    monkeypatch.setattr(opened.profile, "wait", fail)
+    for _ in range(5):
+        with pytest.raises(DeviceError, match="cannot hold or copy values"):
+            array.read()
+    assert np.array_equal(array.read(), np.arange(30_000))
