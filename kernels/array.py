@@ -146,7 +146,7 @@ class Array:
 
     @_told
     def upload(self, rows: int | None = None) -> None:
-        """Let the device see what the host wrote; ``rows`` limits it to the first so many.
+        """Let the device see what the host wrote; ``rows`` is the number of the first rows to copy.
 
         If the host has not touched its side, nothing is copied: the device then holds zeros, or anything.
         """

@@ -507,7 +507,7 @@ class Kernel:
         except cl.Error as error:
             raise failed(self._device, f"run {self.name}", error) from error
 
-    def _put(self, place: int, value: Operand | np.generic | None) -> None:
+    def _put(self, place: int, value: Any) -> None:
         """Set an argument, unless it has this value already: that takes longer than a launch."""
         key: object = value
         if isinstance(value, Operand):

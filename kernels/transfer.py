@@ -163,7 +163,7 @@ class Transfers:
                 slot.mapping.release()
 
     def _room(self, device: Device, nbytes: int) -> _Slot:
-        """Return the slot that uploads fill, with room for so many bytes."""
+        """Return the slot that uploads fill, with room for a number of bytes."""
         slot, self._open = self._open, None
         if slot is not None and slot.used + nbytes > SLOT:
             self._free.put(slot)
@@ -249,7 +249,7 @@ def _cut(reads: Iterable[tuple[Piece, NDArray[Any]]]) -> Iterator[tuple[Piece, N
 
 
 def _pieces(values: NDArray[Any], most: int, flat: bool | None = None) -> Iterator[NDArray[Any]]:
-    """Cut an array into parts of at most so many elements, in C order; ``flat``: anywhere, else into rows."""
+    """Cut an array into parts of at most ``most`` elements, in C order: anywhere if ``flat``, else into rows."""
     if values.size <= most:
         yield values
         return

@@ -219,6 +219,7 @@ def account(device: Device) -> Row:
         row[f"{kind}s"] = sum(one.runs for one in mine)
         row[f"{kind}_MB"] = sum(one.bytes for one in mine) / 1e6
         row[f"{kind}_ms"] = 1e3 * sum(one.seconds for one in mine)
+    row["waits"] = sum(one.runs for one in records if one.kind == "wait")
     kernels = [one for one in records if one.kind == "kernel"][:LONGEST]
     row["longest"] = {one.name: [one.runs, round(1e3 * one.seconds, 4)] for one in kernels}
     return row

@@ -275,18 +275,18 @@ def table(rows: list[Data]) -> list[str]:
     """Return calls in Markdown."""
     lines = [
         "| call | first, ms | ms | launches | in kernels, ms | up, MB (copies) | down, MB (copies)"
-        " | longest, ms |",
-        "|---|---|---|---|---|---|---|---|",
+        " | waits | longest, ms |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
         if "failed" in row:
-            lines.append(f"| {row['call']} | failed: {row['failed'].strip().splitlines()[-1]} |||||||")
+            lines.append(f"| {row['call']} | failed: {row['failed'].strip().splitlines()[-1]} ||||||||")
             continue
         longest = ", ".join(f"{name} {ms:.3g}" for name, (_, ms) in [*row["longest"].items()][:3])
         lines.append(
             f"| {row['call']} | {row['first_ms']:.0f} | {row['ms']:.2f} | {row['kernels']}"
             f" | {row['kernel_ms']:.2f} | {row['upload_MB']:.1f} ({row['uploads']})"
-            f" | {row['download_MB']:.1f} ({row['downloads']}) | {longest} |"
+            f" | {row['download_MB']:.1f} ({row['downloads']}) | {row['waits']} | {longest} |"
         )
     return lines
 
