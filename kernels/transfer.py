@@ -249,7 +249,7 @@ def _cut(reads: Iterable[tuple[Piece, NDArray[Any]]]) -> Iterator[tuple[Piece, N
 
 
 def _pieces(values: NDArray[Any], most: int, flat: bool | None = None) -> Iterator[NDArray[Any]]:
-    """Cut an array into parts of at most ``most`` elements, in C order: anywhere if ``flat``, else into rows."""
+    """Cut an array in parts of at most ``most`` elements, in C order, anywhere if ``flat``, or by rows."""
     if values.size <= most:
         yield values
         return
