@@ -93,7 +93,9 @@ class Focus(Operation):
         around = np.arange(len(travel))[:, np.newaxis] + np.arange(-self.reach, self.reach + 1)
         places = (travel[np.clip(around, 0, len(travel) - 1)] - travel[:, np.newaxis]) / unit
         names = ("height", "spread", "gain", "misfit", "sharpness")
-        maps = {name: self.device.array(name, self.shape, np.float32, zeroed=False) for name in names}
+        maps: dict[str, Any] = {
+            name: self.device.array(name, self.shape, np.float32, zeroed=False) for name in names
+        }
         maps["status"] = self.device.array("status", self.shape, np.uint8, zeroed=False)
         variance = self.noise**2
         self._fit(

@@ -151,7 +151,9 @@ class PhotometricStereo(Operation):
     def result(self) -> dict[str, Any]:
         """Return normals and albedo of the frames so far."""
         names = ("normals_spread", "albedo", "albedo_spread", "residual")
-        arrays = {name: self.device.array(name, self.shape, np.float32, zeroed=False) for name in names}
+        arrays: dict[str, Any] = {
+            name: self.device.array(name, self.shape, np.float32, zeroed=False) for name in names
+        }
         arrays["normals"] = self.device.array("normals", (*self.shape, 3), np.float32, zeroed=False)
         arrays["samples"] = self.device.array("samples", self.shape, np.int32, zeroed=False)
         pixels, moved = self.shape[0] * self.shape[1], sum(array.nbytes for array in arrays.values())
