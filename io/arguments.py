@@ -95,6 +95,11 @@ def check_number(name: str, value: Any) -> Any:
     return value
 
 
+def or_none(check: Check) -> Check:
+    """Return a check that also allows None, for arguments where that is not the default."""
+    return lambda name, value: None if value is None else check(name, value)
+
+
 def check_count(name: str, value: Any) -> Any:
     """Return a whole number, or raise InputError if it is something else."""
     if not hasattr(value, "__index__") or isinstance(value, bool | np.ndarray):

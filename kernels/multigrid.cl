@@ -505,8 +505,7 @@ __kernel void multigrid_ascend(
 }
 
 // A cycle over all levels from `from` on, too small for launches of their own, by one group: the answer to b goes to x, from
-// heights x if `again` is 1. If `twice` is 1, each coarser level is followed by another visit, from there straight to the
-// coarsest one and back.
+// heights x if `again` is 1. Coarser levels are gone through twice.
 typedef struct {
     int base, rows, stride, moved;
 } Level;
@@ -525,9 +524,9 @@ typedef struct {
     FENCE
 __kernel GROUP_SIZE void multigrid_tail(
     const int from, const int last, __global const Level *restrict levels, GRAPH_ARGS, MAP inverse,
-    BYTES to, COUNTS changed, const int again, const int twice, __global value *b, __global value *x, __global value *t)
+    BYTES to, COUNTS changed, const int again, __global value *b, __global value *x, __global value *t)
 {
-    int l = from, start = again, repeated = twice ? last : from;  // the finest level that was visited again
+    int l = from, start = again, gone = 0;  // a bit for each level
     do {
         for (; l < last; ++l, start = 0) {
             OF_LEVEL(l)
@@ -574,8 +573,8 @@ __kernel GROUP_SIZE void multigrid_tail(
             SMOOTH(THIRD, t, x)
             SMOOTH(SECOND, x, t)
             SMOOTH(FIRST, t, x)
-            start = from < l && l < repeated;
-            repeated = start ? l : repeated;
+            start = l > from && !(gone >> l & 1);
+            gone = start ? gone | 1 << l : gone & ~(1 << l);
         }
     } while (start);
 }

@@ -7,20 +7,19 @@ anchors a. A cycle solves it nearly, on grids of which each has half the rows an
 - Three steps of Jacobi's method, x <- x + omega D^-1 (b - A x), take out what changes from node to node.
 - A coarse node stands for an aggregate of fine ones. With I, which gives each node what its aggregate has,
   the coarse right side is I^T (b - A x), and the coarse answer e goes back as x + I e. Then the three steps
-  follow in reverse, so that a visit is symmetric.
+  follow in reverse, so that a cycle is symmetric.
 - A coarse link has half the weight of those that it stands for, since the way between the middles of
   aggregates is twice as long: I^T A I would let heights follow slopes only half as far.
-- As sums and injection are coarser than A asks for, a level answers up to twice too much where parts hang
-  together by few links. So levels from the third on are visited a second time, each from where the first
-  visit left off, straight down to the coarsest level and back (F-cycle). Second visits within second visits
-  (W-cycle) would save no iteration on most graphs, and double the work with each level.
+- As sums and injection are coarser than A asks for, levels from the third on are gone through twice. The
+  first time they answer up to twice too much where parts hang together by few links; the second time mends
+  that, and a cycle is positive definite. It must be done on all of them, or too much becomes more and more.
 
 *Aggregates* are blocks of two by two, as a rule. Over a cut, that would join what A keeps apart, and the
 coarse answer would be wrong on both sides: so where a block's nodes do not hang together by strong links,
 only its largest part stays, and other parts go to aggregates of neighbouring blocks, along their links. A
 coarse node has links to its eight neighbours alone. A part that had others to further ones by moving stays
-where it is: were a link dropped, the coarse operator would be too weak there, and its answer more than twice
-the right one, which no second visit mends.
+where it is: were a link dropped, the coarse operator would be too weak there, its answer more than twice the
+right one, and a level gone through twice not positive definite.
 
 *Variances*: what a node's has, an element of A's inverse, beyond that of its coarse node is, by six numbers
 c, d (c0 + c1 r + c2 d sum w r_j + c5 o) + d sum w d_j (c3 + c4 r_j). Here w are the weights of its links,
@@ -236,18 +235,16 @@ def injected(level: Level, values: Doubles) -> Doubles:
     return np.asarray(values[level.aggregate])
 
 
-def cycle(
-    levels: Sequence[Level], b: Doubles, x: Doubles | None = None, number: int = 0, *, twice: bool = True
-) -> Doubles:
-    """Answer the right side of a level, from heights x or from zero; ``twice``: with second visits."""
+def cycle(levels: Sequence[Level], b: Doubles, x: Doubles | None = None, number: int = 0) -> Doubles:
+    """Answer the right side of a level, from heights x or from zero."""
     level = levels[number]
     if number == len(levels) - 1:
         return inverse_of(level.diagonal) * b
     x = smooth(level, b, np.zeros(b.shape) if x is None else x)
-    coarse = gathered(level, residual(level, b, x))
-    e = cycle(levels, coarse, None, number + 1, twice=twice)
-    if twice and number:
-        e = cycle(levels, coarse, e, number + 1, twice=False)
+    coarse, e = gathered(level, residual(level, b, x)), None
+    for _ in range(2 if number else 1):
+        e = cycle(levels, coarse, e, number + 1)
+    assert e is not None
     return smooth(level, b, x + injected(level, e), STEPS[::-1])
 
 

@@ -12,7 +12,7 @@ from mirrorskin.engine.integration.hierarchy import Hierarchy, Level, tile_colum
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Kernel
 
-_FIRST_REPEATED = 2  # finest level that is visited a second time
+_FIRST_W_LEVEL = 2  # finest level that is visited twice (W-cycle), as are all coarser ones
 _TAIL = 20480  # nodes times lanes of the finest level that one work-group processes with all coarser ones
 _WEAKEST_ANCHORS = 1e-12  # relative to a component's links, up to which its offset counts as free
 
@@ -115,22 +115,18 @@ class Cycle:
 
     def launch(self) -> None:
         """Enqueue a cycle, and the partial sums of the product."""
-        self._go(0, again=False, twice=True)
+        self._go(0, again=False)
         if self._tail == 0:
             self._h.over_parts("dot", self.parts, one=self.b, other=self.x, lanes=self._lanes)
 
-    def _go(self, number: int, *, again: bool, twice: bool) -> None:
-        """Do a cycle over a level and all coarser ones, from x = 0 or, if ``again``, from the current x.
-
-        If ``twice``, each coarser level is followed by another visit, from there straight to the coarsest one
-        and back (F-cycle).
-        """
+    def _go(self, number: int, *, again: bool) -> None:
+        """Do a cycle over a level and all coarser ones, from x = 0 or, if ``again``, from the current x."""
         h = self._h
         if number == 1 and self._factors is not None:
             self._solve_directly()
             return
         if number == self._tail:
-            self._run_tail(again, twice)
+            self._run_tail(again)
             return
         keep = int(h.moves[number] > 0)
         self._half(
@@ -144,20 +140,19 @@ class Cycle:
             coarse_b=self.b,
         )
         h.gather(number, self._rest, self.b, self._lanes)
-        self._go(number + 1, again=False, twice=twice)
-        if twice and number + 1 >= _FIRST_REPEATED:
-            self._go(number + 1, again=True, twice=False)
+        for second in (False, True)[: 1 + (number + 1 >= _FIRST_W_LEVEL)]:
+            self._go(number + 1, again=second)
         arrays = {"e": self.x, "to": h.to, "t": self.spare, "x_new": self.x, "parts": self.parts}
         self._half("ascend", number, moved_nodes=h.moves[number], **arrays)
 
-    def _run_tail(self, again: bool, twice: bool) -> None:
+    def _run_tail(self, again: bool) -> None:
         """Process all small levels."""
         h = self._h
         last = len(h.levels) - 1
         kernel, moved = self._kernel("tail", h.levels[last]), 200 * h.levels[self._tail].nodes
         arguments: dict[str, Any] = {"levels": self._table, **h.graph, "inverse": h.inverse}
         arguments |= {"to": h.to, "changed": h.changed, "b": self.b, "x": self.x, "t": self.spare}
-        arguments |= {"from": self._tail, "last": last, "again": again, "twice": twice}
+        arguments |= {"from": self._tail, "last": last, "again": again}
         kernel(kernel.group, **arguments, moved=moved)
 
     def product(self) -> Doubles:

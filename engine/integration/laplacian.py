@@ -12,7 +12,7 @@ from mirrorskin.engine.integration.graph import Links, find_components
 from mirrorskin.engine.integration.multigrid import Multigrid
 from mirrorskin.engine.integration.surface import IntegrationOptions
 from mirrorskin.io import InputError
-from mirrorskin.io.arguments import as_array_or_number, check_number, checked
+from mirrorskin.io.arguments import as_array_or_number, check_number, checked, or_none
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.links import DOWN, KNOWN, RIGHT, SLOPE
@@ -24,7 +24,10 @@ Doubles = NDArray[np.float64]
 
 
 @checked(
-    right=as_array_or_number, down=as_array_or_number, diagonal=as_array_or_number, tolerance=check_number
+    right=as_array_or_number,
+    down=as_array_or_number,
+    diagonal=as_array_or_number,
+    tolerance=or_none(check_number),
 )
 def invert_laplacian(
     right: ArrayLike,

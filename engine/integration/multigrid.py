@@ -148,7 +148,7 @@ class Multigrid:
         step: dict[str, Any] = {"z": cycle.x, "p": solver.p}
         h.over_parts("curve", self._products, **h.graph, b=cycle.b, **step, count=count)
         products: dict[str, Any] = {"products": len(cycle.parts.host), "product": cycle.parts}
-        lengths = {"lengths": self._lengths}
+        lengths: dict[str, Any] = {"lengths": self._lengths}
         h.alone("best", **products, count=count, parts=self._products, **lengths)
         h.over("follow", h.levels[0], **lengths, **step, x=solver.x)
         solver.copy("release", solver.x, self._height)
