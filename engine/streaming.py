@@ -33,7 +33,7 @@ def feed(
 ) -> None:
     """Push frames of a source into an operation, once or twice.
 
-    A device that shares the host's memory computes on frames where they were read or are mapped. A device
+    A device that shares the host's memory computes on frames where they were read. A device
     with its own memory gets them from where they are mapped; other frames for it, and compressed ones in
     Zarr, are read and decoded while earlier ones are copied and processed.
 
@@ -114,7 +114,7 @@ def _read_in_place(source: Source, operation: Operation, count: int) -> Iterator
 
 
 def _lent_or_read(source: Source, operation: Operation, count: int, *, read: Reader) -> Iterator[Block]:
-    """Use frames where they are mapped, as many at once as possible, as long as the source allows it."""
+    """Use frames in the memory of the source, as many at once as possible, as long as it allows this."""
     lend: Callable[[int], Block | None] = getattr(source, "lend", lambda most: None)
     frame_size = math.prod(source.shape[1:]) * source.dtype.itemsize
     most = max(1, operation.device.max_allocation // frame_size)

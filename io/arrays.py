@@ -64,23 +64,6 @@ class ArrayRecording(Recording):
         Frames, positions or header cannot be used.
     """
 
-    path: Path
-    name: str
-    dataset: str
-    region: Region
-    origin: tuple[int, int]
-    first_frame: int
-    time: None
-    travel: None
-    phase: None
-    displacement: None
-    twist: None
-    tilt: None
-    used: None
-    dropped: None
-    state: str
-    storage: str
-
     def __init__(
         self,
         frames: NDArray[Any] | RawFrames,

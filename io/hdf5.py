@@ -9,7 +9,7 @@ import struct
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, BinaryIO, TypeAlias
 
 import h5py
 import numpy as np
@@ -33,6 +33,7 @@ many bytes as its own size, and ``memory_limit`` raises the limit.
 _LINKS_DEEP = 16
 _MOST_STEPS = 100_000  # through links, and to the sources of virtual datasets
 _GROUPS_DEEP = 64
+_LEAST_FILE = 512  # bytes that every HDF5 file with a dataset has
 _MOST_OBJECTS = 20_000  # groups and datasets in a file
 _MOST_NAMES = 10_000  # members of a group that is read as a whole
 
@@ -274,16 +275,16 @@ class Hdf5File(Closing):
         """
         if text is None:
             raise ValueError("neither numbers nor text")
-        opened = h5py.h5i.get_file_id(node)
-        if size > opened.get_filesize():
-            raise ValueError("a text longer than its file")
         if text.length is not None:
+            if size > _LEAST_FILE and size > h5py.h5i.get_file_id(node).get_filesize():
+                raise ValueError("a text longer than its file")
             return 0
         if isinstance(node, h5py.h5d.DatasetID) and node.get_create_plist().get_layout() == h5py.h5d.VIRTUAL:
             # HDF5 would read them from the heaps of other files, which are not checked.
             raise ValueError("texts of any length in a virtual dataset")
-        if (name := h5py.h5f.get_name(opened)) not in self._longest_text:
-            self._longest_text[name] = _check_heaps(h5py.File(opened))
+        name = h5py.h5f.get_name(node)
+        if name not in self._longest_text:
+            self._longest_text[name] = _check_heaps(h5py.File(h5py.h5i.get_file_id(node)))
         # Many texts may refer to the same bytes.
         return int(math.prod(node.shape)) * self._longest_text[name]
 
@@ -386,7 +387,7 @@ def _open_file(path: Path, real: str) -> h5py.File:
 
 
 _HEAP = re.compile(rb"GCOL\x01\0\0\0")  # its signature, version and reserved bytes
-_HEAD = struct.Struct("<8sQ")  # the start of a heap; each of its objects starts with as many bytes
+_HEAD, _OBJECT = struct.Struct("<8sQ"), struct.Struct("<H6xQ")  # the starts of a heap, and of its objects
 _BULK = 1 << 16  # bytes; larger datasets are not searched for heaps
 _PIECE = 1 << 20  # bytes searched at once; smaller files are searched completely
 
@@ -398,25 +399,30 @@ def _check_heaps(file: h5py.File) -> int:
     Heap" in the HDF5 file format specification.
     """
     longest, at = 0, 0
-    with Path(file.filename).open("rb", buffering=0) as opened:
+    with Path(file.filename).open("rb") as opened:
         size = os.fstat(opened.fileno()).st_size
         bulk = sorted(_bulk(file)) if size > _PIECE else ()
         for stop, after in (*bulk, (size, size)):
             while at < stop:
                 piece = os.pread(opened.fileno(), min(_PIECE, stop - at) + _HEAD.size, at)
                 for heap in _HEAP.finditer(piece):
-                    longest = max(longest, _check_heap(opened.fileno(), at + heap.start(), size))
+                    longest = max(longest, _check_heap(opened, at + heap.start(), size))
                 at += _PIECE
             at = after
     return longest
 
 
-def _check_heap(file: int, at: int, size: int) -> int:
+def _check_heap(file: BinaryIO, at: int, size: int) -> int:
     """Return the size in bytes of the longest object of a heap in a file."""
-    longest, stop = 0, min(at + _HEAD.unpack(os.pread(file, _HEAD.size, at))[1], size)
+
+    def read(head: struct.Struct) -> tuple[Any, ...]:
+        file.seek(at)
+        return head.unpack(file.read(head.size))
+
+    longest, stop = 0, min(at + read(_HEAD)[1], size)
     at += _HEAD.size
     while at + _HEAD.size <= stop:
-        index, length = struct.unpack("<H6xQ", os.pread(file, _HEAD.size, at))
+        index, length = read(_OBJECT)
         step = length if index == 0 else _HEAD.size + -(-length // 8) * 8
         if not 0 < step <= stop - at:
             raise ValueError("a heap of texts that does not end")

@@ -186,7 +186,7 @@ class Calibrated:
         return self._corrected(self.source.read(out))
 
     def lend(self, most: int) -> Block | None:
-        """Return the next frames of a recording without a copy, or None; see ``Recording.lend``."""
+        """Return the next frames of an array without a copy, or None; see ``ArrayRecording.lend``."""
         lend: Callable[[int], Block | None] | None = getattr(self.source, "lend", None)
         return None if lend is None else self._corrected(lend(most))
 
