@@ -7,7 +7,6 @@ import os
 import signal
 
 import pytest
-from simulated import simulate
 
 from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.kernels import device as device_layer
@@ -97,5 +96,7 @@ def clock():
 @pytest.fixture
 def simulated(clock, monkeypatch):
     """Let commands open rigs, stages and cameras on simulated time."""
+    from simulated import simulate  # which imports all hardware
+
     simulate(monkeypatch, clock)
     return clock

@@ -1,4 +1,4 @@
-"""The emulated controller behind a pseudo-terminal: right in time, and with the faults of a real one."""
+"""The emulated controller behind a pseudo-terminal; its faults are those of the line in memory."""
 
 from __future__ import annotations
 
@@ -59,28 +59,20 @@ def test_a_host_that_comes_again_finds_it_as_it_was(port: GrblPort) -> None:
             assert place in line.read_until(b">\r\n")
 
 
-def test_a_silent_controller_still_hears(port: GrblPort, line: serial.Serial) -> None:
-    port.silence()
-    line.timeout = 0.1
-    line.write(b"G0X1\n?")
-    assert line.read(1) == b""
+@pytest.mark.parametrize("fault", ["silence", "garble", "alarm"])
+def test_a_fault_reaches_the_host_and_the_controller_still_hears(port, line, fault) -> None:
+    {"silence": port.silence, "garble": lambda: port.garble(5000), "alarm": lambda: port.alarm(9)}[fault]()
+    line.write(b"$I\n" if fault == "garble" else b"$X\nG0X1\n")
+    if fault == "silence":
+        line.timeout = 0.1
+        assert line.read(1) == b""
+    else:
+        said = {"garble": b"[VER:1.1h", "alarm": b"ALARM:9"}[fault]
+        assert said in line.read_until(said)
     until = time.monotonic() + SOON
-    while port.machine.position()["X"] != 1:
+    while port.machine.position()["X"] != (fault != "garble"):
         assert time.monotonic() < until
         time.sleep(0.005)
-
-
-def test_noise_comes_with_the_replies_among_it(port: GrblPort, line: serial.Serial) -> None:
-    port.garble(5000)
-    line.write(b"$I\n")
-    heard = line.read(5000 + 40)
-    assert len(heard) > 5000
-    assert b"[VER:1.1h" in heard
-
-
-def test_an_alarm_from_another_thread_is_told_at_once(port: GrblPort, line: serial.Serial) -> None:
-    threading.Thread(target=port.alarm, args=(1,)).start()
-    assert line.read_until() == b"ALARM:1\r\n"
 
 
 def test_a_reader_that_waits_learns_that_the_port_is_gone(port: GrblPort, line: serial.Serial) -> None:
