@@ -231,6 +231,93 @@ def _():
     return NODES | made | arrays | {"first": FIRST + HALO, "window": WINDOW, "inverse": inverse}
 
 
+def measured(dtype):
+    """Return a reference that lacks texture in a corner and has a saturated pixel, and empty planes of it."""
+    frame = TEXTURE.frame(PICTURE, 0, 0)
+    frame = (frame * (200 / frame.max())).astype(dtype)
+    frame[20:, 20:] = 7
+    top = {} if dtype == "float32" else {"TOP": np.iinfo(dtype).max}
+    frame[3, 5] = top.get("TOP", 90)
+    padded = np.zeros([size + 2 * MARGIN for size in PICTURE], np.float32)
+    displacement.displacement_pad(frame, padded)
+    half, coefficients = padded.copy(), padded.copy()
+    displacement.displacement_filter(1, padded, half)
+    displacement.displacement_filter(padded.shape[1], half, coefficients)
+    wide = PICTURE[0] + 2 * HALO, PICTURE[1] + 2 * HALO
+    made = named("frame coefficients sums counts", frame, coefficients, *np.full((2, *PICTURE), np.nan))
+    made |= named("planes difference", np.full((4, *wide), np.nan), np.full((2, *wide), np.nan))
+    made |= {"window": WINDOW, "halo": HALO, "shape": PICTURE, "macros": {"WINDOW": WINDOW, **top}}
+    return made | {"macros": made["macros"] | {"FRAME": C_TYPES[dtype]}}
+
+
+def by_plane(atol, correlations=False):
+    """Return a check relative to the largest value of each plane, or of matrices to their diagonal."""
+
+    def check(found, wanted, values):
+        scale = np.maximum(np.nanmax(np.abs(wanted), axis=(-2, -1), keepdims=True), 1e-9)
+        if correlations:  # those of windows with hardly any texture lose digits in float32
+            diagonal = np.sqrt(wanted[range(len(wanted)), range(len(wanted))])
+            scale = diagonal * diagonal[:, np.newaxis]
+        np.testing.assert_allclose(found / scale, wanted / scale, rtol=2e-3, atol=atol)
+
+    return check
+
+
+MEASURED = named("sums counts planes difference summary", *[by_plane(2e-5)] * 5)
+
+
+@case("displacement_across", DTYPES, per="whole row", checks=MEASURED)
+def _(dtype):
+    made = measured(dtype)
+    return {name: made[name] for name in ("frame", "window", "sums", "counts", "shape", "macros")}
+
+
+def wide_rows(device, values):
+    rows, columns = values["difference"].shape[1:]
+    return rows * -(-columns // device.layout.tile)
+
+
+@case("displacement_planes", DTYPES, per=wide_rows, checks=MEASURED)
+def _(dtype):
+    made = measured(dtype)
+    displacement.displacement_across(WINDOW, made["frame"], made["sums"], made["counts"])
+    return made
+
+
+@case(
+    "displacement_normals", DTYPES, per=lambda device, values: math.prod(GRID),
+    checks=MEASURED | {"inverse": by_plane(3e-4, correlations=True)},
+)  # fmt: skip
+def _(dtype):
+    made = measured(dtype)
+    displacement.displacement_across(WINDOW, made["frame"], made["sums"], made["counts"])
+    arrays = (made[name] for name in ("frame", "coefficients", "sums", "counts", "planes", "difference"))
+    displacement.displacement_planes(HALO, WINDOW, *arrays)
+    size = displacement.PARAMETERS
+    answers = {"inverse": np.zeros((size, size, *GRID)), "summary": np.zeros((4, *GRID))}
+    return (
+        NODES
+        | answers
+        | {"planes": made["planes"], "first": FIRST + HALO, "window": WINDOW, "macros": made["macros"]}
+    )
+
+
+PIXELWISE = {"grid": (GRID, (1, 12), (9, 2)), "logarithms": (0, 1)}
+
+
+@case(
+    "displacement_pixels", PIXELWISE, rtol=2e-5, atol=1e-6,
+    per=lambda device, values: 3 * PICTURE[0] * -(-PICTURE[1] // device.layout.tile),
+)  # fmt: skip
+def _(grid, logarithms):
+    nodes = np.random.default_rng(3).normal(0, 1, (3, 2, *grid)).astype(np.float32)
+    nodes[1, :, 0, 1] = np.nan
+    sizes = {"node_rows": grid[0], "node_columns": grid[1], "step": STEP, "start": FIRST + (WINDOW - 1) / 2}
+    arrays = {"nodes": nodes, "pixels": np.zeros((3, *PICTURE, 2), np.float32), "shape": PICTURE}
+    macros = {"FRAME": "uchar", "WINDOW": WINDOW}
+    return sizes | arrays | {"count": 3, "parts": 2, "logarithms": logarithms, "macros": macros}
+
+
 # --- Exposure
 
 SENSORS = [("uint8", 8, 1.5, 0.0), ("uint8", 8, 0.0, 1.0), ("float32", 8, 1.5, 1.0)]
@@ -291,6 +378,43 @@ def _(dtype, radius, reach, first):
     return known | named("best peak recent", *state)
 
 
+def sound(rtol, atol=0.0):
+    """Return a check of pixels whose peak is sound, but for those where float32 decides of a limit."""
+
+    def check(found, wanted, values):
+        part = (values["status"] == 1) & np.isfinite(wanted)
+        largest = np.max(np.abs(wanted[part]), initial=0.0)
+        assert (
+            np.mean(~np.isclose(found[part], wanted[part], rtol, atol * largest)) < 1e-3
+            if part.any()
+            else True
+        )
+
+    return check
+
+
+FITTED = named("height spread gain", sound(1e-5), sound(1e-3), sound(1e-3))
+FITTED |= named("misfit sharpness status", sound(2e-2, 1e-3), near(1e-4, 0.0), near(0.0, 0.0, share=1e-3))
+
+
+@case("focus_fit", {"reach": (1, 2, 4), "variance": (0.0, 2.25)}, checks=FITTED)
+def _(reach, variance):
+    rng, size = np.random.default_rng(1), (11, 130)
+    travel, best = np.cumsum(rng.uniform(0.01, 0.03, 12)), rng.integers(0, 12, size).astype(np.int32)
+    frame, steps = best + np.arange(-reach, reach + 1)[:, None, None], np.arange(-reach, reach + 1)
+    around = np.clip(np.arange(12)[:, None] + steps, 0, 11)
+    places = ((travel[around] - travel[:, None]) / 0.02).astype(np.float32)
+    peak = 4000 * np.exp(-((np.moveaxis(places[best], -1, 0) - rng.uniform(-0.4, 0.4, size)) ** 2) / 8)
+    peak = peak * rng.uniform(0.98, 1.02, peak.shape)
+    peak[(frame < 0) | (frame > 11)] = np.nan
+    peak[:, 3, 7], peak[1:, 4, 9], peak[:, 5, 5] = np.nan, np.nan, 3.0
+    arrays = named("places travel best peak", places, travel, best, peak)
+    arrays |= {name: np.zeros(size) for name in ("height", "spread", "gain", "misfit", "sharpness")}
+    numbers = named("radius least_contrast least_curvature unit count", 2, 5.0, 3.0, 0.02, 12)
+    arrays |= {"status": np.zeros(size, np.uint8), "shape": size, "macros": {"FRAME": "uchar"}}
+    return arrays | numbers | {"reach": reach, "variance": variance}
+
+
 def triangles(found, wanted, values):
     scale = np.abs(wanted[:10]).max(axis=1, keepdims=True)
     np.testing.assert_allclose(found[:10] / scale, wanted[:10] / scale, atol=2e-6)
@@ -309,6 +433,28 @@ def _(dtype, dark_step):
     lambert.lambert_add(frames[:2], lights[:2], True, **known, triangle=triangle)
     known |= {"frames": frames[2:], "lights": lights[2:], "fresh": 0, "triangle": triangle}
     return known | {"dark_step": dark_step, "shape": (1, pixels)}
+
+
+def solved(found, wanted, values):
+    np.testing.assert_allclose(found, np.where(np.isfinite(wanted), wanted, np.nan), rtol=2e-3)
+    assert np.isfinite(wanted).mean() > 0.9
+
+
+SOLVED = dict.fromkeys(("normals", "normals_spread", "albedo", "albedo_spread", "residual"), solved)
+
+
+@case("lambert_normals", checks=SOLVED)
+def _():
+    rng, pixels = np.random.default_rng(0), 1100
+    lights, normals = rng.normal(size=(9, 3)), rng.normal(size=(3, pixels))
+    lit = (rng.random((9, pixels)) < 0.85) & (np.arange(pixels) % 7 > np.arange(9)[:, None] - 5)
+    frames = np.where(lit, lights @ normals * 50 + 300 + rng.normal(size=lit.shape), 0)
+    triangle = np.zeros((11, pixels))
+    lambert.lambert_add(frames, lights, True, np.array([0.0]), 10.0, 1e6, triangle)
+    triangle[:, 0], triangle[7, 1] = 0, 0  # without any lamp, and with two
+    answers = {name: np.zeros(pixels) for name in SOLVED} | {"normals": np.zeros((pixels, 3))}
+    answers |= {"samples": np.zeros(pixels, np.int32), "triangle": triangle}
+    return answers | {"shape": (1, pixels), "macros": {"FRAME": "uchar"}}
 
 
 # --- Limits of memory and arithmetic
@@ -546,10 +692,7 @@ def test_a_kernel_computes_its_reference(device, name, function, chosen, options
 ELSEWHERE = {
     "changepoint": "support/changes.py",
     "components": "kernels/test_components.py",
-    "displacement": "kernels/test_displacement.py",
     "edges": "kernels/test_edges.py",
-    "focus": "kernels/test_focus.py",
-    "lambert": "kernels/test_lambert.py",
     "links": "kernels/test_links.py",
     "multigrid": "kernels/test_multigrid.py",
     "normals": "kernels/test_normals.py",

@@ -85,7 +85,7 @@ def agree(
     rtol, atol : float
         Tolerance, the latter as a share of an answer's largest value. Whole numbers and inputs must be equal.
     checks : dict
-        Instead of that: what to do with the kernel's and the reference's answer.
+        Instead of that: what to do with the kernel's and the reference's answer, and all values afterwards.
     """
     values = {key: _rounded(value, key in pairs.split()) for key, value in values.items()}
     rows, columns = values.pop("shape", (1, 1))
@@ -125,7 +125,7 @@ def agree(
         found, wanted = array.download(), expected[key]
         found = found.sum(axis=-1, dtype=np.float64) if key in pairs.split() else found
         if key in (checks or {}):
-            checks[key](found, wanted, values)
+            checks[key](found, wanted, values | expected)
         elif np.asarray(wanted).dtype.kind != "f":
             np.testing.assert_array_equal(found, wanted, err_msg=key)
         else:
