@@ -153,6 +153,7 @@ class Row(NamedTuple):
     value: float | int | str
     sigma: float = math.nan  # standard error; NaN if unknown
     unit: str = ""
+    name: str = ""  # of the parameter, and of the component
 
     @property
     def text(self) -> str:
@@ -201,7 +202,9 @@ class Part:
                 continue
             if one.flags:
                 for flag, bit in one.flags.items():
-                    yield Row(self.command, flag, int(np.count_nonzero(value & bit)), math.nan, "pixels")
+                    yield Row(
+                        self.command, flag, int(np.count_nonzero(value & bit)), math.nan, "pixels", flag
+                    )
                 continue
             if one.convert is not None:
                 value = one.convert(value)
@@ -210,12 +213,13 @@ class Part:
             named = one.components or ("",)
             for component, number in zip(named, value if one.components else (value,), strict=True):
                 what = title.format(component) if "{}" in title else f"{title} {component}".rstrip()
+                key = f"{name}_{component}" if component else name
                 if isinstance(number, str | int):
-                    yield Row(self.command, what, number)
+                    yield Row(self.command, what, number, name=key)
                     continue
                 factor = 1.0 if one.convert is not None else one.factor
-                sigma = errors.get(f"{name}_{component}" if component else name, math.nan) * factor
-                yield Row(self.command, what, float(number) * factor, sigma, one.shown_unit)
+                sigma = errors.get(key, math.nan) * factor
+                yield Row(self.command, what, float(number) * factor, sigma, one.shown_unit, key)
 
 
 T = TypeVar("T", bound=Part)
