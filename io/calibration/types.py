@@ -111,7 +111,10 @@ class Lens(Part):
         "the corresponding pinhole camera matrix, in pixels of the picture", shape=(3, 3)
     )
     shape: tuple[int, int] = parameter(
-        "rows and columns of the undistorted map, and of the full picture", valid=_above_zero
+        "rows and columns of the undistorted map, and of the full picture",
+        title="{} of the map",
+        components=("rows", "columns"),
+        valid=_above_zero,
     )
     error: float = parameter(
         "RMS distance between the detected and the fitted marks", "pixel", title="left on the board"
@@ -142,7 +145,8 @@ class WallResponse(Part):
     )
     sight: tuple[float, float] = parameter(
         "k0, 1/mm, and k2, 1/mm^3: the line of sight is along (-(k0 + k2 r^2) X, -(k0 + k2 r^2) Y, 1),"
-        " r^2 = X^2 + Y^2"
+        " r^2 = X^2 + Y^2",
+        components=("k0", "k2"),
     )
     lamps: tuple[float, float] = parameter(
         "relative increase of the wall's brightness towards x and y",
@@ -164,7 +168,7 @@ class WallResponse(Part):
     shade: Floats = parameter(
         "s0 to s4 of the shading V = 1 + s0 X/R + s1 Y/R + s2 (X/R)^2 + s3 XY/R^2 + s4 (Y/R)^2; the"
         " relative brightness is (counts - dark) / ((bright - dark) V)",
-        shape=(5,),
+        components=("s0", "s1", "s2", "s3", "s4"),
     )
     pattern: str = parameter(
         "`graded`, or `uniform` for a wall that determines only a threshold",
@@ -303,7 +307,6 @@ class Gel(Part):
     axis: tuple[float, float] = parameter(
         "position of the wall's axis in the picture",
         "mm",
-        title="",
         components="xy",
         place=True,
         default=(0.0, 0.0),
@@ -334,7 +337,9 @@ class Stiffness(Part):
 
     modulus: float = parameter("Young's modulus", "MPa", valid=_above_zero)
     gel_shift: tuple[float, float, float] = parameter(
-        "errors of the gel's threshold, compliance and curvature found from forces, in standard errors"
+        "errors of the gel's threshold, compliance and curvature found from forces, in standard errors",
+        title="shift of the gel's {}",
+        components=("threshold", "compliance", "curvature"),
     )
     covariance: Floats = parameter(
         "covariance of the modulus and of its products with the shifts, MPa^2", shape=(4, 4)
@@ -346,7 +351,7 @@ class Stiffness(Part):
         valid=_at_least_zero,
     )
     gel_threshold: float = parameter(
-        "threshold of the gel used: a gel that is calibrated again needs a new modulus", "rad", title=""
+        "threshold of the gel used: a gel that is calibrated again needs a new modulus", "rad"
     )
     error: float = parameter(
         "relative RMS error of each force predicted from the other presses; NaN for fewer than 2",
