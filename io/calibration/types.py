@@ -146,7 +146,8 @@ class WallResponse(Part):
     sight: tuple[float, float] = parameter(
         "k0, 1/mm, and k2, 1/mm^3: the line of sight is along (-(k0 + k2 r^2) X, -(k0 + k2 r^2) Y, 1),"
         " r^2 = X^2 + Y^2",
-        components=("k0", "k2"),
+        title="line of sight k{}",
+        components=("0", "2"),
     )
     lamps: tuple[float, float] = parameter(
         "relative increase of the wall's brightness towards x and y",
@@ -168,7 +169,8 @@ class WallResponse(Part):
     shade: Floats = parameter(
         "s0 to s4 of the shading V = 1 + s0 X/R + s1 Y/R + s2 (X/R)^2 + s3 XY/R^2 + s4 (Y/R)^2; the"
         " relative brightness is (counts - dark) / ((bright - dark) V)",
-        components=("s0", "s1", "s2", "s3", "s4"),
+        title="shading s{}",
+        components="01234",
     )
     pattern: str = parameter(
         "`graded`, or `uniform` for a wall that determines only a threshold",
