@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 _NEGLIGIBLE = math.radians(0.1)  # error of the azimuth, or mean lean, above which a warning is printed
 _SIGNIFICANT = 3.0  # standard errors above which it is printed in any case
 _RESPONSE = declared("fuse").only("zenith_gain", "zenith_offset")
-_ANGLES = ("tilt", "phase_offset", "major_axis", "centre_x", "centre_y")
 
 
 def command(
@@ -114,21 +113,13 @@ def _brightness(
 
 def _learned(fit: PrecessionFit, facts: dict[str, Any]) -> inputs.Learned:
     precession = fit.precession
-    numbers = {
-        **{name: getattr(precession, name) for name in ("tilt", "phase_offset", "ellipticity", "major_axis")},
-        **{f"centre_{axis}": value for axis, value in zip("xy", precession.centre, strict=True)},
-        **{f"pivot_{axis}": value for axis, value in zip("xyz", precession.pivot, strict=True)},
-    }
-    unit = {name: math.degrees(1) if name in _ANGLES else 1.0 for name in numbers}
-    values = {name: value * unit[name] for name, value in numbers.items()}
-    errors = {name: precession.sigma[name] * unit[name] for name in numbers if name in precession.sigma}
+    numbers = {row.name: (row.value, row.sigma) for row in precession.rows() if isinstance(row.value, float)}
+    each = {name: {"value": value, "sigma": sigma} for name, (value, sigma) in numbers.items()}
     notes = [*fit.notes, *warnings(precession)]
-    each = {name: {"value": value, "sigma": errors.get(name)} for name, value in values.items()}
 
     def text(name: str, digits: int, unit: str = "") -> str:
-        if not math.isfinite(values[name]):
-            return "not determined"
-        return f"{values[name]:.{digits}f} ± {errors[name]:.2g}{unit}"
+        value, sigma = numbers[name]
+        return f"{value:.{digits}f} ± {sigma:.2g}{unit}" if math.isfinite(value) else "not determined"
 
     sense = "counter-clockwise" if precession.direction > 0 else "clockwise"
     residuals = {f"residual_{name}": value for name, value in fit.residual.items()}

@@ -240,8 +240,8 @@ def centre_marks(picture: NDArray[Any], starts: Doubles, radius: float) -> tuple
     found by Gauss-Newton steps with the weights (1 - d^2 / radius^2)^2. The picture is interpolated by cubic
     splines after a slight blur, because splines oscillate next to a sharp edge.
 
-    Light that increases to one side moves such a centre. From the asymmetries around all marks, the light is
-    estimated as the exponential of a quadratic polynomial, by which the picture is divided.
+    Light that increases to one side moves such a centre. The light is estimated from the asymmetries around
+    all marks, as the exponential of a quadratic polynomial, and the picture is divided by it.
 
     ``picture`` has a contrast of about 255, ``starts`` are columns and rows, (n, 2), and ``radius`` is the
     circle's, pixels. Returned are the places, and whether there is such a centre near the start, with the

@@ -6,21 +6,29 @@ figures are derived from the declaration.
 
 from __future__ import annotations
 
+import functools
 import inspect
 import math
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, Field, dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields, replace
 from typing import Any, ClassVar, Literal, NamedTuple, TypeVar, dataclass_transform
 
 import numpy as np
-from numpy.typing import DTypeLike
 
 from mirrorskin.io.units import ratio
 
 Kind = Literal["map", "array", "number", "integer", "numbers", "integers", "text", "names", "mapping"]
 
 _SHOWN = {"rad": "deg", "pixel": "px", "MPa": "kPa"}  # units of tables and figures, unless one is declared
+_KINDS: dict[str, Kind] = {
+    "float": "number",
+    "int": "integer",
+    "str": "text",
+    "Floats": "array",
+    "tuple[str, ...]": "names",
+    "Mapping[str, float]": "mapping",
+}
 _FACTORS = {"%": 100.0, "px": 1.0, "deg": math.degrees(1)}  # of units that `ratio` does not convert
 _TYPES = {
     "number": "float",
@@ -38,10 +46,6 @@ class Parameter:
 
     Attributes
     ----------
-    kind : str
-        A "map" has one value per pixel of the camera, and is cropped with the picture. "numbers", "integers"
-        and "names" are tuples. A "mapping" contains numbers by name, in a group of its own; each has the unit
-        of the parameter of its name, with or without a component.
     text : str
         What the parameter is: a phrase without a full stop. Titles of figures end at its first semicolon.
     unit : str
@@ -54,9 +58,7 @@ class Parameter:
     components : tuple of str
         Names of the components of "numbers" or an "array".
     shape : tuple
-        Shape; letters are sizes that the parameters of a part share.
-    dtype : dtype
-        Type of a map, by default float32, or of an array, by default float64.
+        Shape of an array; letters are sizes that the parameters of a part share.
     valid : callable, optional
         Whether a value in a file is accepted.
     place : bool
@@ -67,28 +69,47 @@ class Parameter:
         Bits of a map that are counted.
     optional : bool
         Whether a file may lack it: it has a default.
+    kind : str
+        From the annotation: a "map" (NDArray) has one value per pixel of the camera, and is cropped with the
+        picture. "numbers", "integers" and "names" are tuples. A "mapping" contains numbers by name, in a
+        group of its own; each has the unit of the parameter of its name, with or without a component.
+    dtype : dtype
+        Type of a map or an array.
     """
 
-    kind: Kind
     text: str
     unit: str = ""
     title: str | None = None
     shown_unit: str = ""
     components: Sequence[str] = ()
     shape: tuple[int | str, ...] = ()
-    dtype: np.dtype[Any] = np.dtype(np.float64)  # noqa: RUF009
     valid: Callable[[Any], bool] | None = None
     place: bool = False
     convert: Callable[[Any], Any] | None = None
     flags: Mapping[str, int] = field(default_factory=dict)
     optional: bool = False
+    kind: Kind = "array"
+    dtype: np.dtype[Any] = np.dtype(np.float64)  # noqa: RUF009
 
-    def __post_init__(self) -> None:
-        own = (len(self.components),) if self.components else ()
-        object.__setattr__(self, "shape", ("rows", "columns") if self.kind == "map" else self.shape or own)
-        if not self.components and self.kind not in ("map", "number", "integer", "text"):
-            object.__setattr__(self, "title", "")
-        object.__setattr__(self, "shown_unit", self.shown_unit or _SHOWN.get(self.unit, self.unit))
+    def settled(self, annotation: str) -> Parameter:
+        """Return the declaration of an attribute with this annotation."""
+        kind, shape, dtype = _KINDS.get(annotation), self.shape or (len(self.components),), self.dtype
+        if annotation.startswith("tuple") and kind is None:
+            kind, shape = "integers" if "int" in annotation else "numbers", (annotation.count(",") + 1,)
+        elif annotation.startswith("NDArray"):
+            kind, shape = "map", ("rows", "columns")
+            dtype = np.dtype(annotation.removeprefix("NDArray[np.").removesuffix("]"))
+        elif kind not in ("array", "names"):
+            shape = ()
+        hidden = kind in ("array", "numbers", "integers", "names", "mapping") and not self.components
+        return replace(
+            self,
+            kind=kind or "array",
+            shape=shape,
+            dtype=dtype,
+            title="" if hidden else self.title,
+            shown_unit=self.shown_unit or _SHOWN.get(self.unit, self.unit),
+        )
 
     @property
     def factor(self) -> float:
@@ -113,21 +134,12 @@ class Parameter:
         return f"{kind}, {self.unit}" if self.unit else kind
 
 
-def parameter(
-    kind: Kind,
-    text: str,
-    unit: str = "",
-    *,
-    dtype: DTypeLike | None = None,
-    default: Any = MISSING,
-    **options: Any,
-) -> Any:
+def parameter(text: str, unit: str = "", *, default: Any = MISSING, **options: Any) -> Any:
     """Declare a parameter in the body of a part, by the fields of `Parameter`.
 
     Without a default, a file must contain it: declare one if older files are still to be read.
     """
-    stored = np.dtype(dtype or (np.float32 if kind == "map" else np.float64))
-    one = Parameter(kind, text, unit, dtype=stored, optional=default is not MISSING, **options)
+    one = Parameter(text, unit, optional=default is not MISSING, **options)
     if callable(default):
         return field(default_factory=default, metadata={"parameter": one})
     return field(default=default, metadata={"parameter": one})
@@ -141,6 +153,7 @@ class Row(NamedTuple):
     value: float | int | str
     sigma: float = math.nan  # standard error; NaN if unknown
     unit: str = ""
+    name: str = ""  # of the parameter, and of the component
 
     @property
     def text(self) -> str:
@@ -189,7 +202,9 @@ class Part:
                 continue
             if one.flags:
                 for flag, bit in one.flags.items():
-                    yield Row(self.command, flag, int(np.count_nonzero(value & bit)), math.nan, "pixels")
+                    yield Row(
+                        self.command, flag, int(np.count_nonzero(value & bit)), math.nan, "pixels", flag
+                    )
                 continue
             if one.convert is not None:
                 value = one.convert(value)
@@ -198,12 +213,13 @@ class Part:
             named = one.components or ("",)
             for component, number in zip(named, value if one.components else (value,), strict=True):
                 what = title.format(component) if "{}" in title else f"{title} {component}".rstrip()
+                key = f"{name}_{component}" if component else name
                 if isinstance(number, str | int):
-                    yield Row(self.command, what, number)
+                    yield Row(self.command, what, number, name=key)
                     continue
                 factor = 1.0 if one.convert is not None else one.factor
-                sigma = errors.get(f"{name}_{component}" if component else name, math.nan) * factor
-                yield Row(self.command, what, float(number) * factor, sigma, one.shown_unit)
+                sigma = errors.get(key, math.nan) * factor
+                yield Row(self.command, what, float(number) * factor, sigma, one.shown_unit, key)
 
 
 T = TypeVar("T", bound=Part)
@@ -229,12 +245,12 @@ def part(cls: type[T]) -> type[T]:
 
 def parameters(of: Any) -> dict[str, Parameter]:
     """Return the declarations of a part, or of its class, by name."""
-    return {one.name: _declared(one) for one in fields(of)}
+    return _parameters(of if isinstance(of, type) else type(of))
 
 
-def _declared(one: Field[Any]) -> Parameter:
-    declared: Parameter = one.metadata["parameter"]
-    return declared
+@functools.cache
+def _parameters(kind: Any) -> dict[str, Parameter]:
+    return {one.name: one.metadata["parameter"].settled(str(one.type)) for one in fields(kind)}
 
 
 def unit_of(name: str, declared: Mapping[str, Parameter]) -> str:

@@ -28,6 +28,10 @@ def _above_zero(values: float | tuple[float, ...]) -> bool:
     return all(0 < value < math.inf for value in np.ravel(values))
 
 
+def _at_least_zero(value: float) -> bool:
+    return value >= 0
+
+
 def _zeniths_on_axis(reach: tuple[float, float]) -> list[float]:
     """Return the zeniths, degrees, of mirrors on the axis that show the wall at q, in ascending order."""
     return sorted(math.degrees(math.pi / 4 - math.atan(q)) for q in reach)
@@ -64,12 +68,12 @@ class References(Part):
     command: ClassVar[str] = "references"
     signal: ClassVar[str] = "bright"
 
-    dark: NDArray[np.float32] = parameter("map", "dark level, without light; NaN at defects", "counts")
-    bright: NDArray[np.float32] = parameter("map", "bright level, in full light; NaN at defects", "counts")
-    dark_sigma: NDArray[np.float32] = parameter("map", "standard error of dark", "counts", title="")
-    bright_sigma: NDArray[np.float32] = parameter("map", "standard error of bright", "counts", title="")
+    dark: NDArray[np.float32] = parameter("dark level, without light; NaN at defects", "counts")
+    bright: NDArray[np.float32] = parameter("bright level, in full light; NaN at defects", "counts")
+    dark_sigma: NDArray[np.float32] = parameter("standard error of dark", "counts", title="")
+    bright_sigma: NDArray[np.float32] = parameter("standard error of bright", "counts", title="")
     defects: NDArray[np.uint8] = parameter(
-        "map", "0 for a sound pixel, or a sum of 1 hot, 2 dead, 4 saturated", dtype=np.uint8, flags=BITS
+        "0 for a sound pixel, or a sum of 1 hot, 2 dead, 4 saturated", flags=BITS
     )
 
     def standard_errors(self) -> Mapping[str, float]:
@@ -88,7 +92,6 @@ class Lens(Part):
     command: ClassVar[str] = "scale"
 
     pixel_size: tuple[float, float] = parameter(
-        "numbers",
         "size along x and y of a pixel of the undistorted map",
         "mm",
         title="pixel size along {}",
@@ -97,29 +100,26 @@ class Lens(Part):
         valid=_above_zero,
     )
     camera: Floats = parameter(
-        "array",
         "homography from a pixel (column, row, 1) of a picture without distortion to millimetres on the"
         " sheet, (x, y, 1), with (0, 0) at the centre of the undistorted map; it includes the perspective",
         shape=(3, 3),
     )
     distortion: Floats = parameter(
-        "array", "coefficients k1, k2, p1, p2, k3 of OpenCV", components=("k1", "k2", "p1", "p2", "k3")
+        "coefficients k1, k2, p1, p2, k3 of OpenCV", components=("k1", "k2", "p1", "p2", "k3")
     )
     matrix: Floats = parameter(
-        "array", "the corresponding pinhole camera matrix, in pixels of the picture", shape=(3, 3)
+        "the corresponding pinhole camera matrix, in pixels of the picture", shape=(3, 3)
     )
     shape: tuple[int, int] = parameter(
-        "integers",
         "rows and columns of the undistorted map, and of the full picture",
-        shape=(2,),
+        title="{} of the map",
+        components=("rows", "columns"),
         valid=_above_zero,
     )
     error: float = parameter(
-        "number", "RMS distance between the detected and the fitted marks", "pixel", title="left on the board"
+        "RMS distance between the detected and the fitted marks", "pixel", title="left on the board"
     )
-    scale_sigma: float = parameter(
-        "number", "relative standard error of the pixel size", title="", default=math.nan
-    )
+    scale_sigma: float = parameter("relative standard error of the pixel size", title="", default=math.nan)
 
     def standard_errors(self) -> Mapping[str, float]:
         """Return those of the pixel size."""
@@ -138,34 +138,28 @@ class WallResponse(Part):
     signal: ClassVar[str] = "zenith_sigma"
     motion: ClassVar[str] = "axial"
 
-    radius: float = parameter("number", "radius R of the wall", "mm", valid=_above_zero)
-    rim: float = parameter("number", "height H of the wall", "mm", valid=_above_zero)
+    radius: float = parameter("radius R of the wall", "mm", valid=_above_zero)
+    rim: float = parameter("height H of the wall", "mm", valid=_above_zero)
     axis: tuple[float, float] = parameter(
-        "numbers",
-        "position (x0, y0) of the wall's axis; X = x - x0, Y = y - y0",
-        "mm",
-        components="xy",
-        place=True,
+        "position (x0, y0) of the wall's axis; X = x - x0, Y = y - y0", "mm", components="xy", place=True
     )
     sight: tuple[float, float] = parameter(
-        "numbers",
         "k0, 1/mm, and k2, 1/mm^3: the line of sight is along (-(k0 + k2 r^2) X, -(k0 + k2 r^2) Y, 1),"
         " r^2 = X^2 + Y^2",
-        shape=(2,),
+        title="line of sight k{}",
+        components=("0", "2"),
     )
     lamps: tuple[float, float] = parameter(
-        "numbers",
         "relative increase of the wall's brightness towards x and y",
         title="lamps towards {}",
         shown_unit="%",
         components="xy",
     )
-    scatter: float = parameter("number", "half-angle of the sheet's scatter", "rad")
+    scatter: float = parameter("half-angle of the sheet's scatter", "rad")
     curve: Floats = parameter(
-        "array", "coefficients of the brightness as a polynomial in q, lowest first", shape=("n",)
+        "coefficients of the brightness as a polynomial in q, lowest first", shape=("n",)
     )
     reach: tuple[float, float] = parameter(
-        "numbers",
         "range of q in which the polynomial is valid",
         title="known on the axis {}",
         shown_unit="deg",
@@ -173,31 +167,26 @@ class WallResponse(Part):
         convert=_zeniths_on_axis,
     )
     shade: Floats = parameter(
-        "array",
         "s0 to s4 of the shading V = 1 + s0 X/R + s1 Y/R + s2 (X/R)^2 + s3 XY/R^2 + s4 (Y/R)^2; the"
         " relative brightness is (counts - dark) / ((bright - dark) V)",
-        shape=(5,),
+        title="shading s{}",
+        components="01234",
     )
     pattern: str = parameter(
-        "text",
         "`graded`, or `uniform` for a wall that determines only a threshold",
         valid=lambda value: value in PATTERNS,
     )
     zenith_sigma: NDArray[np.float32] = parameter(
-        "map", "standard error of zenith, from the response", "rad", title="error of zenith"
+        "standard error of zenith, from the response", "rad", title="error of zenith"
     )
     azimuth_sigma: NDArray[np.float32] = parameter(
-        "map",
         "standard error of azimuth times sin(zenith), from the response",
         "rad",
         title="error of azimuth x sin(zenith)",
     )
-    parameters: tuple[str, ...] = parameter("names", "names of the fitted parameters", shape=("p",))
-    covariance: Floats = parameter(
-        "array", "covariance of the fitted parameters, in their units", shape=("p", "p")
-    )
+    parameters: tuple[str, ...] = parameter("names of the fitted parameters", shape=("p",))
+    covariance: Floats = parameter("covariance of the fitted parameters, in their units", shape=("p", "p"))
     error: float = parameter(
-        "number",
         "residual of the zenith on the balls plus one standard error, RMS",
         "rad",
         title="left on the balls at most",
@@ -217,27 +206,24 @@ class Precession(Part):
     motion: ClassVar[str] = "axial"
 
     tilt: float = parameter(
-        "number", "mean half-angle of the cone", "rad", title="half-angle", valid=lambda value: value > 0
+        "mean half-angle of the cone", "rad", title="half-angle", valid=lambda value: value > 0
     )
-    phase_offset: float = parameter("number", "azimuth of the lean at phase zero", "rad")
+    phase_offset: float = parameter("azimuth of the lean at phase zero", "rad")
     direction: int = parameter(
-        "integer",
         "sense of rotation: 1 if it is that of the phase, counter-clockwise; otherwise -1",
         valid=lambda value: value in (1, -1),
         convert=lambda value: "with the phase" if value > 0 else "against the phase",
     )
-    ellipticity: float = parameter("number", "(a - b) / (a + b) of the largest and the smallest half-angle")
-    major_axis: float = parameter("number", "azimuth of the largest half-angle", "rad")
+    ellipticity: float = parameter("(a - b) / (a + b) of the largest and the smallest half-angle")
+    major_axis: float = parameter("azimuth of the largest half-angle", "rad")
     centre: tuple[float, float] = parameter(
-        "numbers", "the mean lean along x and y", "rad", title="mean lean along {}", components="xy"
+        "the mean lean along x and y", "rad", title="mean lean along {}", components="xy"
     )
     pivot: tuple[float, float, float] = parameter(
-        "numbers", "centre of the rotation; NaN if undetermined", "mm", components="xyz", place=True
+        "centre of the rotation; NaN if undetermined", "mm", components="xyz", place=True
     )
     sigma: Mapping[str, float] = parameter(
-        "mapping",
-        "standard errors, by the names of the parameters; of vectors `pivot_z` and so on",
-        default=dict,
+        "standard errors, by the names of the parameters; of vectors `pivot_z` and so on", default=dict
     )
 
     def lean(self, phase: Floats) -> Floats:
@@ -302,55 +288,46 @@ class Gel(Part):
     motion: ClassVar[str] = "vertical"
 
     threshold: float = parameter(
-        "number",
         "zenith at which a pixel on the wall's axis turns bright",
         "rad",
         title="threshold zenith",
         valid=lambda value: 0 < value < math.pi / 4,
     )
     compliance: float = parameter(
-        "number",
         "deflection of the stage in mm per N / (N/mm^2): its flexure times the gel's modulus",
         "1/mm",
         title="flexure times modulus",
-        valid=lambda value: value >= 0,
+        valid=_at_least_zero,
     )
     curvature: float = parameter(
-        "number",
         "1 / radius of the wall: decrease of the threshold towards it; 0 for the same zenith everywhere",
         "1/mm",
         title="curvature of the wall",
-        valid=lambda value: value >= 0,
+        valid=_at_least_zero,
         default=0.0,
     )
     axis: tuple[float, float] = parameter(
-        "numbers",
         "position of the wall's axis in the picture",
         "mm",
-        title="",
         components="xy",
         place=True,
         default=(0.0, 0.0),
     )
     travel_zero: float = parameter(
-        "number",
         "travel at which the sheet met the calibration ball: a check of the stage, not used",
         "mm",
         title="travel at the touch",
         default=0.0,
     )
     error: float = parameter(
-        "number",
         "RMS residual of the height on the calibration balls",
         "mm",
         title="left on the ball",
         shown_unit="um",
-        valid=lambda value: value >= 0,
+        valid=_at_least_zero,
         default=0.0,
     )
-    sigma: Mapping[str, float] = parameter(
-        "mapping", "standard errors, by the names of the parameters", default=dict
-    )
+    sigma: Mapping[str, float] = parameter("standard errors, by the names of the parameters", default=dict)
 
 
 @part
@@ -360,36 +337,31 @@ class Stiffness(Part):
     command: ClassVar[str] = "force"
     motion: ClassVar[str] = "vertical"
 
-    modulus: float = parameter("number", "Young's modulus", "MPa", valid=_above_zero)
+    modulus: float = parameter("Young's modulus", "MPa", valid=_above_zero)
     gel_shift: tuple[float, float, float] = parameter(
-        "numbers",
         "errors of the gel's threshold, compliance and curvature found from forces, in standard errors",
-        shape=(3,),
+        title="shift of the gel's {}",
+        components=("threshold", "compliance", "curvature"),
     )
-    covariance: NDArray[np.float64] = parameter(
-        "array", "covariance of the modulus and of its products with the shifts, MPa^2", shape=(4, 4)
+    covariance: Floats = parameter(
+        "covariance of the modulus and of its products with the shifts, MPa^2", shape=(4, 4)
     )
     scatter: float = parameter(
-        "number",
         "relative standard deviation of a press's force that neither noise nor these parameters explain",
         title="scatter of a force",
         shown_unit="%",
-        valid=lambda value: value >= 0,
+        valid=_at_least_zero,
     )
     gel_threshold: float = parameter(
-        "number",
-        "threshold of the gel used: a gel that is calibrated again needs a new modulus",
-        "rad",
-        title="",
+        "threshold of the gel used: a gel that is calibrated again needs a new modulus", "rad"
     )
     error: float = parameter(
-        "number",
         "relative RMS error of each force predicted from the other presses; NaN for fewer than 2",
         title="error of held-out forces",
         shown_unit="%",
         default=math.nan,
     )
-    presses: int = parameter("integer", "number of presses used", valid=lambda value: value >= 1, default=1)
+    presses: int = parameter("number of presses used", valid=lambda value: value >= 1, default=1)
 
     def standard_errors(self) -> Mapping[str, float]:
         """Return that of the modulus."""

@@ -66,6 +66,7 @@ def test_machines_get_numbers_and_how_they_came_about(saved):
         "value": 12.0,
         "sigma": 0.3,
         "unit": "mm",
+        "name": "pivot_z",
     }
     assert by_name["scale", "distortion k1"]["sigma"] is None
     assert told["process"]["tilt.frames"] == 8

@@ -18,12 +18,7 @@ class Worn(types.Gel):
     """A gel that wears."""
 
     wear: tuple[float, float] = parameter(
-        "numbers",
-        "depth of the wear along x and y",
-        "mm",
-        components="xy",
-        shown_unit="um",
-        default=(0.0, 0.0),
+        "depth of the wear along x and y", "mm", components="xy", shown_unit="um", default=(0.0, 0.0)
     )
 
 
