@@ -24,7 +24,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import calls
+import gpu_calls
 import numpy as np
 import pyopencl as cl
 from gpu_check import ROOT, frozen_cases, taken_for_gpu
@@ -87,7 +87,7 @@ def main() -> int:
     trial.data["run"] = {**json.loads(run.as_json()), "title": run.title}
     way = f"{device.info.kind}{number}-copied-gpu"
     taken_for_gpu(device)
-    shapes = ((96, 128), (128, 160)) if trial.quick else (calls.MEGAPIXEL, calls.UHD)
+    shapes = ((96, 128), (128, 160)) if trial.quick else (gpu_calls.MEGAPIXEL, gpu_calls.UHD)
     trial.run("device", measure_device, 40)
     trial.run("calls at 1 Mpx", lambda trial, end: measure_calls(trial, end, shapes[0], 64), 120)
     trial.run("calls at 4K", lambda trial, end: measure_calls(trial, end, shapes[1], 240), 90)
@@ -176,7 +176,7 @@ def median(work: Callable[[], object], rounds: int = ROUNDS) -> float:
 def measure_calls(trial: Trial, end: float, shape: tuple[int, int], frames: int) -> list[Data]:
     """Time every public call, as long as there is time."""
     rows: list[Data] = []
-    found = calls.calls(shape, trial.device, frames if not trial.quick else 16)
+    found = gpu_calls.calls(shape, trial.device, frames if not trial.quick else 16)
     while time.monotonic() < end:
         try:
             name, call = next(found)
@@ -185,7 +185,7 @@ def measure_calls(trial: Trial, end: float, shape: tuple[int, int], frames: int)
         except Exception:
             return [*rows, {"call": "the next one", "failed": traceback.format_exc()}]
         try:
-            rows.append(calls.measure(name, call, trial.device, ROUNDS, 3.0))
+            rows.append(gpu_calls.measure(name, call, trial.device, ROUNDS, 3.0))
         except Exception:
             rows.append({"call": name, "failed": traceback.format_exc()})
         print(f"  {name}: {rows[-1].get('ms', 'failed')}", flush=True)
