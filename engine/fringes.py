@@ -17,11 +17,12 @@ from mirrorskin.engine.inputs import Maps, as_result
 from mirrorskin.engine.operation import Operation, phase_function
 from mirrorskin.engine.options import option
 from mirrorskin.engine.rotation.correlation import Correlate
-from mirrorskin.engine.rotation.design_matrix import Doubles, check_weights, fit_matrix
+from mirrorskin.engine.rotation.design_matrix import check_weights, fit_matrix
 from mirrorskin.io import InputError, Map, Result
 from mirrorskin.io.arguments import as_array, as_array_or_number, check_number, checked
 from mirrorskin.io.maps import TABLE
 from mirrorskin.io.types import FRAME_DTYPES
+from mirrorskin.kernels.array_types import Doubles
 
 _TURN = 2 * np.pi
 

@@ -15,9 +15,9 @@ from mirrorskin.engine.press.holes import fill_holes
 from mirrorskin.engine.press.intervals import estimate_interval_errors, fit_paraboloids, interval_evidence
 from mirrorskin.engine.rotation.normals_to_height import Slopes
 from mirrorskin.io import InputError, Result
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 
-Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _UNIFORM = np.sqrt(3.0)  # half the width of a uniform distribution, in its standard deviations

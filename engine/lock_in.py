@@ -13,10 +13,10 @@ from mirrorskin.engine.method import Method, Plan
 from mirrorskin.engine.options import option
 from mirrorskin.engine.press.growth import Growth
 from mirrorskin.engine.rotation.correlation import Correlate
-from mirrorskin.engine.rotation.design_matrix import Doubles
 from mirrorskin.engine.rotation.edited import EditedSource
 from mirrorskin.engine.rotation.frequency import Frequency, frequency_of
 from mirrorskin.io import Block, InputError
+from mirrorskin.kernels.array_types import Doubles
 
 if TYPE_CHECKING:
     from mirrorskin.io import Source

@@ -15,12 +15,11 @@ from mirrorskin.io.arguments import as_array
 from mirrorskin.io.maps import TABLE
 from mirrorskin.io.positions import check_phase
 from mirrorskin.io.types import FRAME_DTYPES
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import C_TYPES
 
 if TYPE_CHECKING:
     from mirrorskin.io import Source
-
-Doubles = NDArray[np.float64]
 
 
 class PhotometricStereo(Operation):

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Doubles = NDArray[np.float64]
+from mirrorskin.kernels.array_types import Doubles
+
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 

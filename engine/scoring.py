@@ -16,8 +16,8 @@ from mirrorskin.io.arguments import check_kind, checked
 from mirrorskin.io.maps import SlipStatus
 from mirrorskin.io.result import map_shape
 from mirrorskin.io.types import UNDISTORTED
+from mirrorskin.kernels.array_types import Doubles
 
-Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _JUMP = np.radians(10.0)  # smallest angle between normals of neighbours that is an edge

@@ -16,8 +16,7 @@ from mirrorskin.io.maps import Map
 from mirrorskin.io.result import map_shape
 from mirrorskin.io.selection import source_region
 from mirrorskin.io.types import UNDISTORTED
-
-Doubles = NDArray[np.float64]
+from mirrorskin.kernels.array_types import Doubles
 
 
 def picture_places(lens: Lens, x: ArrayLike, y: ArrayLike) -> tuple[Doubles, Doubles]:

@@ -24,8 +24,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.kernels.array_types import Doubles
+
 Array = NDArray[Any]
-Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Flags = NDArray[np.uint8]
 

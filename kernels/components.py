@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.kernels.links import KNOWN, Doubles, Flags, Triple
+from mirrorskin.kernels.array_types import Doubles
+from mirrorskin.kernels.links import KNOWN, Flags, Triple
 
 Array = NDArray[Any]
 Labels = NDArray[np.int32]

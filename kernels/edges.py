@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.kernels.array_types import Doubles
+
 Array = NDArray[Any]
-Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 WAYS = 8  # directions, over half a turn

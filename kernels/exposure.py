@@ -20,13 +20,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.kernels.array_types import Doubles
+
 _FACTORS = (0xD2511F53, 0xCD9E8D57)
 _STEPS = (0x9E3779B9, 0xBB67AE85)  # Weyl's constants: of the golden ratio, and of sqrt(3)
 _LOW = 0xFFFFFFFF
 
 Words = NDArray[np.uint32]
 Array = NDArray[Any]
-Doubles = NDArray[np.float64]
 
 
 def philox(counter: Words, key: tuple[int, int]) -> Words:

@@ -36,9 +36,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Doubles = NDArray[np.float64]
+from mirrorskin.kernels.array_types import Doubles
 
 _MEDIAN = 0.6744897501960817  # median magnitude of a standard normal variate
 _TOLERANCE = 1e-8  # relative decrease of the cost that ends the iteration

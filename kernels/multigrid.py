@@ -37,7 +37,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Doubles = NDArray[np.float64]
+from mirrorskin.kernels.array_types import Doubles
+
 Ints = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 Way = tuple[int, int]  # rows down and columns to the right

@@ -22,8 +22,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.kernels.array_types import Doubles
+
 Array = NDArray[Any]
-Doubles = NDArray[np.float64]
 
 MORE = 12
 """Steps after the first two, for pixels of which a sample is clipped, missing or out of range."""

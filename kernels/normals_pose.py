@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.normals import (
     _LEAST,
     _NO_ANSWER,
@@ -26,7 +27,6 @@ from mirrorskin.kernels.normals import (
     MORE,
     Answer,
     Array,
-    Doubles,
     Limits,
     Samples,
     Sums,

@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.normals import (
     MORE,
     Answer,
-    Doubles,
     Limits,
     Samples,
     Sums,

@@ -22,8 +22,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.kernels.array_types import Doubles
+
 Array = NDArray[Any]
-Doubles = NDArray[np.float64]
 
 _LEVEL = 1e-24  # added to the squared level part of rays, which is 0 for vertical ones
 

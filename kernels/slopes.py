@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.kernels.array_types import Doubles
+
 Array = NDArray[Any]
-Doubles = NDArray[np.float64]
 
 _STEEPEST = math.cos(math.radians(80.0))  # of the largest zenith whose slope is used
 _WIDEST = 0.5**2  # radians^2: limit of the variance of an azimuth

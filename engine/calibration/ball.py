@@ -10,9 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.rotation.design_matrix import basis, check_phases
 from mirrorskin.io import InputError, pixel_axes
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import geman_mcclure
-
-Doubles = NDArray[np.float64]
 
 
 class BallSight(NamedTuple):

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.calibration.sources import read_blocks
 from mirrorskin.io import InputError, Source
-
-Doubles = NDArray[np.float64]
+from mirrorskin.kernels.array_types import Doubles
 
 FEWEST = 12
 """Marks of each picture that a fit needs."""

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.rotation.response import shade
 from mirrorskin.io import Header, InputError, WallResponse, pixel_axes
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.response import sight_slopes, wall_light
 
-Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Pixels = NDArray[np.intp]
 

@@ -15,10 +15,9 @@ from mirrorskin.engine.provenance import naming
 from mirrorskin.engine.reconstruction import reconstruct
 from mirrorskin.io import Calibration, InputError, Result, Source, WallResponse
 from mirrorskin.kernels import least_squares
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.response import sight_slopes
-
-Doubles = NDArray[np.float64]
 
 _FEWEST = 20  # pixels with errors in a cell, at least
 _LEAST = 100  # pixels of the ball, at least

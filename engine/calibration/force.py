@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mirrorskin.engine.calibration.sources import pixel_size_of
 from mirrorskin.engine.errors import NotConverged
@@ -17,11 +16,11 @@ from mirrorskin.engine.press.elastic import LEARNED_AT, fit_press
 from mirrorskin.engine.press.press import Press
 from mirrorskin.engine.streaming import Progress
 from mirrorskin.io import Calibrated, Calibration, Gel, InputError, Source, Stiffness
+from mirrorskin.kernels.array_types import Doubles
 
 if TYPE_CHECKING:
     from mirrorskin.kernels.device import Device
 
-Doubles = NDArray[np.float64]
 
 _PRIOR = 6.0  # prior standard deviation of the gel's parameters, in their standard errors
 _MODEL_ERROR = 0.003  # relative error of a load by splines and cells: measured on the twin, balls and cones

@@ -8,16 +8,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mirrorskin.engine.calibration.sources import check_ball_radius, pixel_size_of
 from mirrorskin.engine.press.elastic import threshold_at
 from mirrorskin.io import Gel, InputError, Result, Source, pixel_axes
 from mirrorskin.io.maps import PressStatus
 from mirrorskin.kernels import least_squares
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma, soft_l1
-
-Doubles = NDArray[np.float64]
 
 _NODES = 24  # of the Gauss-Legendre quadrature over punches
 _THINNEST = 1e-3  # radii of the ball: least depth of the mirror below the surface

@@ -15,9 +15,8 @@ from mirrorskin.engine.calibration.marks import Marks, centre_marks, find_marks,
 from mirrorskin.engine.undistort import distorted, picture_places
 from mirrorskin.io import InputError, Lens
 from mirrorskin.kernels import least_squares
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma, soft_l1
-
-Doubles = NDArray[np.float64]
 
 _ROUNDS = 8  # fits, at most; each predicts further marks
 _ADJACENT = 1.5  # pitches: distance from located marks within which others are predicted

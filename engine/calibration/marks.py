@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.calibration.board import Board, Charuco, Dots
 from mirrorskin.io import InputError
+from mirrorskin.kernels.array_types import Doubles
 
-Doubles = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 

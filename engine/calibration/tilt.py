@@ -16,9 +16,8 @@ from mirrorskin.engine.calibration.ball import rotations, smooth_turn
 from mirrorskin.engine.calibration.tilt_tracks import BallTrack, PlateTrack
 from mirrorskin.io import InputError, Precession
 from mirrorskin.kernels import least_squares
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma
-
-Doubles = NDArray[np.float64]
 
 NAMES = ("tilt", "phase_offset", "oval_x", "oval_y", "centre_x", "centre_y", "pivot_x", "pivot_y", "pivot_z")
 """The body's parameters; in a fit, three of each ball and two of each wedge follow."""

@@ -15,9 +15,8 @@ from mirrorskin.engine.provenance import naming
 from mirrorskin.engine.rotation.design_matrix import check_phases
 from mirrorskin.io import InputError, Source, pixel_axes
 from mirrorskin.kernels import least_squares
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma
-
-Doubles = NDArray[np.float64]
 
 _MOST_BYTES = 2_000_000_000  # of frames in memory
 _PHASES = 4  # phases that an ellipse and its mean need

@@ -16,9 +16,9 @@ from mirrorskin.engine.calibration.sources import check_ball_radius
 from mirrorskin.engine.calibration.wall_response import make_response
 from mirrorskin.io import InputError, Precession, References, Source, WallResponse
 from mirrorskin.io.calibration.types import PATTERNS
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma
 
-Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Numbers = NDArray[np.intp]
 

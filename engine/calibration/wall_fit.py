@@ -25,8 +25,7 @@ from mirrorskin.engine.calibration.wall_model import (
 from mirrorskin.engine.provenance import naming
 from mirrorskin.io import InputError, Precession, References, Source, pixel_axes
 from mirrorskin.kernels import least_squares
-
-Doubles = NDArray[np.float64]
+from mirrorskin.kernels.array_types import Doubles
 
 _STEEPEST = math.radians(50.0)  # greatest zenith on the ball of a sample
 _BEYOND = 1.35  # greatest distance of a sample from the ball's centre, relative to the outline of the light

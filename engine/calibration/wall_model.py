@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.calibration.ball import rotations
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.response import Ray, follow, lamp_light, shade_terms, sight_of, sight_slopes
-
-Doubles = NDArray[np.float64]
 
 _PIECES = 8  # of the curve: enough for a gamma of 2.2 within 2e-4 of full light
 _CUBIC = 3  # degree of the curve

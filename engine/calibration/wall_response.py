@@ -15,9 +15,8 @@ from mirrorskin.engine.calibration.sources import pixel_size_of
 from mirrorskin.engine.calibration.wall_fit import WallFit
 from mirrorskin.engine.rotation.response import shade
 from mirrorskin.io import InputError, Source, WallResponse, pixel_axes
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.response import follow, half_tangent, lamp_light, level, sight_of, sight_slopes
-
-Doubles = NDArray[np.float64]
 
 _ZENITHS = 16  # at which the first light is searched for
 _HALVINGS = 16  # of the interval of the first light

@@ -16,9 +16,9 @@ from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.press.halfspace import spectrum_of
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import as_array_or_number, check_count, check_number, checked
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.conjugate_gradients import Face, conjugate_gradients
 
-Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _SOFTNESS = 3 / (4 * math.pi)  # 1 / (4 pi G) at E = 1: G = E / 3

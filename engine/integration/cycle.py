@@ -6,17 +6,15 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mirrorskin.engine.integration.hierarchy import Hierarchy, Level, tile_columns, tile_rows
 from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Kernel
 
 _FIRST_W_LEVEL = 2  # finest level that is visited twice (W-cycle), as are all coarser ones
 _TAIL = 20480  # nodes times lanes of the finest level that one work-group processes with all coarser ones
 _WEAKEST_ANCHORS = 1e-12  # relative to a component's links, up to which its offset counts as free
-
-Doubles = NDArray[np.float64]
 
 
 def add_parts(parts: Array) -> Doubles:

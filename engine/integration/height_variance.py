@@ -47,9 +47,9 @@ from numpy.typing import NDArray
 from mirrorskin.engine.integration.hierarchy import Hierarchy, place_of_coarse
 from mirrorskin.engine.integration.validation import Floats
 from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.array_types import Doubles
 
 Ints = NDArray[np.int64]
-Doubles = NDArray[np.float64]
 
 COARSE = 64
 """Largest number of nodes per side of the level whose variance is computed exactly."""

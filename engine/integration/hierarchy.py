@@ -10,10 +10,10 @@ from numpy.typing import DTypeLike, NDArray
 
 from mirrorskin.engine.integration.graph import Links
 from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, Kernel
 
 Ints = NDArray[np.int64]
-Doubles = NDArray[np.float64]
 
 STRENGTH = 0.25
 """Relative weight from which a link joins its nodes in one aggregate; see ``multigrid_parts``."""

@@ -14,13 +14,12 @@ from mirrorskin.engine.integration.surface import IntegrationOptions
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import as_array_or_number, check_number, checked, or_none
 from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.links import DOWN, KNOWN, RIGHT, SLOPE
 
 if TYPE_CHECKING:
     from scipy.sparse.linalg import LinearOperator
-
-Doubles = NDArray[np.float64]
 
 
 @checked(

@@ -14,6 +14,7 @@ from mirrorskin.engine.integration.graph import Links
 from mirrorskin.engine.integration.height_variance import JOINED, LEAST, find_graph_variance
 from mirrorskin.engine.integration.hierarchy import STRENGTH, Hierarchy, choose_lanes, part_of
 from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.links import KNOWN, SLOPE
 
 _USUAL = 40  # cycles after which coarse levels are replaced by a direct solver
@@ -25,8 +26,6 @@ _FACTORS = 8e-6  # seconds per node of the second level for a factorisation, at 
 _ROUNDING = 1e-6  # residual of an exact solution, relative to the right side
 _FIRM = 1e-3  # smallest share of the energy that remains when that of known heights is subtracted
 _NEAR = 0.03  # residual below which the energy of the heights is not computed again
-
-Doubles = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

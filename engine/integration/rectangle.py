@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from mirrorskin.engine.integration.height_variance import expected_misfit, find_rectangle_variance
 from mirrorskin.engine.integration.validation import Floats, Inputs
 from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, Kernel
 
-Doubles = NDArray[np.float64]
 Whole = NDArray[np.intp]
 
 _RADICES = 13, 11, 7, 5, 3  # odd radices; see ``rectangle.cl``

@@ -11,8 +11,8 @@ from mirrorskin.engine.metrology.fitting import find_uncertain
 from mirrorskin.engine.metrology.patch import Patch
 from mirrorskin.engine.metrology.quantity import Quantity
 from mirrorskin.engine.metrology.sections import apex
+from mirrorskin.kernels.array_types import Doubles
 
-Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _REACH = 3  # pixels on either side of the highest one to which a paraboloid is fitted

@@ -22,9 +22,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.metrology.quantity import Quantity, micrometres
 from mirrorskin.kernels import least_squares
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma
 
-Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 _Frame = tuple[Doubles, Doubles]
 

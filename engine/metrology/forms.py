@@ -6,13 +6,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mirrorskin.engine.metrology.fitting import PointCloud
 from mirrorskin.engine.metrology.quantity import Quantity, degrees
 from mirrorskin.io import InputError
-
-Doubles = NDArray[np.float64]
+from mirrorskin.kernels.array_types import Doubles
 
 _LEVEL = 1e-12  # slope below which a plane counts as level
 _ANY_ANGLE = math.pi / math.sqrt(3)  # standard deviation of a uniformly distributed angle, radians

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from mirrorskin.engine.inputs import spacing
 from mirrorskin.io import InputError, Region, Result
 from mirrorskin.io.result import select_turn
+from mirrorskin.kernels.array_types import Doubles
 
-Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 

@@ -14,8 +14,8 @@ from mirrorskin.engine.metrology.patch import heights_of
 from mirrorskin.engine.metrology.quantity import Quantity
 from mirrorskin.engine.resample import SamplePoints
 from mirrorskin.io import InputError, Result, pixel_axes
+from mirrorskin.kernels.array_types import Doubles
 
-Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Point = tuple[float, float]
 

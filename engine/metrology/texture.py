@@ -6,13 +6,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mirrorskin.engine.metrology.fitting import find_uncertain
 from mirrorskin.engine.metrology.quantity import Quantity, micrometres
 from mirrorskin.io import InputError
-
-Doubles = NDArray[np.float64]
+from mirrorskin.kernels.array_types import Doubles
 
 _ALPHA = math.sqrt(math.log(2) / math.pi)  # constant of the Gaussian filter, which halves waves at the cutoff
 _COVERED = 0.95  # smallest share of the filter's weight on known pixels

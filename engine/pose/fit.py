@@ -13,8 +13,9 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
 from mirrorskin.engine.pose.maps import PoseMap
-from mirrorskin.engine.pose.motion import STILL, Doubles, Motion, cross_matrix
+from mirrorskin.engine.pose.motion import STILL, Motion, cross_matrix
 from mirrorskin.io import InputError
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.pose import BLOCK, PARTS, SUMS
 

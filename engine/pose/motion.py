@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-Doubles = NDArray[np.float64]
+from mirrorskin.kernels.array_types import Doubles
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from mirrorskin.engine.inputs import Maps, as_result
 from mirrorskin.engine.pose.fit import Equations, PairFit
 from mirrorskin.engine.pose.maps import PoseMap
-from mirrorskin.engine.pose.motion import Doubles, Motion
+from mirrorskin.engine.pose.motion import Motion
 from mirrorskin.io.arguments import as_array_or_number, checked
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, open_device
 
 _SHARE = 1e-3  # component of an undetermined direction above which the parameter is undetermined

@@ -14,13 +14,14 @@ from scipy.spatial.transform import Rotation
 from mirrorskin.engine.inputs import Maps, as_result
 from mirrorskin.engine.pose.fit import PairFit
 from mirrorskin.engine.pose.maps import PoseMap
-from mirrorskin.engine.pose.motion import STILL, Doubles, Motion
+from mirrorskin.engine.pose.motion import STILL, Motion
 from mirrorskin.engine.pose.pose import IDENTITY, Pose, pose_of
 from mirrorskin.engine.provenance import signature
 from mirrorskin.engine.resample import SamplePoints
 from mirrorskin.io import InputError, Result, select_turn
 from mirrorskin.io.maps import StitchStatus, status_of
 from mirrorskin.io.types import ProcessValue
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, open_device
 
 _SHARED = 0.2  # smallest share of the smaller map's pixels that two touches must have in common

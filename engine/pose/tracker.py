@@ -8,10 +8,11 @@ from numpy.typing import ArrayLike
 from mirrorskin.engine.inputs import Maps, as_result
 from mirrorskin.engine.pose.fit import FEWEST_SHARED, PairFit, complement
 from mirrorskin.engine.pose.maps import PoseMap
-from mirrorskin.engine.pose.motion import STILL, Doubles, Motion
+from mirrorskin.engine.pose.motion import STILL, Motion
 from mirrorskin.engine.pose.pose import IDENTITY, Pose, pose_of
 from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import Result
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, open_device
 
 _SHARED = 0.6  # share of the key's pixels below which the next result becomes the key

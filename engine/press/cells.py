@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Doubles = NDArray[np.float64]
+from mirrorskin.kernels.array_types import Doubles
+
 Mask = NDArray[np.bool_]
 
 _CELLS = 32  # along each side of the lit area, if it were square

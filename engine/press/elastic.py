@@ -27,9 +27,9 @@ from mirrorskin.engine.press.spline import CellSplines
 from mirrorskin.io import Gel, InputError, Result, Source, pixel_axes
 from mirrorskin.io.maps import PressStatus
 from mirrorskin.kernels import least_squares
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma
 
-Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 LEARNED_AT = 0.5

@@ -15,12 +15,13 @@ from mirrorskin.engine.operation import travel_function
 from mirrorskin.engine.options import option
 from mirrorskin.engine.press.crossing import PressOperation
 from mirrorskin.engine.rotation.correlation import CorrelationOperation
-from mirrorskin.engine.rotation.design_matrix import Doubles, basis
+from mirrorskin.engine.rotation.design_matrix import basis
 from mirrorskin.engine.rotation.frequency import estimate_frequency
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.maps import TABLE
 from mirrorskin.io.positions import check_strokes
 from mirrorskin.io.types import ProcessValue
+from mirrorskin.kernels.array_types import Doubles
 
 if TYPE_CHECKING:
     from mirrorskin.io import Source

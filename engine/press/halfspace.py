@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy import fft, sparse, special
 
 from mirrorskin.engine.errors import NotConverged
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.conjugate_gradients import Face, conjugate_gradients
 
-Doubles = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Real = TypeVar("Real", np.float32, np.float64)
 Mask = NDArray[np.bool_]

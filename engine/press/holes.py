@@ -15,8 +15,8 @@ from mirrorskin.engine.press.membrane import stretch
 from mirrorskin.engine.press.spline import Spline, fit_within
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import as_array_or_number, check_number, checked
+from mirrorskin.kernels.array_types import Doubles
 
-Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-Doubles = NDArray[np.float64]
+from mirrorskin.kernels.array_types import Doubles
 
 _LEAST = 0.02  # least blur of an interval's ends, as a share of its half-width
 _FAR = 6.0  # blurs outside an interval beyond which an onset is an outlier

@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import huber
 
 if TYPE_CHECKING:
     from scipy import sparse
 
-Doubles = NDArray[np.float64]
 
 # Coefficients of t^0 to t^3 of the four splines that overlap a cell; t is 0 to 1 across the cell.
 _PIECES = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6

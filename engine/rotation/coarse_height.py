@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.integration.integration import integrate
 from mirrorskin.engine.nearest_fill import fill_with_nearest
-from mirrorskin.engine.rotation.design_matrix import Doubles
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 
 Mask = NDArray[np.bool_]

@@ -17,13 +17,14 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.operation import Operation, phase_function
 from mirrorskin.engine.options import option
-from mirrorskin.engine.rotation.design_matrix import Doubles, basis, check_phases, check_weights
+from mirrorskin.engine.rotation.design_matrix import basis, check_phases, check_weights
 from mirrorskin.engine.tiling import Band, Planes, Staged, cut_into_bands, join_rows, room_of
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.maps import TABLE
 from mirrorskin.io.positions import check_phase
 from mirrorskin.io.types import FRAME_DTYPES
 from mirrorskin.kernels.array import Array, Operand
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.correlation import WINDOW
 from mirrorskin.kernels.device import C_TYPES, Device
 

@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io import InputError
 from mirrorskin.io.positions import check_phase
-
-Doubles = NDArray[np.float64]
+from mirrorskin.kernels.array_types import Doubles
 
 LONGEST = 64
 """Largest number of frames of one turn."""

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import optimize
 
-from mirrorskin.engine.rotation.design_matrix import Doubles, basis
+from mirrorskin.engine.rotation.design_matrix import basis
 from mirrorskin.io import InputError, Source
 from mirrorskin.io.arguments import as_array, as_array_or_number, checked
+from mirrorskin.kernels.array_types import Doubles
 
 _FEWEST = 8  # least number of frames
 _PIXELS, _SAMPLES = 4096, 2**22  # largest numbers of pixels and of samples that are used

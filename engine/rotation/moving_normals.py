@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.operation import ABOUT_WEIGHTS, apply, array_function
-from mirrorskin.engine.rotation.design_matrix import Doubles
 from mirrorskin.engine.rotation.normals import Normals, NormalsOperation, normals_result
 from mirrorskin.engine.rotation.normals_kernel import MAPS, SLOPE_MAPS, NormalKernel, TurnModel
 from mirrorskin.engine.rotation.poses import PoseFit, check_poses, even_windows, pose_fit, rocks
@@ -18,6 +17,7 @@ from mirrorskin.io import InputError, Result
 from mirrorskin.io.arguments import as_array
 from mirrorskin.io.maps import TABLE, PoseStatus, status_of
 from mirrorskin.io.types import body_axes
+from mirrorskin.kernels.array_types import Doubles
 
 P = ParamSpec("P")
 

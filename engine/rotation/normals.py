@@ -13,7 +13,6 @@ from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.options import option
 from mirrorskin.engine.rotation.design_matrix import (
     LONGEST,
-    Doubles,
     TurnFit,
     check_phases,
     check_weights,
@@ -40,6 +39,7 @@ from mirrorskin.io import InputError, Result
 from mirrorskin.io.maps import TABLE
 from mirrorskin.io.positions import check_phase
 from mirrorskin.io.types import FRAME_DTYPES, ProcessValue
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.correlation import WINDOW
 
 if TYPE_CHECKING:

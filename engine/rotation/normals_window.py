@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.frames import thinning
 from mirrorskin.engine.rotation.correlation import WindowSums
-from mirrorskin.engine.rotation.design_matrix import Doubles, TurnFit, check_phases, turn_fit
+from mirrorskin.engine.rotation.design_matrix import TurnFit, check_phases, turn_fit
 from mirrorskin.engine.rotation.normals_kernel import NormalKernel, Samples, TurnModel
 from mirrorskin.engine.tiling import Band, join_rows
 from mirrorskin.io import InputError, Result
 from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 
 _LENGTH = 16  # frames that can be pushed at once without a copy

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.rotation.design_matrix import LONGEST, Doubles
+from mirrorskin.engine.rotation.design_matrix import LONGEST
 from mirrorskin.engine.rotation.tilt import check_tilts
 from mirrorskin.io import InputError
 from mirrorskin.io.positions import check_phase
 from mirrorskin.io.types import body_axes
+from mirrorskin.kernels.array_types import Doubles
 
 PRESSES = 0.02
 """Least range of travel of a body that also presses, as a share of the greatest travel."""

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.frames import QUANTUM
-from mirrorskin.engine.rotation.design_matrix import Doubles, basis
+from mirrorskin.engine.rotation.design_matrix import basis
 from mirrorskin.io import InputError
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import huber
 
 _FLOAT_NOISE = 1e-6  # least noise of float frames, as a share of the greatest count

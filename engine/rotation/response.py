@@ -10,9 +10,9 @@ from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.provenance import naming
-from mirrorskin.engine.rotation.design_matrix import Doubles
 from mirrorskin.engine.rotation.registration import Sight
 from mirrorskin.io import Calibrated, Header, InputError, Source, WallResponse, pixel_axes
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.normals_wall import Wall
 from mirrorskin.kernels.response import shade_terms
 

@@ -22,7 +22,7 @@ from mirrorskin.engine.options import option
 from mirrorskin.engine.provenance import level_origin, parameter_origin
 from mirrorskin.engine.rotation.coarse_height import coarse_heights
 from mirrorskin.engine.rotation.correlation import Correlate
-from mirrorskin.engine.rotation.design_matrix import LONGEST, Doubles, cut_into_turns
+from mirrorskin.engine.rotation.design_matrix import LONGEST, cut_into_turns
 from mirrorskin.engine.rotation.edited import EditedSource
 from mirrorskin.engine.rotation.last_turn import LastTurn
 from mirrorskin.engine.rotation.moving_normals import MovingNormals
@@ -37,6 +37,7 @@ from mirrorskin.io import Block, Calibrated, Header, InputError, Recording, Sour
 from mirrorskin.io.frames import FrameSequence
 from mirrorskin.io.positions import check_phase
 from mirrorskin.io.result import absolute_heights
+from mirrorskin.kernels.array_types import Doubles
 
 if TYPE_CHECKING:
     from mirrorskin.io.types import ProcessValue

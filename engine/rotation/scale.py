@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.rotation.design_matrix import Doubles
 from mirrorskin.engine.rotation.tilt import STEEP
 from mirrorskin.io import InputError
+from mirrorskin.kernels.array_types import Doubles
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.rotation.design_matrix import Doubles, TurnFit, basis
+from mirrorskin.engine.rotation.design_matrix import TurnFit, basis
 from mirrorskin.engine.rotation.residual_noise import CountNoise, valid
 from mirrorskin.io import InputError
+from mirrorskin.kernels.array_types import Doubles
 
 STEEP = 4.0
 """Ratio of zenith and tilt above which one wave per turn is a good approximation."""

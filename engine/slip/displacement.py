@@ -17,9 +17,8 @@ from mirrorskin.engine.slip.tracking import GRADIENT_NOISE, NodeField, Tracker, 
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import as_array, as_array_or_number, check_count, check_number, checked
 from mirrorskin.io.maps import TABLE, DisplacementStatus, status_of
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, open_device
-
-Doubles = NDArray[np.float64]
 
 MAPS = {
     "displacement": TABLE["displacement"],

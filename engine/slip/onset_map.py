@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.ndimage import gaussian_filter, median_filter
 from scipy.sparse.linalg import splu
 
-Doubles = NDArray[np.float64]
+from mirrorskin.kernels.array_types import Doubles
 
 _CANDIDATES = 48  # onsets that are tried for the first map
 _EVIDENCE = 8.0  # smallest log-likelihood ratio of a departure, for a node's first onset

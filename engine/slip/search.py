@@ -30,12 +30,12 @@ from mirrorskin.io import Calibrated, InputError, Map, Recording, Result, pixel_
 from mirrorskin.io.maps import TABLE, TWIST, DisplacementStatus, SlipStatus, status_of
 from mirrorskin.io.positions import check_finite
 from mirrorskin.io.types import FRAME_DTYPES, UNDISTORTED
+from mirrorskin.kernels.array_types import Doubles
 
 if TYPE_CHECKING:
     from mirrorskin.io import Source
     from mirrorskin.io.types import ProcessValue
 
-Doubles = NDArray[np.float64]
 
 _EXPECTED = {  # see docs/method/slip.md
     "horizontal": Expected(power=1.6, onset_bend=12.0, growth_bend=32.0),

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import C_TYPES, Device
 from mirrorskin.kernels.displacement import AFFINE, MARGIN, PARAMETERS
-
-Doubles = NDArray[np.float64]
 
 ITERATIONS = 8
 """Largest number of iterations; 2 are needed with a good start."""
