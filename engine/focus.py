@@ -15,6 +15,7 @@ from mirrorskin.io.positions import check_strokes
 from mirrorskin.io.types import FRAME_DTYPES
 from mirrorskin.kernels.device import C_TYPES
 
+_LARGEST = 1e18  # noise whose square a float32 holds
 _LEAST_CONTRAST = 5.0  # smallest contrast of a peak above that of noise, in standard errors
 _LEAST_CURVATURE = 3.0  # smallest curvature of a peak, in standard errors
 
@@ -97,7 +98,7 @@ class Focus(Operation):
             name: self.device.array(name, self.shape, np.float32, zeroed=False) for name in names
         }
         maps["status"] = self.device.array("status", self.shape, np.uint8, zeroed=False)
-        variance = self.noise**2
+        variance = min(self.noise, _LARGEST) ** 2
         self._fit(
             -(-rows * columns // self.device.layout.tile), rows=rows, columns=columns, count=len(travel),
             radius=self.radius, reach=self.reach, variance=variance, least_contrast=_LEAST_CONTRAST,

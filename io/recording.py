@@ -127,6 +127,7 @@ class Recording(Closing):
         self._origins = file.origins() if isinstance(file, ZarrFile) else origins(file, dataset)
         self.read_ahead = isinstance(file, ZarrFile)
         self._stack, self._next = stack, 0
+        self._closed = False
         self.truth_maps: list[str] = list(layout.truth_nodes())
 
     def __repr__(self) -> str:
@@ -197,12 +198,14 @@ class Recording(Closing):
 
     @functools.cached_property
     def truth(self) -> Truth | None:
-        """Ground truth of a simulation; it is read when it is first used."""
+        """Ground truth of a simulation; it is read when it is first used, before the recording is closed."""
+        self._check_open("truth")
         return self._layout.truth()
 
     @functools.cached_property
     def carried(self) -> Calibration | None:
         """The copy of a calibration in the recording, for the whole picture; it is not applied here."""
+        self._check_open("calibration")
         return carried_by(self._file)
 
     @property
@@ -217,8 +220,13 @@ class Recording(Closing):
 
     def close(self) -> None:
         """Close the file; frames that were returned without a copy remain valid."""
+        self._closed = True
         self._stack.close()
         self._file.close()
+
+    def _check_open(self, what: str) -> None:
+        if self._closed:
+            raise InputError(f"{self.name}: the recording is closed: use its {what} before, or open it again")
 
 
 @checked(

@@ -23,7 +23,7 @@ _README = ROOT / "README.md", "readme.md"  # under its own name it would be the 
 @functools.cache
 def roots() -> list[Path]:
     """Return the files of the repository that the navigation contains."""
-    return [ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(ROOT.glob("bench/results/*.md"))]
+    return [ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(ROOT.glob("bench/results/**/*.md"))]
 
 
 def uri_of(path: Path) -> str:

@@ -30,6 +30,7 @@ def simulate(motion, *words, size=SMALL):
     assert (code, said) == (0, ""), said
     with io.open_recording(path) as recording:
         found = read_all(recording, 7)
+        assert recording.truth is not None  # it is kept
     columns, rows = recording.shape[:0:-1]
     start = f"{path}: {recording.shape[0]} frames of {columns} x {rows}: Digital twin, "
     assert out.startswith(start)

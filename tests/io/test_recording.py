@@ -81,6 +81,14 @@ def test_the_truth_is_turned_into_our_units_and_types(press):
         assert (recording.truth.height.dtype, recording.truth.contact.dtype) == (np.float32, np.uint8)
 
 
+def test_a_closed_recording_keeps_its_truth_if_it_was_used(press):
+    with io.open_recording(press) as used, io.open_recording(press) as other:
+        height = used.truth.height
+    assert used.truth.height is height
+    with pytest.raises(io.InputError, match="the recording is closed: use its truth before"):
+        other.truth  # noqa: B018
+
+
 def test_what_is_given_overrides_the_file(press):
     with io.open_recording(press, travel=io.Steps(0.5, 1.0), pixel_size=(0.1, 0.2), tilt=0.3) as recording:
         np.testing.assert_allclose(recording.travel, 1.0 + 0.5 * np.arange(8))
