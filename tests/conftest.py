@@ -39,8 +39,8 @@ def _default_interrupt():
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers():
-    """As many as there are cores: hardly any test waits."""
-    return os.cpu_count() or 1
+    """One more than there are cores, as some tests wait for processes that they start."""
+    return (os.cpu_count() or 1) + 1
 
 
 def pytest_configure(config):
