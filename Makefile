@@ -100,7 +100,7 @@ gpu: $(READY)
 # 'tests/portability/gpu.sh build/gpu-wheels'. VERSION is that machine's Python.
 VERSION ?= 3.12
 gpu-wheels: $(READY)
-	@rm -rf build/gpu-wheels
+	@rm -rf build/gpu-wheels build/lib build/bdist.*  # what lies there would be part of the wheel
 	$(PIP) wheel --no-deps --wheel-dir build/gpu-wheels .
 	$(PIP) download --no-deps --only-binary=:all: --dest build/gpu-wheels --python-version $(VERSION) \
 	    $(patsubst %,--platform manylinux%_x86_64,2014 _2_17 _2_27 _2_28 _2_34) click flexcache flexparser lazy_loader \

@@ -33,9 +33,9 @@ def feed(
 ) -> None:
     """Push frames of a source into an operation, once or twice.
 
-    A device that shares the host's memory computes on frames where they were read. Frames for a device with
-    its own memory, and compressed ones in Zarr, are read and decoded while earlier ones are copied and
-    processed.
+    A device that shares the host's memory computes on frames where they are: in an array, or where they were
+    read. Frames of files for a device with its own memory, and compressed ones in Zarr, are read and decoded
+    while earlier ones are copied and processed.
 
     Parameters
     ----------
