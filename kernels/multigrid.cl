@@ -678,6 +678,7 @@ __kernel void multigrid_take(LEVEL_ARGS, STEP_ARGS, VALUES direction, OUT_VALUES
     }
 }
 
+#if LANES == 1  // a live step has one right side
 // Of what a cycle makes of b, z, and of the last step, p, the products with the matrix times them, and of b and p: z A z,
 // z A p, p A p and b p.
 #define STEP(i) AT(p + (i))
@@ -739,6 +740,7 @@ __kernel void multigrid_follow(LEVEL_ARGS, MAP lengths, MAP z, OUT p, OUT x)
         PUT(x + i) = AT(x + i) + step;
     }
 }
+#endif
 
 // The product of two.
 __kernel SUM_GROUP void multigrid_dot(LEVEL_ARGS, VALUES one, VALUES other, OUT_VALUES parts)
