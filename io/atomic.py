@@ -239,8 +239,11 @@ def new_folder(path: Path) -> Iterator[Path]:
 @contextmanager
 def new_hdf5(path: Path, replaces: Replaces = "derived") -> Iterator[NewHdf5]:
     """Write an HDF5 file like ``new_file``."""
-    with new_file(path, replaces) as descriptor, NewHdf5(path, descriptor) as new:
-        yield new
+    with new_file(path, replaces) as descriptor:
+        with as_input_error(f"{path} could not be written", MAKE_ROOM):
+            new = NewHdf5(path, descriptor)
+        with new:
+            yield new
 
 
 def remove_leftovers(folder: Path) -> list[Path]:

@@ -14,6 +14,7 @@ import tempfile
 import weakref
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any
 
 import h5py
@@ -32,6 +33,12 @@ _LIMIT = 256_000_000  # bytes of unpacked frames, by default
 _MANY = 8_000_000  # bytes of contiguous frames that are read by several threads
 
 
+def _close(file: int) -> None:
+    """Close a file that was only read: nothing is lost if that fails."""
+    with suppress(OSError):
+        os.close(file)
+
+
 class RawFrames(Closing):
     """Contiguous frames at an offset of a file, which is closed with the last reference at the latest."""
 
@@ -39,7 +46,7 @@ class RawFrames(Closing):
 
     def __init__(self, file: int, offset: int, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> None:
         self.shape, self.dtype, self._file, self._offset = shape, dtype, file, offset
-        self._close = weakref.finalize(self, os.close, file)
+        self._close = weakref.finalize(self, _close, file)
         self._frame = math.prod(shape[1:]) * dtype.itemsize
 
     def fetch(self, spans: Sequence[Span], out: NDArray[Any]) -> None:
