@@ -218,7 +218,7 @@ class Band:
             borrowed = BorrowedBuffer(self._device, "frames", room)
         # Releasing the previous buffer waits for its kernels, so at most one piece is being processed.
         self._borrowed = borrowed
-        return Staged(borrowed, slice(start, start + len(borrowed.host)))
+        return Staged(borrowed, slice(start, start + borrowed.shape[0]))
 
     def _copy(self, frames: NDArray[Any], start: int) -> Staged:
         """Start to copy frames to one of two buffers on the device, while kernels process the other."""

@@ -64,13 +64,8 @@ __kernel GROUP_SIZE void components_sum(
     }
     some[lane] = part;
     share_of[lane] = shares;
-    for (int reach = lanes / 2; reach > 0; reach /= 2) {
-        barrier(CLK_LOCAL_MEM_FENCE);
-        if (lane < reach) {
-            some[lane] += some[lane + reach];
-            share_of[lane] += share_of[lane + reach];
-        }
-    }
+    GROUP_SUM(some, lanes)
+    GROUP_SUM(share_of, lanes)
     if (lane == 0 && top < rows) {
         sums[item * components + component] = some[0];
         totals[item * components + component] = share_of[0];

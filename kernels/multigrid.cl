@@ -619,10 +619,7 @@ __kernel void multigrid_residual(LEVEL_ARGS, GRAPH_ARGS, VALUES b, VALUES x, OUT
 #define WRITE_SUM(place, sum)                                                                              \
     barrier(CLK_LOCAL_MEM_FENCE);                                                                          \
     room[get_local_id(0)] = sum;                                                                           \
-    for (int reach = SUMS / 2; reach > 0; reach /= 2) {                                                    \
-        barrier(CLK_LOCAL_MEM_FENCE);                                                                      \
-        if ((int)get_local_id(0) < reach) room[get_local_id(0)] += room[get_local_id(0) + reach];          \
-    }                                                                                                      \
+    GROUP_SUM(room, SUMS)                                                                                  \
     if (get_local_id(0) == 0) parts[(place) + get_group_id(0)] = room[0];
 #else
 #define SUM_GROUP
@@ -709,10 +706,7 @@ __kernel SUM_GROUP void multigrid_curve(LEVEL_ARGS, GRAPH_ARGS, MAP b, MAP z, MA
     for (int k = get_local_id(0); k < (number); k += get_local_size(0)) sum += (from)[k];                  \
     barrier(CLK_LOCAL_MEM_FENCE);                                                                          \
     room[get_local_id(0)] = sum;                                                                           \
-    for (int reach = get_local_size(0) / 2; reach > 0; reach /= 2) {                                       \
-        barrier(CLK_LOCAL_MEM_FENCE);                                                                      \
-        if ((int)get_local_id(0) < reach) room[get_local_id(0)] += room[get_local_id(0) + reach];          \
-    }                                                                                                      \
+    GROUP_SUM(room, get_local_size(0))                                                                     \
     barrier(CLK_LOCAL_MEM_FENCE);                                                                          \
     sum = room[0];
 __kernel GROUP_SIZE void multigrid_best(const int products, MAP product, const int count, MAP parts, OUT lengths)

@@ -39,9 +39,9 @@ SLOT = 2**24
 THREADS = max(1, min(4, os.cpu_count() or 1))
 """Threads that copy between the host's memory and staging buffers."""
 
-SMALL = (
-    2**18
-)  # bytes up to which a copy is on the kernels' queue: it takes less than waiting for another queue
+SMALL = 2**18
+"""Bytes up to which a copy is on the kernels' queue: it takes less than waiting for another queue."""
+
 _PATIENCE = 0.1  # seconds after which the slots are counted again: some may be lost after an error
 _SHARE = 2**20  # bytes that are worth a thread
 _LINE = 256  # bytes that copies in a staging buffer are aligned to

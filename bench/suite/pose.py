@@ -32,7 +32,7 @@ def run_track(device: Device, quick: bool) -> Case:
     shape = _QUICK if quick else _SHAPE
     angles = 2 * math.pi * np.arange(_FRAMES + 1) / _FRAMES
     path = [(_REACH * math.sin(a), _REACH * (1 - math.cos(a)), _TURN * math.sin(a)) for a in angles]
-    results = [_surface(shape, *place, seed) for seed, place in enumerate(path)]
+    results = [surface(shape, *place, seed) for seed, place in enumerate(path)]
     seconds: list[float] = []
 
     def follow() -> Pose:
@@ -62,7 +62,7 @@ def run_track(device: Device, quick: bool) -> Case:
     return Case("pose-track", title, list(rows.values()), absent, notes, () if quick else (target,))
 
 
-def _surface(shape: tuple[int, int], right: float, up: float, turn: float, seed: int) -> Result:
+def surface(shape: tuple[int, int], right: float, up: float, turn: float, seed: int) -> Result:
     """Return waves on a dome, rotated about z and moved, with noise of their standard deviations."""
     rng = np.random.default_rng(seed)
     x, y = pixel_axes(shape, (_FIELD / shape[1], _FIELD / shape[1]))

@@ -100,11 +100,9 @@ class Cycle:
         assert self._factors is not None
         level = self._h.levels[1]
         inside = slice(level.first, level.end - level.stride)
-        b, x = self.b.download(), self.x.download()
+        x = self._factors(self.b.read(inside).astype(np.float64))
         with np.errstate(over="ignore"):  # nearly disconnected graphs: the iteration ends then
-            x[inside] = self._factors(b[inside].astype(np.float64))
-        self.b.upload()
-        self.x.upload()
+            self.x.write(x.astype(np.float32), inside.start)
 
     def run(self) -> Doubles:
         """Do a cycle from x = 0; return the product of b and x, (lanes,)."""

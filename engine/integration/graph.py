@@ -150,9 +150,7 @@ class PixelGraph:
     def put(self, name: str, values: NDArray[Any]) -> Array:
         """Return one of the graph's arrays, with values, (H, W)."""
         array = self.array(name, values.dtype)
-        array.claim()
-        array.host[...] = values
-        array.upload()
+        array.write(values)
         return array
 
     def _share(self, **maps: NDArray[Any] | None) -> dict[str, Operand]:
@@ -180,7 +178,7 @@ class PixelGraph:
     def _run(self, name: str, macros: dict[str, int], **arguments: Any) -> None:
         counts = {"WEIGHTS": len(self._weights), "HEIGHTS": len(self.known_heights)}
         kernel = self.device.kernel("links", name, **{"MASK": 0, "KEEP": 0, **counts, **macros})
-        moved = sum(one.host.nbytes for one in arguments.values() if isinstance(one, Operand))
+        moved = sum(one.nbytes for one in arguments.values() if isinstance(one, Operand))
         rows, columns = self.shape
         kernel(self._items(name), rows=rows, columns=columns, **arguments, moved=moved)
 
@@ -276,7 +274,7 @@ class Levelling:
         return self._components.count if self._components else 0
 
     def _array(self, name: str, shape: tuple[int, ...]) -> Array:
-        if name not in self._arrays or self._arrays[name].host.shape != shape:
+        if name not in self._arrays or self._arrays[name].shape != shape:
             self._arrays[name] = self._device.array(name, shape, np.float32)
             self._arrays[name].upload()
         return self._arrays[name]

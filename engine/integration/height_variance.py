@@ -180,7 +180,6 @@ def _masses(hierarchy: Hierarchy, number: int, answered: NDArray[np.bool_]) -> F
             share = padded[row, column]
             np.subtract.at(picture, (row // 2, column // 2), share)
             np.add.at(picture, (row // 2 + down - 1, column // 2 + right - 1), share)
-    hierarchy.to.upload()
     level = hierarchy.levels[number]
     inside = mass[level.first : level.end - level.stride].reshape(level.rows, level.stride)
     inside[:, : level.columns] = picture

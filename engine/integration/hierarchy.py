@@ -124,24 +124,20 @@ class Hierarchy:
         """
         self._admit_graph(links)
         for numbers in (self._splits, self._counts, self._changes):
-            numbers.claim()
-            numbers.host[...] = 0
-            numbers.upload()
+            numbers.fill()
         arguments: dict[str, Any] = {"strength": strength, **self.graph}
         arguments |= {"parts": self._parts, "touched": self._touched}
         for number in range(len(self.levels) - 1):
             if not plain:
                 self.between("parts", number, **arguments, level=number, splits=self._splits)
-                splits = self._splits.download()[number]
-                self._splits.upload()
+                splits = self._splits.read(number)
                 for turn in range(_ROUNDS if splits else 0):
                     old, new = (self._wanted, self.to)[:: 1 if turn % 2 else -1]
                     ends = {"clear": turn < 2, "first_round": turn == 0, "last_round": turn == _ROUNDS - 1}
                     counts: dict[str, Any] = {"level": number, "moves": self._counts}
                     self.between("move", number, **arguments, **ends, to=old, places=new, **counts)
             self._coarsen(number)
-        self.moves[...] = self._changes.download()
-        self._changes.upload()
+        self.moves[...] = self._changes.read()
         for level in self.levels:
             self.over("invert", level, **self.graph, inverse=self.inverse)
 
@@ -159,20 +155,19 @@ class Hierarchy:
     def equations(self, number: int) -> tuple[Ints, Ints, Ints, Doubles, Doubles]:
         """Return a level's nodes, both ends and weights of its links, and the anchor of each node."""
         level = self.levels[number]
-        node = np.arange(level.first, level.end - level.stride)
+        rows = slice(level.first, level.end - level.stride)
+        node = np.arange(rows.start, rows.stop)
         steps = {"right": 1, "down": level.stride}
         if self.links_of(level) == 8:
             steps |= {"falling": level.stride + 1, "rising": level.stride - 1}
         ends, weights = [], []
         for name, step in steps.items():
-            weight = self.graph[name].download()[node]
-            self.graph[name].upload()
+            weight = self.graph[name].read(rows)
             ends.append(node[weight > 0] + np.array([[0], [step]]))
             weights.append(weight[weight > 0].astype(np.float64))
         pull = np.zeros(len(node))
         if self.anchored:
-            pull[...] = self.graph["anchor"].download()[node]
-            self.graph["anchor"].upload()
+            pull[...] = self.graph["anchor"].read(rows)
         a, b = np.concatenate(ends, axis=1)
         return node, a, b, np.concatenate(weights), pull
 
@@ -181,8 +176,8 @@ class Hierarchy:
         width = 8 if self.device.layout.tile > 1 and lanes == 1 else 1
         macros = {"ANCHORED": int(self.anchored), "LINKS": links, "PART": part_of(self.device)}
         macros |= {"ROWS": tile_rows(self.device, lanes), "COLUMNS": tile_columns(self.device, lanes)}
-        macros |= {"WIDTH": width, "LANES": lanes, "GROUP": tail_group(self.device)}
-        macros["SUMS"] = sum_group(self.device)
+        macros |= {"WIDTH": width, "LANES": lanes}
+        macros |= {"GROUP": tail_group(self.device), "SUMS": sum_group(self.device)}
         return self.device.kernel("multigrid", f"multigrid_{name}", **macros)
 
     def places(self, number: int) -> dict[str, int]:
@@ -300,4 +295,4 @@ def sum_group(device: Device) -> int:
 def _bytes(level: Level, arguments: dict[str, Any]) -> int:
     """Return the bytes of a level in all arrays."""
     arrays = [value for value in arguments.values() if isinstance(value, Array)]
-    return sum(min(array.host.nbytes, 4 * level.nodes) for array in arrays)
+    return sum(min(array.nbytes, 4 * level.nodes) for array in arrays)

@@ -141,12 +141,12 @@ class Multigrid:
         solver.copy("admit", solver.source, links.source)
         solver.find_residual()
         cycle.launch()
-        count = len(solver.parts.host)
+        count = solver.parts.shape[0]
         if self._products is None:
             self._products, self._lengths = h.array("parts", 4 * count), h.array("lengths", 2)
         step: dict[str, Any] = {"z": cycle.x, "p": solver.p}
         h.over_parts("curve", self._products, **h.graph, b=cycle.b, **step, count=count)
-        products: dict[str, Any] = {"products": len(cycle.parts.host), "product": cycle.parts}
+        products: dict[str, Any] = {"products": cycle.parts.shape[0], "product": cycle.parts}
         lengths: dict[str, Any] = {"lengths": self._lengths}
         h.alone("best", **products, count=count, parts=self._products, **lengths)
         h.over("follow", h.levels[0], **lengths, **step, x=solver.x)
@@ -321,9 +321,8 @@ class _Gradients:
             arrays = {"direction": self.before, "x": self.x}
             self._h.over("take", self._h.levels[0], lanes=self.lanes, **self._last_step(), **arrays)
         elif self._fresh:
-            self.x.claim()
-            self.x.host[...], self._fresh = 0, False
-            self.x.upload()
+            self.x.fill()
+            self._fresh = False
 
     def _by(self, name: str, factors: Doubles | None) -> float | Array:
         """Return factors of the right sides as arguments of kernels; 0 for None."""

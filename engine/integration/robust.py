@@ -83,8 +83,7 @@ def solve_robust(
         return search.conclude(search.descend(first), flags, tolerance)
     best = search.descend()
     if search.contradicted and not search.late():
-        local, broken = np.array(best.download()), search.link(best)
-        best.upload()
+        local, broken = best.read(), search.link(best)
         search.trust(*_WIDE)
         best = search.descend()
         search.trust(*_LOCAL)
@@ -163,9 +162,7 @@ class _Search:
         maps = {**{name: self._maps[name] for name in names}, **self._slopes}
         maps |= {"held": self._held, "heights": heights, "sums": self._sums}
         self._run("links", **maps, **self._size, **numbers)
-        broken = float(self._sums.download().sum(dtype=np.float64))
-        self._sums.upload()
-        return broken
+        return float(self._sums.download().sum(dtype=np.float64))
 
     def _solve(self, heights: Array, tolerance: float, scale: float, most: float = math.inf) -> Solution:
         self.link(heights, scale, most)
@@ -193,7 +190,6 @@ class _Search:
         flags, edges = flags.copy(), np.zeros_like(flags)
         for bit, axis, link in ((RIGHT, 1, self.last.right), (DOWN, 0, self.last.down)):
             broken = (flags & bit != 0) & (link.download() == 0)
-            link.upload()
             flags[broken] &= np.uint8(~bit & 255)
             edges |= broken | np.roll(broken, 1, axis)
         return Robust(
@@ -225,9 +221,7 @@ class _Search:
         rise, fall = plane[0] * inputs.pixel_size[0], plane[1] * inputs.pixel_size[1]
         weight = anchor.download()
         above = inputs.known_heights - (plane[2] + rise * column - fall * row)
-        held = np.where(weight > 0, weight * above, 0)
-        anchor.upload()
-        return self._given("held", held)
+        return self._given("held", np.where(weight > 0, weight * above, 0))
 
     def _find_curl(self, flags: Flags) -> tuple[Array, float]:
         """Return the curl of the slopes, and the standard deviation of its noise."""
@@ -235,7 +229,6 @@ class _Search:
         size = {name: length / mean for name, length in self._size.items()}
         self._run("curl", flags=self._given("flags", flags, np.uint8), **self._slopes, **size, curl=curl)
         sizes = np.abs(curl.download())
-        curl.upload()
         most, step = float(sizes.max()), max(1, sizes.size // _SAMPLES)
         samples = sizes.ravel()[::step][(flags & (RIGHT | DOWN) == RIGHT | DOWN).ravel()[::step]]
         noise = mad_sigma(samples)
@@ -249,6 +242,6 @@ class _Search:
 
     def _run(self, name: str, **arguments: Any) -> None:
         rows, columns = self._shape
-        moved = sum(value.host.nbytes for value in arguments.values() if isinstance(value, Array))
+        moved = sum(value.nbytes for value in arguments.values() if isinstance(value, Array))
         kernel = self._links.device.kernel("breaks", f"breaks_{name}")
         kernel(self._items, rows=rows, columns=columns, **arguments, moved=moved)

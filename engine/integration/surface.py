@@ -298,8 +298,6 @@ class SurfaceSolver:
                 float(link.download().sum(dtype=np.float64)) / w for link, w in zip(maps, ends, strict=True)
             )
             share = total / max(1, links)
-            for link in maps:
-                link.upload()
         free = int(np.count_nonzero(components.offset_unknown))
         unit = share * expected_misfit(links, count[SLOPE | KNOWN], count[KNOWN], free, ends)
         misfit = 0.0

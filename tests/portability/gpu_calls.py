@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from suite.depth_scenes import SCENES
-from suite.pose import _surface as waves
+from suite.pose import surface
 from suite.scenes import (
     LEVELS,
     PIXEL,
@@ -124,7 +124,7 @@ def others(shape: Shape, device: Device) -> Iterator[tuple[str, Call]]:
         "find_displacement, 3 frames",
         lambda: engine.slip.find_displacement(texture, moved, PIXEL, device=device),
     )
-    first, second = (waves((240, 320), 0.05 * n, 0.03 * n, 0.02 * n, n) for n in (0, 1))
+    first, second = (surface((240, 320), 0.05 * n, 0.03 * n, 0.02 * n, n) for n in (0, 1))
     yield "estimate_pose, 240 x 320", lambda: engine.pose.estimate_pose(first, second, device=device)
     yield "live press, one frame of VGA", live_press(device)
     yield "live rotation, one frame of VGA", live_rotation(device)
