@@ -13,6 +13,7 @@ from mirrorskin.io import InputError, Map
 from mirrorskin.io.maps import TABLE, FocusStatus, status_of
 from mirrorskin.io.positions import check_strokes
 from mirrorskin.io.types import FRAME_DTYPES
+from mirrorskin.kernels.array import fetch
 from mirrorskin.kernels.device import C_TYPES
 
 _LARGEST = 1e18  # noise whose square a float32 holds
@@ -106,7 +107,8 @@ class Focus(Operation):
             travel=self.device.given("travel", travel), unit=unit, best=self._best, peak=self._peak, **maps,
             moved=self._peak.nbytes + sum(array.nbytes for array in maps.values()),
         )  # fmt: skip
-        height, spread, gain, misfit, sharpness, status = (array.detach() for array in maps.values())
+        found = fetch([(array, slice(None)) for array in maps.values()])
+        height, spread, gain, misfit, sharpness, status = found
         misfit = misfit[np.isfinite(misfit)]
         excess = max(0.0, float(np.median(misfit))) if misfit.size else 0.0
         sigma = np.sqrt(np.float32(variance) * spread + np.float32(excess) * gain)

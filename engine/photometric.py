@@ -15,6 +15,7 @@ from mirrorskin.io.arguments import as_array
 from mirrorskin.io.maps import TABLE
 from mirrorskin.io.positions import check_phase
 from mirrorskin.io.types import FRAME_DTYPES
+from mirrorskin.kernels.array import fetch
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import C_TYPES
 
@@ -160,7 +161,8 @@ class PhotometricStereo(Operation):
             -(-pixels // self.device.layout.tile), pixels=pixels, triangle=self._triangle, **arrays,
             moved=moved + self._triangle.nbytes,
         )  # fmt: skip
-        maps = {name: array.detach() for name, array in arrays.items()}
+        found = fetch([(array, slice(None)) for array in arrays.values()])
+        maps = dict(zip(arrays, found, strict=True))
         residual, samples = maps["residual"], maps["samples"]
         noise = noise_of_residual(residual, samples - 3) if self._noise is None else self._noise
         for name in ("normals", "albedo"):
