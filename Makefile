@@ -88,9 +88,11 @@ bench: $(READY)
 portability: $(READY)
 	@$(BIN)/python tests/portability/portability.py
 
-# What kernels take on GPUs that are not here: clang and libclc come from the system, ptxas from the package index.
+# What calls and kernels would have a GPU do that is not here: launches, waits and copies; then registers, for which
+# clang and libclc come from the system, ptxas from the package index.
 gpu-check: .venv/.ptxas
-	@$(BIN)/python tests/portability/gpu_check.py
+	@PYTHONPATH=bench $(BIN)/python tests/portability/gpu_counts.py
+	$(BIN)/python tests/portability/gpu_check.py
 
 # With a GPU: copies, whole calls, answers and device tests, in gpu.json and gpu.md.
 gpu: $(READY)

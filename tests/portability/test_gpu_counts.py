@@ -1,0 +1,39 @@
+"""No call may have a GPU do more than the table says; the table is kept by ``gpu_counts.py --freeze``."""
+
+import gpu_counts
+import pytest
+
+KNOWN = gpu_counts.load()
+
+
+@pytest.fixture(scope="module")
+def found():
+    return dict(gpu_counts.count_all())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", KNOWN)
+def test_a_call_has_a_gpu_do_no_more_than_before(found, name):
+    assert list(gpu_counts.complaints(name, found[name], KNOWN[name])) == []
+
+
+@pytest.mark.slow
+def test_every_call_is_in_the_table(found):
+    assert found.keys() == KNOWN.keys()
+
+
+def test_what_rises_is_told_in_a_line():
+    row = KNOWN["integrate"]
+    more = {**row, "launches": row["launches"] + 1, "waits": row["waits"] - 1}
+    assert list(gpu_counts.complaints("integrate", more, row)) == [
+        f"integrate: launches {row['launches'] + 1}, and the table has {row['launches']}"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("items", "moved", "seconds"),
+    [(1 << 20, 4 << 20, 4 * 2**20 / 2.4e12), (64, 64 * 16384 * 4, 16384 * 0.5e-6)],
+    ids=["as long as the memory takes", "as long as one work-item reads"],
+)
+def test_a_kernel_takes_as_long_as_what_limits_it(items, moved, seconds):
+    assert gpu_counts.seconds_of(items, moved) == pytest.approx(seconds)
