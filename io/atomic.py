@@ -6,7 +6,6 @@ import errno
 import fcntl
 import functools
 import os
-import secrets
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -168,7 +167,7 @@ def new_part(path: Path) -> Iterator[tuple[Path, int]]:
     folder = Path(os.path.realpath(path)).parent
     _tidy(folder)
     # The name is chosen before the file exists, so it is removed whenever the program ends.
-    part, descriptor = folder / f"{_PREFIX}{secrets.token_hex(8)}{_SUFFIX}", -1
+    part, descriptor = folder / f"{_PREFIX}{os.urandom(8).hex()}{_SUFFIX}", -1
     try:
         with as_input_error(f"{path} could not be written"):
             descriptor = _make(part)
@@ -222,7 +221,7 @@ def new_folder(path: Path) -> Iterator[Path]:
     same folder, the first one keeps the name; the others raise InputError.
     """
     _tidy(path.parent)
-    part, descriptor = path.parent / f"{_PREFIX}{secrets.token_hex(8)}{_SUFFIX}", -1
+    part, descriptor = path.parent / f"{_PREFIX}{os.urandom(8).hex()}{_SUFFIX}", -1
     try:
         with as_input_error(f"{path} could not be written"):
             descriptor = _make_folder(part)

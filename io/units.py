@@ -98,6 +98,9 @@ def ratio(unit: str, other: str) -> float:
     """
     if unit == other:
         return 1.0
+    for common in _COMMON.values():  # before any unit that needs pint
+        if unit in common and other in common:
+            return common[unit] / common[other]
     for kind in BASE:
         try:
             if max(len(unit), len(other)) <= _LONGEST:

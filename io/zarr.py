@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import secrets
+import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
@@ -80,7 +80,7 @@ class ZarrFile(Hdf5File):
             self._known: dict[str, Array] = {}
             self._early: dict[str, Future[NDArray[Any]]] = {}
             memory = {"driver": "core", "backing_store": False, "libver": "latest"}
-            root = h5py.File(secrets.token_hex(8), "w", **memory)
+            root = h5py.File(os.urandom(8).hex(), "w", **memory)
             super().__init__(path, memory_limit, opening.enter_context(root))
             self._lay_out(groups)
             self._ours = any(name.startswith("mirrorskin_") for name in groups.get("/entry", {}))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-import secrets
+import os
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -131,7 +131,7 @@ def _claim(store: Any, target: Url) -> str:
 
     from mirrorskin.io.zarr_store import LimitedStore
 
-    claim = f"{_CLAIM}{secrets.token_hex(8)}"
+    claim = f"{_CLAIM}{os.urandom(8).hex()}"
     sync(store.set(claim, default_buffer_prototype().buffer.from_bytes(b"1")))
     if any(name.startswith(_CLAIM) and name != claim for name in sync(LimitedStore(store, target).names(""))):
         sync(store.delete(claim))

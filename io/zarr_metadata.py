@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import math
 import re
@@ -92,6 +91,8 @@ async def read_nodes(store: Any, path: Path) -> Nodes:
 
 async def _walk(store: Any, path: Path, version: int, documents: dict[str, dict[str, Any]]) -> None:
     """Find the members of all groups concurrently."""
+    import asyncio  # slow to import, and unneeded for files
+
     gate = asyncio.Semaphore(_AT_ONCE)
 
     async def gated(work: Any) -> Any:
@@ -118,6 +119,8 @@ async def _walk(store: Any, path: Path, version: int, documents: dict[str, dict[
 
 async def _all_of(works: Iterable[Coroutine[Any, Any, Any]]) -> list[Any]:
     """Run all concurrently; if one fails, cancel the others and raise its error."""
+    import asyncio
+
     try:
         async with asyncio.TaskGroup() as group:
             tasks = [group.create_task(work) for work in works]

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import special
 
 from mirrorskin.engine.press.crossing import EVENT_MAPS, Crossing, CrossingOperation, Event, EventMaps
 from mirrorskin.engine.press.onset import Onset
@@ -224,6 +223,8 @@ class _JoinedOnsets:
             frame, earlier = self._first.frame, np.int32(end - len(travel))
             shifted = np.where(frame < 0, frame, frame + earlier) if earlier else frame
             return self._first._replace(frame=shifted)
+        from scipy import special  # slow to import, and unneeded for a press of one stroke
+
         several, freedom = self._count > 1, np.maximum(self._count, 2) - 1.0
         with np.errstate(divide="ignore", invalid="ignore"):
             mean, width = self._moment / self._weight, self._high - self._low

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.provenance import naming
@@ -52,7 +51,9 @@ class Response:
         wall = self.wall
         radius, rim, scatter = wall.geometry
         low, high = wall.reach
-        curve = Polynomial(wall.curve).convert(domain=[low, high], window=[-1, 1], kind=Polynomial)
+        curve = np.polynomial.Polynomial(wall.curve).convert(
+            domain=[low, high], window=[-1, 1], kind=np.polynomial.Polynomial
+        )
         numbers = [radius, rim, np.sin(scatter) ** 2, *wall.sight, *(lamp / radius for lamp in wall.lamps)]
         numbers += [low, high, *wall.ends, wall.sense, *wall.pivot, (low + high) / 2, 2 / (high - low)]
         return np.array([*numbers, *wall.inverse, *_padded(curve, len(wall.curve))], np.float32)
@@ -174,7 +175,9 @@ def _wall_of(wall: WallResponse, pivot: tuple[float, float, float], follows: boo
     curve = np.asarray(wall.curve, np.float64)
     light = np.polynomial.polynomial.polyval(q, curve)
     uneven = float(np.hypot(*wall.lamps))
-    inverse = Polynomial.fit(light, q, _INVERSE - 1, domain=[light.min(), light.max()]).convert()
+    inverse = np.polynomial.Polynomial.fit(
+        light, q, _INVERSE - 1, domain=[light.min(), light.max()]
+    ).convert()
     return Wall(
         geometry=(wall.radius, wall.rim, wall.scatter),
         sight=wall.sight,
@@ -189,7 +192,7 @@ def _wall_of(wall: WallResponse, pivot: tuple[float, float, float], follows: boo
     )
 
 
-def _padded(polynomial: Polynomial, count: int) -> Doubles:
+def _padded(polynomial: np.polynomial.Polynomial, count: int) -> Doubles:
     """Return the coefficients of a polynomial, with zeros for high orders that were trimmed."""
     numbers = np.zeros(count)
     numbers[: len(polynomial.coef)] = polynomial.coef

@@ -43,12 +43,13 @@ class RegistrationErrors(Step):
         """Return the result with other ``normals_sigma`` and ``contact``, if frames were registered."""
         if not isinstance(context.stream, Registered):
             return result
-        from scipy import ndimage
+        import cv2
 
         sigma, contact = result.normals_sigma, result.contact
-        reach = np.ones((1,) * (contact.ndim - 2) + (_REACH, _REACH), bool)
+        reach = np.ones((_REACH, _REACH), np.uint8)
         lost = np.isfinite(sigma) & (contact == 0)
-        inside = contact * ~ndimage.binary_dilation(lost, reach)
+        near = [cv2.dilate(one.view(np.uint8), reach) for one in lost.reshape(-1, *lost.shape[-2:])]
+        inside = contact * (np.reshape(near, lost.shape) == 0)
         if context.operation.chosen()["noise"] is not None:
             sigma = sigma * context.stream.noise_gain
         return result.assign(normals_sigma=sigma, contact=inside)

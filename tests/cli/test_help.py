@@ -1,34 +1,15 @@
 """`mirrorskin --help`: quick, as no command is needed for it, and true to what commands say themselves."""
 
 import ast
-import json
-import os
 import subprocess
 import sys
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from commands import done, refused, run
+from commands import done, loaded, refused, run
 
 from mirrorskin.cli.main import PURPOSES, app, main
-
-LOADED = """
-import contextlib, io, json, sys
-from mirrorskin.cli.main import main
-sys.argv = ["mirrorskin", *sys.argv[1:]]
-with contextlib.redirect_stdout(io.TextIOWrapper(io.BytesIO())), contextlib.suppress(SystemExit):
-    main()
-print(json.dumps(list(sys.modules)))
-"""
-
-
-def loaded(*words, **variables):
-    """Return which modules a command needs."""
-    command, environment = [sys.executable, "-c", LOADED, *words], {**os.environ, **variables}
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
-    return set(json.loads(done.stdout))
-
 
 HEAVY = (
     "cv2",

@@ -5,6 +5,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import io
+import json
+import os
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -43,6 +46,23 @@ def done(line: object, *words: object) -> Ended:
     ended = run(line, *words)
     assert ended.code == 0, ended.said
     return ended
+
+
+_LOADED = """
+import contextlib, io, json, sys
+from mirrorskin.cli.main import main
+sys.argv = ["mirrorskin", *sys.argv[1:]]
+with contextlib.redirect_stdout(io.TextIOWrapper(io.BytesIO())), contextlib.suppress(SystemExit):
+    main()
+print(json.dumps(list(sys.modules)))
+"""
+
+
+def loaded(*words: str, **variables: str) -> set[str]:
+    """Return which modules a command imports, in a process of its own with these environment variables."""
+    command, environment = [sys.executable, "-c", _LOADED, *words], {**os.environ, **variables}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    return set(json.loads(done.stdout))
 
 
 def refused(said: str, *words: object, run: Callable[..., Ended] = run, code: int = 2) -> str:

@@ -9,6 +9,7 @@ from mirrorskin.engine.press.intervals import (
     estimate_interval_errors,
     fit_paraboloids,
     interval_evidence,
+    normal_distribution,
 )
 
 
@@ -144,3 +145,10 @@ def test_too_little_tells_nothing(known):
     assert np.isnan(found.misfit).all()
     assert np.isfinite(found.along).all()
     assert found.pixels[0] <= known
+
+
+def test_the_normal_distribution_is_scipys():
+    x = np.linspace(-12, 12, 4001)
+    np.testing.assert_allclose(normal_distribution(x), norm.cdf(x), rtol=2e-7, atol=1e-16)
+    near = np.linspace(-3, 3, 4001)
+    np.testing.assert_allclose(normal_distribution(near), norm.cdf(near), rtol=1e-13)
