@@ -386,7 +386,9 @@ class BorrowedBuffer:
         self.shape, self.nbytes = values.shape, values.nbytes
         self.last_use: cl.Event | None = None
         self._lock = threading.RLock()
-        flags = cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR
+        # Kernels only read. But of what is read-only and not aligned to 128 bytes Intel's runtime makes a copy.
+        access = cl.mem_flags.READ_WRITE if values.flags.writeable else cl.mem_flags.READ_ONLY
+        flags = access | cl.mem_flags.USE_HOST_PTR
         loaded = as_strided(values.reshape(-1).view(np.uint8), (values.nbytes + SLACK,))
         with _naming(device, name, values.nbytes):
             self.buffer: cl.Buffer = cl.Buffer(device.context, flags, hostbuf=loaded)

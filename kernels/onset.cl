@@ -69,24 +69,29 @@ __kernel void onset_levels(
     const int pixels, const int stride, const int release, const float share, const float share_rest, MAP brights,
     const int bright_step, MAP darks, const int dark_step, OUT levels, __global FRAME *restrict marks)
 {
-    const int base = get_global_id(0) * TILE, end = min(pixels, base + TILE);
-    for (int p = base; p < end; ++p) {
-        const float bright = brights[p * bright_step], dark = darks[p * dark_step], range = bright - dark;
+    const int base = get_global_id(0) * TILE, width = min(TILE, pixels - base);
+    // Compilers make no vector code of unknown steps, nor (Intel's) of writes to two planes of one array.
+    float high[TILE], low[TILE];
+    for (int p = 0; p < width; ++p) high[p] = brights[bright_step ? base + p : 0];
+    for (int p = 0; p < width; ++p) low[p] = darks[dark_step ? base + p : 0];
+    for (int p = 0; p < width; ++p) {
+        const float bright = high[p], dark = low[p], range = bright - dark;
         const int usable = (range > 0) & (range - range == 0);  // the last: finite
         const float between = level_between(dark, bright, share, share_rest), level = usable ? between : NAN;
 #if BITS == 32
-        marks[p] = release ? next_up(-level) : level;
-        levels[p] = release ? -level : level;
-        levels[stride + p] = release ? -bright : dark;
+        marks[base + p] = release ? next_up(-level) : level;
+        levels[base + p] = release ? -level : level;
+        low[p] = release ? -bright : dark;
 #else
         // Rounded up; a saturated sample is light. What is never dark has no release.
         const float top = NONE, bound = level > 0 ? (level < top ? level : top) : usable ? 0 : top;
         const int whole = (int)bound, reached = whole + (whole < bound);
-        marks[p] = release ? (FRAME)(NONE - reached + 1) : (FRAME)reached;
-        levels[p] = release ? (reached > 0 ? top - level : NAN) : level;
-        levels[stride + p] = release ? top - bright : dark;
+        marks[base + p] = release ? (FRAME)(NONE - reached + 1) : (FRAME)reached;
+        levels[base + p] = release ? (reached > 0 ? top - level : NAN) : level;
+        low[p] = release ? top - bright : dark;
 #endif
     }
+    for (int p = 0; p < width; ++p) levels[stride + base + p] = low[p];
 }
 
 // Finds what is surely dark: samples that miss the level by `tolerance` counts; and what is near the level: all that
@@ -94,27 +99,30 @@ __kernel void onset_levels(
 __kernel void onset_sure(
     const int pixels, const int stride, const float tolerance, MAP levels, __global FRAME *restrict marks)
 {
-    const int base = get_global_id(0) * TILE, end = min(pixels, base + TILE);
-    for (int p = base; p < end; ++p) {
-        const float sure = levels[p] - tolerance;
-        const FRAME light = marks[p];
+    const int base = get_global_id(0) * TILE, width = min(TILE, pixels - base);
+    FRAME sures[TILE], nears[TILE];
+    for (int p = 0; p < width; ++p) {
+        const float level = levels[base + p], sure = level - tolerance;
+        const FRAME light = marks[base + p];
 #if BITS == 32
         const FRAME above = next_up(sure);
 #else
         const float bound = sure < NONE ? (sure < -1 ? -1 : sure) : NONE - 1;
-        const FRAME above = levels[p] < 0 ? light : (FRAME)((int)(bound + 1));
+        const FRAME above = level < 0 ? light : (FRAME)((int)(bound + 1));
 #endif
-        const FRAME dim = above < light ? above : light;
-        const float way = 0.25f * (levels[p] - levels[stride + p]), least = levels[p] - (way > 0 ? way : 0);
-        marks[stride + p] = dim;
+        const FRAME dim = LESSER(above, light);
+        const float way = 0.25f * (level - levels[stride + base + p]), least = level - (way > 0 ? way : 0);
+        sures[p] = dim;
 #if BITS == 32
-        marks[2 * stride + p] = least < dim ? least : dim;
+        nears[p] = LESSER(least, dim);
 #else
         const float bounded = least > 0 ? (least < NONE ? least : NONE) : 0;
         const int whole = (int)bounded, reached = whole + (whole < bounded);
-        marks[2 * stride + p] = reached < dim ? reached : dim;
+        nears[p] = LESSER(reached, dim);
 #endif
     }
+    for (int p = 0; p < width; ++p) marks[stride + base + p] = sures[p];
+    for (int p = 0; p < width; ++p) marks[2 * stride + base + p] = nears[p];
 }
 
 // --- What the samples around an onset tell ------------------------------------------------------------------------
