@@ -9,18 +9,29 @@
 
 // --- The fit that sums tell ---------------------------------------------------------------------------------------
 
-#define FIT(i) ((Pair){fit[i], fit[9 + (i)]})
+#if TILE > 1 && defined(cl_khr_fp64)  // a core's float64 is quicker than its pairs of floats
+typedef double Exact;
+#define EXACT(pair) ((double)(pair).high + (pair).rest)
+#define FLOAT(x) ((float)(x))
+#define ROW(i) (FIT(3 * i) * a + FIT(3 * i + 1) * b + FIT(3 * i + 2) * c)
+#define MISFIT(square) (square - (x * x + y * y + z * z))
+#else
+typedef Pair Exact;
+#define EXACT(pair) (pair)
+#define FLOAT(x) (x).high
 #define ROW(i) normalised(plus(plus(times(FIT(3 * i), a), times(FIT(3 * i + 1), b)), times(FIT(3 * i + 2), c)))
+#define MISFIT(square) normalised(minus(square, plus(plus(times(x, x), times(y, y)), times(z, z))))
+#endif
+#define FIT(i) EXACT(((Pair){fit[i], fit[9 + (i)]}))
 
 // Answers for pixel p from the sums of its samples, less a reference, and of the squares.
 #define ANSWER(p, reference, total, along, across, square) \
     { \
-        const Pair a = total, b = along, c = across, x = ROW(0), y = ROW(1), z = ROW(2); \
-        const Pair fitted = plus(plus(times(x, x), times(y, y)), times(z, z)); \
-        const float left = normalised(minus(square, fitted)).high; \
-        mean[p] = reference + (fit[18] * x.high + fit[19] * y.high + fit[20] * z.high); \
-        cosine_part[p] = fit[22] * y.high + fit[23] * z.high; \
-        sine_part[p] = fit[26] * z.high; \
+        const Exact a = total, b = along, c = across, x = ROW(0), y = ROW(1), z = ROW(2); \
+        const float left = FLOAT(MISFIT(square)); \
+        mean[p] = reference + (fit[18] * FLOAT(x) + fit[19] * FLOAT(y) + fit[20] * FLOAT(z)); \
+        cosine_part[p] = fit[22] * FLOAT(y) + fit[23] * FLOAT(z); \
+        sine_part[p] = fit[26] * FLOAT(z); \
         residual[p] = root((left < 0 ? 0 : left) * fit[27]); \
     }
 
@@ -40,8 +51,13 @@ typedef long Narrow;
     const Sum rest = total - (Sum)centre * used, along = cosine - centre * (Sum)cosines, \
               across = sine - centre * (Sum)sines, spread = square - centre * (total + rest);
 #define PAIR_OF(Sum, a) ((Pair){(float)(a), (float)((a) - (Sum)(float)(a))})
+#if TILE > 1 && defined(cl_khr_fp64)
+#define EXACTLY(Sum, a) (double)(a)
+#else
+#define EXACTLY(Sum, a) PAIR_OF(Sum, a)
+#endif
 #define ANSWER_COUNTS(Sum, p) \
-    ANSWER(p, centre, PAIR_OF(Sum, rest), PAIR_OF(Sum, along), PAIR_OF(Sum, across), PAIR_OF(Sum, spread))
+    ANSWER(p, centre, EXACTLY(Sum, rest), EXACTLY(Sum, along), EXACTLY(Sum, across), EXACTLY(Sum, spread))
 
 // One of the frames that are taken side by side, whose samples are added to a pixel's sums a, b, c and d.
 #define SIDE(i) \
@@ -218,7 +234,7 @@ __kernel void correlation_solve_pairs(
 {
     const int low = get_global_id(0) * TILE, end = min(pixels, low + TILE);
     for (int p = low; p < end; ++p)
-        ANSWER(p, reference[p], PAIR(total[p]), PAIR(cosine[p]), PAIR(sine[p]), PAIR(square[p]))
+        ANSWER(p, reference[p], EXACT(PAIR(total[p])), EXACT(PAIR(cosine[p])), EXACT(PAIR(sine[p])), EXACT(PAIR(square[p])))
 }
 
 // Both at once, for samples of which nothing is kept.
@@ -230,5 +246,5 @@ __kernel void correlation_window_pairs(
     Sums here, *sums = &here;
     add(sums, 1, width, frames + low, count, stride, place, basis);
     for (int p = 0; p < width; ++p)
-        ANSWER(low + p, sums->reference[p], GET(TOTAL), GET(COSINE), GET(SINE), GET(SQUARE))
+        ANSWER(low + p, sums->reference[p], EXACT(GET(TOTAL)), EXACT(GET(COSINE)), EXACT(GET(SINE)), EXACT(GET(SQUARE)))
 }
