@@ -36,6 +36,7 @@ class Focus(Operation):
     """
 
     motions = ("vertical",)
+    takes_device_arrays = True
     dtypes = FRAME_DTYPES
     on_device = True
 

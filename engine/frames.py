@@ -8,9 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from mirrorskin.engine.device_arrays import AnyArray
 from mirrorskin.io import InputError
 from mirrorskin.io.types import FRAME_DTYPES
+from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.least_squares import mad_sigma
+from mirrorskin.kernels.samples import take_samples
 
 SAMPLES = 65536
 """Smallest number of pixels from which the noise of a larger frame is estimated."""
@@ -52,11 +55,11 @@ class Noise:
         self._samples: list[NDArray[np.float64]] = []
         self.value = self._given if known is None else known
 
-    def look(self, frames: NDArray[Any]) -> None:
+    def look(self, frames: AnyArray) -> None:
         """Use the next frames, (n, H, W), if they are among the first two."""
         if self.value is not None:
             return
-        self._samples += [thin_out(frame) for frame in frames[: 2 - len(self._samples)]]
+        self._samples += [*thin_out(frames[: 2 - len(self._samples)])]
         if len(self._samples) == 2:
             self.value = estimate_noise(self._samples[0], self._samples[1], self._integer)
 
@@ -66,9 +69,21 @@ def thinning(shape: tuple[int, ...]) -> int:
     return max(1, math.prod(shape) // SAMPLES)
 
 
-def thin_out(frame: NDArray[Any]) -> NDArray[np.float64]:
-    """Return evenly spaced samples of a frame, enough to estimate its noise within 0.5 %."""
-    return frame.reshape(-1)[:: thinning(frame.shape)].astype(np.float64)
+def thin_out(frames: AnyArray) -> NDArray[np.float64]:
+    """Return evenly spaced samples of one frame or several, enough to estimate the noise within 0.5 %."""
+    return thinned(frames).astype(np.float64)
+
+
+def thinned(frames: AnyArray) -> NDArray[Any]:
+    """Return what `thin_out` does, in the frames' type."""
+    samples: NDArray[Any]
+    *count, rows, columns = frames.shape
+    step, pixels = thinning((rows, columns)), rows * columns
+    if isinstance(frames, Array):
+        samples = take_samples(frames, 0, pixels, step, (math.prod(count), -(-pixels // step)))
+        return samples.reshape(*count, -1)
+    samples = frames.reshape(*count, -1)[..., ::step]
+    return samples
 
 
 def estimate_noise(first: NDArray[np.float64], second: NDArray[np.float64], integer: bool) -> float:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, Protocol, Self, cast
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from mirrorskin.engine.device_arrays import AnyArray, as_any_array, device_of, on_host
 from mirrorskin.engine.options import RESERVED, Configured, Option, documented, option, signature_of
 from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.engine.tiling import MEMORY_LIMIT
@@ -19,6 +20,7 @@ from mirrorskin.io.arguments import as_array
 from mirrorskin.io.maps import declaration_of
 from mirrorskin.io.result import check_maps, result_of
 from mirrorskin.io.types import Motion, ProcessValue
+from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device, open_device
 
 if TYPE_CHECKING:
@@ -128,6 +130,8 @@ class Operation(ThreadSafe, OnDevice):
     """What ``push`` takes of each frame, and whether it needs it; an object's may depend on its options."""
     on_device: ClassVar[bool] = False
     """Whether frames are read for the device: ahead, or where kernels can read them without a copy."""
+    takes_device_arrays: ClassVar[bool] = False
+    """Whether ``push`` takes a `mirrorskin.kernels.array.Array`, which it gets as a NumPy array otherwise."""
     long_blocks: ClassVar[bool] = False
     """Whether as many frames as possible should be pushed at once."""
     updates_per_second: ClassVar[float] = 15.0
@@ -169,6 +173,7 @@ class Operation(ThreadSafe, OnDevice):
 
     def _forget(self) -> None:
         self.count, self._pass = 0, 1
+        self._on_device = False  # whether frames were on a device, where the maps then stay
         self._pushed: dict[str, list[NDArray[np.float64]]] = {}
 
     def configured_for(self, source: Source) -> Self:
@@ -273,17 +278,26 @@ class Operation(ThreadSafe, OnDevice):
             pushed = f"{self.count} has been" if self.count == 1 else f"{self.count or 'none'} have been"
             raise InputError(f"{type(self).__name__} needs at least {frames}; {pushed} pushed so far")
 
-    def _check_frames(self, frames: Any) -> NDArray[Any]:
+    def _check_frames(self, frames: Any) -> AnyArray:
         """Return frames as an array that fits to earlier ones."""
-        array = as_array("frames", frames)
+        array = as_any_array("frames", frames)
+        if not self.takes_device_arrays:
+            array = on_host(array)
+        elif isinstance(array, Array):
+            self.use_device_of(array)
         if self.dtype is None:
             if array.ndim != 3 or 0 in array.shape or array.dtype.kind not in "uif":
                 raise InputError(f"frames are {array.dtype} {array.shape}: numbers (n, H, W) are needed")
             self.begin(array.shape[1:], array.dtype)
+        self._on_device = isinstance(array, Array)
         if array.dtype != self.dtype or array.shape[1:] != self.shape or len(array) == 0:
             expected = f"{self.dtype} (n, {self.shape[0]}, {self.shape[1]})"
             raise InputError(f"frames are {array.dtype} {array.shape}: {expected} is needed")
         return array
+
+    def use_device_of(self, frames: Array) -> None:
+        """Compute on the device of frames, if none was chosen; InputError if they are on another one."""
+        vars(self)["_device"] = device_of(self.opened_device or vars(self)["_device"], frames)
 
     def _check_positions(self, count: int, given: Mapping[str, Any]) -> None:
         """Raise InputError unless there is a position of each frame."""
@@ -510,12 +524,12 @@ def array_function(
 
     def function(*args: Any, **kwargs: Any) -> Result:
         given = signature.bind(*args, **kwargs).arguments
-        frames = as_array("frames", given.pop("frames"))
+        frames = as_any_array("frames", given.pop("frames"))
         where = {one: given.pop(one, None) for one in (*positions, *optional)}
         where = {one: None if values is None else as_array(one, values) for one, values in where.items()}
         return (compute or run)(frames, where, given)
 
-    before = "frames : array_like, (T, H, W)\n    Raw counts.\n"
+    before = "frames : array_like or device array, (T, H, W)\n    Raw counts.\n"
     for names, end in ((positions, ""), (optional, ", optional")):
         before += "".join(f"{one} : array_like, (T,){end}\n    {about}\n" for one, about in names.items())
     function.__name__ = function.__qualname__ = name

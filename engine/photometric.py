@@ -40,6 +40,7 @@ class PhotometricStereo(Operation):
     0.5145
     """
 
+    takes_device_arrays = True
     dtypes = FRAME_DTYPES
     on_device = True
 

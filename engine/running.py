@@ -7,8 +7,9 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from mirrorskin.engine.device_arrays import AnyArray, as_any_array, is_on_device
 from mirrorskin.engine.inputs import as_result
 from mirrorskin.engine.method import Method, check_motion
 from mirrorskin.engine.operation import Operation
@@ -17,6 +18,7 @@ from mirrorskin.engine.reconstruction import calibrated
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.own_class import load_class
+from mirrorskin.kernels.array import Array
 
 if TYPE_CHECKING:
     from mirrorskin.io import Source
@@ -34,7 +36,7 @@ def run(
 
     Parameters
     ----------
-    source : Source, array_like (T, H, W), or iterable of array_like (H, W)
+    source : Source, array_like or device array (T, H, W), or iterable of array_like (H, W)
         An open recording, or anything else that frames come from, which is rewound first, if it can be; or
         the frames themselves: an array is pushed as a whole, frames of an iterable one by one.
     operation : Operation, or a class of operations
@@ -83,6 +85,7 @@ def run(
                 f"{cast('Source', source).name} is a recording: give pixel_size to io.open_recording"
             )
         return _run_source(cast("Source", source), operation, positions, progress)
+    source = as_any_array("frames", source) if is_on_device(source) else source
     if isinstance(source, str | os.PathLike) or not isinstance(source, Iterable):
         remedy = "open a path with io.open_recording, or give an array"
         raise InputError(f"frames are a {type(source).__name__}: {remedy}")
@@ -146,7 +149,7 @@ def _run_frames(
     progress: Progress | None,
 ) -> Result:
     """Push an array as a whole, or frames one by one."""
-    if not isinstance(frames, np.ndarray) and operation.passes == 2:
+    if not isinstance(frames, np.ndarray | Array) and operation.passes == 2:
         frames = np.stack([np.asarray(frame) for frame in frames])
     started = False
     for number in range(operation.passes):
@@ -155,6 +158,8 @@ def _run_frames(
         done = 0
         for piece, where in _cut(frames, positions):
             if not started:
+                if isinstance(piece, Array):
+                    operation.use_device_of(piece)
                 operation.begin(piece.shape[1:], piece.dtype)
                 started = True
             operation.push(piece, **where)
@@ -166,13 +171,13 @@ def _run_frames(
 
 def _cut(
     frames: Iterable[ArrayLike], positions: dict[str, ArrayLike]
-) -> Iterator[tuple[NDArray[Any], dict[str, Any]]]:
+) -> Iterator[tuple[AnyArray, dict[str, Any]]]:
     """Yield an array as a whole, or frames one by one, with their positions."""
     given = {name: np.asarray(values) for name, values in positions.items()}
-    whole = isinstance(frames, np.ndarray)
+    whole = isinstance(frames, np.ndarray | Array)
     done = 0
-    for piece in [frames] if whole else (np.asarray(frame)[np.newaxis] for frame in frames):
-        array = np.asarray(piece)
+    pieces: Iterable[AnyArray] = [frames] if whole else (np.asarray(one)[np.newaxis] for one in frames)
+    for array in pieces:
         if array.ndim != 3 or 0 in array.shape or array.dtype.kind not in "uif":
             shape, needed = (array.shape, "(T, H, W)") if whole else (array.shape[1:], "(H, W) of one size")
             raise InputError(f"frames are {array.dtype} {shape}: numbers {needed} are needed")

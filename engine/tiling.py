@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from mirrorskin.engine.device_arrays import AnyArray
 from mirrorskin.kernels import memory
 from mirrorskin.kernels.array import SLACK, Array, BorrowedBuffer, Operand, fetch
 from mirrorskin.kernels.device import Device
@@ -158,6 +159,11 @@ class Band:
         """Return a plane, (stride,), without its padding, (rows, W)."""
         return plane[: self.pixels].reshape(self._shape)
 
+    def cut(self, name: str, plane: int = 0, components: int = 0) -> Array:
+        """Return a copy on the device of a map, (rows, W), of one of several planes, or of vectors."""
+        shape = (*self._shape, components) if components else self._shape
+        return self.maps[name].cut(plane * self.stride, shape)
+
     def fetch(self, parts: Mapping[str, int | slice], keep: Collection[str] = ()) -> list[NDArray[Any]]:
         """Wait once, and return planes or rows of maps, (count, stride) or (rows, W).
 
@@ -186,14 +192,25 @@ class Band:
             self._blank.clear()
             self._resident = True
 
-    def stage(self, frames: NDArray[Any], lent: bool = False, whole: bool = False) -> Iterator[Staged]:
+    def stage(self, frames: AnyArray, lent: bool = False, whole: bool = False) -> Iterator[Staged]:
         """Yield frames, (n, H, W), on the device in pieces; launch the kernels for each before the next.
+
+        Frames that are on the device already are yielded in one piece; DeviceMemoryError if there is no room
+        for the maps of the whole picture beside them.
 
         If the device shares the host's memory, frames are used in place if their layout allows it. On a
         device with its own memory, they are copied while kernels process the previous piece. Afterwards the
         memory of the frames may be overwritten, except if it is ``lent`` (never overwritten while
         referenced): then kernels may still read it. ``whole``: yield at most ``length`` frames in one piece.
         """
+        if isinstance(frames, Array):
+            if not self._only:
+                raise DeviceMemoryError(
+                    f"{self._device.info.title} has no room for maps beside {len(frames)} frames: "
+                    "pass the frames as a NumPy array"
+                )
+            yield Staged(frames, slice(0, len(frames)))
+            return
         frames = frames[:, self.rows]
         start = 0
         while start < len(frames):

@@ -61,10 +61,13 @@ def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
 def as_array(name: str, value: Any) -> NDArray[Any]:
     """Return an argument as an array of numbers; an array of numbers is returned unchanged.
 
-    Masked values become NaN (frames of integers then become float32), or 0 in maps of integers.
+    Masked values become NaN (frames of integers then become float32), or 0 in maps of integers. Arrays on a
+    device are copied to the host.
     """
     if type(value) is np.ndarray and value.dtype.kind in "buif":
         return value
+    if type(value).__module__ == "pyopencl.array":  # np.asarray would take it for a sequence of arrays
+        value = value.get()
     masked = isinstance(value, np.ma.MaskedArray)
     try:
         array = np.asarray(value)

@@ -109,7 +109,8 @@ class Result(Shown, Mapping[str, Any]):
     ----------
     maps : mapping of str to ndarray or float, optional
         Maps, series (T,) and numbers by name; those that are None are left out. A function without arguments
-        that returns a map is called when the map is first used.
+        that returns a map is called when the map is first used, and an array on a device is then copied to
+        the host.
     x, y : ndarray, (W,) and (H,), float64, optional
         Millimetres of the pixel centres from the picture's centre; y points up the picture.
     process : mapping, optional
@@ -138,7 +139,7 @@ class Result(Shown, Mapping[str, Any]):
     (True, 'mm')
     """
 
-    __slots__ = ("_maps", "calibration", "declarations", "process", "x", "y")
+    __slots__ = ("_maps", "_on_device", "calibration", "declarations", "process", "x", "y")
 
     x: Floats | None
     y: Floats | None
@@ -163,7 +164,8 @@ class Result(Shown, Mapping[str, Any]):
         known = {name: one for name, one in (declarations or {}).items() if name in kept}
         check_declarations(known)
         for name, value in {
-            "_maps": kept,
+            "_maps": {name: getattr(value, "read", value) for name, value in kept.items()},
+            "_on_device": {name: value for name, value in kept.items() if hasattr(value, "read")},
             "x": x,
             "y": y,
             "process": process or {},
@@ -249,7 +251,27 @@ class Result(Shown, Mapping[str, Any]):
         fields = {name: values.pop(name, getattr(self, name)) for name in FIELDS}
         fields["declarations"] = {**self.declarations, **(fields["declarations"] or {})}
         replaced = {self._own_name(name): value for name, value in values.items()}
-        return Result({**self._maps, **replaced}, **fields)
+        changed = Result({**self._maps, **replaced}, **fields)
+        kept = {name: one for name, one in self._on_device.items() if name not in replaced}
+        changed._on_device.update(kept)
+        return changed
+
+    def on_device(self, name: str) -> Any:
+        """Return a map as a `mirrorskin.kernels.array.Array`, or None if it is not on a device.
+
+        Maps stay on the device if the frames, or other inputs, are there. They are copied to the host when
+        they are first used as ``result.height`` or ``result["height"]``.
+
+        Examples
+        --------
+        >>> from mirrorskin import engine
+        >>> from mirrorskin.kernels.device import open_device
+        >>> frames = open_device().given("frames", np.ones((8, 2, 3)), np.uint8)
+        >>> fit = engine.correlate(frames, np.arange(8) * np.pi / 4)
+        >>> fit.on_device("mean").shape, fit.mean[0, 0]
+        ((2, 3), np.float32(1.0))
+        """
+        return self._on_device.get(self._own_name(name))
 
     def maps(self) -> dict[str, NDArray[Any]]:
         """Return the maps, by name: built-in ones in the order of the table, then others."""

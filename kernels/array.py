@@ -7,12 +7,12 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cached_property, wraps
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar, cast
 
 import numpy as np
 import pyopencl as cl
 from numpy.lib.stride_tricks import as_strided
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from mirrorskin.kernels import memory
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError
@@ -21,6 +21,8 @@ from mirrorskin.kernels.transfer import Piece
 from mirrorskin.kernels.waiting import keep_for_ever, waiting
 
 if TYPE_CHECKING:
+    import pyopencl.array
+
     from mirrorskin.kernels.device import Device
 
 SLACK = 64
@@ -94,10 +96,11 @@ class Array:
         self.name = name
         self.arrived: cl.Event | None = None
         self.last_use: cl.Event | None = None
-        self._device = device
+        self.device = self._device = device
         self.is_shared: bool = device.info.shares_memory
         self._lock = threading.RLock()
         self._mapped: Mapping | None = None
+        self._is_lent = False  # whether others may still use the memory when this array is gone
         self._buffer: cl.Buffer | None = None
         self.shape, self.dtype, self._zeroed = shape, dtype, zeroed
         self._filling: Any = (
@@ -128,6 +131,39 @@ class Array:
     def latest(self) -> cl.Event | None:
         """The last command that wrote or read it on the device."""
         return self.last_use or self.arrived
+
+    @property
+    def ndim(self) -> int:
+        """Number of axes."""
+        return len(self.shape)
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __iter__(self) -> Iterator[Array]:
+        return (self[row] for row in range(len(self)))
+
+    def __getitem__(self, rows: int | slice) -> Array:
+        """Return some rows, without a step, on the device: all of them as they are, otherwise a copy."""
+        start, shape = self._part(rows)
+        return self if shape == self.shape else self.cut(start // self.dtype.itemsize, shape)
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
+        if copy is False:
+            raise ValueError(f"{self.name} is on a device: its values have to be copied")
+        return self.read().astype(self.dtype if dtype is None else dtype, copy=False)
+
+    def __dlpack__(self, **options: Any) -> object:
+        self.__dlpack_device__()
+        return self.download().__dlpack__(**options)
+
+    def __dlpack_device__(self) -> tuple[int, int]:
+        if not self.is_shared:
+            raise BufferError(
+                f"{self.name} is in memory of {self._device.info.title} that other libraries cannot use:"
+                " copy it with read() or numpy.asarray"
+            )
+        return np.empty(0).__dlpack_device__()
 
     def __del__(self) -> None:
         # A kernel may still use this memory, which another array gets next. On a lost device none does.
@@ -203,6 +239,37 @@ class Array:
             with self._device.profile.waiting_for(self.name):
                 self._mapped = Mapping(self._device.queue, self._buffer, self.shape, self.dtype)
         return self.host
+
+    @_told
+    def cut(self, start: int, shape: tuple[int, ...]) -> Array:
+        """Return a copy, on the device, of the elements from a number on, in another shape."""
+        copied = Array(self._device, self.name, shape, self.dtype, zeroed=False)
+        if copied.nbytes == 0:
+            return copied
+        after = [event for event in (self.latest, copied.latest) if event is not None]
+        source, target = self.buffer, copied.buffer
+        with self._device.enqueuing:
+            event = cl.enqueue_copy(
+                self._device.queue,
+                target,
+                source,
+                src_offset=start * self.dtype.itemsize,
+                byte_count=copied.nbytes,
+                wait_for=after,
+            )
+        self._device.profile.watch("copy", self.name, event, copied.nbytes)
+        self.last_use = copied.arrived = event
+        copied.last_use = None
+        return copied
+
+    @_told
+    def lend(self) -> pyopencl.array.Array:
+        """Return a `pyopencl.array.Array` in the same memory, on the device's queue."""
+        from pyopencl.array import Array as OpenCLArray
+
+        buffer, self._is_lent = self.buffer, True
+        after = [] if self.latest is None else [self.latest]
+        return OpenCLArray(self._device.queue, self.shape, self.dtype, data=buffer, events=after)
 
     @_told
     def detach(self) -> NDArray[Any]:
@@ -317,7 +384,7 @@ class Array:
     def _give_back(self) -> None:
         """Give the device's side back; other arrays wait for what still uses it."""
         buffer, self._buffer = self._buffer, None
-        if buffer is not None and not self.is_shared:
+        if buffer is not None and not (self.is_shared or self._is_lent):
             self._device.pool.give(buffer, self.latest)
 
     def _allocate(self) -> None:
@@ -330,6 +397,29 @@ class Array:
             else:
                 self._buffer, self.arrived = self._device.take_buffer(self.nbytes + SLACK)
                 self.last_use = None
+
+
+def adopt(device: Device, name: str, values: pyopencl.array.Array) -> Array:
+    """Return a copy, on the device, of an array of pyopencl in C order."""
+    array = Array(device, name, values.shape, np.dtype(values.dtype), zeroed=False)
+    try:
+        after = [*values.events, *([array.latest] if array.latest else [])]
+        target = array.buffer
+        with device.enqueuing:
+            array.arrived = cl.enqueue_copy(
+                device.queue,
+                target,
+                cast(cl.Buffer, values.base_data),
+                src_offset=values.offset,
+                byte_count=array.nbytes,
+                wait_for=after,
+            )
+    except cl.Error as error:
+        raise failed(device, f"copy {name}", error) from error
+    device.profile.watch("copy", name, array.arrived, array.nbytes)
+    values.add_event(array.arrived)
+    array.last_use = None
+    return array
 
 
 def fetch(parts: Sequence[tuple[Array, int | slice]], keep: Sequence[bool] = ()) -> list[NDArray[Any]]:

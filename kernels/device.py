@@ -17,6 +17,7 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
+from weakref import WeakSet
 
 import numpy as np
 import pyopencl as cl
@@ -41,7 +42,7 @@ _FOLDER = Path(__file__).parent
 _log = logging.getLogger("mirrorskin.kernels")
 _opening = threading.Lock()
 _numbers = itertools.count()  # of buffers that were arguments of kernels
-_opened: list[Device] = []
+_opened: WeakSet[Device] = WeakSet()
 _left_out: set[cl.Device] = set()  # those that failed where others could be taken
 _KINDS = ("gpu", "cpu", "other")  # in the order in which they are taken
 _PLACE = re.compile(r"(\w+\.clh?|<kernel>):(\d+):(\d+):\s*(?:fatal )?(?:error:)?\s*(.+)")
@@ -108,7 +109,7 @@ def open_device(choice: str | Device | None = None) -> Device:
         There is no OpenCL device at all, or it cannot run a kernel; or this process was forked from one that
         had opened a device, whose driver's threads it lacks.
     """
-    if any(device.process != os.getpid() for device in _opened):
+    if any(device.process != os.getpid() for device in opened_devices()):
         raise DeviceError(
             "this process was forked from one that had used OpenCL, whose threads it lacks: start it with "
             "multiprocessing.get_context('spawn')"
@@ -127,6 +128,11 @@ def open_device(choice: str | Device | None = None) -> Device:
         return _open(last)
 
 
+def opened_devices() -> list[Device]:
+    """Return the devices that are open in this process."""
+    return list(_opened)
+
+
 def free_memory() -> None:
     """Give the memory that is kept from call to call back to the system.
 
@@ -142,7 +148,7 @@ def free_memory() -> None:
     >>> engine.free_memory()
     """
     with _opening:
-        for device in _opened:
+        for device in opened_devices():
             device.spare.clear()
             device.transfers.free(device)
             device.pool.free()
@@ -201,6 +207,7 @@ class Device:
         self.transfers, self.pool = Transfers(), BufferPool(self.info.memory // SHARE)
         self._kernels: dict[tuple[object, ...], Kernel] = {}
         self.spare: dict[str, Any] = {}
+        _opened.add(self)
         _log.info("using %s (driver %s)", self.info.title, self.info.driver)
 
     def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike, zeroed: bool = True) -> Array:
@@ -265,8 +272,13 @@ class Device:
             _log.info("%s cannot work on %s in place (%s): they are copied", self.info.title, name, error)
             return None
 
-    def seen(self, name: str, values: NDArray[Any]) -> Operand:
-        """Let kernels read values in place, or else a copy; nobody may write to them meanwhile."""
+    def seen(self, name: str, values: NDArray[Any] | Array) -> Operand:
+        """Let kernels read values in place, or else a copy; nobody may write to them meanwhile.
+
+        An array of a device is returned as it is.
+        """
+        if isinstance(values, Array):
+            return values
         borrowed = self.borrow(name, values) if self.info.shares_memory else None
         return borrowed or self.given(name, values, values.dtype)
 
@@ -653,8 +665,7 @@ def _best_first(devices: list[cl.Device]) -> list[cl.Device]:
 
 @functools.cache
 def _open(device: cl.Device) -> Device:
-    _opened.append(Device(device))
-    return _opened[-1]
+    return Device(device)
 
 
 def _with_includes(name: str, text: str) -> str:

@@ -13,7 +13,7 @@ import pyopencl as cl
 
 from mirrorskin.kernels.waiting import waiting
 
-Kind = Literal["compile", "upload", "fill", "kernel", "download", "wait"]
+Kind = Literal["compile", "upload", "fill", "copy", "kernel", "download", "wait"]
 
 _PENDING_LIMIT = 1024  # events held before they are read, so that an endless run stays bounded
 

@@ -14,7 +14,7 @@ from mirrorskin.io import InputError
 Slopes = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32] | None]
 """Slopes along x and y, and their weight, (H, W); None if all weights are equal."""
 
-_EDGE_ON = 1e-4  # squared cosine of the angle between normal and line of sight, up to which there is no slope
+EDGE_ON = 1e-4  # squared cosine of the angle between normal and line of sight, up to which there is no slope
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +99,7 @@ def find_slopes(normals: NDArray[Any], camera: Camera | None, box: Box) -> Slope
             facing += x * across[box[1]] + y * up[box[0]]
         square = x * x + y * y + z * z
         weight = np.square(facing) / square
-        undefined = ~((facing > 0) & (weight > _EDGE_ON))
+        undefined = ~((facing > 0) & (weight > EDGE_ON))
         facing[undefined], weight[undefined] = np.nan, 1
         factor = np.reciprocal(facing if camera is not None else -facing)
         return x * factor, y * factor, weight

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
+from mirrorskin.engine.integration.device_inputs import sample_grid
+from mirrorskin.engine.integration.validation import Flags, Inputs
 from mirrorskin.kernels.array import Array, Operand
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.links import DOWN, KNOWN, RIGHT, SLOPE
@@ -100,11 +101,16 @@ class PixelGraph:
 
     def mean_plane(self, inputs: Inputs) -> Plane:
         """Return the plane of the mean slopes, 0 in the middle; heights above it have more digits."""
-        subset = tuple(slice(step // 2, None, step) for step in (-(-size // _SAMPLES) for size in self.shape))
+        steps = [-(-size // _SAMPLES) for size in self.shape]
+        subset = tuple(slice(step // 2, None, step) for step in steps)
         valid = self.flags.host[subset] & SLOPE != 0
         if not valid.any():
             return LEVEL
-        x, y = (float(slope[subset][valid].mean()) for slope in (inputs.dz_dx, inputs.dz_dy))
+        slopes = (
+            sample_grid(slope, *steps) if isinstance(slope, Array) else slope[subset]
+            for slope in (inputs.dz_dx, inputs.dz_dy)
+        )
+        x, y = (float(slope[valid].mean()) for slope in slopes)
         along_x, along_y, _ = self.steps((x, y, 0.0))
         return x, y, -(along_x * (self.shape[1] - 1) + along_y * (self.shape[0] - 1)) / 2
 
@@ -157,7 +163,7 @@ class PixelGraph:
         """Return maps for the device: in place if it shares the host's memory, else in the graph's arrays."""
         borrow = self.device.borrow if self.device.info.shares_memory else lambda name, values: None
         return {
-            name: borrow(name, values) or self.put(name, values)
+            name: values if isinstance(values, Array) else borrow(name, values) or self.put(name, values)
             for name, values in maps.items()
             if values is not None
         }
@@ -228,9 +234,17 @@ class Levelling:
         self._components: Components | None = None
 
     def level(
-        self, components: Components, reliefs: Array, planes: Sequence[Plane], datum: float = 0.0
-    ) -> Floats:
-        """Return heights, mm, of one or several reliefs; known heights are relative to ``datum``."""
+        self,
+        components: Components,
+        reliefs: Array,
+        planes: Sequence[Plane],
+        datum: float = 0.0,
+        on_device: bool = False,
+    ) -> Any:
+        """Return heights, mm, of one or several reliefs; known heights are relative to ``datum``.
+
+        ``on_device``: as an array of the device instead of NumPy's.
+        """
         graph, unknown = self._graph, components.offset_unknown
         if components is not self._components and components.count > 1:
             graph.put("labels", components.labels)
@@ -251,8 +265,7 @@ class Levelling:
                     offsets.host[selected] = mean - self._means(relief, maps)[selected]
             offsets.upload()
             self._run("components_add_offsets", items, relief, offsets=offsets, heights=heights)
-        levelled: Floats = heights.detach()
-        return levelled
+        return heights if on_device else heights.detach()
 
     def _means(self, relief: dict[str, Any], maps: Mapping[str, Operand]) -> NDArray[np.float64]:
         """Return mean heights of components, or mean differences from known ones, (components,), mm."""

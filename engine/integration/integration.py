@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mirrorskin.engine.device_arrays import as_any_array_or_number, device_of, on_host
 from mirrorskin.engine.integration.camera import Camera
+from mirrorskin.engine.integration.device_inputs import check_device_inputs
 from mirrorskin.engine.integration.surface import IntegrationOptions, SurfaceSolver
 from mirrorskin.engine.integration.validation import (
     Inputs,
@@ -22,6 +24,7 @@ from mirrorskin.engine.integration.validation import (
 from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import as_array_or_number, checked
+from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device, open_device
 
 # Pixels up to which the device keeps the memory of the last call, about 100 bytes per pixel: allocation takes
@@ -31,10 +34,10 @@ _OUTSIDE = {"height": np.nan, "height_sigma": np.nan, "component": -1, "filled":
 
 
 @checked(
-    dz_dx=as_array_or_number,
-    dz_dy=as_array_or_number,
+    dz_dx=as_any_array_or_number,
+    dz_dy=as_any_array_or_number,
     pixel_size=as_array_or_number,
-    normals=as_array_or_number,
+    normals=as_any_array_or_number,
     mask=as_array_or_number,
     slope_weights=as_array_or_number,
     edges=as_array_or_number,
@@ -71,13 +74,13 @@ def integrate(
 
     Parameters
     ----------
-    dz_dx, dz_dy : array_like, (H, W) or (K, H, W), optional
+    dz_dx, dz_dy : array_like or device array, (H, W) or (K, H, W), optional
         Slopes along x (to the right) and along y (up the picture); not finite where undefined. K surfaces
         with the same other arguments are solved together, several times as fast as one after the other. A
         pixel has slopes if all surfaces have them; the first surface determines the links of ``edges``.
     pixel_size : array_like, optional
         Millimetres, one number or (x, y). Not allowed with a camera.
-    normals : array_like, (H, W, 3), optional
+    normals : array_like or device array, (H, W, 3), optional
         Surface normals instead of slopes: components along x, y and z, which points to the camera; of any
         length. Not finite or 0 where undefined. Normals of surfaces that face away, or within 0.6 degrees of
         edge-on, are ignored.
@@ -109,6 +112,10 @@ def integrate(
     **options
         ``robust``, ``bilateral_sharpness``, ``sigma``, ``tolerance``, ``budget`` and ``device``; see
         `mirrorskin.engine.integration.surface.IntegrationOptions`.
+
+    Slopes or normals of one surface that are on a device, in float32, stay there, and so does ``height``; see
+    `mirrorskin.io.Result.on_device`. They are copied to the host first with ``robust``, a camera, known or
+    initial heights, or a map of weights.
 
     Returns
     -------
@@ -149,15 +156,24 @@ def integrate(
     >>> round(float(surface.height[0, 2]), 6)
     0.5
     """
+    on_device = any(isinstance(one, Array) for one in (dz_dx, dz_dy, normals))
+    if on_device:
+        options["device"] = device_of(options.get("device"), dz_dx, dz_dy, normals)
     chosen = IntegrationOptions(**options)
-    inputs = check_inputs(
-        *(dz_dx, dz_dy, pixel_size, mask, slope_weights, edges, known_heights, known_height_weights),
-        normals=normals,
-        camera=camera,
-        robust=chosen.robust,
-        crop=True,
-        several=not chosen.robust and initial_heights is None,
-    )
+    others = camera, known_heights, initial_heights
+    one_weight = slope_weights is None or np.ndim(slope_weights) == 0
+    if on_device and one_weight and not chosen.robust and all(one is None for one in others):
+        inputs = check_device_inputs(dz_dx, dz_dy, normals, pixel_size, mask, slope_weights, edges)
+    else:
+        dz_dx, dz_dy, normals = (on_host(one) for one in (dz_dx, dz_dy, normals))
+        inputs = check_inputs(
+            *(dz_dx, dz_dy, pixel_size, mask, slope_weights, edges, known_heights, known_height_weights),
+            normals=normals,
+            camera=camera,
+            robust=chosen.robust,
+            crop=True,
+            several=not chosen.robust and initial_heights is None,
+        )
     start = None
     if initial_heights is not None:
         start = check_map("initial_heights", initial_heights, inputs.picture)[inputs.box]

@@ -91,7 +91,8 @@ def seems_full(inputs: Inputs) -> bool:
         return False
     rows = slice(None, None, _SAMPLED if min(inputs.shape) > 1 else 1)
     values = inputs.dz_dx, inputs.dz_dy, inputs.known_heights
-    return all(bool(np.isfinite(map_[rows]).all()) for map_ in values if map_ is not None)
+    # What is on a device is not looked at: an undefined slope shows in the heights.
+    return all(bool(np.isfinite(map_[rows]).all()) for map_ in values if isinstance(map_, np.ndarray))
 
 
 def _screening(inputs: Inputs) -> float:
@@ -147,10 +148,11 @@ class Rectangle:
         self._transform("rectangle_heights", 0, rows=math.prod(self.shape[:-1]), height=height)
         return height
 
-    def integrate(self, inputs: Inputs, sigma: bool) -> tuple[Floats, Floats | None] | None:
+    def integrate(self, inputs: Inputs, sigma: bool) -> tuple[Any, Floats | None] | None:
         """Return heights, mm, from slopes, and their standard deviation, (H, W), if ``sigma``.
 
-        None if a slope or a known height is missing. The scale must be the area of a pixel.
+        The heights are on the device if the slopes are. None if a slope or a known height is missing. The
+        scale must be the area of a pixel.
         """
         (width, height), (along, across), screening = self._size, self._weights, _screening(inputs)
         names = [name for name in ("dz_dx", "dz_dy", "known_heights") if getattr(inputs, name) is not None]
@@ -174,8 +176,10 @@ class Rectangle:
         if sigma:
             weights = {"weight_x": along, "weight_y": across, "size_x": width, "size_y": height}
             run("rectangle_misfit", **weights, relief=relief, sums=sums)
-        heights: Floats = relief.detach()
-        if not np.isfinite(heights[..., 0, 0]).all():  # one undefined pixel makes all undefined
+        on_device = isinstance(inputs.dz_dx, Array)
+        heights: Any = relief if on_device else relief.detach()
+        first = relief.read(0) if on_device else heights[..., 0, 0]
+        if not np.isfinite(first).all():  # one undefined pixel makes all undefined
             return None
         deviation = None
         if sigma:
@@ -184,7 +188,8 @@ class Rectangle:
                 misfit = float(sums.download().sum(dtype=np.float64)) / pictures
                 factor *= self._excess(misfit / factor, len(names) > 2)
             deviation = self.deviation(screening) * np.float32(factor**0.5)
-        heights += np.float32(inputs.datum)
+        if not on_device:
+            heights += np.float32(inputs.datum)
         return heights, deviation
 
     def deviation(self, screening: float = 0.0) -> Floats:

@@ -241,7 +241,8 @@ class SurfaceSolver:
     def _finish(self, inputs: Inputs, options: IntegrationOptions, relief: _Relief) -> Result:
         """Add plane and offsets to the relief, and estimate the standard deviation."""
         components = self._find_components(inputs, relief)
-        height = self._levelling.level(components, relief.height, relief.planes, inputs.datum)
+        on_device = isinstance(inputs.dz_dx, Array)
+        height = self._levelling.level(components, relief.height, relief.planes, inputs.datum, on_device)
         return _as_result(
             height,
             self._find_sigma(inputs, relief, components) if options.sigma else None,
@@ -320,7 +321,7 @@ def _relief(solution: Solution, planes: list[Plane]) -> _Relief:
 
 
 def _as_result(
-    height: Floats,
+    height: Any,
     sigma: Floats | None,
     component: NDArray[np.int32],
     offset_unknown: NDArray[np.bool_],

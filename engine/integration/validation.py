@@ -22,7 +22,8 @@ LEAST, MOST = 1e-4, 1e3
 """Range of the weights of slopes, relative to the median, that can be solved in float32."""
 
 _LARGEST_HEIGHT_WEIGHT = 1e4  # relative to the weight of a link; larger weights are clipped
-_SAMPLES = 65536  # pixels for the median weight
+SAMPLES = 65536
+"""Pixels from which the median weight is taken."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,9 +107,9 @@ def check_inputs(
     if camera is not None and pixel_size is not None:
         raise InputError(f"pixel_size {pixel_size!r}: a camera determines it; leave one of the two out")
     size = check_pixel_size(pixel_size) if camera is None else camera.pixel_size
-    weight, planes = _split_weights("slope_weights", slope_weights, shape)
-    height_weight, height_planes = _split_weights("known_height_weights", known_height_weights, shape, 1)
-    marks, cuts = _marks("mask", mask, shape), _marks("edges", edges, shape)
+    weight, planes = split_weights("slope_weights", slope_weights, shape)
+    height_weight, height_planes = split_weights("known_height_weights", known_height_weights, shape, 1)
+    marks, cuts = as_marks("mask", mask, shape), as_marks("edges", edges, shape)
     heights = None if known_heights is None else check_map("known_heights", known_heights, shape)
     if not weight:
         planes = [np.zeros(shape, np.float32)]
@@ -246,7 +247,7 @@ def check_map(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[A
     return array
 
 
-def _marks(name: str, values: ArrayLike | None, shape: tuple[int, ...]) -> Flags | None:
+def as_marks(name: str, values: ArrayLike | None, shape: tuple[int, ...]) -> Flags | None:
     """Return a map of bytes that are 0 where the values are 0 or NaN."""
     if values is None:
         return None
@@ -256,7 +257,7 @@ def _marks(name: str, values: ArrayLike | None, shape: tuple[int, ...]) -> Flags
     return np.asarray((array != 0) & (array == array)).view(np.uint8)
 
 
-def _split_weights(
+def split_weights(
     name: str, values: ArrayLike | None, shape: tuple[int, ...], most: int = 2
 ) -> tuple[float, list[Floats]]:
     """Return a factor, and the maps to be multiplied by it; no maps if all weights are equal."""
@@ -276,12 +277,17 @@ def _split_weights(
     return 1.0, [np.asarray(plane, np.float32) for plane in ([array] if array.ndim == 2 else array)]
 
 
+def median_weight(samples: list[Floats]) -> float:
+    """Return the median of weights above 0, or 1."""
+    weights = np.concatenate([part.ravel() for part in samples])
+    weights = weights[weights > 0]
+    return float(np.median(weights)) if weights.size else 1.0
+
+
 def _median(planes: list[Floats]) -> float:
     """Return the median of weights above 0, from a regular subset of the pixels, or 1."""
-    step = max(1, math.isqrt(planes[0].size // _SAMPLES))
-    samples = np.concatenate([plane[step // 2 :: step, step // 2 :: step].ravel() for plane in planes])
-    samples = samples[samples > 0]
-    return float(np.median(samples)) if samples.size else 1.0
+    step = max(1, math.isqrt(planes[0].size // SAMPLES))
+    return median_weight([plane[step // 2 :: step, step // 2 :: step] for plane in planes])
 
 
 def _clipped(plane: Floats, least: float, most: float) -> Floats:

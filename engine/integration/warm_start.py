@@ -75,7 +75,7 @@ class WarmStartIntegrator(ThreadSafe):
             self._steps = 0
             return np.full(self._shape, np.nan, np.float32)
         relief = self._from_scratch() if self._relief is None else self._relief
-        height = self._levelling.level(components, relief, [LEVEL])
+        height: Floats = self._levelling.level(components, relief, [LEVEL])
         self._steps += 1
         if self._steps > 1 and self._steps % _CHECK_INTERVAL == 0:
             assert self._multigrid is not None

@@ -40,6 +40,8 @@ class ChangePoint(PressOperation):
     array([[ 3, -1]], dtype=int32)
     """
 
+    takes_device_arrays = True
+
     threshold: float = Onset.threshold
     event: Event = Onset.event
 
@@ -162,11 +164,11 @@ class ChangePoint(PressOperation):
         answered = (status == 1) | (status == 3)
         status = _RELEASED[status] if self._release else status
         frame = np.where(answered, frame, np.int32(-1))
-        named = dict(zip(EVENT_MAPS, (height, sigma, status, frame), strict=True))
+        named: dict[str, Any] = dict(zip(EVENT_MAPS, (height, sigma, status, frame), strict=True))
         return Result(named, process={"noise": noise}, declarations=self.declarations)
 
-    def _finish(self, band: Band, noise: float) -> list[NDArray[Any]]:
-        """Return height, sigma, status and frame of a band's rows."""
+    def _finish(self, band: Band, noise: float) -> list[Any]:
+        """Return height, sigma, status and frame of a band's rows; the heights stay where the frames were."""
         if self.passes == 2:
             self._estimate_levels(band, noise)
         names = ["start", "excess", "below", "since", "dark", "gain", "ring", "height", "sigma", "status"]
@@ -184,9 +186,10 @@ class ChangePoint(PressOperation):
                 **maps,
                 moved=sum(array.nbytes for array in maps.values()),
             )
-            return band.fetch(
-                dict.fromkeys(("height", "sigma", "status", "start"), slice(None)), keep=["start"]
-            )
+            names = ["height", "sigma", "status", "start"]
+            heights = names[:2] if self._on_device else []
+            others = dict.fromkeys(names[len(heights) :], slice(None))
+            return [*(band.cut(name) for name in heights), *band.fetch(others, keep=["start"])]
 
     def _travel_pairs(self) -> Array:
         """Copy the travel to the device as (T, 2) floats, whose sums have the precision of float64."""

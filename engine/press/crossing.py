@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
 import numpy as np
@@ -106,13 +106,14 @@ class EventMaps(NamedTuple):
     """The event at each pixel: height and its sigma, status, and number of the first frame after it.
 
     Heights, mm, are NaN unless the status is 1 (see `mirrorskin.io.maps.PressStatus` and ``ReleaseStatus``);
-    frames are -1 without an event.
+    frames are -1 without an event. They are NumPy arrays, or on the device; the frame is then a function that
+    returns it.
     """
 
-    height: NDArray[np.float32]
-    sigma: NDArray[np.float32]
-    status: NDArray[np.uint8]
-    frame: NDArray[np.int32]
+    height: Any
+    sigma: Any
+    status: Any
+    frame: Any
 
 
 class Crossing:
@@ -212,11 +213,18 @@ class Crossing:
         maps = "marks left times levels answers status"
         self._launch(band, "onset_scan", maps, moved, first=first, **arguments, **self._travel.arguments)
 
-    def event_maps(self, last: bool = False) -> EventMaps:
-        """Return the maps of the frames so far; without a copy if they are the ``last`` before a `reset`."""
+    def event_maps(self, last: bool = False, on_device: bool = False) -> EventMaps:
+        """Return the maps of the frames so far; without a copy if they are the ``last`` before a `reset`.
+
+        ``on_device``: height, sigma and status are arrays on the device, for frames that were.
+        """
+        if on_device:
+            (band,) = self._bands
+            later = partial(_first_light, band.cut("times"))
+            return EventMaps(band.cut("answers", 0), band.cut("answers", 1), band.cut("status"), later)
         maps = [self._band_maps(band, last) for band in self._bands]
         height, sigma, status, frame = (join_rows(parts) for parts in zip(*maps, strict=True))
-        return EventMaps(height, sigma, status, np.maximum(frame, DARK, out=frame))
+        return EventMaps(height, sigma, status, _first_light(frame))
 
     def _band_maps(self, band: Band, last: bool) -> list[NDArray[Any]]:
         """Return height, sigma, status and frame of a band's rows."""
@@ -251,6 +259,12 @@ class Crossing:
         }
         kernel = self.device.kernel("onset", name, **self._macros, TILE=tile)
         kernel(-(-band.pixels // tile), **arguments, moved=moved)
+
+
+def _first_light(times: Any) -> NDArray[np.int32]:
+    """Return the first frame after the event, -1 without one, from the state of the search."""
+    frame: NDArray[np.int32] = np.asarray(times)
+    return np.maximum(frame, DARK, out=frame)
 
 
 class _TravelTable:

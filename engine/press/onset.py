@@ -18,6 +18,8 @@ from mirrorskin.io import Result
 class ThresholdOperation(CrossingOperation):
     """Base of operations that search for one event at one or several thresholds."""
 
+    takes_device_arrays = True
+
     event: Event = option(
         default="onset",
         choices=("onset", "release"),
@@ -113,7 +115,8 @@ class Onset(ThresholdOperation):
         return self._result(last=True)
 
     def _result(self, last: bool) -> Result:
-        maps, *lower = [search.event_maps(last) for search in self._searches]
+        on_device = self._on_device and len(self._searches) == 1
+        maps, *lower = [search.event_maps(last, on_device) for search in self._searches]
         if lower:
             # A pixel that is always light at the lower threshold turned light in the first frame or earlier.
             end = self._searches[0].travel[-1 if self.event == "release" else 0]

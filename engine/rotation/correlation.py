@@ -9,12 +9,13 @@ are summed as pairs of floats, in the order of the frames. See `mirrorskin.kerne
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from mirrorskin.engine.device_arrays import AnyArray, on_host
 from mirrorskin.engine.operation import Operation, phase_function
 from mirrorskin.engine.options import option
 from mirrorskin.engine.rotation.design_matrix import basis, check_phases, check_weights
@@ -40,6 +41,7 @@ _FIT = {name: f"wave {name}" for name in ("mean", "cosine_part", "sine_part", "r
 class CorrelationOperation(Operation):
     """Base of operations that fit mean, cosine and sine of a phase to each pixel's brightness."""
 
+    takes_device_arrays = True
     dtypes = FRAME_DTYPES
     on_device = long_blocks = True
 
@@ -57,7 +59,7 @@ class CorrelationOperation(Operation):
     def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         """Prepare for frames of a shape and type."""
         self._length = max(1, self.memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))
-        self._stack: tuple[NDArray[Any], Doubles, Doubles] | None = None
+        self._stack: tuple[AnyArray, Doubles, Doubles] | None = None
         vars(self).pop("_sums", None)
 
     @cached_property
@@ -78,11 +80,13 @@ class CorrelationOperation(Operation):
         """Array in which the next frames may be written before they are pushed, (n, H, W)."""
         return self._sums.room
 
-    def _push(self, frames: NDArray[Any], alpha: Doubles, weights: Doubles, lent: bool) -> None:
+    def _push(self, frames: AnyArray, alpha: Doubles, weights: Doubles, lent: bool) -> None:
         """Take in frames with the phase and the weight of each."""
         if lent and self.count == 0 and self._window() is None and StackSums.take(frames, weights):
             self._stack = frames, alpha, weights  # summed and solved by one kernel, unless more frames follow
             return
+        if self._window() is not None:
+            frames = on_host(frames)
         if self._stack is not None:
             self._sums.push(*self._stack, lent=True)
             self._stack = None
@@ -91,12 +95,12 @@ class CorrelationOperation(Operation):
     def _fit(self) -> Result:
         """Return the fit of the frames so far, or of those in the window."""
         if self._stack is None:
-            return self._sums.result()
+            return self._sums.result(self._on_device and self._window() is None)
         frames, alpha, weights = self._stack
         check_phases(alpha, weights)
         sums = StackSums(self.device, self.shape, self.dtype, len(frames))
         sums.push(frames, alpha, weights)
-        return sums.result()
+        return sums.result(self._on_device)
 
 
 class Correlate(CorrelationOperation):
@@ -224,24 +228,25 @@ class _Sums:
         """Phases and weights of the frames; the weight of a missing frame is 0."""
         return self._phase, self._weight
 
-    def result(self) -> Result:
-        """Return the fit; InputError if the phases do not determine one."""
+    def result(self, on_device: bool = False) -> Result:
+        """Return the fit, perhaps with maps on the device; InputError if the phases do not determine it."""
         used = self._weight > 0
         check_phases(self._phase[used], self._weight[used])
         self._solve()
-        parts = []
+        parts: list[list[Any]] = []
         for band in self.bands:
             with band.resident():
-                parts.append(band.fetch(dict.fromkeys(_FIT.values(), slice(None))))
+                if on_device:
+                    parts.append([band.cut(name) for name in _FIT.values()])
+                else:
+                    parts.append(band.fetch(dict.fromkeys(_FIT.values(), slice(None))))
         mean, cosine, sine, residual = (join_rows(part) for part in zip(*parts, strict=True))
         return Result(
             mean=mean,
             cosine=cosine,
             sine=sine,
-            modulation=lambda: np.sqrt(cosine * cosine + sine * sine),
-            azimuth=lambda: np.where(
-                (cosine == 0) & (sine == 0), np.float32(np.nan), np.arctan2(sine, cosine)
-            ),
+            modulation=partial(_modulation, cosine, sine),
+            azimuth=partial(_azimuth, cosine, sine),
             residual=residual,
             process={"frames": int(np.count_nonzero(used))},
         )
@@ -255,7 +260,7 @@ class _Sums:
         steps = np.array([1, self._step, self._step])
         return np.where((weight == 1)[:, np.newaxis], np.rint(basis(phase) * steps), 0)
 
-    def _stage(self, frames: NDArray[Any], lent: bool, whole: bool = False) -> Iterator[tuple[Band, Staged]]:
+    def _stage(self, frames: AnyArray, lent: bool, whole: bool = False) -> Iterator[tuple[Band, Staged]]:
         """Yield the resident bands, with their rows of the frames on the device."""
         for band in self.bands:
             with band.resident():
@@ -302,12 +307,13 @@ class StackSums(_Sums):
         super().__init__(device, shape, dtype, {}, length, least=length)
 
     @staticmethod
-    def take(frames: NDArray[Any], weight: Doubles) -> bool:
+    def take(frames: AnyArray, weight: Doubles) -> bool:
         """Return whether a stack is short enough, and its weights allow integer sums."""
-        few = np.count_nonzero(weight) <= WINDOW and frames.flags.c_contiguous and frames.flags.aligned
-        return bool(few and (frames.dtype.kind == "f" or _are_counts(weight)))
+        few = np.count_nonzero(weight) <= WINDOW
+        in_order = isinstance(frames, Array) or (frames.flags.c_contiguous and frames.flags.aligned)
+        return bool(few and in_order and (frames.dtype.kind == "f" or _are_counts(weight)))
 
-    def push(self, frames: NDArray[Any], phase: Doubles, weight: Doubles) -> None:
+    def push(self, frames: AnyArray, phase: Doubles, weight: Doubles) -> None:
         """Sum all frames, which must not change before the result is returned."""
         self._phase, self._weight = phase, weight
         for band, staged in self._stage(frames, lent=True, whole=True):
@@ -333,7 +339,7 @@ class TurnSums(_Sums):
             None if self._integer else 0
         )  # frames that were summed as integers; None: all
 
-    def push(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool = False) -> None:
+    def push(self, frames: AnyArray, phase: Doubles, weight: Doubles, lent: bool = False) -> None:
         """Add some frames."""
         if len(self._phase) + len(frames) > _MAX_FRAMES:
             raise InputError(f"sums hold {_MAX_FRAMES} frames: take the result of those so far, and reset")
@@ -359,7 +365,7 @@ class TurnSums(_Sums):
                 maps = _maps_of(band, {**sums, **_FIT})
                 self._run(band, f"correlation_solve_{name}", moved, fit=self._fit, **maps, **counts)
 
-    def _add(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool) -> None:
+    def _add(self, frames: AnyArray, phase: Doubles, weight: Doubles, lent: bool) -> None:
         """Add frames to integer sums, or to pairs."""
         counts = self._counts is None
         rows = self._rows_in_steps(phase, weight) if counts else _float_rows(phase, weight)
@@ -418,7 +424,7 @@ class WindowSums(_Sums):
         self._phase, self._weight = np.zeros((2, self._window))  # oldest frame first; weight 0: no frame
         self.oldest: int = 0
 
-    def push(self, frames: NDArray[Any], phase: Doubles, weight: Doubles, lent: bool = False) -> None:
+    def push(self, frames: AnyArray, phase: Doubles, weight: Doubles, lent: bool = False) -> None:
         """Add frames to the window, and remove as many of the oldest."""
         frames, phase, weight = (part[-self._window :] for part in (frames, phase, weight))
         for band in self.bands:
@@ -435,6 +441,18 @@ class WindowSums(_Sums):
             with band.resident():
                 ring = band.maps["ring"]
                 self._run_at_once(band, ring, band.stride, places, self._phase, self._weight)
+
+
+def _modulation(cosine: Any, sine: Any) -> NDArray[np.float32]:
+    """Return the amplitude of a wave."""
+    a, b = np.asarray(cosine), np.asarray(sine)
+    return np.asarray(np.sqrt(a * a + b * b))
+
+
+def _azimuth(cosine: Any, sine: Any) -> NDArray[np.float32]:
+    """Return the phase of the maximum of a wave, radians; NaN without one."""
+    a, b = np.asarray(cosine), np.asarray(sine)
+    return np.where((a == 0) & (b == 0), np.float32(np.nan), np.arctan2(b, a))
 
 
 def _are_counts(weight: Doubles) -> bool:

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.device_arrays import AnyArray, as_any_array, device_of
 from mirrorskin.io import InputError
-from mirrorskin.io.arguments import as_array, checked
+from mirrorskin.io.arguments import checked
 from mirrorskin.kernels.array import Array
-from mirrorskin.kernels.device import Device, open_device
+from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.edges import COARSE, FINE, MARGIN, NEAR, Limits, Pass, pairs
 
 LIMITS = Limits(
@@ -28,14 +29,14 @@ LIMITS = Limits(
 _SHORTER = 4  # run time of the longest kernel over that of the others, about
 
 
-@checked(normals=as_array, normals_sigma=as_array, contact=as_array)
+@checked(normals=as_any_array, normals_sigma=as_any_array, contact=as_any_array)
 def find_edges(
-    normals: NDArray[np.float32],
-    normals_sigma: NDArray[np.float32],
-    contact: NDArray[np.uint8],
+    normals: AnyArray,
+    normals_sigma: AnyArray,
+    contact: AnyArray,
     *,
     device: str | Device | None = None,
-) -> NDArray[np.uint8]:
+) -> Any:
     """Draw thin lines where the normal jumps by more than 10 degrees, and where contact ends.
 
     A steady bend is not a jump, and a jump must exceed 3.5 of its standard errors. Flags of contact that
@@ -44,18 +45,18 @@ def find_edges(
 
     Parameters
     ----------
-    normals : ndarray, (H, W, 3), float32
+    normals : ndarray or device array, (H, W, 3), float32
         Unit vectors; NaN where undefined.
-    normals_sigma : ndarray, (H, W), float32
+    normals_sigma : ndarray or device array, (H, W), float32
         Their predicted RMS angular error, radians.
-    contact : ndarray, (H, W), uint8
+    contact : ndarray or device array, (H, W), uint8
         1 where there is contact in every frame.
     device : str or Device, optional
         See ``mirrorskin.kernels.device.open_device``. It holds all maps at once, 74 bytes per pixel.
 
     Returns
     -------
-    ndarray, (H, W), uint8
+    ndarray, (H, W), uint8, or `mirrorskin.kernels.array.Array` if the normals are on a device
         1 on edges.
 
     Raises
@@ -77,15 +78,15 @@ def find_edges(
     >>> np.flatnonzero(engine.find_edges(normals, sigma, contact)[10]).tolist()
     [9]
     """
-    shape = contact.shape
+    shape: tuple[int, int] = contact.shape
     if contact.ndim != 2 or normals.shape != (*shape, 3) or normals_sigma.shape != shape or 0 in shape:
         shapes = f"normals {normals.shape}, normals_sigma {normals_sigma.shape} and contact {shape}"
         raise InputError(f"{shapes} do not fit: (H, W, 3), (H, W) and (H, W) are needed")
-    drawing = EdgeDrawing(open_device(device), shape)
+    drawing = EdgeDrawing(device_of(device, normals, normals_sigma, contact), shape)
     drawing.take(normals, normals_sigma, contact)
     for _ in drawing.steps():
         pass
-    return drawing.lines()
+    return drawing.drawn if isinstance(normals, Array) else drawing.lines()
 
 
 class EdgeDrawing:
@@ -104,11 +105,19 @@ class EdgeDrawing:
         self._maps = {name: device.array(name, *kind, zeroed=False) for name, kind in kinds.items()}
 
     def take(
-        self, vectors: NDArray[np.float32], sigma: NDArray[np.float32], contact: NDArray[np.uint8]
+        self,
+        vectors: AnyArray,
+        sigma: AnyArray,
+        contact: AnyArray,
     ) -> None:
-        """Copy the maps of a picture to the device; see `find_edges`."""
-        for name, values in (("vectors", vectors), ("sigma", sigma), ("contact", contact != 0)):
+        """Copy the maps of a picture to the device, unless they are there; see `find_edges`."""
+        for name, values in (("vectors", vectors), ("sigma", sigma), ("contact", contact)):
             array = self._maps[name]
+            if isinstance(values, Array) and values.dtype == array.dtype:
+                self._maps[name] = values
+                continue
+            values = np.asarray(values)
+            values = values != 0 if name == "contact" else values
             array.claim()
             array.host[...] = values
             array.upload()
@@ -130,9 +139,14 @@ class EdgeDrawing:
         drawn: dict[str, Any] = {"clean": maps["clean"], "edges": maps["more"], "drawn": maps["lines"]}
         yield from self._run("edges_bound", fewer, self._tiles, **drawn)
 
+    @property
+    def drawn(self) -> Array:
+        """The edges, once all steps are done."""
+        return self._maps["lines"]
+
     def lines(self) -> NDArray[np.uint8]:
-        """Return the edges, once all steps are done."""
-        return self._maps["lines"].download().copy()
+        """Return a copy of the edges, once all steps are done."""
+        return self.drawn.download().copy()
 
     def _draw(self, chosen: Pass, parts: int, cells: str, before: str, after: str) -> Iterator[None]:
         """Add the lines of one pass."""

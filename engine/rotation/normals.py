@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal, Self, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.frames import thin_out, thinning
+from mirrorskin.engine.device_arrays import AnyArray, on_host
+from mirrorskin.engine.frames import thin_out, thinned
 from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.options import option
 from mirrorskin.engine.rotation.design_matrix import (
@@ -120,7 +121,7 @@ class NormalsOperation(SensorOptions, Operation):
     def clear(self) -> None:
         """Forget the frames so far, and what was estimated from them."""
         self._model = self._kernel.model
-        self._lent: NDArray[Any] | None = None  # a whole stack, which is used without a copy
+        self._lent: AnyArray | None = None  # a whole stack, which is used without a copy
         self._phase = np.empty((0, self._width) if self._width else 0)  # of the frames in the buffer
         self._weights = np.empty(0)
         self._turns = self._frames = 0  # numbers of those in the maps
@@ -132,9 +133,7 @@ class NormalsOperation(SensorOptions, Operation):
         self._copy_lent()
         return self._buffer[len(self._phase) :]
 
-    def _push(
-        self, frames: NDArray[Any], where: Doubles, frame_weights: ArrayLike | None, lent: bool
-    ) -> None:
+    def _push(self, frames: AnyArray, where: Doubles, frame_weights: ArrayLike | None, lent: bool) -> None:
         """Take in frames and the position of each, part by part as the buffer has space for them."""
         weights = check_weights(frame_weights, len(frames))
         first = self.count == 0 and len(self._phase) == 0
@@ -142,6 +141,7 @@ class NormalsOperation(SensorOptions, Operation):
             self._cut(where)
             self._lent, self._phase, self._weights = frames, where, weights
             return
+        frames = on_host(frames)
         self._copy_lent()
         start = 0
         while start < len(frames):
@@ -157,7 +157,7 @@ class NormalsOperation(SensorOptions, Operation):
             self._push(frames, where, weights, lent=False)
 
     @property
-    def _open(self) -> NDArray[Any]:
+    def _open(self) -> AnyArray:
         """Memory that starts with the frames of the open turn."""
         return self._buffer if self._lent is None else self._lent
 
@@ -265,8 +265,7 @@ class NormalsOperation(SensorOptions, Operation):
         """Add a turn to the maps."""
         count = turn.stop - turn.start
         if self._model is None:
-            samples = np.stack([frame.reshape(-1)[:: thinning(self.shape)] for frame in self._open[turn]])
-            self._model = self._kernel.estimate_model(samples, fit)
+            self._model = self._kernel.estimate_model(thinned(self._open[turn]), fit)
         self._turns += 1
         self._frames += count
         turns = 1 if self.per_turn else self._turns
@@ -282,8 +281,11 @@ class NormalsOperation(SensorOptions, Operation):
         names = self._kernel_maps
         return dict(zip(names, band.fetch(dict.fromkeys(names, slice(None)), keep=names), strict=True))
 
-    def _take_maps(self) -> list[NDArray[Any]]:
-        """Return the maps of all rows in the order of `_kernel_maps`, without a copy."""
+    def _take_maps(self) -> list[Any]:
+        """Return the maps of all rows in the order of `_kernel_maps`, on the device if the frames are."""
+        if self._lent is not None and self._on_device and not self.per_turn:
+            (band,) = self._bands
+            return [band.cut(name, components=3 * (name == "vectors")) for name in self._kernel_maps]
         parts = []
         for band in self._bands:
             planes = band.fetch(dict.fromkeys(self._kernel_maps, slice(None)))
@@ -294,7 +296,7 @@ class NormalsOperation(SensorOptions, Operation):
         return [join_rows(part) for part in zip(*parts, strict=True)]
 
 
-def normals_result(maps: list[NDArray[Any]], model: TurnModel, turns: int, frames: int) -> Result:
+def normals_result(maps: list[Any], model: TurnModel, turns: int, frames: int) -> Result:
     """Return the maps of the kernel, in the order of `MAPS`, as a result."""
     normals, sigma, contact, mean, cosine, sine, residual = maps
     samples = thin_out(mean)
@@ -322,15 +324,15 @@ def normals_result(maps: list[NDArray[Any]], model: TurnModel, turns: int, frame
     )
 
 
-def zenith_of(normals: NDArray[np.float32]) -> NDArray[np.float32]:
+def zenith_of(normals: ArrayLike) -> NDArray[np.float32]:
     """Return the angle to the body's axis in the mean pose, (H, W), radians."""
-    x, y, z = np.moveaxis(normals, -1, 0)
+    x, y, z = np.moveaxis(np.asarray(normals), -1, 0)
     return np.asarray(np.arctan2(np.hypot(x, y), z))
 
 
-def azimuth_of(normals: NDArray[np.float32]) -> NDArray[np.float32]:
+def azimuth_of(normals: ArrayLike) -> NDArray[np.float32]:
     """Return the direction in which the surface faces, (H, W), radians from x towards y; NaN where level."""
-    x, y = normals[..., 0], normals[..., 1]
+    x, y, _ = np.moveaxis(np.asarray(normals), -1, 0)
     return np.where((x == 0) & (y == 0), np.float32(np.nan), np.arctan2(y, x))
 
 
@@ -356,6 +358,8 @@ class Normals(NormalsOperation):
     >>> operation.result().process["turns"]
     1
     """
+
+    takes_device_arrays = True
 
     tilt: ArrayLike | None = option(  # of `estimate_normals`, an array is one of each frame
         default=None,
@@ -452,7 +456,7 @@ class Normals(NormalsOperation):
         elif frame_weights is not None:
             raise InputError("frames in a window have no weights: leave frame_weights or window_frames out")
         else:
-            self._window.push(frames, alpha)
+            self._window.push(on_host(frames), alpha)
 
     def result(self) -> Result:
         """Return the maps of the window, or of all turns; the last turn ends with the last frame."""

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from types import SimpleNamespace
+from weakref import WeakSet
 
 import numpy as np
 import pytest
@@ -68,7 +69,7 @@ def machine(monkeypatch):
         return name
 
     monkeypatch.delenv("PYOPENCL_CTX", raising=False)
-    monkeypatch.setattr(device_layer, "_opened", [])
+    monkeypatch.setattr(device_layer, "_opened", WeakSet())
     monkeypatch.setattr(device_layer, "_left_out", set())
     monkeypatch.setattr(device_layer, "_find", lambda: list(devices))
     monkeypatch.setattr(device_layer, "_describe", lambda name: replace(devices[name], name=name))
@@ -387,3 +388,36 @@ def test_a_forked_process_is_refused_instead_of_waiting_for_ever(device):
     script = FORKED.format(choice=device.info.title)
     said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert "forked from one that had used OpenCL" in said.stdout
+
+
+def test_an_array_is_copied_by_numpy_and_its_rows_stay_on_the_device(device):
+    values = np.arange(24, dtype=np.float32).reshape(4, 3, 2)
+    array = device.given("values", values)
+    np.testing.assert_array_equal(np.asarray(array, np.float64), values)
+    assert array[0:4] is array
+    part = array[1:3]
+    assert (len(part), part.ndim, part[1].shape) == (2, 3, (3, 2))
+    np.testing.assert_array_equal(part.read(), values[1:3])
+    np.testing.assert_array_equal(array.cut(5, (2, 4)).read(), values.ravel()[5:13].reshape(2, 4))
+
+
+def test_pyopencl_works_in_the_memory_of_an_array(device):
+    array = device.given("values", np.arange(6.0))
+    lent = array.lend()
+    lent += 1
+    np.testing.assert_array_equal(array.read(), np.arange(1.0, 7.0))
+    del array
+    others = [device.given("others", np.full(6, -1.0)) for _ in range(3)]
+    np.testing.assert_array_equal(lent.get(), np.arange(1.0, 7.0))
+    assert len(others) == 3
+
+
+def test_memory_of_the_host_is_exported_without_a_copy_and_other_memory_refused(device):
+    array = device.given("values", np.arange(6.0))
+    if array.is_shared:
+        exported = np.from_dlpack(array)
+        np.testing.assert_array_equal(exported, np.arange(6.0))
+        assert np.may_share_memory(exported, array.host)
+    else:
+        with pytest.raises(BufferError, match=r"other libraries cannot use: copy it with read\(\)"):
+            np.from_dlpack(array)

@@ -457,6 +457,30 @@ def _():
     return answers | {"shape": (1, pixels), "macros": {"FRAME": "uchar"}}
 
 
+# --- Slopes and samples of arrays on a device
+
+
+@case("facing_slopes", SHAPES, per="picture", rtol=2e-6)
+def _(shape):
+    rng = np.random.default_rng(shape[1])
+    normals = rng.normal(size=(*shape, 3)) * 3 + [0, 0, 2]
+    normals[0, 0] = rng.choice([0, np.nan, np.inf])
+    return {"normals": normals, "edge_on": 1e-4, "unit": 2.5, "shape": shape}
+
+
+@case("facing_clip", SHAPES, returns="weight")
+def _(shape):
+    weight = np.random.default_rng(shape[1]).normal(1, 2, shape)
+    return {"weight": weight, "least": 0.5, "most": 3.0, "shape": shape}
+
+
+@case("samples_take", DTYPES, per=lambda _, values: values["lines"] * values["count"])
+def _(dtype):
+    values = np.random.default_rng(0).normal(100, 20, (40, 50)).astype(dtype)
+    macros = {"VALUE": C_TYPES[dtype]}
+    return {"values": values, "macros": macros} | named("lines count first apart step", 13, 12, 52, 150, 4)
+
+
 # --- Limits of memory and arithmetic
 
 

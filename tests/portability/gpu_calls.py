@@ -52,6 +52,12 @@ def tiled(shape: Shape, count: int, fill: Callable[[Any], None]) -> Any:
     return np.ascontiguousarray(np.tile(small, (1, 4, 4))[:, : shape[0], : shape[1]])
 
 
+def placed(values: Any, device: Device) -> Any:
+    """Return an array on the device."""
+    values = np.ascontiguousarray(values)
+    return device.given("given", values, values.dtype)
+
+
 def calls(shape: Shape, device: Device, frames: int = 64) -> Iterator[tuple[str, Call]]:
     """Give the calls by name; the arrays of a call are made when it is asked for."""
     yield from presses(shape, device, frames)
@@ -66,7 +72,9 @@ def presses(shape: Shape, device: Device, frames: int) -> Iterator[tuple[str, Ca
     """Give what is called with a press."""
     press, travel = tiled(shape, frames, fill_press), travel_of(frames)
     levels: dict[str, Any] = {"dark": DARK, "bright": BRIGHT, "device": device}
-    yield f"find_onset, {frames} frames", partial(engine.find_onset, press, travel, **levels)
+    onset = partial(engine.find_onset, travel=travel, **levels)
+    yield f"find_onset, {frames} frames", partial(onset, press)
+    yield f"find_onset, {frames} frames on the device", partial(onset, placed(press, device))
     if frames <= 64:
         change_point = partial(engine.find_change_point, press, travel, **levels)
         yield f"find_change_point, {frames} frames", change_point
@@ -77,11 +85,22 @@ def presses(shape: Shape, device: Device, frames: int) -> Iterator[tuple[str, Ca
 def rotations(shape: Shape, device: Device) -> Iterator[tuple[str, Call]]:
     """Give what is called with two turns."""
     turns, phase = tiled(shape, 16, fill_turns), phases(16)
+    there = placed(turns, device)
     yield "correlate, 16 frames", partial(engine.correlate, turns, phase, device=device)
+    yield "correlate, 16 frames on the device", partial(engine.correlate, there, phase)
     yield "fit_fringes, 16 frames", partial(engine.fringes.fit_fringes, turns, phase, device=device)
     yield (
         "estimate_normals, 16 frames",
         partial(engine.estimate_normals, turns, phase, device=device, **TURN),
+    )
+    yield "estimate_normals, 16 frames on the device", partial(engine.estimate_normals, there, phase, **TURN)
+    yield (
+        "from frames to heights on the device",
+        lambda: engine.integrate(
+            normals=engine.estimate_normals(there, phase, noise=1.0, **TURN).on_device("normals"),
+            pixel_size=PIXEL,
+            sigma=False,
+        ),
     )
     lamps: dict[str, Any] = {"zenith": 0.7, "dark": DARK, "device": device}
     stereo = partial(engine.photometric.photometric_stereo, turns, phase, **lamps)
@@ -95,8 +114,11 @@ def surfaces(shape: Shape, device: Device) -> Iterator[tuple[str, Call]]:
     options: dict[str, Any] = {"device": device}
     integrate = engine.integrate
     yield "integrate", lambda: integrate(*slopes, PIXEL, sigma=False, **options)
+    there = [placed(slope, device) for slope in slopes]
+    yield "integrate on the device", lambda: integrate(*there, PIXEL, sigma=False)
     yield "integrate with sigma", lambda: integrate(*slopes, PIXEL, **options)
     yield "integrate, same mask", lambda: integrate(*slopes, PIXEL, mask=mask, sigma=False, **options)
+    yield "integrate, same mask, on the device", lambda: integrate(*there, PIXEL, mask=mask, sigma=False)
     yield "integrate, same mask, sigma", lambda: integrate(*slopes, PIXEL, mask=mask, **options)
     yield "integrate, new mask, sigma", lambda: integrate(*slopes, PIXEL, mask=next(masks), **options)
     if math.prod(shape) <= 1 << 20:

@@ -26,10 +26,8 @@ LAUNCH, WAIT, ACCESS = 5e-6, 15e-6, 0.5e-6  # seconds, the last of an access tha
 BUS, MEMORY = 25e9, 2.4e12  # bytes per second: between pinned memory and the device, and on the device
 WORD = 4  # bytes that a work-item is given by one access
 
-COUNTS = (
-    *("launches", "small launches", "waits"),
-    *("copies up", "MB up", "copies down", "MB down", "allocations"),
-)
+COUNTS = "launches", "small launches", "waits", "copies up", "MB up", "copies down", "MB down"
+NOT_COUNTED = "staging", "allocation"  # waits that depend on the moment and on the calls before
 HEAD = f"""# What each call would have a GPU do
 
 By `make gpu-check`, on a device that is treated as a GPU with memory of its own: what happens when a call
@@ -82,8 +80,7 @@ def count(call: Callable[[], object], device: Device) -> Row:
     with launches() as found:
         kept = call()  # noqa: F841, what is given back too early would be used again
     records = device.profile.records()
-    # Whether a staging buffer is free again depends on the moment.
-    waits = [one for one in records if one.kind == "wait" and one.name != "staging"]
+    waits = [one for one in records if one.kind == "wait" and one.name not in NOT_COUNTED]
     row: Row = {
         "launches": len(found),
         "small launches": sum(items < FEW for _, items, _ in found),
@@ -92,7 +89,6 @@ def count(call: Callable[[], object], device: Device) -> Row:
     for kind, way in (("upload", "up"), ("download", "down")):
         row[f"copies {way}"] = sum(one.runs for one in records if one.kind == kind)
         row[f"MB {way}"] = round(sum(one.bytes for one in records if one.kind == kind) / 1e6, 1)
-    row["allocations"] = sum(one.runs for one in waits if one.name == "allocation")
     longest: dict[str, float] = {}
     for kernel, items, moved in found:
         longest[kernel] = longest.get(kernel, 0.0) + seconds_of(items, moved)

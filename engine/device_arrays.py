@@ -1,0 +1,67 @@
+"""Arguments that are arrays in the memory of a device: arrays of `mirrorskin.kernels` and of pyopencl."""
+
+from __future__ import annotations
+
+import sys
+from numbers import Real
+from typing import Any
+
+from mirrorskin.io import InputError
+from mirrorskin.io.arguments import as_array
+from mirrorskin.kernels.array import Array, adopt
+from mirrorskin.kernels.device import Device, open_device, opened_devices
+
+AnyArray = Any
+"""An array on the host, or a `mirrorskin.kernels.array.Array` on a device."""
+
+
+def as_any_array(name: str, value: Any) -> Any:
+    """Return an argument as an array on a device if it is one, otherwise as an array of numbers on the host.
+
+    An array of pyopencl is copied on its device.
+    """
+    if isinstance(value, Array):
+        return value
+    if not is_on_device(value):
+        return as_array(name, value)
+    if not value.flags.c_contiguous or 0 in value.shape or value.dtype.kind not in "uif":
+        raise InputError(f"{name} is {value.dtype} {value.shape} on a device: numbers in C order are needed")
+    owner = next((device for device in opened_devices() if device.context == value.context), None)
+    if owner is None:
+        raise InputError(
+            f"{name} belongs to an OpenCL context that is not mirrorskin's: create it with the queue of "
+            "mirrorskin.kernels.device.open_device()"
+        )
+    return adopt(owner, name, value)
+
+
+def as_any_array_or_number(name: str, value: Any) -> Any:
+    """Return an argument as `as_any_array` does, or unchanged if it is a number."""
+    return value if isinstance(value, Real) else as_any_array(name, value)
+
+
+def device_of(choice: str | Device | None, *arrays: Any) -> Device:
+    """Return the device that is chosen, by default that of the arrays; InputError if one is on another.
+
+    Arrays on the host are on no device.
+    """
+    own = [array for array in arrays if isinstance(array, Array)]
+    device = own[0].device if own and choice is None else open_device(choice)
+    for array in own:
+        if array.device.context != device.context:
+            raise InputError(
+                f"{array.name} is on {array.device.info.title}, not on {device.info.title}: compute there, "
+                "or pass a NumPy array"
+            )
+    return device
+
+
+def on_host(value: Any) -> Any:
+    """Return an argument that is on a device as an array on the host, any other unchanged."""
+    return value.read() if isinstance(value, Array) else value
+
+
+def is_on_device(value: Any) -> bool:
+    """Return whether an argument is an array on a device."""
+    of_pyopencl = getattr(sys.modules.get("pyopencl.array"), "Array", Array)
+    return isinstance(value, Array | of_pyopencl)

@@ -1,0 +1,89 @@
+"""Inputs of an integration whose slopes or normals are on a device, and stay there."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, cast
+
+import numpy as np
+
+from mirrorskin.engine.integration.camera import EDGE_ON
+from mirrorskin.engine.integration.validation import (
+    LEAST,
+    MOST,
+    SAMPLES,
+    Floats,
+    Inputs,
+    as_marks,
+    check_pixel_size,
+    median_weight,
+    split_weights,
+)
+from mirrorskin.io import InputError
+from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.samples import take_samples
+
+
+def check_device_inputs(
+    dz_dx: Any, dz_dy: Any, normals: Any, pixel_size: Any, mask: Any, slope_weights: Any, edges: Any
+) -> Inputs:
+    """Return what `check_inputs` does for slopes or normals on a device, with one weight for all."""
+    maps = [normals] if normals is not None else [dz_dx, dz_dy]
+    axes = 3 if normals is not None else 2
+    if (
+        not all(isinstance(one, Array) and one.dtype == np.float32 and one.ndim == axes for one in maps)
+        or any(one.shape != maps[0].shape for one in maps)
+        or (normals is not None and maps[0].shape[2] != 3)
+    ):
+        kinds = ", ".join(f"{getattr(one, 'dtype', one)} {np.shape(one)}" for one in maps)
+        wanted = "normals (H, W, 3)" if axes == 3 else "two maps of slopes (H, W)"
+        raise InputError(f"on the device are {kinds}: {wanted} of float32 are needed")
+    shape = maps[0].shape[:2]
+    weight, _ = split_weights("slope_weights", slope_weights, shape)
+    planes: list[Array] = []
+    if normals is not None:
+        maps, planes = _find_slopes(normals, weight)
+    return Inputs(
+        # Arrays on a device instead of NumPy's: solvers copy neither to nor from the host.
+        dz_dx=cast(Floats, maps[0]),
+        dz_dy=cast(Floats, maps[1]),
+        pixel_size=check_pixel_size(pixel_size),
+        mask=as_marks("mask", mask, shape),
+        edges=as_marks("edges", edges, shape),
+        weight_x=cast(Floats, planes[0]) if planes else None,
+        typical_weight=_clip(planes[0]) if planes else weight,
+        weights_given=slope_weights is not None,
+        picture=shape,
+    )
+
+
+def _find_slopes(normals: Array, weight: float) -> tuple[list[Array], list[Array]]:
+    """Return slopes along x and y, and their weights; see `camera.find_slopes`."""
+    device, shape = normals.device, normals.shape[:2]
+    pixels = shape[0] * shape[1]
+    names = "dz_dx", "dz_dy", "weight"
+    x, y, weights = (device.array(name, shape, np.float32, zeroed=False) for name in names)
+    device.kernel("facing", "facing_slopes")(
+        -(-pixels // device.layout.tile), pixels=pixels, normals=normals, edge_on=EDGE_ON, unit=weight,
+        dz_dx=x, dz_dy=y, weight=weights, moved=2 * normals.nbytes,
+    )  # fmt: skip
+    return [x, y], [weights]
+
+
+def _clip(weights: Array) -> float:
+    """Clip weights within what can be solved, and return their median."""
+    step = max(1, math.isqrt(math.prod(weights.shape) // SAMPLES))
+    typical = median_weight([sample_grid(weights, step, step)])
+    device, pixels = weights.device, math.prod(weights.shape)
+    device.kernel("facing", "facing_clip")(
+        -(-pixels // device.layout.tile), pixels=pixels, least=typical * LEAST, most=typical * MOST,
+        weight=weights, moved=2 * weights.nbytes,
+    )  # fmt: skip
+    return typical
+
+
+def sample_grid(map_: Array, down: int, across: int) -> Floats:
+    """Return every so many pixels of a map, from the middle of the first step on."""
+    rows, columns = map_.shape
+    shape = len(range(down // 2, rows, down)), len(range(across // 2, columns, across))
+    return take_samples(map_, down // 2 * columns + across // 2, down * columns, across, shape)

@@ -1,0 +1,28 @@
+// Slopes from normals that are seen along z, and their weights. Specification: facing.py.
+//
+// TILE     pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
+
+#pragma OPENCL FP_CONTRACT OFF
+#include "common.clh"
+
+__kernel void facing_slopes(
+    const int pixels, MAP normals, const float edge_on, const float unit, OUT dz_dx, OUT dz_dy, OUT weight)
+{
+    const int low = get_global_id(0) * TILE, end = min(pixels, low + TILE);
+    for (int p = low; p < end; ++p) {
+        const float x = normals[3 * p], y = normals[3 * p + 1], z = normals[3 * p + 2];
+        const float share = z * z / (x * x + y * y + z * z);
+        const int seen = (z > 0) & (share > edge_on);
+        const float factor = seen ? -1.0f / z : NAN;
+        dz_dx[p] = x * factor;
+        dz_dy[p] = y * factor;
+        weight[p] = unit * (seen ? share : 1.0f);
+    }
+}
+
+__kernel void facing_clip(const int pixels, const float least, const float most, OUT weight)
+{
+    const int low = get_global_id(0) * TILE, end = min(pixels, low + TILE);
+    for (int p = low; p < end; ++p)
+        weight[p] = weight[p] > 0 ? GREATER(least, LESSER(weight[p], most)) : 0.0f;
+}

@@ -1,0 +1,260 @@
+"""Frames and maps on a device: the answers of arrays on the host, and no copies in between."""
+
+import dataclasses
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
+import pytest
+
+from mirrorskin import engine, io
+from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.device import Device, _find
+from mirrorskin.kernels.errors import DeviceMemoryError
+from mirrorskin.kernels.layout import GPU_LAYOUT
+
+SHAPE, FRAMES = (60, 75), 16
+LARGER = 8, 8  # times the shape, so that samples of a map are few
+# Bytes per pixel of larger pictures: tables of frames; a map's samples; a solver's flags and partial sums.
+TABLES, SAMPLES, STATE = 0.1, 4 * 72_100 / 288_000, 6
+RANDOM = np.random.default_rng(1)
+PRESS = RANDOM.normal(np.where(np.arange(FRAMES) < 9, 30, 200)[:, None, None], 2, (FRAMES, *SHAPE)).astype(
+    np.uint8
+)
+TRAVEL, PHASE = 0.1 * np.arange(FRAMES), 2 * np.pi / 8 * np.arange(FRAMES)
+WAVE = 10 * np.cos(PHASE - 0.5)[:, None, None]
+TURNS = RANDOM.normal(100 + WAVE, 1, (FRAMES, *SHAPE)).astype(np.uint8)
+LEVELS = {"dark": 30, "bright": 200}
+SENSOR = {"tilt": 0.05, "zenith_gain": 300}
+SLOPES = RANDOM.normal(0, 0.1, (2, *SHAPE)).astype(np.float32)
+NORMALS = np.dstack([-SLOPES[0], -SLOPES[1], np.ones(SHAPE)]).astype(np.float32)
+MASK = np.ones(SHAPE, np.uint8)
+MASK[:20, :30] = 0
+HOLE = SLOPES.copy()
+HOLE[:, 30, 40] = np.nan
+MAPS_OF_A_FIT = {"mean", "cosine", "sine", "residual"}
+
+ON_FRAMES = {
+    "onset": (engine.find_onset, PRESS, TRAVEL, LEVELS, {"height", "height_sigma", "status"}),
+    "levels of scatter": (engine.find_onset, PRESS, TRAVEL, LEVELS | {"dark_sigma": 1.0}, set()),
+    "change point": (engine.find_change_point, PRESS, TRAVEL, LEVELS, {"height", "height_sigma"}),
+    "change point, no levels": (engine.find_change_point, PRESS, TRAVEL, {}, {"height", "height_sigma"}),
+    "correlation": (engine.correlate, TURNS, PHASE, {}, MAPS_OF_A_FIT),
+    "weights": (
+        engine.correlate,
+        TURNS,
+        PHASE,
+        {"frame_weights": np.linspace(0.5, 1, FRAMES)},
+        MAPS_OF_A_FIT,
+    ),
+    "window": (engine.correlate, TURNS, PHASE, {"window_frames": 8}, set()),
+    "normals": (
+        *(engine.estimate_normals, TURNS, PHASE, SENSOR),
+        MAPS_OF_A_FIT | {"normals", "normals_sigma", "contact"},
+    ),
+    "each turn": (engine.estimate_normals, TURNS, PHASE, SENSOR | {"per_turn": True}, set()),
+    "a missing frame": (
+        *(engine.estimate_normals, TURNS, PHASE, SENSOR | {"frame_weights": np.arange(FRAMES) != 3}),
+        set(),
+    ),
+    "fringes": (engine.fringes.fit_fringes, TURNS, PHASE, {}, set()),
+    "focus": (engine.focus.find_focus, PRESS, TRAVEL, {"noise": 2.0}, set()),
+    "lamps": (engine.photometric.photometric_stereo, TURNS, PHASE, {"zenith": 0.7}, set()),
+}
+INTEGRATED = {
+    "slopes": ({"dz_dx": SLOPES[0], "dz_dy": SLOPES[1]}, {}),
+    "within a mask": ({"dz_dx": SLOPES[0], "dz_dy": SLOPES[1]}, {"mask": MASK}),
+    "a slope is missing": ({"dz_dx": HOLE[0], "dz_dy": HOLE[1]}, {}),
+    "normals": ({"normals": NORMALS}, {"mask": MASK}),
+    "weight": ({"normals": NORMALS}, {"slope_weights": 100.0}),
+}
+
+
+def ours(device, values):
+    return device.given("given", values, values.dtype)
+
+
+def of_pyopencl(device, values):
+    return pyopencl.array.to_device(device.queue, np.ascontiguousarray(values))
+
+
+@pytest.fixture(scope="module")
+def card():
+    """A device that is treated as a GPU with its own memory."""
+    device = Device(_find()[0])
+    device.layout = GPU_LAYOUT
+    device.info = dataclasses.replace(device.info, kind="gpu", shares_memory=False)
+    return device
+
+
+def copies(device, call):
+    """Return bytes per pixel that go up and down in a call that is made again, and what it returns."""
+    call()
+    device.finish()
+    device.profile.clear()
+    found = call()
+    records = device.profile.records()
+    up, down = (sum(one.bytes for one in records if one.kind == kind) for kind in ("upload", "download"))
+    return up / 288_000, down / 288_000, found
+
+
+@pytest.mark.parametrize("put", [ours, of_pyopencl])
+@pytest.mark.parametrize("name", ON_FRAMES)
+def test_frames_on_the_device_give_the_same_maps(device, name, put):
+    function, frames, positions, options, stay = ON_FRAMES[name]
+    expected = function(frames, positions, **options, device=device)
+    found = function(put(device, frames), positions, **options, device=device)
+    assert {key for key in found if found.on_device(key) is not None} == stay
+    assert list(found) == list(expected)
+    assert found.process == expected.process
+    for key in stay:
+        np.testing.assert_array_equal(found.on_device(key).read(), expected[key], err_msg=key)
+    for key in expected:
+        np.testing.assert_array_equal(found[key], expected[key], err_msg=key)
+
+
+@pytest.mark.parametrize("put", [ours, of_pyopencl])
+@pytest.mark.parametrize("name", INTEGRATED)
+def test_slopes_and_normals_on_the_device_give_the_same_heights(device, name, put):
+    maps, options = INTEGRATED[name]
+    expected = engine.integrate(**maps, pixel_size=0.1, **options, device=device)
+    given = {key: put(device, np.ascontiguousarray(values)) for key, values in maps.items()}
+    found = engine.integrate(**given, pixel_size=0.1, **options, device=device)
+    assert isinstance(found.on_device("height"), Array)
+    # The kernel may divide by one unit of float32 differently than NumPy.
+    np.testing.assert_allclose(found.height, expected.height, atol=1e-6)
+    np.testing.assert_allclose(found.height_sigma, expected.height_sigma, rtol=1e-4)
+    np.testing.assert_array_equal(found.component, expected.component)
+
+
+@pytest.mark.parametrize("name", ["robust", "known_heights", "slope_weights"])
+def test_what_is_solved_from_maps_on_the_host_takes_arrays_on_the_device(device, name):
+    given = {
+        "robust": True,
+        "known_heights": np.where(RANDOM.random(SHAPE) < 0.01, 1.0, np.nan),
+        "slope_weights": RANDOM.uniform(50, 100, SHAPE),
+    }
+    options = {name: given[name], "pixel_size": 0.1, "device": device}
+    expected = engine.integrate(normals=NORMALS, **options)
+    found = engine.integrate(normals=ours(device, NORMALS), **options)
+    np.testing.assert_array_equal(found.height, expected.height)
+
+
+def test_edges_of_normals_on_the_device_stay_there(device):
+    maps = NORMALS / np.linalg.norm(NORMALS, axis=2, keepdims=True), np.full(SHAPE, 0.01, np.float32), MASK
+    expected = engine.find_edges(*maps, device=device)
+    found = engine.find_edges(*(ours(device, values) for values in maps))
+    assert expected.any()
+    assert isinstance(found, Array)
+    np.testing.assert_array_equal(np.asarray(found), expected)
+
+
+@pytest.mark.parametrize("name", ["onset", "change point", "correlation", "normals"])
+def test_frames_on_a_card_are_not_copied_and_maps_only_when_they_are_used(card, name):
+    function, frames, positions, options, stay = ON_FRAMES[name]
+    options = options | {"noise": 1.0} if name != "correlation" else options
+    placed = ours(card, np.tile(frames, (1, *LARGER)))
+    up, down, found = copies(card, lambda: function(placed, positions, **options))
+    few = 5 if name == "change point" else 0  # status and frame are completed on the host
+    assert up < TABLES
+    assert down < few + SAMPLES
+    card.profile.clear()
+    used = found[max(stay)]
+    down = sum(one.bytes for one in card.profile.records() if one.kind == "download")
+    assert down == used.nbytes
+    assert used is found[max(stay)]
+
+
+def test_a_chain_from_frames_to_heights_copies_no_map(card):
+    frames = ours(card, np.tile(TURNS, (1, *LARGER)))
+
+    def chain():
+        found = engine.estimate_normals(frames, PHASE, **SENSOR, noise=1.0)
+        normals, sigma, contact = map(found.on_device, ("normals", "normals_sigma", "contact"))
+        surface = engine.integrate(normals=normals, pixel_size=0.1, sigma=False)
+        return surface.on_device("height"), engine.find_edges(normals, sigma, contact)
+
+    up, down, (height, edges) = copies(card, chain)
+    assert height.shape == edges.shape == (480, 600)
+    assert up < TABLES
+    assert down < 3 * SAMPLES + STATE
+
+
+def test_an_operation_that_takes_none_gets_numpy_arrays(device):
+    class Last(engine.Operation):
+        last = io.Map("last frame", "counts")
+
+        def push(self, frames):
+            assert type(frames) is np.ndarray
+            self.frame = frames[-1]
+
+        def result(self):
+            return {"last": self.frame}
+
+    np.testing.assert_array_equal(engine.run(ours(device, PRESS), Last())["last"], PRESS[-1])
+
+
+def test_other_functions_copy_what_is_on_a_device(device):
+    texture = RANDOM.normal(100, 20, SHAPE).astype(np.float32)
+    moved = np.roll(texture, 1, axis=1)[None]
+    expected, found = (
+        engine.slip.find_displacement(put(texture), put(moved), 0.1, noise=1.0, device=device).displacement
+        for put in (np.asarray, lambda values: of_pyopencl(device, values))
+    )
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_a_result_keeps_maps_on_the_device_when_others_are_assigned(device):
+    fit = engine.correlate(ours(device, TURNS), PHASE)
+    changed = fit.assign(mean=None, sine=np.zeros(SHAPE))
+    assert changed.on_device("sine") is changed.on_device("mean") is None
+    assert changed.on_device("cosine") is fit.on_device("cosine")
+
+
+def test_an_array_on_another_device_is_refused(device, card):
+    with pytest.raises(
+        io.InputError, match=r"given is on .*, not on .*: compute there, or pass a NumPy array"
+    ):
+        engine.correlate(ours(device, TURNS), PHASE, device=card)
+    with pytest.raises(io.InputError, match="given is on"):
+        engine.integrate(ours(device, SLOPES[0]), ours(card, SLOPES[1]), 0.1)
+
+
+def test_an_array_of_another_context_is_refused(device):
+    queue = cl.CommandQueue(cl.Context([device.context.devices[0]]))
+    with pytest.raises(io.InputError, match="frames belongs to an OpenCL context that is not mirrorskin's"):
+        engine.correlate(pyopencl.array.to_device(queue, TURNS), PHASE)
+
+
+def test_an_array_out_of_order_is_refused(device):
+    with pytest.raises(
+        io.InputError, match=r"frames is uint8 \(16, 75, 60\) on a device: numbers in C order"
+    ):
+        engine.correlate(of_pyopencl(device, TURNS).transpose((0, 2, 1)), PHASE)
+
+
+@pytest.mark.parametrize(
+    ("slopes", "said"),
+    [
+        ((SLOPES[0], SLOPES[1].astype(np.float64)), r"float64 \(60, 75\): two maps of slopes \(H, W\)"),
+        ((SLOPES[0], np.ascontiguousarray(SLOPES[1][:9])), r"float32 \(9, 75\): two maps of slopes"),
+    ],
+    ids=["type", "shape"],
+)
+def test_slopes_that_cannot_be_used_are_refused(device, slopes, said):
+    with pytest.raises(io.InputError, match=said):
+        engine.integrate(*(ours(device, values) for values in slopes), 0.1)
+
+
+def test_a_slope_on_the_host_beside_one_on_the_device_is_refused(device):
+    with pytest.raises(io.InputError, match="two maps of slopes"):
+        engine.integrate(ours(device, SLOPES[0]), SLOPES[1], 0.1)
+
+
+def test_frames_without_room_for_maps_beside_them_are_refused(card, monkeypatch):
+    frames = ours(card, PRESS)
+    monkeypatch.setattr(card, "max_allocation", 4 * PRESS[0].size)
+    with pytest.raises(
+        DeviceMemoryError, match="has no room for maps beside 16 frames: pass the frames as a"
+    ):
+        engine.find_onset(frames, TRAVEL, **LEVELS)
