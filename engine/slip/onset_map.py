@@ -16,7 +16,8 @@ from mirrorskin.kernels.array_types import Doubles
 _CANDIDATES = 48  # onsets that are tried for the first map
 _EVIDENCE = 8.0  # smallest log-likelihood ratio of a departure, for a node's first onset
 _ROUNDS = 20  # largest number of Gauss-Newton steps
-_SETTLED = 1e-3  # change of an onset, relative to the path, that ends them
+_SETTLED = 1e-6  # change of an onset on the path, relative to its length, that ends them
+_NEAR = 0.01  # change below which steps reuse the equations of an earlier one
 _FARTHEST = 0.08  # largest change of an onset in a step, relative to the path
 _LOCKING = 0.05  # prior sigma of the bias of displacements towards halves of a pixel, pixels
 _POWER_SIGMA = 0.1  # standard deviation of the power; those of slides and twists differ by twice that
@@ -96,52 +97,71 @@ def fit_onsets(
         return OnsetMap(np.full(known.shape, _NEVER * length), np.full(known.shape, length))
     onset, usual = first
     stiff = sparse.block_diag([onset_stiff, second * (radius**2 / expected.growth_bend) ** 2], format="csc")
-    floor = _FLOOR * sparse.identity(stiff.shape[0], format="csc")
+    prior = stiff + _FLOOR * sparse.identity(stiff.shape[0], format="csc")
     log_growth, lock = np.zeros_like(onset), np.zeros(2)
-    for number in range(_ROUNDS):
+    moved = np.inf
+    for number in range(_ROUNDS + 1):
         half = np.hypot(*np.gradient(onset)) * window / 2
         half = np.maximum(half, max(0.5, 2.0 - 0.5 * number) / len(distance))  # wider at first
         growth = usual * np.exp(log_growth) * scale
         shape, rate = (_whitened(growth * part) for part in _blurred(times - onset, half, power))
         columns = np.stack([-rate, shape])
-        normal = np.einsum("ityx,jtyx->ijyx", columns, columns).reshape(2, 2, -1)
-        blocks = [[sparse.diags(part) for part in row] for row in normal]
-        system = _Normal((sparse.bmat(blocks) + stiff + floor).tocsc(), columns, locks)
+        # Close to the answer, the equations of an earlier step lead to the same one.
+        ends = number == _ROUNDS or (number > 4 and moved < _SETTLED)
+        if ends or number <= 4 or moved > _NEAR:
+            system = _Normal(columns, locks, prior)
+        if ends:
+            break
         off = np.stack([onset, log_growth]).ravel()
         left = data - shape - np.tensordot(lock, locks, 1)
-        step, more = system.solve(left, -(stiff @ off), -lock / _LOCKING**2)
+        step, more = system.solve(columns, left, -(stiff @ off), -lock / _LOCKING**2)
         change = np.clip(step[0], -_FARTHEST, _FARTHEST)
         onset, log_growth, lock = onset + change, log_growth + np.clip(step[1], -0.3, 0.3), lock + more
-        if number > 3 and np.abs(change).max() < _SETTLED:
-            break
+        # Others, which no frame shows, never settle.
+        moved = float(np.abs(change[known & (onset < 1.0)]).max(initial=0.0))
     other = _whitened(growth * _blurred(times - onset, half, power + _POWER_SIGMA)[0])
-    shift = system.solve(other - shape)[0][0]
+    shift = system.solve(columns, other - shape)[0][0]
     return OnsetMap(length * onset, length * np.sqrt(system.variances() + shift**2))
 
 
 class _Normal:
     """The normal equations of both maps, bordered by those of the locking, which all nodes share."""
 
-    def __init__(self, normal: Any, columns: Doubles, locks: Doubles) -> None:
-        self._lu, self._columns, self._locks = splu(normal), columns, locks
+    def __init__(self, columns: Doubles, locks: Doubles, prior: Any) -> None:
+        normal = np.einsum("ityx,jtyx->ijyx", columns, columns).reshape(2, 2, -1)
+        self._lu = _factor(sparse.bmat([[sparse.diags(part) for part in row] for row in normal]) + prior)
+        self._shape, self._locks = columns.shape[2:], locks
         self._cross = np.einsum("ityx,ktyx->iyxk", columns, locks).reshape(-1, len(locks))
         self._freed = np.asarray(self._lu.solve(self._cross))
         own = np.einsum("ityx,jtyx->ij", locks, locks) + np.identity(len(locks)) / _LOCKING**2
         self._inner = np.linalg.inv(own - self._cross.T @ self._freed)
 
     def solve(
-        self, left: Doubles, pull: Doubles | float = 0.0, lock_pull: Doubles | float = 0.0
+        self,
+        columns: Doubles,
+        left: Doubles,
+        pull: Doubles | float = 0.0,
+        lock_pull: Doubles | float = 0.0,
     ) -> tuple[Doubles, Doubles]:
         """Return the step of the maps, (2, rows, columns), and of the locking, from residuals and priors."""
-        step = self._lu.solve(np.sum(self._columns * left, axis=1).ravel() + pull)
+        step = self._lu.solve(np.sum(columns * left, axis=1).ravel() + pull)
         more = self._inner @ (np.einsum("ktyx,tyx->k", self._locks, left) + lock_pull - self._cross.T @ step)
         return np.asarray((step - self._freed @ more).reshape(2, *left.shape[1:])), more
 
     def variances(self) -> Doubles:
         """Return the variances of the first map."""
-        shape = self._columns.shape[2:]
         shared = np.einsum("nk,kl,nl->n", self._freed, self._inner, self._freed)
-        return np.asarray(_variances(self._lu, shape) + shared.reshape(2, *shape)[0])
+        return np.asarray(_variances(self._lu, self._shape) + shared.reshape(2, *self._shape)[0])
+
+
+def _factor(matrix: Any) -> Any:
+    """Factor a symmetric positive definite matrix: without pivots, in half of the time of any other."""
+    return splu(
+        matrix.tocsc(),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
 
 
 def _whitened(values: Doubles) -> Doubles:
@@ -178,7 +198,7 @@ def _first_onsets(
     if not evident.any():
         return None
     trust = np.where(evident, (_CANDIDATES / length) ** 2, _FLOOR)
-    onset = splu((stiff + sparse.diags(trust.ravel())).tocsc()).solve((trust * onset).ravel())
+    onset = _factor(stiff + sparse.diags(trust.ravel())).solve((trust * onset).ravel())
     onset = onset.reshape(scale.shape)
     shape = _whitened(_blurred(times - onset, length / len(times), power)[0] * scale)
     growth = np.sum(shape * data) / max(float(np.sum(shape**2)), np.finfo(float).tiny)
