@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
 
 Results = dict[str, "io.Result"]
 Scores = dict[str, "Score"]
+Draw = Callable[..., None]
 
 
 @dataclass(frozen=True)
@@ -121,14 +124,15 @@ def command(
             f"{output}: the folder cannot be created: {error.strerror}. Choose another with -o"
         ) from error
     scores: dict[str, Scores] = {}
-    for number, (name, press) in enumerate(PRESSES.items(), 1):
-        _announce(number, press.title)
-        scores[name] = _draw_press(name, press, output, device, overwrite)
-    _announce(_STEPS - 1, TURN.title)
-    truth, results = _turn(output, device, overwrite)
-    scores[_TURN] = _judge(results, truth)
-    _announce(_STEPS, "a press and a rotation, fused")
-    scores |= _draw_surfaces(results, truth, output, device)
+    with _drawing() as draw:
+        for number, (name, press) in enumerate(PRESSES.items(), 1):
+            _announce(number, press.title)
+            scores[name] = _press(name, press, output, device, overwrite, draw)
+        _announce(_STEPS - 1, TURN.title)
+        truth, results = _turn(output, device, overwrite, draw)
+        scores[_TURN] = _judge(results, truth)
+        _announce(_STEPS, "a press and a rotation, fused")
+        scores |= _surfaces(results, truth, output, device, draw)
     if as_json:
         print_json(scores)
         return
@@ -142,7 +146,21 @@ def _announce(number: int, title: str) -> None:
     click.echo(f"{number} of {_STEPS}: {title}", err=True)
 
 
-def _draw_press(name: str, press: Press, folder: Path, device: str | None, overwrite: bool) -> Scores:
+@contextmanager
+def _drawing() -> Iterator[Draw]:
+    """Draw figures in a thread, while kernels of the next experiment are compiled and run."""
+    with ThreadPoolExecutor(max_workers=1) as thread:
+        figures = []
+
+        def draw(figure: Callable[..., None], *arguments: Any, **options: Any) -> None:
+            figures.append(thread.submit(figure, *arguments, **options))
+
+        yield draw
+        for figure in figures:
+            figure.result()
+
+
+def _press(name: str, press: Press, folder: Path, device: str | None, overwrite: bool, draw: Draw) -> Scores:
     """Press on the object, reconstruct with sub-frame onsets and by eq. 4, and draw both."""
     from mirrorskin import engine, io, view
 
@@ -157,11 +175,16 @@ def _draw_press(name: str, press: Press, folder: Path, device: str | None, overw
                 )
     io.save_result(results["sub-frame"], folder / f"{name}-result.h5")
     figure = folder / f"{name}.png"
-    view.height_figure(results, truth, press.title, figure, surface=press.surface, detail=press.detail)
+    draw(
+        view.height_figure,
+        *(results, truth, press.title, figure),
+        surface=press.surface,
+        detail=press.detail,
+    )
     return _judge(results, truth)
 
 
-def _turn(folder: Path, device: str | None, overwrite: bool) -> tuple[io.Truth, Results]:
+def _turn(folder: Path, device: str | None, overwrite: bool, draw: Draw) -> tuple[io.Truth, Results]:
     """Turn about the centre of the sheet, and draw the normals by each method."""
     from mirrorskin import engine, io, view
 
@@ -173,26 +196,28 @@ def _turn(folder: Path, device: str | None, overwrite: bool) -> tuple[io.Truth, 
             heights = truth.height if registered else None
             results[name] = engine.reconstruct(recording, method=method, heights=heights, device=device)
             io.save_result(results[name], folder / f"{_TURN}-{name.replace(', ', '-')}-result.h5")
-    view.normal_figure(results, truth, TURN.title, path.with_suffix(".png"))
+    draw(view.normal_figure, results, truth, TURN.title, path.with_suffix(".png"))
     return truth, results
 
 
-def _draw_surfaces(turned: Results, truth: io.Truth, folder: Path, device: str | None) -> dict[str, Scores]:
+def _surfaces(
+    turned: Results, truth: io.Truth, folder: Path, device: str | None, draw: Draw
+) -> dict[str, Scores]:
     """Draw the heights of the rotation, and those of the press and the rotation fused."""
     from mirrorskin import io, view
 
     rotation = {"rotation, registered": turned["exact, registered"], "rotation": turned["exact"]}
     title = "Fig. 10 (b): sphere, 10 mm, integrated from its normals"
-    view.surface_figure(rotation, truth, title, folder / "fig10b.png")
+    draw(view.surface_figure, rotation, truth, title, folder / "fig10b.png")
     fused = {
         "press": io.open_result(folder / f"{_FUSED_PRESS}-result.h5"),
         "rotation": turned["exact"],
         "press and rotation": _fuse(folder, device),
     }
     title = "Fig. 5 and Fig. 10 fused: sphere, 10 mm, from a press and a rotation"
-    view.surface_figure(fused, truth, title, folder / "fused.png")
-    del fused["rotation"]  # already part of fig10b
-    return {"fig10b": _judge(rotation, truth), "fused": _judge(fused, truth)}
+    draw(view.surface_figure, fused, truth, title, folder / "fused.png")
+    judged = {name: result for name, result in fused.items() if name != "rotation"}  # that is in fig10b
+    return {"fig10b": _judge(rotation, truth), "fused": _judge(judged, truth)}
 
 
 def _fuse(folder: Path, device: str | None) -> io.Result:
