@@ -1,4 +1,4 @@
-# make [demo|test|test-all|test-lowest|test-browser|test-cameras|test-hardware|docs|lint|types|fuzz|bench|portability|gpu-check|gpu|gpu-wheels|clean]; each sets up what it needs in .venv first.
+# make [demo|test|test-all|test-lowest|test-browser|test-cameras|test-hardware|docs|lint|types|fuzz|bench|portability|gpu-check|gpu|gpu-wheels|clean]; each installs what it needs in .venv first.
 # PYTHON=/path/to/python3.12 chooses the interpreter (3.11 or newer).
 
 SHELL := /bin/sh
@@ -10,12 +10,15 @@ PYTHON ?= $(shell for python in python3.13 python3.12 python3.11 python3; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
 PACKAGES := $(patsubst %/__init__.py,%,$(wildcard */__init__.py))
 BIN := .venv/bin
+DEMO := .venv/.demo
 READY := .venv/.ready
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist loadfile --ignore tests/browser
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+# Modules are compiled when they are imported, which few are; setuptools warns of every editable installation.
+INSTALL := PYTHONWARNINGS=ignore $(PIP) install --no-compile --editable
 LOWEST := build/lowest
 
-demo: $(READY)
+demo: $(DEMO)
 	@$(BIN)/mirrorskin demo -o demo --overwrite
 
 # A process for each core, each with files of its own. Types are checked meanwhile.
@@ -113,7 +116,7 @@ clean:
 	find . -name .git -prune -o -type d \( -name __pycache__ -o -name '.*_cache' \) -prune -exec rm -rf {} +
 
 # The stamp is written last, so a half-made environment never passes for done.
-$(READY): pyproject.toml
+$(DEMO): pyproject.toml
 	@trap '[ $$? = 0 ] || rm -rf .venv' EXIT
 	# The interpreter below any active environment, which may be the one that is rebuilt here.
 	python=$$("$(PYTHON)" -c 'import sys; assert sys.version_info >= (3, 11); print(sys._base_executable)' \
@@ -129,13 +132,17 @@ $(READY): pyproject.toml
 	    echo "make: $$python cannot make environments; install Debian's python3-venv, or uv, or virtualenv" >&2
 	    exit 1
 	fi
-	echo 'setting up .venv (once, a minute or two)'
-	export PYTHONWARNINGS=ignore  # setuptools warns of every editable installation
-	$(PIP) install --editable '.[dev]'
+	echo 'installing what the demo needs in .venv (once, half a minute)'
+	$(INSTALL) '.[view]'
 	$(BIN)/python -P -c 'from mirrorskin.kernels import embedded; embedded.verify()' 2>/dev/null || {
 	    echo 'adding a linker for OpenCL kernels: this machine has none that works (100 MB)'
-	    $(PIP) install --editable '.[linker]'
+	    $(INSTALL) '.[linker]'
 	}
+	touch $@
+
+$(READY): $(DEMO)
+	@echo 'adding to .venv what tests and checks need (once, a minute or two)'
+	$(INSTALL) '.[dev]'
 	# mypy and editors do not follow an editable install; they do follow links.
 	site=$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
 	mkdir -p "$$site/mirrorskin"
@@ -144,5 +151,5 @@ $(READY): pyproject.toml
 
 # What only some need comes with the first of them.
 .venv/.browser .venv/.docs .venv/.genicam .venv/.ptxas: $(READY)
-	@$(PIP) install --editable '.[$(@F:.%=%)]'
+	@$(INSTALL) '.[$(@F:.%=%)]'
 	touch $@
