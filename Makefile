@@ -134,7 +134,7 @@ $(DEMO): pyproject.toml
 	fi
 	echo 'installing what the demo needs in .venv (once, half a minute)'
 	$(INSTALL) '.[view]'
-	$(BIN)/python -P -c 'from mirrorskin.kernels import embedded; embedded.verify()' 2>/dev/null || {
+	$(BIN)/mirrorskin devices >/dev/null || {
 	    echo 'adding a linker for OpenCL kernels: this machine has none that works (100 MB)'
 	    $(INSTALL) '.[linker]'
 	}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -149,7 +150,9 @@ def _announce(number: int, title: str) -> None:
 @contextmanager
 def _drawing() -> Iterator[Draw]:
     """Draw figures in a thread, while kernels of the next experiment are compiled and run."""
-    with ThreadPoolExecutor(max_workers=1) as thread:
+    with warnings.catch_warnings(), ThreadPoolExecutor(max_workers=1) as thread:
+        # Threads share the filters of warnings: those that one restores must have what the other ignores.
+        warnings.filterwarnings("ignore", "Non-empty compiler output")
         figures = []
 
         def draw(figure: Callable[..., None], *arguments: Any, **options: Any) -> None:
