@@ -7,6 +7,9 @@
 // LINKS      of a node: 4, or 8 on coarse levels whose aggregates are not all blocks of two by two
 // ANCHORED   1 where there are known heights, 0 where there are none
 // GROUP      work-items of the group that does all small levels, 1 where an item is a core's loop
+// STEPS      of Jacobi's method in half a cycle over a level with launches of its own: 3 or 4
+// NEAR_NODES nodes whose heights the group that does all small levels keeps in local memory; 0 if in global memory
+// COARSEST   nodes of the coarsest level at most, which is solved by the inverse of its matrix
 // SUMS       work-items of a group that adds up one part together, 1 where an item does
 // LANES      right sides that are solved for at once, 1, 4, 8 or 16: a node's value is a vector of them; WIDTH is 1 then
 //
@@ -343,46 +346,111 @@ __kernel void multigrid_invert(LEVEL_ARGS, GRAPH_ARGS, OUT inverse)
     }
 }
 
+// The inverse of the coarsest level's matrix, by one group. Elimination only adds, multiplies and divides positive numbers
+// (Grassmann, Taksar and Heyman, Operations Research 33, 1985): the sum of a node's links and anchor is its pivot. The last node
+// of a part without anchors has none left, and is held at 0. With the links u of node k over its pivot d, rows k of the inverse M
+// are u M, and 1 / d + u M u on the diagonal.
+#define EACH_LATER(j, k) for (int j = (k) + 1 + (int)get_local_id(0); j < nodes; j += (int)get_local_size(0))
+#define NEAR_BARRIER barrier(CLK_LOCAL_MEM_FENCE);
+__kernel GROUP_SIZE void multigrid_invert_coarsest(LEVEL_ARGS, GRAPH_ARGS, OUT matrix)
+{
+    __local float m[COARSEST * COARSEST], held[COARSEST], pivots[COARSEST];
+    const int nodes = rows * stride, first = base + stride;
+    EACH_LATER(n, -1) {
+        for (int k = 0; k < nodes; ++k) {
+            const int y = k / stride - n / stride, x = k % stride - n % stride;
+            const int beside = (y || x) && y * y <= 1 && x * x <= 1;
+            m[n * nodes + k] = beside ? link_of(first + n, stride, y, x, right, down, falling, rising, anchor) : 0;
+        }
+        held[n] = 0 WITH_ANCHOR(anchor[first + n]);
+    }
+    NEAR_BARRIER
+    for (int k = 0; k < nodes; ++k) {
+        float pivot = held[k];
+        for (int j = k + 1; j < nodes; ++j) pivot += m[k * nodes + j];
+        const float inverse = INVERSE(pivot);
+        for (int n = get_local_id(0); n < (nodes - k - 1) * (nodes - k - 1) && inverse > 0; n += get_local_size(0)) {
+            const int i = k + 1 + n / (nodes - k - 1), j = k + 1 + n % (nodes - k - 1);
+            if (i != j) m[i * nodes + j] += m[k * nodes + i] * inverse * m[k * nodes + j];
+        }
+        NEAR_BARRIER
+        EACH_LATER(j, k) {
+            m[k * nodes + j] *= inverse;
+            held[j] += m[k * nodes + j] * held[k];
+        }
+        if (get_local_id(0) == 0) pivots[k] = inverse;
+        NEAR_BARRIER
+    }
+    for (int k = nodes - 1; k >= 0; --k) {
+        EACH_LATER(j, k) {
+            float sum = 0;
+            for (int i = k + 1; i < nodes; ++i) sum += m[k * nodes + i] * m[i * nodes + j];
+            m[j * nodes + k] = sum;
+        }
+        NEAR_BARRIER
+        if (get_local_id(0) == 0) {
+            float sum = pivots[k];
+            for (int i = k + 1; i < nodes; ++i) sum += m[k * nodes + i] * m[i * nodes + k];
+            m[k * nodes + k] = sum;
+        }
+        NEAR_BARRIER
+        EACH_LATER(j, k) m[k * nodes + j] = m[j * nodes + k];
+        NEAR_BARRIER
+    }
+    EACH_LATER(n, -1) for (int k = 0; k < nodes; ++k) matrix[k * nodes + n] = m[k * nodes + n];
+}
+
 // --- Cycles -----------------------------------------------------------------------------------------------------
 
 // Steps of Jacobi's method: Chebyshev's polynomial over the upper half of the spectrum, and one for what sums over blocks leave.
 #define FIRST 1.3896f
 #define SECOND 0.5617f
 #define THIRD 1.0f
+#if STEPS == 4  // where launches count more than arithmetic: for levels gone through once, found by trial
+#define LARGE_FIRST 3.2f
+#define LARGE_EXTRA 0.53f
+#define LARGE_SECOND 1.0f
+#define LARGE_THIRD 0.9f
+#else
+#define LARGE_FIRST FIRST
+#define LARGE_SECOND SECOND
+#define LARGE_THIRD THIRD
+#endif
 #define STEP_BY(omega, READ, p, s) ((1 - (omega)) * READ(p) + (omega) * AT(inverse + i) * (AT(b + i) + AROUND_OF(READ, p, s)))
 
-// What the aggregates of nodes have, and those of fine nodes i, whose blocks are at J.
+// What the aggregates of nodes have, and those of fine nodes i, whose blocks are at J: from e in some memory.
 #if WIDTH == 8
-#define SPREAD(J) ((*(__global const half_loose *)(e + (J))).s00112233)
+#define SPREAD(SPACE, J) ((*(SPACE const half_loose *)(e + (J))).s00112233)
 #else
-#define SPREAD(J) e[J]
+#define SPREAD(SPACE, J) e[J]
 #endif
-values injected(const int i, const int J, const int coarse_stride, VALUES e, const int moved, BYTES to)
-{
-    values found = SPREAD(J);
-    if (!moved) return found;
-#if WIDTH == 8
-    if (*(__global const ulong *)(to + i) == 0) return found;
-#endif
-    for (int k = 0; k < WIDTH; ++k) {
-        if (to[i + k]) ((value *)&found)[k] = e[J + k / 2 + WENT_DOWN(i + k) * coarse_stride + WENT_RIGHT(i + k)];
+#define INJECTED(NAME, SPACE)                                                                              \
+    values NAME(const int i, const int J, const int coarse_stride, SPACE const value *e, const int moved, BYTES to) \
+    {                                                                                                      \
+        values found = SPREAD(SPACE, J);                                                                   \
+        if (!moved || (WIDTH == 8 && *(__global const ulong *)(to + i) == 0)) return found;                \
+        for (int k = 0; k < WIDTH; ++k)                                                                    \
+            if (to[i + k])                                                                                 \
+                ((value *)&found)[k] = e[J + k / 2 + WENT_DOWN(i + k) * coarse_stride + WENT_RIGHT(i + k)]; \
+        return found;                                                                                      \
     }
-    return found;
-}
+INJECTED(injected, __global)
 
 // The sum of what the members of an aggregate have.
-value gathered(
-    const int J, const int base, const int stride, COARSE_ARGS, BYTES to, VALUES had)
-{
-    const int row = (J - coarse_base) / coarse_stride - 1, C = (J - coarse_base) % coarse_stride;
-    value sum = 0;
-    EACH_MEMBER sum += had[i];
-    return sum;
-}
+#define GATHERED(NAME, SPACE)                                                                              \
+    value NAME(const int J, const int base, const int stride, COARSE_ARGS, BYTES to, SPACE const value *had, \
+        const int origin)                                                                                  \
+    {                                                                                                      \
+        const int row = (J - coarse_base) / coarse_stride - 1, C = (J - coarse_base) % coarse_stride;      \
+        value sum = 0;                                                                                     \
+        EACH_MEMBER sum += had[i - origin];                                                                       \
+        return sum;                                                                                        \
+    }
+GATHERED(gathered, __global)
 
 // A group's tile of a level and SIDE nodes around it, in local memory. Beyond rows there is nothing; what lies beyond columns is
 // of other rows, to which no link leads.
-#define AROUND 3
+#define AROUND STEPS
 #define SIDE (WIDTH == 8 ? 8 : AROUND)
 #define ACROSS (COLUMNS + 2 * SIDE)
 #define TILE_ITEMS                                                                                         \
@@ -409,6 +477,13 @@ value gathered(
     for (int y = line, coarse_of_tile = coarse_base + coarse_stride * (top / 2 + 1) + left / 2;            \
          y < ROWS / 2 && top / 2 + y < coarse_rows; y += lines)                                            \
         for (int x = lane * WIDTH; x < wide / 2; x += lanes * WIDTH)
+#if STEPS == 4
+#define STARTED other
+#define EXTRA_STEP FILL(3, one) { STEP_NEAR(LARGE_EXTRA, other, one) } FILLED
+#else
+#define STARTED one
+#define EXTRA_STEP
+#endif
 #define MINE (y >= 0 && y < ROWS && x >= 0 && x < wide)
 
 // Which tiles have nodes with links or anchors: all others are left out.
@@ -423,7 +498,7 @@ __kernel void multigrid_find_live(LEVEL_ARGS, MAP inverse, const int first_tile,
     live[first_tile + tile] = any;
 }
 
-// Three steps of Jacobi's method, from heights x or from zero, to t; and the sums of the residual over blocks, the coarse right
+// Steps of Jacobi's method, from heights x or from zero, to t; and the sums of the residual over blocks, the coarse right
 // side. The residual itself is written if `keep` is 1.
 __kernel void multigrid_descend(
     LEVEL_ARGS, COARSE_ARGS, GRAPH_ARGS, MAP inverse, BYTES live, const int first_tile, VALUES b, const int again, VALUES x_before, OUT_VALUES t, const int keep,
@@ -431,15 +506,16 @@ __kernel void multigrid_descend(
 {
     TILE_ITEMS
     if (again) {
-        FILL(3, one) { SIDES PUT_NEAR(one + p) = STEP_BY(FIRST, AT, x_before + i, stride); }
+        FILL(STEPS, STARTED) { SIDES PUT_NEAR(STARTED + p) = STEP_BY(LARGE_FIRST, AT, x_before + i, stride); }
     } else {
-        FILL(3, one) PUT_NEAR(one + p) = FIRST * AT(inverse + i) * AT(b + i);
+        FILL(STEPS, STARTED) PUT_NEAR(STARTED + p) = LARGE_FIRST * AT(inverse + i) * AT(b + i);
     }
     FILLED
-    FILL(2, other) { STEP_NEAR(SECOND, one, other) }
+    EXTRA_STEP
+    FILL(2, other) { STEP_NEAR(LARGE_SECOND, one, other) }
     FILLED
     FILL(1, one) {
-        STEP_NEAR(THIRD, other, one)
+        STEP_NEAR(LARGE_THIRD, other, one)
         if (MINE) STREAM(t + i, NEAR(one + p));
     }
     FILLED
@@ -464,30 +540,31 @@ __kernel void multigrid_gather(LEVEL_ARGS, COARSE_ARGS, BYTES to, COUNTS changed
     const int begin = get_global_id(0) * SOME, end = LESSER(begin + SOME, count);
     for (int n = begin; n < end; ++n) {
         const int J = changed[coarse_base + n];
-        coarse_b[J] = gathered(J, base, stride, coarse_base, coarse_rows, coarse_stride, to, residual);
+        coarse_b[J] = gathered(J, base, stride, coarse_base, coarse_rows, coarse_stride, to, residual, 0);
     }
 }
 
-// What the aggregates have, added to t, and three steps of Jacobi's method; the sums over tiles of the heights times
+// What the aggregates have, added to t, and steps of Jacobi's method; the sums over tiles of the heights times
 // the right side.
 __kernel void multigrid_ascend(
     LEVEL_ARGS, COARSE_ARGS, GRAPH_ARGS, MAP inverse, BYTES live, const int first_tile, VALUES b, VALUES e, const int moved_nodes, BYTES to, VALUES t,
     OUT_VALUES x_new, OUT_VALUES parts)
 {
     TILE_ITEMS
-    FILL(3, one) {
+    FILL(STEPS, STARTED) {
         const int J = coarse_base + coarse_stride * (((top + y) >> 1) + 1) + ((left + x) >> 1);
-        PUT_NEAR(one + p) = AT(t + i) + injected(i, J, coarse_stride, e, moved_nodes, to);
+        PUT_NEAR(STARTED + p) = AT(t + i) + injected(i, J, coarse_stride, e, moved_nodes, to);
     }
     FILLED
-    FILL(2, other) { STEP_NEAR(THIRD, one, other) }
+    EXTRA_STEP
+    FILL(2, other) { STEP_NEAR(LARGE_THIRD, one, other) }
     FILLED
-    FILL(1, one) { STEP_NEAR(SECOND, other, one) }
+    FILL(1, one) { STEP_NEAR(LARGE_SECOND, other, one) }
     FILLED
     values sum = 0;
     FILL(0, other) {
         SIDES
-        const values height = STEP_BY(FIRST, NEAR, one + p, ACROSS);
+        const values height = STEP_BY(LARGE_FIRST, NEAR, one + p, ACROSS);
         STREAM(x_new + i, height);
         sum += height * AT(b + i);
     }
@@ -504,61 +581,86 @@ __kernel void multigrid_ascend(
     }
 }
 
-// A cycle over all levels from `from` on, too small for launches of their own, by one group: the answer to b goes to x, from
-// heights x if `again` is 1. Coarser levels are gone through twice.
+// A cycle over all levels from `from` on, too small for launches of their own, by one group: the answer to b goes to x. Coarser
+// levels are gone through twice, and the first one if `twice` is 1. The inverse of the last one's matrix is given.
 typedef struct {
     int base, rows, stride, moved;
 } Level;
 
+#if NEAR_NODES > 0  // WIDTH is 1, and pointers to local memory are read as any
+INJECTED(injected_near, __local)
+GATHERED(gathered_near, __local)
+#define INJECTED_AT injected_near
+#define GATHERED_AT gathered_near
+#define ROOMS                                                                                              \
+    __local value x_room[NEAR_NODES], t_room[NEAR_NODES];                                                  \
+    const int origin = levels[from].base - 1;                                                              \
+    for (int i = get_local_id(0); i < NEAR_NODES; i += (int)get_local_size(0)) x_room[i] = t_room[i] = 0;  \
+    FENCE
+#else
+#define INJECTED_AT injected
+#define GATHERED_AT gathered
+#define ROOMS                                                                                              \
+    __global value *x_room = x, *t_room = t;                                                               \
+    const int origin = 0;
+#endif
+#define X(i) (x_room + (i) - origin)
+#define T(i) (t_room + (i) - origin)
 #define EACH_OF_LEVEL                                                                                      \
     for (int i = base + stride + (int)get_local_id(0) * WIDTH; i < base + stride * (rows + 1);             \
          i += (int)get_local_size(0) * WIDTH)
 #define OF_LEVEL(l) const int base = levels[l].base, rows = levels[l].rows, stride = levels[l].stride, moved = levels[l].moved;
 #define OF_COARSE(l) const int coarse_base = levels[l].base, coarse_rows = levels[l].rows, coarse_stride = levels[l].stride;
-#define FENCE barrier(CLK_GLOBAL_MEM_FENCE);
-#define SMOOTH(omega, from, to)                                                                            \
+#define FENCE barrier(CLK_GLOBAL_MEM_FENCE | CLK_LOCAL_MEM_FENCE);
+#define SMOOTH(omega, FROM, TO)                                                                            \
     EACH_OF_LEVEL {                                                                                        \
         SIDES                                                                                              \
-        PUT(to + i) = STEP_BY(omega, AT, from + i, stride);                                                \
+        PUT(TO(i)) = STEP_BY(omega, AT, FROM(i), stride);                                        \
     }                                                                                                      \
     FENCE
 __kernel GROUP_SIZE void multigrid_tail(
-    const int from, const int last, __global const Level *restrict levels, GRAPH_ARGS, MAP inverse,
-    BYTES to, COUNTS changed, const int again, __global value *b, __global value *x, __global value *t)
+    const int from, const int last, __global const Level *restrict levels, GRAPH_ARGS, MAP inverse, MAP matrix,
+    BYTES to, COUNTS changed, const int twice, __global value *b, __global value *x, __global value *t)
 {
-    int l = from, start = again, gone = 0;  // a bit for each level
+    ROOMS
+    int l = from, start = 0, gone = 0;  // a bit for each level
     do {
         for (; l < last; ++l, start = 0) {
             OF_LEVEL(l)
             OF_COARSE(l + 1)
             if (start) {
-                SMOOTH(FIRST, x, t)
+                SMOOTH(FIRST, X, T)
             } else {
-                EACH_OF_LEVEL PUT(t + i) = FIRST * AT(inverse + i) * AT(b + i);
+                EACH_OF_LEVEL PUT(T(i)) = FIRST * AT(inverse + i) * AT(b + i);
                 FENCE
             }
-            SMOOTH(SECOND, t, x)
-            SMOOTH(THIRD, x, t)
+            SMOOTH(SECOND, T, X)
+            SMOOTH(THIRD, X, T)
             EACH_OF_LEVEL {
                 SIDES
-                PUT(x + i) = AT(b + i) + FLOW(AT, t + i, stride);
+                PUT(X(i)) = AT(b + i) + FLOW(AT, T(i), stride);
             }
             FENCE
             const int across = stride / 2;
             for (int n = get_local_id(0) * WIDTH; n < coarse_rows * across; n += (int)get_local_size(0) * WIDTH) {
                 const int row = n / across, C = n % across, I = base + stride * (2 * row + 1) + 2 * C, K = I + stride;
-                PUT(b + coarse_base + coarse_stride * (row + 1) + C) = (EVEN(x + I) + ODD(x + I)) + (EVEN(x + K) + ODD(x + K));
+                PUT(b + coarse_base + coarse_stride * (row + 1) + C) = (EVEN(X(I)) + ODD(X(I))) + (EVEN(X(K)) + ODD(X(K)));
             }
             FENCE
             for (int n = get_local_id(0); n < moved; n += (int)get_local_size(0)) {
                 const int J = changed[coarse_base + n];
-                b[J] = gathered(J, base, stride, coarse_base, coarse_rows, coarse_stride, to, x);
+                b[J] = GATHERED_AT(J, base, stride, coarse_base, coarse_rows, coarse_stride, to, x_room, origin);
             }
             FENCE
         }
         {
             OF_LEVEL(last)
-            EACH_OF_LEVEL PUT(x + i) = AT(inverse + i) * AT(b + i);
+            EACH_OF_LEVEL {
+                values sum = 0;
+                for (int k = 0, nodes = rows * stride, first = base + stride; k < nodes; ++k)
+                    sum += AT(matrix + k * nodes + i - first) * b[first + k];
+                PUT(X(i)) = sum;
+            }
             FENCE
         }
         while (l > from && !start) {
@@ -567,16 +669,20 @@ __kernel GROUP_SIZE void multigrid_tail(
             OF_COARSE(l + 1)
             EACH_OF_LEVEL {
                 const int n = i - base - stride, J = coarse_base + coarse_stride * (n / stride / 2 + 1) + n % stride / 2;
-                PUT(t + i) = AT(t + i) + injected(i, J, coarse_stride, x, moved, to);
+                PUT(T(i)) = AT(T(i)) + INJECTED_AT(i, J - origin, coarse_stride, x_room, moved, to);
             }
             FENCE
-            SMOOTH(THIRD, t, x)
-            SMOOTH(SECOND, x, t)
-            SMOOTH(FIRST, t, x)
-            start = l > from && !(gone >> l & 1);
+            SMOOTH(THIRD, T, X)
+            SMOOTH(SECOND, X, T)
+            SMOOTH(FIRST, T, X)
+            start = (l > from || twice) && !(gone >> l & 1);
             gone = start ? gone | 1 << l : gone & ~(1 << l);
         }
     } while (start);
+#if NEAR_NODES > 0
+    OF_LEVEL(from)
+    EACH_OF_LEVEL x[i] = *X(i);
+#endif
 }
 
 // --- Conjugate gradients ----------------------------------------------------------------------------------------

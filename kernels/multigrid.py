@@ -13,6 +13,9 @@ anchors a. A cycle solves it nearly, on grids of which each has half the rows an
 - As sums and injection are coarser than A asks for, levels from the third on are gone through twice. The
   first time they answer up to twice too much where parts hang together by few links; the second time mends
   that, and a cycle is positive definite. It must be done on all of them, or too much becomes more and more.
+  Where launches are dear, only small levels are gone through twice: a cycle that is gone through once, over
+  a positive definite one, is positive definite itself, whatever the coarse answer is too much by.
+- The coarsest level is answered by the inverse of its matrix.
 
 *Aggregates* are blocks of two by two, as a rule. Over a cut, that would join what A keeps apart, and the
 coarse answer would be wrong on both sides: so where a block's nodes do not hang together by strong links,
@@ -47,6 +50,10 @@ WAYS = (0, 1), (1, 0), (1, 1), (1, -1)
 """Of the links that a node has in ``Level.links``; the other four are its neighbours'."""
 STEPS = 1.3896, 0.5617, 1.0
 """Chebyshev's polynomial over the upper half of the spectrum, and a step for what sums over blocks leave."""
+LARGE_STEPS = 3.2, 0.53, 1.0, 0.9
+"""Found by trial for large levels that are gone through once, where launches count more than arithmetic."""
+COARSEST = 64
+"""Nodes of the coarsest level at most, in rows whose length is a multiple of 16."""
 ROUNDS = 4
 """In which parts of blocks find another aggregate."""
 INDEPENDENT = 1e-4
@@ -190,11 +197,11 @@ def coarsen(level: Level) -> Level:
 
 
 def build(right: Doubles, down: Doubles, anchor: Doubles | None, strength: float | None) -> list[Level]:
-    """Return all levels of a graph, the finest first, to one node; without a strength of blocks alone."""
+    """Return all levels of a graph, the finest first; without a strength of blocks alone."""
     none = np.zeros(right.shape)
     links = np.stack([right, down, none, none]).astype(np.float64)
     levels = [Level(links, none if anchor is None else anchor.astype(np.float64), none.astype(np.int64))]
-    while levels[-1].to.size > 1:
+    while len(levels[-1].to) * -(-levels[-1].to.shape[1] // 16) * 16 > COARSEST:
         if strength is not None:
             level = levels.pop()
             to = moves(level, *parts(level, strength))
@@ -236,17 +243,50 @@ def injected(level: Level, values: Doubles) -> Doubles:
     return np.asarray(values[level.aggregate])
 
 
-def cycle(levels: Sequence[Level], b: Doubles, x: Doubles | None = None, number: int = 0) -> Doubles:
-    """Answer the right side of a level, from heights x or from zero."""
+def inverse_matrix(level: Level) -> Doubles:
+    """Return the inverse of A, with the last node of each part without anchors held at 0."""
+    index: Any = np.arange(level.to.size).reshape(level.to.shape)
+    w, held = np.zeros((index.size, index.size)), level.anchor.ravel().copy()
+    for way, weights in level.sides():
+        w[index[weights > 0], shifted(index, *way)[weights > 0]] = weights[weights > 0]
+    pivots = np.zeros(index.size)
+    for k in range(index.size):
+        links = w[k, k + 1 :].copy()
+        pivots[k] = inverse_of(np.array(held[k] + links.sum()))
+        w[k, k + 1 :] *= pivots[k]
+        w[k + 1 :, k + 1 :] += np.outer(links, w[k, k + 1 :])
+        held[k + 1 :] += w[k, k + 1 :] * held[k]
+    for k in reversed(range(index.size)):
+        u = w[k, k + 1 :]
+        row = u @ w[k + 1 :, k + 1 :]
+        w[k, k] = pivots[k] + u @ row
+        w[k, k + 1 :] = w[k + 1 :, k] = row
+    return w
+
+
+def cycle(
+    levels: Sequence[Level],
+    b: Doubles,
+    x: Doubles | None = None,
+    number: int = 0,
+    *,
+    twice_from: int = 2,
+    large: Sequence[float] = STEPS,
+) -> Doubles:
+    """Answer the right side of a level, from heights x or from zero.
+
+    Levels from `twice_from` on are gone through twice; those before do `large` steps.
+    """
     level = levels[number]
     if number == len(levels) - 1:
-        return inverse_of(level.diagonal) * b
-    x = smooth(level, b, np.zeros(b.shape) if x is None else x)
+        return np.asarray((inverse_matrix(level) @ b.ravel()).reshape(b.shape))
+    steps = large if number < twice_from else STEPS
+    x = smooth(level, b, np.zeros(b.shape) if x is None else x, steps)
     coarse, e = gathered(level, residual(level, b, x)), None
-    for _ in range(2 if number else 1):
-        e = cycle(levels, coarse, e, number + 1)
+    for _ in range(2 if number + 1 >= twice_from else 1):
+        e = cycle(levels, coarse, e, number + 1, twice_from=twice_from, large=large)
     assert e is not None
-    return smooth(level, b, x + injected(level, e), STEPS[::-1])
+    return smooth(level, b, x + injected(level, e), steps[::-1])
 
 
 def best_step(bz: float, zz: float, zp: float, pp: float, bp: float) -> tuple[float, float]:

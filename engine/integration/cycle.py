@@ -7,13 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from mirrorskin.engine.integration.hierarchy import Hierarchy, Level, tile_columns, tile_rows
+from mirrorskin.engine.integration.hierarchy import (
+    Hierarchy,
+    Level,
+    near_nodes,
+    tile_columns,
+    tile_rows,
+)
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Kernel
 
-_FIRST_W_LEVEL = 2  # finest level that is visited twice (W-cycle), as are all coarser ones
-_TAIL = 20480  # nodes times lanes of the finest level that one work-group processes with all coarser ones
+_FIRST_W_LEVEL = 2  # finest level that is visited twice where launches are cheap
 _WEAKEST_ANCHORS = 1e-12  # relative to a component's links, up to which its offset counts as free
 
 
@@ -29,8 +34,9 @@ class Cycle:
 
     With several right sides (``lanes``), the values of a node are adjacent in memory.
 
-    The smoother is three Jacobi steps while descending, and the same in reverse while ascending. Each is one
-    kernel, whose work-groups keep a tile of the level in local memory. One kernel does all small levels.
+    The smoother is three or four Jacobi steps while descending, and the same while ascending. Each is one
+    kernel, whose work-groups keep a tile of the level in local memory. One kernel does all small levels. On a
+    GPU, where launches dominate, the larger levels are visited once (V-cycle), with one more step.
     """
 
     b: Array
@@ -42,11 +48,9 @@ class Cycle:
         self._h = h
         names = "right side", "heights", "other heights", "residual"
         self.b, self.x, self.spare, self._rest = (h.array(name, lanes=lanes) for name in names)
-        self._tail = next(
-            k
-            for k, one in enumerate(h.levels)
-            if k == len(h.levels) - 1 or (k > 0 and one.nodes <= _TAIL // lanes)
-        )
+        self._tail = h.first_of_tail(lanes)
+        # Levels from this one on are visited twice (W-cycle), with any number of right sides.
+        self._first_w_level: int = h.first_of_tail(1) if near_nodes(h.device, 1) else _FIRST_W_LEVEL
         tiles = [self._tiles(one) for one in h.levels[: self._tail]]
         self._first_tile = np.cumsum([0, *tiles])
         self.parts: Array = h.array("parts", self._tiles(h.levels[0]), lanes=lanes)
@@ -122,7 +126,7 @@ class Cycle:
             self._solve_directly()
             return
         if number == self._tail:
-            self._run_tail(again)
+            self._run_tail()
             return
         keep = int(h.moves[number] > 0)
         self._half(
@@ -136,19 +140,27 @@ class Cycle:
             coarse_b=self.b,
         )
         h.gather(number, self._rest, self.b, self._lanes)
-        for second in (False, True)[: 1 + (number + 1 >= _FIRST_W_LEVEL)]:
+        twice = self._first_w_level <= number + 1 < self._tail
+        for second in (False, True)[: 1 + twice]:
             self._go(number + 1, again=second)
         arrays = {"e": self.x, "to": h.to, "t": self.spare, "x_new": self.x, "parts": self.parts}
         self._half("ascend", number, moved_nodes=h.moves[number], **arrays)
 
-    def _run_tail(self, again: bool) -> None:
+    def _run_tail(self) -> None:
         """Process all small levels."""
         h = self._h
         last = len(h.levels) - 1
         kernel, moved = self._kernel("tail", h.levels[last]), 200 * h.levels[self._tail].nodes
         arguments: dict[str, Any] = {"levels": self._table, **h.graph, "inverse": h.inverse}
-        arguments |= {"to": h.to, "changed": h.changed, "b": self.b, "x": self.x, "t": self.spare}
-        arguments |= {"from": self._tail, "last": last, "again": again}
+        arguments |= {
+            "matrix": h.matrix,
+            "to": h.to,
+            "changed": h.changed,
+            "b": self.b,
+            "x": self.x,
+            "t": self.spare,
+        }
+        arguments |= {"from": self._tail, "last": last, "twice": self._tail >= self._first_w_level}
         kernel(kernel.group, **arguments, moved=moved)
 
     def product(self) -> Doubles:
@@ -160,14 +172,14 @@ class Cycle:
             -level.stride // tile_columns(self._h.device, self._lanes)
         )
 
-    def _kernel(self, name: str, level: Level) -> Kernel:
-        return self._h.kernel(name, self._h.links_of(level), self._lanes)
+    def _kernel(self, name: str, level: Level, *, once: bool = True) -> Kernel:
+        return self._h.kernel(name, self._h.links_of(level), self._lanes, once=once)
 
     def _half(self, name: str, number: int, **arguments: Any) -> None:
         """Descend or ascend by one level."""
         h = self._h
         fine = h.levels[number]
-        kernel = self._kernel(name, fine)
+        kernel = self._kernel(name, fine, once=number < self._first_w_level)
         arguments |= {**h.graph, "inverse": h.inverse, "b": self.b, **self._live_of(number)}
         items = self._tiles(fine) * kernel.group
         kernel(items, **h.places(number), **arguments, moved=21 * fine.nodes)

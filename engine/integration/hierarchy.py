@@ -12,6 +12,7 @@ from mirrorskin.engine.integration.graph import Links
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, Kernel
+from mirrorskin.kernels.multigrid import COARSEST
 
 Ints = NDArray[np.int64]
 
@@ -26,6 +27,8 @@ _VECTOR = 16  # the length of a row is a multiple of it: two of a kernel's vecto
 _BEFORE = _VECTOR  # nodes before the first level, which vectors left of its margin read
 _WIDE_TILE_MEMORY = 45056  # bytes of local memory needed; OpenCL guarantees only 32768
 _TAIL_GROUP = 512  # work-items of one group that does several levels
+_TAIL_MEMORY = 49152  # bytes of local memory of that group, at most
+_TAIL_NODES = 20480  # nodes times lanes of the finest level of these, where heights stay in global memory
 _SUM_GROUP = 128  # work-items of one that adds up a part; any device of lanes allows so many
 _BEYOND = 64  # nodes after the last level, which vectors may read
 
@@ -66,9 +69,9 @@ class Level:
 
 
 def cut_levels(shape: tuple[int, int]) -> list[Level]:
-    """Return a picture's levels, the finest first; the last one has one node."""
+    """Return a picture's levels, the finest first; the last one has at most `COARSEST` nodes."""
     levels = [Level.at(_BEFORE, *shape)]
-    while levels[-1].rows * levels[-1].columns > 1:
+    while levels[-1].nodes > COARSEST:
         fine = levels[-1]
         levels.append(Level.at(fine.end, -(-fine.rows // 2), -(-fine.columns // 2)))
     return levels
@@ -97,6 +100,7 @@ class Hierarchy:
         }
         self.graph["anchor"] = self.array("anchor") if anchored else device.given("anchor", [])
         self.inverse: Array = self.array("inverse")
+        self.matrix: Array = self.array("inverse matrix", self.levels[-1].nodes ** 2)
         self._parts, self._wanted, self.to = (
             self.array(name, dtype=np.uint8) for name in ("parts", "wanted", "to")
         )
@@ -140,6 +144,7 @@ class Hierarchy:
         self.moves[...] = self._changes.read()
         for level in self.levels:
             self.over("invert", level, **self.graph, inverse=self.inverse)
+        self._invert_coarsest()
 
     def follow(self, links: Links, *, deep: bool) -> None:
         """Update a plain hierarchy for a similar graph, without copies to the host.
@@ -151,6 +156,8 @@ class Hierarchy:
             if number:
                 self._coarsen(number - 1)
             self.over("invert", level, **self.graph, inverse=self.inverse)
+        if deep:
+            self._invert_coarsest()
 
     def equations(self, number: int) -> tuple[Ints, Ints, Ints, Doubles, Doubles]:
         """Return a level's nodes, both ends and weights of its links, and the anchor of each node."""
@@ -171,13 +178,20 @@ class Hierarchy:
         a, b = np.concatenate(ends, axis=1)
         return node, a, b, np.concatenate(weights), pull
 
-    def kernel(self, name: str, links: int, lanes: int = 1) -> Kernel:
-        """Return a kernel for nodes with a number of links, and for a number of right sides."""
+    def kernel(self, name: str, links: int, lanes: int = 1, *, once: bool = True) -> Kernel:
+        """Return a kernel for a number of links of a node, and of right sides.
+
+        ``once``: for levels that are visited once, on which a GPU does one more step in half a cycle.
+        """
         width = 8 if self.device.layout.tile > 1 and lanes == 1 else 1
         macros = {"ANCHORED": int(self.anchored), "LINKS": links, "PART": part_of(self.device)}
         macros |= {"ROWS": tile_rows(self.device, lanes), "COLUMNS": tile_columns(self.device, lanes)}
         macros |= {"WIDTH": width, "LANES": lanes}
-        macros |= {"GROUP": tail_group(self.device), "SUMS": sum_group(self.device)}
+        macros |= {"GROUP": tail_group(self.device), "SUMS": sum_group(self.device), "COARSEST": COARSEST}
+        macros |= {
+            "NEAR_NODES": near_nodes(self.device, lanes),
+            "STEPS": 3 + (once and near_nodes(self.device, 1) > 0),
+        }
         return self.device.kernel("multigrid", f"multigrid_{name}", **macros)
 
     def places(self, number: int) -> dict[str, int]:
@@ -210,9 +224,9 @@ class Hierarchy:
             arguments |= {"residual": residual, "coarse_b": b}
             self.kernel("gather", 4, lanes)(items, **self.places(number), **arguments, moved=80 * count)
 
-    def alone(self, name: str, **arguments: Any) -> None:
+    def alone(self, name: str, links: int = 4, **arguments: Any) -> None:
         """Run a kernel in one work-group."""
-        kernel = self.kernel(name, 4)
+        kernel = self.kernel(name, links)
         kernel(kernel.group, **arguments, moved=_bytes(self.levels[0], arguments))
 
     def over_parts(self, name: str, parts: Array, *, lanes: int = 1, **arguments: Any) -> None:
@@ -242,6 +256,21 @@ class Hierarchy:
         moves |= {"changed": self.changed, "changes": self._changes}
         self.between("coarsen", number, **self.graph, **moves, **coarse)
 
+    def _invert_coarsest(self) -> None:
+        last = self.levels[-1]
+        links = self.links_of(last)
+        self.alone("invert_coarsest", links, **last.place, **self.graph, matrix=self.matrix)
+
+    def first_of_tail(self, lanes: int) -> int:
+        """Return the number of the finest level that one work-group processes with all coarser ones."""
+        near, end = near_nodes(self.device, lanes), self.levels[-1].end
+        return next(
+            number
+            for number, level in enumerate(self.levels)
+            if number == len(self.levels) - 1
+            or (number and (end - level.base + 2 <= near if near else level.nodes <= _TAIL_NODES // lanes))
+        )
+
 
 def place_of_coarse(coarse: Level) -> dict[str, int]:
     """Return the arguments of kernels that describe the coarser level."""
@@ -266,6 +295,13 @@ def tail_group(device: Device) -> int:
     return lanes if device.layout.tile == 1 else 1
 
 
+def near_nodes(device: Device, lanes: int) -> int:
+    """Return the number of nodes whose heights the group of the small levels keeps in local memory."""
+    if device.layout.tile > 1 or lanes > 1:
+        return 0
+    return min(int(device.context.devices[0].local_mem_size), _TAIL_MEMORY) // 8 - 16
+
+
 def choose_lanes(device: Device, sides: int) -> int:
     """Return the number of right sides to solve at once: as many as the local memory allows."""
     if sides == 1:
@@ -277,7 +313,7 @@ def choose_lanes(device: Device, sides: int) -> int:
         if lanes == LANES[-1]
         or (
             lanes < 2 * sides
-            and 8 * lanes * (tile_rows(device, lanes) + 7) * (tile_columns(device, lanes) + 7) <= local_memory
+            and 8 * lanes * (tile_rows(device, lanes) + 9) * (tile_columns(device, lanes) + 9) <= local_memory
         )
     )
 
