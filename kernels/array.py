@@ -476,7 +476,7 @@ class BorrowedBuffer:
         self.shape, self.nbytes = values.shape, values.nbytes
         self.last_use: cl.Event | None = None
         self._lock = threading.RLock()
-        # Kernels only read. But of what is read-only and not aligned to 128 bytes Intel's runtime makes a copy.
+        # Kernels only read. But Intel's runtime copies what is read-only and not aligned to 128 bytes.
         access = cl.mem_flags.READ_WRITE if values.flags.writeable else cl.mem_flags.READ_ONLY
         flags = access | cl.mem_flags.USE_HOST_PTR
         loaded = as_strided(values.reshape(-1).view(np.uint8), (values.nbytes + SLACK,))

@@ -211,14 +211,17 @@ __kernel void onset_scan(
     for (int p = 0; p < width; ++p) light[p] = marks[base + p];
     if (first > 0)
         for (int p = 0; p < width; ++p) remain[p] = left[base + p];
-    else
+    else {
         for (int p = 0; p < width; ++p) {
-            const int usable = levels[base + p] == levels[base + p];
+            const float level = levels[base + p];
+            const int usable = level == level;
             remain[p] = usable ? whole : 0;
             times[base + p] = usable ? DARK : INVALID;
-            answers[base + p] = answers[stride + base + p] = NAN;
             status[base + p] = usable ? never : 0;
         }
+        for (int p = 0; p < width; ++p) answers[base + p] = NAN;
+        for (int p = 0; p < width; ++p) answers[stride + base + p] = NAN;
+    }
     frames += base;
     times += base;
     levels += base;
@@ -264,9 +267,9 @@ __kernel void onset_scan(
             if (!changed) continue;
 
             for (int p = low; p < high; ++p) {
-                const int known = times[p], unbroken = known >= 0 ? known : now;
-                const int run = begun[p] == NONE ? unbroken : begun[p] == length ? DARK : now + begun[p];
-                const int begin = remain[p] == 0 ? known : bad[p] ? INVALID : run, rest = needed - (end - begin);
+                const int known = times[p], unbroken = known >= 0 ? known : now, broken = bad[p], began = begun[p];
+                const int run = began == NONE ? unbroken : began == length ? DARK : now + began;
+                const int begin = remain[p] == 0 ? known : broken ? INVALID : run, rest = needed - (end - begin);
                 const int lacks = begin == DARK ? needed : begin == INVALID || rest < 0 ? 0 : rest;
                 before[p - low] = remain[p];
                 times[p] = begin;
@@ -331,17 +334,20 @@ __kernel void onset_scan(
                 if (jumped[i]) frame[i] = feet[p] + 1;
             }
 
+            float sigma[CHUNK];
+            for (int p = low; p < high; ++p) sigma[p - low] = answers[stride + p];
             for (int p = low, i = 0; p < high; ++p, ++i) {
                 const int begin = times[p];
                 const float2 found = answer(dim[i], bright[i], later[i], waited[i], doubt[i], travel[frame[i] - 1],
                                             travel[room + frame[i]], levels[p], levels[stride + p], noise,
                                             dark_tolerance, light_tolerance, jumped[i]);
-                const float height = answers[p], sigma = answers[stride + p], spread = rough_inverse_root(found.y);
+                const float height = answers[p], spread = rough_inverse_root(found.y);
                 const uchar was = status[p], is = begin > 0 ? 1 : begin == 0 ? 3 - release : begin == DARK ? never : 0;
                 answers[p] = before[i] == 0 ? height : begin > 0 ? found.x : NAN;
-                answers[stride + p] = before[i] == 0 ? sigma : begin > 0 ? found.y * spread : NAN;
+                sigma[i] = before[i] == 0 ? sigma[i] : begin > 0 ? found.y * spread : NAN;
                 status[p] = before[i] == 0 ? was : is;
             }
+            for (int p = low; p < high; ++p) answers[stride + p] = sigma[p - low];
             for (int p = low; p < high && running; ++p) {
                 const int begin = times[p], dark = darks[p], foot = feet[p];
                 const FRAME risen = risens[p];
