@@ -174,23 +174,28 @@ float2 answer(
 // One of the frames that are taken side by side: where it is dark, the pixel starts again, until it has held.
 #define TAKE(i) \
     sample = SEE(group[(size_t)(i) * pixels + p]); \
-    again = (to_go > 0) & (sample < light[p]); \
-    NOTE_BROKEN \
-    to_go = again ? full : (Count)(to_go - (to_go > 0)); \
-    since = again ? (Count)(t + 1 + (i)) : since;
+    again = (end_of_run > clock##i) & (sample < light[p]); \
+    NOTE_BROKEN(i) \
+    end_of_run = again ? next##i : end_of_run;
 #if BITS == 32
-#define NOTE_BROKEN bad[p] |= (to_go > 0) & BROKEN(sample);
+#define NOTE_BROKEN(i) bad[p] |= (end_of_run > clock##i) & BROKEN(sample);
 #else
-#define NOTE_BROKEN
+#define NOTE_BROKEN(i)
+#endif
+// Read from an array: compilers widen to 32 bits what is computed.
+#define TIMES(i) const Count clock##i = CLOCK(t + i), next##i = CLOCK(t + i + 1) + most;
+#if TILE > 1
+#define CLOCK(t) clock[t]
+#else
+#define CLOCK(t) (Count)(t)
 #endif
 #define PIXELS(take) \
     for (int p = 0; p < width; ++p) { \
         FRAME sample; \
         int again; \
-        Count to_go = missing[p], since = begun[p]; \
+        Count end_of_run = held[p]; \
         take \
-        missing[p] = to_go; \
-        begun[p] = since; \
+        held[p] = end_of_run; \
     }
 
 // Takes in frames `first` to `first + count` of a press. Without `subframe` the height is that of the paper's
@@ -205,7 +210,12 @@ __kernel void onset_scan(
     const int base = get_global_id(0) * TILE, width = min(TILE, pixels - base), never = 2 + release;
     // Frames from an onset on, after which nothing about it can change.
     const int needed = subframe && hold < 3 ? 3 : hold, after = needed - hold;
-    const Count whole = LESSER(needed, MOST), full = LESSER(hold, MOST);
+    const Count whole = LESSER(needed, MOST);
+    const Count most = LESSER(hold, 2 * SPAN);  // frames of a run that are counted: it cannot hold within SPAN beyond that
+#if TILE > 1
+    Count clock[SPAN + 1];
+    for (int t = 0; t <= SPAN; ++t) clock[t] = t;
+#endif
     FRAME light[TILE];
     Count remain[TILE];
     for (int p = 0; p < width; ++p) light[p] = marks[base + p];
@@ -243,17 +253,19 @@ __kernel void onset_scan(
         for (int p = 0; p < width; ++p) any |= remain[p];
         if (!any) break;
 
-        // Light frames that a run lacks, or 0 where it has held; where it begins, counted from `now`.
-        Count missing[TILE], begun[TILE], bad[TILE];
-        for (int p = 0; p < width; ++p) missing[p] = remain[p] > after ? remain[p] - after : 0;
-        for (int p = 0; p < width; ++p) begun[p] = NONE;
+        // When a run has held, counted from `now`, if all frames from its beginning are light; beyond `most` where it begins
+        // after `now`.
+        Count held[TILE], bad[TILE];
+        for (int p = 0; p < width; ++p) held[p] = remain[p] > after ? LESSER(remain[p] - after, most) : 0;
         for (int p = 0; p < width; ++p) bad[p] = 0;
         for (int t = 0; t < length;) {
             __global const FRAME *restrict group = span + (size_t)t * pixels;
             if (t + 8 <= length) {
+                TIMES(0) TIMES(1) TIMES(2) TIMES(3) TIMES(4) TIMES(5) TIMES(6) TIMES(7)
                 PIXELS(TAKE(0) TAKE(1) TAKE(2) TAKE(3) TAKE(4) TAKE(5) TAKE(6) TAKE(7))
                 t += 8;
             } else {
+                TIMES(0)
                 PIXELS(TAKE(0))
                 t += 1;
             }
@@ -263,12 +275,12 @@ __kernel void onset_scan(
             high = min(low + CHUNK, width);
             Count changed = needed > MOST, before[CHUNK];
             for (int p = low; p < high; ++p)
-                changed |= ((remain[p] > 0) & ((missing[p] != full) | (remain[p] != whole))) | bad[p];
+                changed |= ((remain[p] > 0) & ((held[p] != length + most) | (remain[p] != whole))) | bad[p];
             if (!changed) continue;
 
             for (int p = low; p < high; ++p) {
-                const int known = times[p], unbroken = known >= 0 ? known : now, broken = bad[p], began = begun[p];
-                const int run = began == NONE ? unbroken : began == length ? DARK : now + began;
+                const int known = times[p], unbroken = known >= 0 ? known : now, broken = bad[p], began = held[p] - most;
+                const int run = began <= 0 ? unbroken : began == length ? DARK : now + began;
                 const int begin = remain[p] == 0 ? known : broken ? INVALID : run, rest = needed - (end - begin);
                 const int lacks = begin == DARK ? needed : begin == INVALID || rest < 0 ? 0 : rest;
                 before[p - low] = remain[p];

@@ -121,7 +121,10 @@ def test_tiny_stacks_of_all_kinds(device, dtype, hold, subframe, event):
         assert_within_an_ulp(found, by_reference(frames, travel, dark, bright, **options), travel)
 
 
-@pytest.mark.parametrize(("dtype", "hold", "count"), [("uint16", 33, 150), ("uint8", 300, 900)])
+@pytest.mark.parametrize(
+    ("dtype", "hold", "count"),
+    [("uint16", 33, 150), ("float32", 100, 400), ("uint8", 129, 500), ("uint8", 300, 900)],
+)
 def test_long_runs_are_counted_over_spans_and_cuts(device, dtype, hold, count):
     """Runs of about as many light frames as it takes, broken now and then by chance."""
     generator, (dark, bright) = np.random.default_rng(33), SPEC[dtype]
