@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 import functools
 import itertools
+import json
 import logging
 import os
 import re
@@ -16,21 +17,21 @@ import time
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal, NamedTuple, cast
 from weakref import WeakSet
 
 import numpy as np
 import pyopencl as cl
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.kernels import embedded, memory
+from mirrorskin.kernels import bitcode, embedded, memory
 from mirrorskin.kernels.array import Array, BorrowedBuffer, Operand, can_be_borrowed, failed
-from mirrorskin.kernels.disk_cache import keep, recall
+from mirrorskin.kernels.disk_cache import digest, keep, recall
 from mirrorskin.kernels.errors import DeviceError, UnknownDeviceError
 from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT, Layout
 from mirrorskin.kernels.pool import SHARE, BufferPool
 from mirrorskin.kernels.profile import Profile
-from mirrorskin.kernels.signature import Signature, read_signatures
+from mirrorskin.kernels.signature import OPTION, Signature, converter, read_signatures
 from mirrorskin.kernels.transfer import Transfers
 from mirrorskin.kernels.waiting import close_at_exit, waiting
 
@@ -200,7 +201,7 @@ class Device:
             self.queue, self.copies = _queues(self.context)
         except cl.Error as error:
             raise failed(self, "be used", error) from error
-        self._programs: dict[tuple[str | Path, tuple[str, ...]], tuple[cl.Program, dict[str, Signature]]] = {}
+        self._programs: dict[tuple[str | Path, tuple[str, ...]], _Program] = {}
         self._lock = threading.Lock()
         self._launching = threading.Lock()
         self.enqueuing = threading.Lock()
@@ -372,36 +373,33 @@ class Device:
 
     def _make_kernel(self, file: str | Path, name: str, options: tuple[str, ...]) -> Kernel:
         try:
-            program, signatures = self._program(file, options)
-            if name not in signatures:
-                there = ", ".join(signatures) or "none"
+            program = self._program(file, options)
+            if name not in program.signatures:
+                if f"_cl_{name}" in program.signatures:  # PoCL renames those functions, and so the kernel
+                    raise DeviceError(
+                        f"{name} is a function of OpenCL: rename the kernel, such as to my_{name}"
+                    )
+                there = ", ".join(program.signatures) or "none"
                 raise DeviceError(f"there is no kernel {name} in the source; it has {there}")
             try:
-                kernel = cl.Kernel(program, name)
+                kernel = cl.Kernel(program.built, name + program.suffix)
             except cl.LogicError:  # what the driver keeps of built programs is damaged: the source has it
-                program, signatures = self._program(file, options, "__constant int again = 0;\n")
-                kernel = cl.Kernel(program, name)
-            return Kernel(self, name, kernel, signatures[name])
+                program = self._program(file, options, "__constant int again = 0;\n")
+                kernel = cl.Kernel(program.built, name + program.suffix)
+            return Kernel(self, name, kernel, program.signatures[name])
         except OSError as error:
             problem = f"pyopencl cannot write its cache ({error})"
             raise DeviceError(f"{problem}; set XDG_CACHE_HOME to a writable folder") from error
         except cl.Error as error:
-            if error.code == cl.status_code.INVALID_KERNEL_NAME:  # of a kernel that the source has
-                problem = f"kernel {name} has the name of a function of OpenCL"
-                raise DeviceError(f"{problem}: rename it, such as to {name}_of_pixels") from error
             raise failed(self, f"compile {name}", error) from error
 
-    def _program(
-        self, file: str | Path, options: tuple[str, ...], more: str = ""
-    ) -> tuple[cl.Program, dict[str, Signature]]:
+    def _program(self, file: str | Path, options: tuple[str, ...], more: str = "") -> _Program:
         with self._lock:
             if more or (file, options) not in self._programs:
                 self._programs[file, options] = self._build(file, options, more)
             return self._programs[file, options]
 
-    def _build(
-        self, file: str | Path, options: tuple[str, ...], more: str
-    ) -> tuple[cl.Program, dict[str, Signature]]:
+    def _build(self, file: str | Path, options: tuple[str, ...], more: str) -> _Program:
         written = isinstance(file, str) and "{" in file
         path = Path("text.cl") if written else file if isinstance(file, Path) else _FOLDER / f"{file}.cl"
         try:
@@ -416,36 +414,62 @@ class Device:
             with warnings.catch_warnings():  # of a log that is not empty: some compilers always write one
                 warnings.simplefilter("ignore", cl.CompilerWarning)
                 with waiting:
-                    program = self._compile(source, ["-cl-std=CL1.2", *options])
+                    program = self._recall_or_compile(source, ["-cl-std=CL1.2", OPTION, *options])
         except cl.RuntimeError as error:
             raise DeviceError(_explain_build(path, source, str(error), self.info)) from error
         self.profile.add("compile", path.stem, time.perf_counter() - start)
-        defines = dict(option.removeprefix("-D").split("=", 1) for option in options)
-        return program, read_signatures(source, defines)
+        return program
 
-    def _compile(self, source: str, options: list[str]) -> cl.Program:
-        """Build a program, or take from the disk what was built of this source for this device and driver.
-
-        PoCL keeps what it built by itself. Its binaries load sooner (2 against 20 ms), but to ask for one
-        compiles every kernel of the program once more, which takes seconds.
-        """
-        device, nowhere = self.context.devices[0], cast(Any, False)
-        program: cl.Program = cl.Program(self.context, source)
-        if _is_pocl(device):
-            program.build(options, cache_dir=nowhere)
-            return program
-        names = device.platform.version, device.name, device.version, device.driver_version
-        circumstances = names, options, source
-        binary = recall("program", circumstances)
-        if binary is not None:
+    def _recall_or_compile(self, source: str, options: list[str]) -> _Program:
+        """Take from the disk what was built of this source for this device and driver, or build it."""
+        device = self.context.devices[0]
+        driver = device.platform.version, device.name, device.version, device.driver_version
+        circumstances = driver, embedded.compiler(), options, source
+        record = recall("program", circumstances)
+        if record is not None:
+            head, _, binary = record.partition(b"\n")
             try:
-                known: cl.Program = cl.Program(self.context, [device], [binary]).build(options)
-                return known
+                return _Program(self._load(binary, options), *json.loads(head))
             except cl.Error as error:
                 _log.info("a program is built anew: %s", error)
-        program.build(options, cache_dir=nowhere)
-        keep("program", circumstances, cast(list[bytes], program.get_info(cl.program_info.BINARIES))[0])
+        program, kept = self._compile_to_keep(source, options, f"_{digest(circumstances)}")
+        if kept is not None:
+            keep("program", circumstances, b"\n".join([json.dumps(program[1:]).encode(), kept]))
         return program
+
+    def _compile_to_keep(self, source: str, options: list[str], suffix: str) -> tuple[_Program, bytes | None]:
+        """Build a program, and return its binary, too, if the driver has one without more work."""
+        device = self.context.devices[0]
+        if not _is_pocl(device):
+            program = self._compile(source, options)
+            return program, cast(list[bytes], program.built.get_info(cl.program_info.BINARIES))[0]
+        if bitcode.works_with(device.driver_version):
+            try:
+                program = self._compile(source, [*options, *bitcode.rename_kernels(source, suffix)])
+                if program.signatures and all(name.endswith(suffix) for name in program.signatures):
+                    binary = bitcode.find_bitcode(embedded.kernel_cache(), next(iter(program.signatures)))
+                    built = program.built if binary is None else self._load(binary, options)
+                    named = {name.removesuffix(suffix): one for name, one in program.signatures.items()}
+                    return _Program(built, suffix, named), binary
+            except (cl.Error, OSError) as error:
+                _log.info("a program is not kept: %s", error)
+        return self._compile(source, options), None
+
+    def _compile(self, source: str, options: list[str]) -> _Program:
+        built: cl.Program = cl.Program(self.context, source).build(options, cache_dir=cast(Any, False))
+        return _Program(built, "", read_signatures(built))
+
+    def _load(self, binary: bytes, options: list[str]) -> cl.Program:
+        loaded: cl.Program = cl.Program(self.context, self.context.devices, [binary]).build(options)
+        return loaded
+
+
+class _Program(NamedTuple):
+    """A built program: what the names of kernels end with in it, and their arguments."""
+
+    built: cl.Program
+    suffix: str
+    signatures: dict[str, Signature]
 
 
 class Kernel:
@@ -464,7 +488,7 @@ class Kernel:
         self.name = name
         self._device = device
         self._kernel = kernel
-        self._signature = signature
+        self._signature = [(name, converter(name, type_name)) for name, type_name in signature]
         self.arguments: tuple[str, ...] = tuple(name for name, _ in signature)
         self._names = frozenset(self.arguments)
         self._set: list[object] = [...] * len(signature)  # what each argument was set to

@@ -23,8 +23,8 @@ def recall(topic: str, circumstances: object) -> bytes | None:
         kept = _record(topic, circumstances).read_bytes()
     except OSError:
         return None
-    digest, answer = kept[:_DIGEST], kept[_DIGEST:]
-    return answer if hashlib.sha256(answer).digest() == digest else None
+    answer = kept[_DIGEST:]
+    return answer if hashlib.sha256(answer).digest() == kept[:_DIGEST] else None
 
 
 def keep(topic: str, circumstances: object, answer: bytes) -> None:
@@ -39,6 +39,10 @@ def keep(topic: str, circumstances: object, answer: bytes) -> None:
         _log.info("%s will be found out again next time: %s", topic, error)
 
 
+def digest(circumstances: object) -> str:
+    """Return 16 hexadecimal digits that depend on the ``repr`` of circumstances."""
+    return hashlib.sha256(repr(circumstances).encode()).hexdigest()[:16]
+
+
 def _record(topic: str, circumstances: object) -> Path:
-    key = hashlib.sha256(repr(circumstances).encode()).hexdigest()
-    return platformdirs.user_cache_path("mirrorskin") / f"{topic}-{key[:16]}"
+    return platformdirs.user_cache_path("mirrorskin") / f"{topic}-{digest(circumstances)}"

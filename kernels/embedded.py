@@ -20,9 +20,8 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Sequence, Set
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import platformdirs
@@ -30,6 +29,7 @@ import pyopencl as cl
 
 from mirrorskin.kernels.disk_cache import keep, recall
 from mirrorskin.kernels.errors import DeviceError
+from mirrorskin.kernels.processor_name import NAME_FUNCTION, PATCHABLE, ensure_name, look_up
 
 _log = logging.getLogger("mirrorskin.kernels")
 
@@ -61,17 +61,23 @@ def prepare() -> None:
         _check_address_space()
         _provide_caches()
         try:
-            _processor, _patched = _ensure_name(library)
+            _processor, _patched = ensure_name(library)
         except OSError as error:
             _processor = "unknown"
             _log.info("PoCL is used as it is, and may not know this processor: %s", error)
 
 
+def compiler() -> object:
+    """Return what PoCL's programs depend on besides its version, once prepared: processor and settings."""
+    settings = [item for item in os.environ.items() if item[0].startswith("POCL_")]
+    return _processor, sorted(item for item in settings if item[0] != "POCL_CACHE_DIR")
+
+
 def note(driver: str) -> str:
     """Return what a user should know of the embedded device, from the driver's version; mostly nothing."""
-    if not (_patched and driver.startswith(_PATCHABLE)):
+    if not (_patched and driver.startswith(PATCHABLE)):
         return ""
-    return f"compiles for {_processor}: its function {_NAME_FUNCTION} is patched in memory"
+    return f"compiles for {_processor}: its function {NAME_FUNCTION} is patched in memory"
 
 
 @functools.cache
@@ -129,142 +135,6 @@ def find_library() -> Path | None:
     if spec is None or spec.origin is None:
         return None
     return next(Path(spec.origin).parent.glob(".libs/libpocl-*.so"), None)
-
-
-# --- The processor's name ------------------------------------------------------------------------------
-#
-# The wheel of PoCL 3.0 holds LLVM 14. A processor younger than that is "generic" to it, a name that its own
-# compiler then refuses, and no option overrides it. Only the very function of that wheel is called and
-# patched: in another library the same name may stand for anything. Any other PoCL is used as it is.
-
-_PATCHABLE = "3.0"  # version of the wheel whose function was examined
-_NAME_FUNCTION = "pocl_get_llvm_cpu_name"
-_NAME_FUNCTION_SIZE = 83  # bytes, in that wheel
-_NAME_FUNCTION_SHA256 = "fd587da3800019b6c70376351f2227b8fea5f15daff803329977ee54951655b6"  # of its code
-
-# PoCL's builds of its own library, by the processor they are for. Each needs what the ones before it need
-# and what stands beside it: the instructions that a compiler uses unasked, in the words of /proc/cpuinfo.
-_LEVELS = (
-    ("core2", {"pni", "ssse3", "cx16", "lahf_lm"}),
-    ("penryn", {"sse4_1"}),
-    ("sandybridge", {"sse4_2", "popcnt", "xsave", "avx"}),
-    ("ivybridge", {"f16c"}),
-    ("haswell", {"avx2", "bmi1", "bmi2", "fma", "abm", "movbe"}),
-    ("skylake-avx512", {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
-)
-
-
-def _ensure_name(library: Path) -> tuple[str, bool]:
-    """Make PoCL compile for a processor that its LLVM knows; return its name, and whether it was patched.
-
-    Raises OSError if the library is not the expected one, or the system forbids changing code.
-    """
-    try:
-        ask = getattr(ctypes.CDLL(str(library)), _NAME_FUNCTION)
-    except AttributeError:
-        raise OSError(f"{library} has no function {_NAME_FUNCTION}") from None
-    start = _address(ask)
-    if _look_up(start)[1] != _NAME_FUNCTION_SIZE or _digest(start) != _NAME_FUNCTION_SHA256:
-        raise OSError(f"{_NAME_FUNCTION} in {library} is not that of PoCL {_PATCHABLE}")
-    ask.restype = ctypes.c_void_p
-    known = _take_string(ask())
-    if known != "generic":
-        return known, False
-    name = choose_name(_read_flags())
-    _answer_with(start, name)
-    _log.info("PoCL does not know this processor; it compiles for %s", name)
-    return name, True
-
-
-def _digest(start: int) -> str:
-    """Return the SHA-256 of the code of the function that names the processor."""
-    return hashlib.sha256(ctypes.string_at(start, _NAME_FUNCTION_SIZE)).hexdigest()
-
-
-def choose_name(flags: Set[str]) -> str:
-    """Return the best of PoCL's processors without an instruction that is not among these flags."""
-    name = "x86-64"
-    for better, needs in _LEVELS:
-        if not needs <= flags:
-            break
-        name = better
-    return name
-
-
-def _read_flags() -> frozenset[str]:
-    """Return the features of this machine's processor; none where ``/proc`` cannot be read."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return frozenset()
-    found = (line.partition(":")[2].split() for line in lines if line.startswith("flags"))
-    return frozenset(next(found, ()))
-
-
-class _Symbol(ctypes.Structure):
-    """An entry of an ELF symbol table (Elf64_Sym)."""
-
-    _fields_ = (
-        ("name", ctypes.c_uint32), ("info", ctypes.c_uint8), ("other", ctypes.c_uint8),
-        ("section", ctypes.c_uint16), ("value", ctypes.c_uint64), ("size", ctypes.c_uint64),
-    )  # fmt: skip
-
-
-class _Found(ctypes.Structure):
-    """What the dynamic linker knows of an address (Dl_info)."""
-
-    _fields_ = (
-        ("file", ctypes.c_char_p), ("base", ctypes.c_void_p), ("name", ctypes.c_char_p),
-        ("address", ctypes.c_void_p),
-    )  # fmt: skip
-
-
-def _look_up(address: int | None) -> tuple[Path | None, int]:
-    """Return the library that an address is in, and the bytes of its function there, 0 where unknown."""
-    found, symbol = _Found(), ctypes.POINTER(_Symbol)()
-    search = getattr(ctypes.CDLL(None), "dladdr1", None)
-    if search is None or not search(ctypes.c_void_p(address), ctypes.byref(found), ctypes.byref(symbol), 1):
-        return None, 0
-    return Path(os.fsdecode(found.file)), int(symbol.contents.size) if symbol else 0
-
-
-def _take_string(address: int) -> str:
-    text = ctypes.string_at(address).decode()
-    free = ctypes.CDLL(None).free
-    free.argtypes = [ctypes.c_void_p]
-    free(address)
-    return text
-
-
-def _address(function: Any) -> int:
-    return ctypes.cast(function, ctypes.c_void_p).value or 0
-
-
-@functools.cache
-def _c_string(text: str) -> ctypes.Array[ctypes.c_char]:
-    """Return a string that stays in memory: the machine code below points at it."""
-    return ctypes.create_string_buffer(text.encode())
-
-
-def _answer_with(start: int, name: str) -> None:
-    """Overwrite a ``char *function(void)`` with ``return strdup(name)``; its callers free the copy."""
-    text, strdup = ctypes.addressof(_c_string(name)), _address(ctypes.CDLL(None).strdup)
-    code = (
-        b"\x48\xbf" + text.to_bytes(8, "little")  # mov rdi, text
-        + b"\x48\xb8" + strdup.to_bytes(8, "little")  # mov rax, strdup
-        + b"\xff\xe0"  # jmp rax
-    )  # fmt: skip
-    _protect(start, len(code), mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC)
-    ctypes.memmove(start, code, len(code))
-    _protect(start, len(code), mmap.PROT_READ | mmap.PROT_EXEC)
-
-
-def _protect(start: int, length: int, mode: int) -> None:
-    page = start - start % mmap.PAGESIZE
-    mprotect = ctypes.CDLL(None, use_errno=True).mprotect
-    mprotect.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
-    if mprotect(page, start + length - page, mode) != 0:
-        raise OSError(ctypes.get_errno(), "mprotect refused to open PoCL's code for writing")
 
 
 # --- The linker ----------------------------------------------------------------------------------------
@@ -330,14 +200,11 @@ def _circumstances(device: cl.Device) -> object:
     """Return what the answer depends on: this PoCL, this processor, this linker and this Python."""
     # Every object of OpenCL begins with a pointer to the functions of its library.
     functions = ctypes.cast(device.int_ptr, ctypes.POINTER(ctypes.POINTER(ctypes.c_void_p)))[0]
-    files = [_look_up(functions[1])[0], shutil.which("ld")]
+    files = [look_up(functions[1])[0], shutil.which("ld")]
     states = [(file, Path(file).stat()) for file in files if file is not None]
     stamps = [(str(file), state.st_size, state.st_mtime_ns) for file, state in states]
-    settings = sorted(
-        item for item in os.environ.items() if item[0].startswith("POCL_") and item[0] != "POCL_CACHE_DIR"
-    )
-    names = device.platform.version, device.driver_version, device.name, _processor
-    return _SCHEME, names, sys.executable, stamps, settings
+    names = device.platform.version, device.driver_version, device.name
+    return _SCHEME, names, compiler(), sys.executable, stamps
 
 
 def _probe(platform: cl.Platform) -> str | None:
@@ -348,7 +215,7 @@ def _probe(platform: cl.Platform) -> str | None:
     number = str(cl.get_platforms().index(platform))
     command = [sys.executable, "-P", "-m", "mirrorskin.kernels.embedded", number]
     # A cache of its own: a kernel that was linked before would hide that none can be linked now.
-    with tempfile.TemporaryDirectory(dir=_kernel_cache()) as cache:
+    with tempfile.TemporaryDirectory(dir=kernel_cache()) as cache:
         environment = {**os.environ, "POCL_CACHE_DIR": cache}
         try:
             child = subprocess.run(
@@ -378,7 +245,7 @@ def _explain(status: int, complaints: str) -> str:
 # --- The caches ----------------------------------------------------------------------------------------
 
 
-def _kernel_cache() -> Path:
+def kernel_cache() -> Path:
     """Return the folder in which PoCL 3.0 keeps compiled kernels."""
     given = os.environ.get("POCL_CACHE_DIR")
     if given is not None:
@@ -391,7 +258,7 @@ def _kernel_cache() -> Path:
 def _why_no_cache() -> str | None:
     """Try the folders that PoCL and pyopencl must be able to write; return None where both can be."""
     variable = "POCL_CACHE_DIR" if "POCL_CACHE_DIR" in os.environ else "XDG_CACHE_HOME"
-    needed = [("PoCL", _kernel_cache(), variable)]
+    needed = [("PoCL", kernel_cache(), variable)]
     if "PYOPENCL_NO_CACHE" not in os.environ:
         needed.append(("pyopencl", platformdirs.user_cache_path(), "XDG_CACHE_HOME"))
     for owner, folder, remedy in needed:

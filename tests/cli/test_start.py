@@ -1,7 +1,13 @@
 """What commands import: libraries that take long to import are loaded only by what needs them."""
 
+import subprocess
+import sys
+
 import pytest
 from commands import done, loaded
+
+from mirrorskin.kernels import bitcode
+from mirrorskin.kernels.device import list_devices
 
 SIZE = "--size", "48x40", "--pixel-size", "0.25mm"
 SLOW = {
@@ -42,3 +48,24 @@ def test_a_command_imports_only_what_it_needs(words, needed, folder, monkeypatch
     modules = loaded(*words.split())
     assert {f"mirrorskin.cli.{words.split()[0]}", "numpy"} <= modules
     assert modules & SLOW == needed
+
+
+COMPILED = """
+import contextlib, io, sys
+from mirrorskin.cli.main import main
+from mirrorskin.kernels.device import Device
+compiled, compile = [], Device._compile
+Device._compile = lambda *given: compiled.append(given) or compile(*given)
+sys.argv = ["mirrorskin", *sys.argv[1:]]
+with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+    main()
+print(len(compiled))
+"""
+
+
+def test_a_command_compiles_no_program_that_was_compiled_before(folder, monkeypatch):
+    if not any(bitcode.works_with(device.driver) for device in list_devices()[:1]):
+        pytest.skip("another OpenCL than PoCL 3.0")
+    monkeypatch.chdir(folder)
+    command = [sys.executable, "-c", COMPILED, "fuse", "press.h5", "turn.h5", "-o", "again.h5"]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "0\n"

@@ -17,7 +17,6 @@ from mirrorskin.kernels import embedded
 from mirrorskin.kernels.array import fetch
 from mirrorskin.kernels.device import list_devices, open_device
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError, UnknownDeviceError
-from mirrorskin.kernels.signature import read_signatures
 
 MACROS = {"LANES": 16, "WORDS": 64, "STRIDE": 1}
 
@@ -166,7 +165,7 @@ def test_a_kernel_that_has_the_name_of_a_function_of_opencl_runs_or_is_one_line(
         device.kernel(source, "cross")(1, values=values, moved=4)
     except DeviceError as error:
         said = str(error)
-    assert "kernel cross has the name of a function of OpenCL: rename it" in said or values.download() == 7
+    assert "cross is a function of OpenCL: rename the kernel" in said or values.download() == 7
 
 
 def test_arguments_are_named_and_numbers_become_what_the_source_says(device):
@@ -190,7 +189,7 @@ def test_wrong_arguments_are_defects(device, wrong, message):
         device.kernel("limits", "copy_all", **MACROS)(1, moved=0, **wrong)
 
 
-def test_signatures_follow_the_preprocessor():
+def test_arguments_have_the_types_that_macros_and_conditions_give_them(device):
     source = """
     #define MAP __global const float *restrict  // one map
     #if BITS == 8 && !defined(WIDE)
@@ -204,11 +203,21 @@ def test_signatures_follow_the_preprocessor():
     #endif
     ) { }
     """
-    names = [
-        [name for name, _ in read_signatures(source, {"FRAME": "uchar", **more})["one"]]
-        for more in ({"BITS": "8"}, {"BITS": "8", "WIDE": "1", "TAIL": "1"})
-    ]
-    assert names == [["map", "extra", "top"], ["map", "top", "tail"]]
+    short, long = (
+        device.kernel(source, "one", FRAME="uchar", **more)
+        for more in ({"BITS": 8}, {"BITS": 8, "WIDE": 1, "TAIL": 1})
+    )
+    assert (short.arguments, long.arguments) == (("map", "extra", "top"), ("map", "top", "tail"))
+    long(1, map=None, top=255, tail=2**40, moved=0)
+    with pytest.raises(TypeError, match="top cannot be 256"):
+        long(1, map=None, top=256, tail=0, moved=0)
+
+
+def test_an_argument_that_no_number_becomes_is_one_line(device):
+    with pytest.raises(
+        DeviceError, match="argument pair is of type int2: use a number or a __global pointer"
+    ):
+        device.kernel("__kernel void one(const int2 pair) { }", "one")
 
 
 def test_a_parked_array_keeps_its_content(device):

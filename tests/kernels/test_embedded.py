@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import pytest
 
 from mirrorskin.kernels import device as device_layer
-from mirrorskin.kernels import embedded
+from mirrorskin.kernels import embedded, processor_name
 from mirrorskin.kernels.device import open_device
 from mirrorskin.kernels.errors import DeviceError, UnknownDeviceError
 
@@ -290,18 +290,18 @@ def test_a_pocl_that_cannot_run_leaves_the_work_to_a_sound_one(pocl, monkeypatch
     ],
 )
 def test_the_best_name_without_an_instruction_that_is_lacking(flags, name):
-    assert embedded.choose_name(flags) == name
+    assert processor_name.choose_name(flags) == name
 
 
 @pytest.mark.parametrize("offset", [0, mmap.PAGESIZE - 5], ids=["in a page", "across two pages"])
 def test_a_function_is_made_to_answer_with_a_copy_of_the_name(offset):
     code = mmap.mmap(-1, 2 * mmap.PAGESIZE)
     start = ctypes.addressof(ctypes.c_char.from_buffer(code)) + offset
-    embedded._answer_with(start, "haswell")
+    processor_name._answer_with(start, "haswell")
     function = ctypes.CFUNCTYPE(ctypes.c_void_p)(start)
     first, second = function(), function()
     assert first != second
-    assert [embedded._take_string(first), embedded._take_string(second)] == ["haswell"] * 2
+    assert [processor_name._take_string(first), processor_name._take_string(second)] == ["haswell"] * 2
 
 
 @pytest.fixture
@@ -313,13 +313,13 @@ def asked(monkeypatch):
         libc.strdup.restype = ctypes.c_void_p
         ask = ctypes.CFUNCTYPE(ctypes.c_void_p)(lambda: given.append("called") or libc.strdup(names.encode()))
         library = SimpleNamespace(pocl_get_llvm_cpu_name=ask)
-        code = ctypes.string_at(embedded._address(ask), 83)
+        code = ctypes.string_at(processor_name._address(ask), 83)
         digest = hashlib.sha256(code[:-1] + b"?" if changed else code).hexdigest()
         monkeypatch.setattr(ctypes, "CDLL", lambda name, **_: libc if name is None else library)
-        monkeypatch.setattr(embedded, "_NAME_FUNCTION_SHA256", digest)
-        monkeypatch.setattr(embedded, "_look_up", lambda _: (None, size))
-        monkeypatch.setattr(embedded, "_read_flags", lambda: SKYLAKE)
-        monkeypatch.setattr(embedded, "_answer_with", lambda _, name: given.append(name))
+        monkeypatch.setattr(processor_name, "_NAME_FUNCTION_SHA256", digest)
+        monkeypatch.setattr(processor_name, "look_up", lambda _: (None, size))
+        monkeypatch.setattr(processor_name, "_read_flags", lambda: SKYLAKE)
+        monkeypatch.setattr(processor_name, "_answer_with", lambda _, name: given.append(name))
         embedded.prepare()
         return given
 
@@ -345,6 +345,7 @@ def test_another_function_of_that_name_is_neither_called_nor_patched(asked, othe
 def test_a_library_without_the_function_is_used_as_it_is(monkeypatch, caplog):
     monkeypatch.setattr(embedded, "find_library", lambda: Path("libc.so.6"))
     monkeypatch.setattr(embedded, "_processor", None)
+    monkeypatch.setattr(embedded, "_patched", False)
     with caplog.at_level("INFO"):
         embedded.prepare()
     assert "libc.so.6 has no function pocl_get_llvm_cpu_name" in caplog.text
@@ -354,9 +355,9 @@ def test_a_library_without_the_function_is_used_as_it_is(monkeypatch, caplog):
 # Prints which of the two is in the place of PoCL's function, in a process that has not looked at it yet.
 _WHICH = """
 import ctypes
-from mirrorskin.kernels import embedded
-function = getattr(ctypes.CDLL(str(embedded.find_library())), embedded._NAME_FUNCTION)
-print(embedded._digest(embedded._address(function)) == embedded._NAME_FUNCTION_SHA256)
+from mirrorskin.kernels import embedded, processor_name
+function = getattr(ctypes.CDLL(str(embedded.find_library())), processor_name.NAME_FUNCTION)
+print(processor_name._digest(processor_name._address(function)) == processor_name._NAME_FUNCTION_SHA256)
 """
 
 
@@ -369,10 +370,10 @@ def test_the_function_of_the_wheel_is_the_known_one():
 def test_the_library_and_the_size_of_a_function_are_looked_up():
     path = embedded.find_library()
     function = ctypes.CDLL(str(path)).pocl_get_llvm_cpu_name
-    file, size = embedded._look_up(embedded._address(function))
+    file, size = processor_name.look_up(processor_name._address(function))
     assert file.samefile(path)
     assert size > 22  # what is written over it
-    assert embedded._look_up(embedded._address(ctypes.CFUNCTYPE(None)(lambda: None))) == (None, 0)
+    assert processor_name.look_up(processor_name._address(ctypes.CFUNCTYPE(None)(lambda: None))) == (None, 0)
 
 
 # --- The linker ------------------------------------------------------------------------------------------
