@@ -48,6 +48,7 @@ def conjugate_gradients(
     converged: Callable[[Array], bool],
     steps: int,
     start: Array | None = None,
+    moved: Array | None = None,
     limit: Callable[[Array], Array] | None = None,
     axes: tuple[int, ...] | None = None,
 ) -> Solution:
@@ -60,7 +61,7 @@ def conjugate_gradients(
     Parameters
     ----------
     product
-        Returns A x.
+        Returns A times an increment of x: its rounding errors are relative to increments, which become small.
     target
         b.
     face
@@ -71,13 +72,16 @@ def conjugate_gradients(
         Largest number of steps.
     start
         Initial x, within the limits; 0 by default.
+    moved
+        A times the initial x, if it is available.
     limit
         Returns the x within the limits that is closest to an x: the same array if it is within them.
     axes
         Axes of one system; several are solved at once along the others. By default, all are one system.
     """
     x = np.zeros_like(target) if start is None else start
-    moved = np.zeros_like(target) if start is None else product(x)
+    if moved is None:
+        moved = np.zeros_like(target) if start is None else product(x)
     direction = last = np.zeros_like(target)
     gain: Array | float = np.inf
     tiny = np.finfo(target.dtype).tiny
@@ -100,6 +104,7 @@ def conjugate_gradients(
         stiff = along if here.curvature is None else along + here.curvature * direction
         length = inner(residual, direction) / np.maximum(inner(direction, stiff), tiny)
         farther = x + length * direction
-        x = farther if limit is None else limit(farther)
-        moved = moved + length * along if x is farther else product(x)
+        within = farther if limit is None else limit(farther)
+        moved = moved + (length * along if within is farther else product(within - x))
+        x = within
     return Solution(x, moved, residual, step, done)

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin.elastic import HalfSpace, Spectrum, filter_roughly, rectangle, wavenumbers
+from mirrorskin.hw.twin.elastic import HalfSpace, Spectrum, Window, filter_roughly, rectangle, wavenumbers
 from mirrorskin.io.types import Floats
 from mirrorskin.kernels.conjugate_gradients import Face, conjugate_gradients
 
-TOLERANCE = 1e-3
+TOLERANCE = 3e-4
 """Largest error of the surface's shift in a step, as a share of how far the object moves in it."""
 
 ITERATIONS = 1000
@@ -36,17 +36,19 @@ class Friction:
     conjugate gradients that are cut off at the limit, as Polonsky and Keer (1999) do it with pressure, from
     the traction of a step that goes on as the one before.
 
-    ``traction``, (2, H, W), is that of the object on the body, N/mm^2, along x and y.
+    ``traction``, (2, H, W), is that of the object on the body, N/mm^2, along x and y; it is 0 outside of the
+    ``window`` of the grid.
     """
 
     def __init__(self, space: HalfSpace, pressure: Floats, coefficient: float) -> None:
         self.traction: Floats = np.zeros((2, *space.shape))
         self._pixel_area = space.pixel_area
         self._contact = pressure > 0
+        self.window: Window = np.s_[0:0, 0:0]
         if self._contact.any():
-            self._window = rectangle(self._contact)
-            self._touches = self._contact[self._window]
-            self._limit = np.where(self._touches, coefficient * pressure[self._window], 0.0)
+            self.window = rectangle(self._contact)
+            self._touches = self._contact[self.window]
+            self._limit = np.where(self._touches, coefficient * pressure[self.window], 0.0)
             self._space = space.window(*self._touches.shape)
             self._before = self._shift = np.zeros((2, *self._touches.shape))
             self._step = self._growth = np.zeros_like(self._before)
@@ -69,20 +71,21 @@ class Friction:
         slips = np.zeros_like(self._contact)
         if not self._contact.any():
             return slips
-        here = np.where(self._touches, displacement[:, *self._window], 0.0)
+        here = np.where(self._touches, displacement[:, *self.window], 0.0)
         step = here - self._before
         far = float(_length(step).max())
         # Steps of rounding are put together until they are worth a step.
         if far > _NO_STEP * max(float(_length(place).max()) for place in (here, self._shift)):
             tolerance = TOLERANCE * far
-            held = self.traction[:, *self._window]
+            held = self.traction[:, *self.window]
             likely = held + self._likeness(step) * self._growth
             likely *= _shrink(likely, self._limit)
-            traction, self._shift, limited = self._follow(likely, self._shift + step, tolerance)
+            begin = self._shift + self._shifted(likely - held)
+            traction, self._shift, limited = self._follow(likely, begin, self._shift + step, tolerance)
             self._step, self._growth = step, traction - held
-            self.traction[:, *self._window] = traction
+            self.traction[:, *self.window] = traction
             self._before = here
-            slips[self._window] = limited.where & (limited.slip > tolerance)
+            slips[self.window] = limited.where & (limited.slip > tolerance)
         return slips
 
     def _likeness(self, step: Floats) -> float:
@@ -90,20 +93,30 @@ class Friction:
         before = float(np.sum(self._step**2))
         return max(0.0, float(np.sum(step * self._step)) / before) if before > 0 else 0.0
 
-    def _follow(self, traction: Floats, target: Floats, tolerance: float) -> tuple[Floats, Floats, _Limited]:
-        """Return the traction that shifts the surface to the target where the limit allows, and its shift."""
+    def _shifted(self, change: Floats) -> Floats:
+        """Return how much more a change of the traction shifts the surface, (2, H, W), mm."""
+        return self._space.tangential(change.astype(np.float32))
+
+    def _follow(
+        self, traction: Floats, shift: Floats, target: Floats, tolerance: float
+    ) -> tuple[Floats, Floats, _Limited]:
+        """Return the traction that shifts the surface to the target where the limit allows, and its shift.
+
+        The search starts from a traction, and from the shift that it causes.
+        """
 
         def within(traction: Floats) -> Floats:
             factors = _shrink(traction, self._limit)
             return traction if (factors == 1).all() else traction * factors
 
         found = conjugate_gradients(
-            self._space.tangential,
+            self._shifted,
             target,
             lambda traction, lag: self._face(self._limited(traction, lag)),
             converged=lambda residual: float(_length(residual).max()) <= tolerance,
             steps=ITERATIONS,
             start=traction,
+            moved=shift,
             limit=within,
         )
         if not found.converged:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin.elastic import HalfSpace, rectangle
+from mirrorskin.hw.twin.elastic import HalfSpace, Window
 from mirrorskin.hw.twin.friction import Friction
 from mirrorskin.hw.twin.movement import Horizontal, Twist, pose_at_press
 from mirrorskin.hw.twin.skin import Elastic
@@ -20,8 +20,6 @@ _STEPS = 16  # that full sliding takes, at least; and the most between two frame
 _ROUNDS = 200  # fixed-point steps to a point of the skin; each gains a factor of the surface's strain
 _CLOSE = 1e-4  # of a pixel, within which a point of the skin is found
 _POINTS_MAX = 8_000_000
-
-Window = tuple[slice, slice]
 
 
 class _Course(NamedTuple):
@@ -133,7 +131,7 @@ class SkinHistory:
         pressure = skin.solve(pose_at_press(self._movement.deepest)).pressure
         friction = Friction(skin.space, pressure, self._coefficient)
         slide = _Slide(friction, skin, self._coefficient * pressure)
-        window = rectangle(pressure > 0) if pressure.any() else np.s_[0:0, 0:0]
+        window = friction.window
         loads = np.zeros((len(self._steps), *friction.traction[:, *window].shape), np.float32)
         forces = np.zeros((len(self._steps), 2))
         for frame, step in enumerate(self._steps):
@@ -141,11 +139,11 @@ class SkinHistory:
             loads[frame], forces[frame] = friction.traction[:, *window], friction.force
         return _Course(window, loads, forces, slide.onset)
 
-    def _between(self, frame: float) -> tuple[int, int, np.float64]:
+    def _between(self, frame: float) -> tuple[int, int, float]:
         """Return the frames before and after a moment, and its share of the way between."""
         last = len(self._steps) - 1
         before = min(max(math.floor(frame), 0), max(last - 1, 0))
-        return before, min(before + 1, last), np.float64(frame - before)  # float would keep loads in float32
+        return before, min(before + 1, last), frame - before
 
     def _place(self, frame: float) -> Floats:
         before, after, share = self._between(frame)
@@ -157,13 +155,8 @@ class SkinHistory:
         if self._kept is None or self._kept[0] != frame:
             before, after, share = self._between(frame)
             window, loads, *_ = self._course
-            field = np.zeros((2, *self._space.shape))
-            rows, columns = (
-                slice(part.start + more, part.stop + more)
-                for part, more in zip(window, self._margin, strict=True)
-            )
-            field[:, rows, columns] = (1 - share) * loads[before] + share * loads[after]
-            self._kept = frame, self._space.tangential(field)
+            load = (1 - share) * loads[before] + share * loads[after]
+            self._kept = frame, _shifted(self._skin.space, window, load, self._margin)
         return self._kept[1]
 
 
@@ -201,8 +194,9 @@ class SkinState:
             height, width = self._skin.space.shape
             self._space = self._skin.space.window(height + 2 * rows, width + 2 * columns)
             self._margin = rows, columns
-        padding = (0, 0), (rows, rows), (columns, columns)
-        self._shift = self._space.tangential(np.pad(self._friction.traction, padding))
+        window = self._friction.window
+        load = self._friction.traction[:, *window].astype(np.float32)
+        self._shift = _shifted(self._skin.space, window, load, self._margin)
 
     def material(self, frame: float, points: Floats) -> Floats:
         """Return where the skin was at the press that lies at points now, whatever the frame."""
@@ -242,6 +236,15 @@ class _Slide:
         middle = np.full_like(falls, (travel - now) / 2)
         more = np.divide(lacks[new] * (now - before), falls, out=middle, where=falls > 0)
         self.onset[new] = np.minimum(now + more, travel)
+
+
+def _shifted(space: HalfSpace, window: Window, load: NDArray[np.float32], margin: tuple[int, int]) -> Floats:
+    """Return how far traction in a window shifts the surface of the grid, grown by a margin, (2, ...), mm."""
+    rows, columns = (size + 2 * more for size, more in zip(space.shape, margin, strict=True))
+    across, along = (
+        slice(part.start + more, part.stop + more) for part, more in zip(window, margin, strict=True)
+    )
+    return space.window(rows, columns, (across, along)).tangential(load)
 
 
 def _material(space: HalfSpace, shift: Floats, place: Floats, points: Floats) -> Floats:
