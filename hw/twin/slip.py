@@ -15,10 +15,10 @@ from mirrorskin.hw.twin.friction import Friction
 from mirrorskin.hw.twin.movement import Horizontal, Twist, pose_at_press
 from mirrorskin.hw.twin.skin import Elastic
 from mirrorskin.io.types import Floats, InputError
+from mirrorskin.kernels.device import Device
+from mirrorskin.kernels.skin import drive, material, on_object
 
 _STEPS = 16  # that full sliding takes, at least; and the most between two frames
-_ROUNDS = 200  # fixed-point steps to a point of the skin; each gains a factor of the surface's strain
-_CLOSE = 1e-4  # of a pixel, within which a point of the skin is found
 _POINTS_MAX = 8_000_000
 
 
@@ -35,10 +35,8 @@ class SkinHistory:
     """Stick and slip along a horizontal movement or a twist, and where each point of the skin goes.
 
     The press's pressure goes with the object. In the object's own frame it stands still, and there `Friction`
-    finds the traction q, and u, how far q shifts the surface, while the object moves by U. A point of the
-    object is ahead of the skin by U - u, so that there lies the skin that was at its place plus U - u at the
-    press. Of a twist U is proportional to the angle, as in the linear theory, and U - u is taken for an arc
-    about the body's axis and a way along the radius: this is exact where all sticks and where nothing does.
+    finds the traction q, and u, how far q shifts the surface. `mirrorskin.kernels.skin` says where this drags
+    the skin.
 
     A frame takes as many steps as are needed for 16 to full sliding. A point breaks loose when its traction
     reaches the limit mu p; near to that, the square of what is missing falls evenly with the travel (exactly
@@ -51,6 +49,7 @@ class SkinHistory:
     movement : Horizontal or Twist
     coefficient : float
         Coulomb's, between sheet and object.
+    device : Device
 
     Attributes
     ----------
@@ -63,8 +62,10 @@ class SkinHistory:
         The way is too long for so small pixels.
     """
 
-    def __init__(self, skin: Elastic, movement: Horizontal | Twist, coefficient: float) -> None:
-        self._skin, self._movement, self._coefficient = skin, movement, coefficient
+    def __init__(
+        self, skin: Elastic, movement: Horizontal | Twist, coefficient: float, device: Device
+    ) -> None:
+        self._skin, self._movement, self._coefficient, self._device = skin, movement, coefficient, device
         self._path: Floats = movement.path.reshape(len(movement.path), -1)
         self._steps = np.diff(self._path, axis=0, prepend=np.zeros_like(self._path[:1]))
         self.travel: Floats = np.cumsum(np.sqrt(np.sum(self._steps**2, axis=1)))
@@ -94,34 +95,41 @@ class SkinHistory:
 
         ``frame`` is a number with fractions, which may lie half a frame before the first or after the last.
         """
-        return _material(self._space, self._shift(frame), self._place(frame), points)
-
-    def displacement(self, frame: int, start: Floats) -> Floats:
-        """Return how far points of the skin that lay at the pixels at the press have moved, (2, H, W), mm.
-
-        ``start`` is a guess, as that of the frame before. NaN where the skin's surface would fold.
-        """
-        rest = self._skin.places
-        reached = rest + np.nan_to_num(start)
-        open_ = np.ones(rest.shape[1:], bool)
-        close = _CLOSE * min(self._space.pixel_size)
-        for _ in range(_ROUNDS):
-            missing = rest[:, open_] - self.material(frame, reached[:, open_])
-            reached[:, open_] += missing
-            open_[open_] = np.hypot(*missing) > close
-            if not open_.any():
-                break
-        reached[:, open_] = np.nan
-        return reached - rest
+        return material(self._shift(frame), self._space.pixel_size, self._place(frame), points)
 
     def displacements(self) -> NDArray[np.float32]:
-        """Return how far the skin has moved along itself in each frame, (T, H, W, 2), mm; on the disk."""
-        moved: Floats = np.zeros_like(self._skin.places)
+        """Return how far the skin has moved along itself in each frame, (T, H, W, 2), mm; on the disk.
+
+        These are points that lay at the pixels at the press. NaN where the skin's surface would fold.
+        """
+        device, (rows, columns) = self._device, self._skin.places.shape[1:]
         with TemporaryFile() as file:
-            maps = np.memmap(file, np.float32, "w+", shape=(len(self._path), *moved.shape[1:], 2))
+            maps = np.memmap(file, np.float32, "w+", shape=(len(self._path), rows, columns, 2))
+        twists = isinstance(self._movement, Twist)
+        kernel = device.kernel("skin", "skin_displacement", TWIST=int(twists))
+        along_x, along_y = self._space.pixel_size
+        shift = device.array("shift", (2, *self._space.shape), np.float32)
+        displacement = device.array("displacement", (2, rows, columns), np.float32)
         for frame, kept in enumerate(maps):
-            moved = self.displacement(frame, moved)
-            kept[...] = np.moveaxis(moved, 0, -1)
+            shift.claim()
+            shift.host[...] = self._shift(frame)
+            shift.upload()
+            place_x, place_y = (*self._path[frame], 0.0)[:2]
+            kernel(
+                -(-rows * columns // device.layout.tile),
+                rows=rows,
+                columns=columns,
+                grid_rows=shift.shape[1],
+                grid_columns=shift.shape[2],
+                along_x=along_x,
+                along_y=along_y,
+                place_x=place_x,
+                place_y=place_y,
+                shift=shift,
+                displacement=displacement,  # it starts from that of the frame before
+                moved=shift.nbytes + 2 * displacement.nbytes,
+            )
+            kept[...] = np.moveaxis(displacement.download(), 0, -1)
         return maps
 
     @functools.cached_property
@@ -180,7 +188,7 @@ class SkinState:
         self._friction = Friction(skin.space, pressure, coefficient)
         self._slide = _Slide(self._friction, skin, coefficient * pressure)
         self._place: Floats | None = None
-        self._space, self._margin = skin.space, (0, 0)
+        self._margin = 0, 0
 
     def go(self, place: Floats) -> None:
         """Move the body straight on to a place: x and y, (2,), mm, or a twist, (1,), radians."""
@@ -189,11 +197,8 @@ class SkinState:
             return
         self._slide.go(place - before)
         self._place = place
-        rows, columns = map(max, _margin(self._skin, place[np.newaxis]), self._margin)
-        if (rows, columns) != self._margin:
-            height, width = self._skin.space.shape
-            self._space = self._skin.space.window(height + 2 * rows, width + 2 * columns)
-            self._margin = rows, columns
+        rows, columns = _margin(self._skin, place[np.newaxis])
+        self._margin = max(rows, self._margin[0]), max(columns, self._margin[1])
         window = self._friction.window
         load = self._friction.traction[:, *window].astype(np.float32)
         self._shift = _shifted(self._skin.space, window, load, self._margin)
@@ -201,7 +206,7 @@ class SkinState:
     def material(self, frame: float, points: Floats) -> Floats:
         """Return where the skin was at the press that lies at points now, whatever the frame."""
         assert self._place is not None  # it has gone somewhere
-        return _material(self._space, self._shift, self._place, points)
+        return material(self._shift, self._skin.space.pixel_size, self._place, points)
 
 
 class _Slide:
@@ -220,10 +225,10 @@ class _Slide:
         """Go on from one frame to the next."""
         start = np.zeros_like(step) if self._place is None else self._place
         self._place = start + step
-        moved = float(np.hypot(*_drive(step, self._pressed)).max(initial=0.0))
+        moved = float(np.hypot(*drive(step, self._pressed)).max(initial=0.0))
         count = min(max(1, math.ceil(_STEPS * moved / self._far)), _STEPS) if self._far > 0 else 1
         for number in range(count if step.any() else 0):
-            slips = self._friction.move(_drive(start + (number + 1) / count * step, self._places))
+            slips = self._friction.move(drive(start + (number + 1) / count * step, self._places))
             travel = self._now[0] + math.hypot(*step) / count
             self._note(slips & np.isnan(self.onset), travel)
             lacking = (self._limit - np.hypot(*self._friction.traction)) ** 2
@@ -247,49 +252,10 @@ def _shifted(space: HalfSpace, window: Window, load: NDArray[np.float32], margin
     return space.window(rows, columns, (across, along)).tangential(load)
 
 
-def _material(space: HalfSpace, shift: Floats, place: Floats, points: Floats) -> Floats:
-    """Return where the skin was that lies at points; the traction's shift is that of the object's frame."""
-    from scipy.ndimage import map_coordinates
-
-    at = _on_object(place, points)
-    rows, columns = space.shape
-    along_x, along_y = space.pixel_size
-    index = np.stack([(rows - 1) / 2 - at[1] / along_y, at[0] / along_x + (columns - 1) / 2])
-    shifted = [map_coordinates(part, index, order=1, mode="nearest") for part in shift]
-    return _behind(place, at, _drive(place, at) - np.stack(shifted))
-
-
 def _margin(skin: Elastic, path: Floats) -> tuple[int, int]:
     """Return by how many rows and columns the grid must grow to hold the places that pixels see."""
     corners = skin.places[:, [0, 0, -1, -1], [0, -1, 0, -1]]
-    at = np.concatenate([_on_object(place, corners) for place in np.unique(path, axis=0)], axis=1)
+    at = np.concatenate([on_object(place, corners) for place in np.unique(path, axis=0)], axis=1)
     far_x, far_y = np.abs(at).max(axis=1)
     (rows, columns), (along_x, along_y) = skin.space.shape, skin.space.pixel_size
     return max(0, math.ceil(far_y / along_y - rows / 2)), max(0, math.ceil(far_x / along_x - columns / 2))
-
-
-def _drive(place: Floats, at: Floats) -> Floats:
-    """Return how far points of the object have moved, (2, ...), mm, in the linear theory of small angles."""
-    if len(place) == 1:
-        return np.stack([place[0] * at[1], -place[0] * at[0]])
-    return np.broadcast_to(-place.reshape(2, *[1] * (at.ndim - 1)), at.shape)
-
-
-def _on_object(place: Floats, points: Floats) -> Floats:
-    """Return the points of the object, by their places at the press, that now lie at points, (2, ...)."""
-    if len(place) == 1:
-        return _as_plane((points[0] + 1j * points[1]) * np.exp(1j * place[0]))
-    return points + place.reshape(2, *[1] * (points.ndim - 1))
-
-
-def _behind(place: Floats, at: Floats, lag: Floats) -> Floats:
-    """Return where the skin was at the press over which points of the object are ahead by a lag."""
-    if len(place) != 1:
-        return at + lag
-    point, ahead = at[0] + 1j * at[1], lag[0] + 1j * lag[1]
-    share = np.divide(ahead, point, out=np.zeros_like(point), where=point != 0)
-    return _as_plane(np.where(point != 0, point * (1 + share.real) * np.exp(1j * share.imag), ahead))
-
-
-def _as_plane(number: NDArray[np.complex128]) -> Floats:
-    return np.stack([number.real, number.imag])

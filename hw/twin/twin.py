@@ -342,7 +342,7 @@ class Twin(Closing):
     def _make_history(self) -> SkinHistory | None:
         skin, movement = self._skin, self.movement
         if isinstance(skin, Elastic) and isinstance(movement, Horizontal | Twist):
-            return SkinHistory(skin, movement, self._body.friction)
+            return SkinHistory(skin, movement, self._body.friction, self._sensor.device)
         return None
 
     def _make_optics(self, pattern: Pattern) -> Ideal | Wall | Coat:

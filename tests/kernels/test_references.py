@@ -647,6 +647,26 @@ def _(count):
     }
 
 
+# --- Skin that friction drags
+
+
+@case(
+    "skin_displacement",
+    {"twist": (0, 1), "grid": ((40, 50), (20, 31), (1, 1))},
+    per="picture",
+    checks={"displacement": near(1e-5, 6e-6)},
+)
+def _(twist, grid):
+    """Return a smooth shift, over more than the picture and over less."""
+    y, x = np.mgrid[: grid[0], : grid[1]]
+    shift = 0.3 * np.stack([np.cos(0.11 * x + 0.07 * y), np.sin(0.06 * x - 0.12 * y)])
+    displacement = np.random.default_rng(5).normal(0, 0.01, (2, 30, 40))
+    displacement[:, 3, 4] = np.nan
+    numbers = named("place_x place_y along_x along_y", 0.23, 0.0 if twist else -0.11, 0.1, 0.08)
+    sizes = named("grid_rows grid_columns shape twist", *grid, (30, 40), twist)
+    return numbers | sizes | {"shift": shift, "displacement": displacement, "macros": {"TWIST": twist}}
+
+
 # --- The wall in the mirror
 
 LAMPS, NONE = ((0.3, -0.2), (0.1, 0.2)), (0.0, 0.0)

@@ -1,0 +1,96 @@
+"""Where friction drags the skin: what ``skin.cl`` computes, in plain NumPy with float64.
+
+In the frame of the object that it touches, the traction shifts the skin's surface by a map u. While the
+object moves by U against the body, a point of it is ahead of the skin by U - u: there is the skin that was at
+this place plus U - u at the press. A place is (x, y) of a movement along the skin, mm, or (angle,) of a twist
+about the origin, radians. U is then proportional to the angle, and U - u is taken for an arc about the origin
+and a distance along the radius: this is exact where all sticks and where nothing does.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.kernels.array_types import Doubles
+
+ROUNDS = 200  # fixed-point steps to a point of the skin; each gains a factor of the surface's strain
+CLOSE = 1e-4  # of a pixel, within which a point of the skin is found
+
+
+def skin_displacement(
+    shift: NDArray[Any],
+    displacement: NDArray[Any],
+    place_x: float,
+    place_y: float,
+    along_x: float,
+    along_y: float,
+    twist: int = 0,
+) -> None:
+    """Find how far points of the skin that were at the pixels at the press have moved.
+
+    Parameters
+    ----------
+    shift : (2, R, C), u along x and y (up), mm; beyond its edge it continues as it ends
+    displacement : (2, H, W), mm; a guess before, NaN where the skin's surface would fold afterwards
+    place_x, place_y : of the body, mm; or the angle, radians, and nothing
+    along_x, along_y : mm, size of a pixel of both maps, which have the same centre
+    twist : 1 for a twist
+    """
+    rows, columns = displacement.shape[1:]
+    x = (np.arange(columns) - (columns - 1) / 2) * along_x
+    y = ((rows - 1) / 2 - np.arange(rows)) * along_y
+    rest = np.stack(np.meshgrid(x, y))
+    place = np.array([place_x] if twist else [place_x, place_y])
+    reached = rest + np.nan_to_num(displacement)
+    open_ = np.ones((rows, columns), bool)
+    for _ in range(ROUNDS):
+        missing = rest[:, open_] - material(shift, (along_x, along_y), place, reached[:, open_])
+        reached[:, open_] += missing
+        open_[open_] = np.hypot(*missing) > CLOSE * min(along_x, along_y)
+        if not open_.any():
+            break
+    reached[:, open_] = np.nan
+    displacement[...] = reached - rest
+
+
+def material(
+    shift: NDArray[Any], pixel_size: tuple[float, float], place: Doubles, points: Doubles
+) -> Doubles:
+    """Return where the skin that is now at points was at the press, (2, ...), mm along x and y."""
+    from scipy.ndimage import map_coordinates
+
+    at = on_object(place, points)
+    rows, columns = shift.shape[1:]
+    index = np.stack([(rows - 1) / 2 - at[1] / pixel_size[1], at[0] / pixel_size[0] + (columns - 1) / 2])
+    shifted = [map_coordinates(part, index, order=1, mode="nearest") for part in shift]
+    return _behind(place, at, drive(place, at) - np.stack(shifted))
+
+
+def drive(place: Doubles, at: Doubles) -> Doubles:
+    """Return U of points of the object, (2, ...), mm, in the linear theory of small angles."""
+    if len(place) == 1:
+        return np.stack([place[0] * at[1], -place[0] * at[0]])
+    return np.broadcast_to(-place.reshape(2, *[1] * (at.ndim - 1)), at.shape)
+
+
+def on_object(place: Doubles, points: Doubles) -> Doubles:
+    """Return the points of the object, by their places at the press, that are now at points, (2, ...)."""
+    if len(place) == 1:
+        return _as_plane((points[0] + 1j * points[1]) * np.exp(1j * place[0]))
+    return points + place.reshape(2, *[1] * (points.ndim - 1))
+
+
+def _behind(place: Doubles, at: Doubles, lag: Doubles) -> Doubles:
+    """Return where the skin was at the press over which points of the object are ahead by a lag."""
+    if len(place) != 1:
+        return at + lag
+    point, ahead = at[0] + 1j * at[1], lag[0] + 1j * lag[1]
+    share = np.divide(ahead, point, out=np.zeros_like(point), where=point != 0)
+    return _as_plane(np.where(point != 0, point * (1 + share.real) * np.exp(1j * share.imag), ahead))
+
+
+def _as_plane(number: NDArray[np.complex128]) -> Doubles:
+    return np.stack([number.real, number.imag])
