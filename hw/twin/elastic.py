@@ -172,7 +172,7 @@ def _transform(corners: Floats) -> Floats:
     return np.ascontiguousarray(fft.rfft2(fft.ifftshift(pixels)).real)
 
 
-TOLERANCE = 1e-6
+TOLERANCE = 3e-7
 """Largest error of the gap, as a share of how far the object reaches above the rest plane."""
 
 ITERATIONS = 1000
