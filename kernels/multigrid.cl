@@ -687,21 +687,17 @@ __kernel GROUP_SIZE void multigrid_tail(
 
 // --- Conjugate gradients ----------------------------------------------------------------------------------------
 //
-// Sums are written in parts, for the host to add up. Each of several right sides has a factor of its own; nodes without links or
-// anchors are then left as they are.
+// Sums are written in parts, which each group of the next kernel adds up again: no sum goes to the host. Of each cycle, `history` has
+// three numbers of each right side: the product of b and z, the length of the step, and the square of b before it. A length is 0 where
+// one of both products is not positive, or `moving` is 0.
 
+#define HISTORY(cycle, number) history[3 * (cycle) + (number)]
+#define RATIO(a, b) ((((a) > 0) & ((b) > 0)) ? (a) / (b) : (value)0)
+#define ALONG(length, what) ((length) != 0 ? (length) * (what) : (values)0)
 #if LANES == 1
-#define FACTOR_ARG const float factor
-#define FACTOR factor
-#define STEP_ARGS const float taken, const int step
-#define STEP_FACTOR taken
-#define EACH_LIVE EACH_PART
+#define EACH_LIVE EACH_OF_PART
 #else
-#define FACTOR_ARG VALUES factor
-#define FACTOR (*factor)
-#define STEP_ARGS VALUES taken, const int step
-#define STEP_FACTOR (*taken)
-#define EACH_LIVE EACH_PART if (inverse[i] > 0)
+#define EACH_LIVE EACH_OF_PART if (inverse[i] > 0)
 #endif
 
 // The residual, b - A x.
@@ -727,8 +723,19 @@ __kernel void multigrid_residual(LEVEL_ARGS, GRAPH_ARGS, VALUES b, VALUES x, OUT
     room[get_local_id(0)] = sum;                                                                           \
     GROUP_SUM(room, SUMS)                                                                                  \
     if (get_local_id(0) == 0) parts[(place) + get_group_id(0)] = room[0];
+#define ADD_UP(sum, from, number)                                                                          \
+    value sum = 0;                                                                                         \
+    for (int k = get_local_id(0); k < (number); k += (int)get_local_size(0)) sum += (from)[k];             \
+    barrier(CLK_LOCAL_MEM_FENCE);                                                                          \
+    room[get_local_id(0)] = sum;                                                                           \
+    GROUP_SUM(room, (int)get_local_size(0))                                                                \
+    barrier(CLK_LOCAL_MEM_FENCE);                                                                          \
+    sum = room[0];
 #else
 #define SUM_GROUP
+#define ADD_UP(sum, from, number)                                                                          \
+    value sum = 0;                                                                                         \
+    for (int k = 0; k < (number); ++k) sum += (from)[k];
 #define PART_NODES                                                                                         \
     const int begin = base + stride + (int)get_global_id(0) * PART;                                        \
     const int end = LESSER(begin + PART, base + stride * (rows + 1));
@@ -742,30 +749,45 @@ __kernel void multigrid_residual(LEVEL_ARGS, GRAPH_ARGS, VALUES b, VALUES x, OUT
 #define WRITE_PART WRITE_SUM(0, sum)
 
 // The next direction, and the product of it with the matrix times it. The last step, along the direction before, is taken here, as it is
-// read anyway: `taken` of it, if `step` is 1 from zero, if 2 from x.
-#define DIRECTION(i) (AT(z + (i)) + FACTOR * AT(before + (i)))
-#define TAKEN(along) ((step == 1 ? (values)0 : AT(x + i)) + STEP_FACTOR * AT(along + i))
+// read anyway, if `step` is 1 from zero, if 2 from x.
+#define DIRECTION(i) (AT(z + (i)) + factor * AT(before + (i)))
+#define TAKEN(length, along) ((step == 1 ? (values)0 : AT(x + i)) + ALONG(length, AT(along + i)))
 __kernel SUM_GROUP void multigrid_direct(
-    LEVEL_ARGS, FACTOR_ARG, STEP_ARGS, GRAPH_ARGS, MAP inverse, VALUES z, VALUES before, OUT_VALUES direction, OUT_VALUES x,
-    OUT_VALUES parts)
+    LEVEL_ARGS, const int cycle, const int step, GRAPH_ARGS, MAP inverse, const int products, VALUES product, const int count,
+    VALUES squares, OUT_VALUES history, VALUES z, VALUES before, OUT_VALUES direction, OUT_VALUES x, OUT_VALUES parts)
 {
+    PART_NODES
+    ADD_UP(bz, product, products)
+    const value factor = cycle > 0 ? RATIO(bz, HISTORY(cycle - 1, 0)) : 0, length = cycle > 0 ? HISTORY(cycle - 1, 1) : 0;
+    ADD_UP(square, squares, count)
+    if (get_global_id(0) == 0) {
+        HISTORY(cycle, 0) = bz;
+        HISTORY(cycle, 2) = square;
+    }
+    values sum = 0;
     EACH_LIVE {
         SIDES
-        const values p = DIRECTION(i);
+        const values p = bz > 0 ? DIRECTION(i) : (values)0;  // never infinite: it may be read at nodes without links later
         STREAM(direction + i, p);
         sum += p * -FLOW(DIRECTION, i, stride);
-        if (step) PUT(x + i) = TAKEN(before);
+        if (step) PUT(x + i) = TAKEN(length, before);
     }
     WRITE_PART
 }
 
 // The residual after a step along it, and the square of that.
 __kernel SUM_GROUP void multigrid_advance(
-    LEVEL_ARGS, FACTOR_ARG, GRAPH_ARGS, MAP inverse, VALUES direction, OUT_VALUES b, OUT_VALUES parts)
+    LEVEL_ARGS, const int cycle, GRAPH_ARGS, MAP inverse, VALUES moving, const int count, VALUES products, OUT_VALUES history,
+    VALUES direction, OUT_VALUES b, OUT_VALUES parts)
 {
+    PART_NODES
+    ADD_UP(product, products, count)
+    const value length = *moving * RATIO(HISTORY(cycle, 0), product);
+    if (get_global_id(0) == 0) HISTORY(cycle, 1) = length;
+    values sum = 0;
     EACH_LIVE {
         SIDES
-        const values image = -FLOW(AT, direction + i, stride), r = AT(b + i) - FACTOR * image;
+        const values image = -FLOW(AT, direction + i, stride), r = AT(b + i) - ALONG(length, image);
         PUT(b + i) = r;
         sum += r * r;
     }
@@ -773,11 +795,11 @@ __kernel SUM_GROUP void multigrid_advance(
 }
 
 // A step, where no direction follows.
-__kernel void multigrid_take(LEVEL_ARGS, STEP_ARGS, VALUES direction, OUT_VALUES x)
+__kernel void multigrid_take(LEVEL_ARGS, const int cycle, const int step, VALUES history, VALUES direction, OUT_VALUES x)
 {
     ITEMS_NODES
     EACH_NODE {
-        PUT(x + i) = TAKEN(direction);
+        PUT(x + i) = TAKEN(HISTORY(cycle, 1), direction);
     }
 }
 
@@ -807,14 +829,6 @@ __kernel SUM_GROUP void multigrid_curve(LEVEL_ARGS, GRAPH_ARGS, MAP b, MAP z, MA
 // How far to go along both, to the least in their plane, by the parts of these products and of that of b and z, which one group
 // adds up. No sum goes to the host.
 #define INDEPENDENT 1e-4f  // share of the products' determinant from which on both directions are used
-#define ADD_UP(sum, from, number)                                                                          \
-    float sum = 0;                                                                                         \
-    for (int k = get_local_id(0); k < (number); k += get_local_size(0)) sum += (from)[k];                  \
-    barrier(CLK_LOCAL_MEM_FENCE);                                                                          \
-    room[get_local_id(0)] = sum;                                                                           \
-    GROUP_SUM(room, get_local_size(0))                                                                     \
-    barrier(CLK_LOCAL_MEM_FENCE);                                                                          \
-    sum = room[0];
 __kernel GROUP_SIZE void multigrid_best(const int products, MAP product, const int count, MAP parts, OUT lengths)
 {
     __local float room[GROUP];

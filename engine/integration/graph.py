@@ -11,7 +11,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from mirrorskin.engine.integration.device_inputs import sample_grid
 from mirrorskin.engine.integration.validation import Flags, Inputs
-from mirrorskin.kernels.array import Array, Operand
+from mirrorskin.kernels.array import Array, Operand, fetch
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.links import DOWN, KNOWN, RIGHT, SLOPE
 
@@ -279,7 +279,8 @@ class Levelling:
         sizes = {"strip": strip, "components": count}
         items = strips * (count * group if group > 1 else 1)
         self._run("components_sum", items, relief, **known, **sizes, sums=sums, totals=totals, group=group)
-        sum_, total = (part.download().sum(axis=0, dtype=np.float64) for part in (sums, totals))
+        parts = fetch([(sums, slice(None)), (totals, slice(None))], [True, True])
+        sum_, total = (part.sum(axis=0, dtype=np.float64) for part in parts)
         return np.asarray(np.divide(sum_, total, out=np.zeros(count), where=total > 0))
 
     @property

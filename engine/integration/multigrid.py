@@ -13,12 +13,14 @@ from mirrorskin.engine.integration.cycle import Cycle, add_parts
 from mirrorskin.engine.integration.graph import Links
 from mirrorskin.engine.integration.height_variance import JOINED, LEAST, find_graph_variance
 from mirrorskin.engine.integration.hierarchy import STRENGTH, Hierarchy, choose_lanes, part_of
-from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.array import Array, fetch
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.links import KNOWN, SLOPE
 
 _USUAL = 40  # cycles after which coarse levels are replaced by a direct solver
 _CYCLES = 2  # cycles without a tolerance
+_DEEP = 3e-4  # tolerance that one cycle from 0 does not reach: two are done before the first test
+_LONGEST = 100  # cycles of a solution, at most
 _PATIENCE, _PROGRESS = 8, 0.7  # iterations in which the residual must decrease to this share of the best one
 _WORSE = 10  # times the smallest residual so far, above which rounding errors dominate
 _FAILED = 0.3  # residual above which two cycles count as failed
@@ -75,7 +77,7 @@ class Multigrid:
         start: Array | None = None,
         *,
         tolerance: float | None = 1e-5,
-        limit: int = 100,
+        limit: int = _LONGEST,
         deadline: float | None = None,
     ) -> Solution:
         """Solve for the heights, starting from ``start``, (H, W), or from 0.
@@ -99,7 +101,7 @@ class Multigrid:
         iterations, residual = 0, np.zeros(sides)
         for batch, solver in self._batches(sides):
             solver.begin(sources, None, batch)
-            count, residuals = solver.solve(tolerance, 100, deadline)
+            count, residuals = solver.solve(tolerance, _LONGEST, deadline)
             solver.copy("release", solver.x, height, batch)
             iterations, residual[batch] = max(iterations, count), residuals[: batch.stop - batch.start]
         return _solution(height, iterations, residual, tolerance)
@@ -197,10 +199,14 @@ class _Gradients:
         names = "x", "direction", "direction before"
         self.x, self.p, self.before = (h.array(name, size, lanes=lanes) for name in names)
         self.source = h.array("source") if lanes == 1 else self.p  # several are rarely needed again
-        self.parts = h.array("parts", -(-finest.nodes // part_of(h.device)), lanes=lanes)
-        factors = "factor", "taken"
-        self._factors = {name: h.device.array(name, (lanes,), np.float32) for name in factors}
-        self._alpha: Doubles | None = None  # length of the last step, until it is added to the heights
+        count = -(-finest.nodes // part_of(h.device))
+        # Partial sums: of products, and of the residual's squares. Rows of the history have three numbers of
+        # a cycle: product, length of the step, and the squared residual before it.
+        self.parts, self._squares = (h.array(name, count, lanes=lanes) for name in ("parts", "squares"))
+        self._history = h.device.array("history", (_LONGEST, 3, lanes), np.float32)
+        self._moving = h.device.array("moving", (lanes,), np.float32)
+        self._taken: int | None = None  # the cycle whose step is not yet added to the heights
+        self._given: Doubles | None = None  # squared right sides
         self.cycle = Cycle(h, lanes)
 
     def copy(self, name: str, level: Array, map_: Array, batch: slice = slice(0, 1)) -> None:
@@ -211,21 +217,22 @@ class _Gradients:
     def begin(self, sources: Array, start: Array | None, batch: slice = slice(0, 1)) -> None:
         """Set the right sides of a batch, and the first heights."""
         self._sources, self._batch, b = sources, batch, self.cycle.b
-        self._gained, self._alpha = np.zeros(self.lanes), None
+        self._gained, self._taken, self._given = np.zeros(self.lanes), None, None
         self.started = start is not None
         self.copy("admit", b, sources, batch)
-        if self.lanes == 1:
-            self.copy("admit", self.source, sources)
-        self._rest = self._given = self._dot(b, b)
+        self._fresh = start is None
         if start is not None:
+            self.copy("admit", self.source, sources)
+            self._dot(b, b, self.parts)
             self.copy("admit", self.x, start)
             self.find_residual()
-            self._rest = self._dot(b, b)
-        self._fresh = start is None or not self._rest <= self._given  # ignore a start that is worse than 0
-        if self._fresh:
-            if start is not None:
+        self._dot(b, b, self._squares)
+        if start is not None:
+            self._given, rest = map(_sum, self._read(self.parts, self._squares))
+            self._fresh = not (rest <= self._given).all()  # ignore a start that is worse than 0
+            if self._fresh:
                 self.copy("admit", b, sources)
-            self._rest = self._given
+                self._dot(b, b, self._squares)
 
     def solve(self, tolerance: float | None, limit: int, deadline: float | None) -> tuple[int, Doubles]:
         """Solve; return the number of cycles, and the residuals."""
@@ -234,12 +241,12 @@ class _Gradients:
         done, residual = self._iterate(goal, min(count, _USUAL), deadline)
         ready = time.perf_counter() + _FACTORS * sum(level.nodes for level in self._h.levels[1:2])
         late = deadline is not None and ready > deadline
-        left = 0 if np.isnan(self._rest).any() else _CYCLES if tolerance is None else count - done
+        assert self._given is not None
+        left = 0 if np.isnan(self._given).any() else _CYCLES if tolerance is None else count - done
         if (residual > enough).any() and left > 0 and not late and self.cycle.factorise():
-            if self.lanes > 1:
-                self.copy("admit", self.source, self._sources, self._batch)
+            self.copy("admit", self.source, self._sources, self._batch)
             self.find_residual()
-            self._rest = self._dot(self.cycle.b, self.cycle.b)
+            self._dot(self.cycle.b, self.cycle.b, self._squares)
             more, residual = self._iterate(goal, left, deadline)
             done += more
         return done, residual
@@ -255,35 +262,47 @@ class _Gradients:
         if self.started or self._h.anchored:
             self._take()
         if self.started:
-            energy = self._dot(self.source, self.x)
+            self._dot(self.source, self.x, self.parts)
+            energy = add_parts(self.parts)
         if not self._h.anchored:
             return energy
-        anchored = self._sum("weigh", anchor=self._h.graph["anchor"], x=self.x)
-        return np.maximum(energy - anchored, _FIRM * energy)
+        weigh: dict[str, Any] = {"anchor": self._h.graph["anchor"], "x": self.x}
+        self._h.over_parts("weigh", self.parts, **weigh, lanes=self.lanes)
+        return np.maximum(energy - add_parts(self.parts), _FIRM * energy)
 
     @np.errstate(all="ignore")  # a right side that overflows stops
     def _iterate(self, goal: float, limit: int, deadline: float | None) -> tuple[int, Doubles]:
         """Do conjugate gradient steps; return their number, and the residuals."""
-        rest, done = self._rest, 0
-        residual, energy = np.where(rest == 0, 0.0, np.inf), np.zeros(self.lanes)
-        best, progress, before = np.full(self.lanes, np.inf), np.zeros(self.lanes, int), rest
-        moving = (residual > goal) & ~np.isnan(rest).any()
+        done, residual, energy = 0, np.full(self.lanes, np.inf), np.zeros(self.lanes)
+        best, progress = residual.copy(), np.zeros(self.lanes, int)
+        moving, active = np.ones(self.lanes, bool), np.zeros(self.lanes, bool)
         while done < limit and moving.any():
-            begun = time.perf_counter()
-            product = self.cycle.run()
+            begun, first = time.perf_counter(), done
+            if (moving != active).any():
+                self._moving.write(moving.astype(np.float32))
+                active = moving.copy()
+            unseen = not (done or self.started) and deadline is None and goal < _DEEP
+            for _ in range(min(_CYCLES, limit) if unseen else 1):
+                self._step(done)
+                done += 1
+            history, parts = self._read(self._history, self._squares, rows=slice(first, done))
+            after = _sum(parts)
+            if self._given is None:
+                self._given = history[0, 2]
+            # A step of no length leaves heights and residual as they are.
+            product, rest = history[-1, 0], history[-1, 2]
             residual[moving & ~(product > 0) & (rest <= _ROUNDING**2 * self._given)] = 0
             moving &= product > 0
+            self._gained = self._gained + (history[:, 0] * history[:, 1]).sum(axis=0)
             if not moving.any():
+                done = first + int((history[:, 0] > 0).any(axis=1).sum())
                 break
-            after = self._step(_ratio(product, before, moving) if done else None, product, moving)
             if (residual[moving] > _NEAR).any():
                 energy = np.where(residual > _NEAR, self.energy(), energy)
             # The product is the energy of the error before the step. It decreases like the squared residual.
             valid = moving & (energy > 0)
             error = np.sqrt(_ratio(_ratio(product * after, rest, valid), energy, valid))
             residual[moving] = np.where(valid, error, np.inf)[moving]
-            before, rest = product, after
-            done += 1
             better = residual < _PROGRESS * best
             best, progress = np.where(better, residual, best), np.where(better, done, progress)
             moving &= (residual > goal) & (residual <= _WORSE * best) & (done - progress < _PATIENCE)
@@ -293,54 +312,55 @@ class _Gradients:
         self._take()
         return done, residual
 
-    def _step(self, beta: Doubles | None, product: Doubles, moving: NDArray[np.bool_]) -> Doubles:
-        """Do a step, with ``beta`` times the last direction; return the squared residuals."""
+    def _step(self, number: int) -> None:
+        """Enqueue a cycle and a step; the history gets a row of this number."""
         h, cycle = self._h, self.cycle
-        before = cycle.x if beta is None else self.before  # which may contain infinities of the last solution
-        graph: dict[str, Any] = {**h.graph, "inverse": h.inverse}
+        cycle.launch()
+        before = self.before if number else cycle.x  # which may contain infinities of the last solution
+        graph: dict[str, Any] = {**h.graph, "inverse": h.inverse, "cycle": number, "history": self._history}
         arrays = {"z": cycle.x, "before": before, "direction": self.p, "x": self.x}
-        curvature = self._sum(
-            "direct", **graph, factor=self._by("factor", beta), **self._last_step(), **arrays
-        )
+        sums = {"products": cycle.parts.shape[0], "product": cycle.parts, "squares": self._squares}
+        count = {"count": self.parts.shape[0]}
+        self._sum("direct", self.parts, **graph, **sums, **count, **arrays, step=self._use_step())
         self.p, self.before = self.before, self.p
-        alpha = self._alpha = _ratio(product, curvature, moving & (curvature > 0))
-        self._gained = self._gained + alpha * product
-        factor = self._by("factor", alpha)
-        return self._sum("advance", **graph, factor=factor, direction=self.before, b=cycle.b)
+        arrays = {"direction": self.before, "b": cycle.b, "products": self.parts, "moving": self._moving}
+        self._sum("advance", self._squares, **graph, **count, **arrays)
+        self._taken = number
 
-    def _last_step(self) -> dict[str, Any]:
-        """Return the arguments with which a kernel adds the last step to the heights."""
-        alpha, self._alpha = self._alpha, None
-        step = 0 if alpha is None else 2 - self._fresh
-        self._fresh = self._fresh and alpha is None
-        return {"taken": self._by("taken", alpha), "step": step}
+    def _use_step(self) -> int:
+        """Return whether a kernel adds the last step to the heights: 0 no, 1 to zero, 2 to x."""
+        step = 0 if self._taken is None else 2 - self._fresh
+        self._fresh = self._fresh and self._taken is None
+        self._taken = None
+        return step
 
     def _take(self) -> None:
         """Add the last step to the heights, or set them to 0 if there was no step."""
-        if self._alpha is not None:
-            arrays = {"direction": self.before, "x": self.x}
-            self._h.over("take", self._h.levels[0], lanes=self.lanes, **self._last_step(), **arrays)
+        if self._taken is not None:
+            arrays = {"history": self._history, "direction": self.before, "x": self.x}
+            numbers = {"cycle": self._taken, "step": self._use_step()}
+            self._h.over("take", self._h.levels[0], lanes=self.lanes, **numbers, **arrays)
         elif self._fresh:
             self.x.fill()
             self._fresh = False
 
-    def _by(self, name: str, factors: Doubles | None) -> float | Array:
-        """Return factors of the right sides as arguments of kernels; 0 for None."""
-        if self.lanes == 1:
-            return 0.0 if factors is None else float(factors[0])
-        array = self._factors[name]
-        array.claim()
-        array.host[...] = 0 if factors is None else factors
-        array.upload()
-        return array
+    def _dot(self, a: Array, b: Array, parts: Array) -> None:
+        self._sum("dot", parts, one=a, other=b)
 
-    def _dot(self, a: Array, b: Array) -> Doubles:
-        return self._sum("dot", one=a, other=b)
+    def _sum(self, name: str, parts: Array, **arguments: Any) -> None:
+        """Run a reduction over the finest level."""
+        self._h.over_parts(name, parts, **arguments, lanes=self.lanes)
 
-    def _sum(self, name: str, **arguments: Any) -> Doubles:
-        """Run a reduction over the finest level; return the sums."""
-        self._h.over_parts(name, self.parts, **arguments, lanes=self.lanes)
-        return add_parts(self.parts)
+    def _read(self, *arrays: Array, rows: slice = slice(None)) -> list[Doubles]:
+        """Wait once for the device, and return arrays, of the first one some rows, as float64."""
+        wanted = [(array, slice(None) if number else rows) for number, array in enumerate(arrays)]
+        return [part.astype(np.float64) for part in fetch(wanted, [True] * len(arrays))]
+
+
+def _sum(parts: Doubles) -> Doubles:
+    """Return the sums of partial sums, (lanes,)."""
+    sums: Doubles = parts.reshape(len(parts), -1).sum(axis=0)
+    return sums
 
 
 def _ratio(a: Doubles, b: Doubles, where: NDArray[np.bool_]) -> Doubles:

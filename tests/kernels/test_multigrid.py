@@ -164,19 +164,49 @@ def test_steps_of_conjugate_gradients_and_sums(cases, graph):
         weighed = case.sums("weigh", anchor=case.h.graph["anchor"], x=x_given)
         assert weighed == pytest.approx((level.anchor * x**2).sum(), rel=1e-5)
     direction, known = case.h.array("direction"), {**case.h.graph, "inverse": case.h.inverse}
+    given, history = case.device.given, case.device.array("history", (3, 3, 1), np.float32)
+    history.write(np.array([[[10], [0.2], [1]]]))
+    known |= {"cycle": 1, "history": history}
+    sums = {"products": 2, "product": given("product", [3, 4]), "squares": given("squares", np.ones(99))}
     arrays = {"z": z_given, "before": before_given, "direction": direction, "x": x_given}
-    curvature = case.sums("direct", factor=0.7, taken=0.2, step=2, **known, **arrays)
+    curvature = case.sums("direct", step=2, count=99, **known, **sums, **arrays)
     p, x = z + 0.7 * before, x + 0.2 * before
     image = -twin.residual(level, zero, p)
     close(case.get(direction), p)
     close(case.get(x_given), x)
     assert curvature == pytest.approx((p * image).sum(), rel=1e-5)
-    square = case.sums("advance", factor=0.3, **known, direction=direction, b=b_given)
-    close(case.get(b_given), b - 0.3 * image)
+    products = {"count": 3, "products": given("products", [5, 10, 5])}
+    moving = given("moving", [1])
+    square = case.sums("advance", moving=moving, **known, **products, direction=direction, b=b_given)
+    b -= 7 / 20 * image
+    close(case.get(b_given), b)
     assert square == pytest.approx((case.get(b_given).astype(float) ** 2).sum(), rel=1e-5)
-    for step, expected in ((2, x + 0.3 * p), (1, 0.3 * p)):
-        case.h.over("take", case.h.levels[0], taken=0.3, step=step, direction=direction, x=x_given)
+    np.testing.assert_allclose(history.read()[1, :, 0], [7, 7 / 20, 99], rtol=1e-6)
+    step = {"cycle": 1, "history": history, "direction": direction}
+    for number, expected in ((2, x + 7 / 20 * p), (1, 7 / 20 * p)):
+        case.h.over("take", case.h.levels[0], step=number, **step, x=x_given)
         close(case.get(x_given), expected)
+
+
+@pytest.mark.parametrize(
+    ("product", "curvature", "moving"), [(-1, 5, 1), (np.nan, 5, 1), (7, -5, 1), (7, 5, 0)]
+)
+def test_a_step_that_cannot_be_is_not_done(cases, product, curvature, moving):
+    case = cases(*STRAIGHT)
+    (b, b_given), (x, x_given), endless = case.random(), case.random(), case.h.array("direction")
+    endless.fill(np.inf)
+    history = case.device.array("history", (2, 3, 1), np.float32)
+    history.write(np.array([[[product], [9], [1]]]))
+    known = {**case.h.graph, "inverse": case.h.inverse, "cycle": 0, "history": history}
+    given = {
+        name: case.device.given(name, [value])
+        for name, value in (("products", curvature), ("moving", moving))
+    }
+    case.sums("advance", count=1, **known, **given, direction=endless, b=b_given)
+    assert history.read()[0, 1, 0] == 0
+    np.testing.assert_array_equal(case.get(b_given), b)
+    case.h.over("take", case.h.levels[0], cycle=0, step=2, history=history, direction=endless, x=x_given)
+    np.testing.assert_array_equal(case.get(x_given), x)
 
 
 @pytest.mark.parametrize("same", [False, True], ids=["plane", "line"])
