@@ -198,6 +198,9 @@ float2 answer(
         held[p] = end_of_run; \
     }
 
+#define EIGHT(each) each(0) each(1) each(2) each(3) each(4) each(5) each(6) each(7)
+#define SIXTEEN(each) EIGHT(each) each(8) each(9) each(10) each(11) each(12) each(13) each(14) each(15)
+
 // Takes in frames `first` to `first + count` of a press. Without `subframe` the height is that of the paper's
 // equation 4, at the frame of the onset itself, and there are no `samples`.
 __kernel void onset_scan(
@@ -260,9 +263,13 @@ __kernel void onset_scan(
         for (int p = 0; p < width; ++p) bad[p] = 0;
         for (int t = 0; t < length;) {
             __global const FRAME *restrict group = span + (size_t)t * pixels;
-            if (t + 8 <= length) {
-                TIMES(0) TIMES(1) TIMES(2) TIMES(3) TIMES(4) TIMES(5) TIMES(6) TIMES(7)
-                PIXELS(TAKE(0) TAKE(1) TAKE(2) TAKE(3) TAKE(4) TAKE(5) TAKE(6) TAKE(7))
+            if (t + 16 <= length) {
+                SIXTEEN(TIMES)
+                PIXELS(SIXTEEN(TAKE))
+                t += 16;
+            } else if (t + 8 <= length) {
+                EIGHT(TIMES)
+                PIXELS(EIGHT(TAKE))
                 t += 8;
             } else {
                 TIMES(0)
