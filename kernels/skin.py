@@ -18,6 +18,7 @@ from mirrorskin.kernels.array_types import Doubles
 
 ROUNDS = 200  # fixed-point steps to a point of the skin; each gains a factor of the surface's strain
 CLOSE = 1e-4  # of a pixel, within which a point of the skin is found
+FLAKES = 512  # coefficients of flakes along each axis, after which they repeat
 
 
 def skin_displacement(
@@ -40,9 +41,7 @@ def skin_displacement(
     twist : 1 for a twist
     """
     rows, columns = displacement.shape[1:]
-    x = (np.arange(columns) - (columns - 1) / 2) * along_x
-    y = ((rows - 1) / 2 - np.arange(rows)) * along_y
-    rest = np.stack(np.meshgrid(x, y))
+    rest = _rest(rows, columns, along_x, along_y)
     place = np.array([place_x] if twist else [place_x, place_y])
     reached = rest + np.nan_to_num(displacement)
     open_ = np.ones((rows, columns), bool)
@@ -54,6 +53,51 @@ def skin_displacement(
             break
     reached[:, open_] = np.nan
     displacement[...] = reached - rest
+
+
+def skin_flakes(
+    shift: NDArray[Any],
+    seen: NDArray[Any],
+    flakes: NDArray[np.uint8],
+    cell_x: NDArray[np.int32],
+    cell_y: NDArray[np.int32],
+    part_x: NDArray[Any],
+    part_y: NDArray[Any],
+    place_x: float,
+    place_y: float,
+    along_x: float,
+    along_y: float,
+    spacing: float,
+    twist: int = 0,
+) -> Doubles:
+    """Return the share of flakes, (H, W), that pixels see of the skin: a cubic B-spline, 0 to 1.
+
+    Parameters
+    ----------
+    shift, place_x, place_y, along_x, along_y, twist : see `skin_displacement`
+    seen : (2, H, W), mm from a pixel along x and y to the point that it sees
+    flakes : (`FLAKES`, `FLAKES`), coefficients by x and y, 0 or 1, which repeat without end
+    cell_x, cell_y, part_x, part_y : (W,) and (H,), where the skin that was at pixels at the press has its
+        coefficients: a whole number, and the rest
+    spacing : of coefficients, mm
+    """
+    from scipy.ndimage import map_coordinates
+
+    rest = _rest(seen.shape[1], seen.shape[2], along_x, along_y)
+    place = np.array([place_x] if twist else [place_x, place_y])
+    dragged = material(shift, (along_x, along_y), place, rest + seen) - rest
+    cells = np.stack(np.meshgrid(cell_x + part_x.astype(float), cell_y + part_y.astype(float)))
+    share: Doubles = map_coordinates(
+        flakes.astype(float), cells + dragged / spacing, order=3, mode="grid-wrap", prefilter=False
+    )
+    return share
+
+
+def _rest(rows: int, columns: int, along_x: float, along_y: float) -> Doubles:
+    """Return x and y of pixels, (2, H, W), mm."""
+    x = (np.arange(columns) - (columns - 1) / 2) * along_x
+    y = ((rows - 1) / 2 - np.arange(rows)) * along_y
+    return np.stack(np.meshgrid(x, y))
 
 
 def material(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol
 
 import numpy as np
@@ -88,7 +90,22 @@ class Scene:
         lights = [self._at(pose_at(late), middle + late) for late in self.moments]
         return lights[0] if len(lights) == 1 else np.mean(lights, axis=0, dtype=np.float32)
 
+    def render_ahead(self, poses: Iterable[Pose], meanwhile: Callable[[], object]) -> None:
+        """Render poses to come in a thread, as many as are kept, while something else is worked out."""
+        thread = ThreadPoolExecutor(max_workers=1)
+        try:
+            rendered = [thread.submit(self._render, pose) for pose in itertools.islice(poses, self._room)]
+            meanwhile()
+            for light in rendered:
+                light.result()
+        finally:
+            thread.shutdown(cancel_futures=True)
+
     def _at(self, pose: Pose, moment: float) -> Light:
+        light, height = self._render(pose)
+        return light if self._shade is None or height is None else self._shade(light, height, pose, moment)
+
+    def _render(self, pose: Pose) -> tuple[Light, Floats | None]:
         key = _key(pose)
         if key not in self._kept:
             sheet = self._skin.drape(pose)
@@ -96,8 +113,7 @@ class Scene:
             if len(self._kept) >= self._room:
                 self._kept.pop(next(iter(self._kept)))  # the oldest
             self._kept[key] = light, sheet.height if self._shade else None
-        light, height = self._kept[key]
-        return light if self._shade is None or height is None else self._shade(light, height, pose, moment)
+        return self._kept[key]
 
 
 class Witness:

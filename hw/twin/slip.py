@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from tempfile import TemporaryFile
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,65 @@ class _Course(NamedTuple):
     loads: NDArray[np.float32]  # (T, 2, h, w), N/mm^2
     forces: Floats  # (T, 2), N
     onset: Floats  # on the grid
+
+
+class Drag(NamedTuple):
+    """How friction drags the skin at one moment: see `mirrorskin.kernels.skin`.
+
+    Attributes
+    ----------
+    shift : ndarray, (2, rows, columns), float32
+        How far traction shifts the surface, mm, in the object's frame.
+    place : ndarray, (2,) or (1,)
+        Of the body, mm, or its angle.
+    pixel_size : (float, float)
+        Millimetres along x and y.
+    """
+
+    shift: NDArray[Any]
+    place: Floats
+    pixel_size: tuple[float, float]
+
+    @classmethod
+    def by(
+        cls,
+        space: HalfSpace,
+        window: Window,
+        load: NDArray[np.float32],
+        margin: tuple[int, int],
+        place: Floats,
+    ) -> Drag:
+        """Return the drag of the traction in a window of a grid, on the grid grown by a margin."""
+        rows, columns = (size + 2 * more for size, more in zip(space.shape, margin, strict=True))
+        across, along = (
+            slice(part.start + more, part.stop + more) for part, more in zip(window, margin, strict=True)
+        )
+        shift = space.window(rows, columns, (across, along)).tangential(load)
+        return cls(shift, place, space.pixel_size)
+
+    def material(self, points: Floats) -> Floats:
+        """Return where the skin was at the press that lies at points, (2, ...), mm along x and y."""
+        return material(self.shift, self.pixel_size, self.place, points)
+
+    def launch(self, name: str, device: Device, shape: tuple[int, ...], **arguments: Any) -> None:
+        """Run a kernel of ``skin.cl`` on maps of a shape."""
+        (rows, columns), (along_x, along_y) = shape, self.pixel_size
+        place_x, place_y = (*self.place, 0.0)[:2]
+        shift = device.given("shift", self.shift)
+        device.kernel("skin", name, TWIST=int(len(self.place) == 1))(
+            -(-rows * columns // device.layout.tile),
+            rows=rows,
+            columns=columns,
+            grid_rows=shift.shape[1],
+            grid_columns=shift.shape[2],
+            along_x=along_x,
+            along_y=along_y,
+            place_x=place_x,
+            place_y=place_y,
+            shift=shift,
+            moved=shift.nbytes + 16 * rows * columns,
+            **arguments,
+        )
 
 
 class SkinHistory:
@@ -76,8 +135,6 @@ class SkinHistory:
                 f"a way of {self.travel[-1]:g} {'rad' if isinstance(movement, Twist) else 'mm'} over the skin"
                 f" needs {rows} x {columns} points, and {_POINTS_MAX} are the most: take larger pixels"
             )
-        self._space = skin.space.window(rows, columns)
-        self._kept: tuple[float, Floats] | None = None
 
     @property
     def force(self) -> Floats:
@@ -90,45 +147,29 @@ class SkinHistory:
         onset: Floats = self._skin.crop(self._course.onset)
         return onset
 
-    def material(self, frame: float, points: Floats) -> Floats:
-        """Return where the skin was at the press that lies at points, (2, ...), mm along x and y.
+    def drag(self, frame: float) -> Drag:
+        """Return how the skin is dragged at a frame.
 
-        ``frame`` is a number with fractions, which may lie half a frame before the first or after the last.
+        The number may have a fraction, and lie half a frame before the first or after the last.
         """
-        return material(self._shift(frame), self._space.pixel_size, self._place(frame), points)
+        before, after, share = self._between(frame)
+        window, loads, *_ = self._course
+        load = (1 - share) * loads[before] + share * loads[after]
+        place = self._path[before] + share * (self._path[after] - self._path[before])
+        return Drag.by(self._skin.space, window, load, self._margin, place)
 
     def displacements(self) -> NDArray[np.float32]:
         """Return how far the skin has moved along itself in each frame, (T, H, W, 2), mm; on the disk.
 
         These are points that lay at the pixels at the press. NaN where the skin's surface would fold.
         """
-        device, (rows, columns) = self._device, self._skin.places.shape[1:]
+        shape = self._skin.places.shape
         with TemporaryFile() as file:
-            maps = np.memmap(file, np.float32, "w+", shape=(len(self._path), rows, columns, 2))
-        twists = isinstance(self._movement, Twist)
-        kernel = device.kernel("skin", "skin_displacement", TWIST=int(twists))
-        along_x, along_y = self._space.pixel_size
-        shift = device.array("shift", (2, *self._space.shape), np.float32)
-        displacement = device.array("displacement", (2, rows, columns), np.float32)
+            maps = np.memmap(file, np.float32, "w+", shape=(len(self._path), *shape[1:], 2))
+        displacement = self._device.array("displacement", shape, np.float32)
         for frame, kept in enumerate(maps):
-            shift.claim()
-            shift.host[...] = self._shift(frame)
-            shift.upload()
-            place_x, place_y = (*self._path[frame], 0.0)[:2]
-            kernel(
-                -(-rows * columns // device.layout.tile),
-                rows=rows,
-                columns=columns,
-                grid_rows=shift.shape[1],
-                grid_columns=shift.shape[2],
-                along_x=along_x,
-                along_y=along_y,
-                place_x=place_x,
-                place_y=place_y,
-                shift=shift,
-                displacement=displacement,  # it starts from that of the frame before
-                moved=shift.nbytes + 2 * displacement.nbytes,
-            )
+            # It starts from that of the frame before.
+            self.drag(frame).launch("skin_displacement", self._device, shape[1:], displacement=displacement)
             kept[...] = np.moveaxis(displacement.download(), 0, -1)
         return maps
 
@@ -152,20 +193,6 @@ class SkinHistory:
         last = len(self._steps) - 1
         before = min(max(math.floor(frame), 0), max(last - 1, 0))
         return before, min(before + 1, last), frame - before
-
-    def _place(self, frame: float) -> Floats:
-        before, after, share = self._between(frame)
-        place: Floats = self._path[before] + share * (self._path[after] - self._path[before])
-        return place
-
-    def _shift(self, frame: float) -> Floats:
-        """Return how far traction shifts the surface, (2, rows, columns), mm, in the object's frame."""
-        if self._kept is None or self._kept[0] != frame:
-            before, after, share = self._between(frame)
-            window, loads, *_ = self._course
-            load = (1 - share) * loads[before] + share * loads[after]
-            self._kept = frame, _shifted(self._skin.space, window, load, self._margin)
-        return self._kept[1]
 
 
 class SkinState:
@@ -201,12 +228,11 @@ class SkinState:
         self._margin = max(rows, self._margin[0]), max(columns, self._margin[1])
         window = self._friction.window
         load = self._friction.traction[:, *window].astype(np.float32)
-        self._shift = _shifted(self._skin.space, window, load, self._margin)
+        self._drag = Drag.by(self._skin.space, window, load, self._margin, place)
 
-    def material(self, frame: float, points: Floats) -> Floats:
-        """Return where the skin was at the press that lies at points now, whatever the frame."""
-        assert self._place is not None  # it has gone somewhere
-        return material(self._shift, self._skin.space.pixel_size, self._place, points)
+    def drag(self, frame: float) -> Drag:
+        """Return how the skin is dragged now, whatever the frame."""
+        return self._drag
 
 
 class _Slide:
@@ -241,15 +267,6 @@ class _Slide:
         middle = np.full_like(falls, (travel - now) / 2)
         more = np.divide(lacks[new] * (now - before), falls, out=middle, where=falls > 0)
         self.onset[new] = np.minimum(now + more, travel)
-
-
-def _shifted(space: HalfSpace, window: Window, load: NDArray[np.float32], margin: tuple[int, int]) -> Floats:
-    """Return how far traction in a window shifts the surface of the grid, grown by a margin, (2, ...), mm."""
-    rows, columns = (size + 2 * more for size, more in zip(space.shape, margin, strict=True))
-    across, along = (
-        slice(part.start + more, part.stop + more) for part, more in zip(window, margin, strict=True)
-    )
-    return space.window(rows, columns, (across, along)).tangential(load)
 
 
 def _margin(skin: Elastic, path: Floats) -> tuple[int, int]:

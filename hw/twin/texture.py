@@ -5,24 +5,25 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.hw.twin.body import check_values
 from mirrorskin.hw.twin.movement import Pose
 from mirrorskin.hw.twin.optics import Ideal, Wall
 from mirrorskin.hw.twin.scene import Light
 from mirrorskin.hw.twin.skin import Elastic, Sheet
-from mirrorskin.hw.twin.slip import SkinHistory, SkinState
+from mirrorskin.hw.twin.slip import Drag, SkinHistory, SkinState
 from mirrorskin.hw.twin.view import View
 from mirrorskin.io.types import Floats, InputError
+from mirrorskin.kernels.device import Device
+from mirrorskin.kernels.skin import FLAKES
 
 TextureName = Literal["flakes", "dots", "random-dots"]
 TEXTURES: tuple[TextureName, ...] = get_args(TextureName)
 
-_TILE = 512  # random numbers along each axis, after which a texture repeats itself
 _PIXELS_MIN = 2.0  # of a flake or a dot
 _PITCH = 2.0  # from dot to dot, in diameters
 _RIM = 0.3  # width of a dot's soft rim, in diameters
@@ -96,26 +97,34 @@ class SheetTexture:
         share: Floats = np.mean([self._dots(part) for part in quarters], axis=0)
         return 1 - self.contrast * share
 
-    def shown(self, reflectance: Floats, light: Light) -> Light:
+    def shown(self, reflectance: NDArray[Any], light: Light) -> Light:
         """Return the share of full light of pixels that get a light from the mirror."""
         return np.asarray(reflectance * ((1 - self.diffuse) * light + self.diffuse), np.float32)
 
     def _flakes(self, places: Floats) -> Floats:
         from scipy.ndimage import map_coordinates
 
-        flakes = _random(self.seed, 1)[0] < 0.5
-        index = places * (2 / self.size)
-        spline: Floats = map_coordinates(
-            flakes.astype(np.float64), index, order=3, mode="grid-wrap", prefilter=False
-        )
+        index = places / self.spacing
+        flakes = self.coefficients.astype(np.float64)
+        spline: Floats = map_coordinates(flakes, index, order=3, mode="grid-wrap", prefilter=False)
         return spline
+
+    @property
+    def coefficients(self) -> NDArray[np.uint8]:
+        """Those of the flakes' spline by x and y, 0 or 1, which repeat."""
+        return np.asarray(_random(self.seed, 1)[0] < 0.5, np.uint8)
+
+    @property
+    def spacing(self) -> float:
+        """Millimetres from one to the next."""
+        return self.size / 2
 
     def _dots(self, places: Floats) -> Floats:
         index = places / (_PITCH * self.size)
         cell = np.floor(index)
         off = (index - cell - 0.5) * _PITCH
         if self.kind == "random-dots":
-            row, column = cell.astype(np.intp) % _TILE
+            row, column = cell.astype(np.intp) % FLAKES
             off -= (2 * _JITTER) * (_random(self.seed, 2)[:, row, column] - 0.5)
         inwards = np.clip((0.5 - np.hypot(*off)) / _RIM + 0.5, 0, 1)
         return np.asarray(inwards**2 * (3 - 2 * inwards))
@@ -123,7 +132,7 @@ class SheetTexture:
 
 @functools.lru_cache(maxsize=2)
 def _random(seed: int, count: int) -> Floats:
-    return np.random.default_rng(seed).random((count, _TILE, _TILE))
+    return np.random.default_rng(seed).random((count, FLAKES, FLAKES))
 
 
 class Coat:
@@ -141,13 +150,13 @@ class Coat:
     texture: SheetTexture
     optics: Ideal | Wall
 
-    def __init__(self, texture: SheetTexture, optics: Ideal | Wall, view: View) -> None:
+    def __init__(self, texture: SheetTexture, optics: Ideal | Wall, view: View, device: Device) -> None:
         if texture.size < _PIXELS_MIN * max(view.pixel_size):
             raise InputError(
                 f"a texture of {texture.size:g} mm is too fine for pixels of {max(view.pixel_size):g} mm:"
                 f" make it {_PIXELS_MIN:g} pixels or more"
             )
-        self.texture, self.optics, self._view = texture, optics, view
+        self.texture, self.optics, self._view, self._device = texture, optics, view, device
         self.rest: Floats = texture.reflectance(np.stack([view.x, view.y]), view.pixel_size)
 
     def levels(self, dark: ArrayLike, bright: ArrayLike) -> tuple[Floats, Floats]:
@@ -167,10 +176,43 @@ class Coat:
         view = self._view
         if view.orthographic and history is None:
             return self.texture.shown(self.rest, light)
-        seen = np.stack([view.x + height * view.slope_x, view.y + height * view.slope_y])
+        off = np.stack([height * view.slope_x, height * view.slope_y])
+        if history is not None and self.texture.kind == "flakes":
+            share = self._flakes.share(history.drag(frame), off)
+            return self.texture.shown(1 - self.texture.contrast * share, light)
+        seen = np.stack([view.x, view.y]) + off
         if history is not None:
-            seen = history.material(frame, seen)
+            seen = history.drag(frame).material(seen)
         return self.texture.shown(self.texture.reflectance(seen, view.pixel_size), light)
+
+    @functools.cached_property
+    def _flakes(self) -> _DraggedFlakes:
+        return _DraggedFlakes(self.texture, self._view, self._device)
+
+
+class _DraggedFlakes:
+    """The share of flakes that each pixel sees of dragged skin, on a device."""
+
+    def __init__(self, texture: SheetTexture, view: View, device: Device) -> None:
+        self._device, self._shape = device, view.shape
+        self._seen = device.array("seen", (2, *view.shape), np.float32)
+        self._share = device.array("share", view.shape, np.float32)
+        self._given: dict[str, Any] = {
+            "flakes": device.given("flakes", texture.coefficients, np.uint8),
+            "spacing": texture.spacing,
+        }
+        for axis, places in (("x", view.x[0]), ("y", view.y[:, 0])):
+            index = places / texture.spacing
+            self._given[f"cell_{axis}"] = device.given("cell", np.floor(index), np.int32)
+            self._given[f"part_{axis}"] = device.given("part", index - np.floor(index))
+
+    def share(self, drag: Drag, off: Floats) -> Light:
+        """Return the share, (H, W), at points that are off their pixels' places at rest, (2, H, W), mm."""
+        self._seen.write(off)
+        drag.launch(
+            "skin_flakes", self._device, self._shape, seen=self._seen, share=self._share, **self._given
+        )
+        return np.asarray(self._share.download())
 
 
 class DraggedCoat:

@@ -272,6 +272,11 @@ class Twin(Closing):
         frames = out[: self.shape[0] - first]
         if len(frames) == 0:
             return None
+        history = self._history
+        if history is not None:
+            numbers = range(first, first + len(frames))
+            poses = itertools.starmap(self.movement.pose_at, itertools.product(numbers, self._scene.moments))
+            self._scene.render_ahead(poses, meanwhile=lambda: history.force)
         for k, frame in enumerate(frames, start=first):
             light = self._scene.light(functools.partial(self.movement.pose_at, k), k)
             self._sensor.expose(light, k, frame)
@@ -351,7 +356,9 @@ class Twin(Closing):
             optics = Ideal(self._body, pattern)
         else:
             optics = Wall(self._body, pattern, self._view, self._sensor.device)
-        return optics if self._texture is None else Coat(self._texture, optics, self._view)
+        return (
+            optics if self._texture is None else Coat(self._texture, optics, self._view, self._sensor.device)
+        )
 
     def _make_scene(self) -> Scene:
         share = self._camera.exposure * self._camera.frame_rate

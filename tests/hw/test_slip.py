@@ -142,7 +142,7 @@ def test_a_sliding_ball_drags_the_skin_as_johnson_says() -> None:
     found = history(Horizontal([[0.0, 0.0], [way / 2, 0.0], [way, 0.0]], press.depth), friction, 0.03)
     x, y = found._skin.places
     object_s = np.stack([x - way, y])  # where the object's points of the press have gone
-    dragged = object_s - found.material(2, object_s)
+    dragged = object_s - found.drag(2).material(object_s)
     most = friction * float(press.pressure(np.zeros(())))
     # Eq. 3.91 at Poisson ratio 0.5; the object goes to the left, and so does the skin.
     scale, inside = np.pi * most / (32 * shear * radius), np.hypot(x, y) < 0.9 * radius
@@ -154,7 +154,9 @@ def test_a_sliding_ball_drags_the_skin_as_johnson_says() -> None:
 def test_displacement_and_material_are_each_other_s_inverse() -> None:
     case = pushed(0.9, 1.6)
     there = case.found._skin.places + displacement(case.found, 7)
-    np.testing.assert_allclose(case.found.material(7, there), case.found._skin.places, atol=1e-4 * case.pixel)
+    np.testing.assert_allclose(
+        case.found.drag(7).material(there), case.found._skin.places, atol=1e-4 * case.pixel
+    )
 
 
 def test_a_long_slide_drags_the_skin_along_beneath_the_object_alone() -> None:
@@ -172,7 +174,7 @@ def test_a_long_slide_drags_the_skin_along_beneath_the_object_alone() -> None:
 def test_between_frames_the_skin_is_between() -> None:
     case = pushed(0.5, 1.2)
     points: Floats = case.found._skin.places
-    before, middle, after = (case.found.material(frame, points) for frame in (5, 5.5, 6))
+    before, middle, after = (case.found.drag(frame).material(points) for frame in (5, 5.5, 6))
     np.testing.assert_allclose(middle, (before + after) / 2, atol=0.02 * case.far * SHARES[1])
 
 

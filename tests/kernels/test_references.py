@@ -14,6 +14,7 @@ from mirrorskin.cli.bench.limits import CHAINS, CORES, LANES
 from mirrorskin.kernels import correlation, displacement, focus, lambert, pose, registration
 from mirrorskin.kernels.breaks import DOWN, RIGHT
 from mirrorskin.kernels.device import C_TYPES
+from mirrorskin.kernels.skin import FLAKES
 
 DTYPES, WHOLE = {"dtype": ("uint8", "uint16", "float32")}, {"dtype": ("uint8", "uint16")}
 
@@ -649,22 +650,32 @@ def _(count):
 
 # --- Skin that friction drags
 
+DRAGGED = {"axes": {"twist": (0, 1), "grid": ((40, 50), (20, 31), (1, 1))}}
 
-@case(
-    "skin_displacement",
-    {"twist": (0, 1), "grid": ((40, 50), (20, 31), (1, 1))},
-    per="picture",
-    checks={"displacement": near(1e-5, 6e-6)},
-)
-def _(twist, grid):
-    """Return a smooth shift, over more than the picture and over less."""
+
+def dragged(twist, grid):
+    """Return a smooth shift, over more than the picture of 30 x 40 and over less."""
     y, x = np.mgrid[: grid[0], : grid[1]]
     shift = 0.3 * np.stack([np.cos(0.11 * x + 0.07 * y), np.sin(0.06 * x - 0.12 * y)])
-    displacement = np.random.default_rng(5).normal(0, 0.01, (2, 30, 40))
-    displacement[:, 3, 4] = np.nan
     numbers = named("place_x place_y along_x along_y", 0.23, 0.0 if twist else -0.11, 0.1, 0.08)
     sizes = named("grid_rows grid_columns shape twist", *grid, (30, 40), twist)
-    return numbers | sizes | {"shift": shift, "displacement": displacement, "macros": {"TWIST": twist}}
+    return numbers | sizes | {"shift": shift, "macros": {"TWIST": twist}}
+
+
+@case("skin_displacement", **DRAGGED, checks={"displacement": near(1e-5, 6e-6)})  # CLOSE of a pixel
+def _(**chosen):
+    displacement = np.random.default_rng(5).normal(0, 0.01, (2, 30, 40))
+    displacement[:, 3, 4] = np.nan
+    return dragged(**chosen) | {"displacement": displacement}
+
+
+@case("skin_flakes", **DRAGGED, checks={"share": near(0, 1e-5)})
+def _(**chosen):
+    rng = np.random.default_rng(6)
+    flakes = (rng.random((FLAKES, FLAKES)) < 0.5).astype(np.uint8)
+    cells = [rng.integers(-99, 99, size).astype(np.int32) for size in (40, 30)]
+    maps = named("flakes cell_x cell_y part_x part_y", flakes, *cells, rng.random(40), rng.random(30))
+    return dragged(**chosen) | maps | {"seen": rng.normal(0, 0.05, (2, 30, 40)), "spacing": 0.15}
 
 
 # --- The wall in the mirror
