@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.hw.twin.body import Body
 from mirrorskin.hw.twin.elastic import Contact, HalfSpace, press
-from mirrorskin.hw.twin.movement import Pose
+from mirrorskin.hw.twin.movement import Pose, pose_at_press
 from mirrorskin.hw.twin.objects import Object
 from mirrorskin.hw.twin.obstacle import meet
 from mirrorskin.hw.twin.view import View
@@ -66,16 +67,23 @@ class Elastic:
     """Frictionless contact of the rigid object with the body, taken for an incompressible half-space.
 
     The pressure is found on the pixel grid, grown to all that the object can reach in the given poses. The
-    mirror lies a sheet's thickness below the surface. A pose is solved for itself: a start from the pose
-    before would save a fifth of the time, and make a frame depend on what was read before it.
+    mirror lies a sheet's thickness below the surface. A pose is solved for itself, so that a frame does not
+    depend on what was read before it. Poses to which a body of the ``deepest`` travel slides or twists start
+    from the pressure of that press, which goes with the object.
     """
 
     def __init__(
-        self, thing: Object, poses: Iterable[Pose], view: View, body: Body, compliance: float = 0.0
+        self,
+        thing: Object,
+        poses: Iterable[Pose],
+        view: View,
+        body: Body,
+        compliance: float = 0.0,
+        deepest: float = 0.0,
     ) -> None:
         self._thing = thing
         self._view = view
-        self._compliance = compliance
+        self._compliance, self._deepest = compliance, deepest
         rows, columns = view.shape
         grow_y, grow_x = _margin(thing, poses, view, body)
         shape = rows + 2 * grow_y, columns + 2 * grow_x
@@ -90,9 +98,32 @@ class Elastic:
 
     def solve(self, pose: Pose) -> Contact:
         """Return pressure and force in a pose, on the grown grid."""
+        if pose.shift[2] != self._deepest or pose.rotation[2, 2] != 1:
+            return self._press(pose)
+        if pose.upright and not pose.shift[:2].any():
+            return self._pressed
+        return self._press(pose, self._moved_along(pose))
+
+    def _press(self, pose: Pose, start: Floats | None = None) -> Contact:
         height = meet(self._thing, pose, self._grid).height
         obstacle = np.where(self._grid.on_body, height, np.nan)
-        return press(self.space, obstacle, compliance=self._compliance)
+        return press(self.space, obstacle, start=start, compliance=self._compliance)
+
+    @functools.cached_property
+    def _pressed(self) -> Contact:
+        return self._press(pose_at_press(self._deepest))
+
+    def _moved_along(self, pose: Pose) -> Floats:
+        """Return the pressure of the deepest press where the object has gone by a slide or a twist."""
+        from scipy.ndimage import map_coordinates
+
+        grid, (along_x, along_y) = self._grid, self._grid.pixel_size
+        places = np.stack([grid.x - pose.shift[0], grid.y - pose.shift[1]])
+        x, y = np.tensordot(pose.rotation[:2, :2].T, places, 1)
+        rows, columns = grid.shape
+        index = np.stack([(rows - 1) / 2 - y / along_y, x / along_x + (columns - 1) / 2])
+        moved: Floats = map_coordinates(self._pressed.pressure, index, order=1)
+        return moved
 
     def drape(self, pose: Pose) -> Sheet:
         """Press the sheet on the object in a pose."""

@@ -342,7 +342,7 @@ class Twin(Closing):
         movement = self.movement
         poses = [movement.pose(place) for place in _spread(movement.reduced(movement.path))]
         poses.append(pose_at_press(movement.deepest))
-        return Elastic(self._thing, poses, self._view, self._body, self._compliance)
+        return Elastic(self._thing, poses, self._view, self._body, self._compliance, movement.deepest)
 
     def _make_history(self) -> SkinHistory | None:
         skin, movement = self._skin, self.movement
