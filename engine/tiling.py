@@ -122,7 +122,6 @@ class Band:
         self._places = [] if device.info.shares_memory else _places(device, self.length, least, shape, dtype)
         self._borrowed: BorrowedBuffer | None = None
         self._only = True  # whether the picture has no other bands
-        self._resident = False
         self._blank = set(maps)  # maps that are uninitialised
 
     @cached_property
@@ -140,18 +139,9 @@ class Band:
     def write(self, name: str, values: ArrayLike, plane: int | None = None) -> None:
         """Fill a map, or one of several planes; a number, broadcast or not, is set on the device."""
         array, values = self.maps[name], np.asarray(values)
-        parked = not (self._resident or self._only or array.is_shared)
-        if not parked:
-            self._keep_resident()
         self._blank.discard(name)
-        if plane is None and not any(values.strides) and not parked:
+        if plane is None and not any(values.strides):
             array.fill(values.flat[0].item())
-        elif array.is_shared or parked:
-            if plane is not None and self._resident:
-                array.download()  # the other planes
-            array.claim()
-            target = array.host if plane is None else self.picture(array.host[plane])
-            target[:] = values
         else:
             array.write(np.broadcast_to(values, array.shape if plane is None else self._shape), plane or 0)
 
@@ -177,20 +167,10 @@ class Band:
     @contextmanager
     def resident(self) -> Iterator[None]:
         """Keep the maps on the device within a context."""
-        self._keep_resident()
+        self._blank.clear()
         yield
         if not self._only:
             self._park()
-
-    def _keep_resident(self) -> None:
-        if not self._resident:
-            for name, array in self.maps.items():
-                if name in self._blank:
-                    array.reserve()
-                else:
-                    array.upload()
-            self._blank.clear()
-            self._resident = True
 
     def stage(self, frames: AnyArray, lent: bool = False, whole: bool = False) -> Iterator[Staged]:
         """Yield frames, (n, H, W), on the device in pieces; launch the kernels for each before the next.
@@ -246,13 +226,9 @@ class Band:
 
     def _park(self) -> None:
         for name, array in self.maps.items():
-            if name in self._blank:
-                array.discard()
-            else:
-                array.evict()
+            array.park(keep=name not in self._blank)
         for place in self._places:
-            place.discard()
-        self._resident = False
+            place.park(keep=False)
 
 
 def cut_into_bands(

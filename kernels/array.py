@@ -67,18 +67,20 @@ def _told(work: Callable[Concatenate[Any, _Given], _Made]) -> Callable[Concatena
 class Array:
     """An array that host and device both see: one memory where they share it, a copy each otherwise.
 
-    It holds zeros at first, on both sides, unless its first content does not matter.
-    Either the host writes ``host`` and calls ``upload``, or it calls ``write``, which copies values to the
-    device without filling ``host``. ``download`` brings everything back to ``host``, ``read`` a copy of some
-    rows; neither has to be undone before the next kernel. On a device that shares the host's memory nothing
-    is copied.
+    It holds zeros at first, or anything where that does not matter. ``write``, ``fill`` and ``read`` copy
+    values. ``release`` ends the use, and does not copy memory that is shared. ``park`` makes room on the
+    device for other arrays. Kernels wait for what was written, and reading waits for kernels.
+
+    ``numpy.asarray(array)`` is a copy on the host, ``array[rows]`` another array on the device, and ``lend``
+    the same memory for pyopencl. Where memory is shared, ``numpy.from_dlpack(array)`` is the array itself.
 
     Attributes
     ----------
     name : str
+    device : Device
     shape : tuple of int
     dtype : dtype
-    nbytes : int
+    ndim, nbytes : int
     is_shared : bool
         Whether host and device have one memory.
     arrived : pyopencl.Event or None
@@ -100,6 +102,8 @@ class Array:
         self.is_shared: bool = device.info.shares_memory
         self._lock = threading.RLock()
         self._mapped: Mapping | None = None
+        self._parked: NDArray[Any] | None = None  # values while there is no memory on the device
+        self._is_parked = False
         self._is_lent = False  # whether others may still use the memory when this array is gone
         self._buffer: cl.Buffer | None = None
         self.shape, self.dtype, self._zeroed = shape, dtype, zeroed
@@ -114,13 +118,13 @@ class Array:
             self._allocate()
         else:
             try:
-                _ = self.host
+                _ = self._host
             except MemoryError as error:
                 raise DeviceMemoryError(_no_room(device, name, self.nbytes)) from error
 
     @cached_property
-    def host(self) -> NDArray[Any]:
-        """The host's side."""
+    def _host(self) -> NDArray[Any]:
+        """The memory that host and device share."""
         return self._memory[: self.nbytes].view(self.dtype).reshape(self.shape)
 
     @cached_property
@@ -155,7 +159,8 @@ class Array:
 
     def __dlpack__(self, **options: Any) -> object:
         self.__dlpack_device__()
-        return self.download().__dlpack__(**options)
+        self._map()
+        return self._host.__dlpack__(**options)
 
     def __dlpack_device__(self) -> tuple[int, int]:
         if not self.is_shared:
@@ -166,79 +171,78 @@ class Array:
         return np.empty(0).__dlpack_device__()
 
     def __del__(self) -> None:
-        # A kernel may still use this memory, which another array gets next. On a lost device none does.
+        # A command may still use this memory, which another array gets next. On a lost device none does.
         if not self.is_shared:
             self._give_back()
-        elif self.last_use is not None:
-            _wait_before_end(self.last_use, self._memory)
-
-    @_told
-    def claim(self) -> None:
-        """Let the host write anew, whatever the device holds."""
-        if self.is_shared and self._mapped is None and self._buffer is not None:
-            if self.last_use is not None:
-                self._device.profile.wait(self.name, self.last_use)
-            self._buffer = None  # a new one sees what the host wrote, without a turn of the queue
-
-    @_told
-    def upload(self, rows: int | None = None) -> None:
-        """Let the device see what the host wrote; ``rows`` is the number of the first rows to copy.
-
-        If the host has not touched its side, nothing is copied: the device then holds zeros, or anything.
-        """
-        if self.is_shared:
-            return
-        self.reserve()
-        if "host" in vars(self):
-            self._copy_up(self.host[:rows], 0)
-        elif self._zeroed:
-            self._filling = ZERO
+        elif self.latest is not None:
+            _wait_before_end(self.latest, self._memory)
 
     @_told
     def write(self, values: NDArray[Any], row: int = 0) -> None:
-        """Write values in C order from a row on; what comes behind them stays as it is.
-
-        The values may be changed at once. On a device with its own memory, ``host`` stays as it is.
-        """
-        start = row * (self.nbytes // self.shape[0])
-        if self.is_shared:
-            self.claim()
-            first = start // self.dtype.itemsize
-            self.host.reshape(-1)[first : first + values.size].reshape(values.shape)[...] = values
+        """Write values in C order from a row on; other rows stay. The values may be changed at once."""
+        row_size = math.prod(self.shape[1:])
+        whole = row == 0 and values.size == row_size * self.shape[0]
+        if self._is_parked:
+            if self._parked is None:
+                self._parked = _empty(self.shape, self.dtype)
+                if self._filling is not None:
+                    self._parked[...] = self._filling
+            _put(self._parked, values, row * row_size)
+        elif self.is_shared:
+            self._let_host_write(whole)
+            _put(self._host, values, row * row_size)
         else:
-            self.reserve()
-            self._copy_up(values, start)
+            self._copy_up(values, row * row_size * self.dtype.itemsize)
 
     @_told
     def fill(self, value: float | np.generic = ZERO) -> None:
-        """Set all elements to a number; on a device with its own memory, ``host`` stays as it is."""
+        """Set all elements to a number."""
         if self.is_shared:
-            self.claim()
-            self.host[...] = value
+            self._let_host_write(whole=True)
+            self._host[...] = value
         else:
-            self.reserve()
-            self._filling = value
+            self._filling, self._parked = value, None
 
     @_told
-    def read(self, rows: int | slice = slice(None)) -> NDArray[Any]:
-        """Wait for the device and return a copy of some rows, without a step; both sides stay as they are."""
-        return self._read(rows, self._device.queue, [self.latest] if self.latest else [])
+    def read(self, rows: int | slice = slice(None), after: cl.Event | None = None) -> NDArray[Any]:
+        """Wait for the device and return a copy of some rows, without a step.
 
-    @_told
-    def snapshot(self, kernel: cl.Event | None) -> NDArray[Any]:
-        """Wait for one kernel, while others that only read may run, and return a copy of what it wrote."""
+        ``after`` is the kernel to wait for if later ones only read; by default all commands are waited for.
+        """
+        if after is None:
+            return self._read(rows, self._device.queue, [self.latest] if self.latest else [])
         self._device.queue.flush()
-        return self._read(slice(None), self._device.copies, [] if kernel is None else [kernel])
+        return self._read(rows, self._device.copies, [after])
 
     @_told
-    def download(self) -> NDArray[Any]:
-        """Wait for the device and return what it wrote, in the host's array."""
+    def release(self) -> NDArray[Any]:
+        """Wait for the device and return what it wrote; the array is no longer of use.
+
+        Shared memory is returned as it is, without a copy.
+        """
         if not self.is_shared:
-            self._copy_down(self.host, 0, self._device.queue, [self.latest] if self.latest else [])
-        elif self._mapped is None and self._buffer is not None:
-            with self._device.profile.waiting_for(self.name):
-                self._mapped = Mapping(self._device.queue, self._buffer, self.shape, self.dtype)
-        return self.host
+            values = self._read(slice(None), self._device.queue, [self.latest] if self.latest else [])
+            self._give_back()
+            return values
+        self._map()
+        if self._mapped is not None:
+            self._mapped.release()
+            self._mapped = None
+            self._device.finish()
+        return self._host
+
+    @_told
+    def park(self, keep: bool = True) -> None:
+        """Make room on the device until a kernel uses the array; keep its values on the host or forget them.
+
+        Shared memory stays as it is.
+        """
+        if self.is_shared or self._is_parked:
+            return
+        if keep and self._filling is None:
+            self._parked = self._read(slice(None), self._device.queue, [self.latest] if self.latest else [])
+        self._give_back()
+        self._is_parked = True
 
     @_told
     def cut(self, start: int, shape: tuple[int, ...]) -> Array:
@@ -271,57 +275,44 @@ class Array:
         after = [] if self.latest is None else [self.latest]
         return OpenCLArray(self._device.queue, self.shape, self.dtype, data=buffer, events=after)
 
-    @_told
-    def detach(self) -> NDArray[Any]:
-        """Wait for the device and return what it wrote, without a copy; the array is no longer of use."""
-        host = self.download()
-        if self._mapped is not None:
-            self._mapped.release()
-            self._mapped = None
-            self._device.finish()
-        self._give_back()
-        return host
-
-    def evict(self) -> None:
-        """Make room on the device: keep the content on the host until the next upload."""
-        if not self.is_shared and self._buffer is not None:
-            self.download()
-            self.discard()
-
-    @_told
-    def discard(self) -> None:
-        """Make room on the device, and forget what the device held."""
-        if not self.is_shared:
-            self._give_back()
-
-    @_told
-    def reserve(self) -> None:
-        """Have room on the device, which holds anything if there was none."""
-        if self._buffer is None:
-            self._allocate()
-
     @property
     def buffer(self) -> cl.Buffer:
-        """The device's side, for kernels; the host must not write while they run."""
+        """The device's side, for kernels."""
         buffer = self._buffer
         if buffer is not None and self._mapped is None and self._filling is None:
             return buffer
-        if buffer is None and not self.is_shared:
-            raise RuntimeError(f"{self.name} was evicted: upload it first")
         return self._ready()
 
     @_told
     def _ready(self) -> cl.Buffer:
-        """Return the device's side, allocated, filled and unmapped."""
+        """Return the device's side, with all that was written."""
         if self._buffer is None:
             self._allocate()
             assert self._buffer is not None
+        parked, self._parked, self._is_parked = self._parked, None, False
         if self._mapped is not None:
             self._mapped.release()
             self._mapped = None
-        if self._filling is not None:
+        if parked is not None:
+            self._copy_up(parked, 0)
+        elif self._filling is not None:
             self._fill_on_device()
         return self._buffer
+
+    def _let_host_write(self, whole: bool) -> None:
+        """Let the host write to shared memory: all of it, or a part beside what the device wrote."""
+        if not whole:
+            self._map()
+        elif self._mapped is None and self._buffer is not None:
+            if self.last_use is not None:
+                self._device.profile.wait(self.name, self.last_use)
+            self._buffer = None  # a new one sees what the host wrote, without a turn of the queue
+
+    def _map(self) -> None:
+        """Let the host see what the device wrote to shared memory, if anything."""
+        if self._mapped is None and self._buffer is not None:
+            with self._device.profile.waiting_for(self.name):
+                self._mapped = Mapping(self._device.queue, self._buffer, self.shape, self.dtype)
 
     def _fill_on_device(self) -> None:
         value, self._filling = self._filling, None
@@ -351,22 +342,18 @@ class Array:
         event = self._device.transfers.upload(self._device, piece, values, self.dtype, after)
         self.arrived, self.last_use = event, None
 
-    def _copy_down(
-        self, out: NDArray[Any], start: int, queue: cl.CommandQueue, after: Sequence[cl.Event]
-    ) -> None:
-        """Copy from the device's side to an array in C order, from a place in bytes on."""
-        piece = Piece(self.name, self.buffer, start)
-        self._device.transfers.download(self._device, [(piece, out)], queue, after)
-
     def _read(self, rows: int | slice, queue: cl.CommandQueue, after: Sequence[cl.Event]) -> NDArray[Any]:
         """Return a copy of some rows, once some commands are over."""
         start, shape = self._part(rows)
         if not self.is_shared:
+            if self._parked is not None:
+                return self._parked[rows].copy()
             out = _empty(shape, self.dtype)
-            self._copy_down(out, start, queue, after)
+            piece = Piece(self.name, self.buffer, start)
+            self._device.transfers.download(self._device, [(piece, out)], queue, after)
             return out
         if self._mapped is not None or self._buffer is None:
-            return self.host[rows].copy()
+            return self._host[rows].copy()
         with self._device.profile.waiting_for(self.name):
             mapping = Mapping(
                 queue, self.buffer, shape, self.dtype, cl.map_flags.READ, offset=start, after=after
@@ -432,7 +419,7 @@ def fetch(parts: Sequence[tuple[Array, int | slice]], keep: Sequence[bool] = ())
     device, reads, after = parts[0][0]._device, [], []
     if parts[0][0].is_shared:
         return [
-            array.read(rows) if kept else array.detach()[rows]
+            array.read(rows) if kept else array.release()[rows]
             for (array, rows), kept in zip(parts, keep, strict=True)
         ]
     try:
@@ -447,8 +434,13 @@ def fetch(parts: Sequence[tuple[Array, int | slice]], keep: Sequence[bool] = ())
         raise failed(device, f"copy {', '.join(array.name for array, _ in parts)}", error) from error
     for (array, _), kept in zip(parts, keep, strict=True):
         if not kept:
-            array.discard()
+            array.park(keep=False)
     return [out for _, out in reads]
+
+
+def _put(target: NDArray[Any], values: NDArray[Any], first: int) -> None:
+    """Write values to elements from a number on."""
+    target.reshape(-1)[first : first + values.size].reshape(values.shape)[...] = values
 
 
 def _empty(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
@@ -513,11 +505,11 @@ Operand = Array | BorrowedBuffer
 """What a kernel takes besides numbers."""
 
 
-def _wait_before_end(last_use: cl.Event, memory_in_use: NDArray[Any]) -> None:
-    """Wait for the last kernel that uses some memory, before nobody refers to the memory any more."""
+def _wait_before_end(command: cl.Event, memory_in_use: NDArray[Any]) -> None:
+    """Wait for the last command that uses some memory, before nobody refers to the memory any more."""
     try:
         with waiting, suppress(cl.Error):
-            last_use.wait()
+            command.wait()
     except SystemExit:  # the interpreter ends, and the kernel goes on
         keep_for_ever(memory_in_use)
 

@@ -326,7 +326,7 @@ class Device:
         >>> words = device.given("words", np.arange(8), np.uint32)
         >>> copy = device.kernel("limits", "copy_all", LANES=2, WORDS=2, STRIDE=1)
         >>> copy(1, words=words, count=2, moved=32)
-        >>> words.download().tolist()
+        >>> words.read().tolist()
         [0, 1, 2, 3, 0, 1, 2, 3]
         """
         key = file, name, self.layout, *defines.items()

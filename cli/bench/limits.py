@@ -48,13 +48,10 @@ class Limits:
         numbers = max(size // 4, 64 * 3)
         self._device = device
         self._shapes = CORES if device.info.kind == "cpu" else LANES
-        self._data = device.array("limits", (numbers,), np.uint32)
         # Distinct pages: the system would map a single page of zeros many times.
-        self._data.host[:] = np.arange(numbers, dtype=np.uint32)
-        self._data.upload()
+        self._data = device.given("limits", np.arange(numbers, dtype=np.uint32), np.uint32)
         largest = max(shape.lanes * shape.items(numbers // shape.lanes) for shape in self._shapes)
         self._sums = device.array("sums", (largest,), np.uint32)
-        self._sums.upload()
 
     def works(self) -> dict[str, Work]:
         """Return the works to be timed."""
@@ -93,8 +90,7 @@ class Arithmetic:
         self._steps = max(1, pixels // 256)
         numbers = 128 * max(1, pixels // 8192) if on_cores else 4096 * max(1, pixels // 2048)
         self._data = device.array("numbers", (numbers,), np.float32)
-        self._data.host[:] = 0
-        self._data.upload()
+        self._data.fill()
 
     def works(self) -> dict[str, Work]:
         """Return the works to be timed."""

@@ -24,7 +24,7 @@ _WEAKEST_ANCHORS = 1e-12  # relative to a component's links, up to which its off
 
 def add_parts(parts: Array) -> Doubles:
     """Return the sums of partial sums, (lanes,)."""
-    values = parts.download()
+    values = parts.read()
     sums: Doubles = np.ascontiguousarray(values.reshape(len(values), -1).T).sum(axis=1, dtype=np.float64)
     return sums
 

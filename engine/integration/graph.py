@@ -62,14 +62,14 @@ class PixelGraph:
         self._arrays: dict[str, Array] = {}
 
     def upload(self, inputs: Inputs) -> Flags:
-        """Copy maps to the device; return the flags, in memory that the next call overwrites."""
+        """Copy maps to the device; return the flags."""
         slopes = self._share(dz_dx=inputs.dz_dx, dz_dy=inputs.dz_dy)
         weights = self._share(map_x=inputs.weight_x, map_y=inputs.weight_y)
         heights = self._share(heights=inputs.known_heights, height_weights=inputs.known_height_weights)
         mask, edges = self._share(mask=inputs.mask), self._share(edges=inputs.edges)
         self._use(inputs, slopes, weights, heights, mask, edges)
-        flags: Flags = self.flags.download()
-        return flags
+        self._read_flags: Flags = self.flags.read()
+        return self._read_flags
 
     def use_device_maps(self, inputs: Inputs) -> None:
         """Use the slopes and weights in this graph's arrays; the inputs' maps are not read."""
@@ -103,7 +103,7 @@ class PixelGraph:
         """Return the plane of the mean slopes, 0 in the middle; heights above it have more digits."""
         steps = [-(-size // _SAMPLES) for size in self.shape]
         subset = tuple(slice(step // 2, None, step) for step in steps)
-        valid = self.flags.host[subset] & SLOPE != 0
+        valid = self._read_flags[subset] & SLOPE != 0
         if not valid.any():
             return LEVEL
         slopes = (
@@ -139,7 +139,7 @@ class PixelGraph:
         macros = {} if links is None else {"WEIGHTS": 3}
         problem = self._problem(plane, links)
         self._run("links_misfit", macros, **problem, reliefs=reliefs, place=number, sums=sums)
-        return float(sums.download().sum(dtype=np.float64)) / self.scale
+        return float(sums.read().sum(dtype=np.float64)) / self.scale
 
     def _problem(self, plane: Plane, links: Links | None) -> dict[str, Any]:
         """Return the arguments of the kernels for links."""
@@ -172,7 +172,6 @@ class PixelGraph:
         """Return one of the graph's arrays, (H, W) by default."""
         if name not in self._arrays:
             self._arrays[name] = self.device.array(name, shape or self.shape, dtype)
-            self._arrays[name].upload()
         return self._arrays[name]
 
     def _items(self, name: str) -> int:
@@ -251,7 +250,6 @@ class Levelling:
         self._components = components
         offsets = self._array("offsets", unknown.shape)
         heights = self._device.array("levelled", reliefs.shape, np.float32, zeroed=False)
-        heights.upload()
         rows, columns = graph.shape
         items = rows * -(-columns // min(self._device.layout.tile, _CHUNK))
         parts: list[tuple[NDArray[np.bool_], Mapping[str, Operand], float]]
@@ -259,13 +257,13 @@ class Levelling:
         for number, plane in enumerate(planes):
             steps = dict(zip(("plane_x", "plane_y", "plane_z"), graph.steps(plane), strict=True))
             relief: dict[str, Any] = {"reliefs": reliefs, "place": number, **steps}
-            offsets.claim()
+            added = np.zeros(unknown.shape, np.float32)
             for selected, maps, mean in parts:
                 if selected.any():
-                    offsets.host[selected] = mean - self._means(relief, maps)[selected]
-            offsets.upload()
+                    added[selected] = mean - self._means(relief, maps)[selected]
+            offsets.write(added)
             self._run("components_add_offsets", items, relief, offsets=offsets, heights=heights)
-        return heights if on_device else heights.detach()
+        return heights if on_device else heights.release()
 
     def _means(self, relief: dict[str, Any], maps: Mapping[str, Operand]) -> NDArray[np.float64]:
         """Return mean heights of components, or mean differences from known ones, (components,), mm."""
@@ -290,7 +288,6 @@ class Levelling:
     def _array(self, name: str, shape: tuple[int, ...]) -> Array:
         if name not in self._arrays or self._arrays[name].shape != shape:
             self._arrays[name] = self._device.array(name, shape, np.float32)
-            self._arrays[name].upload()
         return self._arrays[name]
 
     def _run(self, name: str, items: int, relief: dict[str, Any], group: int = 1, **arguments: Any) -> None:

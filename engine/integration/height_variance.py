@@ -80,10 +80,9 @@ def find_graph_variance(
     )
     nodes, coarse = _find_coarse(h, number, _masses(h, number, answered))
     variance, evened, returns, part, prolonged = arrays
-    variance.claim()
-    variance.host[...] = 0
-    variance.host[nodes] = coarse
-    variance.upload()
+    known = np.zeros(variance.shape, np.float32)
+    known[nodes] = coarse
+    variance.write(known)
     links = {name: h.graph[name] for name in ("right", "down")}
     for fine in reversed(range(number)):
         level, places = h.levels[fine], place_of_coarse(h.levels[fine + 1])
@@ -166,7 +165,7 @@ def expected_misfit(links: int, pixels: int, known: int, free: int, weights: tup
 
 def _masses(hierarchy: Hierarchy, number: int, answered: NDArray[np.bool_]) -> Floats:
     """Return the number of pixels in each node of a level, (nodes,)."""
-    mass, moved = np.zeros(hierarchy.nodes, np.float32), hierarchy.to.download()
+    mass, moved = np.zeros(hierarchy.nodes, np.float32), hierarchy.to.read()
     picture = answered.view(np.uint8).astype(np.float32)
     levels = zip(hierarchy.levels[:number], hierarchy.levels[1:], hierarchy.moves, strict=False)
     for fine, coarse, moves in levels:

@@ -115,9 +115,7 @@ class Hierarchy:
     ) -> Array:
         """Return an array on the device, by default of all nodes, (size,) or (size, lanes)."""
         shape = (size or self.nodes,) if lanes == 1 else (size or self.nodes, lanes)
-        array = self.device.array(name, shape, dtype)
-        array.upload()
-        return array
+        return self.device.array(name, shape, dtype)
 
     def build(self, links: Links, *, plain: bool = False, strength: float = STRENGTH) -> None:
         """Build the levels of a graph of this shape.

@@ -141,7 +141,7 @@ class _Solver:
         scaled = (exact / scales).reshape(-1, *self._links.shape)
         maps = self._links.device.given("sources", scaled)
         height = self._multigrid.precondition(maps) if self._tolerance is None else self._solve(maps)
-        solution = self._centred(height.download().reshape(exact.shape) * (scales / self._unit))
+        solution = self._centred(height.read().reshape(exact.shape) * (scales / self._unit))
         return solution.T.reshape(np.shape(sources))
 
     def _solve(self, maps: Array) -> Array:

@@ -48,7 +48,6 @@ class Multigrid:
     def __init__(self, links: Links, *, plain: bool = False) -> None:
         self._device = links.device
         self._height = self._device.array("height", links.shape, np.float32)
-        self._height.upload()
         self._allocate(links)
         self.rebuild(links, plain=plain)
 
@@ -97,7 +96,6 @@ class Multigrid:
         """Solve for the heights of several right sides, (K, H, W), in groups that run together."""
         sides = sources.shape[0]
         height = self._device.array("heights", sources.shape, np.float32, zeroed=False)
-        height.upload()
         iterations, residual = 0, np.zeros(sides)
         for batch, solver in self._batches(sides):
             solver.begin(sources, None, batch)
@@ -120,7 +118,6 @@ class Multigrid:
     def precondition(self, sources: Array) -> Array:
         """Return the results of one cycle for right sides, (K, H, W): symmetric positive definite."""
         height = self._device.array("heights", sources.shape, np.float32, zeroed=False)
-        height.upload()
         for batch, solver in self._batches(sources.shape[0]):
             solver.copy("admit", solver.cycle.b, sources, batch)
             solver.cycle.launch()
@@ -169,7 +166,7 @@ class Multigrid:
         sigma = self._device.array("sigma", self._links.shape, np.float32)
         limits: dict[str, Any] = {"least": LEAST, "wanted": SLOPE | KNOWN, "flags": flags}
         h.copy_picture("deviation", cycle.x, sigma, inverse=h.inverse, **limits)
-        deviation: NDArray[np.float32] = sigma.detach()
+        deviation: NDArray[np.float32] = sigma.release()
         return deviation
 
     def gap(self) -> float:

@@ -141,7 +141,6 @@ class Rectangle:
             self._across = screening, self._device.given("across", across)
         if height is None:
             height = self._device.array("height", self.shape, np.float32, zeroed=False)
-            height.upload()
         rates = {"along": self._along, "across": self._across[1]}
         self._transform("rectangle_modes", 0, rows=math.prod(self.shape[:-1]), source=source)
         self._transform("rectangle_divide", 1, pictures=math.prod(self.shape[:-2]), **rates)
@@ -177,7 +176,7 @@ class Rectangle:
             weights = {"weight_x": along, "weight_y": across, "size_x": width, "size_y": height}
             run("rectangle_misfit", **weights, relief=relief, sums=sums)
         on_device = isinstance(inputs.dz_dx, Array)
-        heights: Any = relief if on_device else relief.detach()
+        heights: Any = relief if on_device else relief.release()
         first = relief.read(0) if on_device else heights[..., 0, 0]
         if not np.isfinite(first).all():  # one undefined pixel makes all undefined
             return None
@@ -185,7 +184,7 @@ class Rectangle:
         if sigma:
             factor = math.prod(self._size) / inputs.typical_weight
             if not inputs.weights_given:
-                misfit = float(sums.download().sum(dtype=np.float64)) / pictures
+                misfit = float(sums.read().sum(dtype=np.float64)) / pictures
                 factor *= self._excess(misfit / factor, len(names) > 2)
             deviation = self.deviation(screening) * np.float32(factor**0.5)
         if not on_device:
@@ -242,6 +241,4 @@ class Rectangle:
         return self._device.kernel("rectangle", name, **{**self._runs[axis][1], "KNOWN": 0, **macros})
 
     def _array(self, name: str, shape: tuple[int, ...]) -> Array:
-        array = self._device.array(name, shape, np.float32)
-        array.upload()
-        return array
+        return self._device.array(name, shape, np.float32)

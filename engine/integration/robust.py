@@ -162,7 +162,7 @@ class _Search:
         maps = {**{name: self._maps[name] for name in names}, **self._slopes}
         maps |= {"held": self._held, "heights": heights, "sums": self._sums}
         self._run("links", **maps, **self._size, **numbers)
-        return float(self._sums.download().sum(dtype=np.float64))
+        return float(self._sums.read().sum(dtype=np.float64))
 
     def _solve(self, heights: Array, tolerance: float, scale: float, most: float = math.inf) -> Solution:
         self.link(heights, scale, most)
@@ -189,7 +189,7 @@ class _Search:
             last = self._solver.solve(last.height, tolerance=tolerance, deadline=self._deadline)
         flags, edges = flags.copy(), np.zeros_like(flags)
         for bit, axis, link in ((RIGHT, 1, self.last.right), (DOWN, 0, self.last.down)):
-            broken = (flags & bit != 0) & (link.download() == 0)
+            broken = (flags & bit != 0) & (link.read() == 0)
             flags[broken] &= np.uint8(~bit & 255)
             edges |= broken | np.roll(broken, 1, axis)
         return Robust(
@@ -219,7 +219,7 @@ class _Search:
             return self._given("held", np.zeros(self._shape))
         row, column = np.ogrid[: self._shape[0], : self._shape[1]]
         rise, fall = plane[0] * inputs.pixel_size[0], plane[1] * inputs.pixel_size[1]
-        weight = anchor.download()
+        weight = anchor.read()
         above = inputs.known_heights - (plane[2] + rise * column - fall * row)
         return self._given("held", np.where(weight > 0, weight * above, 0))
 
@@ -228,7 +228,7 @@ class _Search:
         curl, mean = self._array("curl", self._shape), math.sqrt(math.prod(self._size.values()))
         size = {name: length / mean for name, length in self._size.items()}
         self._run("curl", flags=self._given("flags", flags, np.uint8), **self._slopes, **size, curl=curl)
-        sizes = np.abs(curl.download())
+        sizes = np.abs(curl.read())
         most, step = float(sizes.max()), max(1, sizes.size // _SAMPLES)
         samples = sizes.ravel()[::step][(flags & (RIGHT | DOWN) == RIGHT | DOWN).ravel()[::step]]
         noise = mad_sigma(samples)
@@ -236,9 +236,7 @@ class _Search:
         return curl, noise
 
     def _array(self, name: str, shape: tuple[int, ...]) -> Array:
-        array = self._links.device.array(name, shape, np.float32)
-        array.upload()
-        return array
+        return self._links.device.array(name, shape, np.float32)
 
     def _run(self, name: str, **arguments: Any) -> None:
         rows, columns = self._shape

@@ -145,7 +145,7 @@ class SurfaceSolver:
         if inputs.weight_x is None and inputs.known_height_weights is None:
             numbers = inputs.weight, inputs.known_height_weight, inputs.known_heights is None
         if numbers is None or numbers != self._cache.numbers or not np.array_equal(flags, self._cache.flags):
-            self._cache = _GraphCache(numbers, flags.copy())
+            self._cache = _GraphCache(numbers, flags)
         relief = (
             self._find(inputs, options, start)
             if inputs.dz_dx.ndim == 2
@@ -206,7 +206,6 @@ class SurfaceSolver:
         planes = [self._graph.mean_plane(surface) for surface in each]
         solver = self._build(self._graph.links(planes[0]))
         sources = self._device.array("sources", inputs.dz_dx.shape, np.float32, zeroed=False)
-        sources.upload()
         for number, (surface, plane) in enumerate(zip(each, planes, strict=True)):
             self._graph.set_slopes(surface)
             self._graph.put_source(plane, sources, number)
@@ -296,7 +295,7 @@ class SurfaceSolver:
         if relief.links is not None:  # the mean weight is this share of the full weight
             maps = relief.links.right, relief.links.down
             total = sum(
-                float(link.download().sum(dtype=np.float64)) / w for link, w in zip(maps, ends, strict=True)
+                float(link.read().sum(dtype=np.float64)) / w for link, w in zip(maps, ends, strict=True)
             )
             share = total / max(1, links)
         free = int(np.count_nonzero(components.offset_unknown))

@@ -52,7 +52,7 @@ class WarmStartIntegrator(ThreadSafe):
 
     def push(self, typical_weight: float) -> None:
         """Enqueue one step of the heights towards the solution for the maps, without waiting for it."""
-        maps: dict[str, Any] = {name: array.host for name, array in self.maps.items()}
+        maps: dict[str, Any] = {**self.maps}
         inputs = Inputs(**maps, pixel_size=self._pixel_size, typical_weight=typical_weight)
         self._graph.use_device_maps(inputs)
         self._flagged = self._graph.flags.last_use
@@ -70,7 +70,7 @@ class WarmStartIntegrator(ThreadSafe):
         return self._height
 
     def _level(self) -> Floats:
-        components = find_components(self._graph.flags.snapshot(self._flagged), cut=False)
+        components = find_components(self._graph.flags.read(after=self._flagged), cut=False)
         if components.count == 0:
             self._steps = 0
             return np.full(self._shape, np.nan, np.float32)

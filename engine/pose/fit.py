@@ -154,7 +154,7 @@ class PairFit:
             sums=sums,
             moved=32 * rows * columns // step**2 * len(motions),
         )
-        return sums.download()
+        return sums.read()
 
     def solve(self, start: Motion | None = None, near: bool = False) -> tuple[Motion, Equations, Doubles]:
         """Return the motion, its equations, and the directions that they do not determine.

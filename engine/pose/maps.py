@@ -175,7 +175,7 @@ def _gradient(values: Floats, grid: tuple[float, float, float, float], device: D
         gradient=gradient,
         moved=12 * values.size,
     )
-    return gradient.download().copy()
+    return gradient.release()
 
 
 def _curvature(

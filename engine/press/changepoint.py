@@ -107,12 +107,11 @@ class ChangePoint(PressOperation):
         count = len(self._travel)
         self._travel.clear()
         split = np.arange(1.0, count)
-        self._weight = self.device.array("weight", (count + 1,), np.float32)
-        self._weight.host[1:-1] = self._sign / np.sqrt(split * (count - split))
-        self._weight.upload()
+        weight = self._sign / np.sqrt(split * (count - split))
+        self._weight = self.device.given("weight", np.pad(weight, 1))
         for band in self._bands:
             with band.resident():
-                total, rest = (band.maps[name].download() for name in ("total", "total_rest"))
+                total, rest = (band.maps[name].read() for name in ("total", "total_rest"))
                 mean = (total.astype(np.float64) + rest) / count
             band.write("mean", mean)
             band.write("mean_rest", mean - mean.astype(np.float32))
@@ -193,11 +192,9 @@ class ChangePoint(PressOperation):
 
     def _travel_pairs(self) -> Array:
         """Copy the travel to the device as (T, 2) floats, whose sums have the precision of float64."""
-        pairs = self.device.array("travel", (len(self._travel), 2), np.float32)
-        pairs.host[:, 0] = self._travel
-        pairs.host[:, 1] = np.array(self._travel, np.float64) - pairs.host[:, 0]
-        pairs.upload()
-        return pairs
+        travel = np.array(self._travel, np.float64)
+        high = travel.astype(np.float32)
+        return self.device.given("travel", np.stack([high, travel - high], axis=1))
 
     def _estimate_levels(self, band: Band, noise: float) -> None:
         """Compute the levels from the best splits, where they are significant."""

@@ -272,7 +272,8 @@ class _TravelTable:
 
     def __init__(self, device: Device) -> None:
         self._device = device
-        self._table = device.array("travel", (3, 64), np.float32)
+        self._rows = np.zeros((3, 64), np.float32)
+        self._table = device.array("travel", self._rows.shape, np.float32, zeroed=False)
         self.clear()
 
     @property
@@ -292,11 +293,9 @@ class _TravelTable:
         old = len(self.values)
         steps = np.diff(travel, prepend=self.values[-1] if old else travel[0])
         count = old + len(travel)
-        self._table.claim()
         if count > self._table.shape[1]:
-            old_table = self._table.host
-            self._table = self._device.array("travel", (3, 2 * count), np.float32)
-            self._table.host[:, : old_table.shape[1]] = old_table
+            self._rows = np.pad(self._rows, ((0, 0), (0, 2 * count - self._table.shape[1])))
+            self._table = self._device.array("travel", self._rows.shape, np.float32, zeroed=False)
         self.values.extend(travel.tolist())
-        self._table.host[:, old:count] = travel, steps, travel - self.values[0]
-        self._table.upload()
+        self._rows[:, old:count] = travel, steps, travel - self.values[0]
+        self._table.write(self._rows)

@@ -112,15 +112,11 @@ class EdgeDrawing:
     ) -> None:
         """Copy the maps of a picture to the device, unless they are there; see `find_edges`."""
         for name, values in (("vectors", vectors), ("sigma", sigma), ("contact", contact)):
-            array = self._maps[name]
-            if isinstance(values, Array) and values.dtype == array.dtype:
+            if isinstance(values, Array) and values.dtype == self._maps[name].dtype:
                 self._maps[name] = values
-                continue
-            values = np.asarray(values)
-            values = values != 0 if name == "contact" else values
-            array.claim()
-            array.host[...] = values
-            array.upload()
+            else:
+                array = np.asarray(values)
+                self._maps[name].write(array != 0 if name == "contact" else array)
 
     def steps(self, parts: int = 1) -> Iterator[None]:
         """Enqueue the kernels, the longest ones in ``parts`` parts, and yield after each."""
@@ -146,7 +142,7 @@ class EdgeDrawing:
 
     def lines(self) -> NDArray[np.uint8]:
         """Return a copy of the edges, once all steps are done."""
-        return self.drawn.download().copy()
+        return self.drawn.read()
 
     def _draw(self, chosen: Pass, parts: int, cells: str, before: str, after: str) -> Iterator[None]:
         """Add the lines of one pass."""

@@ -192,10 +192,10 @@ class NormalKernel:
         if all(fit in self._places for fit in fits):
             return
         self._places = {fit: place for place, fit in enumerate(dict.fromkeys(fits))}
-        self._tables.claim()
+        tables = np.zeros((len(self._places), *self._tables.shape[1:]), np.float32)
         for fit, place in self._places.items():
-            self._tables.host[place, :, : fit.table.shape[1]] = fit.table
-        self._tables.upload(len(self._places))
+            tables[place, :, : fit.table.shape[1]] = fit.table
+        self._tables.write(tables)
 
     def run(
         self,

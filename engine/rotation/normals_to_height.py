@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.frames import SAMPLES
+from mirrorskin.engine.integration.device_inputs import sample_grid
 from mirrorskin.engine.integration.integration import integrate
 from mirrorskin.engine.integration.surface import explain
 from mirrorskin.engine.integration.validation import LEAST, MOST
@@ -199,8 +200,6 @@ class SlopeKernels:
         self._device, self._shape = device, shape
         names = "squares_x", "squares_y"
         self._squares: dict[str, Any] = {name: device.array(name, shape, np.float32) for name in names}
-        for array in self._squares.values():
-            array.upload()
         self.typical: float = math.nan
 
     def find(self, tilt: float, normals: Mapping[str, Array], to: Mapping[str, Array]) -> None:
@@ -258,8 +257,8 @@ def _typical(*weights: Array) -> float:
     """Return the median of the weights above 0 of evenly spread pixels, or NaN."""
     parts = []
     for array in weights:
-        step = max(1, math.isqrt(array.host.size // SAMPLES))
-        parts.append(array.download()[step // 2 :: step, step // 2 :: step].ravel())
+        step = max(1, math.isqrt(math.prod(array.shape) // SAMPLES))
+        parts.append(sample_grid(array, step, step).ravel())
     samples = np.concatenate(parts)
     samples = samples[samples > 0]
     return float(np.median(samples)) if samples.size else math.nan

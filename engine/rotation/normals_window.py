@@ -111,7 +111,7 @@ class NormalWindow:
         if len(self.bands) > 1:
             return self.fetch(name)
         band = self.bands[0]
-        return self._without_padding(band, band.maps[name].snapshot(self._estimated))
+        return self._without_padding(band, band.maps[name].read(after=self._estimated))
 
     def on_device(self, name: str) -> Array:
         """Return a map of the last estimate as one array on the device; it may have padding."""

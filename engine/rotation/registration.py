@@ -14,7 +14,6 @@ from mirrorskin.engine.rotation.edited import DerivedSource
 from mirrorskin.io import Block, Header, InputError, Source, pixel_axes
 from mirrorskin.io.positions import check_phase
 from mirrorskin.io.types import block_memory
-from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
 from mirrorskin.kernels.registration import BORDER
 
@@ -115,14 +114,14 @@ class Registered(DerivedSource):
         It assumes that the noise of the source's pixels is independent, and equal on their common scale. The
         noise of registered neighbours is correlated.
         """
-        squares, count = self._noise.download()
+        squares, count = self._noise.read()
         gain: NDArray[np.float32] = np.sqrt(squares / np.where(count > 0, count, np.float32(np.nan)))
         return gain
 
     def rewind(self) -> None:
         """Go back to the first frame, and forget the noise."""
         self._source.rewind()
-        _fill(self._noise, np.zeros_like(self._noise.host))
+        self._noise.fill()
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
         """Read the next frames and resample them; see ``Source.read``."""
@@ -133,10 +132,10 @@ class Registered(DerivedSource):
         count = len(block.frames)
         phases = check_phase(block.phase, count, f"{self.name}: the phase of frames from {block.index} on")
         for frame, phase, registered in zip(block.frames, phases, out, strict=False):
-            _fill(self._shift, self._geometry.shift(float(phase)))
-            _fill(self._frame, frame)
+            self._shift.write(self._geometry.shift(float(phase)))
+            self._frame.write(frame)
             self._resample()
-            registered[:] = self._registered.download()
+            registered[:] = self._registered.read()
         return replace(block, frames=out[:count], lent=False)
 
     def _resample(self) -> None:
@@ -220,12 +219,6 @@ class _Geometry:
                 [y * number, y * column, y * row - along_y * number, 0, 0, -along_y * column, -along_y * row],
             ]
         )
-
-
-def _fill(array: Array, values: NDArray[Any]) -> None:
-    array.claim()
-    array.host[:] = values
-    array.upload()
 
 
 def _interpolated_pixels(offset: NDArray[np.float32], gain: NDArray[np.float32]) -> NDArray[np.int32]:

@@ -202,7 +202,7 @@ class _Level:
         }
         self._maps["frame"] = device.array("frame", self.shape, reference.dtype, zeroed=False)
         self._measure_reference(reference)
-        summary = self._maps["summary"].download().astype(np.float64)
+        summary = self._maps["summary"].read().astype(np.float64)
         variances, self.measured = summary[:3], summary[3]
         # Information about the displacement, with all other parameters free.
         self.information: NDArray[Any] = invert_symmetric(variances)
@@ -258,7 +258,7 @@ class _Level:
             nodes=nodes,
             pixels=pixels,
         )
-        return pixels.detach()
+        return pixels.release()
 
     @property
     def _sizes(self) -> dict[str, int]:
@@ -270,7 +270,7 @@ class _Level:
     def _fit_spline(self, frame: NDArray[Any]) -> None:
         """Compute the coefficients of a frame's spline on the device."""
         maps, (rows, columns) = self._maps, self.shape
-        _write(maps["frame"], frame)
+        maps["frame"].write(frame)
         width = columns + 2 * MARGIN
         pixels = width * (rows + 2 * MARGIN)
         items = math.ceil(pixels / self._tile)
@@ -300,14 +300,14 @@ class _Level:
     def _solve(self, field: Doubles) -> Doubles:
         """Warp the frame back by a field, and solve all windows."""
         maps, (rows, columns), sizes = self._maps, self.shape, self._sizes
-        _write(maps["field"], field)
+        maps["field"].write(field)
         shared = {name: maps[name] for name in ("planes", "field", "difference")}
         items = rows * math.ceil(columns / self._tile)
         self._launch("warp", items, **sizes, **shared, start=self.start, coefficients=maps["coefficients"])
         arrays = {"inverse": maps["inverse"], "answer": maps["answer"]}
         first = self._first + self._halo
         self._launch("solve", math.prod(self.grid), **sizes, **shared, first=first, **arrays)
-        return maps["answer"].download().astype(np.float64)
+        return maps["answer"].read().astype(np.float64)
 
     def _next_field(self, field: Doubles, affine: Doubles) -> Doubles:
         """Return the field of all windows, each weighted by how well its movement is determined.
@@ -356,9 +356,3 @@ def invert_symmetric(matrices: Doubles) -> Doubles:
     first, mixed, last = matrices
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(np.stack([last, -mixed, first]) / (first * last - mixed**2))
-
-
-def _write(array: Array, values: NDArray[Any]) -> None:
-    array.claim()
-    array.host[...] = values
-    array.upload()

@@ -149,9 +149,7 @@ class Sensor:
         self._span = self.device.array("span", room, np.float32)
         self._counts = self.device.array("counts", room, self.dtype)
         for array, values in ((self._offset, self.offset), (self._span, span)):
-            array.host[: self._pixels] = values.ravel()
-            array.upload()
-        self._counts.upload()
+            array.write(values.ravel())
 
     def expose(self, light: NDArray[np.float32], frame: int, out: NDArray[Any]) -> None:
         """Write one frame, by the mean light over its exposure.
@@ -159,9 +157,7 @@ class Sensor:
         The frame's number, a whole number of 64 bits, decides the noise; negative ones can stand for frames
         outside the stack.
         """
-        self._light.claim()
-        self._light.host[: self._pixels].reshape(self._shape)[...] = self._spread(light)
-        self._light.upload()
+        self._light.write(self._spread(np.broadcast_to(light, self._shape)).ravel())
         camera, quarter = self.camera, self._quarter
         kernel = self.device.kernel(
             "exposure",
@@ -184,7 +180,7 @@ class Sensor:
             counts=self._counts,
             moved=self._pixels * (3 * 4 + self.dtype.itemsize),
         )
-        out[...] = self._counts.download()[: self._pixels].reshape(self._shape)
+        out[...] = self._counts.read()[: self._pixels].reshape(self._shape)
 
     def _spread(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
         """Blur light by the lens; beyond the picture's edge it goes on as it ends."""

@@ -242,11 +242,9 @@ class Wall:
         Full is what the pattern's clear places give where the lamps are brightest. The sheet is finite
         everywhere.
         """
-        self._sheet.claim()
-        for plane, values in zip(self._sheet.host, (sheet.height, sheet.dz_dx, sheet.dz_dy), strict=True):
-            plane[:] = values
-        self._sheet.upload()
-        body, pixels = self._body, self._light.host.size
+        for plane, values in enumerate((sheet.height, sheet.dz_dx, sheet.dz_dy)):
+            self._sheet.write(values, row=plane)
+        body, pixels = self._body, math.prod(self._light.shape)
         rows, columns = self._table.shape
         lean = body.asymmetry_azimuth
         self._device.kernel("wall", "wall_light", **self._macros)(
@@ -270,7 +268,7 @@ class Wall:
             light=self._light,
             moved=sum(array.nbytes for array in (self._sheet, self._places, self._light)),
         )
-        return self._light.download().copy()
+        return self._light.read()
 
 
 def scatter_rays(scatter: float) -> Floats:

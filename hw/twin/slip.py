@@ -170,7 +170,7 @@ class SkinHistory:
         for frame, kept in enumerate(maps):
             # It starts from that of the frame before.
             self.drag(frame).launch("skin_displacement", self._device, shape[1:], displacement=displacement)
-            kept[...] = np.moveaxis(displacement.download(), 0, -1)
+            kept[...] = np.moveaxis(displacement.read(), 0, -1)
         return maps
 
     @functools.cached_property

@@ -212,7 +212,7 @@ class _DraggedFlakes:
         drag.launch(
             "skin_flakes", self._device, self._shape, seen=self._seen, share=self._share, **self._given
         )
-        return np.asarray(self._share.download())
+        return self._share.read()
 
 
 class DraggedCoat:

@@ -60,7 +60,7 @@ class Mean(engine.Operation):
         self.device.finish()
 
     def result(self):
-        above, travel = self.above.download(), self.pushed("travel") + self.travel_offset
+        above, travel = self.above.read(), self.pushed("travel") + self.travel_offset
         step = np.diff(travel).mean()
         depth = np.where(above > 0, above * step - travel[-1] - step / 2, np.nan)
         return {"depth": depth, "depth_sigma": np.where(above > 0, step / 12**0.5, np.nan), "kind": above > 0}

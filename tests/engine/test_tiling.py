@@ -6,6 +6,7 @@ from presses import LEVELS, SPEC, assert_equal, random_press
 
 from mirrorskin.engine import Onset, find_onset
 from mirrorskin.kernels import device as device_layer
+from mirrorskin.kernels.array import BorrowedBuffer
 from mirrorskin.kernels.errors import DeviceError
 
 FRAMES = random_press("uint8", 30, (23, 31), seed=5)
@@ -105,7 +106,8 @@ def test_lent_frames_are_worked_on_where_they_lie(device):
     placed = lent(FRAMES, 128)
     search = ready(Onset(device=device))
     (staged,) = search._searches[0]._bands[0].stage(placed, lent=True)
-    assert np.shares_memory(staged.array.host, placed) == device.info.shares_memory
+    in_place = isinstance(staged.array, BorrowedBuffer) and np.shares_memory(staged.array.host, placed)
+    assert in_place == device.info.shares_memory
 
 
 def test_lent_frames_stay_until_their_kernels_are_done(device):

@@ -159,7 +159,7 @@ from mirrorskin.kernels.device import open_device
 device = open_device("portable")
 words = device.given("words", np.arange(8), np.uint32)
 device.kernel("limits", "copy_all", LANES=2, WORDS=2, STRIDE=1)(1, words=words, count=2, moved=32)
-print(len(children), *words.download())
+print(len(children), *words.read())
 """
 
 

@@ -32,7 +32,7 @@ device = open_device("Portable Computing Language")
 values = device.given("values", [0, 1, 2])
 kernel = device.kernel('''{CHANGED}''', "change", CHANGE=sys.argv[1])
 kernel(3, values=values, count=3, moved=24)
-print(json.dumps([values.download().tolist(), len(compiled)]))
+print(json.dumps([values.read().tolist(), len(compiled)]))
 """
 EXP = [1, pytest.approx(2.7182817), pytest.approx(7.389056)]
 

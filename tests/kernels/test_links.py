@@ -75,8 +75,7 @@ def arguments(inputs, flags, scale):
 def put(room, values):
     """An array on the room's device."""
     array = room.device.array("test", values.shape, np.float32)
-    array.host[...] = values
-    array.upload()
+    array.write(values)
     return array
 
 
@@ -92,15 +91,15 @@ def test_kernels_and_reference_build_the_same_graph(device, shape, scene):
     np.testing.assert_array_equal(room.upload(inputs), flags)
     right, down, anchor, source = links.links_join(*arguments(inputs, flags, room.scale))
     found = room.links(PLANE)
-    near(found.right.download(), right)
-    near(found.down.download(), down)
-    near(found.source.download(), source)
+    near(found.right.read(), right)
+    near(found.down.read(), down)
+    near(found.source.read(), source)
     assert (found.anchor is None) == (inputs.known_heights is None)
     if found.anchor is not None:
-        near(found.anchor.download(), anchor)
+        near(found.anchor.read(), anchor)
     found = put(room, np.zeros((3, *shape)))
     room.put_source(PLANE, found, 1)
-    near(found.download(), np.stack([0 * source, source, 0 * source]))
+    near(found.read(), np.stack([0 * source, source, 0 * source]))
 
 
 @scenes
@@ -119,9 +118,7 @@ def test_links_may_have_weights_of_their_own(device):
     joined = room.links(PLANE)
     own = [np.random.default_rng(n).random(room.shape).astype(np.float32) for n in (1, 2)]
     for array, values in zip((joined.right, joined.down), own, strict=True):
-        array.claim()
-        array.host[...] = values
-        array.upload()
+        array.write(values)
     maps = (*own, inputs.known_heights, inputs.known_height_weights)
     numbers = (1.0, 1.0, room.scale), SIZE, PLANE
     given = inputs.dz_dx, inputs.dz_dy, flags, *maps, *numbers

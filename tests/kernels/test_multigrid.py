@@ -33,22 +33,21 @@ class Case:
         right, down = (self.map(getattr(graph, name)) for name in ("right", "down"))
         anchor = self.map(graph.anchor) if anchored else None
         self.h.build(Links(device, SHAPE, right, down, anchor, right), plain=plain)
-        given = [None if one is None else one.host.copy() for one in (right, down, anchor)]
+        given = [None if one is None else one.read() for one in (right, down, anchor)]
         self.levels = twin.build(*given, None if plain else STRENGTH)
 
     def map(self, values, dtype=np.float32):
         array = self.device.array("map", values.shape, dtype)
-        array.host[...] = values
-        array.upload()
+        array.write(values)
         return array
 
     def random(self, number=0):
         """Return a picture of a level, and an array that holds it."""
         picture = self.rng.normal(size=self.levels[number].to.shape).astype(np.float32)
         array = self.h.array("picture")
-        array.claim()
-        self._inside(number, array.host)[...] = picture
-        array.upload()
+        values = array.read()
+        self._inside(number, values)[...] = picture
+        array.write(values)
         return picture.astype(np.float64), array
 
     def _inside(self, number, values):
@@ -58,16 +57,14 @@ class Case:
         ]
 
     def get(self, array, number=0):
-        found = self._inside(number, array.download()).copy()
-        array.upload()
-        return found
+        return self._inside(number, array.read()).copy()
 
     def sums(self, name, parts=1, **arguments):
         """Run a pass that adds up; return its sums."""
         count = -(-self.h.levels[0].nodes // part_of(self.device))
         array = self.h.array("parts", parts * count)
         self.h.over_parts(name, array, **arguments, **({"count": count} if parts > 1 else {}))
-        return array.download().reshape(parts, count).sum(axis=1, dtype=np.float64)
+        return array.read().reshape(parts, count).sum(axis=1, dtype=np.float64)
 
 
 def close(found, expected, within=1e-5):
@@ -96,8 +93,7 @@ def test_levels_are_those_of_the_reference(device, kind, anchored):
             assert moves == len(changed(level))
             if moves:
                 coarse = case.h.levels[number + 1]
-                found = case.h.changed.download()[coarse.base : coarse.base + moves] - coarse.first
-                case.h.changed.upload()
+                found = case.h.changed.read()[coarse.base : coarse.base + moves] - coarse.first
                 assert sorted(np.transpose(np.divmod(found, coarse.stride)).tolist()) == changed(level)
         assert plain == (not case.h.moves.any()) or kind == "rectangle"
 
@@ -217,9 +213,7 @@ def test_the_best_step_in_a_plane(cases, graph, same):
     (z, z_given), (p, p_given), (b, b_given), (x, x_given) = (case.random() for _ in range(4))
     if same:
         p, p_given = z, case.h.array("same")
-        p_given.claim()
-        p_given.host[...] = z_given.host
-        p_given.upload()
+        p_given.write(z_given.read())
     z_image, p_image = (-twin.residual(level, zero, one) for one in (z, p))
     expected = [(one * other).sum() for one, other in ((z, z_image), (z, p_image), (p, p_image), (b, p))]
     products = case.sums("curve", 4, **case.h.graph, b=b_given, z=z_given, p=p_given)
@@ -233,7 +227,7 @@ def test_the_best_step_in_a_plane(cases, graph, same):
     case.h.alone("best", products=2, count=2, **given, lengths=lengths)
     case.h.over("follow", case.h.levels[0], lengths=lengths, z=z_given, p=p_given, x=x_given)
     along, again = twin.best_step((b * z).sum(), *expected)
-    close(lengths.download(), [along, again], 1e-4)
+    close(lengths.read(), [along, again], 1e-4)
     assert (again == 0) == same
     close(case.get(p_given), along * z + again * p, 1e-4)
     close(case.get(x_given), x + along * z + again * p, 1e-4)
@@ -270,10 +264,10 @@ def test_pictures_come_to_the_finest_level_and_back(cases):
     case.h.copy_picture("admit", level, case.map(picture))
     np.testing.assert_array_equal(case.get(level), picture)
     case.h.copy_picture("release", level, back)
-    np.testing.assert_array_equal(back.download(), picture)
+    np.testing.assert_array_equal(back.read(), picture)
     flags = case.rng.choice([1, 4, 6, 8], SHAPE)
     known = {"least": 0.12, "wanted": 12, "flags": case.map(flags, np.uint8), "inverse": case.h.inverse}
     case.h.copy_picture("deviation", level, found, **known)
     least = 0.12 * twin.inverse_of(case.levels[0].diagonal)
     expected = np.where(flags & 12, np.sqrt(np.maximum(picture, least)), np.nan)
-    np.testing.assert_allclose(found.download(), expected, rtol=1e-5)
+    np.testing.assert_allclose(found.read(), expected, rtol=1e-5)

@@ -70,8 +70,7 @@ class Answers:
 
     def put(self, values):
         array = self.device.array("a", values.shape, values.dtype)
-        array.host[...] = values
-        array.upload()
+        array.write(values)
         return array
 
     def take(self, method, turn, start=0):
@@ -111,7 +110,7 @@ class Answers:
 
     def read(self):
         """Return the answers; nothing behind the last vector of a plane may have been written."""
-        found = {name: array.download().copy() for name, array in self.maps.items()}
+        found = {name: array.read() for name, array in self.maps.items()}
         lanes = vector_lanes(self.device)
         behind = -(-self.pixels // lanes) * lanes
         for name, values in found.items():

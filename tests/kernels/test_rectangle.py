@@ -74,10 +74,9 @@ def test_device_and_reference_find_the_same_heights(device, shape, screening):
     along, across = WEIGHTS
     for picture, size in ((source, (along, across)), (source.T, (across, along))):
         given = device.array("source", picture.shape, np.float32)
-        given.host[...] = picture
-        given.upload()
+        given.write(picture)
         solver = Rectangle(picture.shape, (size[0] ** -0.5, size[1] ** -0.5), device)
-        height = solver.solve(given, screening).download()
+        height = solver.solve(given, screening).read()
         told = refer(source, screening)
         told = told if picture is source else told.T
         np.testing.assert_allclose(height, told, atol=2e-6 * max(1e-3, np.ptp(told)))

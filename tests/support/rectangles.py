@@ -8,8 +8,7 @@ import scipy.fft
 
 def put(device, values):
     array = device.array("source", values.shape, np.float32)
-    array.host[...] = values
-    array.upload()
+    array.write(values)
     return array
 
 

@@ -122,7 +122,7 @@ def agree(
     kernel(items, **{key: arrays[key] if key in arrays else values[key] for key in kernel.arguments}, moved=0)
 
     for key, array in arrays.items():
-        found, wanted = array.download(), expected[key]
+        found, wanted = array.read(), expected[key]
         found = found.sum(axis=-1, dtype=np.float64) if key in pairs.split() else found
         if key in (checks or {}):
             checks[key](found, wanted, values | expected)

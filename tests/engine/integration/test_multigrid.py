@@ -20,8 +20,7 @@ CYCLES |= {"uneven": 20, "isolated": 16, "comb": 45}
 
 def given(device, name, values):
     array = device.array(name, values.shape, np.float32)
-    array.host[...] = values
-    array.upload()
+    array.write(values)
     return array
 
 
@@ -32,9 +31,7 @@ def links_of(device, graph):
 
 
 def heights_of(solution):
-    heights = solution.height.download().astype(float)
-    solution.height.upload()
-    return heights
+    return solution.height.read().astype(float)
 
 
 def error_of(graph, heights):
@@ -88,7 +85,7 @@ def answer(cycle, values):
     cycle.run()
     found = given(hierarchy.device, "found", np.zeros(values.shape))
     hierarchy.copy_picture("release", cycle.x, found)
-    return found.download().astype(float)
+    return found.read().astype(float)
 
 
 @pytest.mark.parametrize("kind", ["comb", "spiral"])

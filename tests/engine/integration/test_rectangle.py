@@ -35,22 +35,22 @@ def test_heights_solve_the_links_of_any_shape(device, shape, screening):
     source = np.random.default_rng(0).normal(size=shape)
     source = (source - source.mean()).astype(np.float32)
     solver = Rectangle(shape, (0.03, 0.04), device, scale=2.5)
-    height = solver.solve(put(device, source), screening * wx).download()
+    height = solver.solve(put(device, source), screening * wx).read()
     told = solve_sparse(source, wx, wy, screening * wx)
     np.testing.assert_allclose(height, told, atol=1e-6 * np.ptp(told))
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 3), (40, 30)])
 def test_a_picture_without_slopes_is_flat(device, shape):
-    height = Rectangle(shape, (1.0, 1.0), device).solve(put(device, np.zeros(shape))).download()
+    height = Rectangle(shape, (1.0, 1.0), device).solve(put(device, np.zeros(shape))).read()
     np.testing.assert_array_equal(height, 0)
 
 
 def test_what_a_source_sums_to_changes_nothing(device):
     source = source_of(scene((60, 45), 0.3))
     solver = Rectangle((60, 45), (1.0, 1.0), device)
-    height = solver.solve(put(device, source)).download().copy()
-    lifted = solver.solve(put(device, source + 0.25)).download()
+    height = solver.solve(put(device, source)).read()
+    lifted = solver.solve(put(device, source + 0.25)).read()
     np.testing.assert_allclose(lifted, height, atol=2e-5 * np.ptp(height))
 
 
@@ -61,7 +61,7 @@ def test_a_solver_serves_one_picture_and_screening_after_the_other(device):
         surface = np.random.default_rng(seed).normal(size=shape).cumsum(0).cumsum(1)
         surface -= surface.mean()
         source = put(device, source_of(surface, screening=screening))
-        height = solver.solve(source, screening).download()
+        height = solver.solve(source, screening).read()
         np.testing.assert_allclose(height, surface, atol=1e-5 * np.ptp(surface))
 
 
@@ -73,21 +73,21 @@ def test_cosines_are_as_high_as_their_wave_numbers_say(device, size):
     )
     wy, wx = (4 * np.sin(np.pi * n / (2 * count)) ** 2 for n, count in zip(waves, shape, strict=True))
     source = put(device, (wx / size[0] ** 2 + wy / size[1] ** 2) * np.outer(y, x))
-    height = Rectangle(shape, size, device).solve(source).download()
+    height = Rectangle(shape, size, device).solve(source).read()
     np.testing.assert_allclose(height, np.outer(y, x), atol=5e-6)
 
 
 def test_several_pictures_are_solved_at_once(device):
     pictures = np.random.default_rng(0).normal(size=(3, 11, 21))
     told = [solve_by_cosines(picture) for picture in pictures]
-    found = Rectangle(pictures.shape, (1.0, 1.0), device).solve(put(device, pictures)).download()
+    found = Rectangle(pictures.shape, (1.0, 1.0), device).solve(put(device, pictures)).read()
     np.testing.assert_allclose(found, told, atol=5e-6)
 
 
 @pytest.mark.parametrize(("shape", "lean"), [((250, 256), 0.0), ((256, 251), 30.0)])
 def test_errors_are_less_than_a_millionth_of_the_range(device, shape, lean):
     source = source_of(scene(shape, lean)).astype(np.float32)
-    height = Rectangle(shape, (1.0, 1.0), device).solve(put(device, source)).download()
+    height = Rectangle(shape, (1.0, 1.0), device).solve(put(device, source)).read()
     told = solve_by_cosines(source)
     assert np.abs(height - told).max() < 5e-7 * np.ptp(told)
     assert abs(height.mean(dtype=np.float64)) < 1e-7 * np.ptp(told)
@@ -96,7 +96,7 @@ def test_errors_are_less_than_a_millionth_of_the_range(device, shape, lean):
 def test_a_long_slope_stays_straight(device):
     """The slowest modes add up what each line rounds: they carry twice the digits."""
     surface = scene((3000, 48), 1.0)
-    height = Rectangle((3000, 48), (1.0, 1.0), device).solve(put(device, source_of(surface))).download()
+    height = Rectangle((3000, 48), (1.0, 1.0), device).solve(put(device, source_of(surface))).read()
     told = solve_by_cosines(source_of(surface).astype(np.float32))
     assert np.abs(height - told).max() < 5e-7 * np.ptp(told)
 
@@ -105,7 +105,7 @@ def test_a_long_slope_stays_straight(device):
 def test_a_long_strip_is_solved_by_a_convolution_or_outside_of_a_group_s_own_memory(device, columns):
     shape = (37, columns)
     source = source_of(scene(shape, 1.0, noise=0.0)).astype(np.float32)
-    height = Rectangle(shape, (1.0, 1.0), device).solve(put(device, source)).download()
+    height = Rectangle(shape, (1.0, 1.0), device).solve(put(device, source)).read()
     told = solve_by_cosines(source)
     assert np.abs(height - told).max() < 1e-6 * np.ptp(told)
 

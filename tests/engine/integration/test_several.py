@@ -80,7 +80,7 @@ def test_any_graph_is_solved_for_many_right_sides(device, kind, anchored):
     solver = Multigrid(Links(device, (45, 70), *maps, anchor, device.given("source", sources[0])))
     found = solver.solve_many(device.given("sources", sources), tolerance=1e-6)
     assert found.converged
-    for source, height in zip(sources, found.height.download(), strict=True):
+    for source, height in zip(sources, found.height.read(), strict=True):
         graph.source[...] = source
         exact = graph.solve()
         np.testing.assert_allclose(graph.centred(height), exact, atol=2e-5 * np.ptp(exact))

@@ -25,9 +25,7 @@ def scene(shape, seed=0, blobs=True):
 def follow(follower, maps):
     for name, values in zip(MAPS, maps, strict=True):
         array = follower.maps[name]
-        array.claim()
-        array.host[...] = values
-        array.upload()
+        array.write(values)
     follower.push(1.0)
     return follower.result()
 
