@@ -1,11 +1,5 @@
 """Figures, reports and interactive views."""
 
-from mirrorskin.view.canvas import check_drawing
-from mirrorskin.view.truth import height_figure, normal_figure, surface_figure
+import lazy_loader
 
-__all__ = [
-    "check_drawing",
-    "height_figure",
-    "normal_figure",
-    "surface_figure",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

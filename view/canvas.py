@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
@@ -20,11 +20,13 @@ from mirrorskin.io.types import Floats
 from mirrorskin.view.colours import FILLED_SHADES, MISSING
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
+    from matplotlib.text import Text
 
 Extent = tuple[float, float, float, float]
 """Outer edges of a map's pixels: left, right, bottom and top."""
@@ -65,12 +67,24 @@ def write_figure(figure: Figure, path: Path) -> None:
 
 def encode_figure(figure: Figure, dpi: float) -> bytes:
     """Return a figure as a PNG."""
-    _print_texts_as_they_are(figure)
+    from PIL import Image
+
     target = BytesIO()
+    Image.fromarray(figure_pixels(figure, dpi)).save(target, format="png", dpi=(dpi, dpi))
+    return target.getvalue()
+
+
+def figure_pixels(figure: Figure, dpi: float) -> NDArray[np.uint8]:
+    """Return a figure's pixels, (H, W, 3): red, green and blue."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    _print_texts_as_they_are(figure)
+    figure.set_dpi(dpi)
+    canvas = FigureCanvasAgg(figure)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
-        figure.savefig(target, format="png", dpi=dpi)
-    return target.getvalue()
+        canvas.draw()  # type: ignore[no-untyped-call]  # once; savefig draws twice
+    return np.asarray(canvas.buffer_rgba())[..., :3]  # type: ignore[no-untyped-call]
 
 
 def _print_texts_as_they_are(figure: Figure) -> None:
@@ -78,19 +92,20 @@ def _print_texts_as_they_are(figure: Figure) -> None:
 
     Tick labels are formulas made by Matplotlib.
     """
-    from matplotlib.axes import Axes
+    for text in _texts(figure):
+        text.set_parse_math(False)
+        text.set_text("\n".join(map(printable, text.get_text().split("\n"))))
+
+
+def _texts(artist: Artist) -> Iterator[Text]:
+    """Yield the texts below an artist, but for those of ticks, which Matplotlib makes when it draws."""
+    from matplotlib.axis import Axis
     from matplotlib.text import Text
 
-    of_ticks = {
-        label
-        for axes in figure.findobj(Axes)
-        for axis in (axes.xaxis, axes.yaxis)
-        for label in (*axis.get_ticklabels(which="both"), axis.get_offset_text())
-    }
-    for text in figure.findobj(Text):
-        if text not in of_ticks:
-            text.set_parse_math(False)
-            text.set_text("\n".join(map(printable, text.get_text().split("\n"))))
+    if isinstance(artist, Text):
+        yield artist
+    for part in [artist.label] if isinstance(artist, Axis) else artist.get_children():
+        yield from _texts(part)
 
 
 def extent(x: Floats, y: Floats) -> Extent:

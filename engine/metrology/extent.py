@@ -65,13 +65,16 @@ def rim(patch: Patch) -> Quantity | None:
     picture's border.
     """
     import cv2
-    from scipy import ndimage
 
     area = patch.measured | np.isfinite(patch.filled)
     count, label = cv2.connectedComponents(area.view(np.uint8), connectivity=8)
     if count > 2:
         area = label == 1 + np.argmax(np.bincount(label.ravel())[1:])
-    area = ndimage.binary_fill_holes(area)
+    # Everything that is not connected to the outside of the picture, without diagonals: no holes.
+    _, outside = cv2.connectedComponents(
+        np.pad(~area, 1, constant_values=True).view(np.uint8), connectivity=4
+    )
+    area = outside[1:-1, 1:-1] != outside[0, 0]
     outermost = border(area)
     if 2 * np.count_nonzero(outermost) < np.count_nonzero(border(area, ends=True)):
         return None
@@ -84,9 +87,13 @@ def rim(patch: Patch) -> Quantity | None:
 
 def border(mask: Mask, *, ends: bool = False) -> Mask:
     """Return the pixels of a mask with a neighbour outside of it; with ``ends`` also the picture's border."""
-    from scipy import ndimage
+    import cv2
 
-    return np.asarray(mask & ~ndimage.binary_erosion(mask, border_value=not ends))
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    inside = cv2.erode(
+        mask.astype(np.uint8), cross, borderType=cv2.BORDER_CONSTANT, borderValue=int(not ends)
+    )
+    return np.asarray(mask & (inside == 0))
 
 
 def _highest(patch: Patch) -> Quantity:

@@ -40,7 +40,9 @@ def folder(tmp_path_factory):
     [
         ("reconstruct press.h5 -o press-result.h5", set()),
         ("reconstruct turn.h5 -o turn-result.h5", set()),
-        ("fuse press.h5 turn.h5 -o fused.h5", set()),
+        ("fuse press.h5 turn.h5 -o surface.h5", set()),
+        ("view fused.h5 -o fused.png", {"matplotlib"}),
+        ("report fused.h5 -o fused.html", {"matplotlib"}),
     ],
 )
 def test_a_command_imports_only_what_it_needs(words, needed, folder, monkeypatch):

@@ -2,7 +2,6 @@
 
 import itertools
 
-import cv2
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -10,7 +9,7 @@ from matplotlib.figure import Figure
 from shown import ball, panel
 
 from mirrorskin import io
-from mirrorskin.view.result import figures_of, overview, png_of
+from mirrorskin.view.result import figures_of, overview, pixels_of
 
 PRESS = ("height", "height_sigma", "status", "filled", "x", "y")
 TURN = ("height", "height_sigma", "normals", "normals_sigma", "azimuth", "modulation", "edges", "contact")
@@ -119,8 +118,8 @@ def test_a_result_of_turns_needs_the_choice_of_one():
         overview(turns, name="it")
 
 
-def test_a_png_is_as_wide_as_asked_and_the_right_side_up(alone):
-    picture = cv2.imdecode(np.frombuffer(png_of(alone["status"], 700), np.uint8), cv2.IMREAD_COLOR)
+def test_a_figure_is_as_wide_as_asked_and_the_right_side_up(alone):
+    picture = pixels_of(alone["status"], 700)
     assert picture.shape[1] == 700
     title, below = (picture[rows].min(axis=(1, 2)) for rows in (slice(0, 40), slice(-8, None)))
     assert title.min() < 100  # the name stands above

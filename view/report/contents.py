@@ -219,13 +219,13 @@ class Picture:
 
 def pictures_of(result: Result, name: str, section: Ends | None) -> list[Picture]:
     """Draw all figures of a result."""
-    from mirrorskin.view.result import figures_of, png_of
+    from mirrorskin.view.result import figures_of, pixels_of
 
     figures = figures_of(result, name=name, section=section)
     pictures = []
     for which, figure in figures.items():
-        png = png_of(_untitled(figure), round(FINENESS * figure.get_figwidth()))
-        pictures.append(_picture(*picture_texts(result, which), png))
+        pixels = pixels_of(_untitled(figure), round(FINENESS * figure.get_figwidth()))
+        pictures.append(_picture(*picture_texts(result, which), pixels))
     return pictures
 
 
@@ -237,8 +237,8 @@ def _untitled(figure: Figure) -> Figure:
     return figure
 
 
-def _picture(caption: str, alt: str, png: bytes) -> Picture:
-    pixels = _trimmed(np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR), np.uint8))
+def _picture(caption: str, alt: str, drawn: Pixels) -> Picture:
+    pixels = _trimmed(np.asarray(cv2.cvtColor(drawn, cv2.COLOR_RGB2BGR), np.uint8))
     kind, data = packed(pixels)
     source = f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
     return Picture(caption, alt, source, pixels.shape[1], pixels.shape[0])
@@ -254,7 +254,7 @@ def _trimmed(pixels: Pixels) -> Pixels:
 
 def packed(pixels: Pixels) -> tuple[str, bytes]:
     """Encode a picture in at most ``MOST_BYTES``: losslessly if possible, else lossily, else smaller."""
-    png = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 6])[1].tobytes()
+    png = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 4])[1].tobytes()
     if len(png) <= MOST_BYTES:
         return "png", png
     for quality in _QUALITIES:

@@ -1,5 +1,5 @@
 """Figures of one result."""
 
-from mirrorskin.view.result.figures import figures_of, overview, png_of
+from mirrorskin.view.result.figures import figures_of, overview, pixels_of
 
-__all__ = ["figures_of", "overview", "png_of"]
+__all__ = ["figures_of", "overview", "pixels_of"]

@@ -10,10 +10,11 @@ from textwrap import wrap
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mirrorskin.engine.summary import summarise
 from mirrorskin.io import InputError, Result
-from mirrorskin.view.canvas import encode_figure, new_figure
+from mirrorskin.view.canvas import figure_pixels, new_figure
 from mirrorskin.view.result.maps import draw_declared, draw_height
 from mirrorskin.view.result.section import draw_histogram, draw_section
 from mirrorskin.view.result.sheet import BOX, TEXT, Sheet, sheet_of
@@ -86,9 +87,9 @@ def overview(
     return _figure(sheet, _chosen(sheet, name, section, maps), name)
 
 
-def png_of(figure: Figure, width_px: int) -> bytes:
-    """Return a figure as a PNG with a width in pixels."""
-    return encode_figure(figure, width_px / figure.get_figwidth())
+def pixels_of(figure: Figure, width_px: int) -> NDArray[np.uint8]:
+    """Return a figure with a width in pixels, (H, W, 3): red, green and blue."""
+    return figure_pixels(figure, width_px / figure.get_figwidth())
 
 
 def _chosen(sheet: Sheet, name: str, section: Ends | None, maps: Sequence[str] | None) -> list[_Panel]:
