@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import sparse
-from scipy.ndimage import gaussian_filter, median_filter
+from scipy.ndimage import gaussian_filter, map_coordinates, median_filter
 from scipy.sparse.linalg import splu
 
 from mirrorskin.kernels.array_types import Doubles
@@ -16,6 +16,8 @@ from mirrorskin.kernels.array_types import Doubles
 _CANDIDATES = 48  # onsets that are tried for the first map
 _EVIDENCE = 8.0  # smallest log-likelihood ratio of a departure, for a node's first onset
 _ROUNDS = 20  # largest number of Gauss-Newton steps
+_WIDE = 5  # of them, in the first of which departures begin gradually
+_MANY = 1000  # nodes above which a fit of a quarter of them saves time
 _SETTLED = 1e-6  # change of an onset on the path, relative to its length, that ends them
 _NEAR = 0.01  # change below which steps reuse the equations of an earlier one
 _FARTHEST = 0.08  # largest change of an onset in a step, relative to the path
@@ -84,31 +86,73 @@ def fit_onsets(
     expected : of the motion
     locking : (2, T, rows, columns), mm, what an amplitude of a pixel along x, or y, would add to departures
     """
+    fit = _fit(departure, sigma, distance, window, radius, expected, locking)
+    length = float(distance[-1])
+    if fit is None:
+        return OnsetMap(np.full(sigma.shape, _NEVER * length), np.full(sigma.shape, length))
+    return OnsetMap(length * fit.onset, length * np.sqrt(fit.system.variances() + fit.shift**2))
+
+
+class _Fit(NamedTuple):
+    """Maps of onsets, relative to the path, and of the growth's logarithm, and the amplitude of the locking.
+
+    ``shift`` is the change of the onset for another power.
+    """
+
+    onset: Doubles
+    log_growth: Doubles
+    lock: Doubles
+    system: _Normal
+    shift: Doubles
+
+
+def _fit(
+    departure: Doubles,
+    sigma: Doubles,
+    distance: Doubles,
+    window: float,
+    radius: float,
+    expected: Expected,
+    locking: Doubles,
+) -> _Fit | None:
+    """Return what fits best; None without departure. Many nodes start from the fit of every second one."""
     power = expected.power
     known = np.isfinite(departure).all(axis=0) & np.isfinite(sigma)
     scale = np.divide(1.0, sigma, out=np.zeros(sigma.shape), where=known)
     data = _whitened(np.where(known, departure * scale, 0.0))
-    length, times = float(distance[-1]), (distance / distance[-1])[:, None, None]
+    times = (distance / distance[-1])[:, None, None]
     locks = _whitened(np.where(known, locking * scale, 0.0))
     second, third = (_bending(known.shape, order) for order in (2, 3))
     onset_stiff = third * (radius**3 / expected.onset_bend) ** 2
-    first = _first_onsets(data, scale, times, onset_stiff, power)
-    if first is None:
-        return OnsetMap(np.full(known.shape, _NEVER * length), np.full(known.shape, length))
-    onset, usual = first
     stiff = sparse.block_diag([onset_stiff, second * (radius**2 / expected.growth_bend) ** 2], format="csc")
     prior = stiff + _FLOOR * sparse.identity(stiff.shape[0], format="csc")
-    log_growth, lock = np.zeros_like(onset), np.zeros(2)
+
+    coarse, number = None, 0
+    if known.size > _MANY:
+        half = np.s_[..., ::2, ::2]
+        coarse = _fit(departure[half], sigma[half], distance, window / 2, radius / 2, expected, locking[half])
+    if coarse is not None:
+        places, lock, number = np.indices(known.shape) / 2, coarse.lock, _WIDE
+        onset, log_growth = (
+            map_coordinates(values, places, order=1, mode="nearest")
+            for values in (coarse.onset, coarse.log_growth)
+        )
+    else:
+        first = _first_onsets(data, scale, times, onset_stiff, power)
+        if first is None:
+            return None
+        onset, usual = first
+        log_growth, lock = np.full_like(onset, math.log(usual)), np.zeros(2)
     moved = np.inf
-    for number in range(_ROUNDS + 1):
+    while True:
         half = np.hypot(*np.gradient(onset)) * window / 2
         half = np.maximum(half, max(0.5, 2.0 - 0.5 * number) / len(distance))  # wider at first
-        growth = usual * np.exp(log_growth) * scale
+        growth = np.exp(log_growth) * scale
         shape, rate = (_whitened(growth * part) for part in _blurred(times - onset, half, power))
         columns = np.stack([-rate, shape])
         # Close to the answer, the equations of an earlier step lead to the same one.
-        ends = number == _ROUNDS or (number > 4 and moved < _SETTLED)
-        if ends or number <= 4 or moved > _NEAR:
+        ends = number == _ROUNDS or (number >= _WIDE and moved < _SETTLED)
+        if ends or number < _WIDE or moved > _NEAR:
             system = _Normal(columns, locks, prior)
         if ends:
             break
@@ -119,9 +163,9 @@ def fit_onsets(
         onset, log_growth, lock = onset + change, log_growth + np.clip(step[1], -0.3, 0.3), lock + more
         # Others, which no frame shows, never settle.
         moved = float(np.abs(change[known & (onset < 1.0)]).max(initial=0.0))
+        number += 1
     other = _whitened(growth * _blurred(times - onset, half, power + _POWER_SIGMA)[0])
-    shift = system.solve(columns, other - shape)[0][0]
-    return OnsetMap(length * onset, length * np.sqrt(system.variances() + shift**2))
+    return _Fit(onset, log_growth, lock, system, system.solve(columns, other - shape)[0][0])
 
 
 class _Normal:
