@@ -143,7 +143,8 @@ class _Search:
         """
         scales: tuple[float, ...] = _SCALES[3:]
         if heights is None:
-            heights, scales = self._solve(self._held, _LOOSE, math.inf).height, _SCALES
+            self.link(self._held, math.inf)
+            heights, scales = self._solve(None, _LOOSE).height, _SCALES
         for scale in scales:
             broken = math.inf
             for _ in range(_MOST):
@@ -152,7 +153,7 @@ class _Search:
                 before, broken = broken, self.link(heights, scale)
                 if broken > (1 - _REST) * before:
                     break
-                heights = self._solve(heights, _LOOSE, scale).height
+                heights = self._solve(heights, _LOOSE).height
         return heights
 
     def link(self, heights: Array, scale: float = 1.0, most: float = math.inf) -> float:
@@ -164,8 +165,8 @@ class _Search:
         self._run("links", **maps, **self._size, **numbers)
         return float(self._sums.read().sum(dtype=np.float64))
 
-    def _solve(self, heights: Array, tolerance: float, scale: float, most: float = math.inf) -> Solution:
-        self.link(heights, scale, most)
+    def _solve(self, start: Array | None, tolerance: float) -> Solution:
+        """Solve for the weights of the last `link`."""
         right, down, source = (self._maps[name] for name in ("right", "down", "source"))
         links = Links(self._links.device, self._shape, right, down, self._links.anchor, source)
         if self._solver is None:
@@ -174,14 +175,14 @@ class _Search:
             self._solver.rebuild(links)
         self._steps += 1
         self.last = links
-        start = None if scale == math.inf else heights
         limit = _CYCLES if tolerance == _LOOSE else 100
         return self._solver.solve(start, tolerance=tolerance, limit=limit, deadline=self._deadline)
 
     def conclude(self, heights: Array, flags: Flags, tolerance: float) -> Robust:
         """Cut broken links, solve the rest to the tolerance, and return the surface."""
         done = not self.late()
-        last = self._solve(heights, tolerance, 1.0, _BROKEN)
+        self.link(heights, most=_BROKEN)
+        last = self._solve(heights, tolerance)
         for _ in range(_AGAIN):  # a restart recomputes the residual, whose rounding errors stop the iteration
             if last.converged or self.late():
                 break
