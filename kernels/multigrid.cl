@@ -9,6 +9,7 @@
 // GROUP      work-items of the group that does all small levels, 1 where an item is a core's loop
 // STEPS      of Jacobi's method in half a cycle over a level with launches of its own: 3 or 4
 // NEAR_NODES nodes whose heights the group that does all small levels keeps in local memory; 0 if in global memory
+// ROUNDS     in which parts of blocks move to another aggregate; even
 // COARSEST   nodes of the coarsest level at most, which is solved by the inverse of its matrix
 // SUMS       work-items of a group that adds up one part together, 1 where an item does
 // LANES      right sides that are solved for at once, 1, 4, 8 or 16: a node's value is a vector of them; WIDTH is 1 then
@@ -122,10 +123,11 @@ typedef int ints;
 // of that neighbouring block to which their strongest link leads: `to` has 0 of a node that stays, else 1 + 3 (down + 1) +
 // (right + 1). Parts that have no link to another block's largest part stay.
 
-#define COARSE_ITEMS                                                                                       \
-    const int pieces = (stride / 2 + TILE - 1) / TILE, row = get_global_id(0) / pieces;                    \
-    const int from = get_global_id(0) % pieces * TILE, upto = LESSER(stride / 2, from + TILE);             \
-    if (row >= coarse_rows) return;                                                                        \
+// Items take pieces of rows, in turn where one group does all.
+#define PIECES ((stride / 2 + TILE - 1) / TILE)
+#define EACH_PIECE for (int piece = get_global_id(0); piece < coarse_rows * PIECES; piece += (int)get_global_size(0))
+#define OF_PIECE                                                                                           \
+    const int row = piece / PIECES, from = piece % PIECES * TILE, upto = LESSER(stride / 2, from + TILE);  \
     const int first = base + stride * (2 * row + 1), coarse_first = coarse_base + coarse_stride * (row + 1);
 #define EACH_BLOCK                                                                                         \
     for (int C = from, J = coarse_first + C, I = first + 2 * C, K = I + stride; C < upto;                  \
@@ -158,40 +160,42 @@ __kernel void multigrid_parts(
     LEVEL_ARGS, COARSE_ARGS, const float strength, GRAPH_ARGS, __global uchar *restrict parts, __global int *restrict touched,
     const int level, __global int *restrict splits)
 {
-    COARSE_ITEMS
-    EACH_BLOCK {
-        const reals ax = ALONG_X(EVEN, I), bx = ALONG_X(ODD, I), cx = ALONG_X(EVEN, K), dx = ALONG_X(ODD, K);
-        const reals ay = ALONG_Y(EVEN, I), by = ALONG_Y(ODD, I), cy = ALONG_Y(EVEN, K), dy = ALONG_Y(ODD, K);
-        const reals ab = EVEN(right + I), cd = EVEN(right + K), ac = EVEN(down + I), bd = ODD(down + I);
-        const ints is_ab = BIT(STRONG(ab, ax, bx), 15), is_cd = BIT(STRONG(cd, cx, dx), 15);
-        const ints is_ac = BIT(STRONG(ac, ay, cy), 15), is_bd = BIT(STRONG(bd, by, dy), 15);
+    EACH_PIECE {
+        OF_PIECE
+        EACH_BLOCK {
+            const reals ax = ALONG_X(EVEN, I), bx = ALONG_X(ODD, I), cx = ALONG_X(EVEN, K), dx = ALONG_X(ODD, K);
+            const reals ay = ALONG_Y(EVEN, I), by = ALONG_Y(ODD, I), cy = ALONG_Y(EVEN, K), dy = ALONG_Y(ODD, K);
+            const reals ab = EVEN(right + I), cd = EVEN(right + K), ac = EVEN(down + I), bd = ODD(down + I);
+            const ints is_ab = BIT(STRONG(ab, ax, bx), 15), is_cd = BIT(STRONG(cd, cx, dx), 15);
+            const ints is_ac = BIT(STRONG(ac, ay, cy), 15), is_bd = BIT(STRONG(bd, by, dy), 15);
 #if LINKS == 8
-        const reals ad = EVEN(falling + I), bc = ODD(rising + I);
-        const ints is_ad = BIT(STRONG(ad, GREATER(ax, ay), GREATER(dx, dy)), 15);
-        const ints is_bc = BIT(STRONG(bc, GREATER(bx, by), GREATER(cx, cy)), 15);
+            const reals ad = EVEN(falling + I), bc = ODD(rising + I);
+            const ints is_ad = BIT(STRONG(ad, GREATER(ax, ay), GREATER(dx, dy)), 15);
+            const ints is_bc = BIT(STRONG(bc, GREATER(bx, by), GREATER(cx, cy)), 15);
 #else
-        const ints is_ad = 0, is_bc = 0;
+            const ints is_ad = 0, is_bc = 0;
 #endif
-        const ints join_a = 1 | (is_ab & 2) | (is_ac & 4) | (is_ad & 8);
-        const ints join_b = 2 | (is_ab & 1) | (is_bc & 4) | (is_bd & 8);
-        const ints join_c = 4 | (is_ac & 1) | (is_bc & 2) | (is_cd & 8);
-        const ints join_d = 8 | (is_ad & 1) | (is_bd & 2) | (is_cd & 4);
-        const ints live = BIT(GREATER(ax, ay) > 0, 1) | BIT(GREATER(bx, by) > 0, 2) | BIT(GREATER(cx, cy) > 0, 4)
-            | BIT(GREATER(dx, dy) > 0, 8);
-        const ints a = JOINED_TO(join_a), b = JOINED_TO(join_b), c = JOINED_TO(join_c), d = JOINED_TO(join_d);
-        ints main = JOINED_TO(a) & live;
-        const ints with_b = JOINED_TO(b) & live, with_c = JOINED_TO(c) & live, with_d = JOINED_TO(d) & live;
-        LARGER(with_b)
-        LARGER(with_c)
-        LARGER(with_d)
-        PUT_BYTES(parts + J, main | live << 4);
+            const ints join_a = 1 | (is_ab & 2) | (is_ac & 4) | (is_ad & 8);
+            const ints join_b = 2 | (is_ab & 1) | (is_bc & 4) | (is_bd & 8);
+            const ints join_c = 4 | (is_ac & 1) | (is_bc & 2) | (is_cd & 8);
+            const ints join_d = 8 | (is_ad & 1) | (is_bd & 2) | (is_cd & 4);
+            const ints live = BIT(GREATER(ax, ay) > 0, 1) | BIT(GREATER(bx, by) > 0, 2) | BIT(GREATER(cx, cy) > 0, 4)
+                | BIT(GREATER(dx, dy) > 0, 8);
+            const ints a = JOINED_TO(join_a), b = JOINED_TO(join_b), c = JOINED_TO(join_c), d = JOINED_TO(join_d);
+            ints main = JOINED_TO(a) & live;
+            const ints with_b = JOINED_TO(b) & live, with_c = JOINED_TO(c) & live, with_d = JOINED_TO(d) & live;
+            LARGER(with_b)
+            LARGER(with_c)
+            LARGER(with_d)
+            PUT_BYTES(parts + J, main | live << 4);
+        }
+        int some = 0;
+        EACH_COARSE_NODE {
+            touched[J] = 0;
+            some |= (parts[J] >> 4) & ~parts[J];
+        }
+        if (some) atomic_or(splits + level, 1);
     }
-    int some = 0;
-    EACH_COARSE_NODE {
-        touched[J] = 0;
-        some |= (parts[J] >> 4) & ~parts[J];
-    }
-    if (some) atomic_or(splits + level, 1);
 }
 
 // Rows and columns from a node's block to the aggregate that it belongs to.
@@ -207,63 +211,66 @@ __kernel void multigrid_parts(
 // marked.
 __kernel void multigrid_move(
     LEVEL_ARGS, COARSE_ARGS, const float strength, GRAPH_ARGS, BYTES parts, const int clear, const int first_round, const int last_round,
-    BYTES to, __global uchar *restrict places, __global int *restrict touched, const int level, __global int *restrict moves)
+    BYTES to, __global uchar *restrict places, __global int *restrict touched, const int level, COUNTS splits, __global int *restrict moves)
 {
-    COARSE_ITEMS
-    for (int x = 2 * from; x < 2 * upto && clear; ++x) places[first + x] = places[first + stride + x] = 0;
-    EACH_COARSE_NODE {
-        const int I = first + 2 * C;
-        for (int rest = (parts[J] >> 4) & ~parts[J]; rest;) {
-            int part = rest & -rest, before = 0;
-            while (part != before) {  // what hangs together with it
-                before = part;
-                for (int k = 0; k < 16; ++k) {
-                    const int a = NODE(k / 4), b = NODE(k % 4), y = k % 4 / 2 - k / 8, x = k % 2 - k / 4 % 2;
-                    if (!(part >> k / 4 & 1) || !(rest >> k % 4 & 1) || k / 4 == k % 4) continue;
-                    const float w = link_of(a, stride, y, x, right, down, falling, rising, anchor);
-                    const float ax = ALONG_X(*, a), ay = ALONG_Y(*, a), bx = ALONG_X(*, b), by = ALONG_Y(*, b);
-                    const float g = y == 0 ? ax : x == 0 ? ay : GREATER(ax, ay);
-                    const float h = y == 0 ? bx : x == 0 ? by : GREATER(bx, by);
-                    if (STRONG(w, g, h)) part |= 1 << k % 4;
+    if (splits[level] == 0) return;
+    EACH_PIECE {
+        OF_PIECE
+        for (int x = 2 * from; x < 2 * upto && clear; ++x) places[first + x] = places[first + stride + x] = 0;
+        EACH_COARSE_NODE {
+            const int I = first + 2 * C;
+            for (int rest = (parts[J] >> 4) & ~parts[J]; rest;) {
+                int part = rest & -rest, before = 0;
+                while (part != before) {  // what hangs together with it
+                    before = part;
+                    for (int k = 0; k < 16; ++k) {
+                        const int a = NODE(k / 4), b = NODE(k % 4), y = k % 4 / 2 - k / 8, x = k % 2 - k / 4 % 2;
+                        if (!(part >> k / 4 & 1) || !(rest >> k % 4 & 1) || k / 4 == k % 4) continue;
+                        const float w = link_of(a, stride, y, x, right, down, falling, rising, anchor);
+                        const float ax = ALONG_X(*, a), ay = ALONG_Y(*, a), bx = ALONG_X(*, b), by = ALONG_Y(*, b);
+                        const float g = y == 0 ? ax : x == 0 ? ay : GREATER(ax, ay);
+                        const float h = y == 0 ? bx : x == 0 ? by : GREATER(bx, by);
+                        if (STRONG(w, g, h)) part |= 1 << k % 4;
+                    }
                 }
-            }
-            rest &= ~part;
-            float sums[9] = {0, 0, 0, 0, 0, 0, 0, 0, 0}, most = 0;
-            int top = -2, bottom = 2, left = -2, right_most = 2, old = 0, target = 0;  // where no link would be too long
-            for (int k = 0; k < 36; ++k) {
-                const int m = k / 9, y = k % 9 / 3 - 1, x = k % 3 - 1, v = m / 2 + y, u = m % 2 + x;
-                const int inside = v >> 1 == 0 && u >> 1 == 0;
-                if (!(part >> m & 1) || (inside && part >> (2 * v + u) & 1)) continue;
-                if (!first_round) old = to[NODE(m)];
-                const float w = link_of(NODE(m), stride, y, x, right, down, falling, rising, anchor);
-                if (w == 0) continue;
-                const int j = NODE(m) + y * stride + x, J_there = J + (v >> 1) * coarse_stride + (u >> 1);
-                const int went = first_round ? 0 : to[j];
-                const int below = (v >> 1) + (went ? (went - 1) / 3 - 1 : 0), beside = (u >> 1) + (went ? (went - 1) % 3 - 1 : 0);
-                top = GREATER(top, below - 1);
-                bottom = LESSER(bottom, below + 1);
-                left = GREATER(left, beside - 1);
-                right_most = LESSER(right_most, beside + 1);
-                const int has_place = went || parts[J_there] >> (2 * (v & 1) + (u & 1)) & 1;
-                if (!has_place || inside || below < -1 || below > 1 || beside < -1 || beside > 1) continue;
-                for (int way = 0; way < 9; ++way) sums[way] += way == 3 * below + beside + 4 ? w : 0;  // in registers
-            }
-            for (int way = 0; way < 9; ++way) {
-                const int y = way / 3 - 1, x = way % 3 - 1, is_old = way + 1 == old;
-                if (sums[way] == 0 || y < top || y > bottom || x < left || x > right_most) continue;
-                if (last_round ? is_old : is_old || sums[way] > most) {
-                    most = is_old ? INFINITY : sums[way];
-                    target = way + 1;
+                rest &= ~part;
+                float sums[9] = {0, 0, 0, 0, 0, 0, 0, 0, 0}, most = 0;
+                int top = -2, bottom = 2, left = -2, right_most = 2, old = 0, target = 0;  // where no link would be too long
+                for (int k = 0; k < 36; ++k) {
+                    const int m = k / 9, y = k % 9 / 3 - 1, x = k % 3 - 1, v = m / 2 + y, u = m % 2 + x;
+                    const int inside = v >> 1 == 0 && u >> 1 == 0;
+                    if (!(part >> m & 1) || (inside && part >> (2 * v + u) & 1)) continue;
+                    if (!first_round) old = to[NODE(m)];
+                    const float w = link_of(NODE(m), stride, y, x, right, down, falling, rising, anchor);
+                    if (w == 0) continue;
+                    const int j = NODE(m) + y * stride + x, J_there = J + (v >> 1) * coarse_stride + (u >> 1);
+                    const int went = first_round ? 0 : to[j];
+                    const int below = (v >> 1) + (went ? (went - 1) / 3 - 1 : 0), beside = (u >> 1) + (went ? (went - 1) % 3 - 1 : 0);
+                    top = GREATER(top, below - 1);
+                    bottom = LESSER(bottom, below + 1);
+                    left = GREATER(left, beside - 1);
+                    right_most = LESSER(right_most, beside + 1);
+                    const int has_place = went || parts[J_there] >> (2 * (v & 1) + (u & 1)) & 1;
+                    if (!has_place || inside || below < -1 || below > 1 || beside < -1 || beside > 1) continue;
+                    for (int way = 0; way < 9; ++way) sums[way] += way == 3 * below + beside + 4 ? w : 0;  // in registers
                 }
+                for (int way = 0; way < 9; ++way) {
+                    const int y = way / 3 - 1, x = way % 3 - 1, is_old = way + 1 == old;
+                    if (sums[way] == 0 || y < top || y > bottom || x < left || x > right_most) continue;
+                    if (last_round ? is_old : is_old || sums[way] > most) {
+                        most = is_old ? INFINITY : sums[way];
+                        target = way + 1;
+                    }
+                }
+                if (last_round && target == 5) target = 0;
+                for (int k = 0; k < 4; ++k) {
+                    if (part >> k & 1) places[NODE(k)] = target;
+                }
+                if (!last_round || !target) continue;
+                atomic_or(touched + J, 1);
+                atomic_or(touched + J + ((target - 1) / 3 - 1) * coarse_stride + (target - 1) % 3 - 1, 1);
+                atomic_inc(moves + level);
             }
-            if (last_round && target == 5) target = 0;
-            for (int k = 0; k < 4; ++k) {
-                if (part >> k & 1) places[NODE(k)] = target;
-            }
-            if (!last_round || !target) continue;
-            atomic_or(touched + J, 1);
-            atomic_or(touched + J + ((target - 1) / 3 - 1) * coarse_stride + (target - 1) % 3 - 1, 1);
-            atomic_inc(moves + level);
         }
     }
 }
@@ -287,51 +294,53 @@ __kernel void multigrid_coarsen(
     OUT coarse_down, OUT coarse_falling, OUT coarse_rising, OUT coarse_anchor, __global int *restrict changed,
     __global int *restrict changes)
 {
-    COARSE_ITEMS
-    EACH_BLOCK {
+    EACH_PIECE {
+        OF_PIECE
+        EACH_BLOCK {
 #if LINKS == 8
-        PUT(coarse_right + J) = 0.5f * ((ODD(right + I) + ODD(right + K)) + (ODD(falling + I) + EVEN(rising + I + 2)));
-        PUT(coarse_down + J) = 0.5f * ((EVEN(down + K) + ODD(down + K)) + (EVEN(falling + K) + ODD(rising + K)));
-        PUT(coarse_falling + J) = 0.5f * ODD(falling + K);
-        PUT(coarse_rising + J) = 0.5f * EVEN(rising + K);
+            PUT(coarse_right + J) = 0.5f * ((ODD(right + I) + ODD(right + K)) + (ODD(falling + I) + EVEN(rising + I + 2)));
+            PUT(coarse_down + J) = 0.5f * ((EVEN(down + K) + ODD(down + K)) + (EVEN(falling + K) + ODD(rising + K)));
+            PUT(coarse_falling + J) = 0.5f * ODD(falling + K);
+            PUT(coarse_rising + J) = 0.5f * EVEN(rising + K);
 #else
-        PUT(coarse_right + J) = 0.5f * (ODD(right + I) + ODD(right + K));
-        PUT(coarse_down + J) = 0.5f * (EVEN(down + K) + ODD(down + K));
-        PUT(coarse_falling + J) = 0;
-        PUT(coarse_rising + J) = 0;
+            PUT(coarse_right + J) = 0.5f * (ODD(right + I) + ODD(right + K));
+            PUT(coarse_down + J) = 0.5f * (EVEN(down + K) + ODD(down + K));
+            PUT(coarse_falling + J) = 0;
+            PUT(coarse_rising + J) = 0;
 #endif
 #if ANCHORED
-        PUT(coarse_anchor + J) = (EVEN(anchor + I) + ODD(anchor + I)) + (EVEN(anchor + K) + ODD(anchor + K));
+            PUT(coarse_anchor + J) = (EVEN(anchor + I) + ODD(anchor + I)) + (EVEN(anchor + K) + ODD(anchor + K));
 #endif
-    }
-    if (moves[level] == 0) return;
-    EACH_COARSE_NODE {
-        if (touched[J]) changed[coarse_base + atomic_inc(changes + level)] = J;
-        if (!IS_TOUCHED(J)) continue;
-        float to_right = 0, to_below = 0, falls = 0, rises = 0, held = 0;
-        EACH_MEMBER {
-#if ANCHORED
-            held += anchor[i];
-#endif
-            for (int way = 0; way < 9; ++way) {
-                const float w = way == 4 ? 0
-                    : link_of(i, stride, way / 3 - 1, way % 3 - 1, right, down, falling, rising, anchor);
-                if (w == 0) continue;
-                const int v = y + way / 3 - 1, u = x + way % 3 - 1, j = i + (way / 3 - 1) * stride + way % 3 - 1;
-                const int below = (v >> 1) + WENT_DOWN(j) - row, beside = (u >> 1) + WENT_RIGHT(j) - C;
-                if (below == 0 && beside == 1) to_right += w;
-                if (below == 1 && beside == -1) rises += w;
-                if (below == 1 && beside == 0) to_below += w;
-                if (below == 1 && beside == 1) falls += w;
-            }
         }
-        coarse_right[J] = 0.5f * to_right;
-        coarse_rising[J] = 0.5f * rises;
-        coarse_down[J] = 0.5f * to_below;
-        coarse_falling[J] = 0.5f * falls;
+        if (moves[level] == 0) continue;
+        EACH_COARSE_NODE {
+            if (touched[J]) changed[coarse_base + atomic_inc(changes + level)] = J;
+            if (!IS_TOUCHED(J)) continue;
+            float to_right = 0, to_below = 0, falls = 0, rises = 0, held = 0;
+            EACH_MEMBER {
 #if ANCHORED
-        coarse_anchor[J] = held;
+                held += anchor[i];
 #endif
+                for (int way = 0; way < 9; ++way) {
+                    const float w = way == 4 ? 0
+                        : link_of(i, stride, way / 3 - 1, way % 3 - 1, right, down, falling, rising, anchor);
+                    if (w == 0) continue;
+                    const int v = y + way / 3 - 1, u = x + way % 3 - 1, j = i + (way / 3 - 1) * stride + way % 3 - 1;
+                    const int below = (v >> 1) + WENT_DOWN(j) - row, beside = (u >> 1) + WENT_RIGHT(j) - C;
+                    if (below == 0 && beside == 1) to_right += w;
+                    if (below == 1 && beside == -1) rises += w;
+                    if (below == 1 && beside == 0) to_below += w;
+                    if (below == 1 && beside == 1) falls += w;
+                }
+            }
+            coarse_right[J] = 0.5f * to_right;
+            coarse_rising[J] = 0.5f * rises;
+            coarse_down[J] = 0.5f * to_below;
+            coarse_falling[J] = 0.5f * falls;
+#if ANCHORED
+            coarse_anchor[J] = held;
+#endif
+        }
     }
 }
 
@@ -343,6 +352,50 @@ __kernel void multigrid_invert(LEVEL_ARGS, GRAPH_ARGS, OUT inverse)
         SIDES
         const reals diagonal = SUM_OF_SIDES;
         PUT(inverse + i) = INVERSE(diagonal);
+    }
+}
+
+// All levels from `from` on, by one group, and one over their diagonals: of blocks alone if `plain` is 1.
+typedef struct {
+    int base, rows, stride;
+} Level;
+
+#define EACH_OF_LEVEL                                                                                      \
+    for (int i = base + stride + (int)get_local_id(0) * WIDTH; i < base + stride * (rows + 1);             \
+         i += (int)get_local_size(0) * WIDTH)
+#define OF_LEVEL(l) const int base = levels[l].base, rows = levels[l].rows, stride = levels[l].stride;
+#define OF_COARSE(l) const int coarse_base = levels[l].base, coarse_rows = levels[l].rows, coarse_stride = levels[l].stride;
+#define FENCE barrier(CLK_GLOBAL_MEM_FENCE | CLK_LOCAL_MEM_FENCE);
+#define BETWEEN base, rows, stride, coarse_base, coarse_rows, coarse_stride
+__kernel GROUP_SIZE void multigrid_build(
+    const int from, const int last, __global const Level *restrict levels, const int plain, const float strength,
+    __global float *right, __global float *down, __global float *falling, __global float *rising, __global float *anchor,
+    OUT inverse, __global uchar *parts, __global uchar *wanted, __global uchar *to, __global int *touched, __global int *splits,
+    __global int *moves, __global int *changed, __global int *changes)
+{
+    for (int l = from; l <= last; ++l) {
+        OF_LEVEL(l)
+        EACH_OF_LEVEL {
+            SIDES
+            const reals diagonal = SUM_OF_SIDES;
+            PUT(inverse + i) = INVERSE(diagonal);
+        }
+        if (l == last) break;
+        OF_COARSE(l + 1)
+        if (!plain) {
+            multigrid_parts(BETWEEN, strength, right, down, falling, rising, anchor, parts, touched, l, splits);
+            FENCE
+            for (int turn = 0; turn < ROUNDS; ++turn) {
+                multigrid_move(
+                    BETWEEN, strength, right, down, falling, rising, anchor, parts, turn < 2, turn == 0, turn == ROUNDS - 1,
+                    turn % 2 ? wanted : to, turn % 2 ? to : wanted, touched, l, splits, moves);
+                FENCE
+            }
+        }
+        multigrid_coarsen(
+            BETWEEN, right, down, falling, rising, anchor, to, touched, l, moves, right, down, falling, rising, anchor, changed,
+            changes);
+        FENCE
     }
 }
 
@@ -583,10 +636,6 @@ __kernel void multigrid_ascend(
 
 // A cycle over all levels from `from` on, too small for launches of their own, by one group: the answer to b goes to x. Coarser
 // levels are gone through twice, and the first one if `twice` is 1. The inverse of the last one's matrix is given.
-typedef struct {
-    int base, rows, stride, moved;
-} Level;
-
 #if NEAR_NODES > 0  // WIDTH is 1, and pointers to local memory are read as any
 INJECTED(injected_near, __local)
 GATHERED(gathered_near, __local)
@@ -606,12 +655,6 @@ GATHERED(gathered_near, __local)
 #endif
 #define X(i) (x_room + (i) - origin)
 #define T(i) (t_room + (i) - origin)
-#define EACH_OF_LEVEL                                                                                      \
-    for (int i = base + stride + (int)get_local_id(0) * WIDTH; i < base + stride * (rows + 1);             \
-         i += (int)get_local_size(0) * WIDTH)
-#define OF_LEVEL(l) const int base = levels[l].base, rows = levels[l].rows, stride = levels[l].stride, moved = levels[l].moved;
-#define OF_COARSE(l) const int coarse_base = levels[l].base, coarse_rows = levels[l].rows, coarse_stride = levels[l].stride;
-#define FENCE barrier(CLK_GLOBAL_MEM_FENCE | CLK_LOCAL_MEM_FENCE);
 #define SMOOTH(omega, FROM, TO)                                                                            \
     EACH_OF_LEVEL {                                                                                        \
         SIDES                                                                                              \
@@ -620,7 +663,7 @@ GATHERED(gathered_near, __local)
     FENCE
 __kernel GROUP_SIZE void multigrid_tail(
     const int from, const int last, __global const Level *restrict levels, GRAPH_ARGS, MAP inverse, MAP matrix,
-    BYTES to, COUNTS changed, const int twice, __global value *b, __global value *x, __global value *t)
+    BYTES to, COUNTS changed, COUNTS changes, const int twice, __global value *b, __global value *x, __global value *t)
 {
     ROOMS
     int l = from, start = 0, gone = 0;  // a bit for each level
@@ -628,6 +671,7 @@ __kernel GROUP_SIZE void multigrid_tail(
         for (; l < last; ++l, start = 0) {
             OF_LEVEL(l)
             OF_COARSE(l + 1)
+            const int moved = changes[l];
             if (start) {
                 SMOOTH(FIRST, X, T)
             } else {
@@ -669,7 +713,7 @@ __kernel GROUP_SIZE void multigrid_tail(
             OF_COARSE(l + 1)
             EACH_OF_LEVEL {
                 const int n = i - base - stride, J = coarse_base + coarse_stride * (n / stride / 2 + 1) + n % stride / 2;
-                PUT(T(i)) = AT(T(i)) + INJECTED_AT(i, J - origin, coarse_stride, x_room, moved, to);
+                PUT(T(i)) = AT(T(i)) + INJECTED_AT(i, J - origin, coarse_stride, x_room, changes[l], to);
             }
             FENCE
             SMOOTH(THIRD, T, X)

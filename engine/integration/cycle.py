@@ -58,9 +58,6 @@ class Cycle:
 
     def prepare(self) -> None:
         """Prepare for the current graph of the hierarchy."""
-        h = self._h
-        table = [[*one.place.values(), moves] for one, moves in zip(h.levels, h.moves, strict=True)]
-        self._table = h.device.given("levels", np.array(table), np.int32)
         self._factors: Callable[[Doubles], Doubles] | None = None
         self.find_tiles()
 
@@ -151,11 +148,12 @@ class Cycle:
         h = self._h
         last = len(h.levels) - 1
         kernel, moved = self._kernel("tail", h.levels[last]), 200 * h.levels[self._tail].nodes
-        arguments: dict[str, Any] = {"levels": self._table, **h.graph, "inverse": h.inverse}
+        arguments: dict[str, Any] = {"levels": h.table, **h.graph, "inverse": h.inverse}
         arguments |= {
             "matrix": h.matrix,
             "to": h.to,
             "changed": h.changed,
+            "changes": h.changes,
             "b": self.b,
             "x": self.x,
             "t": self.spare,

@@ -12,7 +12,7 @@ from mirrorskin.engine.integration.graph import Links
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, Kernel
-from mirrorskin.kernels.multigrid import COARSEST
+from mirrorskin.kernels.multigrid import COARSEST, ROUNDS
 
 Ints = NDArray[np.int64]
 
@@ -22,7 +22,6 @@ STRENGTH = 0.25
 LANES = 16, 8, 4
 """Numbers of right sides that are solved at once, if there are several."""
 
-_ROUNDS = 4  # rounds in which parts of blocks move to another aggregate; an even number
 _VECTOR = 16  # the length of a row is a multiple of it: two of a kernel's vectors
 _BEFORE = _VECTOR  # nodes before the first level, which vectors left of its margin read
 _WIDE_TILE_MEMORY = 45056  # bytes of local memory needed; OpenCL guarantees only 32768
@@ -83,18 +82,21 @@ class Hierarchy:
     ``graph`` has the nodes' links, and the weights of known heights as ``anchor`` (see
     ``kernels/multigrid.cl``); ``inverse`` is the inverse of the diagonal. ``to`` marks nodes that belong to
     the aggregate of another block. ``moves`` counts, for each level, the aggregates that differ from blocks
-    for this reason, and ``changed`` lists them.
+    for this reason, and ``changed`` lists them; ``changes`` are the same numbers on the device.
     """
 
     device: Device
     anchored: bool
     to: Array
     changed: Array
+    changes: Array
 
     def __init__(self, shape: tuple[int, int], anchored: bool, device: Device) -> None:
         self.device, self.anchored = device, anchored
         self.levels: list[Level] = cut_levels(shape)
         self.nodes: int = self.levels[-1].end + _BEYOND
+        places = [[*level.place.values()] for level in self.levels]
+        self.table: Array = device.given("levels", np.array(places), np.int32)
         self.graph: dict[str, Any] = {
             name: self.array(name) for name in ("right", "down", "falling", "rising")
         }
@@ -106,7 +108,7 @@ class Hierarchy:
         )
         self._touched, self.changed = (self.array(name, dtype=np.int32) for name in ("touched", "changed"))
         self.moves: NDArray[np.int32] = np.zeros(len(self.levels), np.int32)
-        self._splits, self._counts, self._changes = (
+        self._splits, self._counts, self.changes = (
             self.array(name, len(self.levels), dtype=np.int32) for name in ("splits", "moves", "changes")
         )
 
@@ -125,22 +127,23 @@ class Hierarchy:
         weights of both nodes along the same axis.
         """
         self._admit_graph(links)
-        for numbers in (self._splits, self._counts, self._changes):
+        for numbers in (self._splits, self._counts, self.changes):
             numbers.fill()
         arguments: dict[str, Any] = {"strength": strength, **self.graph}
-        arguments |= {"parts": self._parts, "touched": self._touched}
-        for number in range(len(self.levels) - 1):
+        arguments |= {"parts": self._parts, "touched": self._touched, "splits": self._splits}
+        tail = self.first_of_tail(1)
+        for number in range(tail):
             if not plain:
-                self.between("parts", number, **arguments, level=number, splits=self._splits)
-                splits = self._splits.read(number)
-                for turn in range(_ROUNDS if splits else 0):
-                    old, new = (self._wanted, self.to)[:: 1 if turn % 2 else -1]
-                    ends = {"clear": turn < 2, "first_round": turn == 0, "last_round": turn == _ROUNDS - 1}
-                    counts: dict[str, Any] = {"level": number, "moves": self._counts}
-                    self.between("move", number, **arguments, **ends, to=old, places=new, **counts)
+                self.between("parts", number, **arguments, level=number)
+            for turn in range(0 if plain else ROUNDS):
+                old, new = (self._wanted, self.to)[:: 1 if turn % 2 else -1]
+                ends = {"clear": turn < 2, "first_round": turn == 0, "last_round": turn == ROUNDS - 1}
+                counts: dict[str, Any] = {"level": number, "moves": self._counts}
+                self.between("move", number, **arguments, **ends, to=old, places=new, **counts)
             self._coarsen(number)
-        self.moves[...] = self._changes.read()
-        for level in self.levels:
+        self._build_tail(tail, plain=plain, strength=strength)
+        self.moves[...] = 0 if plain else self.changes.read()
+        for level in self.levels[:tail]:
             self.over("invert", level, **self.graph, inverse=self.inverse)
         self._invert_coarsest()
 
@@ -150,11 +153,15 @@ class Hierarchy:
         Unless ``deep``, only the finest level is updated.
         """
         self._admit_graph(links)
-        for number, level in enumerate(self.levels if deep else self.levels[:1]):
+        tail = self.first_of_tail(1)
+        for number, level in enumerate(self.levels[: tail if deep else 1]):
             if number:
                 self._coarsen(number - 1)
             self.over("invert", level, **self.graph, inverse=self.inverse)
         if deep:
+            if tail:
+                self._coarsen(tail - 1)
+            self._build_tail(tail, plain=True)
             self._invert_coarsest()
 
     def equations(self, number: int) -> tuple[Ints, Ints, Ints, Doubles, Doubles]:
@@ -185,7 +192,12 @@ class Hierarchy:
         macros = {"ANCHORED": int(self.anchored), "LINKS": links, "PART": part_of(self.device)}
         macros |= {"ROWS": tile_rows(self.device, lanes), "COLUMNS": tile_columns(self.device, lanes)}
         macros |= {"WIDTH": width, "LANES": lanes}
-        macros |= {"GROUP": tail_group(self.device), "SUMS": sum_group(self.device), "COARSEST": COARSEST}
+        macros |= {
+            "GROUP": tail_group(self.device),
+            "SUMS": sum_group(self.device),
+            "COARSEST": COARSEST,
+            "ROUNDS": ROUNDS,
+        }
         macros |= {
             "NEAR_NODES": near_nodes(self.device, lanes),
             "STEPS": 3 + (once and near_nodes(self.device, 1) > 0),
@@ -251,8 +263,16 @@ class Hierarchy:
     def _coarsen(self, number: int) -> None:
         coarse = {f"coarse_{name}": array for name, array in self.graph.items()}
         moves = {"to": self.to, "touched": self._touched, "level": number, "moves": self._counts}
-        moves |= {"changed": self.changed, "changes": self._changes}
+        moves |= {"changed": self.changed, "changes": self.changes}
         self.between("coarsen", number, **self.graph, **moves, **coarse)
+
+    def _build_tail(self, tail: int, *, plain: bool, strength: float = STRENGTH) -> None:
+        """Build the levels after that of a number, in one work-group."""
+        arguments: dict[str, Any] = {"from": tail, "last": len(self.levels) - 1, "levels": self.table}
+        arguments |= {"plain": plain, "strength": strength, **self.graph, "inverse": self.inverse}
+        arguments |= {"parts": self._parts, "wanted": self._wanted, "to": self.to, "touched": self._touched}
+        arguments |= {"splits": self._splits, "moves": self._counts}
+        self.alone("build", 8, **arguments, changed=self.changed, changes=self.changes)
 
     def _invert_coarsest(self) -> None:
         last = self.levels[-1]
