@@ -105,7 +105,8 @@ from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.hw.stage import Position
 
 axes = {name: structs.replace(axis, zero=0.0) for name, axis in stage_settings().axes.items()}
-stage = GrblStage(stage_settings(port=sys.argv[1], **axes))
+# A controller on a busy machine may be late, which is no fault here.
+stage = GrblStage(stage_settings(port=sys.argv[1], timeout=60.0, silence=60.0, **axes))
 stage.move(Position(-4.5), 0.1)
 stage.wait()
 """
