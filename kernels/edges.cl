@@ -239,7 +239,8 @@ __kernel void edges_thin(
             if (at(strength, rows, columns, row + down, column + right) > here) here = 0;
             if (at(strength, rows, columns, row - down, column - right) >= here) here = 0;
         }
-        if (here > 0 && (FIRST || !guarded(edges, rows, columns, row, column, cosine, sine))) added[p] = 1;
+        if (!(here > 0)) continue;
+        if (FIRST || !guarded(edges, rows, columns, row, column, cosine, sine)) added[p] = 1;
     }
 }
 #endif
