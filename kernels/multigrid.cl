@@ -70,6 +70,8 @@ typedef int ints;
 #define LEVEL_ARGS const int base, const int rows, const int stride
 #define COARSE_ARGS const int coarse_base, const int coarse_rows, const int coarse_stride
 #define GRAPH_ARGS MAP right, MAP down, MAP falling, MAP rising, MAP anchor
+#define GRAPH right, down, falling, rising, anchor
+#define BETWEEN base, rows, stride, coarse_base, coarse_rows, coarse_stride
 
 // Nodes from `begin` to `end`, which an item takes of a level.
 #define ITEMS_NODES                                                                                        \
@@ -156,9 +158,10 @@ float link_of(const int i, const int stride, const int down_by, const int right_
 #define LARGER(part) main = SIZE(part) > SIZE(main) ? part : main;
 
 // Of each block's nodes a, b and below them c, d, by bits: the largest part, and, 4 bits on, those that have links.
-__kernel void multigrid_parts(
-    LEVEL_ARGS, COARSE_ARGS, const float strength, GRAPH_ARGS, __global uchar *restrict parts, __global int *restrict touched,
-    const int level, __global int *restrict splits)
+#define PARTS_ARGS                                                                                         \
+    LEVEL_ARGS, COARSE_ARGS, const float strength, GRAPH_ARGS, __global uchar *restrict parts,             \
+    __global int *restrict touched, const int level, __global int *restrict splits
+void find_parts(PARTS_ARGS)
 {
     EACH_PIECE {
         OF_PIECE
@@ -197,6 +200,7 @@ __kernel void multigrid_parts(
         if (some) atomic_or(splits + level, 1);
     }
 }
+__kernel void multigrid_parts(PARTS_ARGS) { find_parts(BETWEEN, strength, GRAPH, parts, touched, level, splits); }
 
 // Rows and columns from a node's block to the aggregate that it belongs to.
 #define WENT_DOWN(i) (to[i] ? (to[i] - 1) / 3 - 1 : 0)
@@ -209,9 +213,11 @@ __kernel void multigrid_parts(
 // block to which its links to nodes with a place lead, unless another of its links would then lead further than to the next
 // aggregate. In the last round, parts of which that has become true stay with their block, and aggregates that are no blocks are
 // marked.
-__kernel void multigrid_move(
-    LEVEL_ARGS, COARSE_ARGS, const float strength, GRAPH_ARGS, BYTES parts, const int clear, const int first_round, const int last_round,
-    BYTES to, __global uchar *restrict places, __global int *restrict touched, const int level, COUNTS splits, __global int *restrict moves)
+#define MOVE_ARGS                                                                                          \
+    LEVEL_ARGS, COARSE_ARGS, const float strength, GRAPH_ARGS, BYTES parts, const int clear,               \
+    const int first_round, const int last_round, BYTES to, __global uchar *restrict places,                \
+    __global int *restrict touched, const int level, COUNTS splits, __global int *restrict moves
+void move_parts(MOVE_ARGS)
 {
     if (splits[level] == 0) return;
     EACH_PIECE {
@@ -274,6 +280,10 @@ __kernel void multigrid_move(
         }
     }
 }
+__kernel void multigrid_move(MOVE_ARGS)
+{
+    move_parts(BETWEEN, strength, GRAPH, parts, clear, first_round, last_round, to, places, touched, level, splits, moves);
+}
 
 // Fine nodes i of the aggregate J, whose block is at a row and a column C of the coarse level; from all blocks around.
 #define BELONGS(i, y, x)                                                                                   \
@@ -289,10 +299,11 @@ __kernel void multigrid_move(
 
 // The coarse links and anchors, and a list of the aggregates that are no blocks. A coarse link has half the weight of those that it stands for, since the way between the
 // middles of aggregates is twice as long; links further than to the next aggregate are left out.
-__kernel void multigrid_coarsen(
-    LEVEL_ARGS, COARSE_ARGS, GRAPH_ARGS, BYTES to, COUNTS touched, const int level, COUNTS moves, OUT coarse_right,
-    OUT coarse_down, OUT coarse_falling, OUT coarse_rising, OUT coarse_anchor, __global int *restrict changed,
-    __global int *restrict changes)
+#define COARSEN_ARGS                                                                                       \
+    LEVEL_ARGS, COARSE_ARGS, GRAPH_ARGS, BYTES to, COUNTS touched, const int level, COUNTS moves,          \
+    OUT coarse_right, OUT coarse_down, OUT coarse_falling, OUT coarse_rising, OUT coarse_anchor,           \
+    __global int *restrict changed, __global int *restrict changes
+void coarsen(COARSEN_ARGS)
 {
     EACH_PIECE {
         OF_PIECE
@@ -343,6 +354,11 @@ __kernel void multigrid_coarsen(
         }
     }
 }
+#define COARSE_GRAPH coarse_right, coarse_down, coarse_falling, coarse_rising, coarse_anchor
+__kernel void multigrid_coarsen(COARSEN_ARGS)
+{
+    coarsen(BETWEEN, GRAPH, to, touched, level, moves, COARSE_GRAPH, changed, changes);
+}
 
 // One over the diagonal.
 __kernel void multigrid_invert(LEVEL_ARGS, GRAPH_ARGS, OUT inverse)
@@ -355,6 +371,8 @@ __kernel void multigrid_invert(LEVEL_ARGS, GRAPH_ARGS, OUT inverse)
     }
 }
 
+// A kernel that is called by another is not portable: what both do is in functions.
+//
 // All levels from `from` on, by one group, and one over their diagonals: of blocks alone if `plain` is 1.
 typedef struct {
     int base, rows, stride;
@@ -366,7 +384,6 @@ typedef struct {
 #define OF_LEVEL(l) const int base = levels[l].base, rows = levels[l].rows, stride = levels[l].stride;
 #define OF_COARSE(l) const int coarse_base = levels[l].base, coarse_rows = levels[l].rows, coarse_stride = levels[l].stride;
 #define FENCE barrier(CLK_GLOBAL_MEM_FENCE | CLK_LOCAL_MEM_FENCE);
-#define BETWEEN base, rows, stride, coarse_base, coarse_rows, coarse_stride
 __kernel GROUP_SIZE void multigrid_build(
     const int from, const int last, __global const Level *restrict levels, const int plain, const float strength,
     __global float *right, __global float *down, __global float *falling, __global float *rising, __global float *anchor,
@@ -383,18 +400,16 @@ __kernel GROUP_SIZE void multigrid_build(
         if (l == last) break;
         OF_COARSE(l + 1)
         if (!plain) {
-            multigrid_parts(BETWEEN, strength, right, down, falling, rising, anchor, parts, touched, l, splits);
+            find_parts(BETWEEN, strength, GRAPH, parts, touched, l, splits);
             FENCE
             for (int turn = 0; turn < ROUNDS; ++turn) {
-                multigrid_move(
-                    BETWEEN, strength, right, down, falling, rising, anchor, parts, turn < 2, turn == 0, turn == ROUNDS - 1,
-                    turn % 2 ? wanted : to, turn % 2 ? to : wanted, touched, l, splits, moves);
+                __global uchar *old = turn % 2 ? wanted : to, *new = turn % 2 ? to : wanted;
+                const int first = turn == 0, last_round = turn == ROUNDS - 1;
+                move_parts(BETWEEN, strength, GRAPH, parts, turn < 2, first, last_round, old, new, touched, l, splits, moves);
                 FENCE
             }
         }
-        multigrid_coarsen(
-            BETWEEN, right, down, falling, rising, anchor, to, touched, l, moves, right, down, falling, rising, anchor, changed,
-            changes);
+        coarsen(BETWEEN, GRAPH, to, touched, l, moves, GRAPH, changed, changes);
         FENCE
     }
 }
