@@ -11,6 +11,8 @@
 #define CLOSE 1e-4f
 #define FLAKES 512
 
+#define FLOOR(x) ((int)(x) - ((x) < (int)(x)))
+
 // Of a map, bilinear.
 #define BETWEEN(at) ((1 - down) * ((1 - right) * (at)[upper + west] + right * (at)[upper + east]) \
     + down * ((1 - right) * (at)[lower + west] + right * (at)[lower + east]))
@@ -28,11 +30,12 @@ float2 dragged(const float x, const float y, const int row, const int column, co
     const float across = at_x / along_x + 0.5f * (grid_columns - 1) - column;
     const float along = 0.5f * (grid_rows - 1) - at_y / along_y - row;
 #else
-    const float across = (x + place.x) / along_x + 0.5f * (grid_columns - columns);
-    const float along = 0.5f * (grid_rows - rows) - (y + place.y) / along_y;
+    const float per_x = 1 / along_x, per_y = 1 / along_y;
+    const float across = (x + place.x) * per_x + 0.5f * (grid_columns - columns);
+    const float along = 0.5f * (grid_rows - rows) - (y + place.y) * per_y;
 #endif
-    const float whole_x = floor(across), whole_y = floor(along);
-    int west = column + (int)whole_x, north = row + (int)whole_y;
+    const int whole_x = FLOOR(across), whole_y = FLOOR(along);
+    int west = column + whole_x, north = row + whole_y;
     float right = across - whole_x, down = along - whole_y;
     right = west < 0 ? 0 : west < grid_columns - 1 ? right : 1;
     down = north < 0 ? 0 : north < grid_rows - 1 ? down : 1;
@@ -113,8 +116,8 @@ __kernel void skin_flakes(
         const float2 drag = dragged(
             x, y, row, column, rows, columns, grid_rows, grid_columns, along_x, along_y, place, shift);
         const float across = part_x[column] + (x - drag.x) / spacing, along = part_y[row] + (y - drag.y) / spacing;
-        const float whole_x = floor(across), whole_y = floor(along);
-        const int west = cell_x[column] + (int)whole_x - 1, south = cell_y[row] + (int)whole_y - 1;
+        const int whole_x = FLOOR(across), whole_y = FLOOR(along);
+        const int west = cell_x[column] + whole_x - 1, south = cell_y[row] + whole_y - 1;
         float w_x[4], w_y[4], sum = 0;
         CUBIC(w_x, across - whole_x)
         CUBIC(w_y, along - whole_y)
