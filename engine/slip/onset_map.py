@@ -6,9 +6,10 @@ import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy import sparse
-from scipy.ndimage import gaussian_filter, map_coordinates, median_filter
 from scipy.sparse.linalg import splu
 
 from mirrorskin.kernels.array_types import Doubles
@@ -132,11 +133,8 @@ def _fit(
         half = np.s_[..., ::2, ::2]
         coarse = _fit(departure[half], sigma[half], distance, window / 2, radius / 2, expected, locking[half])
     if coarse is not None:
-        places, lock, number = np.indices(known.shape) / 2, coarse.lock, _WIDE
-        onset, log_growth = (
-            map_coordinates(values, places, order=1, mode="nearest")
-            for values in (coarse.onset, coarse.log_growth)
-        )
+        onset, log_growth = (_finer(values, known.shape) for values in (coarse.onset, coarse.log_growth))
+        lock, number = coarse.lock, _WIDE
     else:
         first = _first_onsets(data, scale, times, onset_stiff, power)
         if first is None:
@@ -166,6 +164,14 @@ def _fit(
         number += 1
     other = _whitened(growth * _blurred(times - onset, half, power + _POWER_SIGMA)[0])
     return _Fit(onset, log_growth, lock, system, system.solve(columns, other - shape)[0][0])
+
+
+def _finer(values: Doubles, shape: tuple[int, ...]) -> Doubles:
+    """Return values at all nodes, by linear interpolation, of those at every second one."""
+    for axis, size in enumerate(shape):
+        node, last = np.arange(size), values.shape[axis] - 1
+        values = (values.take(node // 2, axis) + values.take(np.minimum((node + 1) // 2, last), axis)) / 2
+    return values
 
 
 class _Normal:
@@ -236,7 +242,7 @@ def _first_onsets(
         shape = _whitened(np.maximum(times - trial, 0.0) ** power * scale)
         products, squares = np.sum(shape * data, axis=0), np.sum(shape**2, axis=0)
         gain = np.maximum(products, 0.0) ** 2 / (2 * np.maximum(squares, np.finfo(float).tiny))
-        gain = gaussian_filter(gain, 1.0)
+        gain = cv2.GaussianBlur(gain, (9, 9), 1.0, borderType=cv2.BORDER_REFLECT)
         onset, best = np.where(gain > best, trial, onset), np.maximum(gain, best)
     evident = best > _EVIDENCE
     if not evident.any():
@@ -271,4 +277,5 @@ def _variances(system: Any, shape: tuple[int, int]) -> Doubles:
             right[0][here] = signs[here]
             answer = system.solve(right.ravel()).reshape(2, *shape)[0]
             diagonal[here] = (answer * signs)[here]
-    return np.maximum(np.asarray(median_filter(diagonal, 3), np.float64), 0.0)  # less noise of the probing
+    around = sliding_window_view(np.pad(diagonal, 1, mode="edge"), (3, 3))
+    return np.maximum(np.median(around, axis=(2, 3)), 0.0)  # less noise of the probing

@@ -10,7 +10,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
@@ -337,6 +336,8 @@ class _Level:
         """Return a field of another level's nodes at those of this one, with pixels larger by a scale."""
         if level is self:
             return field
+        from scipy.ndimage import map_coordinates
+
         places = [(self.start + self.step * np.arange(n)) * scale for n in self.grid]
         rows, columns = ((place - level.start) / level.step for place in places)
         where = np.meshgrid(rows, columns, indexing="ij")
