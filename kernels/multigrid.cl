@@ -649,8 +649,8 @@ __kernel void multigrid_ascend(
     }
 }
 
-// A cycle over all levels from `from` on, too small for launches of their own, by one group: the answer to b goes to x. Coarser
-// levels are gone through twice, and the first one if `twice` is 1. The inverse of the last one's matrix is given.
+// A cycle over all levels from `from` on, too small for launches of their own, by one group: the answer to b, after what
+// `multigrid_gather` does to it, goes to x. Coarser levels are gone through twice, and the first one if `twice` is 1. The inverse of the last one's matrix is given.
 #if NEAR_NODES > 0  // WIDTH is 1, and pointers to local memory are read as any
 INJECTED(injected_near, __local)
 GATHERED(gathered_near, __local)
@@ -678,9 +678,19 @@ GATHERED(gathered_near, __local)
     FENCE
 __kernel GROUP_SIZE void multigrid_tail(
     const int from, const int last, __global const Level *restrict levels, GRAPH_ARGS, MAP inverse, MAP matrix,
-    BYTES to, COUNTS changed, COUNTS changes, const int twice, __global value *b, __global value *x, __global value *t)
+    BYTES to, COUNTS changed, COUNTS changes, const int twice, VALUES residual, __global value *b,
+    __global value *x, __global value *t)
 {
     ROOMS
+    if (from > 0) {
+        OF_LEVEL(from - 1)
+        OF_COARSE(from)
+        for (int n = get_local_id(0); n < changes[from - 1]; n += (int)get_local_size(0)) {
+            const int J = changed[coarse_base + n];
+            b[J] = gathered(J, base, stride, coarse_base, coarse_rows, coarse_stride, to, residual, 0);
+        }
+    }
+    FENCE
     int l = from, start = 0, gone = 0;  // a bit for each level
     do {
         for (; l < last; ++l, start = 0) {
@@ -862,7 +872,26 @@ __kernel void multigrid_take(LEVEL_ARGS, const int cycle, const int step, VALUES
     }
 }
 
-#if LANES == 1  // a live step has one right side
+// Pieces of the rows of a map without margins.
+#define PICTURE_ITEMS                                                                                      \
+    const int pieces = (columns + TILE - 1) / TILE, row = get_global_id(0) / pieces;                       \
+    const int from = get_global_id(0) % pieces * TILE, upto = LESSER(columns, from + TILE);                \
+    if (row >= rows) return;
+
+#if LANES == 1
+// A last step, and the map of the heights.
+__kernel void multigrid_finish(
+    LEVEL_ARGS, const int columns, const int cycle, const int step, VALUES history, VALUES direction, OUT level, OUT map)
+{
+    PICTURE_ITEMS
+    for (int c = from; c < upto; ++c) {
+        const int i = base + (row + 1) * stride + c;
+        const float before = step == 1 ? 0 : level[i];
+        map[row * columns + c] = level[i] = before + (step && HISTORY(cycle, 1) != 0 ? HISTORY(cycle, 1) * direction[i] : 0);
+    }
+}
+
+// A live step has one right side.
 // Of what a cycle makes of b, z, and of the last step, p, the products with the matrix times them, and of b and p: z A z,
 // z A p, p A p and b p.
 #define STEP(i) AT(p + (i))
@@ -934,10 +963,6 @@ __kernel SUM_GROUP void multigrid_weigh(LEVEL_ARGS, MAP anchor, VALUES x, OUT_VA
 }
 
 // Maps of pixels without margins, to and from the finest level.
-#define PICTURE_ITEMS                                                                                      \
-    const int pieces = (columns + TILE - 1) / TILE, row = get_global_id(0) / pieces;                       \
-    const int from = get_global_id(0) % pieces * TILE, upto = LESSER(columns, from + TILE);                \
-    if (row >= rows) return;
 #if LANES == 1
 __kernel void multigrid_admit(LEVEL_ARGS, const int columns, MAP map, OUT level)
 {

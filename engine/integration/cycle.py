@@ -136,7 +136,8 @@ class Cycle:
             residual=self._rest,
             coarse_b=self.b,
         )
-        h.gather(number, self._rest, self.b, self._lanes)
+        if number + 1 != self._tail or self._factors is not None:  # the tail does it itself
+            h.gather(number, self._rest, self.b, self._lanes)
         twice = self._first_w_level <= number + 1 < self._tail
         for second in (False, True)[: 1 + twice]:
             self._go(number + 1, again=second)
@@ -159,6 +160,7 @@ class Cycle:
             "t": self.spare,
         }
         arguments |= {"from": self._tail, "last": last, "twice": self._tail >= self._first_w_level}
+        arguments["residual"] = self._rest
         kernel(kernel.group, **arguments, moved=moved)
 
     def product(self) -> Doubles:

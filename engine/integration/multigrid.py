@@ -87,7 +87,7 @@ class Multigrid:
         solver = self._alone
         solver.begin(self._links.source, start)
         iterations, residual = solver.solve(tolerance, limit, deadline)
-        solver.copy("release", solver.x, self._height)
+        solver.finish(self._height)
         return _solution(self._height, iterations, residual, tolerance)
 
     def solve_many(
@@ -100,7 +100,7 @@ class Multigrid:
         for batch, solver in self._batches(sides):
             solver.begin(sources, None, batch)
             count, residuals = solver.solve(tolerance, _LONGEST, deadline)
-            solver.copy("release", solver.x, height, batch)
+            solver.finish(height, batch)
             iterations, residual[batch] = max(iterations, count), residuals[: batch.stop - batch.start]
         return _solution(height, iterations, residual, tolerance)
 
@@ -241,12 +241,23 @@ class _Gradients:
         assert self._given is not None
         left = 0 if np.isnan(self._given).any() else _CYCLES if tolerance is None else count - done
         if (residual > enough).any() and left > 0 and not late and self.cycle.factorise():
+            self._take()
             self.copy("admit", self.source, self._sources, self._batch)
             self.find_residual()
             self._dot(self.cycle.b, self.cycle.b, self._squares)
             more, residual = self._iterate(goal, left, deadline)
             done += more
         return done, residual
+
+    def finish(self, map_: Array, batch: slice = slice(0, 1)) -> None:
+        """Add the last step to the heights, and copy them to a batch of maps."""
+        if self.lanes > 1 or self._taken is None:
+            self._take()
+            self.copy("release", self.x, map_, batch)
+            return
+        numbers = {"cycle": self._taken, "step": self._use_step()}
+        arrays: dict[str, Any] = {"history": self._history, "direction": self.before}
+        self._h.copy_picture("finish", self.x, map_, **numbers, **arrays)
 
     def find_residual(self) -> None:
         """Compute the residual, which is the right side of a cycle."""
@@ -306,7 +317,6 @@ class _Gradients:
             now = time.perf_counter()
             if deadline is not None and now + (now - begun) > deadline:
                 break
-        self._take()
         return done, residual
 
     def _step(self, number: int) -> None:

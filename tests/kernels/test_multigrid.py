@@ -182,6 +182,11 @@ def test_steps_of_conjugate_gradients_and_sums(cases, graph):
     for number, expected in ((2, x + 7 / 20 * p), (1, 7 / 20 * p)):
         case.h.over("take", case.h.levels[0], step=number, **step, x=x_given)
         close(case.get(x_given), expected)
+    for number, expected in ((0, 7 / 20 * p), (2, 14 / 20 * p), (1, 7 / 20 * p)):
+        whole = case.map(np.zeros(SHAPE))
+        case.h.copy_picture("finish", x_given, whole, **{**step, "step": number})
+        close(case.get(x_given), expected)
+        close(whole.read(), expected)
 
 
 @pytest.mark.parametrize(
