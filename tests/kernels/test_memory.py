@@ -3,6 +3,8 @@
 import threading
 
 import numpy as np
+import pyopencl as cl
+import pytest
 
 from mirrorskin import engine
 from mirrorskin.kernels import memory
@@ -50,3 +52,21 @@ def test_threads_do_not_get_each_others_memory():
     for thread in threads:
         thread.join()
     assert not wrong
+
+
+@pytest.mark.parametrize("writeable", [True, False])
+def test_what_can_be_written_is_not_read_only_to_a_device(device, writeable):
+    """Intel's runtime copies what is read-only and not aligned, however large, before each kernel."""
+    values = np.arange(65_636, dtype=np.uint8)[4:-96]
+    values.flags.writeable = writeable
+    if device.info.shares_memory:
+        borrowed = device.borrow("values", values)
+        assert bool(borrowed.buffer.flags & cl.mem_flags.READ_ONLY) == (not writeable)
+    seen = device.seen("values", values)
+    copied = device.array("copied", values.shape, np.uint8)
+    source = "__kernel void copy(__global const uchar *from, __global uchar *to)"
+    kernel = device.kernel(
+        f"{source} {{ int i = get_global_id(0); if (i < {values.size}) to[i] = from[i]; }}", "copy"
+    )
+    kernel(values.size, moved=2 * values.nbytes, **{"from": seen, "to": copied})
+    np.testing.assert_array_equal(copied.read(), values)

@@ -207,7 +207,7 @@ def read_ptxas(said: str, ptx: str) -> dict[str, Row]:
 def read_assembly(text: str) -> dict[str, Row]:
     """Return what clang says of each kernel for AMD: of a lane, and how many waves a SIMD has room for."""
     found = re.compile(
-        r"\.name: +(\w+)\n +\.private_segment_fixed_size: (\d+)\n(?: +\..*\n)*?"
+        r"\.name: +(\w+)\n +\.private_segment_fixed_size: (\d+)\n(?: +[.-].*\n)*?"
         r" +\.vgpr_count: +(\d+)\n +\.vgpr_spill_count: (\d+)"
     )
     rows = {}

@@ -48,6 +48,10 @@ sum:                                    ; @sum
   - .agpr_count:     0
     .name:           sum
     .private_segment_fixed_size: 0
+    .reqd_workgroup_size:
+      - 64
+      - 1
+      - 1
     .vgpr_count:     9
     .vgpr_spill_count: 0
 """
