@@ -201,7 +201,7 @@ class _Gradients:
         # a cycle: product, length of the step, and the squared residual before it.
         self.parts, self._squares = (h.array(name, count, lanes=lanes) for name in ("parts", "squares"))
         self._history = h.device.array("history", (_LONGEST, 3, lanes), np.float32)
-        self._moving = h.device.array("moving", (lanes,), np.float32)
+        self._moving, self._active = h.device.array("moving", (lanes,), np.float32), np.zeros(lanes, bool)
         self._taken: int | None = None  # the cycle whose step is not yet added to the heights
         self._given: Doubles | None = None  # squared right sides
         self.cycle = Cycle(h, lanes)
@@ -283,27 +283,28 @@ class _Gradients:
         """Do conjugate gradient steps; return their number, and the residuals."""
         done, residual, energy = 0, np.full(self.lanes, np.inf), np.zeros(self.lanes)
         best, progress = residual.copy(), np.zeros(self.lanes, int)
-        moving, active = np.ones(self.lanes, bool), np.zeros(self.lanes, bool)
+        moving = np.ones(self.lanes, bool)
         while done < limit and moving.any():
             begun, first = time.perf_counter(), done
-            if (moving != active).any():
+            if (moving != self._active).any():
                 self._moving.write(moving.astype(np.float32))
-                active = moving.copy()
+                self._active = moving.copy()
             unseen = not (done or self.started) and deadline is None and goal < _DEEP
-            for _ in range(min(_CYCLES, limit) if unseen else 1):
-                self._step(done)
-                done += 1
-            history, parts = self._read(self._history, self._squares, rows=slice(first, done))
-            after = _sum(parts)
+            count = min(_CYCLES, limit) if unseen else 1
+            for number in range(count):
+                self._step(first + number)
+            history, parts = self._read(self._history, self._squares, rows=slice(first, first + count))
             if self._given is None:
                 self._given = history[0, 2]
-            # A step of no length leaves heights and residual as they are.
-            product, rest = history[-1, 0], history[-1, 2]
+            # Steps of no length, where a product is not positive, leave heights and residual as they are.
+            steps = int((history[:, 0] > 0).any(axis=1).sum())
+            done = first + steps
+            product, _, rest = history[max(steps, 1) - 1]
+            after = history[steps, 2] if 0 < steps < count else _sum(parts)
             residual[moving & ~(product > 0) & (rest <= _ROUNDING**2 * self._given)] = 0
             moving &= product > 0
             self._gained = self._gained + (history[:, 0] * history[:, 1]).sum(axis=0)
             if not moving.any():
-                done = first + int((history[:, 0] > 0).any(axis=1).sum())
                 break
             if (residual[moving] > _NEAR).any():
                 energy = np.where(residual > _NEAR, self.energy(), energy)

@@ -54,11 +54,11 @@ CALLS = {
         Moved(4, FRAMES, 7, 33, 1),
     ),
     "heights": (engine.integrate, (*SLOPES, 0.1), {"sigma": False}, Moved(2, 8, 1, 4, 1)),
-    # Slopes, mask, offsets and a number; flags, heights and sums, and those of conjugate gradients twice.
+    # Slopes, mask and offsets; flags, heights and sums, and those of conjugate gradients twice.
     "heights within a mask": (
         *(engine.integrate, (*SLOPES, 0.1)),
         {"mask": np.hypot(*np.ogrid[-60:60, -75:75]) > 20, "sigma": False},
-        Moved(5, 9, 8, 5, 5),
+        Moved(4, 9, 8, 5, 5),
     ),
 }
 SMALL = 0.3  # bytes per pixel: tables of frames
