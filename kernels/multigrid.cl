@@ -71,6 +71,7 @@ typedef int ints;
 #define COARSE_ARGS const int coarse_base, const int coarse_rows, const int coarse_stride
 #define GRAPH_ARGS MAP right, MAP down, MAP falling, MAP rising, MAP anchor
 #define GRAPH right, down, falling, rising, anchor
+#define INLINE static inline __attribute__((always_inline))
 #define BETWEEN base, rows, stride, coarse_base, coarse_rows, coarse_stride
 
 // Nodes from `begin` to `end`, which an item takes of a level.
@@ -161,7 +162,7 @@ float link_of(const int i, const int stride, const int down_by, const int right_
 #define PARTS_ARGS                                                                                         \
     LEVEL_ARGS, COARSE_ARGS, const float strength, GRAPH_ARGS, __global uchar *restrict parts,             \
     __global int *restrict touched, const int level, __global int *restrict splits
-void find_parts(PARTS_ARGS)
+INLINE void find_parts(PARTS_ARGS)
 {
     EACH_PIECE {
         OF_PIECE
@@ -217,7 +218,7 @@ __kernel void multigrid_parts(PARTS_ARGS) { find_parts(BETWEEN, strength, GRAPH,
     LEVEL_ARGS, COARSE_ARGS, const float strength, GRAPH_ARGS, BYTES parts, const int clear,               \
     const int first_round, const int last_round, BYTES to, __global uchar *restrict places,                \
     __global int *restrict touched, const int level, COUNTS splits, __global int *restrict moves
-void move_parts(MOVE_ARGS)
+INLINE void move_parts(MOVE_ARGS)
 {
     if (splits[level] == 0) return;
     EACH_PIECE {
@@ -303,7 +304,7 @@ __kernel void multigrid_move(MOVE_ARGS)
     LEVEL_ARGS, COARSE_ARGS, GRAPH_ARGS, BYTES to, COUNTS touched, const int level, COUNTS moves,          \
     OUT coarse_right, OUT coarse_down, OUT coarse_falling, OUT coarse_rising, OUT coarse_anchor,           \
     __global int *restrict changed, __global int *restrict changes
-void coarsen(COARSEN_ARGS)
+INLINE void coarsen(COARSEN_ARGS)
 {
     EACH_PIECE {
         OF_PIECE
