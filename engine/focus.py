@@ -82,7 +82,7 @@ class Focus(Operation):
         check_strokes(travel, len(frames), "travel")
         rows, columns = self.shape
         self._scan(
-            -(-rows * columns // self.device.layout.tile), frames=self.device.seen("frames", frames),
+            -(-rows * columns // self.device.layout.tile), frames=self.device.share("frames", frames),
             count=len(frames), rows=rows, columns=columns, first=self.count, radius=self.radius,
             reach=self.reach, best=self._best, peak=self._peak, recent=self._recent, moved=frames.nbytes,
         )  # fmt: skip
@@ -104,9 +104,9 @@ class Focus(Operation):
         self._fit(
             -(-rows * columns // self.device.layout.tile), rows=rows, columns=columns, count=len(travel),
             radius=self.radius, reach=self.reach, variance=variance, least_contrast=_LEAST_CONTRAST,
-            least_curvature=_LEAST_CURVATURE, places=self.device.given("places", places),
-            travel=self.device.given("travel", travel), unit=unit, best=self._best, peak=self._peak, **maps,
-            moved=self._peak.nbytes + sum(array.nbytes for array in maps.values()),
+            least_curvature=_LEAST_CURVATURE, places=self.device.from_host("places", places),
+            travel=self.device.from_host("travel", travel), unit=unit, best=self._best, peak=self._peak,
+            **maps, moved=self._peak.nbytes + sum(array.nbytes for array in maps.values()),
         )  # fmt: skip
         found = fetch([(array, slice(None)) for array in maps.values()])
         height, spread, gain, misfit, sharpness, status = found

@@ -113,7 +113,7 @@ class PhotometricStereo(Operation):
         top = np.inf if dtype.kind == "f" else float(np.iinfo(dtype).max)
         self._saturation = top if self.bright is None else self.bright
         darks = _map("dark", 0.0 if self.dark is None else self.dark, shape)
-        self._darks, self._dark_step = self.device.given("darks", darks.ravel()), int(darks.ndim > 0)
+        self._darks, self._dark_step = self.device.from_host("darks", darks.ravel()), int(darks.ndim > 0)
         self._add = self.device.kernel("lambert", "lambert_add", FRAME=C_TYPES[dtype.name])
         self._solve = self.device.kernel("lambert", "lambert_normals", FRAME=C_TYPES[dtype.name])
         self._triangle = self.device.array("triangle", (11, *shape), np.float32, zeroed=False)
@@ -126,8 +126,8 @@ class PhotometricStereo(Operation):
         lights = self._lights_of(len(frames), phase)
         pixels = self.shape[0] * self.shape[1]
         self._add(
-            -(-pixels // self.device.layout.tile), frames=self.device.seen("frames", frames),
-            count=len(frames), pixels=pixels, lights=self.device.given("lights", lights),
+            -(-pixels // self.device.layout.tile), frames=self.device.share("frames", frames),
+            count=len(frames), pixels=pixels, lights=self.device.from_host("lights", lights),
             fresh=self.count == 0, darks=self._darks, dark_step=self._dark_step, shadow=self.shadow,
             bright=self._saturation, triangle=self._triangle, moved=frames.nbytes,
         )  # fmt: skip

@@ -266,7 +266,7 @@ class Result(Shown, Mapping[str, Any]):
         --------
         >>> from mirrorskin import engine
         >>> from mirrorskin.kernels.device import open_device
-        >>> frames = open_device().given("frames", np.ones((8, 2, 3)), np.uint8)
+        >>> frames = open_device().from_host("frames", np.ones((8, 2, 3)), np.uint8)
         >>> fit = engine.correlate(frames, np.arange(8) * np.pi / 4)
         >>> fit.on_device("mean").shape, fit.mean[0, 0]
         ((2, 3), np.float32(1.0))

@@ -42,14 +42,16 @@ _Given = ParamSpec("_Given")
 _Made = TypeVar("_Made")
 
 
-def failed(device: Device, what: str, error: cl.Error) -> DeviceError:
+def device_error(device: Device, what: str, error: cl.Error) -> DeviceError:
     """Return an error that says what a device could not do, why, and what to do."""
     return DeviceError(
         f"{device.info.title} cannot {what}: {error}; if that goes on, choose another ('mirrorskin devices')"
     )
 
 
-def _told(work: Callable[Concatenate[Any, _Given], _Made]) -> Callable[Concatenate[Any, _Given], _Made]:
+def _wrap_cl_errors(
+    work: Callable[Concatenate[Any, _Given], _Made],
+) -> Callable[Concatenate[Any, _Given], _Made]:
     """Run a method of an array in one thread at a time, and name device and array where OpenCL fails."""
 
     @wraps(work)
@@ -59,7 +61,7 @@ def _told(work: Callable[Concatenate[Any, _Given], _Made]) -> Callable[Concatena
                 with waiting:
                     return work(array, *given, **named)
             except cl.Error as error:
-                raise failed(array._device, f"hold or copy {array.name}", error) from error
+                raise device_error(array._device, f"hold or copy {array.name}", error) from error
 
     return told
 
@@ -177,7 +179,7 @@ class Array:
         elif self.latest is not None:
             _wait_before_end(self.latest, self._memory)
 
-    @_told
+    @_wrap_cl_errors
     def write(self, values: NDArray[Any], row: int = 0) -> None:
         """Write values in C order from a row on; other rows stay. The values may be changed at once."""
         row_size = math.prod(self.shape[1:])
@@ -194,7 +196,7 @@ class Array:
         else:
             self._copy_up(values, row * row_size * self.dtype.itemsize)
 
-    @_told
+    @_wrap_cl_errors
     def fill(self, value: float | np.generic = ZERO) -> None:
         """Set all elements to a number."""
         if self.is_shared:
@@ -203,7 +205,7 @@ class Array:
         else:
             self._filling, self._parked = value, None
 
-    @_told
+    @_wrap_cl_errors
     def read(self, rows: int | slice = slice(None), after: cl.Event | None = None) -> NDArray[Any]:
         """Wait for the device and return a copy of some rows, without a step.
 
@@ -214,7 +216,7 @@ class Array:
         self._device.queue.flush()
         return self._read(rows, self._device.copies, [after])
 
-    @_told
+    @_wrap_cl_errors
     def release(self) -> NDArray[Any]:
         """Wait for the device and return what it wrote; the array is no longer of use.
 
@@ -231,7 +233,7 @@ class Array:
             self._device.finish()
         return self._host
 
-    @_told
+    @_wrap_cl_errors
     def park(self, keep: bool = True) -> None:
         """Make room on the device until a kernel uses the array; keep its values on the host or forget them.
 
@@ -244,7 +246,7 @@ class Array:
         self._give_back()
         self._is_parked = True
 
-    @_told
+    @_wrap_cl_errors
     def cut(self, start: int, shape: tuple[int, ...]) -> Array:
         """Return a copy, on the device, of the elements from a number on, in another shape."""
         copied = Array(self._device, self.name, shape, self.dtype, zeroed=False)
@@ -266,7 +268,7 @@ class Array:
         copied.last_use = None
         return copied
 
-    @_told
+    @_wrap_cl_errors
     def lend(self) -> pyopencl.array.Array:
         """Return a `pyopencl.array.Array` in the same memory, on the device's queue."""
         from pyopencl.array import Array as OpenCLArray
@@ -283,7 +285,7 @@ class Array:
             return buffer
         return self._ready()
 
-    @_told
+    @_wrap_cl_errors
     def _ready(self) -> cl.Buffer:
         """Return the device's side, with all that was written."""
         if self._buffer is None:
@@ -402,7 +404,7 @@ def adopt(device: Device, name: str, values: pyopencl.array.Array) -> Array:
                 wait_for=after,
             )
     except cl.Error as error:
-        raise failed(device, f"copy {name}", error) from error
+        raise device_error(device, f"copy {name}", error) from error
     device.profile.watch("copy", name, array.arrived, array.nbytes)
     values.add_event(array.arrived)
     array.last_use = None
@@ -431,7 +433,7 @@ def fetch(parts: Sequence[tuple[Array, int | slice]], keep: Sequence[bool] = ())
                     after.append(array.latest)
             device.transfers.download(device, reads, device.queue, after)
     except cl.Error as error:
-        raise failed(device, f"copy {', '.join(array.name for array, _ in parts)}", error) from error
+        raise device_error(device, f"copy {', '.join(array.name for array, _ in parts)}", error) from error
     for (array, _), kept in zip(parts, keep, strict=True):
         if not kept:
             array.park(keep=False)
@@ -479,7 +481,7 @@ class BorrowedBuffer:
         if self.last_use is not None:
             _wait_before_end(self.last_use, self.host)
 
-    @_told
+    @_wrap_cl_errors
     def wait(self) -> None:
         """Wait until no kernel reads it."""
         if self.last_use is not None:
@@ -521,7 +523,7 @@ def _naming(device: Device, name: str, nbytes: int) -> Iterator[None]:
         yield
     except cl.Error as error:
         if error.code not in _NO_ROOM:
-            raise failed(device, f"hold {name}", error) from error
+            raise device_error(device, f"hold {name}", error) from error
         raise DeviceMemoryError(_no_room(device, name, nbytes)) from error
 
 

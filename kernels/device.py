@@ -25,7 +25,7 @@ import pyopencl as cl
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.kernels import bitcode, embedded, memory
-from mirrorskin.kernels.array import Array, BorrowedBuffer, Operand, can_be_borrowed, failed
+from mirrorskin.kernels.array import Array, BorrowedBuffer, Operand, can_be_borrowed, device_error
 from mirrorskin.kernels.disk_cache import digest, keep, recall
 from mirrorskin.kernels.errors import DeviceError, UnknownDeviceError
 from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT, Layout
@@ -150,7 +150,7 @@ def free_memory() -> None:
     """
     with _opening:
         for device in opened_devices():
-            device.spare.clear()
+            device.cache.clear()
             device.transfers.free(device)
             device.pool.free()
     memory.free()
@@ -177,7 +177,7 @@ class Device:
         do at once.
     transfers, pool
         Staging buffers and buffers that are kept, if it has memory of its own.
-    spare : dict of str to object
+    cache : dict of str to object
         What callers keep on it from one call to the next, taken out while in use.
     """
 
@@ -200,14 +200,14 @@ class Device:
             self.context: cl.Context = cl.Context([device])
             self.queue, self.copies = _queues(self.context)
         except cl.Error as error:
-            raise failed(self, "be used", error) from error
+            raise device_error(self, "be used", error) from error
         self._programs: dict[tuple[str | Path, tuple[str, ...]], _Program] = {}
         self._lock = threading.Lock()
         self._launching = threading.Lock()
         self.enqueuing = threading.Lock()
         self.transfers, self.pool = Transfers(), BufferPool(self.info.memory // SHARE)
         self._kernels: dict[tuple[object, ...], Kernel] = {}
-        self.spare: dict[str, Any] = {}
+        self.cache: dict[str, Any] = {}
         _opened.add(self)
         _log.info("using %s (driver %s)", self.info.title, self.info.driver)
 
@@ -230,7 +230,7 @@ class Device:
         """
         return Array(self, name, shape, np.dtype(dtype), zeroed)
 
-    def given(self, name: str, values: ArrayLike, dtype: DTypeLike = np.float32) -> Array:
+    def from_host(self, name: str, values: ArrayLike, dtype: DTypeLike = np.float32) -> Array:
         """Make an array that holds values; where there are none, one element that means nothing.
 
         Parameters
@@ -247,7 +247,7 @@ class Device:
         """
         values = np.asarray(values)
         if values.size == 0:
-            return self.given(name, np.zeros(1), dtype)
+            return self.from_host(name, np.zeros(1), dtype)
         array = self.array(name, values.shape or (1,), dtype, zeroed=False)
         array.write(values)
         return array
@@ -273,7 +273,7 @@ class Device:
             _log.info("%s cannot work on %s in place (%s): they are copied", self.info.title, name, error)
             return None
 
-    def seen(self, name: str, values: NDArray[Any] | Array) -> Operand:
+    def share(self, name: str, values: NDArray[Any] | Array) -> Operand:
         """Let kernels read values in place, or else a copy; nobody may write to them meanwhile.
 
         An array of a device is returned as it is.
@@ -281,7 +281,7 @@ class Device:
         if isinstance(values, Array):
             return values
         borrowed = self.borrow(name, values) if self.info.shares_memory else None
-        return borrowed or self.given(name, values, values.dtype)
+        return borrowed or self.from_host(name, values, values.dtype)
 
     def take_buffer(self, nbytes: int) -> tuple[cl.Buffer, cl.Event | None]:
         """Return memory on the device, and the last command that uses it; `cl.Error` if there is none."""
@@ -323,7 +323,7 @@ class Device:
         Examples
         --------
         >>> device = open_device()
-        >>> words = device.given("words", np.arange(8), np.uint32)
+        >>> words = device.from_host("words", np.arange(8), np.uint32)
         >>> copy = device.kernel("limits", "copy_all", LANES=2, WORDS=2, STRIDE=1)
         >>> copy(1, words=words, count=2, moved=32)
         >>> words.read().tolist()
@@ -337,7 +337,7 @@ class Device:
             kernel = self._kernels.setdefault(key, self._make_kernel(file, name, options))
         return kernel
 
-    def beside(self) -> Device:
+    def with_new_queue(self) -> Device:
         """Return the same device with queues of its own, whose kernels need not wait for those before.
 
         Arrays may be passed from one to the other; what a kernel must wait for is their ``arrived``.
@@ -349,19 +349,19 @@ class Device:
 
     def free(self) -> None:
         """Give memory that is kept for later calls back to the driver."""
-        self.spare.clear()
+        self.cache.clear()
         try:
             self.transfers.free(self)
             self.pool.free()
         except cl.Error as error:
-            raise failed(self, "give memory back", error) from error
+            raise device_error(self, "give memory back", error) from error
 
     def flush(self) -> None:
         """Have the device begin what it was given, without waiting for it."""
         try:
             self.queue.flush()
         except cl.Error as error:
-            raise failed(self, "begin its work", error) from error
+            raise device_error(self, "begin its work", error) from error
 
     def finish(self) -> None:
         """Wait until everything given to the device is done."""
@@ -369,7 +369,7 @@ class Device:
             with self.profile.waiting_for("queue"):
                 self.queue.finish()
         except cl.Error as error:
-            raise failed(self, "finish its work", error) from error
+            raise device_error(self, "finish its work", error) from error
 
     def _make_kernel(self, file: str | Path, name: str, options: tuple[str, ...]) -> Kernel:
         try:
@@ -391,7 +391,7 @@ class Device:
             problem = f"pyopencl cannot write its cache ({error})"
             raise DeviceError(f"{problem}; set XDG_CACHE_HOME to a writable folder") from error
         except cl.Error as error:
-            raise failed(self, f"compile {name}", error) from error
+            raise device_error(self, f"compile {name}", error) from error
 
     def _program(self, file: str | Path, options: tuple[str, ...], more: str = "") -> _Program:
         with self._lock:
@@ -541,7 +541,7 @@ class Kernel:
                     array.last_use = event
             self._device.profile.watch("kernel", self.name, event, moved)
         except cl.Error as error:
-            raise failed(self._device, f"run {self.name}", error) from error
+            raise device_error(self._device, f"run {self.name}", error) from error
 
     def _put(self, place: int, value: Any) -> None:
         """Set an argument, unless it has this value already: that takes longer than a launch."""

@@ -355,7 +355,7 @@ def likelihood(
 ) -> tuple[Doubles, Doubles, Doubles]:
     """Return of each sample its share of information, its pull on the zenith, and its squared misfit.
 
-    Expected is ``seen``; where that is not inside the range, a sample contributes nothing.
+    Expected is ``share``; where that is not inside the range, a sample contributes nothing.
 
     A clipped sample has the likelihood of being beyond its bound (Tobin 1958): with z the bound's distance
     in standard deviations and m the ratio of the normal distribution's density to its integral there, its

@@ -49,7 +49,7 @@ class Limits:
         self._device = device
         self._shapes = CORES if device.info.kind == "cpu" else LANES
         # Distinct pages: the system would map a single page of zeros many times.
-        self._data = device.given("limits", np.arange(numbers, dtype=np.uint32), np.uint32)
+        self._data = device.from_host("limits", np.arange(numbers, dtype=np.uint32), np.uint32)
         largest = max(shape.lanes * shape.items(numbers // shape.lanes) for shape in self._shapes)
         self._sums = device.array("sums", (largest,), np.uint32)
 

@@ -88,7 +88,7 @@ def find_graph_variance(
         level, places = h.levels[fine], place_of_coarse(h.levels[fine + 1])
         h.over("even", level, **h.graph, evened=evened)
         h.over("returns", level, **links, evened=evened, returns=returns)
-        numbers = h.device.given("local", local_part(fine == 0))
+        numbers = h.device.from_host("local", local_part(fine == 0))
         h.over("local", level, **links, evened=evened, returns=returns, c=numbers, local_part=part)
         h.over("inject", level, **places, e=variance, moved_nodes=h.moves[fine], to=h.to, t=prolonged)
         h.over("spread", level, **h.graph, inverse=h.inverse, t=prolonged, part=part, x=variance)

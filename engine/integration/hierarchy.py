@@ -96,11 +96,11 @@ class Hierarchy:
         self.levels: list[Level] = cut_levels(shape)
         self.nodes: int = self.levels[-1].end + _BEYOND
         places = [[*level.place.values()] for level in self.levels]
-        self.table: Array = device.given("levels", np.array(places), np.int32)
+        self.table: Array = device.from_host("levels", np.array(places), np.int32)
         self.graph: dict[str, Any] = {
             name: self.array(name) for name in ("right", "down", "falling", "rising")
         }
-        self.graph["anchor"] = self.array("anchor") if anchored else device.given("anchor", [])
+        self.graph["anchor"] = self.array("anchor") if anchored else device.from_host("anchor", [])
         self.inverse: Array = self.array("inverse")
         self.matrix: Array = self.array("inverse matrix", self.levels[-1].nodes ** 2)
         self._parts, self._wanted, self.to = (

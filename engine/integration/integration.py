@@ -204,13 +204,13 @@ def _uncropped(result: Result, inputs: Inputs) -> Result:
 def _cached_solver(device: Device, inputs: Inputs) -> Iterator[SurfaceSolver]:
     """Use the solver of the last call again if it fits, and keep it for the next call."""
     key = inputs.shape, inputs.pixel_size
-    cached_key, solver = device.spare.pop("integration", (None, None))  # atomic: one thread gets it
+    cached_key, solver = device.cache.pop("integration", (None, None))  # atomic: one thread gets it
     if cached_key != key:
         solver = SurfaceSolver(device, inputs.shape)
     yield solver  # after an exception it is not kept
     solver.reset()
     if math.prod(inputs.shape) <= _LARGEST_CACHED:
-        device.spare["integration"] = key, solver
+        device.cache["integration"] = key, solver
 
 
 class Integrator(ThreadSafe):

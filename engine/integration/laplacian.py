@@ -123,9 +123,9 @@ class _Solver:
         components = find_components(flags | np.uint8(SLOPE), cut=True)
         self._labels = components.labels.ravel()
         self._free, self._pixels = components.offset_unknown, np.bincount(self._labels)
-        arrays = [device.given("links", one) for one in weigh]
+        arrays = [device.from_host("links", one) for one in weigh]
         anchor = arrays[2] if weigh[2].any() else None
-        source = device.given("source", np.zeros(diagonal.shape))
+        source = device.from_host("source", np.zeros(diagonal.shape))
         self._links = Links(device, diagonal.shape, arrays[0], arrays[1], anchor, source)
         self._multigrid = Multigrid(self._links)
 
@@ -139,7 +139,7 @@ class _Solver:
             return exact.T.reshape(np.shape(sources))
         scales = np.where(sizes > 0, sizes, 1)[:, np.newaxis]
         scaled = (exact / scales).reshape(-1, *self._links.shape)
-        maps = self._links.device.given("sources", scaled)
+        maps = self._links.device.from_host("sources", scaled)
         height = self._multigrid.precondition(maps) if self._tolerance is None else self._solve(maps)
         solution = self._centred(height.read().reshape(exact.shape) * (scales / self._unit))
         return solution.T.reshape(np.shape(sources))

@@ -125,7 +125,7 @@ class Rectangle:
         groups = -(-pictures * rows // at_once), pictures * modes.size // at_once
         self._spectrum = self._array("spectrum", (len(modes), groups[0] * at_once, at_once))
         self._runs = [self._prepare(columns, groups[0]), self._prepare(rows, groups[1])]
-        self._along = device.given("along", self._rates(modes, columns, self._weights[0]))
+        self._along = device.from_host("along", self._rates(modes, columns, self._weights[0]))
         self._across: tuple[float, Array] | None = None  # screening, and eigenvalues along y
         self._deviation: tuple[float, Floats] | None = None  # screening, and standard deviation
         self._work: tuple[Array, Array] | None = None  # right side, and partial sums
@@ -138,7 +138,7 @@ class Rectangle:
         if self._across is None or self._across[0] != screening:
             rows = self.shape[-2]
             across = self._rates(np.arange(rows + 1), rows, self._weights[1], screening)
-            self._across = screening, self._device.given("across", across)
+            self._across = screening, self._device.from_host("across", across)
         if height is None:
             height = self._device.array("height", self.shape, np.float32, zeroed=False)
         rates = {"along": self._along, "across": self._across[1]}
@@ -155,7 +155,7 @@ class Rectangle:
         """
         (width, height), (along, across), screening = self._size, self._weights, _screening(inputs)
         names = [name for name in ("dz_dx", "dz_dy", "known_heights") if getattr(inputs, name) is not None]
-        maps: dict[str, Any] = {name: self._device.seen(name, getattr(inputs, name)) for name in names}
+        maps: dict[str, Any] = {name: self._device.share(name, getattr(inputs, name)) for name in names}
         if len(names) > 2:
             maps["weight_z"] = screening
         pictures, (rows, columns) = math.prod(self.shape[:-2]), self.shape[-2:]
@@ -223,7 +223,7 @@ class Rectangle:
         scratch = self._array("scratch", (1 if inside else groups * size * 2 * self._lanes,))
         odd = int(tables["plan"][:, 0].max(initial=0) >= _RARE)
         arrays = {
-            name: self._device.given(name, table, np.int32 if table.dtype == np.intp else np.float32)
+            name: self._device.from_host(name, table, np.int32 if table.dtype == np.intp else np.float32)
             for name, table in tables.items()
         }
         macros = {"LANES": self._lanes, "ROOM": room if inside else 0, "ODD": odd}

@@ -79,7 +79,7 @@ def solve_robust(
     search = _Search(inputs, links, flags, plane, sharpness, deadline)
     search.trust(*_LOCAL)
     if start is not None:
-        first = links.device.given("start", np.where(np.isfinite(start), start, 0.0))
+        first = links.device.from_host("start", np.where(np.isfinite(start), start, 0.0))
         return search.conclude(search.descend(first), flags, tolerance)
     best = search.descend()
     if search.contradicted and not search.late():
@@ -89,7 +89,7 @@ def solve_robust(
         search.trust(*_LOCAL)
         best = search.descend(best)
         if search.link(best) >= broken:
-            best = links.device.given("first", local)
+            best = links.device.from_host("first", local)
     return search.conclude(best, flags, tolerance)
 
 
@@ -105,7 +105,7 @@ class _Search:
         sharpness: float,
         deadline: float | None,
     ) -> None:
-        self._links, self._shape, self._given = links, links.shape, links.device.given
+        self._links, self._shape, self._given = links, links.shape, links.device.from_host
         self._sharpness, self._deadline, self._steps = 2 * sharpness, deadline, 0
         self._size = dict(zip(("width", "height"), inputs.pixel_size, strict=True))
         rows, columns = links.shape

@@ -138,7 +138,7 @@ class PairFit:
         blocks = -(-rows // side) * -(-columns // side)
         maps = *second.middle, *first.grid, *second.grid, first.least, second.least
         rows_of_poses = [[*motion.turn.ravel(), *motion.shift, *maps] for motion in motions]
-        poses = self.device.given("poses", rows_of_poses)
+        poses = self.device.from_host("poses", rows_of_poses)
         sums = self.device.array("sums", (len(motions), blocks, SUMS), np.float32, zeroed=False)
         self.device.kernel("pose", "pose_equations", BESIDE=int(unbiased))(
             len(motions) * blocks,

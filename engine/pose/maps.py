@@ -66,7 +66,7 @@ class PoseMap:
             records[..., 5:] = _curvature(normals, usable, grid, device)
             usable &= np.isfinite(records[..., 5])
         records[~usable] = np.nan
-        return cls(records, grid, _least(result), device.given("records", records))
+        return cls(records, grid, _least(result), device.from_host("records", records))
 
     def halved(self, device: Device) -> PoseMap:
         """Return the map at half the resolution: means of 2 x 2 pixels, if all four are known."""
@@ -76,7 +76,7 @@ class PoseMap:
         records[..., [2, 4]] /= 4
         x, y, step_x, step_y = self.grid
         grid = x + step_x / 2, y - step_y / 2, 2 * step_x, 2 * step_y
-        return PoseMap(records, grid, self.least, device.given("records", records))
+        return PoseMap(records, grid, self.least, device.from_host("records", records))
 
     @cached_property
     def points(self) -> NDArray[np.float64]:
@@ -171,7 +171,7 @@ def _gradient(values: Floats, grid: tuple[float, float, float, float], device: D
         columns=columns,
         step_x=grid[2],
         step_y=grid[3],
-        values=device.given("values", values),
+        values=device.from_host("values", values),
         gradient=gradient,
         moved=12 * values.size,
     )

@@ -108,7 +108,7 @@ class ChangePoint(PressOperation):
         self._travel.clear()
         split = np.arange(1.0, count)
         weight = self._sign / np.sqrt(split * (count - split))
-        self._weight = self.device.given("weight", np.pad(weight, 1))
+        self._weight = self.device.from_host("weight", np.pad(weight, 1))
         for band in self._bands:
             with band.resident():
                 total, rest = (band.maps[name].read() for name in ("total", "total_rest"))
@@ -194,7 +194,7 @@ class ChangePoint(PressOperation):
         """Copy the travel to the device as (T, 2) floats, whose sums have the precision of float64."""
         travel = np.array(self._travel, np.float64)
         high = travel.astype(np.float32)
-        return self.device.given("travel", np.stack([high, travel - high], axis=1))
+        return self.device.from_host("travel", np.stack([high, travel - high], axis=1))
 
     def _estimate_levels(self, band: Band, noise: float) -> None:
         """Compute the levels from the best splits, where they are significant."""

@@ -172,7 +172,7 @@ class Crossing:
             references: dict[str, Any] = {}
             for name, values in (("bright", bright), ("dark", dark)):
                 rows = values[band.rows] if values.ndim else values.reshape(1)
-                references |= {f"{name}s": self.device.seen(name, rows), f"{name}_step": values.ndim // 2}
+                references |= {f"{name}s": self.device.share(name, rows), f"{name}_step": values.ndim // 2}
             with band.resident():
                 self._launch(
                     band, "onset_levels", "levels marks",

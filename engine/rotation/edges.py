@@ -205,10 +205,10 @@ class EdgeDrawing:
 def _pairs_on(device: Device, chosen: Pass) -> Array:
     """Return the pairs of a pass on a device, where they stay: columns, rows and distance of each."""
     name = f"pairs of edges, {chosen}"
-    table = device.spare.get(name)
+    table = device.cache.get(name)
     if table is None:
         places, distances = pairs(chosen)
         values = np.concatenate([places, distances[..., np.newaxis]], axis=-1)
-        table = device.spare[name] = device.given("pairs", values)
+        table = device.cache[name] = device.from_host("pairs", values)
     assert isinstance(table, Array)
     return table

@@ -26,7 +26,7 @@ class FollowingHeights:
     """
 
     def __init__(self, device: Device, shape: tuple[int, int], pixel_size: ArrayLike) -> None:
-        device = device.beside()
+        device = device.with_new_queue()
         self._slopes = SlopeKernels(device, shape)
         self._integrator = WarmStartIntegrator(device, shape, pixel_size)
         self._thread = ThreadPoolExecutor(1, "heights")

@@ -133,8 +133,8 @@ class NormalKernel:
         self._scale = response or make_scale(*levels, shape)
         self.device: Device = device
         if not self._scale.per_pixel:
-            self._one_scale = self.device.given("scale", self._scale.planes)
-        self._wall = None if response is None else self.device.given("wall", response.table)
+            self._one_scale = self.device.from_host("scale", self._scale.planes)
+        self._wall = None if response is None else self.device.from_host("wall", response.table)
         planes = _POSE_PLANES if poses else _TURN_PLANES
         self._poses = poses
         self.tables_at_once: int = max(1, min(_TABLES, self.device.max_allocation // (4 * planes * LONGEST)))

@@ -117,7 +117,7 @@ class NormalWindow:
         """Return a map of the last estimate as one array on the device; it may have padding."""
         if len(self.bands) == 1:
             return self.bands[0].maps[name]
-        return self.device.given(name, self.fetch(name), self.bands[0].maps[name].dtype)
+        return self.device.from_host(name, self.fetch(name), self.bands[0].maps[name].dtype)
 
     def _without_padding(self, band: Band, planes: NDArray[Any]) -> NDArray[Any]:
         depth = len(planes)

@@ -93,14 +93,14 @@ class Registered(DerivedSource):
         }
         padding = np.full((rows + 2 * BORDER, columns + 2 * BORDER), np.nan, np.float32)
         self._maps = {
-            "padded": self.device.given("padded", padding),
-            "offset": self.device.given("offset", offset),
-            "gain": self.device.given("gain", gain),
+            "padded": self.device.from_host("padded", padding),
+            "offset": self.device.from_host("offset", offset),
+            "gain": self.device.from_host("gain", gain),
         }
-        self._height = self.device.given("height", height)
+        self._height = self.device.from_host("height", height)
         places = _interpolated_pixels(offset, gain)
-        self._places = self.device.given("places", places, np.int32) if len(places) else None
-        self._noise = self.device.given("noise", np.zeros((2, rows, columns), np.float32))
+        self._places = self.device.from_host("places", places, np.int32) if len(places) else None
+        self._noise = self.device.from_host("noise", np.zeros((2, rows, columns), np.float32))
         self._shift = self.device.array("shift", (2, 4 if sight is None else 7), np.float32)
         self._frame = self.device.array("frame", (rows, columns), source.dtype)
         self._registered = self.device.array("registered", (rows, columns), np.float32)

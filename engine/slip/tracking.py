@@ -243,7 +243,7 @@ class _Level:
     def _pixels(self, values: Doubles, logarithms: bool) -> NDArray[np.float32]:
         """Return values of nodes, (T, n, rows, columns), at all pixels, (T, H, W, n)."""
         (rows, columns), (count, parts) = self.shape, values.shape[:2]
-        nodes = self._device.given("nodes", values)
+        nodes = self._device.from_host("nodes", values)
         pixels = self._device.array("pixels", (count, rows, columns, parts), np.float32, zeroed=False)
         sizes = {name: size for name, size in self._sizes.items() if name != "halo"}
         self._launch(

@@ -224,9 +224,9 @@ class Wall:
         places = [view.x, view.y]
         if not view.orthographic:
             places += [view.slope_x, view.slope_y]
-        self._places = device.given("places", np.stack([place.ravel() for place in places]))
-        self._rays = device.given("rays", scatter_rays(body.scatter))
-        self._table = device.given("table", table)
+        self._places = device.from_host("places", np.stack([place.ravel() for place in places]))
+        self._rays = device.from_host("rays", scatter_rays(body.scatter))
+        self._table = device.from_host("table", table)
         self._sheet = device.array("sheet", (3, *view.shape), np.float32)
         self._light = device.array("light", view.shape, np.float32)
         self._macros = {

@@ -73,7 +73,7 @@ class Drag(NamedTuple):
         """Run a kernel of ``skin.cl`` on maps of a shape."""
         (rows, columns), (along_x, along_y) = shape, self.pixel_size
         place_x, place_y = (*self.place, 0.0)[:2]
-        shift = device.given("shift", self.shift)
+        shift = device.from_host("shift", self.shift)
         device.kernel("skin", name, TWIST=int(len(self.place) == 1))(
             -(-rows * columns // device.layout.tile),
             rows=rows,

@@ -198,13 +198,13 @@ class _DraggedFlakes:
         self._seen = device.array("seen", (2, *view.shape), np.float32)
         self._share = device.array("share", view.shape, np.float32)
         self._given: dict[str, Any] = {
-            "flakes": device.given("flakes", texture.coefficients, np.uint8),
+            "flakes": device.from_host("flakes", texture.coefficients, np.uint8),
             "spacing": texture.spacing,
         }
         for axis, places in (("x", view.x[0]), ("y", view.y[:, 0])):
             index = places / texture.spacing
-            self._given[f"cell_{axis}"] = device.given("cell", np.floor(index), np.int32)
-            self._given[f"part_{axis}"] = device.given("part", index - np.floor(index))
+            self._given[f"cell_{axis}"] = device.from_host("cell", np.floor(index), np.int32)
+            self._given[f"part_{axis}"] = device.from_host("part", index - np.floor(index))
 
     def share(self, drag: Drag, off: Floats) -> Light:
         """Return the share, (H, W), at points that are off their pixels' places at rest, (2, H, W), mm."""

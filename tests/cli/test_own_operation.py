@@ -44,17 +44,17 @@ class Mean(engine.Operation):
 
     def start(self, shape, dtype):
         self.total, self.level = np.zeros(shape), None
-        self.above = self.device.given("above", np.zeros(shape), np.int32)
+        self.above = self.device.from_host("above", np.zeros(shape), np.int32)
         self.kernel = self.device.kernel(KERNEL, "above_mean", FRAME=C_TYPES[dtype.name])
 
     def start_second_pass(self):
-        self.level = self.device.given("level", self.total / self.count + self.margin, np.float32)
+        self.level = self.device.from_host("level", self.total / self.count + self.margin, np.float32)
 
     def push(self, frames, *, travel):
         if self.level is None:
             self.total += frames.sum(axis=0, dtype=np.float64)
             return
-        pixels, seen = self.total.size, self.device.seen("frames", frames)
+        pixels, seen = self.total.size, self.device.share("frames", frames)
         arguments = {"count": len(frames), "pixels": pixels, "level": self.level, "above": self.above}
         self.kernel(pixels, frames=seen, moved=frames.nbytes, **arguments)
         self.device.finish()

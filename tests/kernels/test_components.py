@@ -36,7 +36,7 @@ def test_kernels_and_reference_agree(device, shape, heights, parts):
     found = find_components(flags, cut=False)
     assert min(shape) < 9 or (found.count > 20) == (parts == "many")
     relief = random.normal(0, 1, shape).astype(np.float32)
-    array = device.given("relief", np.stack([2 * relief, relief]))
+    array = device.from_host("relief", np.stack([2 * relief, relief]))
     levelling = Levelling(room)
 
     rise = PLANE[0] * 0.5, -PLANE[1] * 0.25, PLANE[2]

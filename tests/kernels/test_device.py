@@ -108,7 +108,7 @@ def test_a_program_is_kept_and_a_damaged_one_is_built_again(device, tmp_path, mo
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     for damaged in (False, False, True):
         opened = device_layer.Device(device.context.devices[0])
-        words = opened.given("words", np.arange(8), np.uint32)
+        words = opened.from_host("words", np.arange(8), np.uint32)
         opened.kernel("limits", "copy_all", **{**MACROS, "LANES": 2, "WORDS": 2})(
             1, words=words, count=2, moved=32
         )
@@ -128,7 +128,7 @@ def test_a_kernel_of_ones_own_runs_and_may_use_what_ours_share(device, tmp_path)
                 x[i] = root(x[i]);
         }"""
     )
-    x = device.given("x", np.arange(1.0, 3000.0))
+    x = device.from_host("x", np.arange(1.0, 3000.0))
     device.kernel(tmp_path / "mine.cl", "roots")(2999, count=2999, x=x, moved=0)
     np.testing.assert_allclose(x.read(), np.sqrt(np.arange(1.0, 3000.0)), rtol=1e-6)
     (tmp_path / "worse.cl").write_text("__kernel void worse(const int x) { y = x; }")
@@ -146,7 +146,7 @@ __kernel void twice(__global int *values, const int count) {
 
 
 def test_a_kernel_in_a_text_runs_and_one_that_does_not_compile_is_quoted(device):
-    values = device.given("values", np.arange(5), np.int32)
+    values = device.from_host("values", np.arange(5), np.int32)
     device.kernel(TWICE, "twice")(5, values=values, count=5, moved=40)
     assert values.read().tolist() == [0, 2, 4, 6, 8]
     with pytest.raises(DeviceError, match=r"text\.cl line 5 does not compile.*`if .item < count. valus"):
@@ -169,7 +169,7 @@ def test_a_kernel_that_has_the_name_of_a_function_of_opencl_runs_or_is_one_line(
 
 
 def test_arguments_are_named_and_numbers_become_what_the_source_says(device):
-    numbers = device.given("numbers", np.ones((8, 16), np.float32))
+    numbers = device.from_host("numbers", np.ones((8, 16), np.float32))
     kernel = device.kernel("limits", "multiply_all", LANES=16, WORDS=8, STRIDE=1)
     kernel(1, summand=np.float64(0.5), factor=2, numbers=numbers, steps=np.int64(1), count=8, moved=0)
     assert np.all(numbers.read() == 2.5)
@@ -244,7 +244,7 @@ def test_zeros_and_numbers_that_no_kernel_has_seen_outlast_a_park(device):
 
 
 def test_rows_are_read_and_written_and_the_others_stay(device):
-    array = device.given("numbers", np.arange(12).reshape(4, 3), np.int32)
+    array = device.from_host("numbers", np.arange(12).reshape(4, 3), np.int32)
     array.write(np.array([30, 31, 32, 40]), row=2)
     expected = [[0, 1, 2], [3, 4, 5], [30, 31, 32], [40, 10, 11]]
     assert array.read().tolist() == expected
@@ -271,7 +271,7 @@ def test_an_array_that_the_host_never_wrote_is_filled_or_left_on_the_device(devi
 
 
 def test_parts_of_several_arrays_are_waited_for_once(device):
-    arrays = [device.given(name, np.full((3, 4), n), np.int32) for n, name in enumerate("abc")]
+    arrays = [device.from_host(name, np.full((3, 4), n), np.int32) for n, name in enumerate("abc")]
     for keep in (True, False):
         device.profile.clear()
         found = fetch([(arrays[0], slice(None)), (arrays[1], 2), (arrays[2], slice(1, 3))], [keep] * 3)
@@ -399,7 +399,7 @@ def test_a_forked_process_is_refused_instead_of_waiting_for_ever(device):
 
 def test_an_array_is_copied_by_numpy_and_its_rows_stay_on_the_device(device):
     values = np.arange(24, dtype=np.float32).reshape(4, 3, 2)
-    array = device.given("values", values)
+    array = device.from_host("values", values)
     np.testing.assert_array_equal(np.asarray(array, np.float64), values)
     assert array[0:4] is array
     part = array[1:3]
@@ -409,28 +409,28 @@ def test_an_array_is_copied_by_numpy_and_its_rows_stay_on_the_device(device):
 
 
 def test_a_copy_that_is_dropped_at_once_is_not_written_to_the_next_arrays_memory(device):
-    source = device.given("source", np.ones((64, 1 << 16)))
+    source = device.from_host("source", np.ones((64, 1 << 16)))
     for _ in range(20):
         source.cut(0, source.shape)
-        kept = device.given("kept", np.zeros(source.shape))
+        kept = device.from_host("kept", np.zeros(source.shape))
         device.finish()
         assert not kept.read().any()
 
 
 @pytest.mark.filterwarnings("ignore:Non-empty compiler output")  # Intel's is never empty
 def test_pyopencl_works_in_the_memory_of_an_array(device):
-    array = device.given("values", np.arange(6.0))
+    array = device.from_host("values", np.arange(6.0))
     lent = array.lend()
     lent += 1
     np.testing.assert_array_equal(array.read(), np.arange(1.0, 7.0))
     del array
-    others = [device.given("others", np.full(6, -1.0)) for _ in range(3)]
+    others = [device.from_host("others", np.full(6, -1.0)) for _ in range(3)]
     np.testing.assert_array_equal(lent.get(), np.arange(1.0, 7.0))
     assert len(others) == 3
 
 
 def test_memory_of_the_host_is_exported_without_a_copy_and_other_memory_refused(device):
-    array = device.given("values", np.arange(6.0))
+    array = device.from_host("values", np.arange(6.0))
     if array.is_shared:
         exported = np.from_dlpack(array)
         np.testing.assert_array_equal(exported, np.arange(6.0))

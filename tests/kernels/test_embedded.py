@@ -157,7 +157,7 @@ sys.addaudithook(lambda event, args: event == "subprocess.Popen" and children.ap
 import numpy as np
 from mirrorskin.kernels.device import open_device
 device = open_device("portable")
-words = device.given("words", np.arange(8), np.uint32)
+words = device.from_host("words", np.arange(8), np.uint32)
 device.kernel("limits", "copy_all", LANES=2, WORDS=2, STRIDE=1)(1, words=words, count=2, moved=32)
 print(len(children), *words.read())
 """

@@ -29,7 +29,7 @@ from mirrorskin.kernels.device import Device, open_device
 compiled, compile = [], Device._compile
 Device._compile = lambda *given: compiled.append(1) or compile(*given)
 device = open_device("Portable Computing Language")
-values = device.given("values", [0, 1, 2])
+values = device.from_host("values", [0, 1, 2])
 kernel = device.kernel('''{CHANGED}''', "change", CHANGE=sys.argv[1])
 kernel(3, values=values, count=3, moved=24)
 print(json.dumps([values.read().tolist(), len(compiled)]))

@@ -62,7 +62,7 @@ def test_what_can_be_written_is_not_read_only_to_a_device(device, writeable):
     if device.info.shares_memory:
         borrowed = device.borrow("values", values)
         assert bool(borrowed.buffer.flags & cl.mem_flags.READ_ONLY) == (not writeable)
-    seen = device.seen("values", values)
+    seen = device.share("values", values)
     copied = device.array("copied", values.shape, np.uint8)
     source = "__kernel void copy(__global const uchar *from, __global uchar *to)"
     kernel = device.kernel(

@@ -160,7 +160,7 @@ def test_steps_of_conjugate_gradients_and_sums(cases, graph):
         weighed = case.sums("weigh", anchor=case.h.graph["anchor"], x=x_given)
         assert weighed == pytest.approx((level.anchor * x**2).sum(), rel=1e-5)
     direction, known = case.h.array("direction"), {**case.h.graph, "inverse": case.h.inverse}
-    given, history = case.device.given, case.device.array("history", (3, 3, 1), np.float32)
+    given, history = case.device.from_host, case.device.array("history", (3, 3, 1), np.float32)
     history.write(np.array([[[10], [0.2], [1]]]))
     known |= {"cycle": 1, "history": history}
     sums = {"products": 2, "product": given("product", [3, 4]), "squares": given("squares", np.ones(99))}
@@ -200,7 +200,7 @@ def test_a_step_that_cannot_be_is_not_done(cases, product, curvature, moving):
     history.write(np.array([[[product], [9], [1]]]))
     known = {**case.h.graph, "inverse": case.h.inverse, "cycle": 0, "history": history}
     given = {
-        name: case.device.given(name, [value])
+        name: case.device.from_host(name, [value])
         for name, value in (("products", curvature), ("moving", moving))
     }
     case.sums("advance", count=1, **known, **given, direction=endless, b=b_given)
@@ -226,7 +226,7 @@ def test_the_best_step_in_a_plane(cases, graph, same):
     halves = np.array([0.25, 0.75]) * (b * z).sum()
     parts = np.repeat(expected, 2) * np.tile([0.5, 0.5], 4)
     given = {
-        name: case.device.given(name, values) for name, values in (("product", halves), ("parts", parts))
+        name: case.device.from_host(name, values) for name, values in (("product", halves), ("parts", parts))
     }
     lengths = case.h.array("lengths", 2)
     case.h.alone("best", products=2, count=2, **given, lengths=lengths)
@@ -248,7 +248,7 @@ def test_what_a_level_adds_to_variances(cases, graph, number):
     links, c = {name: h.graph[name] for name in ("right", "down")}, local_part(number == 0)
     h.over("even", fine, **h.graph, evened=evened)
     h.over("returns", fine, **links, evened=evened, returns=returns)
-    numbers = h.device.given("local", c)
+    numbers = h.device.from_host("local", c)
     h.over("local", fine, **links, evened=evened, returns=returns, c=numbers, local_part=part)
     arrays = {"e": given, "moved_nodes": h.moves[number], "to": h.to, "t": brought}
     h.over("inject", fine, **place_of_coarse(h.levels[number + 1]), **arrays)

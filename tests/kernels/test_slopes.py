@@ -29,8 +29,8 @@ def normals(shape):
 def on_device(device, vectors, sigma, contact):
     maps = SlopeKernels(device, contact.shape)
     given = {"vectors": (vectors, np.float32), "sigma": (sigma, np.float32), "contact": (contact, np.uint8)}
-    to = {name: device.given(name, np.zeros(contact.shape)) for name in MAPS}
-    maps.find(TILT, {name: device.given(name, *one) for name, one in given.items()}, to)
+    to = {name: device.from_host(name, np.zeros(contact.shape)) for name in MAPS}
+    maps.find(TILT, {name: device.from_host(name, *one) for name, one in given.items()}, to)
     return maps, {name: to[name].read() for name in MAPS}
 
 

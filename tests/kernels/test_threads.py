@@ -89,7 +89,7 @@ def test_memory_of_arrays_that_other_threads_drop_is_not_reused_by_running_kerne
         wrong = 0
         for _ in range(200):
             fill(2**16, values=device.array("dropped", (2**16,), np.int32, zeroed=False), number=-1, moved=0)
-            kept = device.given("kept", np.full(2**16, number), np.int32)
+            kept = device.from_host("kept", np.full(2**16, number), np.int32)
             wrong += np.count_nonzero(kept.read() != number)
         return wrong
 
@@ -98,7 +98,7 @@ def test_memory_of_arrays_that_other_threads_drop_is_not_reused_by_running_kerne
 
 
 SHARED = """
-values = device.given("values", np.zeros(256), np.int32)
+values = device.from_host("values", np.zeros(256), np.int32)
 start, done, raised = threading.Barrier(3), threading.Event(), []
 
 def read():
@@ -137,7 +137,7 @@ def map_twice(*arguments, **named):  # a release too many, as of a lost device, 
     other.base.release()
     return mapped
 
-values = device.given("values", np.zeros(256), np.int32)
+values = device.from_host("values", np.zeros(256), np.int32)
 fill(256, values=values, number=1, moved=0)
 arrays.cl.enqueue_map_buffer = map_twice
 {use}

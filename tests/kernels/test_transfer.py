@@ -39,8 +39,8 @@ def test_arrays_of_any_size_arrive_and_return(opened, shape, dtype):
 @pytest.mark.parametrize("part", [np.s_[:, 5:35], np.s_[:, :, 3:], np.s_[::2], np.s_[::-1, ::-1]])
 def test_frames_that_are_not_contiguous_arrive(opened, part):
     values = np.random.default_rng(1).random((9, 40, 50), np.float32)[part]
-    assert np.array_equal(opened.given("values", values).read(), values)
-    assert np.array_equal(opened.given("values", values, np.float64).read(), values)
+    assert np.array_equal(opened.from_host("values", values).read(), values)
+    assert np.array_equal(opened.from_host("values", values, np.float64).read(), values)
 
 
 def test_values_may_be_overwritten_as_soon_as_they_were_written(opened):
@@ -48,14 +48,14 @@ def test_values_may_be_overwritten_as_soon_as_they_were_written(opened):
     arrays = []
     for number in range(20):
         values[...] = number
-        arrays.append(opened.given("values", values, np.int32))
+        arrays.append(opened.from_host("values", values, np.int32))
     assert [set(array.read().ravel().tolist()) for array in arrays] == [{number} for number in range(20)]
 
 
 def test_threads_share_the_staging_buffers_while_they_are_freed(opened):
     def work(number):
         for step in range(20):
-            arrays = [opened.given("values", np.full(n, number + step), np.int32) for n in (5, 3000, 40)]
+            arrays = [opened.from_host("values", np.full(n, number + step), np.int32) for n in (5, 3000, 40)]
             for found in fetch([(array, slice(None)) for array in arrays]):
                 assert np.all(found == number + step)
         return number
@@ -71,17 +71,17 @@ def test_device_memory_is_kept_until_it_is_freed(opened):
     def allocations():
         opened.profile.clear()
         opened.array("kept", (1000, 10), np.float32)
-        opened.given("other", np.ones(10))
+        opened.from_host("other", np.ones(10))
         return sum(record.runs for record in opened.profile.records() if record.name == "allocation")
 
     assert [allocations(), allocations()] == [2, 0]
     opened.free()
     assert allocations() == 2
-    assert opened.given("values", np.arange(3000), np.int32).read()[-1] == 2999
+    assert opened.from_host("values", np.arange(3000), np.int32).read()[-1] == 2999
 
 
 def test_staging_buffers_that_are_lost_to_an_error_are_replaced(opened, monkeypatch):
-    array = opened.given("values", np.arange(30_000), np.int32)
+    array = opened.from_host("values", np.arange(30_000), np.int32)
     wait, failures = opened.profile.wait, iter(range(5))
 
     def fail(name, event):

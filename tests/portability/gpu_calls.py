@@ -55,7 +55,7 @@ def tiled(shape: Shape, count: int, fill: Callable[[Any], None]) -> Any:
 def placed(values: Any, device: Device) -> Any:
     """Return an array on the device."""
     values = np.ascontiguousarray(values)
-    return device.given("given", values, values.dtype)
+    return device.from_host("given", values, values.dtype)
 
 
 def calls(shape: Shape, device: Device, frames: int = 64) -> Iterator[tuple[str, Call]]:

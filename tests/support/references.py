@@ -118,7 +118,7 @@ def agree(
             given = np.stack([given.astype(np.float32), given - given.astype(np.float32)], axis=-1)
         if isinstance(given, np.ndarray):
             kind = np.float32 if given.dtype == np.float64 else given.dtype
-            arrays[key] = device.given(key, given, kind)
+            arrays[key] = device.from_host(key, given, kind)
     kernel(items, **{key: arrays[key] if key in arrays else values[key] for key in kernel.arguments}, moved=0)
 
     for key, array in arrays.items():

@@ -423,7 +423,7 @@ def heights(case):
 def alone():
     found = []
     for case in range(len(CASES)):
-        open_device().spare.clear()
+        open_device().cache.clear()
         found.append(heights(case))
     return found
 

@@ -75,10 +75,10 @@ def test_any_graph_is_solved_for_many_right_sides(device, kind, anchored):
     graph = graphs.pixel_graph(kind, (45, 70), anchored)
     sources = np.random.default_rng(0).normal(size=(6, 45, 70))
     sources = np.stack([graph.centred(one) for one in sources])
-    maps = [device.given("links", getattr(graph, name)) for name in ("right", "down")]
-    anchor = device.given("anchor", graph.anchor) if anchored else None
-    solver = Multigrid(Links(device, (45, 70), *maps, anchor, device.given("source", sources[0])))
-    found = solver.solve_many(device.given("sources", sources), tolerance=1e-6)
+    maps = [device.from_host("links", getattr(graph, name)) for name in ("right", "down")]
+    anchor = device.from_host("anchor", graph.anchor) if anchored else None
+    solver = Multigrid(Links(device, (45, 70), *maps, anchor, device.from_host("source", sources[0])))
+    found = solver.solve_many(device.from_host("sources", sources), tolerance=1e-6)
     assert found.converged
     for source, height in zip(sources, found.height.read(), strict=True):
         graph.source[...] = source
