@@ -2,7 +2,8 @@
 //
 // TILE     pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
 // ONE      1 where there is one component: labels are then not read
-// GROUP    work-items that add up one component of a strip together; 1 where an item adds up all components of its strip
+// GROUP    work-items that add up one component of a strip together; 1 where an item adds up all components of its strip.
+//          As many find the offset of one component
 //
 // PoCL makes vector code of loops without branches.
 
@@ -109,6 +110,39 @@ __kernel GROUP_SIZE void components_sum(
 #endif
     }
 #endif
+}
+
+// Offsets of the components without a known height, or of all others, that give them a mean: `mean` and its rest.
+__kernel GROUP_SIZE void components_offsets(
+    const int strips, const int components, MAP sums, MAP totals, __global const uchar *restrict unknown,
+    const int of_unknown, const float mean, const float mean_rest, OUT offsets)
+{
+    const int component = get_global_id(0) / GROUP, lane = GROUP > 1 ? get_local_id(0) : 0;
+    Pair sum = {0.0f, 0.0f}, total = {0.0f, 0.0f};
+    for (int strip = lane; strip < strips && component < components; strip += GROUP) {
+        sum = plus(sum, (Pair){sums[strip * components + component], 0.0f});
+        total = plus(total, (Pair){totals[strip * components + component], 0.0f});
+    }
+#if GROUP > 1
+    __local Pair some[GROUP], share_of[GROUP];
+    some[lane] = sum;
+    share_of[lane] = total;
+    for (int reach = GROUP / 2; reach > 0; reach /= 2) {
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (lane < reach) {
+            some[lane] = plus(some[lane], some[lane + reach]);
+            share_of[lane] = plus(share_of[lane], share_of[lane + reach]);
+        }
+    }
+    sum = some[0];
+    total = share_of[0];
+#endif
+    if (lane > 0 || component >= components || unknown[component] != of_unknown) return;
+    sum = normalised(sum);
+    total = normalised(total);
+    const float one = total.high > 0.0f ? total.high : 1.0f, ratio = sum.high / one;
+    const Pair left = normalised(minus(sum, times((Pair){ratio, 0.0f}, total)));
+    offsets[component] = normalised(minus((Pair){mean, mean_rest}, sum_of(ratio, left.high / one))).high;
 }
 
 __kernel void components_add_offsets(

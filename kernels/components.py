@@ -37,6 +37,20 @@ def components_sum(flags: Flags, labels: Labels, relief: Array, plane: Triple, h
     return np.asarray(sums, np.float64), np.asarray(totals, np.float64)
 
 
+def components_offsets(
+    sums: Array, totals: Array, unknown: Array, of_unknown: int, mean: float, offsets: Array
+) -> None:
+    """Write offsets that give some components a mean; those of the others stay.
+
+    These are the components without a known height, if ``of_unknown`` is 1, or all others. ``sums`` and
+    ``totals``, (strips, components), are those of `components_sum`; ``unknown`` is 1 for a component without
+    a known height.
+    """
+    sum_, total = (part.sum(axis=0, dtype=np.float64) for part in (sums, totals))
+    means = np.divide(sum_, total, out=np.zeros(len(sum_)), where=total > 0)
+    offsets[unknown == of_unknown] = (mean - means)[unknown == of_unknown]
+
+
 def components_add_offsets(
     flags: Flags, labels: Labels, relief: Array, plane: Triple, offsets: Array
 ) -> Doubles:

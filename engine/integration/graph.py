@@ -11,7 +11,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from mirrorskin.engine.integration.device_inputs import sample_grid
 from mirrorskin.engine.integration.validation import Flags, Inputs
-from mirrorskin.kernels.array import Array, Operand, fetch
+from mirrorskin.kernels.array import Array, Operand
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.links import DOWN, KNOWN, RIGHT, SLOPE
 
@@ -245,30 +245,38 @@ class Levelling:
         ``on_device``: as an array of the device instead of NumPy's.
         """
         graph, unknown = self._graph, components.offset_unknown
-        if components is not self._components and components.count > 1:
-            graph.put("labels", components.labels)
+        if components is not self._components:
+            self._unknown = self._device.from_host("unknown", unknown, np.uint8)
+            if components.count > 1:
+                graph.put("labels", components.labels)
         self._components = components
         offsets = self._array("offsets", unknown.shape)
         heights = self._device.array("levelled", reliefs.shape, np.float32, zeroed=False)
         rows, columns = graph.shape
         items = rows * -(-columns // min(self._device.layout.tile, _CHUNK))
-        parts: list[tuple[NDArray[np.bool_], Mapping[str, Operand], float]]
-        parts = [(unknown, {}, 0.0), (~unknown, graph.known_heights, datum)]
         for number, plane in enumerate(planes):
             steps = dict(zip(("plane_x", "plane_y", "plane_z"), graph.steps(plane), strict=True))
             relief: dict[str, Any] = {"reliefs": reliefs, "place": number, **steps}
-            added = np.zeros(unknown.shape, np.float32)
-            for selected, maps, mean in parts:
-                if selected.any():
-                    added[selected] = mean - self._means(relief, maps)[selected]
-            offsets.write(added)
+            if unknown.any():
+                self._find_offsets(relief, {}, offsets, of_unknown=1, mean=0.0)
+            if not unknown.all():
+                self._find_offsets(relief, graph.known_heights, offsets, of_unknown=0, mean=datum)
             self._run("components_add_offsets", items, relief, offsets=offsets, heights=heights)
         return heights if on_device else heights.release()
 
-    def _means(self, relief: dict[str, Any], maps: Mapping[str, Operand]) -> NDArray[np.float64]:
-        """Return mean heights of components, or mean differences from known ones, (components,), mm."""
+    def _find_offsets(
+        self,
+        relief: dict[str, Any],
+        maps: Mapping[str, Operand],
+        offsets: Array,
+        *,
+        of_unknown: int,
+        mean: float,
+    ) -> None:
+        """Write offsets that give components a mean height, or a mean difference from known ones, mm."""
         rows, count, layout = self._graph.shape[0], self._count, self._device.layout
-        group = layout.group if layout.tile == 1 and count <= _FEW else 1
+        together = layout.group if layout.tile == 1 else 1
+        group = together if count <= _FEW else 1
         most = _PARTIAL_SUMS if layout.tile > 1 else 4 * _PARTIAL_SUMS if group > 1 else rows
         strip = max(-(-rows // most), -(-rows * count // _MOST_SUMS))
         strips = -(-rows // strip)
@@ -277,9 +285,12 @@ class Levelling:
         sizes = {"strip": strip, "components": count}
         items = strips * (count * group if group > 1 else 1)
         self._run("components_sum", items, relief, **known, **sizes, sums=sums, totals=totals, group=group)
-        parts = fetch([(sums, slice(None)), (totals, slice(None))], [True, True])
-        sum_, total = (part.sum(axis=0, dtype=np.float64) for part in parts)
-        return np.asarray(np.divide(sum_, total, out=np.zeros(count), where=total > 0))
+        high = np.float32(mean)
+        self._device.kernel("components", "components_offsets", ONE=0, GROUP=together)(
+            count * together, strips=strips, components=count, sums=sums, totals=totals,
+            unknown=self._unknown, of_unknown=of_unknown, mean=high, mean_rest=mean - float(high),
+            offsets=offsets, moved=2 * sums.nbytes,
+        )  # fmt: skip
 
     @property
     def _count(self) -> int:

@@ -42,14 +42,11 @@ def test_kernels_and_reference_agree(device, shape, heights, parts):
     rise = PLANE[0] * 0.5, -PLANE[1] * 0.25, PLANE[2]
     given = flags, found.labels, relief, rise
     offsets = np.zeros(found.count)
-    for some, maps in (
-        (found.offset_unknown, (None, None)),
-        (~found.offset_unknown, (inputs.known_heights, inputs.known_height_weights)),
-    ):
-        if some.any():
-            total, share = components.components_sum(*given, *maps, found.count)
-            offsets[some] = -(total[some] / share[some])
-    offsets[~found.offset_unknown] += 5.0
+    weights = inputs.known_heights, inputs.known_height_weights
+    for of_unknown, maps, mean in ((1, (None, None), 0.0), (0, weights, 5.0)):
+        if np.any(found.offset_unknown == of_unknown):
+            sums = [part[np.newaxis] for part in components.components_sum(*given, *maps, found.count)]
+            components.components_offsets(*sums, found.offset_unknown, of_unknown, mean, offsets)
     exact = components.components_add_offsets(*given, offsets)
     levelled = levelling.level(found, array, [(0.0, 0.0, 0.0), PLANE], 5.0)
     np.testing.assert_allclose(levelled[1], exact, atol=1e-5)
