@@ -7,6 +7,7 @@ import os
 import signal
 
 import pytest
+from gpu_check import taken_for_gpu
 
 from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.kernels import device as device_layer
@@ -74,6 +75,14 @@ def device(request):
     opened = Device(device_layer._find()[number])
     opened.info = dataclasses.replace(opened.info, shares_memory=shared)
     opened.layout = LAYOUTS[layout]
+    return opened
+
+
+@pytest.fixture(scope="module")
+def card():
+    """A device that is treated as a GPU with its own memory."""
+    opened = Device(device_layer._find()[0])
+    taken_for_gpu(opened)
     return opened
 
 

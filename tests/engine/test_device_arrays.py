@@ -1,7 +1,5 @@
 """Frames and maps on a device: the answers of arrays on the host, and no copies in between."""
 
-import dataclasses
-
 import numpy as np
 import pyopencl as cl
 import pyopencl.array
@@ -9,9 +7,7 @@ import pytest
 
 from mirrorskin import engine, io
 from mirrorskin.kernels.array import Array
-from mirrorskin.kernels.device import Device, _find
 from mirrorskin.kernels.errors import DeviceMemoryError
-from mirrorskin.kernels.layout import GPU_LAYOUT
 
 SHAPE, FRAMES = (60, 75), 16
 LARGER = 8, 8  # times the shape, so that samples of a map are few
@@ -76,15 +72,6 @@ def ours(device, values):
 
 def of_pyopencl(device, values):
     return pyopencl.array.to_device(device.queue, np.ascontiguousarray(values))
-
-
-@pytest.fixture(scope="module")
-def card():
-    """A device that is treated as a GPU with its own memory."""
-    device = Device(_find()[0])
-    device.layout = GPU_LAYOUT
-    device.info = dataclasses.replace(device.info, kind="gpu", shares_memory=False)
-    return device
 
 
 def copies(device, call):

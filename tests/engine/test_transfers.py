@@ -1,6 +1,5 @@
 """What each call moves between the host and a device with its own memory: no entry of the table may rise."""
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -62,17 +61,6 @@ CALLS = {
     ),
 }
 SMALL = 0.3  # bytes per pixel: tables of frames
-
-
-@pytest.fixture(scope="module")
-def card():
-    """A device that is treated as a GPU with its own memory."""
-    from mirrorskin.kernels.device import _find
-
-    device = Device(_find()[0])
-    device.layout = GPU_LAYOUT
-    device.info = dataclasses.replace(device.info, kind="gpu", shares_memory=False)
-    return device
 
 
 def moved(device, call):
