@@ -555,16 +555,26 @@ GATHERED(gathered, __global)
 #endif
 #define MINE (y >= 0 && y < ROWS && x >= 0 && x < wide)
 
-// Which tiles have nodes with links or anchors: all others are left out.
+// Which tiles, one for a group, have nodes with links or anchors: all others are left out.
 __kernel void multigrid_find_live(LEVEL_ARGS, MAP inverse, const int first_tile, __global uchar *restrict live)
 {
-    const int across = (stride + COLUMNS - 1) / COLUMNS, tile = get_global_id(0), top = tile / across * ROWS;
+    const int across = (stride + COLUMNS - 1) / COLUMNS, tile = get_group_id(0), top = tile / across * ROWS;
     const int left = tile % across * COLUMNS, bottom = LESSER(top + ROWS, rows), right_end = LESSER(left + COLUMNS, stride);
-    if (top >= rows) return;
+#if TILE > 1  // a group has one item, a core's loop
     int any = 0;
     for (int y = top; y < bottom && !any; ++y)
         for (int x = left; x < right_end; ++x) any |= inverse[base + stride * (y + 1) + x] > 0;
     live[first_tile + tile] = any;
+#else
+    __local int any;
+    if (get_local_id(0) == 0) any = 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (int y = top; y < bottom; ++y)
+        for (int x = left + get_local_id(0); x < right_end; x += get_local_size(0))
+            if (inverse[base + stride * (y + 1) + x] > 0) atomic_or(&any, 1);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (get_local_id(0) == 0) live[first_tile + tile] = any;
+#endif
 }
 
 // Steps of Jacobi's method, from heights x or from zero, to t; and the sums of the residual over blocks, the coarse right

@@ -65,8 +65,9 @@ class Cycle:
         """Find the tiles that have nodes; cycles skip the others."""
         h = self._h
         for number, level in enumerate(h.levels[: self._tail]):
-            kernel, items = self._kernel("find_live", level), self._tiles(level)
-            kernel(items, **level.place, inverse=h.inverse, **self._live_of(number), moved=4 * level.nodes)
+            kernel = self._kernel("find_live", level)
+            items, place = self._tiles(level) * kernel.group, level.place | self._live_of(number)
+            kernel(items, **place, inverse=h.inverse, moved=4 * level.nodes)
 
     def _live_of(self, number: int) -> dict[str, Any]:
         return {"live": self._live, "first_tile": int(self._first_tile[number])}

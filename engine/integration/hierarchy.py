@@ -234,10 +234,10 @@ class Hierarchy:
             arguments |= {"residual": residual, "coarse_b": b}
             self.kernel("gather", 4, lanes)(items, **self.places(number), **arguments, moved=80 * count)
 
-    def alone(self, name: str, links: int = 4, **arguments: Any) -> None:
-        """Run a kernel in one work-group."""
+    def alone(self, name: str, level: Level, links: int = 4, **arguments: Any) -> None:
+        """Run a kernel in one work-group, mostly on a level."""
         kernel = self.kernel(name, links)
-        kernel(kernel.group, **arguments, moved=_bytes(self.levels[0], arguments))
+        kernel(kernel.group, **arguments, moved=_bytes(level, arguments))
 
     def over_parts(self, name: str, parts: Array, *, lanes: int = 1, **arguments: Any) -> None:
         """Run a reduction over the finest level; ``parts`` receives the partial sums."""
@@ -272,12 +272,13 @@ class Hierarchy:
         arguments |= {"plain": plain, "strength": strength, **self.graph, "inverse": self.inverse}
         arguments |= {"parts": self._parts, "wanted": self._wanted, "to": self.to, "touched": self._touched}
         arguments |= {"splits": self._splits, "moves": self._counts}
-        self.alone("build", 8, **arguments, changed=self.changed, changes=self.changes)
+        arguments |= {"changed": self.changed, "changes": self.changes}
+        self.alone("build", self.levels[tail], 8, **arguments)
 
     def _invert_coarsest(self) -> None:
         last = self.levels[-1]
         links = self.links_of(last)
-        self.alone("invert_coarsest", links, **last.place, **self.graph, matrix=self.matrix)
+        self.alone("invert_coarsest", last, links, **last.place, **self.graph, matrix=self.matrix)
 
     def first_of_tail(self, lanes: int) -> int:
         """Return the number of the finest level that one work-group processes with all coarser ones."""

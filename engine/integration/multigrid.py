@@ -147,7 +147,7 @@ class Multigrid:
         h.over_parts("curve", self._products, **h.graph, b=cycle.b, **step, count=count)
         products: dict[str, Any] = {"products": cycle.parts.shape[0], "product": cycle.parts}
         lengths: dict[str, Any] = {"lengths": self._lengths}
-        h.alone("best", **products, count=count, parts=self._products, **lengths)
+        h.alone("best", h.levels[-1], **products, count=count, parts=self._products, **lengths)
         h.over("follow", h.levels[0], **lengths, **step, x=solver.x)
         solver.copy("release", solver.x, self._height)
         return self._height

@@ -229,7 +229,7 @@ def test_the_best_step_in_a_plane(cases, graph, same):
         name: case.device.from_host(name, values) for name, values in (("product", halves), ("parts", parts))
     }
     lengths = case.h.array("lengths", 2)
-    case.h.alone("best", products=2, count=2, **given, lengths=lengths)
+    case.h.alone("best", case.h.levels[-1], products=2, count=2, **given, lengths=lengths)
     case.h.over("follow", case.h.levels[0], lengths=lengths, z=z_given, p=p_given, x=x_given)
     along, again = twin.best_step((b * z).sum(), *expected)
     close(lengths.read(), [along, again], 1e-4)
