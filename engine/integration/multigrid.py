@@ -22,6 +22,8 @@ _CYCLES = 2  # cycles without a tolerance
 _DEEP = 3e-4  # tolerance that one cycle from 0 does not reach: two are done before the first test
 _LONGEST = 100  # cycles of a solution, at most
 _PATIENCE, _PROGRESS = 8, 0.7  # iterations in which the residual must decrease to this share of the best one
+_SOONER = 0.75  # share of the expected cycles, as later ones reduce more
+_UNTESTED = 6  # cycles between tests of convergence, at most
 _WORSE = 10  # times the smallest residual so far, above which rounding errors dominate
 _FAILED = 0.3  # residual above which two cycles count as failed
 _FACTORS = 8e-6  # seconds per node of the second level for a factorisation, at most
@@ -205,6 +207,9 @@ class _Gradients:
         self._taken: int | None = None  # the cycle whose step is not yet added to the heights
         self._given: Doubles | None = None  # squared right sides
         self.cycle = Cycle(h, lanes)
+        self._waits_long = (
+            h.device.layout.tile == 1
+        )  # whether a wait takes longer than a cycle that is too many
 
     def copy(self, name: str, level: Array, map_: Array, batch: slice = slice(0, 1)) -> None:
         """Copy a batch of maps, (H, W) each, to the finest level ("admit"), or back ("release")."""
@@ -283,6 +288,7 @@ class _Gradients:
         """Do conjugate gradient steps; return their number, and the residuals."""
         done, residual, energy = 0, np.full(self.lanes, np.inf), np.zeros(self.lanes)
         best, progress = residual.copy(), np.zeros(self.lanes, int)
+        last, untested = np.ones(self.lanes), 1
         moving = np.ones(self.lanes, bool)
         while done < limit and moving.any():
             begun, first = time.perf_counter(), done
@@ -290,7 +296,7 @@ class _Gradients:
                 self._moving.write(moving.astype(np.float32))
                 self._active = moving.copy()
             unseen = not (done or self.started) and deadline is None and goal < _DEEP
-            count = min(_CYCLES, limit) if unseen else 1
+            count = min(_CYCLES if unseen else untested if deadline is None else 1, limit - done)
             for number in range(count):
                 self._step(first + number)
             history, parts = self._read(self._history, self._squares, rows=slice(first, first + count))
@@ -312,6 +318,10 @@ class _Gradients:
             valid = moving & (energy > 0)
             error = np.sqrt(_ratio(_ratio(product * after, rest, valid), energy, valid))
             residual[moving] = np.where(valid, error, np.inf)[moving]
+            untested = (
+                _cycles_to(goal, residual[moving], last[moving], done - first) if self._waits_long else 1
+            )
+            last = residual.copy()
             better = residual < _PROGRESS * best
             best, progress = np.where(better, residual, best), np.where(better, done, progress)
             moving &= (residual > goal) & (residual <= _WORSE * best) & (done - progress < _PATIENCE)
@@ -363,6 +373,16 @@ class _Gradients:
         """Wait once for the device, and return arrays, of the first one some rows, as float64."""
         wanted = [(array, slice(None) if number else rows) for number, array in enumerate(arrays)]
         return [part.astype(np.float64) for part in fetch(wanted, [True] * len(arrays))]
+
+
+def _cycles_to(goal: float, residual: Doubles, last: Doubles, cycles: int) -> int:
+    """Return after how many more cycles residuals may be at the goal, from what some cycles reduced."""
+    with np.errstate(all="ignore"):
+        rate = np.log(residual / last) / max(cycles, 1)
+        further = np.log(goal / residual) / rate
+    if not (np.isfinite(further).all() and (rate < 0).all()):
+        return 1
+    return int(np.clip(_SOONER * further.max(initial=1.0), 1, _UNTESTED))
 
 
 def _sum(parts: Doubles) -> Doubles:
