@@ -72,6 +72,10 @@ def integrate(
     the weight of the known height. The boundary is free (Neumann condition). A full rectangle with uniform
     weights is solved directly, everything else by conjugate gradients with multigrid.
 
+    Slopes or normals of one surface that are on a device, in float32, stay there, and so does ``height``; see
+    `mirrorskin.io.Result.on_device`. They are copied to the host first with ``robust``, a camera, known or
+    initial heights, or a map of weights.
+
     Parameters
     ----------
     dz_dx, dz_dy : array_like or device array, (H, W) or (K, H, W), optional
@@ -112,10 +116,6 @@ def integrate(
     **options
         ``robust``, ``bilateral_sharpness``, ``sigma``, ``tolerance``, ``budget`` and ``device``; see
         `mirrorskin.engine.integration.surface.IntegrationOptions`.
-
-    Slopes or normals of one surface that are on a device, in float32, stay there, and so does ``height``; see
-    `mirrorskin.io.Result.on_device`. They are copied to the host first with ``robust``, a camera, known or
-    initial heights, or a map of weights.
 
     Returns
     -------
