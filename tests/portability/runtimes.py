@@ -109,14 +109,15 @@ def time_calls(calls: Sequence[str], layout: str, target: str | None = None) -> 
 def compile_for(target: str) -> None:
     """Make the wheel's PoCL compile for a processor, from its first look at devices on."""
     from mirrorskin.engine.rotation import normals_kernel
-    from mirrorskin.kernels import embedded
+    from mirrorskin.kernels import embedded, processor_name
 
     def name_target(library: Path) -> tuple[str, bool]:
-        function = getattr(ctypes.CDLL(str(library)), embedded._NAME_FUNCTION)
-        embedded._answer_with(embedded._address(function), target)
+        function = getattr(ctypes.CDLL(str(library)), processor_name.NAME_FUNCTION)
+        processor_name._answer_with(processor_name._address(function), target)
         return target, True
 
-    embedded._ensure_name = name_target
+    assert embedded.ensure_name is processor_name.ensure_name
+    embedded.ensure_name = name_target
     if "avx512" not in target:  # the device goes on to report the registers of this processor
         normals_kernel.vector_lanes = lambda device: 1 if device.layout.tile == 1 else 8
 
