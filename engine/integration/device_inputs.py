@@ -15,6 +15,7 @@ from mirrorskin.engine.integration.validation import (
     Floats,
     Inputs,
     as_marks,
+    check_one_source,
     check_pixel_size,
     median_weight,
     split_weights,
@@ -28,6 +29,7 @@ def check_device_inputs(
     dz_dx: Any, dz_dy: Any, normals: Any, pixel_size: Any, mask: Any, slope_weights: Any, edges: Any
 ) -> Inputs:
     """Return what `check_inputs` does for slopes or normals on a device, with one weight for all."""
+    check_one_source(dz_dx, dz_dy, normals)
     maps = [normals] if normals is not None else [dz_dx, dz_dy]
     axes = 3 if normals is not None else 2
     if (
@@ -72,14 +74,19 @@ def _find_slopes(normals: Array, weight: float) -> tuple[list[Array], list[Array
 
 def _clip(weights: Array) -> float:
     """Clip weights within what can be solved, and return their median."""
-    step = max(1, math.isqrt(math.prod(weights.shape) // SAMPLES))
-    typical = median_weight([sample_grid(weights, step, step)])
+    typical = median_weight([sample_evenly(weights)])
     device, pixels = weights.device, math.prod(weights.shape)
     device.kernel("facing", "facing_clip")(
         -(-pixels // device.layout.tile), pixels=pixels, least=typical * LEAST, most=typical * MOST,
         weight=weights, moved=2 * weights.nbytes,
     )  # fmt: skip
     return typical
+
+
+def sample_evenly(map_: Array) -> Floats:
+    """Return enough pixels of a map for its median."""
+    step = max(1, math.isqrt(math.prod(map_.shape) // SAMPLES))
+    return sample_grid(map_, step, step)
 
 
 def sample_grid(map_: Array, down: int, across: int) -> Floats:

@@ -160,6 +160,12 @@ def check_inputs(
     )
 
 
+def check_one_source(dz_dx: Any, dz_dy: Any, normals: Any) -> None:
+    """Raise InputError if there are both slopes and normals."""
+    if normals is not None and (dz_dx is not None or dz_dy is not None):
+        raise InputError("both slopes and normals are given: leave one of the two out")
+
+
 def _find_source(
     dz_dx: ArrayLike | None,
     dz_dy: ArrayLike | None,
@@ -168,9 +174,8 @@ def _find_source(
     several: bool,
 ) -> tuple[tuple[int, int], Callable[[Box], Slopes]]:
     """Return rows and columns of the picture, and a function that returns the slopes within a box."""
+    check_one_source(dz_dx, dz_dy, normals)
     if normals is not None:
-        if dz_dx is not None or dz_dy is not None:
-            raise InputError("both slopes and normals are given: leave one of the two out")
         vectors = np.asarray(normals)
         if vectors.ndim != 3 or vectors.shape[2] != 3 or 0 in vectors.shape:
             raise InputError(f"normals: shape {vectors.shape}; vectors (H, W, 3) are needed")

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.errors import NotConverged
-from mirrorskin.engine.frames import SAMPLES
-from mirrorskin.engine.integration.device_inputs import sample_grid
+from mirrorskin.engine.integration.device_inputs import sample_evenly
 from mirrorskin.engine.integration.integration import integrate
 from mirrorskin.engine.integration.surface import explain
 from mirrorskin.engine.integration.validation import LEAST, MOST
@@ -255,10 +254,6 @@ class SlopeKernels:
 
 def _typical(*weights: Array) -> float:
     """Return the median of the weights above 0 of evenly spread pixels, or NaN."""
-    parts = []
-    for array in weights:
-        step = max(1, math.isqrt(math.prod(array.shape) // SAMPLES))
-        parts.append(sample_grid(array, step, step).ravel())
-    samples = np.concatenate(parts)
+    samples = np.concatenate([sample_evenly(array).ravel() for array in weights])
     samples = samples[samples > 0]
     return float(np.median(samples)) if samples.size else math.nan

@@ -233,6 +233,12 @@ def test_slopes_that_cannot_be_used_are_refused(device, slopes, said):
         engine.integrate(*(ours(device, values) for values in slopes), 0.1)
 
 
+def test_slopes_and_normals_at_once_are_refused(device):
+    slopes = [ours(device, slope) for slope in SLOPES]
+    with pytest.raises(io.InputError, match="both slopes and normals are given: leave one of the two out"):
+        engine.integrate(*slopes, 0.1, normals=ours(device, NORMALS))
+
+
 def test_a_slope_on_the_host_beside_one_on_the_device_is_refused(device):
     with pytest.raises(io.InputError, match="two maps of slopes"):
         engine.integrate(ours(device, SLOPES[0]), SLOPES[1], 0.1)
