@@ -61,7 +61,7 @@ def _wrap_cl_errors(
                 with waiting:
                     return work(array, *given, **named)
             except cl.Error as error:
-                raise device_error(array._device, f"hold or copy {array.name}", error) from error
+                raise device_error(array.device, f"hold or copy {array.name}", error) from error
 
     return told
 
@@ -100,7 +100,7 @@ class Array:
         self.name = name
         self.arrived: cl.Event | None = None
         self.last_use: cl.Event | None = None
-        self.device = self._device = device
+        self.device = device
         self.is_shared: bool = device.info.shares_memory
         self._lock = threading.RLock()
         self._mapped: Mapping | None = None
@@ -167,7 +167,7 @@ class Array:
     def __dlpack_device__(self) -> tuple[int, int]:
         if not self.is_shared:
             raise BufferError(
-                f"{self.name} is in memory of {self._device.info.title} that other libraries cannot use:"
+                f"{self.name} is in memory of {self.device.info.title} that other libraries cannot use:"
                 " copy it with read() or numpy.asarray"
             )
         return np.empty(0).__dlpack_device__()
@@ -212,9 +212,9 @@ class Array:
         ``after`` is the kernel to wait for if later ones only read; by default all commands are waited for.
         """
         if after is None:
-            return self._read(rows, self._device.queue, [self.latest] if self.latest else [])
-        self._device.queue.flush()
-        return self._read(rows, self._device.copies, [after])
+            return self._read(rows, self.device.queue, [self.latest] if self.latest else [])
+        self.device.queue.flush()
+        return self._read(rows, self.device.copies, [after])
 
     @_wrap_cl_errors
     def release(self) -> NDArray[Any]:
@@ -223,14 +223,14 @@ class Array:
         Shared memory is returned as it is, without a copy.
         """
         if not self.is_shared:
-            values = self._read(slice(None), self._device.queue, [self.latest] if self.latest else [])
+            values = self.read()
             self._give_back()
             return values
         self._map()
         if self._mapped is not None:
             self._mapped.release()
             self._mapped = None
-            self._device.finish()
+            self.device.finish()
         return self._host
 
     @_wrap_cl_errors
@@ -242,28 +242,28 @@ class Array:
         if self.is_shared or self._is_parked:
             return
         if keep and self._filling is None:
-            self._parked = self._read(slice(None), self._device.queue, [self.latest] if self.latest else [])
+            self._parked = self.read()
         self._give_back()
         self._is_parked = True
 
     @_wrap_cl_errors
     def cut(self, start: int, shape: tuple[int, ...]) -> Array:
         """Return a copy, on the device, of the elements from a number on, in another shape."""
-        copied = Array(self._device, self.name, shape, self.dtype, zeroed=False)
+        copied = Array(self.device, self.name, shape, self.dtype, zeroed=False)
         if copied.nbytes == 0:
             return copied
         after = [event for event in (self.latest, copied.latest) if event is not None]
         source, target = self.buffer, copied.buffer
-        with self._device.enqueuing:
+        with self.device.enqueuing:
             event = cl.enqueue_copy(
-                self._device.queue,
+                self.device.queue,
                 target,
                 source,
                 src_offset=start * self.dtype.itemsize,
                 byte_count=copied.nbytes,
                 wait_for=after,
             )
-        self._device.profile.watch("copy", self.name, event, copied.nbytes)
+        self.device.profile.watch("copy", self.name, event, copied.nbytes)
         self.last_use = copied.arrived = event
         copied.last_use = None
         return copied
@@ -275,7 +275,7 @@ class Array:
 
         buffer, self._is_lent = self.buffer, True
         after = [] if self.latest is None else [self.latest]
-        return OpenCLArray(self._device.queue, self.shape, self.dtype, data=buffer, events=after)
+        return OpenCLArray(self.device.queue, self.shape, self.dtype, data=buffer, events=after)
 
     @property
     def buffer(self) -> cl.Buffer:
@@ -307,14 +307,14 @@ class Array:
             self._map()
         elif self._mapped is None and self._buffer is not None:
             if self.last_use is not None:
-                self._device.profile.wait(self.name, self.last_use)
+                self.device.profile.wait(self.name, self.last_use)
             self._buffer = None  # a new one sees what the host wrote, without a turn of the queue
 
     def _map(self) -> None:
         """Let the host see what the device wrote to shared memory, if anything."""
         if self._mapped is None and self._buffer is not None:
-            with self._device.profile.waiting_for(self.name):
-                self._mapped = Mapping(self._device.queue, self._buffer, self.shape, self.dtype)
+            with self.device.profile.waiting_for(self.name):
+                self._mapped = Mapping(self.device.queue, self._buffer, self.shape, self.dtype)
 
     def _fill_on_device(self) -> None:
         value, self._filling = self._filling, None
@@ -324,13 +324,13 @@ class Array:
             if value == ZERO and not np.signbit(value)
             else np.array([value]).astype(self.dtype)
         )
-        queue, size = self._device.queue, -(-self.nbytes // pattern.itemsize) * pattern.itemsize
+        queue, size = self.device.queue, -(-self.nbytes // pattern.itemsize) * pattern.itemsize
         assert self._buffer is not None
-        with self._device.enqueuing:
+        with self.device.enqueuing:
             event = cl.enqueue_fill_buffer(
                 queue, self._buffer, pattern, 0, size, wait_for=[self.latest] if self.latest else None
             )
-        self._device.profile.watch("fill", self.name, event, size)
+        self.device.profile.watch("fill", self.name, event, size)
         self.arrived, self.last_use = event, None
 
     def _copy_up(self, values: NDArray[Any], start: int) -> None:
@@ -341,7 +341,7 @@ class Array:
             self._filling = None
         piece = Piece(self.name, self.buffer, start)
         after = [self.latest] if self.latest else []
-        event = self._device.transfers.upload(self._device, piece, values, self.dtype, after)
+        event = self.device.transfers.upload(self.device, piece, values, self.dtype, after)
         self.arrived, self.last_use = event, None
 
     def _read(self, rows: int | slice, queue: cl.CommandQueue, after: Sequence[cl.Event]) -> NDArray[Any]:
@@ -352,11 +352,11 @@ class Array:
                 return self._parked[rows].copy()
             out = _empty(shape, self.dtype)
             piece = Piece(self.name, self.buffer, start)
-            self._device.transfers.download(self._device, [(piece, out)], queue, after)
+            self.device.transfers.download(self.device, [(piece, out)], queue, after)
             return out
         if self._mapped is not None or self._buffer is None:
             return self._host[rows].copy()
-        with self._device.profile.waiting_for(self.name):
+        with self.device.profile.waiting_for(self.name):
             mapping = Mapping(
                 queue, self.buffer, shape, self.dtype, cl.map_flags.READ, offset=start, after=after
             )
@@ -374,17 +374,17 @@ class Array:
         """Give the device's side back; other arrays wait for what still uses it."""
         buffer, self._buffer = self._buffer, None
         if buffer is not None and not (self.is_shared or self._is_lent):
-            self._device.pool.give(buffer, self.latest)
+            self.device.pool.give(buffer, self.latest)
 
     def _allocate(self) -> None:
         flags = cl.mem_flags.READ_WRITE
-        with _naming(self._device, self.name, self.nbytes), waiting:
+        with _naming(self.device, self.name, self.nbytes), waiting:
             if self.is_shared:
                 self._buffer = cl.Buffer(
-                    self._device.context, flags | cl.mem_flags.USE_HOST_PTR, hostbuf=self._memory
+                    self.device.context, flags | cl.mem_flags.USE_HOST_PTR, hostbuf=self._memory
                 )
             else:
-                self._buffer, self.arrived = self._device.take_buffer(self.nbytes + SLACK)
+                self._buffer, self.arrived = self.device.take_buffer(self.nbytes + SLACK)
                 self.last_use = None
 
 
@@ -418,7 +418,7 @@ def fetch(parts: Sequence[tuple[Array, int | slice]], keep: Sequence[bool] = ())
     of the others are no copies.
     """
     keep = keep or [False] * len(parts)
-    device, reads, after = parts[0][0]._device, [], []
+    device, reads, after = parts[0][0].device, [], []
     if parts[0][0].is_shared:
         return [
             array.read(rows) if kept else array.release()[rows]
@@ -466,7 +466,7 @@ class BorrowedBuffer:
     arrived = None
 
     def __init__(self, device: Device, name: str, values: NDArray[Any]) -> None:
-        self._device, self.name, self.host = device, name, values
+        self.device, self.name, self.host = device, name, values
         self.shape, self.nbytes = values.shape, values.nbytes
         self.last_use: cl.Event | None = None
         self._lock = threading.RLock()
@@ -485,7 +485,7 @@ class BorrowedBuffer:
     def wait(self) -> None:
         """Wait until no kernel reads it."""
         if self.last_use is not None:
-            self._device.profile.wait(self.name, self.last_use)
+            self.device.profile.wait(self.name, self.last_use)
 
 
 def can_be_borrowed(values: NDArray[Any]) -> bool:

@@ -207,9 +207,8 @@ class _Gradients:
         self._taken: int | None = None  # the cycle whose step is not yet added to the heights
         self._given: Doubles | None = None  # squared right sides
         self.cycle = Cycle(h, lanes)
-        self._waits_long = (
-            h.device.layout.tile == 1
-        )  # whether a wait takes longer than a cycle that is too many
+        # Whether a wait takes longer than a cycle that is too many.
+        self._waits_long = h.device.layout.tile == 1
 
     def copy(self, name: str, level: Array, map_: Array, batch: slice = slice(0, 1)) -> None:
         """Copy a batch of maps, (H, W) each, to the finest level ("admit"), or back ("release")."""
@@ -377,9 +376,8 @@ class _Gradients:
 
 def _cycles_to(goal: float, residual: Doubles, last: Doubles, cycles: int) -> int:
     """Return after how many more cycles residuals may be at the goal, from what some cycles reduced."""
-    with np.errstate(all="ignore"):
-        rate = np.log(residual / last) / max(cycles, 1)
-        further = np.log(goal / residual) / rate
+    rate = np.log(residual / last) / max(cycles, 1)
+    further = np.log(goal / residual) / rate
     if not (np.isfinite(further).all() and (rate < 0).all()):
         return 1
     return int(np.clip(_SOONER * further.max(initial=1.0), 1, _UNTESTED))
