@@ -2,10 +2,11 @@
 
 import os
 import signal
-import socket
+import socketserver
 import subprocess
 import sys
 import threading
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -74,28 +75,29 @@ def test_notes_that_cannot_be_printed_do_not_end_a_command(recording, tmp_path):
 )
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_an_interrupted_read_from_a_network_is_quiet(begun, number, code):
-    asked, connections = threading.Event(), []
-    with socket.create_server(("127.0.0.1", 0)) as server:
+    asked = threading.Event()
 
-        def serve():
-            while True:
-                try:
-                    connections.append(server.accept()[0])
-                except OSError:  # closed
-                    return
-                connections[-1].recv(4096)
-                connections[-1].sendall(begun)
+    class Handler(socketserver.BaseRequestHandler):
+        """Answers with what is begun, then waits until the reader is gone, which may be at any time."""
+
+        def handle(self):
+            with suppress(ConnectionError):
+                self.request.recv(4096)
+                self.request.sendall(begun)
                 asked.set()
+                while self.request.recv(4096):
+                    pass
 
-        threading.Thread(target=serve, daemon=True).start()
-        address = f"http://127.0.0.1:{server.getsockname()[1]}/press.zarr"
-        with subprocess.Popen(
-            [PROGRAM, "info", address], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        ) as process:
-            assert asked.wait(LIMIT)
-            process.send_signal(number)
-            out, said = process.communicate(timeout=LIMIT)
-        server.shutdown(socket.SHUT_RDWR)
-    for one in connections:
-        one.close()
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Handler) as server:
+        threading.Thread(target=server.serve_forever).start()
+        address = f"http://127.0.0.1:{server.server_address[1]}/press.zarr"
+        try:
+            with subprocess.Popen(
+                [PROGRAM, "info", address], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            ) as process:
+                assert asked.wait(LIMIT)
+                process.send_signal(number)
+                out, said = process.communicate(timeout=LIMIT)
+        finally:
+            server.shutdown()
     assert (process.returncode, out, said) == (code, "", "")
