@@ -26,9 +26,11 @@ from .selection import Region
 from .streaming import StreamRecorder
 from .types import (
     Block,
+    Finding,
     Header,
     InputError,
     LiveSource,
+    MirrorskinWarning,
     Motion,
     Source,
     Truth,
@@ -41,6 +43,7 @@ __all__ = [
     "Calibrated",
     "Calibration",
     "CameraId",
+    "Finding",
     "Gel",
     "Header",
     "InputError",
@@ -48,6 +51,7 @@ __all__ = [
     "LiveSource",
     "Map",
     "Mesh",
+    "MirrorskinWarning",
     "Motion",
     "Precession",
     "Recorder",

@@ -31,6 +31,7 @@ from mirrorskin.io.types import (
     UNDISTORTED,
     Block,
     Closing,
+    Finding,
     Floats,
     Header,
     InputError,
@@ -74,6 +75,8 @@ class Recording(Closing):
         The frames of the whole stack that these are, as text.
     storage : str
         How the frames are stored, as text.
+    findings : tuple of Finding
+        What the metadata of the file make doubtful, or what was converted.
     read_ahead : bool
         Whether reading in a separate thread is faster, as for Zarr.
     """
@@ -100,6 +103,7 @@ class Recording(Closing):
     rewindable = True
     read_ahead = False
     left_out: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     def __init__(
         self,
