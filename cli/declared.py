@@ -73,6 +73,10 @@ class Term:
     def read(self, text: str, where: str) -> Any:
         """Return the value that a text on the command line stands for, in the option's unit."""
         if self.kind == "numbers":
+            if self.unit in _UNITS:
+                from mirrorskin.cli.quantity import refuse_decimal_comma
+
+                refuse_decimal_comma(text, where)
             return [self.read_one(part, where) for part in text.split(",")]
         return self.read_one(text, where)
 

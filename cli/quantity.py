@@ -13,7 +13,8 @@ from mirrorskin.io import InputError, Region
 from mirrorskin.io.text import shortened
 from mirrorskin.io.units import Kind, in_base
 
-_NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+"""Pattern of a number with a decimal point."""
 _UNIT = r"[A-Za-z\u00b5\u03bc]+|°"
 _EXAMPLES: dict[Kind, str] = {
     "length": "0.1mm",
@@ -24,15 +25,19 @@ _EXAMPLES: dict[Kind, str] = {
     "pressure": "0.1MPa",
 }
 _PER_ANGLE = "5.7/deg"
+_DECIMAL_COMMA = re.compile(
+    rf"\s*([+-]?[0-9]+),([0-9]+(?:[eE][+-]?[0-9]+)?)\s*((?:{_UNIT})?(?:/(?:{_UNIT}))?)\s*"
+)
 
 
 def length(text: str, option: str = "") -> float:
     """Return a length, as in ``0.1mm``, in millimetres; of either sign."""
-    return _read(text, option, "length")
+    return read_quantity(text, option, "length")
 
 
 def lengths(text: str, option: str = "") -> tuple[float, float]:
     """Return lengths along x and y, as in ``0.03mm,0.04mm``, or one for both, in millimetres."""
+    refuse_decimal_comma(text, option)
     values = [length(part, option) for part in text.split(",")]
     if len(values) > 2:
         raise _error(text, option, "one or two lengths are needed", "0.03mm,0.04mm")
@@ -41,6 +46,7 @@ def lengths(text: str, option: str = "") -> tuple[float, float]:
 
 def vector(text: str, count: int, option: str = "") -> tuple[float, ...]:
     """Return ``count`` lengths, as in ``0mm,0mm,40mm``, in millimetres."""
+    refuse_decimal_comma(text, option)
     values = tuple(length(part, option) for part in text.split(","))
     if len(values) != count:
         raise _error(text, option, f"{count} lengths are needed", ",".join(["0mm"] * (count - 1) + ["1mm"]))
@@ -65,12 +71,12 @@ def compliance(text: str, option: str = "") -> float:
 
 def force(text: str, option: str = "") -> float:
     """Return a force above 0, as in ``1.5N``, or that of a weight, as in ``150g``, in newtons."""
-    return _above_zero(_read(text, option, "force"), text, option, "force")
+    return _above_zero(read_quantity(text, option, "force"), text, option, "force")
 
 
 def pressure(text: str, option: str = "") -> float:
     """Return a pressure or a modulus above 0, as in ``0.1MPa``, in N/mm^2."""
-    return _above_zero(_read(text, option, "pressure"), text, option, "pressure")
+    return _above_zero(read_quantity(text, option, "pressure"), text, option, "pressure")
 
 
 def _above_zero(value: float, text: str, option: str, kind: Kind) -> float:
@@ -84,6 +90,7 @@ def number(text: str, option: str = "") -> float:
     try:
         return float(text)
     except ValueError:
+        refuse_decimal_comma(text, option)
         raise _error(text, option, "a number is needed", "0.25") from None
 
 
@@ -97,25 +104,26 @@ def integer(text: str, option: str = "") -> int:
 
 def duration(text: str, option: str = "") -> float:
     """Return a time, as in ``10ms``, in seconds."""
-    return _read(text, option, "time")
+    return read_quantity(text, option, "time")
 
 
 def angle(text: str, option: str = "") -> float:
     """Return an angle, as in ``2.5deg``, in radians."""
-    return _read(text, option, "angle")
+    return read_quantity(text, option, "angle")
 
 
 def per_angle(text: str, option: str = "") -> float:
     """Return a number per unit of angle, as in ``5.7/deg``, per radian."""
-    match = re.fullmatch(rf"\s*({_NUMBER})\s*/\s*({_UNIT})\s*", text)
+    match = re.fullmatch(rf"\s*({NUMBER})\s*/\s*({_UNIT})\s*", text)
     if match is None:
+        refuse_decimal_comma(text, option)
         raise _error(text, option, "a number over a unit of angle is needed", _PER_ANGLE)
     return _scaled(float(match[1]), match[2], "angle", text, option, _PER_ANGLE, per_unit=True)
 
 
 def memory(text: str, option: str = "") -> int:
     """Return an amount of memory, as in ``512MB`` (10^6) or ``512MiB`` (2^20), in bytes, at least one."""
-    size = round(_read(text, option, "memory"))
+    size = round(read_quantity(text, option, "memory"))
     if size < 1:
         raise _error(text, option, "at least one byte is needed", _EXAMPLES["memory"])
     return size
@@ -148,9 +156,11 @@ def frame_range(text: str, option: str = "") -> tuple[int, int | None]:
     return start or 0, stop
 
 
-def _read(text: str, option: str, kind: Kind) -> float:
-    match = re.fullmatch(rf"\s*({_NUMBER})\s*({_UNIT})?\s*", text)
+def read_quantity(text: str, option: str, kind: Kind) -> float:
+    """Return a number with a unit of some kind, in the base unit of that kind."""
+    match = re.fullmatch(rf"\s*({NUMBER})\s*({_UNIT})?\s*", text)
     if match is None:
+        refuse_decimal_comma(text, option)
         raise _error(text, option, "a number and a unit are needed", _EXAMPLES[kind])
     if match[2] is None:
         raise _error(text, option, "a unit is needed", _EXAMPLES[kind])
@@ -168,6 +178,28 @@ def _scaled(
     if not math.isfinite(value):
         raise _error(text, option, "the number is too large", example)
     return value
+
+
+def decimal_comma(text: str) -> str:
+    """Return a number that is written with a decimal comma with a point instead; "" for any other text.
+
+    Examples
+    --------
+    >>> decimal_comma("0,05mm"), decimal_comma("0.05mm,0.04mm")
+    ('0.05mm', '')
+    """
+    found = _DECIMAL_COMMA.fullmatch(text)
+    return f"{found[1]}.{found[2]}{found[3]}" if found else ""
+
+
+def refuse_decimal_comma(text: str, option: str) -> None:
+    """Raise InputError if quantities are written with a decimal comma: 0,05mm or 0,03mm,0,04mm."""
+    for part in text.split(":"):
+        numbers = part.split(",")
+        pairs = [",".join(numbers[first : first + 2]) for first in range(0, len(numbers), 2)]
+        if found := next(filter(None, map(decimal_comma, pairs)), ""):
+            given = " ".join(f"{option} {shortened(text)}".split())
+            raise InputError(f"{given}: write the number with a decimal point, {found}")
 
 
 def _error(text: str, option: str, wrong: str, example: str) -> InputError:

@@ -17,7 +17,7 @@ from mirrorskin.engine.reconstruction import method_for
 from mirrorskin.engine.rotation.tilt import check_tilt
 from mirrorskin.engine.running import load_operation
 from mirrorskin.io import InputError
-from mirrorskin.io.os_errors import MAX_TEXT_BYTES, read_regular
+from mirrorskin.io.os_errors import read_text
 from mirrorskin.io.settings_file import load_toml
 
 _REMEDY = "write the tables [stack], [press], [rotation], [slip], or [stack] and [operation] in TOML"
@@ -57,8 +57,9 @@ def _operation_of(path: Path) -> str:
 
     `load_toml` reports what else is wrong with the file.
     """
+    text = read_text(path, _REMEDY)
     try:
-        table = tomllib.loads(read_regular(path, _REMEDY, MAX_TEXT_BYTES).decode()).get("operation")
+        table = tomllib.loads(text).get("operation")
     except (ValueError, RecursionError):
         return ""
     if not isinstance(table, dict):

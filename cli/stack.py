@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
@@ -128,54 +128,24 @@ class Listed:
 
 
 def read_phases(path: Path) -> Listed:
-    """Read angles with their units, one a line or several between blanks; ``#`` begins a comment."""
-    from mirrorskin.cli.quantity import angle
+    """Read the phase of each frame: angles with units, or numbers under a heading that states the unit."""
+    from mirrorskin.cli.table import read_column
 
-    return _listed(path, "phases", "write one angle a frame in it, such as 178.1deg", angle)
+    remedy, names = "write one angle a frame in it, such as 178.1deg", (("phase", "phases"), ("angle",))
+    return Listed(path, "phases", read_column(path, "angle", "phases", remedy, names))
 
 
 def read_travel(path: Path) -> Listed:
-    """Read the travel of each frame: an array of NumPy's, mm, or a text of lengths, mm where no unit stands.
+    """Read the travel of each frame: an array of NumPy's, mm, or a table.
 
-    In a text they stand between blanks, commas or semicolons; ``#`` begins a comment, and a first line that
-    begins with a letter is a head.
+    Numbers in a table are mm unless they, or the heading of their column, state another unit.
     """
-    from mirrorskin.cli.quantity import length
+    from mirrorskin.cli.table import read_column
 
     if path.suffix.lower() == ".npy":
         from mirrorskin.io.arrays import read_array
 
         return Listed(path, "travels", tuple(map(float, read_array(path).reshape(-1))))
-
-    def millimetres(text: str, where: str) -> float:
-        try:
-            return float(text)
-        except ValueError:
-            return length(text, where)
-
     remedy = "write one length a frame in it, such as 0.15mm"
-    return _listed(path, "travels", remedy, millimetres, table=True)
-
-
-def _listed(
-    path: Path, what: str, remedy: str, read: Callable[[str, str], float], *, table: bool = False
-) -> Listed:
-    """Read a text of positions; in a ``table``, commas and semicolons are blanks, and there may be a head."""
-    from mirrorskin.io import InputError
-    from mirrorskin.io.os_errors import MAX_TEXT_BYTES, read_regular
-
-    try:
-        lines = read_regular(path, remedy, MAX_TEXT_BYTES).decode().splitlines()
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is no text: {remedy}") from error
-    if table:
-        lines = [line.replace(",", " ").replace(";", " ") for line in lines]
-        lines[:1] = ["" if line.strip()[:1].isalpha() else line for line in lines[:1]]
-    values = tuple(
-        read(word, f"{path}, line {number}:")
-        for number, line in enumerate(lines, 1)
-        for word in line.partition("#")[0].split()
-    )
-    if not values:
-        raise InputError(f"{path} lists no {what}: {remedy}")
-    return Listed(path, what, values)
+    names = ("travel", "travels"), ("position", "pos"), ("z",), ("depth", "displacement")
+    return Listed(path, "travels", read_column(path, "length", "travels", remedy, names, "mm"))

@@ -47,7 +47,7 @@ class Emulator:
         None if the twin did not write it, or if the stage's port has been changed: then it is a user's own.
         """
         with open_regular(path) as file:
-            text = file.read(_LONGEST).decode(errors="replace")
+            text = file.read(_LONGEST).decode("utf-8-sig", errors="replace")
         found = _HEADING.match(text)
         if found is None or f'\nport = "{found[1]}"\n' not in text:
             return None

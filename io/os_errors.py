@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import stat
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from io import BufferedReader, FileIO
@@ -106,6 +107,15 @@ def read_regular(path: Path, remedy: str = "", limit: int = MAX_UNPACKED_BYTES) 
             return file.read(limit)
         except OSError as error:
             raise InputError(f"{path} cannot be read: {error.strerror}{remedy and f'; {remedy}'}") from error
+
+
+def read_text(path: Path, remedy: str = "") -> str:
+    """Read a text file: UTF-8, or UTF-16 after a byte-order mark, which is not part of the text."""
+    data = read_regular(path, remedy, MAX_TEXT_BYTES)
+    try:
+        return data.decode("utf-16" if data.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not text in UTF-8{remedy and f'; {remedy}'}") from error
 
 
 def check_unpacked(size: int, what: str, remedy: str, limit: int = MAX_UNPACKED_BYTES) -> None:

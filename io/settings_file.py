@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
 
-from mirrorskin.io.os_errors import MAX_TEXT_BYTES, read_regular
+from mirrorskin.io.os_errors import read_text
 from mirrorskin.io.text import printable, shortened
 from mirrorskin.io.types import InputError
 
@@ -40,12 +41,17 @@ def load_toml(path: str | Path, model: type[_Model], remedy: str) -> _Model:
     2.0
     """
     path = Path(path)
-    data = read_regular(path, remedy, MAX_TEXT_BYTES)
+    text = read_text(path, remedy)
     try:
-        tables = tomllib.loads(data.decode())
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not text, but must be TOML; {remedy}") from error
+        tables = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
+        comma = re.search(r"^[^#\n\"']*=\s*([+-]?\d+),(\d+)\s*(?:#.*)?$", text, re.MULTILINE)
+        if comma:
+            line = text.count("\n", 0, comma.start()) + 1
+            written, number = ",".join(comma.groups()), ".".join(comma.groups())
+            raise InputError(
+                f"{path}, line {line}: {written}: write the number with a decimal point, {number}"
+            ) from error
         raise InputError(f"{path} is not TOML: {error}; correct it there") from error
     return _table(tables, model, str(path), "")
 

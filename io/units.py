@@ -64,6 +64,11 @@ def in_base(symbol: str, kind: Kind) -> float:
     return _pint_factor(symbol, kind) if known is None else known
 
 
+def is_common(symbol: str, kind: Kind | None = None) -> bool:
+    """Return whether a text is the symbol of a common unit, of some kind or of any."""
+    return any(symbol in units for own, units in _COMMON.items() if kind in (None, own))
+
+
 def conversion_factor(unit: str, wanted: str, where: str) -> float:
     """Return the factor that converts a value in a file from its unit to a base unit, or to one over it."""
     if unit == wanted:

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from mirrorskin.io import InputError
-from mirrorskin.io.os_errors import MAX_TEXT_BYTES, read_regular
+from mirrorskin.io.os_errors import read_text
 from mirrorskin.kernels.device import Device
 
 THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -213,10 +213,10 @@ def open_run(path: Path) -> Run:
     InputError
         The file cannot be read, or is not a run.
     """
-    data = read_regular(path, limit=MAX_TEXT_BYTES)
+    text = read_text(path)
     try:
-        return msgspec.json.decode(data, type=Run)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        return msgspec.json.decode(text, type=Run)
+    except (msgspec.DecodeError, RecursionError) as error:
         reason = str(error).replace("JSON is", "the JSON is")
         reason = reason[:1].lower() + reason[1:]
         raise InputError(f"{path}: {reason}. Specify a file that 'mirrorskin bench -o' wrote") from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -79,25 +78,22 @@ def _forces(presses: list[Path], texts: list[str], readings: Path | None) -> lis
 
 
 def _table(path: Path) -> dict[str, float]:
-    """Read newtons by the names of recordings; the first line may be a heading."""
+    """Read forces by the names of recordings, newtons where no unit is stated."""
+    from mirrorskin.cli import table
+    from mirrorskin.cli.quantity import force
     from mirrorskin.io import InputError
-    from mirrorskin.io.os_errors import MAX_TEXT_BYTES, read_regular
     from mirrorskin.io.text import shortened
 
-    try:
-        text = read_regular(path, _REMEDY, MAX_TEXT_BYTES).decode()
-        rows = [row for row in csv.reader(text.splitlines()) if row]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path} cannot be read: {error}; {_REMEDY}") from error
-    table = {}
-    for number, row in enumerate(rows):
-        try:
-            table[Path(row[0].strip()).name] = float(row[1])
-        except (IndexError, ValueError) as error:
-            if number:
-                line = shortened(",".join(row))
-                raise InputError(f"{path}: {line!r} is not a force: {_REMEDY}") from error
-    return table
+    read = table.read_table(path, _REMEDY)
+    unit = table.unit_of(read.heading[1], "force", str(path)) if len(read.heading) == 2 else ""
+    forces = {}
+    for row in read.rows:
+        line = shortened(",".join(row.cells))
+        if len(row.cells) != 2:
+            raise InputError(f"{row.where} {line!r} is not a recording and a force: {_REMEDY}")
+        name, text = row.cells
+        forces[Path(name).name] = force(text if text[-1:].isalpha() else f"{text}{unit or 'N'}", row.where)
+    return forces
 
 
 def _learned(fit: StiffnessFit, presses: list[Path], newtons: list[float]) -> inputs.Learned:

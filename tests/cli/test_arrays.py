@@ -104,7 +104,10 @@ def test_the_travel_of_a_real_stage_places_heights():
             ["ball.npz", "--dataset", "none"],
             "holds no array 'none': choose from frames, travel, dark, bright",
         ),
-        (["ball.npy", "--travel", "ball.npz"], "ball.npz is no text: write one length a frame in it"),
+        (
+            ["ball.npy", "--travel", "ball.npz"],
+            "ball.npz is not text in UTF-8; write one length",
+        ),
         (["ball.npy", "--travel", "t.txt"], "t.txt lists 2 travels for 12 frames: one a frame is needed"),
         (["ball.npy", "--travel", "t.txt", *STEPS], "Remove --travel-step and --travel-start"),
         (["ball.npy", "--travel", "ball.npy"], "lists 2304 travels for 12 frames"),

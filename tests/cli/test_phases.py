@@ -18,6 +18,9 @@ MEASURED = [178.1, 220.8, 280.5, 316.5, 7.6, 48.0, 96.3, 136.4]
         ("\n".join(f"{angle}deg" for angle in MEASURED), MEASURED),
         (" ".join(f"{angle}deg" for angle in MEASURED) + "\n", MEASURED),
         ("# lights, as measured\n\n 10deg 20deg # two\n#30deg\n\t40deg\r\n", [10, 20, 40]),
+        ("10deg, 20deg", [10, 20]),
+        ("10 deg\n20 deg", [10, 20]),
+        ("frame;phase [deg]\n0;10\n1;20.5", [10, 20.5]),
         ("0rad 3.141592653589793rad 1turn -90\u00b0", [0, 180, 360, -90]),
     ],
 )
@@ -44,15 +47,14 @@ def test_another_number_of_phases_than_of_frames_is_refused(tmp_path):
     ("content", "line"),
     [
         (b"10deg\n20deg\n\n# three\n30\n", ", line 5: 30: a unit is needed; write e.g. 2.5deg"),
-        (b"10deg, 20deg", ", line 1: 10deg,: a number and a unit are needed; write e.g. 2.5deg"),
-        (b"10 deg", ", line 1: 10: a unit is needed; write e.g. 2.5deg"),
+        (b"10,5deg\n20deg", ", line 1: 10,5deg: write the number with a decimal point, 10.5deg"),
         (b"10mm", ", line 1: 10mm: millimeters are not an angle; write e.g. 2.5deg"),
         (b"nandeg", ", line 1: nandeg: a number and a unit are needed; write e.g. 2.5deg"),
         (b"x" * 9999, f", line 1: {'x' * 40}...: a number and a unit are needed; write e.g. 2.5deg"),
         (b"1e999deg", ", line 1: 1e999deg: the number is too large; write e.g. 2.5deg"),
         (b"", " lists no phases: write one angle a frame in it, such as 178.1deg"),
         (b"# 10deg\n", " lists no phases: write one angle a frame in it, such as 178.1deg"),
-        (b"\x89HDF\r\n\xff", " is no text: write one angle a frame in it, such as 178.1deg"),
+        (b"\x89HDF\r\n\xff", " is not text in UTF-8; write one angle a frame in it, such as 178.1deg"),
         (None, " cannot be read: No such file or directory; write one angle a frame in it, such as 178.1deg"),
     ],
 )

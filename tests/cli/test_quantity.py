@@ -16,6 +16,7 @@ from mirrorskin.cli.quantity import (
     length,
     lengths,
     memory,
+    number,
     per_angle,
     segment,
     vector,
@@ -225,7 +226,6 @@ def test_messages_name_the_option_the_value_and_an_example(read, text, message):
         "nan mm",
         "inf mm",
         "-inf mm",
-        "0,1mm",
         "5 mm mm",
         "2*3mm",
         "1mm**2",
@@ -291,3 +291,23 @@ def test_a_segment_is_two_points():
 def test_what_is_no_segment_is_refused(text):
     with pytest.raises(InputError, match="--section"):
         segment(text, "--section")
+
+
+@pytest.mark.parametrize(
+    ("read", "text", "written"),
+    [
+        (length, "0,05mm", "0.05mm"),
+        (lengths, "0,05mm", "0.05mm"),
+        (lengths, "0,03mm,0,04mm", "0.03mm"),
+        (two, "-0,5mm,1,5mm", "-0.5mm"),
+        (segment, "-2,5mm,0mm:2mm,0mm", "-2.5mm"),
+        (angle, "22,5deg", "22.5deg"),
+        (memory, "4,1GB", "4.1GB"),
+        (per_angle, "5,7/deg", "5.7/deg"),
+        (compliance, "0,01mm/N", "0.01mm"),
+        (number, "0,25", "0.25"),
+    ],
+)
+def test_a_decimal_comma_is_named(read, text, written):
+    with pytest.raises(InputError, match=rf"^--o .*: write the number with a decimal point, {written}$"):
+        read(text, "--o")

@@ -88,9 +88,21 @@ def test_a_file_that_is_no_text_or_missing(tmp_path):
     path = tmp_path / "rig.toml"
     with pytest.raises(io.InputError, match=r"cannot be read: .*; write it anew"):
         load_toml(path, Rig, "write it anew")
-    path.write_bytes(b"\xff\xfe")
-    with pytest.raises(io.InputError, match="is not text"):
+    path.write_bytes(b"press = \xff")
+    with pytest.raises(io.InputError, match="is not text in UTF-8; write it anew"):
         load_toml(path, Rig, "write it anew")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_byte_order_mark_is_not_part_of_the_text(tmp_path, encoding):
+    path = tmp_path / "rig.toml"
+    path.write_text("[stage]\npress-depth = 2", encoding=encoding)
+    assert load_toml(path, Rig, "write it anew").stage.press_depth == 2.0
+
+
+def test_a_decimal_comma_is_named(tmp_path):
+    with pytest.raises(io.InputError, match=r"line 2: 0,5: write the number with a decimal point, 0\.5"):
+        load(tmp_path, "[stage]\npress-depth = 0,5  # mm\n")
 
 
 def test_a_pipe_that_nobody_writes_to_is_refused(tmp_path):

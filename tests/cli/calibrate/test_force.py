@@ -87,11 +87,13 @@ def test_a_modulus_can_be_given(folder):
         ("--force -1N", "a force above 0 is needed; write e.g. 1.5N"),
         ("--readings none.csv", "none.csv: no such file"),
         ("--readings other.csv", "other.csv has no line for press-0.h5"),
-        ("--readings bad.csv", "is not a force: write REC.h5,newtons"),
+        ("--readings bad.csv", "bad.csv, line 2: much: a number and a unit are needed; write e.g. 1.5N"),
+        ("--readings comma.csv", "comma.csv, line 2: 'press-0.h5,1,5' is not a recording and a force"),
         ("--force 1N -o new.h5", "new.h5 has no gel"),
     ],
 )
 def test_a_wrong_call_is_one_line(words, said):
     Path("other.csv").write_text("press-9.h5,1.0\n")
     Path("bad.csv").write_text("name,newtons\npress-0.h5,much\n")
+    Path("comma.csv").write_text("name,newtons\npress-0.h5,1,5\n")
     refused(said, f"calibrate force press-0.h5 -o cal.h5 {words}")

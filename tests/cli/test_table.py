@@ -1,0 +1,100 @@
+"""Tables of the travel of each frame, as spreadsheets and stages write them."""
+
+from __future__ import annotations
+
+import pytest
+
+from mirrorskin.cli.stack import read_travel
+from mirrorskin.cli.table import read_table, unit_of
+from mirrorskin.io import InputError
+
+TRAVEL = (0.0, 0.05, 0.1)
+
+
+def read(tmp_path, text, encoding="utf-8"):
+    path = tmp_path / "travel.csv"
+    path.write_bytes(text.encode(encoding))
+    return read_travel(path).values
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le"])
+def test_a_byte_order_mark_is_not_part_of_the_first_number(tmp_path, encoding):
+    mark = "\ufeff" if encoding == "utf-16-le" else ""
+    assert read(tmp_path, mark + "0\r\n0.05\r\n0.1\r\n", encoding) == pytest.approx(TRAVEL)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "travel [um]\n0\n50\n100",
+        "z_um\n0\n50\n100",
+        "position/\u00b5m\n0\n50\n100",
+        "travel (mm)\n0\n0.05\n0.1",
+        "travel\n0\n0.05\n0.1",
+        "travel, mm\n0\n0.05\n0.1",
+        "travel [m]\n0\n5e-5\n1e-4",
+        "travel [um]\n0\n50\n0.1mm",
+        "# travel [um]\n0\n50\n100",
+        "# of the stage\n0 0.05 0.1",
+        "0,0.05,0.1",
+        "travel [um]\n0 50 100",
+        "0mm 0.05mm\n0.1mm",
+        "0 mm\n50 um\n0.1 mm",
+        "frame,time [s],z [um]\n0,0,0\n1,0.1,50\n2,0.2,100",
+        "frame;travel [um]\n0;0\n1;50\n2;100",
+        "frame\ttravel [um]\n0\t0\n1\t50\n2\t100",
+        "frame travel [um]\n0 0\n1 50\n2 100",
+        '"frame","travel, smoothed [um]"\n0,0\n1,50\n2,100',
+        "# frame, position [um]\n0,0\n1,50\n2,100",
+        "sep=;\nframe;travel [um]\n0;0\n1;50\n2;100",
+        "z [um],travel [mm]\n7,0\n8,0.05\n9,0.1",
+    ],
+)
+def test_the_heading_states_the_unit_and_the_column(tmp_path, text):
+    assert read(tmp_path, text) == pytest.approx(TRAVEL, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("travel [s]\n0\n1", "the heading 'travel [s]' states the unit 's': seconds are not a length"),
+        (
+            "travel [steps]\n0\n1",
+            "states the unit 'steps': steps is not a known unit; write",
+        ),
+        ("travel_deg\n0\n1", "states the unit 'deg': degrees are not a length"),
+        ("0,05\n0,10\n0,15", "travel.csv, line 1: 0,05: write the number with a decimal point, 0.05"),
+        ("travel [mm]\n0,05\n0,10", "line 2: 0,05: write the number with a decimal point, 0.05"),
+        ("frame;travel\n0;0,05\n1;0,10", "line 2: 0,05: write the number with a decimal point, 0.05"),
+        ("0,05 0,10 0,15", "line 1: 0,05: write the number with a decimal point, 0.05"),
+        ("0,05mm\n0,1mm", "line 1: 0,05mm: write the number with a decimal point, 0.05mm"),
+        (
+            "0 0.05\n1 0.1",
+            "has 2 columns without names: name them in a first line, such as frame,",
+        ),
+        ("0,0.05\n1,0.1", "has 2 columns without names"),
+        ("frame,load\n0,1\n1,2", "has the columns frame, load, and none of travels: name one travel"),
+        (
+            "z_set,z_true\n0,1\n1,2",
+            "has several columns of travels, 'z_set' and 'z_true'",
+        ),
+        ("a,b,travel\n0,1\n1,2", "has 2 columns and 3 names in its first line"),
+        ("frame,travel\n0,0.05\n1", "line 3:: a number and a unit are needed"),
+    ],
+)
+def test_what_does_not_state_one_travel_of_each_frame_is_refused(tmp_path, text, said):
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, text)
+    assert said in str(caught.value)
+
+
+def test_a_heading_without_unit_has_none():
+    assert unit_of("s", "length", "here") == ""
+    assert unit_of("travel", "length", "here") == ""
+
+
+def test_the_cells_of_a_table_are_without_blanks(tmp_path):
+    path = tmp_path / "forces.csv"
+    path.write_text("name ; force [mN]\na.h5; 5 \n")
+    table = read_table(path, "write it")
+    assert (table.heading, [row.cells for row in table.rows]) == (("name", "force [mN]"), [("a.h5", "5")])
