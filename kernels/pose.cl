@@ -1,9 +1,18 @@
 // Normal equations of a rigid motion between two maps. Specification: pose.py.
 //
-// TILE     pixels of one work-item of pose_gradient
+// TILE     pixels of one work-item of pose_gradient; 1 where an item is a lane, many where it is a core's loop
 // BESIDE   1 where the Jacobian by the first map's own curvature is wanted too
 
 #include "common.clh"
+
+#if TILE > 1
+#define LANES 8  // pixels of a row of a block
+#else
+#define LANES 1
+#endif
+#include "lanes.clh"
+
+#define UNROLL _Pragma("unroll")
 
 #define AROUND 2
 #define LEAST 7
@@ -51,53 +60,115 @@ __kernel void pose_gradient(
     }
 }
 
-float upright(const float x, const float y) { return root(GREATER(1.0f - x * x - y * y, 1e-6f)); }
+typedef struct { F x, y, z; } Vector;
+typedef struct { F xx, xy, yy; } Symmetric;  // covariance of a normal's x and y, or second derivatives
+typedef struct { F x, y, square, z, variance, xx, xy, yy; } Record;
 
-// Covariance xx, xy, yy of a normal's x and y after a rotation.
-float3 variances(const float x, const float y, const float *turn, const float square, const float least)
+#if LANES > 1
+// The records of a row of pixels, number by number.
+#define LOW(a, b) (F)(a.s0, b.s0, a.s1, b.s1, a.s4, b.s4, a.s5, b.s5)
+#define HIGH(a, b) (F)(a.s2, b.s2, a.s3, b.s3, a.s6, b.s6, a.s7, b.s7)
+#define LOW_PAIRS(a, b) (F)(a.s01, b.s01, a.s45, b.s45)
+#define HIGH_PAIRS(a, b) (F)(a.s23, b.s23, a.s67, b.s67)
+Record transposed(const float8 *r)
 {
-    const float flat = x * x + y * y, outside = GREATER(flat, least), z = upright(x, y);
-    const float share = 0.5f * least / outside, across = (1.0f - share) * square;
-    const float more = (2.0f * share - 1.0f) * square / outside;
-    const float u = turn[0] * x + turn[1] * y + turn[2] * z, v = turn[3] * x + turn[4] * y + turn[5] * z;
-    const float a = z * (turn[0] * x + turn[1] * y) - turn[2] * flat, b = z * (turn[3] * x + turn[4] * y) - turn[5] * flat;
-    return (float3)(across * (1.0f - u * u) + more * a * a, more * a * b - across * u * v,
-                    across * (1.0f - v * v) + more * b * b);
+    const F a = LOW(r[0], r[1]), b = HIGH(r[0], r[1]), c = LOW(r[2], r[3]), d = HIGH(r[2], r[3]);
+    const F e = LOW(r[4], r[5]), f = HIGH(r[4], r[5]), g = LOW(r[6], r[7]), h = HIGH(r[6], r[7]);
+    const F i = LOW_PAIRS(a, c), j = HIGH_PAIRS(a, c), k = LOW_PAIRS(b, d), l = HIGH_PAIRS(b, d);
+    const F m = LOW_PAIRS(e, g), n = HIGH_PAIRS(e, g), o = LOW_PAIRS(f, h), p = HIGH_PAIRS(f, h);
+    return (Record){(F)(i.lo, m.lo), (F)(j.lo, n.lo), (F)(k.lo, o.lo), (F)(l.lo, p.lo),
+                    (F)(i.hi, m.hi), (F)(j.hi, n.hi), (F)(k.hi, o.hi), (F)(l.hi, p.hi)};
 }
 
-float3 same_variances(const float x, const float y, const float z, const float square, const float least)
+float sum_over_lanes(const F x)
 {
-    const float flat = x * x + y * y, outside = GREATER(flat, least);
-    const float share = 0.5f * least / outside, across = (1.0f - share) * square;
-    const float more = (2.0f * share - 1.0f) * square / outside * z * z - across;
-    return (float3)(across + more * x * x, more * x * y, across + more * y * y);
+    const float4 four = x.lo + x.hi;
+    const float2 two = four.lo + four.hi;
+    return two.x + two.y;
+}
+
+#define NUMBERS (I)(0, 1, 2, 3, 4, 5, 6, 7)
+#define KEEP(values, room) vstore8(values, 0, room)
+#define KEPT(room) vload8(0, room)
+#else
+Record transposed(const float8 *r)
+{
+    return (Record){r->s0, r->s1, r->s2, r->s3, r->s4, r->s5, r->s6, r->s7};
+}
+
+float sum_over_lanes(const F x) { return x; }
+
+#define NUMBERS 0
+#define KEEP(values, room) (*(room) = (values))
+#define KEPT(room) (*(room))
+#endif
+
+// What does not count has no effect, and is finite.
+Record where(const I known, const Record r)
+{
+    const F none = 0.0f;
+    return (Record){known ? r.x : none, known ? r.y : none, known ? r.square : (F)1.0f, known ? r.z : none,
+                    known ? r.variance : none, known ? r.xx : none, known ? r.xy : none, known ? r.yy : none};
+}
+
+Vector upright(const F x, const F y) { return (Vector){x, y, roots(GREATER(1.0f - x * x - y * y, (F)1e-6f))}; }
+
+// Covariance of a normal after a rotation; u, v: x and y of it then.
+Symmetric variances(const Vector n, const float *turn, const F u, const F v, const F square, const float least)
+{
+    const F flat = n.x * n.x + n.y * n.y, outside = GREATER(flat, (F)least), per_outside = 1.0f / outside;
+    const F share = 0.5f * least * per_outside, across = (1.0f - share) * square;
+    const F more = (2.0f * share - 1.0f) * square * per_outside;
+    const F a = n.z * (turn[0] * n.x + turn[1] * n.y) - turn[2] * flat;
+    const F b = n.z * (turn[3] * n.x + turn[4] * n.y) - turn[5] * flat;
+    return (Symmetric){across * (1.0f - u * u) + more * a * a, more * a * b - across * u * v,
+                       across * (1.0f - v * v) + more * b * b};
+}
+
+Symmetric same_variances(const Vector n, const F square, const float least)
+{
+    const F flat = n.x * n.x + n.y * n.y, per_outside = 1.0f / GREATER(flat, (F)least);
+    const F share = 0.5f * least * per_outside, across = (1.0f - share) * square;
+    const F more = (2.0f * share - 1.0f) * square * per_outside * n.z * n.z - across;
+    return (Symmetric){across + more * n.x * n.x, more * n.x * n.y, across + more * n.y * n.y};
 }
 
 // A second derivative of F = z - h(x, y) after a rotation.
 #define SECOND(i, j)                                                                                              \
-    -(h.x * turn[3 * i] * turn[3 * j] + h.y * (turn[3 * i] * turn[3 * j + 1] + turn[3 * i + 1] * turn[3 * j])       \
-      + h.z * turn[3 * i + 1] * turn[3 * j + 1])
+    -(h.xx * (turn[3 * i] * turn[3 * j]) + h.xy * (turn[3 * i] * turn[3 * j + 1] + turn[3 * i + 1] * turn[3 * j])   \
+      + h.yy * (turn[3 * i + 1] * turn[3 * j + 1]))
 
-float3 turn_curvature(const float z_before, const float3 h, const float *turn, const float3 n)
+Symmetric turn_curvature(const F z_before, const Symmetric h, const F over_z, const float *turn, const Vector n)
 {
-    const float p = -n.x / n.z, q = -n.y / n.z, scale = z_before / n.z;
-    const float xx = SECOND(0, 0), xy = SECOND(0, 1), yy = SECOND(1, 1), xz = SECOND(0, 2), yz = SECOND(1, 2), zz = SECOND(2, 2);
-    return -scale * (float3)(xx + 2.0f * xz * p + zz * p * p, xy + xz * q + yz * p + zz * p * q, yy + 2.0f * yz * q + zz * q * q);
+    const F p = -n.x * over_z, q = -n.y * over_z, scale = -z_before * over_z;
+    const F xx = SECOND(0, 0), xy = SECOND(0, 1), yy = SECOND(1, 1), xz = SECOND(0, 2), yz = SECOND(1, 2), zz = SECOND(2, 2);
+    return (Symmetric){scale * (xx + 2.0f * xz * p + zz * p * p), scale * (xy + xz * q + yz * p + zz * p * q),
+                       scale * (yy + 2.0f * yz * q + zz * q * q)};
 }
 
-// Three rows of the Jacobian, six numbers each in a vector of eight; the first two are whitened.
-void jacobian(const float3 n, const float3 h, const float3 arm, const float3 lower, const float sure, float8 *rows)
+// Three rows of the Jacobian, six numbers each; the first two are whitened, and have 0 for a translation along z.
+typedef struct { F x[5], y[5], z[6]; } Jacobian;
+#define UPPER(i, k) ((i) * (11 - (i)) / 2 + (k))
+#define PRODUCT(a, i, b, k) \
+    (((i) < 5 && (k) < 5 ? (a).x[i] * (b).x[k] + (a).y[i] * (b).y[k] : 0.0f) + (a).z[i] * (b).z[k])
+
+void jacobian(const Vector n, const Symmetric h, const F over_z, const Vector arm, const Vector lower, const F sure, Jacobian *rows)
 {
-    const float8 move_x = (float8)(0, arm.z, -arm.y, 1, 0, 0, 0, 0), move_y = (float8)(-arm.z, 0, arm.x, 0, 1, 0, 0, 0);
-    const float8 move_z = (float8)(arm.y, -arm.x, 0, 0, 0, 1, 0, 0);
-    const float8 turn_x = (float8)(0, n.z, -n.y, 0, 0, 0, 0, 0), turn_y = (float8)(-n.z, 0, n.x, 0, 0, 0, 0, 0);
-    const float8 change_x = h.x * move_x + h.y * move_y, change_y = h.y * move_x + h.z * move_y;
-    const float8 along = n.x * change_x + n.y * change_y;
-    const float8 x = turn_x + n.z * (change_x - n.x * along), y = turn_y + n.z * (change_y - n.y * along);
-    rows[0] = x * lower.x;
-    rows[1] = (y - lower.y * rows[0]) * lower.z;
-    const float by = sure / n.z;
-    rows[2] = sure * move_z + by * n.x * move_x + by * n.y * move_y;
+    const F change_x[5] = {-h.xy * arm.z, h.xx * arm.z, h.xy * arm.x - h.xx * arm.y, h.xx, h.xy};
+    const F change_y[5] = {-h.yy * arm.z, h.xy * arm.z, h.yy * arm.x - h.xy * arm.y, h.xy, h.yy};
+    const F turn_x[5] = {0.0f, n.z, -n.y, 0.0f, 0.0f}, turn_y[5] = {-n.z, 0.0f, n.x, 0.0f, 0.0f};
+    UNROLL for (int i = 0; i < 5; ++i) {
+        const F along = n.x * change_x[i] + n.y * change_y[i];
+        rows->x[i] = (turn_x[i] + n.z * (change_x[i] - n.x * along)) * lower.x;
+        rows->y[i] = (turn_y[i] + n.z * (change_y[i] - n.y * along) - lower.y * rows->x[i]) * lower.z;
+    }
+    const F by = sure * over_z, by_x = by * n.x, by_y = by * n.y;
+    rows->z[0] = sure * arm.y - by_y * arm.z;
+    rows->z[1] = by_x * arm.z - sure * arm.x;
+    rows->z[2] = by_y * arm.x - by_x * arm.y;
+    rows->z[3] = by_x;
+    rows->z[4] = by_y;
+    rows->z[5] = sure;
 }
 
 // Of pose after pose, and block after block of the first map's pixels: the sums that pose.py names, SUMS numbers each.
@@ -111,96 +182,92 @@ __kernel void pose_equations(
     if (item / blocks >= count) return;
     MAP pose = poses + item / blocks * POSE;
     float turn[9];
-    for (int i = 0; i < 9; ++i) turn[i] = pose[i];
+    UNROLL for (int i = 0; i < 9; ++i) turn[i] = pose[i];
     const float3 shift = vload3(3, pose), centre = vload3(4, pose);
     const float x0 = pose[15], y0 = pose[16], step_x = pose[17], step_y = pose[18], least = pose[23];
     const float other_x = pose[19], other_y = pose[20], wide = pose[21], high = pose[22], other_least = pose[24];
     const float east_x = 1.0f / wide, south_y = 1.0f / high;
-    float8 upper[6], whole[6], right = 0.0f;
-    float chi = 0, expected = 0, heights = 0, normals = 0;
-    for (int i = 0; i < 6; ++i) upper[i] = whole[i] = 0.0f;
+    F total[SUMS];
+    UNROLL for (int i = 0; i < SUMS; ++i) total[i] = 0.0f;
     for (int row = top; row < LESSER(top + side, rows); row += step)
-        for (int column = begin; column < LESSER(begin + side, columns); column += step) {
-            const float8 mine = vload8(row * columns + column, first);
-            if (mine.s0 != mine.s0) continue;
-            const float x = x0 + column * step_x, y = y0 - row * step_y, z = mine.s3;
-            const float3 place = (float3)(turn[0] * x + turn[1] * y + turn[2] * z + shift.x,
-                                          turn[3] * x + turn[4] * y + turn[5] * z + shift.y,
-                                          turn[6] * x + turn[7] * y + turn[8] * z + shift.z);
-            const float to_right = (place.x - other_x) * east_x, to_below = (other_y - place.y) * south_y;
-            if (!(to_right >= 0.0f && to_right < other_columns - 1 && to_below >= 0.0f && to_below < other_rows - 1))
-                continue;
-            const int west = to_right, north = to_below, at = north * other_columns + west;
-            const float u = to_right - west, v = to_below - north;
-            const float left = 1.0f - u, above = 1.0f - v;
-            const float nw = left * above, ne = u * above, sw = left * v, se = u * v;
-            const float8 a_nw = vload8(at, second), a_ne = vload8(at + 1, second);
-            const float8 a_sw = vload8(at + other_columns, second), a_se = vload8(at + other_columns + 1, second);
-            const float8 found = nw * a_nw + ne * a_ne + sw * a_sw + se * a_se;
-            if (found.s0 != found.s0) continue;
-            const float share = (u * u + (1.0f - u) * (1.0f - u)) * (v * v + (1.0f - v) * (1.0f - v));
-            const float3 n = (float3)(found.s0, found.s1, upright(found.s0, found.s1)), arm = place - centre;
-            const float bent_x = u * left * (above * (a_nw.s0 - a_ne.s0) + v * (a_sw.s0 - a_se.s0)) * wide;
-            const float bent_y = v * above * (left * (a_nw.s1 - a_sw.s1) + u * (a_ne.s1 - a_se.s1)) * high;
-            const float height = found.s3 - 0.5f * (bent_x - bent_y) / n.z;
-            const float z_before = upright(mine.s0, mine.s1);
-            const float3 turned = (float3)(turn[0] * mine.s0 + turn[1] * mine.s1 + turn[2] * z_before,
-                                           turn[3] * mine.s0 + turn[4] * mine.s1 + turn[5] * z_before,
-                                           turn[6] * mine.s0 + turn[7] * mine.s1 + turn[8] * z_before);
-            const float3 other = same_variances(n.x, n.y, n.z, found.s2, other_least);
-            const float3 both = variances(mine.s0, mine.s1, turn, mine.s2, least) + other;
-            const float area = both.x * both.z - both.y * both.y;
-            const float low = inverse_root(both.x), told = both.x + both.z < VAGUE ? 1.0f : 0.0f;
-            const float3 lower = (float3)(told * low, both.y * low, told * inverse_root(area) / low);
-            const float lift = (turn[2] * n.x + turn[5] * n.y + turn[8] * n.z) / n.z, own = lift * lift * mine.s4;
-            const int compared = mine.s4 < NEAR && found.s4 < NEAR;
-            const float sure = compared ? inverse_root(own + found.s4) : 0.0f;
-            float8 mine_rows[3];
-            jacobian(n, (float3)(found.s5, found.s6, found.s7), arm, lower, sure, mine_rows);
-            const float r0 = (turned.x - n.x) * lower.x, r1 = (turned.y - n.y - lower.y * r0) * lower.z;
-            const float r2 = sure * (place.z - height);
-            const float8 a = mine_rows[0], b = mine_rows[1], c = mine_rows[2];
-            right += a * r0 + b * r1 + c * r2;
-            chi += r0 * r0 + r1 * r1 + r2 * r2;
-            const float traced = (both.z * other.x - 2.0f * both.y * other.y + both.x * other.z) / area;
-            expected += told * (2.0f - (1.0f - share) * traced) + sure * sure * (own + share * found.s4);
-            heights += compared ? 1.0f : 0.0f;
-            normals += told;
-            upper[0] += a.s0 * a + b.s0 * b + c.s0 * c;
-            upper[1] += a.s1 * a + b.s1 * b + c.s1 * c;
-            upper[2] += a.s2 * a + b.s2 * b + c.s2 * c;
-            upper[3] += a.s3 * a + b.s3 * b + c.s3 * c;
-            upper[4] += a.s4 * a + b.s4 * b + c.s4 * c;
-            upper[5] += a.s5 * a + b.s5 * b + c.s5 * c;
+        for (int column = begin; column < LESSER(begin + side, columns); column += LANES * step) {
+            float8 records[LANES];
+            UNROLL for (int i = 0; i < LANES; ++i)
+                records[i] = vload8(row * columns + LESSER(column + i * step, columns - 1), first);
+            Record mine = transposed(records);
+            const I number = column + step * NUMBERS;
+            const F x = x0 + WIDE(convert_float)(number) * step_x;
+            const float y = y0 - row * step_y;
+            const Vector place = {turn[0] * x + turn[1] * y + turn[2] * mine.z + shift.x,
+                                  turn[3] * x + turn[4] * y + turn[5] * mine.z + shift.y,
+                                  turn[6] * x + turn[7] * y + turn[8] * mine.z + shift.z};
+            F to_right = (place.x - other_x) * east_x, to_below = (other_y - place.y) * south_y;
+            const I inside = (number < columns) & (mine.x == mine.x) & (to_right >= 0.0f) & (to_right < other_columns - 1)
+                & (to_below >= 0.0f) & (to_below < other_rows - 1);
+            if (!any_of(inside)) continue;
+            to_right = inside ? to_right : (F)0.0f;
+            to_below = inside ? to_below : (F)0.0f;
+            const I west = WIDE(convert_int)(to_right), north = WIDE(convert_int)(to_below);
+            const F u = to_right - WIDE(convert_float)(west), v = to_below - WIDE(convert_float)(north);
+            float us[LANES], vs[LANES], bents[LANES];
+            int corners[LANES];
+            KEEP(u, us);
+            KEEP(v, vs);
+            KEEP(north * other_columns + west, corners);
+            UNROLL for (int i = 0; i < LANES; ++i) {
+                const int at = corners[i];
+                const float left = 1.0f - us[i], right = us[i], above = 1.0f - vs[i], below = vs[i];
+                const float8 a_nw = vload8(at, second), a_ne = vload8(at + 1, second);
+                const float8 a_sw = vload8(at + other_columns, second), a_se = vload8(at + other_columns + 1, second);
+                records[i] = left * above * a_nw + right * above * a_ne + left * below * a_sw + right * below * a_se;
+                bents[i] = left * right * (above * (a_nw.s0 - a_ne.s0) + below * (a_sw.s0 - a_se.s0)) * wide
+                    - above * below * (left * (a_nw.s1 - a_sw.s1) + right * (a_ne.s1 - a_se.s1)) * high;
+            }
+            Record found = transposed(records);
+            const I known = inside & (found.x == found.x);
+            if (!any_of(known)) continue;
+            mine = where(known, mine);
+            found = where(known, found);
+
+            const F share = (u * u + (1.0f - u) * (1.0f - u)) * (v * v + (1.0f - v) * (1.0f - v));
+            const Vector n = upright(found.x, found.y), before = upright(mine.x, mine.y);
+            const Vector arm = {known ? place.x - centre.x : (F)0.0f, known ? place.y - centre.y : (F)0.0f,
+                                known ? place.z - centre.z : (F)0.0f};
+            const F over_z = 1.0f / n.z, height = found.z - 0.5f * KEPT(bents) * over_z;
+            const Vector turned = {turn[0] * before.x + turn[1] * before.y + turn[2] * before.z,
+                                   turn[3] * before.x + turn[4] * before.y + turn[5] * before.z,
+                                   turn[6] * before.x + turn[7] * before.y + turn[8] * before.z};
+            const Symmetric own = variances(before, turn, turned.x, turned.y, mine.square, least);
+            const Symmetric other = same_variances(n, found.square, other_least);
+            const F xx = own.xx + other.xx, xy = own.xy + other.xy, yy = own.yy + other.yy, area = xx * yy - xy * xy;
+            const F told = (known & (xx + yy < VAGUE)) ? (F)1.0f : (F)0.0f, low = inverse_roots(xx);
+            const Vector lower = {told * low, xy * low, told * inverse_roots(area) * xx * low};
+            const F lift = (turn[2] * n.x + turn[5] * n.y + turn[8] * n.z) * over_z, own_height = lift * lift * mine.variance;
+            const I compared = known & (mine.variance < NEAR) & (found.variance < NEAR);
+            const F sure = compared ? inverse_roots(own_height + found.variance) : (F)0.0f;
+            const F r0 = (turned.x - n.x) * lower.x, r1 = (turned.y - n.y - lower.y * r0) * lower.z;
+            const F r2 = compared ? sure * (place.z - height) : (F)0.0f;
+            const F traced = (yy * other.xx - 2.0f * xy * other.xy + xx * other.yy) / area;
+            Jacobian j;
+            jacobian(n, (Symmetric){found.xx, found.xy, found.yy}, over_z, arm, lower, sure, &j);
+            UNROLL for (int i = 0; i < 6; ++i) {
+                UNROLL for (int k = 0; k < 6; ++k)
+                    if (k >= i) total[UPPER(i, k)] += PRODUCT(j, i, j, k);
+                total[21 + i] += (i < 5 ? j.x[i] * r0 + j.y[i] * r1 : 0.0f) + j.z[i] * r2;
+            }
+            total[27] += r0 * r0 + r1 * r1 + r2 * r2;
+            total[28] += told * (2.0f - (1.0f - share) * traced) + sure * sure * (own_height + share * found.variance);
+            total[29] += compared ? (F)1.0f : (F)0.0f;
+            total[30] += told;
 #if BESIDE
-            const float3 curved = turn_curvature(z_before, (float3)(mine.s5, mine.s6, mine.s7), turn, turned);
-            float8 own_rows[3];
-            jacobian(turned, curved, arm, lower, sure, own_rows);
-            const float8 d = own_rows[0], e = own_rows[1], f = own_rows[2];
-            whole[0] += a.s0 * d + b.s0 * e + c.s0 * f;
-            whole[1] += a.s1 * d + b.s1 * e + c.s1 * f;
-            whole[2] += a.s2 * d + b.s2 * e + c.s2 * f;
-            whole[3] += a.s3 * d + b.s3 * e + c.s3 * f;
-            whole[4] += a.s4 * d + b.s4 * e + c.s4 * f;
-            whole[5] += a.s5 * d + b.s5 * e + c.s5 * f;
+            const F over_turned = 1.0f / turned.z;
+            const Symmetric curved = turn_curvature(before.z, (Symmetric){mine.xx, mine.xy, mine.yy}, over_turned, turn, turned);
+            Jacobian beside;
+            jacobian(turned, curved, over_turned, arm, lower, sure, &beside);
+            UNROLL for (int i = 0; i < 6; ++i)
+                UNROLL for (int k = 0; k < 6; ++k) total[31 + 6 * i + k] += PRODUCT(j, i, beside, k);
 #endif
         }
     OUT out = sums + item * SUMS;
-    int k = 0;
-    for (int i = 0; i < 6; ++i) {
-        float line[8];
-        vstore8(upper[i], 0, line);
-        for (int j = i; j < 6; ++j) out[k++] = line[j];
-    }
-    float line[8];
-    vstore8(right, 0, line);
-    for (int j = 0; j < 6; ++j) out[k++] = line[j];
-    out[k++] = chi;
-    out[k++] = expected;
-    out[k++] = heights;
-    out[k++] = normals;
-    for (int i = 0; i < 6; ++i) {
-        vstore8(whole[i], 0, line);
-        for (int j = 0; j < 6; ++j) out[k++] = line[j];
-    }
+    UNROLL for (int i = 0; i < SUMS; ++i) out[i] = sum_over_lanes(total[i]);
 }
