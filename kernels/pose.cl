@@ -60,6 +60,13 @@ __kernel void pose_gradient(
     }
 }
 
+#define LOAD(map, p) (*(__global const Loose *)((map) + 8 * (p)))
+#define KEEP(values, room) (*(Lanes *)(room) = (values))
+#define KEPT(room) (*(const Lanes *)(room))
+typedef float8 __attribute__((aligned(4))) Loose;  // somewhere in memory
+typedef F __attribute__((aligned(4))) Lanes;
+typedef I __attribute__((aligned(4))) Places;
+
 typedef struct { F x, y, z; } Vector;
 typedef struct { F xx, xy, yy; } Symmetric;  // covariance of a normal's x and y, or second derivatives
 typedef struct { F x, y, square, z, variance, xx, xy, yy; } Record;
@@ -88,8 +95,6 @@ float sum_over_lanes(const F x)
 }
 
 #define NUMBERS (I)(0, 1, 2, 3, 4, 5, 6, 7)
-#define KEEP(values, room) vstore8(values, 0, room)
-#define KEPT(room) vload8(0, room)
 #else
 Record transposed(const float8 *r)
 {
@@ -99,8 +104,6 @@ Record transposed(const float8 *r)
 float sum_over_lanes(const F x) { return x; }
 
 #define NUMBERS 0
-#define KEEP(values, room) (*(room) = (values))
-#define KEPT(room) (*(room))
 #endif
 
 // What does not count has no effect, and is finite.
@@ -193,10 +196,10 @@ __kernel void pose_equations(
         for (int column = begin; column < LESSER(begin + side, columns); column += LANES * step) {
             float8 records[LANES];
             UNROLL for (int i = 0; i < LANES; ++i)
-                records[i] = vload8(row * columns + LESSER(column + i * step, columns - 1), first);
+                records[i] = LOAD(first, row * columns + LESSER(column + i * step, columns - 1));
             Record mine = transposed(records);
             const I number = column + step * NUMBERS;
-            const F x = x0 + WIDE(convert_float)(number) * step_x;
+            const F x = x0 + CONVERT(number, F) * step_x;
             const float y = y0 - row * step_y;
             const Vector place = {turn[0] * x + turn[1] * y + turn[2] * mine.z + shift.x,
                                   turn[3] * x + turn[4] * y + turn[5] * mine.z + shift.y,
@@ -207,21 +210,21 @@ __kernel void pose_equations(
             if (!any_of(inside)) continue;
             to_right = inside ? to_right : (F)0.0f;
             to_below = inside ? to_below : (F)0.0f;
-            const I west = WIDE(convert_int)(to_right), north = WIDE(convert_int)(to_below);
-            const F u = to_right - WIDE(convert_float)(west), v = to_below - WIDE(convert_float)(north);
-            float us[LANES], vs[LANES], bents[LANES];
+            const I west = CONVERT(to_right, I), north = CONVERT(to_below, I);
+            const F u = to_right - CONVERT(west, F), v = to_below - CONVERT(north, F);
+            float us[LANES], vs[LANES], bents_x[LANES], bents_y[LANES];
             int corners[LANES];
             KEEP(u, us);
             KEEP(v, vs);
-            KEEP(north * other_columns + west, corners);
+            *(Places *)corners = north * other_columns + west;
             UNROLL for (int i = 0; i < LANES; ++i) {
-                const int at = corners[i];
-                const float left = 1.0f - us[i], right = us[i], above = 1.0f - vs[i], below = vs[i];
-                const float8 a_nw = vload8(at, second), a_ne = vload8(at + 1, second);
-                const float8 a_sw = vload8(at + other_columns, second), a_se = vload8(at + other_columns + 1, second);
-                records[i] = left * above * a_nw + right * above * a_ne + left * below * a_sw + right * below * a_se;
-                bents[i] = left * right * (above * (a_nw.s0 - a_ne.s0) + below * (a_sw.s0 - a_se.s0)) * wide
-                    - above * below * (left * (a_nw.s1 - a_sw.s1) + right * (a_ne.s1 - a_se.s1)) * high;
+                const int at = corners[i], below = at + other_columns;
+                const float8 nw = LOAD(second, at), ne = LOAD(second, at + 1), sw = LOAD(second, below), se = LOAD(second, below + 1);
+                const float8 upper = (1.0f - us[i]) * nw + us[i] * ne, lower = (1.0f - us[i]) * sw + us[i] * se;
+                const float8 change_x = (1.0f - vs[i]) * (nw - ne) + vs[i] * (sw - se), change_y = upper - lower;
+                records[i] = (1.0f - vs[i]) * upper + vs[i] * lower;
+                bents_x[i] = change_x.s0;
+                bents_y[i] = change_y.s1;
             }
             Record found = transposed(records);
             const I known = inside & (found.x == found.x);
@@ -233,7 +236,8 @@ __kernel void pose_equations(
             const Vector n = upright(found.x, found.y), before = upright(mine.x, mine.y);
             const Vector arm = {known ? place.x - centre.x : (F)0.0f, known ? place.y - centre.y : (F)0.0f,
                                 known ? place.z - centre.z : (F)0.0f};
-            const F over_z = 1.0f / n.z, height = found.z - 0.5f * KEPT(bents) * over_z;
+            const F bent = u * (1.0f - u) * wide * KEPT(bents_x) - v * (1.0f - v) * high * KEPT(bents_y);
+            const F over_z = 1.0f / n.z, height = found.z - 0.5f * bent * over_z;
             const Vector turned = {turn[0] * before.x + turn[1] * before.y + turn[2] * before.z,
                                    turn[3] * before.x + turn[4] * before.y + turn[5] * before.z,
                                    turn[6] * before.x + turn[7] * before.y + turn[8] * before.z};
