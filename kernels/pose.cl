@@ -18,7 +18,7 @@
 #define LEAST 7
 #define FLAT 1e-3f
 #define BLOCK 8
-#define SUMS 67
+#define SUMS (BESIDE ? 67 : 31)
 #define POSE 25
 #define NEAR 1e20f
 #define VAGUE 100.0f

@@ -21,8 +21,8 @@ BLOCK = 8
 """Pixels on each side of a block, whose sums are written together."""
 PARTS = (0, 21, 27, 28, 29, 30, 31, 67)
 """Where the sums of a block begin: upper triangle of J'WJ; J'Wr; chi^2; what is expected of it; compared
-heights; compared normals; and J'WK, K being the Jacobian by the first map's own normals and curvature."""
-SUMS = PARTS[-1]
+heights; compared normals; and J'WK, K being the Jacobian by the first map's own normals and curvature, which
+is the only part that a block may lack."""
 FAR = 1e30
 _NEAR = 1e20  # of FAR, the smallest share between pixels is more
 AROUND = 2
@@ -85,7 +85,7 @@ def pose_equations(step: int, first: Array, second: Array, poses: Array, sums: A
         of the first map's first pixel and the pixel's size along x and y (4), the same of the second (4),
         and of both the squared sine of the tilt (2), with which the normals were measured; 1 of normals whose
         error is the same in all directions.
-    sums : (count, blocks, SUMS)
+    sums : (count, blocks, PARTS[-1] or PARTS[-2])
         See `PARTS`.
     """
     for pose, out in zip(poses, sums, strict=True):
@@ -135,7 +135,7 @@ def _equations_at(step: int, first: Array, second: Array, pose: Array, sums: Arr
             np.einsum("kin,kjn->ijn", jacobian, beside).reshape(36, -1),
         ]
     )
-    sums[...] = np.stack([np.bincount(block, one, len(sums)) for one in whole], axis=-1)
+    sums[...] = np.stack([np.bincount(block, one, len(sums)) for one in whole[: sums.shape[1]]], axis=-1)
 
 
 def _upright(x: Doubles, y: Doubles) -> Doubles:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from mirrorskin.engine.pose.motion import STILL, Motion, cross_matrix
 from mirrorskin.io import InputError
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.pose import BLOCK, PARTS, SUMS
+from mirrorskin.kernels.pose import BLOCK, PARTS
 
 FEWEST_SHARED = 20
 """Smallest number of pixels that two maps must share."""
@@ -45,30 +46,29 @@ class Equations:
     normal_matrix, unbiased : ndarray, (6, 6)
         J'WJ, and J'WK, in which the noise of the Jacobians averages out; J'WJ if K was not computed.
     right : ndarray, (6,)
-        J'Wr, and `scores`, (blocks, 6), of each block.
+        J'Wr.
     chi_square : float
         For each degree of freedom, `compared` in all.
-    typical : float
-        Median of that over the blocks, which a dent in the object does not change.
     """
 
-    heights: NDArray[np.float64]
-    normals: NDArray[np.float64]
-
     def __init__(self, sums: NDArray[np.float32], size: float, unbiased: bool) -> None:
-        scale = _scale_of(size)
-        parts = np.split(sums.astype(np.float64), PARTS[1:-1], axis=1)
-        upper, scores, chi, expected, self.heights, self.normals, products = parts
-        self.normal_matrix: NDArray[Any] = _symmetric(upper.sum(axis=0), scale)
-        full = products.sum(axis=0).reshape(6, 6) * np.outer(scale, scale)
-        self.unbiased: NDArray[Any] = full if unbiased else self.normal_matrix
-        self.scores: NDArray[np.float64] = scores * scale
-        self.right: NDArray[Any] = self.scores.sum(axis=0)
-        self.pixels: float = max(float(self.normals.sum()), float(self.heights.sum()))
-        self.compared: float = float(expected.sum())
-        self.chi_square: float = float(chi.sum()) / max(self.compared, 1e-9)
+        self._scale, self._sums = _scale_of(size), sums
+        upper, right, chi, expected, heights, normals, *products = _split(sums.sum(axis=0, dtype=np.float64))
+        self.normal_matrix: NDArray[Any] = _symmetric(upper, self._scale)
+        self.unbiased: NDArray[Any] = self.normal_matrix
+        if unbiased:
+            self.unbiased = products[0].reshape(6, 6) * np.outer(self._scale, self._scale)
+        self.right: NDArray[Any] = right * self._scale
+        self.pixels: float = max(float(normals[0]), float(heights[0]))
+        self.compared: float = float(expected[0])
+        self.chi_square: float = float(chi[0]) / max(self.compared, 1e-9)
+
+    @cached_property
+    def typical(self) -> float:
+        """Median chi square of the blocks, which a dent in the object does not change."""
+        _, _, chi, expected, *_ = _split(self._sums.astype(np.float64))
         used = expected > 0
-        self.typical: float = float(np.median(chi[used] / expected[used])) if used.any() else math.inf
+        return float(np.median(chi[used] / expected[used])) if used.any() else math.inf
 
     def free(self, noise: float | None = None) -> Doubles:
         """Return orthonormal directions, (6, k), that the maps do not determine.
@@ -90,13 +90,21 @@ class Equations:
         independent errors.
         """
         directions = complement(free)
-        count = int(np.count_nonzero(self.normals + self.heights))
+        _, scores, _, _, heights, normals, *_ = _split(self._sums.astype(np.float64))
+        scores = scores * self._scale
+        count = int(np.count_nonzero(normals + heights))
         independent = directions.T @ self.normal_matrix @ directions
-        scatter = directions.T @ self.scores.T @ self.scores @ directions * count / max(count - 6, 1)
+        scatter = directions.T @ scores.T @ scores @ directions * count / max(count - 6, 1)
         size = np.trace(np.linalg.solve(independent, scatter)) / len(independent)
         middle = (count * scatter + _BLOCKS * size * independent) / (count + _BLOCKS)
         inverse = np.linalg.inv(directions.T @ self.unbiased @ directions)
         return np.asarray(directions @ inverse @ middle @ inverse.T @ directions.T)
+
+
+def _split(sums: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Return the parts that `PARTS` names of sums, (..., numbers)."""
+    ends = PARTS[1 : PARTS.index(sums.shape[-1]) + 1]
+    return [sums[..., start:end] for start, end in itertools.pairwise((0, *ends))]
 
 
 def _scale_of(size: float) -> Doubles:
@@ -131,7 +139,7 @@ class PairFit:
         return Equations(self._sums([motion], unbiased, step)[0], self.second.size, unbiased)
 
     def _sums(self, motions: Sequence[Motion], unbiased: bool = False, step: int = 1) -> NDArray[np.float32]:
-        """Return the sums of each block at each motion, (n, blocks, SUMS)."""
+        """Return the sums of each block at each motion, (n, blocks, numbers); J'WK only if ``unbiased``."""
         first, second = self.first, self.second
         rows, columns = first.records.shape[:2]
         side = BLOCK * step
@@ -139,7 +147,8 @@ class PairFit:
         maps = *second.middle, *first.grid, *second.grid, first.least, second.least
         rows_of_poses = [[*motion.turn.ravel(), *motion.shift, *maps] for motion in motions]
         poses = self.device.from_host("poses", rows_of_poses)
-        sums = self.device.array("sums", (len(motions), blocks, SUMS), np.float32, zeroed=False)
+        shape = len(motions), blocks, PARTS[-1 if unbiased else -2]
+        sums = self.device.array("sums", shape, np.float32, zeroed=False)
         self.device.kernel("pose", "pose_equations", BESIDE=int(unbiased))(
             len(motions) * blocks,
             count=len(motions),
@@ -204,7 +213,7 @@ class PairFit:
         scale = _scale_of(self.second.size)
         for starts in self._starts():
             sums = self._sums(starts).sum(axis=1, dtype=np.float64)
-            upper, right, chi, compared, heights, normals, _ = np.split(sums, PARTS[1:-1], axis=1)
+            upper, right, chi, compared, heights, normals = _split(sums)
             overlap = np.maximum(heights, normals)[:, 0] > _SHARED * len(self.first.points)
             matrix, slope = _symmetric(upper[overlap], scale), right[overlap] * scale
             matrix += _FLOOR * np.trace(matrix, axis1=1, axis2=2)[:, np.newaxis, np.newaxis] / 6 * np.eye(6)

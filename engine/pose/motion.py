@@ -34,7 +34,8 @@ class Motion:
         turn = np.asarray(Rotation.from_rotvec(step[:3]).as_matrix())
         moved = self.then(Motion(turn, centre - turn @ centre + step[3:]))
         # Rounding errors would grow from motion to motion, because the transpose is used as the inverse.
-        return Motion(np.asarray(Rotation.from_matrix(moved.turn).as_matrix()), moved.shift)
+        # A Newton step towards the nearest rotation squares them.
+        return Motion(moved.turn @ (1.5 * np.eye(3) - 0.5 * moved.turn.T @ moved.turn), moved.shift)
 
     def adjoint(self) -> Doubles:
         """Return the matrix, (6, 6), that converts small motions before this one to ones after it."""

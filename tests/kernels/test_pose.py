@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mirrorskin.kernels.pose import BLOCK, PARTS, SUMS, pose_equations, pose_gradient
+from mirrorskin.kernels.pose import BLOCK, PARTS, pose_equations, pose_gradient
 
 PIXEL = 0.05, 0.06
 
@@ -51,7 +51,7 @@ def test_a_moved_ball_fits_where_it_was_moved_to() -> None:
     first, second = sphere_map(*shape, 5, (0, 0, -5)), sphere_map(*shape, 5, (*move[:2], move[2] - 5))
     pose = pose_of((0, 0, 0), shape, tuple(move), 1.0).astype(float)
     pose[12:15] = [*move[:2], move[2] - 5]
-    sums = np.zeros((1, blocks_of(shape, 1), SUMS))
+    sums = np.zeros((1, blocks_of(shape, 1), PARTS[-1]))
     pose_equations(1, first, second, pose[np.newaxis], sums)
     total = sums.sum(axis=(0, 1))
     normal_matrix = np.zeros((6, 6))
@@ -77,7 +77,7 @@ def test_the_jacobian_is_the_residuals_change(number: int) -> None:
         moved = Rotation.from_rotvec(step[:3]).apply(shift - centre) + centre + step[3:]
         pose = pose_of((0, 0, 0), shape, tuple(moved), 1.0).astype(float)
         pose[:9] = turn.as_matrix().ravel()
-        sums = np.zeros((1, blocks_of(shape, 1), SUMS))
+        sums = np.zeros((1, blocks_of(shape, 1), PARTS[-1]))
         pose_equations(1, first[10:-10, 10:-10], second, shifted(pose)[np.newaxis], sums)
         return sums.sum(axis=(0, 1))
 

@@ -548,7 +548,7 @@ def summed(found, wanted, values):
     np.testing.assert_allclose(found / scale, wanted / scale, atol=1e-4)
 
 
-POSES = {"size": (((24, 33), 1), ((3, 2), 1), ((40, 30), 2)), "least": (1.0, 0.002)}
+POSES = {"size": (((24, 33), 1), ((3, 2), 1), ((40, 30), 2)), "least": (1.0, 0.002), "beside": (0, 1)}
 
 
 @case(
@@ -557,17 +557,19 @@ POSES = {"size": (((24, 33), 1), ((3, 2), 1), ((40, 30), 2)), "least": (1.0, 0.0
     per=lambda device, values: math.prod(values["sums"].shape[:2]),
     checks={"sums": summed},
 )
-def _(size, least):
+def _(size, least, beside):
     shape, step = size
     grid = -(shape[1] - 1) / 2 * 0.05, (shape[0] - 1) / 2 * 0.06, 0.05, 0.06
     turns = (Rotation.from_rotvec((0.02, -0.05, turn)).as_matrix().ravel() for turn in (0.3, -0.1, 0.0))
     poses = [[*turn, 0.03, -0.04, 0.01, 0.1, -0.2, 0.05, *grid, *grid, least, least] for turn in turns]
-    sums = np.zeros((3, math.prod(-(-size // (pose.BLOCK * step)) for size in shape), pose.SUMS))
+    sums = np.zeros(
+        (3, math.prod(-(-size // (pose.BLOCK * step)) for size in shape), pose.PARTS[-1 if beside else -2])
+    )
     maps = named(
         "first second poses sums", waves(shape, 0.0), waves(shape, 0.1, seed=1), np.array(poses), sums
     )
     sizes = {"count": 3, "other_rows": shape[0], "other_columns": shape[1], "step": step, "shape": shape}
-    return maps | sizes | {"macros": {"BESIDE": 1}}
+    return maps | sizes | {"macros": {"BESIDE": beside}}
 
 
 @case("pose_gradient", {"shape": ((1, 1), (3, 50), (40, 37))}, atol=1e-4)
