@@ -55,7 +55,7 @@ def command(
         list[str] | None,
         Option(
             metavar="NAME",
-            help="Number or part of the name, as in 'mirrorskin devices'; may be given again.",
+            help="Number or part of the name, as in 'mirrorskin devices', or 'all'; may be given again.",
             show_default="the default one, or all GPUs",
         ),
     ] = None,
@@ -205,10 +205,10 @@ def _run(
         yield from run_cluster(todo, plan, address=scheduler, workers=workers)
         return
     from mirrorskin.engine.batch.local import default_devices, run_local
-    from mirrorskin.kernels.device import open_device
+    from mirrorskin.kernels.device import open_devices
 
-    named = [open_device(name) for name in device or ()]
-    yield from run_local(todo, plan, list(dict.fromkeys(named)) or default_devices(), show.under_way)
+    devices = open_devices(device) if device else default_devices()
+    yield from run_local(todo, plan, devices, show.under_way)
 
 
 @contextmanager

@@ -17,7 +17,7 @@ def command(
     stack: Annotated[Path, Argument(metavar="STACK", help="Frames in HDF5, of any layout.")],
     output: Annotated[Path | None, options.result_option("STACK-correlation.h5")] = None,
     memory: options.Memory = "256MB",
-    device: options.Device = None,
+    device: options.Devices = None,
     as_json: options.Json = False,
     **chosen: Annotated[Any, STACK.without("motion", "tilt", *_TRAVEL), declared("correlate")],
 ) -> None:

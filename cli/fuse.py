@@ -25,7 +25,7 @@ def command(
         Option(help="Let the rotation's frames follow the object; without it, they need no press and pivot."),
     ] = True,
     memory: options.Memory = "256MB",
-    device: options.Device = None,
+    device: options.Devices = None,
     as_json: options.Json = False,
     **chosen: Annotated[Any, STACK.without("motion", "frames", "tilt"), declared("fuse")],
 ) -> None:

@@ -71,7 +71,7 @@ def command(
         ),
     ] = None,
     calibration: options.Calibration = None,
-    device: options.Device = None,
+    device: options.Devices = None,
     **given: Annotated[Any, scans.PLAN, declared("reconstruct").only(*_OPTIONS)],
 ) -> None:
     """Reconstruct while the stage moves. Ctrl-C stops it, and keeps what was computed and recorded."""

@@ -32,6 +32,14 @@ Json = Annotated[bool, Option("--json", help="Print machine-readable output.")]
 Device = Annotated[
     str | None, Option(metavar="NAME", help="Number or part of the name, as in 'mirrorskin devices'.")
 ]
+Devices = Annotated[
+    str | None,
+    Option(
+        metavar="NAME",
+        help="Number or part of the name, as in 'mirrorskin devices'; 'all' divides the picture among all"
+        " devices like the default one.",
+    ),
+]
 LiveFrames = Annotated[
     bool, Option("--live", help="Only the frames that a live run used, with the positions it had.")
 ]

@@ -26,12 +26,13 @@ def save_and_report(result: Result, path: Path, device: str | None, as_json: boo
     """Write a result and print its summary in a line, or with its process as JSON."""
     from mirrorskin import io
     from mirrorskin.engine.summary import summarise
-    from mirrorskin.kernels.device import open_device
+    from mirrorskin.kernels.device import open_devices
 
     io.save_result(result, path)
     summary, pieces = summarise(result), _pieces(result)
     if as_json:
-        profile = open_device(device).profile.records() if "device" in result.process else []
+        devices = open_devices(device) if "device" in result.process else []
+        profile = [record for one in devices for record in one.profile.records()]
         facts = {"summary": summary.as_dict() | pieces, "process": result.process}
         print_json({"output": str(path), **facts, "profile": profile})
     else:

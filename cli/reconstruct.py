@@ -22,7 +22,7 @@ def command(
     live: options.LiveFrames = False,
     calibration: options.Calibration = None,
     memory: options.Memory = "256MB",
-    device: options.Device = None,
+    device: options.Devices = None,
     as_json: options.Json = False,
     **chosen: Annotated[Any, RECORDING, declared("reconstruct")],
 ) -> None:

@@ -19,7 +19,7 @@ def command(
     output: Annotated[Path | None, options.result_option("REC-CLASS.h5")] = None,
     live: options.LiveFrames = False,
     memory: options.Memory = "256MB",
-    device: options.Device = None,
+    device: options.Devices = None,
     as_json: options.Json = False,
     **chosen: Annotated[Any, RECORDING],
 ) -> None:
@@ -32,11 +32,11 @@ def command(
     from mirrorskin.cli.output import progress, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.engine.running import load_operation, run_class
-    from mirrorskin.kernels.device import open_device
+    from mirrorskin.kernels.device import open_devices
 
     kind = load_operation(class_name)
     if device is not None:
-        open_device(device)  # raises if there is none, even if the operation does not use it
+        open_devices(device)  # raises if there is none, even if the operation does not use it
     files = [value for value in chosen.values() if isinstance(value, Path)]
     stack = stack_options(chosen)
     limit = bytes_of(memory, "--memory")

@@ -9,7 +9,7 @@ from typing import Any
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import as_array
 from mirrorskin.kernels.array import Array, adopt
-from mirrorskin.kernels.device import Device, open_device, opened_devices
+from mirrorskin.kernels.device import Choice, Device, are_several, open_device, opened_devices
 
 AnyArray = Any
 """An array on the host, or a `mirrorskin.kernels.array.Array` on a device."""
@@ -40,12 +40,17 @@ def as_any_array_or_number(name: str, value: Any) -> Any:
     return value if isinstance(value, Real) else as_any_array(name, value)
 
 
-def device_of(choice: str | Device | None, *arrays: Any) -> Device:
+def device_of(choice: Choice, *arrays: Any) -> Device:
     """Return the device that is chosen, by default that of the arrays; InputError if one is on another.
 
     Arrays on the host are on no device.
     """
     own = [array for array in arrays if isinstance(array, Array)]
+    if own and are_several(choice):
+        raise InputError(
+            f"{own[0].name} is on {own[0].device.info.title}, but several devices are chosen: leave device"
+            " out to compute there, or pass a NumPy array"
+        )
     device = own[0].device if own and choice is None else open_device(choice)
     for array in own:
         if array.device.context != device.context:

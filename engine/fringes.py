@@ -75,7 +75,7 @@ class Fringes(Operation):
     def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         """Prepare the fit."""
         self._noise = None if self.noise is None else _map(self.noise, shape, "noise")
-        self._fit = Correlate(device=self.device, memory_limit=self.memory_limit)
+        self._fit = Correlate(device=self.devices, memory_limit=self.memory_limit)
         self._fit.begin(shape, dtype)
         self._weights: list[Doubles] = []
 

@@ -25,7 +25,7 @@ from mirrorskin.io import InputError, Motion, Result, Source, pixel_axes
 from mirrorskin.io.arguments import as_array_or_number, check_count, check_flag, checked
 from mirrorskin.io.result import absolute_heights
 from mirrorskin.io.types import ProcessValue
-from mirrorskin.kernels.device import Device, open_device
+from mirrorskin.kernels.device import Choice, Device, open_device, open_devices
 
 Mask = NDArray[np.bool_]
 
@@ -163,7 +163,7 @@ def fuse_recordings(
     register: bool = True,
     robust: bool = False,
     memory_limit: int = MEMORY_LIMIT,
-    device: str | Device | None = None,
+    device: Choice = None,
     progress: Progress | None = None,
 ) -> Result:
     """Reconstruct a press and a rotation on the same object, and join them to one surface.
@@ -185,8 +185,8 @@ def fuse_recordings(
         As for `fuse`.
     memory_limit : int
         Bytes of host memory for frames that are read ahead.
-    device : str or Device, optional
-        See ``mirrorskin.kernels.device.open_device``.
+    device : str, Device or sequence of them, optional
+        See ``mirrorskin.kernels.device.open_devices``.
     progress : callable, optional
         Called with the number of frames so far, of ``frames_to_read(vertical, axial, register)``.
 
@@ -205,7 +205,7 @@ def fuse_recordings(
     """
     vertical, axial = calibrated(vertical), calibrated(axial)
     pixel_size = _check_sources(vertical, axial)
-    opened = open_device(device)
+    opened = open_devices(device)
     common: dict[str, Any] = {"memory_limit": memory_limit, "device": opened}
     turn = Rotation(**{**_options_of(rotation), **common})
     _check_rotation(axial, turn)
@@ -216,7 +216,7 @@ def fuse_recordings(
         raise InputError(f"{vertical.name}: no pixel turned light, so no height is known to fuse")
     before = fill_with_nearest(pressed.height)
     known = AbsoluteHeights.of(pressed.height, pressed.height_sigma)
-    solver, passes = FusionSolver(known, pixel_size, robust, opened), _passes(axial, register)
+    solver, passes = FusionSolver(known, pixel_size, robust, opened[0]), _passes(axial, register)
     for number in range(passes):
         method = turn.with_options(heights=before) if register else turn
         done = vertical.shape[0] + number * axial.shape[0]

@@ -91,8 +91,8 @@ class Plan:
         result = result.assign(process=process)
         for step in self.steps:
             result = step.apply(result, context)
-        device = self.operation.opened_device
-        return attach_provenance(result, source, device, dict(result.process))
+        devices = self.operation.opened_devices
+        return attach_provenance(result, source, devices, dict(result.process))
 
 
 class Method(OnDevice):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property, wraps
 from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, Protocol, Self, cast, get_args, overload
@@ -21,7 +21,7 @@ from mirrorskin.io.maps import declaration_of
 from mirrorskin.io.result import check_maps, result_of
 from mirrorskin.io.types import Motion, ProcessValue
 from mirrorskin.kernels.array import Array
-from mirrorskin.kernels.device import Device, open_device
+from mirrorskin.kernels.device import Choice, Device, open_devices
 
 if TYPE_CHECKING:
     from mirrorskin.io import Source
@@ -36,13 +36,16 @@ ABOUT_WEIGHTS = "Weight of each frame, such as its inverse variance; 0 for a mis
 
 
 class _DeviceOption(Option):
-    """The device: a name or an open device is given, and it is opened on first use."""
+    """The device, or several: names or open devices are given, and they are opened on first use.
+
+    The attribute is the first of them, which computes what is not divided among them.
+    """
 
     def store(self, holder: object, value: Any) -> None:
         vars(holder)["_device"] = value
 
     def stored(self, holder: object) -> Any:
-        return vars(holder).get("_opened_device", vars(holder)["_device"])
+        return vars(holder)["_device"]
 
     @overload
     def __get__(self, holder: None, owner: type) -> Option: ...
@@ -51,30 +54,37 @@ class _DeviceOption(Option):
     def __get__(self, holder: object, owner: type) -> Device: ...
 
     def __get__(self, holder: object | None, owner: type) -> Any:
-        if holder is None:
-            return self
-        if "_opened_device" not in vars(holder):
-            vars(holder)["_opened_device"] = open_device(vars(holder)["_device"])
-        return vars(holder)["_opened_device"]
+        return self if holder is None else cast(OnDevice, holder).devices[0]
 
-    def __set__(self, holder: object, value: str | Device | None) -> None:
+    def __set__(self, holder: object, value: Choice) -> None:
         super().__set__(holder, value)
 
 
 _device: Option = option(
-    default=None, help="device to compute on; see `mirrorskin.kernels.device.open_device`", python_only=True
+    default=None,
+    help='device to compute on, or several of which each gets a band of rows: "all" or a list; see'
+    " `mirrorskin.kernels.device.open_devices`",
+    python_only=True,
 )
 
 
 class OnDevice(Configured):
-    """What has a device: the attribute is opened on first use."""
+    """What has a device, or several: they are opened on first use."""
 
     device: _DeviceOption = _DeviceOption(**{**vars(_device), "name": "device"})
 
     @property
-    def opened_device(self) -> Device | None:
-        """The device, if it has been used."""
-        return vars(self).get("_opened_device")
+    def devices(self) -> Sequence[Device]:
+        """The devices, at least one."""
+        if not self.opened_devices:
+            vars(self)["_opened_devices"] = open_devices(vars(self)["_device"])
+        return self.opened_devices
+
+    @property
+    def opened_devices(self) -> Sequence[Device]:
+        """The devices, if they have been used."""
+        opened: Sequence[Device] = vars(self).get("_opened_devices", ())
+        return opened
 
 
 class Operation(ThreadSafe, OnDevice):
@@ -297,7 +307,7 @@ class Operation(ThreadSafe, OnDevice):
 
     def use_device_of(self, frames: Array) -> None:
         """Compute on the device of frames, if none was chosen; InputError if they are on another one."""
-        vars(self)["_device"] = device_of(self.opened_device or vars(self)["_device"], frames)
+        vars(self)["_device"] = device_of(self.opened_devices or vars(self)["_device"], frames)
 
     def _check_positions(self, count: int, given: Mapping[str, Any]) -> None:
         """Raise InputError unless there is a position of each frame."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -38,13 +39,14 @@ def signature() -> dict[str, str]:
 
 
 def attach_provenance(
-    result: Result, source: Source, device: Device | None, process: dict[str, ProcessValue]
+    result: Result, source: Source, devices: Sequence[Device], process: dict[str, ProcessValue]
 ) -> Result:
     """Return a result with coordinates, provenance, and the calibration if any."""
     own = source.source if isinstance(source, io.Calibrated) else source
     known: dict[str, ProcessValue] = {**signature(), "source": source.name}
-    if device is not None:
-        known |= {"device": device.info.title, "driver": device.info.driver}
+    if devices:
+        known["device"] = _listed([device.info.title for device in devices])
+        known["driver"] = "; ".join(dict.fromkeys(device.info.driver for device in devices))
     x = y = None
     if source.header.pixel_size is not None:  # from the centre of the whole picture
         shape = own.full_shape if isinstance(own, io.Recording) else own.shape
@@ -64,6 +66,12 @@ def attach_provenance(
         known |= {"calibration": source.whole.name, "calibration_parts": source.whole.contents}
         result = result.assign(calibration=source.whole)
     return result.assign(x=x, y=y, process=known | process)
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return names in one line, those that occur more than once with their number."""
+    counts = Counter(names)
+    return "; ".join(name if count == 1 else f"{count} x {name}" for name, count in counts.items())
 
 
 def describe(configured: Configured, source: Source | None = None) -> dict[str, ProcessValue]:

@@ -139,7 +139,7 @@ def _run_source(
         feed(source, configured, progress=progress)
         result = configured.finish()
     process = {**describe(configured, source), **result.process}
-    return attach_provenance(result, source, configured.opened_device, process)
+    return attach_provenance(result, source, configured.opened_devices, process)
 
 
 def _run_frames(

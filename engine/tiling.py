@@ -1,13 +1,16 @@
-"""A picture's maps and staged frames on a device: in one piece if they fit, otherwise in bands of rows."""
+"""A picture's maps and staged frames on devices: in one piece if they fit, otherwise in bands of rows."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from itertools import pairwise
+from threading import Event
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -18,6 +21,8 @@ from mirrorskin.kernels.array import SLACK, Array, BorrowedBuffer, Operand, fetc
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.device import free_memory as free_memory
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError
+
+T = TypeVar("T")
 
 MEMORY_LIMIT = 256_000_000
 """Default number of bytes of host memory for staged frames."""
@@ -81,6 +86,7 @@ class Band:
 
     Attributes
     ----------
+    device : Device
     rows : slice
         Rows of the picture.
     pixels : int
@@ -90,10 +96,14 @@ class Band:
         Uninitialised at first.
     length : int
         Number of frames that fit in the memory.
+    stop : Event
+        Shared by the bands of a picture: set if no more frames should be staged.
     """
 
+    device: Device
     rows: slice
     pixels: int
+    stop: Event
 
     def __init__(
         self,
@@ -104,9 +114,10 @@ class Band:
         maps: Mapping[str, DTypeLike | Planes],
         length: int,
         least: int,
+        stop: Event,
     ) -> None:
         self._shape = shape = (rows.stop - rows.start, columns)
-        self._device, self._dtype = device, dtype
+        self.device, self._dtype, self.stop = device, dtype, stop
         self.rows, self.pixels = rows, shape[0] * shape[1]
         word = _LINE // dtype.itemsize
         self.stride: int = -(-self.pixels // word) * word
@@ -182,11 +193,13 @@ class Band:
         device with its own memory, they are copied while kernels process the previous piece. Afterwards the
         memory of the frames may be overwritten, except if it is ``lent`` (never overwritten while
         referenced): then kernels may still read it. ``whole``: yield at most ``length`` frames in one piece.
+
+        It ends before the next piece if ``stop`` is set; see `for_each_band`.
         """
         if isinstance(frames, Array):
             if not self._only:
                 raise DeviceMemoryError(
-                    f"{self._device.info.title} has no room for maps beside {len(frames)} frames: "
+                    f"{self.device.info.title} has no room for maps beside {len(frames)} frames: "
                     "pass the frames as a NumPy array"
                 )
             yield Staged(frames, slice(0, len(frames)))
@@ -194,6 +207,8 @@ class Band:
         frames = frames[:, self.rows]
         start = 0
         while start < len(frames):
+            if self.stop.is_set():
+                raise _StoppedError
             rest = frames[start:]
             if self._places:
                 yield (staged := self._copy(rest, start))
@@ -206,13 +221,13 @@ class Band:
 
     def _share(self, frames: NDArray[Any], start: int, whole: bool) -> Staged:
         """Share frames with the device in place, or copies of some."""
-        borrowed = self._device.borrow("frames", frames)
+        borrowed = self.device.borrow("frames", frames)
         if borrowed is None and not whole and frames.flags.c_contiguous and len(frames) > 1:
-            borrowed = self._device.borrow("frames", frames[:-1])  # the memory may end after the last frame
+            borrowed = self.device.borrow("frames", frames[:-1])  # the memory may end after the last frame
         if borrowed is None:
             room = self.room[: len(frames)]
             room[...] = frames[: len(room)]
-            borrowed = BorrowedBuffer(self._device, "frames", room)
+            borrowed = BorrowedBuffer(self.device, "frames", room)
         # Releasing the previous buffer waits for its kernels, so at most one piece is being processed.
         self._borrowed = borrowed
         return Staged(borrowed, slice(start, start + borrowed.shape[0]))
@@ -232,35 +247,86 @@ class Band:
 
 
 def cut_into_bands(
-    device: Device,
+    devices: Sequence[Device],
     shape: tuple[int, int],
     dtype: np.dtype[Any],
     maps: Mapping[str, DTypeLike | Planes],
     length: int,
     least: int = 1,
 ) -> list[Band]:
-    """Allocate the bands of a picture: one if the device has enough memory, otherwise as few as possible.
+    """Allocate the bands of a picture: one on each device if its memory is enough, else as few as possible.
 
-    ``shape`` is rows and columns of the picture, ``dtype`` that of samples, ``maps`` the arrays of pixels.
-    A band has memory for ``length`` frames, or fewer if they do not fit, but at least ``least``. DeviceError
-    if a single row does not fit.
+    Devices get equal numbers of rows. ``shape`` is rows and columns of the picture, ``dtype`` that of
+    samples, ``maps`` the arrays of pixels. A band has memory for ``length`` frames, or fewer if they do not
+    fit, but at least ``least``. DeviceError if a single row does not fit.
     """
+    stop = Event()
 
-    def cut(start: int, stop: int) -> list[Band]:
+    def cut(device: Device, start: int, end: int) -> list[Band]:
         try:
-            return [Band(device, slice(start, stop), shape[1], dtype, maps, length, least)]
+            return [Band(device, slice(start, end), shape[1], dtype, maps, length, least, stop)]
         except DeviceMemoryError as error:
-            if stop - start == 1:
+            if end - start == 1:
                 message = f"one row of {shape[1]} pixels does not fit: {error}"
                 raise DeviceError(message) from error
-        middle, bands = (start + stop) // 2, []
-        for half in ((start, middle), (middle, stop)):
-            bands += cut(*half)
+        middle, bands = (start + end) // 2, []
+        for half in ((start, middle), (middle, end)):
+            bands += cut(device, *half)
             for band in bands:
                 band.share_device()
         return bands
 
-    return cut(0, shape[0])
+    used = devices[: shape[0]]
+    cuts = [shape[0] * number // len(used) for number in range(len(used) + 1)]
+    return [band for device, rows in zip(used, pairwise(cuts), strict=True) for band in cut(device, *rows)]
+
+
+def for_each_band(bands: Sequence[Band], work: Callable[[Band], T]) -> list[T]:
+    """Return what a function returns for each band.
+
+    Several devices work at the same time, in a thread each. If one fails, or the program is interrupted, the
+    others stop before their next frames, and the first error is raised, with the device in its message.
+    Therefore ``work`` must not use locks that the caller holds, such as the public methods of an `Operation`.
+    """
+    by_device: dict[Device, list[Band]] = {}
+    for band in bands:
+        by_device.setdefault(band.device, []).append(band)
+    if len(by_device) == 1:
+        return [work(band) for band in bands]
+    stop = bands[0].stop
+    stop.clear()
+    with ThreadPoolExecutor(len(by_device), "mirrorskin-device") as threads:
+        try:
+            running = [threads.submit(_run_on_device, own, work, stop) for own in by_device.values()]
+            errors = [one.exception() for one in running]
+        except BaseException:  # Ctrl-C
+            stop.set()
+            raise
+    for error in errors:
+        if error is not None and not isinstance(error, _StoppedError):
+            raise error
+    return [value for one in running for value in one.result()]
+
+
+class _StoppedError(Exception):
+    """Work on a device ended early, since that on another one failed."""
+
+
+def _run_on_device(bands: Sequence[Band], work: Callable[[Band], T], stop: Event) -> list[T]:
+    """Return what a function returns for the bands of one device; let the others stop if it fails."""
+    values = []
+    try:
+        for band in bands:
+            if stop.is_set():
+                raise _StoppedError
+            values.append(work(band))
+    except DeviceError as error:
+        stop.set()
+        raise type(error)(f"device {bands[0].device.number}: {error}") from error
+    except BaseException:
+        stop.set()
+        raise
+    return values
 
 
 def room_of(bands: Sequence[Band], length: int) -> NDArray[Any]:

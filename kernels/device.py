@@ -15,9 +15,10 @@ import re
 import threading
 import time
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple, TypeAlias, cast
 from weakref import WeakSet
 
 import numpy as np
@@ -36,6 +37,10 @@ from mirrorskin.kernels.transfer import Transfers
 from mirrorskin.kernels.waiting import close_at_exit, waiting
 
 DeviceKind = Literal["gpu", "cpu", "other"]
+Choice: TypeAlias = "str | Device | Sequence[str | Device] | None"
+"""What names one device or several; see `open_devices`."""
+ALL = "all"
+"""The choice of all devices of a kind."""
 C_TYPES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
 """OpenCL's names of the types that a recording's samples have; set ``dtypes`` of an operation to these."""
 
@@ -91,16 +96,16 @@ def list_devices() -> list[DeviceInfo]:
     return [_describe(device) for device in _find()]
 
 
-def open_device(choice: str | Device | None = None) -> Device:
+def open_device(choice: Choice = None) -> Device:
     """Open a device; the same choice gives the same object, with what it has compiled.
 
     Parameters
     ----------
-    choice : str, Device or None
+    choice : str, Device, sequence of them, or None
         A number of ``list_devices``, ``"gpu"``, ``"cpu"``, or a part of the platform's and device's
         names. None takes what ``PYOPENCL_CTX`` names, else the best GPU that works, else the best CPU. The
         best of a kind is one with its own memory, then the one with the largest product of compute units and
-        memory.
+        memory. Of several devices, the first is opened; see `open_devices`.
 
     Raises
     ------
@@ -117,16 +122,54 @@ def open_device(choice: str | Device | None = None) -> Device:
         )
     if isinstance(choice, Device):
         return choice
+    if not isinstance(choice, str | None):
+        return open_devices(choice)[0]
     with _opening:
-        *others, last = _choose(choice)
+        *others, last = _choose(None if _is_all(choice) else choice)
         for device in others:
-            try:
-                if device not in _left_out:
-                    return _open(device)
-            except DeviceError as error:
-                _left_out.add(device)
-                _log.warning("%s is left out: %s", _describe(device).title, error)
+            if (opened := _open_if_it_works(device)) is not None:
+                return opened
         return _open(last)
+
+
+def open_devices(choice: Choice = None) -> list[Device]:
+    """Open several devices, among which large pictures are divided.
+
+    Parameters
+    ----------
+    choice : str, Device, sequence of them, or None
+        ``"all"`` takes all devices that work of the kind and the platform of the one that `open_device` takes
+        by default, which comes first; of a sequence, each item is opened. Anything else is one device.
+
+    Raises
+    ------
+    UnknownDeviceError, DeviceError
+        As of `open_device`; or a sequence is empty.
+
+    Examples
+    --------
+    >>> open_devices("all")[0] is open_device()
+    True
+    """
+    if not isinstance(choice, str | Device | None):
+        opened = [device for one in choice for device in open_devices(one)]
+        if not opened:
+            raise UnknownDeviceError("no device is given: give at least one, or None for the default one")
+        return list(dict.fromkeys(opened))
+    first = open_device(choice)
+    if not _is_all(choice):
+        return [first]
+    with _opening:
+        alike = [device for device in _best_first(_find()) if _are_alike(_describe(device), first.info)]
+        found = dict.fromkeys([first, *map(_open_if_it_works, alike)])
+    return [device for device in found if device is not None]
+
+
+def are_several(choice: Choice) -> bool:
+    """Return whether a choice means several devices, even if there is only one of the kind."""
+    if isinstance(choice, str | Device | None):
+        return _is_all(choice)
+    return len(choice) > 1 or any(map(are_several, choice))
 
 
 def opened_devices() -> list[Device]:
@@ -210,6 +253,11 @@ class Device:
         self.cache: dict[str, Any] = {}
         _opened.add(self)
         _log.info("using %s (driver %s)", self.info.title, self.info.driver)
+
+    @property
+    def number(self) -> int:
+        """Its number in `list_devices`, which distinguishes it from others of the same title."""
+        return _find().index(self.context.devices[0])
 
     def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike, zeroed: bool = True) -> Array:
         """Make room for an array on the device.
@@ -690,6 +738,30 @@ def _best_first(devices: list[cl.Device]) -> list[cl.Device]:
 @functools.cache
 def _open(device: cl.Device) -> Device:
     return Device(device)
+
+
+def _open_if_it_works(device: cl.Device) -> Device | None:
+    """Return a device, or None, with a warning the first time, if it does not work."""
+    try:
+        if device not in _left_out:
+            return _open(device)
+    except DeviceError as error:
+        _left_out.add(device)
+        _log.warning("%s is left out: %s", _describe(device).title, error)
+    return None
+
+
+def _are_alike(one: DeviceInfo, other: DeviceInfo) -> bool:
+    """Return whether devices are of one kind and platform.
+
+    Another platform may offer the same hardware once more, and compute other last digits.
+    """
+    return (one.platform, one.kind) == (other.platform, other.kind)
+
+
+def _is_all(choice: object) -> bool:
+    """Return whether a choice is the word for all devices."""
+    return isinstance(choice, str) and choice.casefold().strip() == ALL
 
 
 def _with_includes(name: str, text: str) -> str:

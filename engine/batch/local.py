@@ -10,7 +10,7 @@ from threading import Event, Semaphore, Thread
 
 from mirrorskin.engine.batch.jobs import Job, Plan
 from mirrorskin.engine.batch.work import Outcome, keep_memory, run_job
-from mirrorskin.kernels.device import Device, list_devices, open_device
+from mirrorskin.kernels.device import ALL, Device, open_device, open_devices
 
 Watch = Callable[[Job, int], None]
 
@@ -27,8 +27,7 @@ def default_devices() -> list[Device]:
     first = open_device()
     if first.info.kind != "gpu" or "PYOPENCL_CTX" in os.environ:
         return [first]
-    kinds = [info.kind for info in list_devices()]
-    return [open_device(str(number)) for number, kind in enumerate(kinds) if kind == "gpu"]
+    return open_devices(ALL)
 
 
 def run_local(

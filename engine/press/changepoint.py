@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -12,12 +12,12 @@ from mirrorskin.engine.frames import Noise, reference_pair
 from mirrorskin.engine.operation import travel_function
 from mirrorskin.engine.press.crossing import EVENT_MAPS, Event, PressOperation
 from mirrorskin.engine.press.onset import Onset
-from mirrorskin.engine.tiling import Band, Staged, cut_into_bands, join_rows, room_of
+from mirrorskin.engine.tiling import Band, Staged, cut_into_bands, for_each_band, join_rows, room_of
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.positions import check_travel
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.changepoint import DECIDED, INVALID, REACH, SLOTS, UNIT
-from mirrorskin.kernels.device import C_TYPES, Kernel
+from mirrorskin.kernels.device import C_TYPES, Device, Kernel
 
 _EVIDENCE = 12.0  # least logarithm of the likelihood ratio of a change
 _RELEASED = np.array([0, 1, 3, 2], np.uint8)  # status of a release, from that of a press
@@ -61,15 +61,15 @@ class ChangePoint(PressOperation):
 
     def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         """Prepare for frames of a shape and type."""
-        self._release = self.event == "release"
+        self._release, self._twice = self.event == "release", self.passes == 2
         self._noise = Noise(self.noise, dtype.kind == "u")
         self._length = max(1, self.memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))
-        self._bands = cut_into_bands(self.device, shape, dtype, self._planes(), self._length)
+        self._bands = cut_into_bands(self.devices, shape, dtype, self._planes(), self._length)
         # A release is a change from bright to dark: its first level is the bright one.
         self._level = 1 - self.threshold if self._release else self.threshold
         self._travel: list[float] = []
         self._start: ArrayLike = 0
-        if self.passes == 1:
+        if not self._twice:
             references = reference_pair(self.dark, self.bright, shape, dtype)
             first, second = reversed(references) if self._release else references
             if not any(first.strides + second.strides):  # the same references at all pixels
@@ -90,16 +90,16 @@ class ChangePoint(PressOperation):
         twice = dict.fromkeys(("mean", "mean_rest", "total", "total_rest", "score"), np.float32)
         ring = np.dtype((np.void, SLOTS * self.dtype.itemsize))  # the last samples
         return {
-            "ring": ring, "status": np.uint8, **integers, **floats, **(twice if self.passes == 2 else {})
+            "ring": ring, "status": np.uint8, **integers, **floats, **(twice if self._twice else {})
         }  # fmt: skip
 
     def clear(self) -> None:
         """Forget the frames so far."""
         self._travel.clear()
         self._noise.reset()
-        self._weight: Array | None = None
+        self._weights: dict[Device, Array] = {}
         self._fill(start=self._start, excess=0, below=0, since=0)
-        if self.passes == 2:
+        if self._twice:
             self._fill(total=0, total_rest=0)
 
     def start_second_pass(self) -> None:
@@ -107,9 +107,10 @@ class ChangePoint(PressOperation):
         count = len(self._travel)
         self._travel.clear()
         split = np.arange(1.0, count)
-        weight = self._sign / np.sqrt(split * (count - split))
-        self._weight = self.device.from_host("weight", np.pad(weight, 1))
-        for band in self._bands:
+        weight = np.pad(self._sign / np.sqrt(split * (count - split)), 1)
+        self._weights = {device: device.from_host("weight", weight) for device in self.devices}
+
+        def begin_split(band: Band) -> None:
             with band.resident():
                 total, rest = (band.maps[name].read() for name in ("total", "total_rest"))
                 mean = (total.astype(np.float64) + rest) / count
@@ -119,34 +120,39 @@ class ChangePoint(PressOperation):
             for name in ("total", "total_rest", "score"):
                 band.write(name, 0)
 
+        for_each_band(self._bands, begin_split)
+
     def push(self, frames: NDArray[Any], *, travel: ArrayLike, lent: bool = False) -> None:
         """Take in the next frames, (n, H, W), and the travel of each, (n,) mm."""
         first = len(self._travel)
-        if self._weight is not None and first + len(frames) >= self._weight.shape[0]:
+        if any(first + len(frames) >= len(weight) for weight in self._weights.values()):
             raise InputError("the second pass has more frames than the first. Push the same frames twice")
         last = self._travel[-1:]
         self._travel.extend(check_travel(travel, len(frames), "travel", after=last, falls=self._release))
         self._noise.look(frames)
-        for band in self._bands:
+
+        def scan(band: Band) -> None:
             with band.resident():
                 for staged in band.stage(frames, lent):
                     self._scan(band, staged, first + staged.frames.start)
 
+        for_each_band(self._bands, scan)
+
     def _scan(self, band: Band, staged: Staged, first: int) -> None:
         """Run the kernel of this pass on frames of a band."""
         arguments: dict[str, Any] = {"first": first}
-        if self.passes == 1:
+        if not self._twice:
             name, maps = "changepoint_scan", "dark gain start excess below ring"
             level = round(self._level * UNIT)
             arguments |= {"level": level, "least": self.hold * (UNIT - level), "quiet": self._quiet()}
-        elif self._weight is None:
+        elif not self._weights:
             name, maps, arguments = "changepoint_sum", "total total_rest", {}
         else:
             name, maps = "changepoint_split", "mean mean_rest total total_rest start since score ring"
-            arguments |= {"weight": self._weight}
+            arguments |= {"weight": self._weights[band.device]}
         arguments |= {plane: band.maps[plane] for plane in maps.split()}
-        self._kernel(name)(
-            self._items(band),
+        self._kernel(band, name)(
+            _items(band),
             frames=staged.array,
             count=staged.count,
             pixels=band.pixels,
@@ -158,7 +164,7 @@ class ChangePoint(PressOperation):
         """Return height, status and frame of the frames so far."""
         noise = self._noise.value
         assert noise is not None  # there are two frames
-        maps = [self._finish(band, noise) for band in self._bands]
+        maps = for_each_band(self._bands, partial(self._finish, noise=noise))
         height, sigma, status, frame = (join_rows(parts) for parts in zip(*maps, strict=True))
         answered = (status == 1) | (status == 3)
         status = _RELEASED[status] if self._release else status
@@ -166,22 +172,22 @@ class ChangePoint(PressOperation):
         named: dict[str, Any] = dict(zip(EVENT_MAPS, (height, sigma, status, frame), strict=True))
         return Result(named, process={"noise": noise}, declarations=self.declarations)
 
-    def _finish(self, band: Band, noise: float) -> list[Any]:
+    def _finish(self, band: Band, *, noise: float) -> list[Any]:
         """Return height, sigma, status and frame of a band's rows; the heights stay where the frames were."""
-        if self.passes == 2:
+        if self._twice:
             self._estimate_levels(band, noise)
         names = ["start", "excess", "below", "since", "dark", "gain", "ring", "height", "sigma", "status"]
         maps: dict[str, Any] = {name: band.maps[name] for name in names}
         with band.resident():
-            self._kernel("changepoint_heights")(
-                self._items(band),
+            self._kernel(band, "changepoint_heights")(
+                _items(band),
                 pixels=band.pixels,
                 count=len(self._travel),
-                travel=self._travel_pairs(),
+                travel=self._travel_pairs(band.device),
                 noise=noise,
                 quiet=self._quiet(),
                 level=self._level,
-                own=self.passes == 2,
+                own=self._twice,
                 **maps,
                 moved=sum(array.nbytes for array in maps.values()),
             )
@@ -190,11 +196,11 @@ class ChangePoint(PressOperation):
             others = dict.fromkeys(names[len(heights) :], slice(None))
             return [*(band.cut(name) for name in heights), *band.fetch(others, keep=["start"])]
 
-    def _travel_pairs(self) -> Array:
-        """Copy the travel to the device as (T, 2) floats, whose sums have the precision of float64."""
+    def _travel_pairs(self, device: Device) -> Array:
+        """Copy the travel to a device as (T, 2) floats, whose sums have the precision of float64."""
         travel = np.array(self._travel, np.float64)
         high = travel.astype(np.float32)
-        return self.device.from_host("travel", np.stack([high, travel - high], axis=1))
+        return device.from_host("travel", np.stack([high, travel - high], axis=1))
 
     def _estimate_levels(self, band: Band, noise: float) -> None:
         """Compute the levels from the best splits, where they are significant."""
@@ -225,12 +231,14 @@ class ChangePoint(PressOperation):
         """Return the squared counts that noise alone may add up to; 0 before the second frame."""
         return _EVIDENCE * (self._noise.value or 0.0) ** 2
 
-    def _items(self, band: Band) -> int:
-        return int(-(-band.pixels // self.device.layout.tile))
-
-    def _kernel(self, name: str) -> Kernel:
+    def _kernel(self, band: Band, name: str) -> Kernel:
         top = {} if self.dtype.kind == "f" else {"TOP": int(np.iinfo(self.dtype).max)}
-        return self.device.kernel("changepoint", name, FRAME=C_TYPES[self.dtype.name], **top)
+        return band.device.kernel("changepoint", name, FRAME=C_TYPES[self.dtype.name], **top)
+
+
+def _items(band: Band) -> int:
+    """Return the work-items that process a band."""
+    return int(-(-band.pixels // band.device.layout.tile))
 
 
 find_change_point = travel_function(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.frames import Noise, reference_maps
 from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.options import option
-from mirrorskin.engine.tiling import Band, Planes, Staged, cut_into_bands, join_rows, room_of
+from mirrorskin.engine.tiling import Band, Planes, Staged, cut_into_bands, for_each_band, join_rows, room_of
 from mirrorskin.io import Map
 from mirrorskin.io.maps import TABLE, PressStatus, ReleaseStatus, status_of
 from mirrorskin.io.positions import check_travel
@@ -117,7 +117,7 @@ class EventMaps(NamedTuple):
 
 
 class Crossing:
-    """Search for the crossing of one threshold on a device.
+    """Search for the crossing of one threshold on a device, or on several.
 
     It uses the options of ``operation``, except for the threshold.
     """
@@ -136,10 +136,9 @@ class Crossing:
         self._release, self._subframe = event == "release", operation.subframe
         self._hold = min(operation.hold, _LONGEST)
         self._noise = Noise(operation.noise, dtype.kind == "u")
-        self.device: Device = operation.device
         self._length = max(1, operation.memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))
-        self._bands = cut_into_bands(self.device, shape, dtype, self._planes(), self._length)
-        self._travel = _TravelTable(self.device)
+        self._bands = cut_into_bands(operation.devices, shape, dtype, self._planes(), self._length)
+        self._travel = _TravelTable(operation.devices)
         # Of a release, the dark plateau is unknown: no reference specifies it.
         self._dark_from_frames = self._release or dark is None
         self._macros: dict[str, str | int] = {"FRAME": C_TYPES[dtype.name], "BITS": 8 * dtype.itemsize}
@@ -168,28 +167,34 @@ class Crossing:
         """Compute the smallest sample of each pixel that counts as light, in the type of the frames."""
         share = threshold - _ROUNDING
         coarse = float(np.float32(share))
-        for band in self._bands:
+
+        def set_levels(band: Band) -> None:
             references: dict[str, Any] = {}
             for name, values in (("bright", bright), ("dark", dark)):
                 rows = values[band.rows] if values.ndim else values.reshape(1)
-                references |= {f"{name}s": self.device.share(name, rows), f"{name}_step": values.ndim // 2}
+                references |= {f"{name}s": band.device.share(name, rows), f"{name}_step": values.ndim // 2}
             with band.resident():
                 self._launch(
                     band, "onset_levels", "levels marks",
                     release=self._release, share=coarse, share_rest=share - coarse, **references,
                 )  # fmt: skip
 
+        for_each_band(self._bands, set_levels)
+
     def push(self, frames: NDArray[Any], travel: ArrayLike, lent: bool = False) -> None:
         """Take in the next frames, (n, H, W), and the travel of each; InputError if it reverses."""
         first, last = self._travel.count, self._travel.values[-1:]
         self._travel.extend(check_travel(travel, len(frames), "travel", after=last, falls=self._release))
         self._noise.look(frames)
-        for band in self._bands:
+
+        def scan(band: Band) -> None:
             if self._subframe:
                 self._set_plateaus(band, frames[0] if first == 0 else None)
             with band.resident():
                 for staged in band.stage(frames, lent):
                     self._scan(band, staged, first + staged.frames.start)
+
+        for_each_band(self._bands, scan)
         self._marked_noise = self._noise.value
 
     def _set_plateaus(self, band: Band, first: NDArray[Any] | None) -> None:
@@ -211,7 +216,9 @@ class Crossing:
         arguments |= {"frames": staged.array, "count": staged.count, "samples": band.maps.get("samples")}
         moved = staged.count * band.pixels * self._dtype.itemsize
         maps = "marks left times levels answers status"
-        self._launch(band, "onset_scan", maps, moved, first=first, **arguments, **self._travel.arguments)
+        self._launch(
+            band, "onset_scan", maps, moved, first=first, **arguments, **self._travel.on(band.device)
+        )
 
     def event_maps(self, last: bool = False, on_device: bool = False) -> EventMaps:
         """Return the maps of the frames so far; without a copy if they are the ``last`` before a `reset`.
@@ -222,11 +229,11 @@ class Crossing:
             (band,) = self._bands
             later = partial(_first_light, band.cut("times"))
             return EventMaps(band.cut("answers", 0), band.cut("answers", 1), band.cut("status"), later)
-        maps = [self._band_maps(band, last) for band in self._bands]
+        maps = for_each_band(self._bands, partial(self._band_maps, last=last))
         height, sigma, status, frame = (join_rows(parts) for parts in zip(*maps, strict=True))
         return EventMaps(height, sigma, status, _first_light(frame))
 
-    def _band_maps(self, band: Band, last: bool) -> list[NDArray[Any]]:
+    def _band_maps(self, band: Band, *, last: bool) -> list[NDArray[Any]]:
         """Return height, sigma, status and frame of a band's rows."""
         parts: dict[str, int | slice] = {"answers": slice(None), "status": 0, "times": 0}
         answers, status, frame = band.fetch(parts, keep=() if last else parts)
@@ -251,13 +258,13 @@ class Crossing:
 
     def _launch(self, band: Band, name: str, maps: str, moved: int = 0, **arguments: Any) -> None:
         """Run a kernel over a band; ``maps`` are names of its maps, ``moved`` the bytes of frames."""
-        tile = _TILE if self.device.layout.tile > 1 else 1
+        tile = _TILE if band.device.layout.tile > 1 else 1
         arguments |= {
             "pixels": band.pixels,
             "stride": band.stride,
             **{plane: band.maps[plane] for plane in maps.split()},
         }
-        kernel = self.device.kernel("onset", name, **self._macros, TILE=tile)
+        kernel = band.device.kernel("onset", name, **self._macros, TILE=tile)
         kernel(-(-band.pixels // tile), **arguments, moved=moved)
 
 
@@ -270,16 +277,16 @@ def _first_light(times: Any) -> NDArray[np.int32]:
 class _TravelTable:
     """The travel of all frames so far in planes: travel, its steps, and the distance from the first frame."""
 
-    def __init__(self, device: Device) -> None:
-        self._device = device
+    def __init__(self, devices: Sequence[Device]) -> None:
+        self._devices = devices
         self._rows = np.zeros((3, 64), np.float32)
-        self._table = device.array("travel", self._rows.shape, np.float32, zeroed=False)
+        self._allocate()
         self.clear()
 
-    @property
-    def arguments(self) -> dict[str, Any]:
-        """The table and its length, as kernel arguments."""
-        return {"travel": self._table, "room": self._table.shape[1]}
+    def on(self, device: Device) -> dict[str, Any]:
+        """Return the table on a device and its length, as kernel arguments."""
+        table = self._tables[device]
+        return {"travel": table, "room": table.shape[1]}
 
     def clear(self) -> None:
         self.values: list[float] = []
@@ -293,9 +300,16 @@ class _TravelTable:
         old = len(self.values)
         steps = np.diff(travel, prepend=self.values[-1] if old else travel[0])
         count = old + len(travel)
-        if count > self._table.shape[1]:
-            self._rows = np.pad(self._rows, ((0, 0), (0, 2 * count - self._table.shape[1])))
-            self._table = self._device.array("travel", self._rows.shape, np.float32, zeroed=False)
+        if count > self._rows.shape[1]:
+            self._rows = np.pad(self._rows, ((0, 0), (0, 2 * count - self._rows.shape[1])))
+            self._allocate()
         self.values.extend(travel.tolist())
         self._rows[:, old:count] = travel, steps, travel - self.values[0]
-        self._table.write(self._rows)
+        for table in self._tables.values():
+            table.write(self._rows)
+
+    def _allocate(self) -> None:
+        self._tables = {
+            device: device.array("travel", self._rows.shape, np.float32, zeroed=False)
+            for device in self._devices
+        }

@@ -8,7 +8,7 @@ are summed as pairs of floats, in the order of the frames. See `mirrorskin.kerne
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from typing import Any
 
@@ -19,7 +19,7 @@ from mirrorskin.engine.device_arrays import AnyArray, on_host
 from mirrorskin.engine.operation import Operation, phase_function
 from mirrorskin.engine.options import option
 from mirrorskin.engine.rotation.design_matrix import basis, check_phases, check_weights
-from mirrorskin.engine.tiling import Band, Planes, Staged, cut_into_bands, join_rows, room_of
+from mirrorskin.engine.tiling import Band, Planes, cut_into_bands, for_each_band, join_rows, room_of
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.maps import TABLE
 from mirrorskin.io.positions import check_phase
@@ -66,8 +66,8 @@ class CorrelationOperation(Operation):
     def _sums(self) -> TurnSums | WindowSums:
         window = self._window()
         if window is None:
-            return TurnSums(self.device, self.shape, self.dtype, self._length)
-        return WindowSums(self.device, self.shape, self.dtype, self._length, window)
+            return TurnSums(self.devices, self.shape, self.dtype, self._length)
+        return WindowSums([self.device], self.shape, self.dtype, self._length, window)
 
     def clear(self) -> None:
         """Forget the frames so far."""
@@ -98,7 +98,7 @@ class CorrelationOperation(Operation):
             return self._sums.result(self._on_device and self._window() is None)
         frames, alpha, weights = self._stack
         check_phases(alpha, weights)
-        sums = StackSums(self.device, self.shape, self.dtype, len(frames))
+        sums = StackSums(self.devices, self.shape, self.dtype, len(frames))
         sums.push(frames, alpha, weights)
         return sums.result(self._on_device)
 
@@ -192,31 +192,38 @@ correlate = phase_function(
 )
 
 
+class _Tables:
+    """The small tables of a launch, on a device."""
+
+    def __init__(self, device: Device) -> None:
+        self.place: Array = device.array("place", (_BATCH,), np.int32, zeroed=False)
+        self.steps: Array = device.array("basis", (3 * _BATCH,), np.int32, zeroed=False)
+        self.floats: Array = device.array("basis", (3 * _BATCH,), np.float32, zeroed=False)
+        self.fit: Array = device.array("fit", (28,), np.float32, zeroed=False)
+
+
 class _Sums:
-    """Sums over frames on a device, and the fit that they determine."""
+    """Sums over frames on devices, and the fit that they determine."""
 
     _phase: Doubles
     _weight: Doubles
 
     def __init__(
         self,
-        device: Device,
+        devices: Sequence[Device],
         shape: tuple[int, int],
         dtype: np.dtype[Any],
         maps: Mapping[str, DTypeLike | Planes],
         length: int,
         least: int = 1,
     ) -> None:
-        self._device, self._size, self._integer = device, dtype.itemsize, dtype.kind == "u"
+        self._size, self._integer = dtype.itemsize, dtype.kind == "u"
         self._step = _STEPS.get(dtype.itemsize, 1)
         self._macros: dict[str, str | int] = {"FRAME": C_TYPES[dtype.name], "BITS": 8 * dtype.itemsize}
         maps = {**maps, **dict.fromkeys(_FIT.values(), np.float32)}
-        self.bands: list[Band] = cut_into_bands(device, shape, dtype, maps, length, least)
+        self.bands: list[Band] = cut_into_bands(devices, shape, dtype, maps, length, least)
         self._length = length
-        self._place = device.array("place", (_BATCH,), np.int32, zeroed=False)
-        self._steps = device.array("basis", (3 * _BATCH,), np.int32, zeroed=False)
-        self._floats = device.array("basis", (3 * _BATCH,), np.float32, zeroed=False)
-        self._fit = device.array("fit", (28,), np.float32, zeroed=False)
+        self._tables = {device: _Tables(device) for device in devices}
 
     @cached_property
     def room(self) -> NDArray[Any]:
@@ -233,13 +240,14 @@ class _Sums:
         used = self._weight > 0
         check_phases(self._phase[used], self._weight[used])
         self._solve()
-        parts: list[list[Any]] = []
-        for band in self.bands:
+
+        def take_fit(band: Band) -> list[Any]:
             with band.resident():
                 if on_device:
-                    parts.append([band.cut(name) for name in _FIT.values()])
-                else:
-                    parts.append(band.fetch(dict.fromkeys(_FIT.values(), slice(None))))
+                    return [band.cut(name) for name in _FIT.values()]
+                return band.fetch(dict.fromkeys(_FIT.values(), slice(None)))
+
+        parts = for_each_band(self.bands, take_fit)
         mean, cosine, sine, residual = (join_rows(part) for part in zip(*parts, strict=True))
         return Result(
             mean=mean,
@@ -260,17 +268,10 @@ class _Sums:
         steps = np.array([1, self._step, self._step])
         return np.where((weight == 1)[:, np.newaxis], np.rint(basis(phase) * steps), 0)
 
-    def _stage(self, frames: AnyArray, lent: bool, whole: bool = False) -> Iterator[tuple[Band, Staged]]:
-        """Yield the resident bands, with their rows of the frames on the device."""
-        for band in self.bands:
-            with band.resident():
-                for staged in band.stage(frames, lent, whole):
-                    yield band, staged
-
     def _run(self, band: Band, name: str, moved: int, **arguments: Any) -> None:
         """Run a kernel over a band; ``moved`` is bytes per pixel."""
-        kernel = self._device.kernel("correlation", name, **self._macros)
-        items = -(-band.pixels // self._device.layout.tile)
+        kernel = band.device.kernel("correlation", name, **self._macros)
+        items = -(-band.pixels // band.device.layout.tile)
         kernel(items, pixels=band.pixels, moved=moved * band.pixels, **arguments)
 
     def _run_at_once(
@@ -283,28 +284,30 @@ class _Sums:
         weight: Doubles,
     ) -> None:
         """Sum and solve at most `WINDOW` frames on the device."""
-        used, name = np.flatnonzero(weight), "correlation_window"
+        used, name, tables = np.flatnonzero(weight), "correlation_window", self._tables[band.device]
         counts: dict[str, int] = {}
         if self._integer and _are_counts(weight):
-            rows, table = self._rows_in_steps(phase, weight), self._steps
+            rows, basis = self._rows_in_steps(phase, weight), tables.steps
             counts = _counted(rows)
         else:
-            rows, table, name = _float_rows(phase, weight), self._floats, f"{name}_pairs"
-        _fill(self._fit, _fit_table(phase, rows))
-        _fill(self._place, places[used])
-        _fill(table, rows[used])
+            rows, basis, name = _float_rows(phase, weight), tables.floats, f"{name}_pairs"
+        _fill(tables.fit, _fit_table(phase, rows))
+        _fill(tables.place, places[used])
+        _fill(basis, rows[used])
         count = len(used)
         self._run(
-            band, name, self._size * count + 16, frames=frames, count=count, stride=stride, place=self._place,
-            basis=table, fit=self._fit, **counts, **_maps_of(band, _FIT),
+            band, name, self._size * count + 16, frames=frames, count=count, stride=stride,
+            place=tables.place, basis=basis, fit=tables.fit, **counts, **_maps_of(band, _FIT),
         )  # fmt: skip
 
 
 class StackSums(_Sums):
     """Sums over a complete stack, which one kernel computes and solves, without storing them."""
 
-    def __init__(self, device: Device, shape: tuple[int, int], dtype: np.dtype[Any], length: int) -> None:
-        super().__init__(device, shape, dtype, {}, length, least=length)
+    def __init__(
+        self, devices: Sequence[Device], shape: tuple[int, int], dtype: np.dtype[Any], length: int
+    ) -> None:
+        super().__init__(devices, shape, dtype, {}, length, least=length)
 
     @staticmethod
     def take(frames: AnyArray, weight: Doubles) -> bool:
@@ -316,8 +319,13 @@ class StackSums(_Sums):
     def push(self, frames: AnyArray, phase: Doubles, weight: Doubles) -> None:
         """Sum all frames, which must not change before the result is returned."""
         self._phase, self._weight = phase, weight
-        for band, staged in self._stage(frames, lent=True, whole=True):
-            self._run_at_once(band, staged.array, band.pixels, np.arange(len(frames)), phase, weight)
+
+        def run(band: Band) -> None:
+            with band.resident():
+                for staged in band.stage(frames, lent=True, whole=True):
+                    self._run_at_once(band, staged.array, band.pixels, np.arange(len(frames)), phase, weight)
+
+        for_each_band(self.bands, run)
 
     def _solve(self) -> None:
         """Do nothing: `push` has solved the fit."""
@@ -326,10 +334,12 @@ class StackSums(_Sums):
 class TurnSums(_Sums):
     """Sums over all frames so far: integers until the first weight that is neither 0 nor 1, then pairs."""
 
-    def __init__(self, device: Device, shape: tuple[int, int], dtype: np.dtype[Any], length: int) -> None:
+    def __init__(
+        self, devices: Sequence[Device], shape: tuple[int, int], dtype: np.dtype[Any], length: int
+    ) -> None:
         # Eight bytes are one integer or two floats.
         maps = {"reference": np.float32, **dict.fromkeys(_SUMS.values(), np.int64)}
-        super().__init__(device, shape, dtype, maps, length)
+        super().__init__(devices, shape, dtype, maps, length)
         self.reset()
 
     def reset(self) -> None:
@@ -359,30 +369,41 @@ class TurnSums(_Sums):
             rows /= [1, self._step, self._step]
             rows[self._counts :] = _float_rows(self._phase, self._weight)[self._counts :]
             name, moved, sums, counts = "pairs", 52, _PAIRS, {}
-        _fill(self._fit, _fit_table(self._phase, rows))
-        for band in self.bands:
+        table = _fit_table(self._phase, rows)
+        for tables in self._tables.values():
+            _fill(tables.fit, table)
+
+        def solve(band: Band) -> None:
             with band.resident():
-                maps = _maps_of(band, {**sums, **_FIT})
-                self._run(band, f"correlation_solve_{name}", moved, fit=self._fit, **maps, **counts)
+                maps, fit = _maps_of(band, {**sums, **_FIT}), self._tables[band.device].fit
+                self._run(band, f"correlation_solve_{name}", moved, fit=fit, **maps, **counts)
+
+        for_each_band(self.bands, solve)
 
     def _add(self, frames: AnyArray, phase: Doubles, weight: Doubles, lent: bool) -> None:
         """Add frames to integer sums, or to pairs."""
         counts = self._counts is None
         rows = self._rows_in_steps(phase, weight) if counts else _float_rows(phase, weight)
-        basis, name = (self._steps, "add") if counts else (self._floats, "sum")
         fresh = not np.any(self._weight)
-        for band, staged in self._stage(frames, lent):
-            used = staged.frames.start + np.flatnonzero(weight[staged.frames])
-            for start in range(0, len(used), _BATCH):
-                places = used[start : start + _BATCH]
-                _fill(self._place, places - staged.frames.start)
-                _fill(basis, rows[places])
-                arguments = _maps_of(band, _SUMS if counts else _PAIRS)
-                arguments |= {"frames": staged.array, "count": len(places), "stride": band.pixels}
-                arguments |= {"place": self._place, "basis": basis}
-                arguments["fresh"] = fresh and not np.any(weight[: places[0]])
-                moved = self._size * len(places) + (64 if counts else 72)
-                self._run(band, f"correlation_{name}", moved, **arguments)
+
+        def add(band: Band) -> None:
+            tables = self._tables[band.device]
+            basis, name = (tables.steps, "add") if counts else (tables.floats, "sum")
+            with band.resident():
+                for staged in band.stage(frames, lent):
+                    used = staged.frames.start + np.flatnonzero(weight[staged.frames])
+                    for start in range(0, len(used), _BATCH):
+                        places = used[start : start + _BATCH]
+                        _fill(tables.place, places - staged.frames.start)
+                        _fill(basis, rows[places])
+                        arguments = _maps_of(band, _SUMS if counts else _PAIRS)
+                        arguments |= {"frames": staged.array, "count": len(places), "stride": band.pixels}
+                        arguments |= {"place": tables.place, "basis": basis}
+                        arguments["fresh"] = fresh and not np.any(weight[: places[0]])
+                        moved = self._size * len(places) + (64 if counts else 72)
+                        self._run(band, f"correlation_{name}", moved, **arguments)
+
+        for_each_band(self.bands, add)
         self._phase = np.concatenate([self._phase, phase])
         self._weight = np.concatenate([self._weight, weight])
 
@@ -393,10 +414,13 @@ class TurnSums(_Sums):
         self._counts = len(self._phase)
         if np.any(self._weight):
             counts = _counted(self._rows_in_steps(self._phase, self._weight))
-            for band in self.bands:
+
+            def convert(band: Band) -> None:
                 with band.resident():
                     sums = _maps_of(band, _PAIRS)
                     self._run(band, "correlation_convert", 68, unit=1 / self._step, **counts, **sums)
+
+            for_each_band(self.bands, convert)
 
 
 class WindowSums(_Sums):
@@ -408,7 +432,7 @@ class WindowSums(_Sums):
 
     def __init__(
         self,
-        device: Device,
+        devices: Sequence[Device],
         shape: tuple[int, int],
         dtype: np.dtype[Any],
         length: int,
@@ -416,7 +440,8 @@ class WindowSums(_Sums):
         other_maps: Mapping[str, DTypeLike | Planes] | None = None,
     ) -> None:
         self._window = window
-        super().__init__(device, shape, dtype, {"ring": Planes(window, dtype), **(other_maps or {})}, length)
+        maps = {"ring": Planes(window, dtype), **(other_maps or {})}
+        super().__init__(devices, shape, dtype, maps, length)
         self.reset()
 
     def reset(self) -> None:

@@ -56,7 +56,7 @@ class MovingNormals(NormalsOperation):
     _width = 4
 
     def _make_kernel(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> NormalKernel:
-        return NormalKernel(self, self.device, shape, dtype, poses=True)
+        return NormalKernel(self, self.devices, shape, dtype, poses=True)
 
     def clear(self) -> None:
         """Forget the frames so far, and what was estimated from them."""

@@ -35,7 +35,7 @@ from mirrorskin.engine.rotation.poses import PoseFit
 from mirrorskin.engine.rotation.response import Response, initial_response, wall_response_of
 from mirrorskin.engine.rotation.scale import check_gain
 from mirrorskin.engine.rotation.tilt import check_tilt
-from mirrorskin.engine.tiling import Band, cut_into_bands, join_rows, room_of
+from mirrorskin.engine.tiling import Band, cut_into_bands, for_each_band, join_rows, room_of
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.maps import TABLE
 from mirrorskin.io.positions import check_phase
@@ -106,7 +106,7 @@ class NormalsOperation(SensorOptions, Operation):
         self._kernel = self._make_kernel(shape, dtype)
         length = max(self._longest + 1, self.memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))
         self._bands = cut_into_bands(
-            self.device, shape, dtype, self._kernel.planes, length, self._longest + 1
+            self.devices, shape, dtype, self._kernel.planes, length, self._longest + 1
         )
         vars(self).pop("_buffer", None)
         for band in self._bands:
@@ -165,7 +165,7 @@ class NormalsOperation(SensorOptions, Operation):
         """Return the maps of all turns; the last turn ends with the last frame."""
         state = self._model, self._turns, self._frames, self._phase.copy(), self._weights.copy()
         frames = self._open[: len(self._phase)].copy() if np.any(self._weights == 0) else None
-        closed = [self._copy_maps(band) for band in self._bands] if self._turns and not self.per_turn else []
+        closed = for_each_band(self._bands, self._copy_maps) if self._turns and not self.per_turn else []
         try:
             return self._complete()
         finally:  # more frames may follow: open the last turn again
@@ -269,10 +269,14 @@ class NormalsOperation(SensorOptions, Operation):
         self._turns += 1
         self._frames += count
         turns = 1 if self.per_turn else self._turns
-        for band in self._bands:
+        frames, model = self._open[turn], self._model
+
+        def run(band: Band) -> None:
             with band.resident():
-                for staged in band.stage(self._open[turn], whole=True):
-                    self._kernel.run(band, Samples(staged.array, 0, count), fit, self._model, turns)
+                for staged in band.stage(frames, whole=True):
+                    self._kernel.run(band, Samples(staged.array, 0, count), fit, model, turns)
+
+        for_each_band(self._bands, run)
         if self.per_turn:
             self._each.append(self._take_maps())
 
@@ -286,14 +290,16 @@ class NormalsOperation(SensorOptions, Operation):
         if self._lent is not None and self._on_device and not self.per_turn:
             (band,) = self._bands
             return [band.cut(name, components=3 * (name == "vectors")) for name in self._kernel_maps]
-        parts = []
-        for band in self._bands:
-            planes = band.fetch(dict.fromkeys(self._kernel_maps, slice(None)))
-            vectors, *others = (plane.reshape(-1) for plane in planes)
-            rows = (-1, self.shape[1])
-            flat = [values[: band.pixels].reshape(rows) for values in others]
-            parts.append([vectors[: 3 * band.pixels].reshape(*rows, 3), *flat])
+        parts = for_each_band(self._bands, self._take_band_maps)
         return [join_rows(part) for part in zip(*parts, strict=True)]
+
+    def _take_band_maps(self, band: Band) -> list[NDArray[Any]]:
+        """Return the maps of a band's rows in the order of `_kernel_maps`."""
+        planes = band.fetch(dict.fromkeys(self._kernel_maps, slice(None)))
+        vectors, *others = (plane.reshape(-1) for plane in planes)
+        rows = (-1, self.shape[1])
+        flat = [values[: band.pixels].reshape(rows) for values in others]
+        return [vectors[: 3 * band.pixels].reshape(*rows, 3), *flat]
 
 
 def normals_result(maps: list[Any], model: TurnModel, turns: int, frames: int) -> Result:
@@ -420,8 +426,9 @@ class Normals(NormalsOperation):
         if not isinstance(self.response, Response | None):
             raise InputError(f"response is a {type(self.response).__name__}: a Response is needed")
         tilt = cast('float | Literal["estimate"]', self.tilt)
+        devices = self.devices if self.window_frames is None else [self.device]
         return NormalKernel(
-            self, self.device, shape, dtype, tilt=tilt, method=self.method, response=self.response
+            self, devices, shape, dtype, tilt=tilt, method=self.method, response=self.response
         )
 
     @property

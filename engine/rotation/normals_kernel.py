@@ -107,7 +107,7 @@ class NormalKernel:
     def __init__(
         self,
         options: SensorOptions,
-        device: Device,
+        devices: Sequence[Device],
         shape: tuple[int, int],
         dtype: np.dtype[Any],
         *,
@@ -131,14 +131,17 @@ class NormalKernel:
         self._dtype, self._method, self._step = dtype, method, thinning(shape)
         levels = options.zenith_gain, options.zenith_offset, options.dark, options.bright
         self._scale = response or make_scale(*levels, shape)
-        self.device: Device = device
-        if not self._scale.per_pixel:
-            self._one_scale = self.device.from_host("scale", self._scale.planes)
-        self._wall = None if response is None else self.device.from_host("wall", response.table)
+        self.devices: Sequence[Device] = devices
+        scale = None if self._scale.per_pixel else self._scale.planes
+        wall = None if response is None else response.table
+        self._one_scale = {one: one.from_host("scale", scale) for one in devices if scale is not None}
+        self._wall = {one: one.from_host("wall", wall) for one in devices if wall is not None}
         planes = _POSE_PLANES if poses else _TURN_PLANES
         self._poses = poses
-        self.tables_at_once: int = max(1, min(_TABLES, self.device.max_allocation // (4 * planes * LONGEST)))
-        self._tables = self.device.array("turns", (self.tables_at_once, planes, LONGEST), np.float32)
+        largest = min(one.max_allocation for one in devices)
+        self.tables_at_once: int = max(1, min(_TABLES, largest // (4 * planes * LONGEST)))
+        tables = self.tables_at_once, planes, LONGEST
+        self._tables = {one: one.array("turns", tables, np.float32) for one in devices}
         self._places: dict[TurnFit | PoseFit, int] = {}
 
     @property
@@ -162,7 +165,7 @@ class NormalKernel:
             steep = samples.compress(clear, axis=1)
             noise = residual_noise(steep if steep.shape[1] >= _ENOUGH else samples, fit.phase, fit.weights)
         if tilt is None:
-            if self._wall is not None:
+            if self._wall:
                 raise InputError(
                     "the tilt cannot be estimated with a calibrated response: calibrate it, or give it,"
                     " such as 2.5deg"
@@ -188,14 +191,16 @@ class NormalKernel:
                 band.write("scale", values[band.rows], plane=plane)
 
     def write_tables(self, fits: Sequence[TurnFit | PoseFit]) -> None:
-        """Copy the tables of turns to the device, after earlier turns, unless they are there already."""
+        """Copy the tables of turns to the devices, after earlier turns, unless they are there already."""
         if all(fit in self._places for fit in fits):
             return
         self._places = {fit: place for place, fit in enumerate(dict.fromkeys(fits))}
-        tables = np.zeros((len(self._places), *self._tables.shape[1:]), np.float32)
+        shape = self._tables[self.devices[0]].shape
+        tables = np.zeros((len(self._places), *shape[1:]), np.float32)
         for fit, place in self._places.items():
             tables[place, :, : fit.table.shape[1]] = fit.table
-        self._tables.write(tables)
+        for array in self._tables.values():
+            array.write(tables)
 
     def run(
         self,
@@ -211,14 +216,14 @@ class NormalKernel:
         The maps become the mean of ``turns`` turns, including this one. ``bare`` omits mean, cosine, sine and
         residual.
         """
-        count, noise, layout = samples.count, model.noise, self.device.layout
+        device, count, noise = band.device, samples.count, model.noise
         tilt = fit.tilt if isinstance(fit, PoseFit) else model.tilt
-        lanes, per_pixel = vector_lanes(self.device), self._scale.per_pixel
-        file = "normals" if self._wall is None else "normals_wall"
-        name = f"normals_{self._method}" if self._wall is None else "normals_wall"
+        lanes, per_pixel = vector_lanes(device), self._scale.per_pixel
+        file = "normals_wall" if self._wall else "normals"
+        name = "normals_wall" if self._wall else f"normals_{self._method}"
         if isinstance(fit, PoseFit):
             file, name = "normals_pose", "normals_pose" if fit.direction is None else "normals_rock"
-        kernel = self.device.kernel(file, name, FRAME=C_TYPES[self._dtype.name], LANES=lanes)
+        kernel = device.kernel(file, name, FRAME=C_TYPES[self._dtype.name], LANES=lanes)
         limits = contact_limits(count - 3, tilt)
         fitted = tilt if self._method == "exact" else 0.0  # the exact method fits a pixel's excess over this
         further: dict[str, Any] = {}
@@ -229,17 +234,17 @@ class NormalKernel:
         elif isinstance(self._scale, Response):
             wall = self._scale.wall
             sizes = {"curve_length": len(wall.curve), "inverse_length": len(wall.inverse)}
-            further = {"wall_numbers": self._wall, "follows": int(wall.follows), **sizes}
+            further = {"wall_numbers": self._wall[device], "follows": int(wall.follows), **sizes}
         elif self._method == "paper":
             (mean, *_), (_, cosine, both), (*_, sine) = fit.covariance
             further = {"of_mean": mean, "of_cosine": cosine, "of_both": both, "of_sine": sine}
         planes = 4 * len(self._scale.planes) * per_pixel
         maps: dict[str, Any] = {name: band.maps[name] for name in MAPS}
         kernel(
-            -(-band.pixels // (lanes * layout.words)),
+            -(-band.pixels // (lanes * device.layout.words)),
             stack=samples.stack,
-            tables=self._tables,
-            scale=band.maps["scale"] if per_pixel else self._one_scale,
+            tables=self._tables[device],
+            scale=band.maps["scale"] if per_pixel else self._one_scale[device],
             table=self._places[fit],
             start=samples.start,
             count=count,

@@ -28,12 +28,14 @@ class NormalWindow:
     those that ``estimate_normals`` and ``correlate`` compute from the same frames.
     """
 
+    device: Device
+
     def __init__(
         self, kernel: NormalKernel, shape: tuple[int, int], dtype: np.dtype[Any], length: int
     ) -> None:
         self._shape, self.length, self._kernel = shape, length, kernel
-        self.device: Device = kernel.device
-        self._sums = WindowSums(self.device, shape, dtype, _LENGTH, length, kernel.planes)
+        (self.device,) = kernel.devices
+        self._sums = WindowSums([self.device], shape, dtype, _LENGTH, length, kernel.planes)
         for band in self.bands:
             kernel.write_scale(band)
         self._model, self.count = kernel.model, 0

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from operations import CASES, CUTS, LEVELS, engine_classes
+from operations import CASES, CUTS, LEVELS, assert_same, engine_classes
 
 from mirrorskin import engine, io
 from mirrorskin.engine.live import LiveOperation
@@ -31,15 +31,6 @@ def of_type(name, dtype=None):
 @functools.cache
 def whole(name, device=None, dtype=None):
     return of_type(name, dtype).whole(device=device)
-
-
-def assert_same(found, expected):
-    """Hold maps and numbers equal bit by bit."""
-    assert list(found) == list(expected)
-    for name, values in expected.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name, strict=True)
-    numbers = {name: value for name, value in expected.process.items() if isinstance(value, float)}
-    assert {name: found.process[name] for name in numbers} == pytest.approx(numbers, nan_ok=True, rel=0)
 
 
 def answer(operation):

@@ -48,7 +48,9 @@ def test_errors_name_their_source_once_and_others_pass():
 
 def test_a_result_says_its_source_and_its_device(device):
     bare = io.Result(mean=np.zeros((3, 5), np.float32))
-    signed = attach_provenance(bare, made_up(pixel_size=(0.1, 0.2)), device, {"method": "exact", "tilt": 0.1})
+    signed = attach_provenance(
+        bare, made_up(pixel_size=(0.1, 0.2)), [device], {"method": "exact", "tilt": 0.1}
+    )
     assert signed.mean is bare.mean
     np.testing.assert_allclose(signed.x, [-0.2, -0.1, 0, 0.1, 0.2], atol=1e-12)
     np.testing.assert_allclose(signed.y, [0.2, 0, -0.2], atol=1e-12)
@@ -60,7 +62,7 @@ def test_a_result_says_its_source_and_its_device(device):
 
 
 def test_pixels_of_unknown_size_have_no_place():
-    signed = attach_provenance(io.Result(), made_up(), open_device(None), {})
+    signed = attach_provenance(io.Result(), made_up(), [open_device(None)], {})
     assert signed.x is None
     assert signed.y is None
 
@@ -68,7 +70,7 @@ def test_pixels_of_unknown_size_have_no_place():
 def test_pixels_of_a_part_lie_where_they_do_in_the_whole_picture(tmp_path):
     path = record(sphere(), tmp_path / "ball.h5")
     with io.open_recording(path) as recording:
-        whole = attach_provenance(io.Result(), recording, open_device(None), {})
+        whole = attach_provenance(io.Result(), recording, [open_device(None)], {})
         for name in ("fingerprint", "modified"):
             own = getattr(recording, name)
             assert whole.process[f"source_{name}"] == (own() if callable(own) else own)
@@ -76,7 +78,7 @@ def test_pixels_of_a_part_lie_where_they_do_in_the_whole_picture(tmp_path):
         count, rows, columns = recording.shape
     part = io.Region((1, rows - 1), (2, columns - 1))
     with io.open_recording(path, region=part, frames=(2, 5)) as recording:
-        signed = attach_provenance(io.Result(), recording, open_device(None), {})
+        signed = attach_provenance(io.Result(), recording, [open_device(None)], {})
     np.testing.assert_array_equal(signed.x, whole.x[2:-1])
     np.testing.assert_array_equal(signed.y, whole.y[1:-1])
     assert signed.process["source_region"] == f"2,1,{columns - 3}x{rows - 2}"

@@ -15,7 +15,7 @@ from injected_faults import lost
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels import embedded
 from mirrorskin.kernels.array import fetch
-from mirrorskin.kernels.device import list_devices, open_device
+from mirrorskin.kernels.device import list_devices, open_device, open_devices
 from mirrorskin.kernels.errors import DeviceError, DeviceMemoryError, UnknownDeviceError
 
 MACROS = {"LANES": 16, "WORDS": 64, "STRIDE": 1}
@@ -62,10 +62,17 @@ def machine(monkeypatch):
     }
     broken = set()
 
+    class Opened(str):
+        """An open device: its name, and its description."""
+
+        @property
+        def info(self):
+            return replace(devices[self], name=self)
+
     def opened(name):
         if name in broken:
             raise DeviceError(f"{name} cannot be used")
-        return name
+        return Opened(name)
 
     monkeypatch.delenv("PYOPENCL_CTX", raising=False)
     monkeypatch.setattr(device_layer, "_opened", WeakSet())
@@ -87,6 +94,24 @@ def test_the_best_device_that_works_is_opened(machine, caplog):
         f"maker: {name} is left out: {name} cannot be used"
         for name in ("large card", "small card", "integrated")
     ]
+
+
+def test_all_devices_like_the_default_one_are_opened_the_best_first(machine):
+    assert open_devices("all") == ["large card", "small card", "integrated"]
+    machine.add("large card")
+    assert open_devices(" All ") == ["small card", "integrated"]
+    assert open_device("all") == "small card"
+
+
+def test_a_list_of_devices_is_opened_in_its_order_and_none_twice(machine):
+    assert open_devices(["processor", "integrated", "2"]) == ["processor", "integrated"]
+    assert open_devices(["processor", "all"]) == ["processor", "large card", "small card", "integrated"]
+    assert open_device(["processor", "integrated"]) == "processor"
+
+
+def test_an_empty_list_of_devices_is_refused():
+    with pytest.raises(UnknownDeviceError, match="no device is given: give at least one"):
+        open_devices([])
 
 
 def test_a_device_that_is_named_is_not_replaced(machine):

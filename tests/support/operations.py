@@ -11,6 +11,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import pytest
 from live_frames import phases, press_frames, turn_frames
 from numpy.typing import NDArray
 from speckle import Speckle
@@ -173,3 +174,12 @@ CUTS = {
     "unevenly": lambda count: [slice(*ends) for ends in pairwise((0, 1, 4, 5, count - 1, count))],
     "in halves": lambda count: [slice(0, count // 2), slice(count // 2, count)],
 }
+
+
+def assert_same(found: Result, expected: Result) -> None:
+    """Hold maps and numbers equal bit by bit."""
+    assert list(found) == list(expected)
+    for name, values in expected.items():
+        np.testing.assert_array_equal(found[name], values, err_msg=name, strict=True)
+    numbers = {name: value for name, value in expected.process.items() if isinstance(value, float)}
+    assert {name: found.process[name] for name in numbers} == pytest.approx(numbers, nan_ok=True, rel=0)

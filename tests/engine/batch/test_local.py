@@ -74,15 +74,13 @@ def test_ctrl_c_gives_up_the_job_under_way_and_keeps_the_finished_ones(jobs, dev
 
 
 def test_all_gpus_are_used_where_one_is_the_default(monkeypatch):
-    kinds = ["cpu", "gpu", "gpu"]
-    devices = {str(n): SimpleNamespace(info=SimpleNamespace(kind=kind)) for n, kind in enumerate(kinds)}
-    devices[None] = devices["1"]
-    monkeypatch.setattr(local, "list_devices", lambda: [one.info for one in list(devices.values())[:3]])
-    monkeypatch.setattr(local, "open_device", lambda choice=None: devices[choice])
+    gpu, other_gpu = (SimpleNamespace(info=SimpleNamespace(kind="gpu")) for _ in range(2))
+    monkeypatch.setattr(local, "open_device", lambda: gpu)
+    monkeypatch.setattr(local, "open_devices", lambda choice: {"all": [gpu, other_gpu]}[choice])
     monkeypatch.delenv("PYOPENCL_CTX", raising=False)
-    assert default_devices() == [devices["1"], devices["2"]]
+    assert default_devices() == [gpu, other_gpu]
     monkeypatch.setitem(os.environ, "PYOPENCL_CTX", "0:1")
-    assert default_devices() == [devices["1"]]
+    assert default_devices() == [gpu]
 
 
 HANGS = """
