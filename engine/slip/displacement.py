@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.device_arrays import AnyArray, as_any_array, device_of, on_host
 from mirrorskin.engine.frames import check_dtype, check_frames
 from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.slip.tracking import GRADIENT_NOISE, NodeField, Tracker, invert_symmetric
 from mirrorskin.io import InputError, Result, pixel_axes
-from mirrorskin.io.arguments import as_array, as_array_or_number, check_count, check_number, checked
+from mirrorskin.io.arguments import as_array_or_number, check_count, check_number, checked
 from mirrorskin.io.maps import TABLE, DisplacementStatus, status_of
+from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.device import Device, open_device
+from mirrorskin.kernels.device import Device
 
 MAPS = {
     "displacement": TABLE["displacement"],
@@ -37,16 +38,16 @@ _LEAST_TEXTURED = 0.1  # smallest share of windows with texture; edges of light 
 
 
 @checked(
-    reference=as_array,
-    frames=as_array,
+    reference=as_any_array,
+    frames=as_any_array,
     pixel_size=as_array_or_number,
     window_size=check_count,
     window_step=check_count,
     noise=check_number,
 )
 def find_displacement(
-    reference: NDArray[Any],
-    frames: NDArray[Any],
+    reference: AnyArray,
+    frames: AnyArray,
     pixel_size: ArrayLike,
     *,
     window_size: int = 12,
@@ -64,8 +65,8 @@ def find_displacement(
 
     Parameters
     ----------
-    reference : ndarray, (H, W), uint8, uint16 or float32
-    frames : ndarray, (T, H, W), of the same type
+    reference : ndarray or device array, (H, W), uint8, uint16 or float32
+    frames : ndarray or device array, (T, H, W), of the same type
         In the order in which they were taken.
     pixel_size : float or (float, float)
         Millimetres, along x and y.
@@ -84,7 +85,8 @@ def find_displacement(
     Result
         ``displacement`` and ``displacement_sigma``, (T, H, W, 2), mm along x and y (up), are undefined unless
         ``status``, (T, H, W), is 1: 0 the window leaves the picture or has no usable sample, 2 the texture
-        was not found again, 3 no texture beyond the noise. ``process`` contains the ``noise``, counts.
+        was not found again, 3 no texture beyond the noise. ``process`` contains the ``noise``, counts. Of
+        frames on a device, displacement and sigma stay there.
 
     Raises
     ------
@@ -103,28 +105,27 @@ def find_displacement(
     >>> found.displacement[0, 30, 40].astype(float).round(3).tolist()
     [0.3, 0.0]
     """
-    frames = np.asarray(frames)
-    if frames.ndim != 3 or np.ndim(reference) != 2:
-        shapes = f"reference has shape {np.shape(reference)}, frames {frames.shape}"
+    if frames.ndim != 3 or reference.ndim != 2:
+        shapes = f"reference has shape {reference.shape}, frames {frames.shape}"
         raise InputError(f"{shapes}: (H, W) and (T, H, W) are needed")
-    dtype = check_dtype(np.asarray(reference).dtype)
-    check_frames(frames, dtype, np.shape(reference))
-    if not np.isfinite(reference).all():
+    check_frames(frames, check_dtype(reference.dtype), reference.shape)
+    if reference.dtype.kind == "f" and not np.isfinite(on_host(reference)).all():
         raise InputError("the reference has samples that are not finite: leave out the part that has them")
     size = check_pixel_size(pixel_size)
-    check_windows(np.shape(reference), window_size, window_step)
+    check_windows(reference.shape, window_size, window_step)
     if noise is not None and not 0 < noise < 1e9:
         raise InputError(f"noise {noise}: a standard deviation in counts above 0 is needed, such as 1.5")
-    tracker = Tracker(reference, window_size, window_step, open_device(device))
+    tracker = Tracker(reference, window_size, window_step, device_of(device, reference, frames))
     fields = [tracker.follow(frame) for frame in frames]
     texture = Texture.of(tracker, np.mean([field.variance for field in fields], axis=0), noise)
     texture.refuse_clear("the frames")
     sigma = np.sqrt(np.einsum("yxii->yxi", texture.covariance)) * size
     nodes = [_at_nodes(tracker, field, texture, window_size, sigma, size) for field in fields]
     displacement, sigma, status = (np.stack(part) for part in zip(*nodes, strict=True))
+    on_device = isinstance(frames, Array)
     maps = {
-        "displacement": tracker.to_pixels(displacement),
-        "displacement_sigma": tracker.positive_to_pixels(sigma),
+        "displacement": tracker.to_pixels(displacement, on_device),
+        "displacement_sigma": tracker.positive_to_pixels(sigma, on_device),
         "status": tracker.worst_at_pixels(status, _RANK),
     }
     x, y = pixel_axes(frames.shape[1:], size)

@@ -289,7 +289,7 @@ class Slip(Operation):
 
     def _each(self, tracker: Tracker, moved: Doubles) -> NDArray[np.float32]:
         rest = np.where(np.isfinite(moved[:1]).any(axis=0), 0.0, np.nan)
-        return tracker.to_pixels(np.stack([rest, *moved]))
+        return np.asarray(tracker.to_pixels(np.stack([rest, *moved])))
 
     def _node_places(self, tracker: Tracker) -> tuple[Doubles, Doubles]:
         """Return x and y of the nodes, mm from the picture's centre, (rows, columns)."""

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.device_arrays import AnyArray, on_host
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import C_TYPES, Device
@@ -68,13 +69,14 @@ class Tracker:
 
     Parameters
     ----------
-    reference : ndarray, (H, W), uint8, uint16 or float32
+    reference : ndarray or Array, (H, W), uint8, uint16 or float32
+        Frames that are followed are in either memory as well.
     window, step : int
         Pixels of a window's side, and from node to node.
     device : Device
     """
 
-    def __init__(self, reference: NDArray[Any], window: int, step: int, device: Device) -> None:
+    def __init__(self, reference: AnyArray, window: int, step: int, device: Device) -> None:
         self._make = partial(_Level, window=window, step=step, device=device)
         self._least = 2 * window
         self._reference = reference
@@ -84,7 +86,7 @@ class Tracker:
     @cached_property
     def _levels(self) -> list[_Level]:
         """The reference at all resolutions, each half of the one before."""
-        levels, counts = [self.finest], self._reference
+        levels, counts = [self.finest], on_host(self._reference)
         for _ in range(1, _LEVELS):
             counts = cv2.pyrDown(counts.astype(np.float32))
             if min(counts.shape) < self._least:
@@ -92,7 +94,7 @@ class Tracker:
             levels.append(self._make(counts))
         return levels
 
-    def follow(self, frame: NDArray[Any], stride: float = 1.0) -> NodeField:
+    def follow(self, frame: AnyArray, stride: float = 1.0) -> NodeField:
         """Return the displacement of a frame; ``stride`` is its step as a multiple of the previous step."""
         last, before = self._fields
         begin = last + stride * (last - before)
@@ -100,22 +102,24 @@ class Tracker:
         for correlated in (False, True):
             if np.mean(best.found) >= _ENOUGH * np.mean(self.finest.usable):
                 break
+            frame = on_host(frame)
             found, other = self._follow_down(frame, self._correlated(frame) if correlated else begin)
             if np.mean(found.found) > np.mean(best.found):
                 best, field = found, other
         self._fields = [field, last]
         return best
 
-    def to_pixels(self, values: Doubles) -> NDArray[np.float32]:
+    def to_pixels(self, values: Doubles, on_device: bool = False) -> AnyArray:
         """Return values of the nodes, (rows, columns) or ([T,] rows, columns, n), at all pixels.
 
-        They are cubic, where nodes are missing linear, and else NaN.
+        They are cubic, where nodes are missing linear, and else NaN. ``on_device``: those of (T, rows,
+        columns, n) stay on the device if it can hold them in one array.
         """
-        return self.finest.to_pixels(values, logarithms=False)
+        return self.finest.to_pixels(values, logarithms=False, on_device=on_device)
 
-    def positive_to_pixels(self, values: Doubles) -> NDArray[np.float32]:
-        """Return values above 0 at all pixels, interpolated as logarithms to remain above 0."""
-        return self.finest.to_pixels(np.log(values), logarithms=True)
+    def positive_to_pixels(self, values: Doubles, on_device: bool = False) -> AnyArray:
+        """Return values above 0 as `to_pixels` does, interpolated as logarithms to remain above 0."""
+        return self.finest.to_pixels(np.log(values), logarithms=True, on_device=on_device)
 
     def worst_at_pixels(self, codes: NDArray[np.uint8], rank: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return at all pixels the code of highest rank of the nodes around, (T, rows, columns)."""
@@ -162,7 +166,9 @@ class Tracker:
 
     def _correlated(self, frame: NDArray[Any]) -> Doubles:
         """Return the field of a uniform displacement, by phase correlation of the whole picture."""
-        reference, moved = (np.nan_to_num(counts.astype(np.float64)) for counts in (self._reference, frame))
+        reference, moved = (
+            np.nan_to_num(on_host(counts).astype(np.float64)) for counts in (self._reference, frame)
+        )
         taper = cv2.createHanningWindow(frame.shape[::-1], cv2.CV_64F)
         (right, down), _ = cv2.phaseCorrelate(reference, moved, taper)
         return np.asarray(self.finest.rest + np.array([right, down])[:, None, None])
@@ -174,7 +180,7 @@ class _Level:
     step: int
     measured: Doubles
 
-    def __init__(self, reference: NDArray[Any], window: int, step: int, device: Device) -> None:
+    def __init__(self, reference: AnyArray, window: int, step: int, device: Device) -> None:
         self._device, self._window, self.step = device, window, step
         self._frame_type = C_TYPES[reference.dtype.name]
         self._top = int(np.iinfo(reference.dtype).max) if reference.dtype.kind == "u" else 0
@@ -199,7 +205,7 @@ class _Level:
         self._maps = {
             name: device.array(name, shape, np.float32, zeroed=False) for name, shape in shapes.items()
         }
-        self._maps["frame"] = device.array("frame", self.shape, reference.dtype, zeroed=False)
+        self._dtype = reference.dtype
         self._measure_reference(reference)
         summary = self._maps["summary"].read().astype(np.float64)
         variances, self.measured = summary[:3], summary[3]
@@ -209,12 +215,11 @@ class _Level:
         self._trust = np.nan_to_num(1 / (variances[0] + variances[2]))
         self._trust += 1e-9 * self._trust.max() + np.finfo(float).tiny
 
-    def _measure_reference(self, reference: NDArray[Any]) -> None:
+    def _measure_reference(self, reference: AnyArray) -> None:
         """Compute the reference's planes, and the inverse normal matrix of each node."""
-        self._fit_spline(reference)
+        frame = {"frame": self._fit_spline(reference)}
         maps, (rows, columns) = self._maps, self.shape
         sizes: dict[str, Any] = {"rows": rows, "columns": columns}
-        frame = {"frame": maps["frame"]}
         sums = {"sums": maps["padded"], "counts": maps["half"]}
         self._launch("across", rows * math.ceil(columns / self._tile), **sizes, **frame, **sums)
         wide = columns + 2 * self._halo
@@ -230,17 +235,19 @@ class _Level:
         found = {name: maps[name] for name in ("planes", "inverse", "summary")}
         self._launch("normals", math.prod(self.grid), **self._sizes, first=self._first + self._halo, **found)
 
-    def to_pixels(self, values: Doubles, logarithms: bool) -> NDArray[np.float32]:
+    def to_pixels(self, values: Doubles, logarithms: bool, on_device: bool) -> AnyArray:
         """Return values, or their exponentials, (rows, columns) or ([T,] rows, columns, n), at all pixels."""
         kind = values.shape[values.ndim - 1 :] if values.ndim > 2 else ()
         nodes = np.moveaxis(values.reshape(-1, *self.grid, math.prod(kind)), -1, 1)
         nbytes = 4 * math.prod(self.shape) * math.prod(kind)
         most = max(1, self._device.max_allocation // nbytes)
-        parts = [self._pixels(nodes[k : k + most], logarithms) for k in range(0, len(nodes), most)]
+        if on_device and len(nodes) <= most:
+            return self._pixels(nodes, logarithms)
+        parts = [self._pixels(nodes[k : k + most], logarithms).release() for k in range(0, len(nodes), most)]
         pixels = parts[0] if len(parts) == 1 else np.concatenate(parts)
         return pixels.reshape(*values.shape[:-3], *self.shape, *kind)
 
-    def _pixels(self, values: Doubles, logarithms: bool) -> NDArray[np.float32]:
+    def _pixels(self, values: Doubles, logarithms: bool) -> Array:
         """Return values of nodes, (T, n, rows, columns), at all pixels, (T, H, W, n)."""
         (rows, columns), (count, parts) = self.shape, values.shape[:2]
         nodes = self._device.from_host("nodes", values)
@@ -257,7 +264,7 @@ class _Level:
             nodes=nodes,
             pixels=pixels,
         )
-        return pixels.release()
+        return pixels
 
     @property
     def _sizes(self) -> dict[str, int]:
@@ -266,20 +273,28 @@ class _Level:
         sizes = {"rows": rows, "columns": columns, "node_rows": node_rows, "node_columns": node_columns}
         return sizes | {"step": self.step, "halo": self._halo}
 
-    def _fit_spline(self, frame: NDArray[Any]) -> None:
-        """Compute the coefficients of a frame's spline on the device."""
+    @cached_property
+    def _frame(self) -> Array:
+        """Memory on the device for a frame from the host."""
+        return self._device.array("frame", self.shape, self._dtype, zeroed=False)
+
+    def _fit_spline(self, frame: AnyArray) -> Array:
+        """Compute the coefficients of a frame's spline on the device, and return the frame there."""
         maps, (rows, columns) = self._maps, self.shape
-        maps["frame"].write(frame)
+        placed = frame if isinstance(frame, Array) else self._frame
+        if placed is not frame:
+            placed.write(frame)
         width = columns + 2 * MARGIN
         pixels = width * (rows + 2 * MARGIN)
         items = math.ceil(pixels / self._tile)
-        self._launch("pad", items, rows=rows, columns=columns, frame=maps["frame"], padded=maps["padded"])
+        self._launch("pad", items, rows=rows, columns=columns, frame=placed, padded=maps["padded"])
         for step, source, filtered in ((1, "padded", "half"), (width, "half", "coefficients")):
             self._launch(
                 "filter", items, pixels=pixels, step=step, source=maps[source], filtered=maps[filtered]
             )
+        return placed
 
-    def follow(self, frame: NDArray[Any], field: Doubles) -> tuple[NodeField, Doubles]:
+    def follow(self, frame: AnyArray, field: Doubles) -> tuple[NodeField, Doubles]:
         """Return the displacement of a frame, starting from a field, and the final field."""
         self._fit_spline(frame)
         for _ in range(ITERATIONS):

@@ -181,14 +181,41 @@ def test_an_operation_that_takes_none_gets_numpy_arrays(device):
     np.testing.assert_array_equal(engine.run(ours(device, PRESS), Last())["last"], PRESS[-1])
 
 
-def test_other_functions_copy_what_is_on_a_device(device):
-    texture = RANDOM.normal(100, 20, SHAPE).astype(np.float32)
-    moved = np.roll(texture, 1, axis=1)[None]
+def textures(dtype, larger=(1, 1)):
+    """Return a texture, and frames in which it moves by a pixel each time."""
+    texture = np.tile(RANDOM.normal(100, 20, SHAPE), larger).astype(dtype)
+    return texture, np.stack([np.roll(texture, n, axis=1) for n in (1, 2)])
+
+
+@pytest.mark.parametrize("put", [ours, of_pyopencl])
+@pytest.mark.parametrize("dtype", ["uint8", "float32"])
+def test_displacements_of_frames_on_the_device_stay_there(device, put, dtype):
+    texture, moved = textures(dtype)
+    expected = engine.slip.find_displacement(texture, moved, 0.1, device=device)
+    found = engine.slip.find_displacement(put(device, texture), put(device, moved), 0.1)
+    assert {name for name in found if found.on_device(name) is not None} == set(found) - {"status"}
+    for name, values in expected.items():
+        np.testing.assert_array_equal(found[name], values, err_msg=name, strict=True)
+
+
+def test_a_step_beyond_the_texture_s_grain_is_found_on_the_device(device):
+    texture = np.kron(RANDOM.normal(100, 20, (15, 18)), np.ones((4, 4))).astype(np.float32)
+    moved = np.roll(texture, 11, axis=1)[None]
     expected, found = (
         engine.slip.find_displacement(put(texture), put(moved), 0.1, noise=1.0, device=device).displacement
-        for put in (np.asarray, lambda values: of_pyopencl(device, values))
+        for put in (np.asarray, lambda values: ours(device, values))
     )
     np.testing.assert_array_equal(found, expected)
+
+
+def test_frames_of_a_texture_on_a_card_are_not_copied_and_displacements_only_when_they_are_used(card):
+    texture, moved = textures("uint8", LARGER)
+    up, down, expected = copies(card, lambda: engine.slip.find_displacement(texture, moved, 0.1, device=card))
+    placed = ours(card, texture), ours(card, moved)
+    fewer_up, fewer_down, found = copies(card, lambda: engine.slip.find_displacement(*placed, 0.1))
+    assert up - fewer_up == pytest.approx(len(moved) + 1)
+    assert down - fewer_down == pytest.approx(2 * 8 * len(moved))
+    np.testing.assert_array_equal(found.displacement, expected.displacement)
 
 
 def test_a_result_keeps_maps_on_the_device_when_others_are_assigned(device):

@@ -146,6 +146,11 @@ def others(shape: Shape, device: Device) -> Iterator[tuple[str, Call]]:
         "find_displacement, 3 frames",
         lambda: engine.slip.find_displacement(texture, moved, PIXEL, device=device),
     )
+    there = placed(texture, device), placed(moved, device)
+    yield (
+        "find_displacement, 3 frames on the device",
+        lambda: engine.slip.find_displacement(*there, PIXEL),
+    )
     first, second = (surface((240, 320), 0.05 * n, 0.03 * n, 0.02 * n, n) for n in (0, 1))
     yield "estimate_pose, 240 x 320", lambda: engine.pose.estimate_pose(first, second, device=device)
     yield "live press, one frame of VGA", live_press(device)
