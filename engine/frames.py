@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.device_arrays import AnyArray
+from mirrorskin.engine.device_arrays import AnyArray, as_any_array
 from mirrorskin.io import InputError
+from mirrorskin.io.samples import convert_samples, frame_dtype
 from mirrorskin.io.types import FRAME_DTYPES
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.least_squares import mad_sigma
@@ -32,10 +33,21 @@ def check_dtype(dtype: DTypeLike) -> np.dtype[Any]:
     return sample_type
 
 
+def as_frames(name: str, value: Any) -> AnyArray:
+    """Return an argument as an array of a type that kernels accept; see `frame_dtype`."""
+    array = as_any_array(name, value)
+    if not isinstance(array, np.ndarray):
+        check_dtype(array.dtype)
+        return array
+    return convert_samples(array, frame_dtype(array.dtype, name), name)
+
+
 def check_frames(frames: NDArray[Any], dtype: np.dtype[Any], shape: tuple[int, int]) -> None:
     """Raise InputError unless frames are one or more of a type and size, (n, *shape)."""
     if frames.dtype != dtype or frames.shape[1:] != shape or len(frames) == 0:
-        raise InputError(f"frames of {frames.dtype} {frames.shape}: expected {dtype} (n, *{shape})")
+        raise InputError(
+            f"frames of {frames.dtype} {frames.shape}: {dtype} (n, {shape[0]}, {shape[1]}) is needed"
+        )
 
 
 class Noise:

@@ -19,6 +19,7 @@ from mirrorskin.io import InputError, Map, Result
 from mirrorskin.io.arguments import as_array
 from mirrorskin.io.maps import declaration_of
 from mirrorskin.io.result import check_maps, result_of
+from mirrorskin.io.samples import convert_samples, frame_dtype
 from mirrorskin.io.types import Motion, ProcessValue
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Choice, Device, open_devices
@@ -295,7 +296,14 @@ class Operation(ThreadSafe, OnDevice):
             array = on_host(array)
         elif isinstance(array, Array):
             self.use_device_of(array)
+        if self.dtypes is not None and array.dtype not in self.dtypes and isinstance(array, np.ndarray):
+            array = convert_samples(array, frame_dtype(array.dtype, "frames"), "frames", self.count)
         if self.dtype is None:
+            if array.ndim == 2 and 0 not in array.shape:
+                shape = f"({', '.join(map(str, array.shape))})"
+                raise InputError(
+                    f"frames are one frame {shape}: a stack (n, H, W) is needed, such as frame[None]"
+                )
             if array.ndim != 3 or 0 in array.shape or array.dtype.kind not in "uif":
                 raise InputError(f"frames are {array.dtype} {array.shape}: numbers (n, H, W) are needed")
             self.begin(array.shape[1:], array.dtype)

@@ -19,6 +19,8 @@ R = TypeVar("R")
 Check = Callable[[str, Any], Any]
 """Function of an argument's name and value that returns the value, perhaps converted; or InputError."""
 
+_COUNTS = ("frames", "reference", "dark", "bright", "zenith_offset")  # arguments whose numbers are counts
+
 
 def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Return a decorator that checks arguments, each by a function; None is valid where it is the default.
@@ -61,8 +63,8 @@ def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
 def as_array(name: str, value: Any) -> NDArray[Any]:
     """Return an argument as an array of numbers; an array of numbers is returned unchanged.
 
-    Masked values become NaN (frames of integers then become float32), or 0 in maps of integers. Arrays on a
-    device are copied to the host.
+    Masked values become NaN (frames and references of integers then become float32), or 0 in other maps of
+    integers. Arrays on a device are copied to the host.
     """
     if type(value) is np.ndarray and value.dtype.kind in "buif":
         return value
@@ -80,7 +82,7 @@ def as_array(name: str, value: Any) -> NDArray[Any]:
         return array
     if array.dtype.kind == "f":
         return np.where(mask, array.dtype.type(np.nan), array)
-    if name == "frames":
+    if name in _COUNTS:
         return np.where(mask, np.float32(np.nan), array.astype(np.float32))
     return np.where(mask, array.dtype.type(0), array)
 

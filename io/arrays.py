@@ -26,9 +26,10 @@ from mirrorskin.io.os_errors import (
 )
 from mirrorskin.io.positions import Positions, along, check_finite
 from mirrorskin.io.recording import Recording, cut_out
+from mirrorskin.io.samples import DecodedFrames, Decoding
 from mirrorskin.io.selection import Region
 from mirrorskin.io.stack import RawFrames
-from mirrorskin.io.types import FRAME_DTYPES, MOTIONS, Block, Header, InputError, Motion, block_memory
+from mirrorskin.io.types import MOTIONS, Block, Header, InputError, Motion, block_memory
 
 NUMPY_SUFFIXES = (".npy", ".npz")
 _KNOWN = {*POSITIONS.values(), "dark", "bright"}  # arrays of an archive that are not frames
@@ -43,8 +44,9 @@ class ArrayRecording(Recording):
 
     Parameters
     ----------
-    frames : ndarray or RawFrames, (T, H, W), uint8, uint16 or float32
-        An array, or frames of one in a file, which are read when they are used.
+    frames : ndarray or RawFrames, (T, H, W)
+        An array, or frames of one in a file, which are read when they are used; see
+        `mirrorskin.io.samples.frame_dtype` for their types.
     positions : mapping
         ``travel``, mm, (T,), ``phase`` or ``twist``, radians, (T,), or ``displacement``, mm, (T, 2).
     header : mapping
@@ -77,19 +79,21 @@ class ArrayRecording(Recording):
     ) -> None:
         if len(frames.shape) != 3 or frames.shape[0] < 2 or 0 in frames.shape:
             raise InputError(f"{name} has shape {frames.shape}: frames, (T, H, W), at least 2, are needed")
-        if frames.dtype not in FRAME_DTYPES:
-            raise InputError(
-                f"{name} is of type {frames.dtype}: frames are uint8, uint16 or float32; convert it first"
-            )
+        decoding = Decoding(frames.dtype.newbyteorder("="), where=name)
+        self._frames: NDArray[Any] | RawFrames | DecodedFrames = frames
+        if isinstance(frames, np.ndarray) and frames.dtype != decoding.dtype:
+            self._frames = decoding.decode(frames)
+        elif isinstance(frames, RawFrames) and not decoding.plain:
+            self._frames = DecodedFrames(frames, decoding, frames.shape)
+        self.findings = decoding.findings
         self.path, self.name, self.dataset, self._files = Path(name), name, "", dict(origins or {})
         self.motion, series = _motion(name, positions, motion)
         self.full_shape: tuple[int, int, int] = frames.shape[0], frames.shape[1], frames.shape[2]
         cut = cut_out(name, self.full_shape, wanted, region)
         self.region, self.origin, self.first_frame = cut.region, cut.region.origin, cut.frames[0]
         self.which: str = f"{cut.frames[0]}:{cut.frames[1]}"
-        self._frames = frames
         self.shape: tuple[int, int, int] = (cut.frames[1] - cut.frames[0], *cut.region.shape)
-        self.dtype: np.dtype[Any] = frames.dtype.newbyteorder("=")
+        self.dtype: np.dtype[Any] = decoding.dtype
         self.time = self.travel = self.phase = self.displacement = self.twist = self.tilt = None
         given = along(positions[series], self.full_shape[0])
         assert given is not None
@@ -108,14 +112,14 @@ class ArrayRecording(Recording):
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
         """Return the next frames, at most as many as ``out`` holds: a view of the array, or in ``out``."""
         out = block_memory(out, self.shape, self.dtype)
-        if not isinstance(self._frames, RawFrames):
+        if isinstance(self._frames, np.ndarray):
             return self.lend(len(out))
         out = out[: self.shape[0] - self._next]
         return self._block(self._part(self._next, out)) if len(out) else None
 
     def lend(self, most: int) -> Block | None:
         """Return the next frames as a view of the array, at most ``most``; None at the end, or of a file."""
-        if isinstance(self._frames, RawFrames):
+        if not isinstance(self._frames, np.ndarray):
             return None
         start = self.first_frame + self._next
         stop = min(start + most, self.first_frame + self.shape[0])
@@ -130,7 +134,7 @@ class ArrayRecording(Recording):
     def _part(self, start: int, out: NDArray[Any]) -> NDArray[Any]:
         """Return frames: a view of the array, or read into ``out``."""
         start += self.first_frame
-        if not isinstance(self._frames, RawFrames):
+        if isinstance(self._frames, np.ndarray):
             return self._frames[start : start + len(out), *self.region.slices]
         span = start, start + len(out)
         with as_input_error(f"{self.name}: frames {start} to {span[1] - 1} cannot be read"):
@@ -162,7 +166,7 @@ class ArrayRecording(Recording):
     @property
     def how(self) -> str:
         """How the frames are read."""
-        return "directly" if isinstance(self._frames, RawFrames) else "where they lie"
+        return "where they lie" if isinstance(self._frames, np.ndarray) else self._frames.how
 
     @property
     def modified(self) -> str:
@@ -171,10 +175,10 @@ class ArrayRecording(Recording):
 
     def close(self) -> None:
         """Release the frames."""
-        if isinstance(self._frames, RawFrames):
-            self._frames.close()
-        else:
+        if isinstance(self._frames, np.ndarray):
             self._frames = self._frames[:0]
+        else:
+            self._frames.close()
 
 
 @contextmanager

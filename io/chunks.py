@@ -49,7 +49,7 @@ class Chunks:
         self.shape: tuple[int, ...] = dataset.get_create_plist().get_chunk()
         self._whole, self._dtype = dataset.shape, dataset.dtype
         self._size = math.prod(self.shape) * self._dtype.itemsize
-        self.length: int = self.shape[0]
+        self.chunk, self.length = self.shape, self.shape[0]
         self.scratch_bytes: int = threads * self._size
         by = "one thread" if threads == 1 else f"{threads} threads"
         self.how: str = f"chunks {'decoded' if codecs else 'read'} by {by}"

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.chunks import Chunks, find_codecs
-from mirrorskin.io.os_errors import MAX_UNPACKED_BYTES, as_input_error, is_flagged
+from mirrorskin.io.os_errors import MAX_UNPACKED_BYTES, as_input_error, is_flagged, open_regular
+from mirrorskin.io.samples import ATTRIBUTES, Packing, packing_of
 from mirrorskin.io.types import Closing, InputError, ProcessValue
 from mirrorskin.io.units import conversion_factor
 
@@ -33,6 +34,7 @@ many bytes as its own size, and ``memory_limit`` raises the limit.
 _LINKS_DEEP = 16
 _MOST_STEPS = 100_000  # through links, and to the sources of virtual datasets
 _GROUPS_DEEP = 64
+_MATLAB_5 = b"MATLAB 5.0 MAT-file"
 _LEAST_FILE = 512  # bytes that every HDF5 file with a dataset has
 _MOST_OBJECTS = 20_000  # groups and datasets in a file
 _MOST_NAMES = 10_000  # members of a group that is read as a whole
@@ -155,7 +157,7 @@ class Hdf5File(Closing):
         remedy: str = "",
         rows: int | None = None,
     ) -> NDArray[Any]:
-        """Read numbers, converted to a unit, after checking that they are stored."""
+        """Read numbers, unpacked and converted to a unit, after checking that they are stored."""
         remedy = remedy and f": {remedy}"
         with as_input_error(lambda: self.where(node)):
             if not isinstance(node, h5py.Dataset) or node.id.dtype.kind not in "iufb":
@@ -167,11 +169,45 @@ class Hdf5File(Closing):
             needed = " or ".join(map(str, dict.fromkeys(shapes)))
             raise InputError(f"{self.where(node)} has shape {shape} where {needed} is needed{remedy}")
         values = self.load(node, rows)
+        packing = self.packing(node)
+        if packing is not None:
+            values = packing.unpack(values, np.float64)
         stated = None if unit is None else self._attribute_of(node, "units")
         given = unit if stated is None else str(stated or unit)
         if given is None or unit is None or given == unit:
             return values
         return values * conversion_factor(given, unit, self.where(node))
+
+    def packing(self, node: h5py.Dataset) -> Packing | None:
+        """Return how the values of a dataset are stored, as its attributes state; None if as they are."""
+        with as_input_error(lambda: self.where(node)):
+            if not h5py.h5a.get_num_attrs(node.id):
+                return None
+        values = {name: self.attribute_values(node, name) for name in ATTRIBUTES}
+        stated = {name: value for name, value in values.items() if value is not None}
+        if "_Unsigned" in stated:
+            stated["_Unsigned"] = first_value(stated["_Unsigned"])
+        return packing_of(stated, node.id.dtype, self.where(node)) if stated else None
+
+    def dimensions(self, node: h5py.Dataset) -> tuple[str, ...]:
+        """Return the names of a dataset's axes, "" for one without; empty if it states none.
+
+        They are those of its dimension scales, such as netCDF has, of its labels, or of NeXus.
+        """
+        with as_input_error(lambda: self.where(node)):
+            if h5py.h5a.exists(node.id, b"DIMENSION_LIST"):
+                self._check_heaps_of(node.id)
+                scales = [list(node.dims[axis].values())[:1] for axis in range(node.ndim)]
+                return tuple(str(one[0].name).rpartition("/")[2] if one else "" for one in scales)
+        group = str(node.name).rpartition("/")[0]
+        for owner, attribute in ((node, "DIMENSION_LABELS"), (self.find(group), "axes")):
+            nexus = attribute == "axes" and owner is not None
+            if nexus and self._attribute_of(owner, "signal") != str(node.name).rpartition("/")[2]:
+                continue
+            values = None if owner is None else self.attribute_values(owner, attribute)
+            if values is not None and values.shape == (node.ndim,):
+                return tuple(str(first_value(value) or "") for value in values)
+        return ()
 
     def load(self, node: h5py.Dataset, rows: int | None = None) -> NDArray[Any]:
         """Read a dataset, or its first rows, if it is completely stored and within `VALUES_LIMIT`.
@@ -282,11 +318,15 @@ class Hdf5File(Closing):
         if isinstance(node, h5py.h5d.DatasetID) and node.get_create_plist().get_layout() == h5py.h5d.VIRTUAL:
             # HDF5 would read them from the heaps of other files, which are not checked.
             raise ValueError("texts of any length in a virtual dataset")
+        # Many texts may refer to the same bytes.
+        return int(math.prod(node.shape)) * self._check_heaps_of(node)
+
+    def _check_heaps_of(self, node: h5py.h5d.DatasetID | h5py.h5a.AttrID) -> int:
+        """Return the length in bytes of the longest text in the file of an object; see `_check_heaps`."""
         name = h5py.h5f.get_name(node)
         if name not in self._longest_text:
             self._longest_text[name] = _check_heaps(h5py.File(h5py.h5i.get_file_id(node)))
-        # Many texts may refer to the same bytes.
-        return int(math.prod(node.shape)) * self._longest_text[name]
+        return self._longest_text[name]
 
     def spend(self, size: int, scratch: int = 0) -> None:
         """Count the bytes of values that are read; InputError above `VALUES_LIMIT`, with scratch memory."""
@@ -381,6 +421,16 @@ def _open_file(path: Path, real: str) -> h5py.File:
                 return h5py.File(real, "r", swmr=True, locking=False)
         if h5py.is_hdf5(path):
             raise
+        with open_regular(path) as file:
+            start = file.read(len(_MATLAB_5))
+        if start == _MATLAB_5:
+            raise InputError(
+                f"{path} is a file of MATLAB before version 7.3: write it with save(..., '-v7.3')"
+            ) from None
+        if start[:3] == b"CDF":
+            raise InputError(
+                f"{path} is a netCDF file of version 3, which is not HDF5: convert it with 'nccopy -k nc4'"
+            ) from None
         raise InputError(
             f"{path} is not an HDF5 file; 'mirrorskin import' turns other files into recordings"
         ) from None

@@ -72,11 +72,11 @@ class RecordingState:
         return replace(self, used=used, dropped=None if self.dropped is None else self.dropped[frames])
 
 
-def read_state(file: Hdf5File, ours: bool, stack: h5py.Dataset) -> RecordingState:
-    """Read the state of a recording; stacks of other programs are complete."""
+def read_state(file: Hdf5File, ours: bool, stack: h5py.Dataset, count: int) -> RecordingState:
+    """Read the state of a recording; stacks of other programs, of ``count`` frames, are complete."""
     node = file.find(STATE) if ours else None
     if node is None:
-        return RecordingState(int(stack.shape[0]))
+        return RecordingState(count)
     state = str(file.value(node))
     if state == UNDER_WAY and not (file.root.swmr_mode and is_locked(file.path)):
         state = f"{CUT_SHORT}its writer was killed"

@@ -24,10 +24,10 @@ from mirrorskin.io.recorder import checksums
 from mirrorskin.io.result import absolute_heights
 from mirrorskin.io.result_file import MARK as RESULT_MARK
 from mirrorskin.io.result_file import open_result
+from mirrorskin.io.samples import Decoding, frame_dtype, order_of
 from mirrorskin.io.selection import Region, Selection, source_region
 from mirrorskin.io.stack import Stack
 from mirrorskin.io.types import (
-    FRAME_DTYPES,
     UNDISTORTED,
     Block,
     Closing,
@@ -90,6 +90,7 @@ class Recording(Closing):
     region: Region
     origin: tuple[int, int]
     first_frame: int
+    full_shape: tuple[int, int, int]
     state: str
     used: NDArray[np.bool_] | None
     dropped: NDArray[np.int32] | None
@@ -115,13 +116,14 @@ class Recording(Closing):
         positions: Mapping[str, Floats | None],
         layout: Layout,
         state: RecordingState,
+        full_shape: tuple[int, int, int],
         live: bool = False,
     ) -> None:
         self.path, self.name, self.dataset = file.path, str(file.path), str(dataset.name)
         self.header, self.motion, self._layout = header, header.motion, layout
         self.shape, self.dtype = stack.shape, stack.dtype
         self.region, self.origin, self.first_frame = cut.region, cut.region.origin, cut.frames[0]
-        self.full_shape: tuple[int, int, int] = (state.count, *_shape(dataset)[1:])
+        self.full_shape = full_shape
         self.state, self.used, self.dropped = state.state, state.used, state.dropped
         self.time, self.travel, self.phase = (positions.get(name) for name in ("time", "travel", "phase"))
         self.displacement, self.twist = positions.get("displacement"), positions.get("twist")
@@ -315,8 +317,8 @@ def open_recording(
         file = opening.enter_context(open_file(path, memory_limit))
         ours = file.marked(MARK)
         file.check_layout(MARK)
-        stack, state = _find_stack(file, dataset, ours)
-        shape = (state.count, *_shape(stack)[1:])
+        stack, state, decoding = _find_stack(file, dataset, ours)
+        shape = (state.count, *decoding.shape(stack.shape)[1:])
         cut = cut_out(str(path), shape, frames, region)
         layout = Layout(file, ours, shape, cut)
         header = layout.header(motion, tilt, pixel_size, override_motion)
@@ -329,15 +331,13 @@ def open_recording(
             given = {"vertical": travel, "axial": phase}.get(header.motion)
             positions = layout.positions(header.motion, along(given, shape[0]))
         opened = file.frames(stack) if isinstance(file, ZarrFile) else None
-        frames_of = Stack(stack, str(path), shape[0], numbers, cut.region, memory_limit, threads, opened)
-        recording = Recording(file, stack, frames_of, cut, header, positions, layout, state, live)
+        frames_of = Stack(
+            stack, str(path), shape[0], numbers, cut.region, memory_limit, threads, decoding, opened
+        )
+        recording = Recording(file, stack, frames_of, cut, header, positions, layout, state, shape, live)
+        recording.findings = decoding.findings
         opening.pop_all()  # the recording closes the file from now on
     return recording
-
-
-def _shape(stack: h5py.Dataset) -> tuple[int, int, int]:
-    frames, rows, columns = map(int, stack.shape)
-    return frames, rows, columns
 
 
 def cut_out(
@@ -375,8 +375,10 @@ def _used(
     return used
 
 
-def _find_stack(file: Hdf5File, dataset: str | None, ours: bool) -> tuple[h5py.Dataset, RecordingState]:
-    """Find the stack of frames and its state; refuse one that cannot be read."""
+def _find_stack(
+    file: Hdf5File, dataset: str | None, ours: bool
+) -> tuple[h5py.Dataset, RecordingState, Decoding]:
+    """Find the stack of frames, its state, and how it is stored; refuse one that cannot be read."""
     if dataset is None:
         dataset = STACK if ours else _only_stack(file)
     stack = file.follow(dataset, "name the stack with --dataset")
@@ -384,18 +386,35 @@ def _find_stack(file: Hdf5File, dataset: str | None, ours: bool) -> tuple[h5py.D
     if not isinstance(stack, h5py.Dataset):
         raise InputError(f"{where} is not a dataset: name one with --dataset")
     with as_input_error(where):
-        shape, dtype = stack.shape, stack.dtype.newbyteorder("=")
+        shape = stack.shape
     if shape is None or len(shape) != 3:
         raise InputError(f"{where} has shape {shape}: a stack of frames, (T, H, W), is needed")
-    if dtype not in FRAME_DTYPES:
-        raise InputError(f"{where} is of type {dtype}: frames are uint8, uint16 or float32; convert it first")
-    if 0 in shape[1:]:
+    ours = ours and dataset == STACK
+    decoding = _decoding(file, stack, ours, where)
+    count, *picture = decoding.shape(shape)
+    if 0 in picture:
         raise InputError(f"{where} has shape {shape}: its frames have no pixels; record it again")
-    state = read_state(file, ours and dataset == STACK, stack)
+    state = read_state(file, ours, stack, count)
     if state.count < 2:
         raise InputError(f"{where} holds {state.count} frames: at least 2 are needed; record more")
-    file.check_frames(stack, state.count)
-    return stack, state
+    file.check_frames(stack, state.count if decoding.order[0] == 0 else shape[0])
+    return stack, state, decoding
+
+
+def _decoding(file: Hdf5File, stack: h5py.Dataset, ours: bool, where: str) -> Decoding:
+    """Return how the frames follow from what a stack stores, which its attributes and its axes state."""
+    with as_input_error(where):
+        dtype = stack.dtype.newbyteorder("=")
+    frame_dtype(dtype, where)
+    packing = file.packing(stack)
+    if ours:
+        return Decoding(dtype, packing=packing, where=where)
+    if file.attribute_values(stack, "MATLAB_class") is not None:
+        # MATLAB stores the axes in the opposite order, and a stack of pictures is (H, W, T) there.
+        return Decoding(dtype, (0, 2, 1), packing, where=where, matlab=True)
+    names = file.dimensions(stack)
+    order = order_of(names, where) if names else (0, 1, 2)
+    return Decoding(dtype, order, packing, names, where)
 
 
 def is_recording(path: str | Path) -> bool:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.chunks import Chunks, find_codecs
 from mirrorskin.io.os_errors import as_input_error
+from mirrorskin.io.samples import DecodedFrames, Decoding, Reader
 from mirrorskin.io.selection import Place, Region, Span
 from mirrorskin.io.types import Closing, InputError
 from mirrorskin.io.zarr import ZarrFrames
@@ -42,12 +43,15 @@ def _close(file: int) -> None:
 class RawFrames(Closing):
     """Contiguous frames at an offset of a file, which is closed with the last reference at the latest."""
 
-    length, how, scratch_bytes = 1, "directly", 0
+    length: int = 1
+    how: str = "directly"
+    scratch_bytes: int = 0
 
     def __init__(self, file: int, offset: int, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> None:
         self.shape, self.dtype, self._file, self._offset = shape, dtype, file, offset
         self._close = weakref.finalize(self, _close, file)
         self._frame = math.prod(shape[1:]) * dtype.itemsize
+        self.chunk = (1, *shape[1:])
 
     def fetch(self, spans: Sequence[Span], out: NDArray[Any]) -> None:
         """Write frames, some rows and columns of each, into ``out``, a C-contiguous array."""
@@ -95,8 +99,9 @@ class Hdf5Frames(Closing):
     scratch_bytes: int
 
     def __init__(self, dataset: h5py.Dataset, why: str) -> None:
-        chunk = dataset.chunks or (1, *dataset.shape[1:])
-        self.length, self.scratch_bytes = chunk[0], math.prod(chunk) * dataset.dtype.itemsize
+        self.chunk: tuple[int, ...] = dataset.chunks or (1, *dataset.shape[1:])
+        self.length = self.chunk[0]
+        self.scratch_bytes = math.prod(self.chunk) * dataset.dtype.itemsize
         self.how: str = f"through HDF5 ({why})"
         self._dataset = dataset
 
@@ -107,6 +112,8 @@ class Hdf5Frames(Closing):
 
 class Stack:
     """Some frames (``numbers``, in order) of the first ``count`` of a dataset, and the ``region`` of each.
+
+    ``decoding`` says how they follow from what the dataset stores.
 
     A chunk is unpacked once: if chunks contain more frames than are read at a time, these are kept in memory,
     up to ``limit`` bytes, or on disk.
@@ -124,14 +131,17 @@ class Stack:
         region: Region,
         memory_limit: int | None,
         threads: int | None,
+        decoding: Decoding,
         frames: ZarrFrames | None = None,
     ) -> None:
-        self.shape, self.dtype = (len(numbers), *region.shape), dataset.dtype.newbyteorder("=")
+        self.shape, self.dtype = (len(numbers), *region.shape), decoding.dtype
         self._place, self._limit = Place(path, str(dataset.name)), memory_limit or _LIMIT
         self._numbers, self._region = numbers, region
         self._first, self._end = int(numbers[0]), int(numbers[-1]) + 1
         with as_input_error(f"{path}: {dataset.name}"):
-            self._frames = frames or _open(dataset, self._place, count, self._limit, threads)
+            first = count if decoding.order[0] == 0 else int(dataset.shape[0])
+            reader: Reader = frames or _open(dataset, self._place, first, self._limit, threads)
+            self._frames = reader if decoding.plain else DecodedFrames(reader, decoding, dataset.shape)
             self._file = None if frames else dataset.file
             self._size = 0 if frames else os.fstat(dataset.file.id.get_vfd_handle()).st_size
         self._kept: Span = (0, 0)

@@ -161,7 +161,7 @@ def block_memory(out: NDArray[Any] | None, shape: tuple[int, int, int], dtype: n
     if out is None:
         return np.empty((1, *shape[1:]), dtype)
     if out.dtype != dtype or out.shape[1:] != shape[1:] or not len(out):
-        raise ValueError(f"out is {out.shape} {out.dtype}; needed is (n, *{shape[1:]}) {dtype}")
+        raise ValueError(f"out is {out.shape} {out.dtype}; needed is (n, {shape[1]}, {shape[2]}) {dtype}")
     return out
 
 

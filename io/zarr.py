@@ -6,13 +6,15 @@ like such a file. Values are read from the store when they are needed.
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import json
 import math
 import os
+import struct
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -102,7 +104,7 @@ class ZarrFile(Hdf5File):
                 most = (None, *one.shape[1:]) if grows and one.shape and name != STACK else None
                 dtype = "S1" if one.is_text else one.dtype
                 made = self.root.create_dataset(name, one.shape, dtype, maxshape=most)
-                _set_attributes(made, one.attributes)
+                _set_attributes(made, {**one.attributes, **_fill_value(one)})
 
     def _read_early(self) -> None:
         """Read small arrays concurrently, as each takes a request; an error is stored until it matters."""
@@ -177,6 +179,14 @@ class ZarrFile(Hdf5File):
                     f"its last chunk, {key}, is missing: copy it again, or write empty ones, too"
                 )
 
+    def dimensions(self, node: h5py.Dataset) -> tuple[str, ...]:
+        """Return the names of an array's axes, "" for one without; empty if it states none."""
+        one = self.arrays[str(node.name)]
+        names = one.document.get("dimension_names", one.attributes.get("_ARRAY_DIMENSIONS"))
+        if not isinstance(names, list) or len(names) != node.ndim:
+            return ()
+        return tuple(name if isinstance(name, str) else "" for name in names)
+
     def frames(self, stack: h5py.Dataset) -> ZarrFrames:
         """Return the object that reads the frames."""
         return ZarrFrames(self._array(str(stack.name)), Place(str(self.path), str(stack.name)))
@@ -222,6 +232,24 @@ def _set_attributes(node: h5py.Group | h5py.Dataset, attributes: Mapping[str, An
             node.attrs.create(name, value)
         elif isinstance(value, list) and all(isinstance(one, str) for one in value):
             node.attrs.create(name, fixed_text(value))
+        elif isinstance(value, list) and all(isinstance(one, int | float) for one in value):
+            node.attrs.create(name, np.array(value, np.float64))
+
+
+def _fill_value(array: ArrayMetadata) -> dict[str, float]:
+    """Return the attribute ``_FillValue`` as a number, as xarray writes it.
+
+    In version 2 it is the fill value of the array, and in version 3 that of a float is base64 of its bytes.
+    """
+    value = array.attributes.get("_FillValue")
+    if value is None and "_ARRAY_DIMENSIONS" in array.attributes:
+        value = array.document.get("fill_value")
+    if isinstance(value, str) and isinstance(array.dtype, np.dtype) and array.dtype.kind == "f":
+        with suppress(ValueError, struct.error):
+            return {"_FillValue": float(value)}
+        with suppress(ValueError, struct.error):
+            return {"_FillValue": struct.unpack("<d", base64.b64decode(value, validate=True))[0]}
+    return {} if value is None or isinstance(value, str) else {"_FillValue": value}
 
 
 class ZarrFrames(Closing):
@@ -230,6 +258,7 @@ class ZarrFrames(Closing):
     how = "chunks of Zarr, several at once"
 
     def __init__(self, array: Array, place: Place) -> None:
+        self.chunk: Shape = array.chunks
         self.length = array.chunks[0]
         self.scratch_bytes = AT_ONCE * math.prod(array.chunks) * array.dtype.itemsize
         self._array, self._place = array, place

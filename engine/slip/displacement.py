@@ -9,8 +9,8 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.device_arrays import AnyArray, as_any_array, device_of, on_host
-from mirrorskin.engine.frames import check_dtype, check_frames
+from mirrorskin.engine.device_arrays import AnyArray, device_of, on_host
+from mirrorskin.engine.frames import as_frames, check_frames
 from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.slip.tracking import GRADIENT_NOISE, NodeField, Tracker, invert_symmetric
@@ -38,8 +38,8 @@ _LEAST_TEXTURED = 0.1  # smallest share of windows with texture; edges of light 
 
 
 @checked(
-    reference=as_any_array,
-    frames=as_any_array,
+    reference=as_frames,
+    frames=as_frames,
     pixel_size=as_array_or_number,
     window_size=check_count,
     window_step=check_count,
@@ -108,7 +108,7 @@ def find_displacement(
     if frames.ndim != 3 or reference.ndim != 2:
         shapes = f"reference has shape {reference.shape}, frames {frames.shape}"
         raise InputError(f"{shapes}: (H, W) and (T, H, W) are needed")
-    check_frames(frames, check_dtype(reference.dtype), reference.shape)
+    check_frames(frames, reference.dtype, reference.shape)
     if reference.dtype.kind == "f" and not np.isfinite(on_host(reference)).all():
         raise InputError("the reference has samples that are not finite: leave out the part that has them")
     size = check_pixel_size(pixel_size)

@@ -113,7 +113,8 @@ def test_the_travel_of_a_real_stage_places_heights():
         (["ball.npy", "--travel", "ball.npy"], "lists 2304 travels for 12 frames"),
         (["cut.npy", *STEPS], "cut.npy is not a NumPy array"),
         (["cut.npz", *STEPS], "cut.npz is not a NumPy array"),
-        (["double.npy", *STEPS], "double.npy is of type float64: frames are uint8, uint16 or float32"),
+        (["complex.npy", *STEPS], "complex.npy is not a NumPy array of numbers (it holds complex128)"),
+        (["negative.npy", *STEPS], "frame 0 has a sample of -1; int16 is read as uint16, 0 to 65535"),
         (["flat.npy", *STEPS], "flat.npy has shape (4, 5): frames, (T, H, W)"),
         (["two.npz", *STEPS], "two.npz holds the arrays a, b: choose the frames with --dataset"),
     ],
@@ -122,7 +123,8 @@ def test_an_array_that_cannot_be_used_is_refused_in_a_line(words, said):
     Path("t.txt").write_text("0.1 0.2")
     for name in ("cut.npy", "cut.npz"):
         Path(name).write_bytes(Path(f"ball{Path(name).suffix}").read_bytes()[:700])
-    np.save("double.npy", np.zeros((4, 5, 6)))
+    np.save("complex.npy", np.zeros((4, 5, 6), np.complex128))
+    np.save("negative.npy", np.full((4, 5, 6), -1, np.int16))
     np.save("flat.npy", np.zeros((4, 5), np.uint8))
     np.savez("two.npz", a=np.zeros((4, 5, 6), np.uint8), b=np.zeros((4, 5, 6), np.uint8))
     refused(said, "reconstruct", *words, "-o", "out.h5")

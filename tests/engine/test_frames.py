@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from mirrorskin import engine
 from mirrorskin.engine.frames import SAMPLES, estimate_noise, thin_out
+from mirrorskin.io import InputError
 
 RANDOM = np.random.default_rng(0)
 
@@ -40,3 +42,23 @@ def test_samples_are_taken_from_all_over_the_frame():
     assert SAMPLES <= len(samples) < 2 * SAMPLES
     assert samples[-1] > 0.99 * frame.max()
     assert len(thin_out(frame[:1, :9])) == 9
+
+
+@pytest.mark.parametrize("dtype", ["?", "i1", "i2", ">u2", "i8", "f2", "f8"])
+def test_frames_of_other_types_are_converted(dtype):
+    frames = np.zeros((5, 1, 2), dtype)
+    frames[3:, 0, 0] = 1
+    found = engine.find_onset(frames, [0.0, 0.1, 0.2, 0.3, 0.4], dark=0, bright=1, noise=0.01)
+    np.testing.assert_allclose(found.height, [[-0.25, np.nan]], rtol=1e-6)
+
+
+def test_the_frame_that_cannot_be_converted_is_named_across_pushes():
+    onset = engine.Onset(dark=0, bright=100)
+    onset.push(np.zeros((3, 1, 2), np.int16), travel=[0.0, 0.1, 0.2])
+    with pytest.raises(InputError, match="frames: frame 4 has a sample of -1; int16 is read as uint16"):
+        onset.push(np.array([[[0, 0]], [[0, -1]]], np.int16), travel=[0.3, 0.4])
+
+
+def test_one_frame_is_not_a_stack():
+    with pytest.raises(InputError, match=r"uint8 \(4, 5\): for a single frame, pass frame\[None\]"):
+        engine.find_onset(np.zeros((4, 5), np.uint8), [0.0])

@@ -1,0 +1,280 @@
+"""Stacks of other programs whose metadata say what their values and axes mean."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+import xarray
+from stacks import read_all
+
+from mirrorskin import io
+from mirrorskin.io.samples import order_of
+
+SHAPE = 9, 6, 5
+GIVEN = {"motion": "vertical", "travel": io.Steps(0.3)}
+TRAVEL = 0.05 * np.arange(SHAPE[0])
+
+
+def stack(dtype="u2", top=1000):
+    return np.random.default_rng(2).integers(0, top, SHAPE).astype(dtype)
+
+
+def opened(path, **given):
+    return io.open_recording(path, **{**GIVEN, **given})
+
+
+def read(path, **given):
+    with opened(path, **given) as recording:
+        return read_all(recording, 4).frames
+
+
+def written(path, frames, encoding=None, dims=("t", "y", "x"), attributes=None, **coordinates):
+    """Write a stack as xarray does: netCDF-4, or Zarr of version 2 or 3."""
+    data = xarray.Dataset({"frames": (dims, frames, attributes)}, coordinates)
+    given = {"encoding": {"frames": encoding or {}}}
+    if path.suffix == ".nc":
+        data.to_netcdf(path, engine="h5netcdf", **given)
+    else:
+        data.to_zarr(path, zarr_format=2 if "2" in path.name else 3, consolidated=False, **given)
+    return path
+
+
+@pytest.fixture(params=["stack.nc", "stack2.zarr", "stack3.zarr"])
+def path(request, tmp_path):
+    return tmp_path / request.param
+
+
+@pytest.mark.parametrize("name", ["_FillValue", "missing_value"])
+def test_fill_values_are_unknown(path, name):
+    frames = stack()
+    frames[3:, 2, 1] = 65535
+    found = read(written(path, frames, {name: np.uint16(65535)}))
+    assert found.dtype == np.float32
+    np.testing.assert_array_equal(found, np.where(frames == 65535, np.nan, frames.astype("f4")))
+
+
+@pytest.mark.parametrize("chunks", [None, (4, 3, 5), (1, 6, 5)])
+def test_packed_samples_are_unpacked(path, chunks):
+    values = stack() * 0.5 - 3
+    values[4, 1, 1] = np.nan
+    encoding = {"dtype": "i2", "scale_factor": 0.5, "add_offset": -3.0, "_FillValue": -1}
+    if chunks:
+        encoding["chunksizes" if path.suffix == ".nc" else "chunks"] = chunks
+    found = read(written(path, values, encoding))
+    np.testing.assert_array_equal(found, values.astype("f4"))
+
+
+def test_unsigned_integers_are_read_as_such(path):
+    frames = stack("i2")
+    frames[2, 2, 2] = -1  # 65535
+    found = read(written(path, frames, attributes={"_Unsigned": "true"}))
+    assert found.dtype == np.uint16
+    np.testing.assert_array_equal(found, frames.view("u2"))
+
+
+@pytest.mark.parametrize(
+    "attributes",
+    [{"valid_range": np.array([10, 900], "u2")}, {"valid_min": np.uint16(10), "valid_max": np.uint16(900)}],
+)
+def test_samples_outside_of_the_valid_range_are_unknown(path, attributes):
+    frames = stack()
+    found = read(written(path, frames, attributes=attributes))
+    np.testing.assert_array_equal(
+        found, np.where((frames < 10) | (frames > 900), np.nan, frames.astype("f4"))
+    )
+
+
+def test_the_fill_value_of_floats_that_xarray_always_writes_changes_nothing(path):
+    frames = stack("f4")
+    with opened(written(path, frames)) as recording:
+        assert recording.findings == ()
+        np.testing.assert_array_equal(read_all(recording, 4).frames, frames)
+
+
+def test_a_fill_value_of_floats_is_unknown(path):
+    frames = stack("f4")
+    frames[1, 1, 1] = np.nan
+    np.testing.assert_array_equal(read(written(path, frames, {"_FillValue": -1.0})), frames)
+
+
+@pytest.mark.parametrize(
+    "dims",
+    [("y", "x", "t"), ("x", "y", "frame"), ("row", "time", "column"), ("y", "x", "pose"), ("a", "b", "t")],
+)
+@pytest.mark.parametrize("chunks", [None, (3, 4, 2)])
+def test_axes_are_in_the_order_of_their_names(path, dims, chunks):
+    frames = stack()
+    kinds = {"y": 1, "row": 1, "a": 1, "x": 2, "column": 2, "b": 2}
+    encoding = {"chunksizes" if path.suffix == ".nc" else "chunks": chunks} if chunks else {}
+    written(path, frames.transpose([kinds.get(name, 0) for name in dims]), encoding, dims)
+    with opened(path) as recording:
+        assert recording.shape == SHAPE
+        assert [(one.kind, one.warning) for one in recording.findings] == [("order of axes", False)]
+        np.testing.assert_array_equal(recording.frame(5), frames[5])
+        np.testing.assert_array_equal(read_all(recording, 4).frames, frames)
+
+
+def test_a_region_of_transposed_frames_is_that_part(path):
+    frames = stack()
+    written(path, frames.transpose(1, 2, 0), dims=("y", "x", "t"))
+    found = read(path, region=io.Region((1, 5), (2, 4)), frames=(2, 8))
+    np.testing.assert_array_equal(found, frames[2:8, 1:5, 2:4])
+
+
+@pytest.mark.parametrize(
+    ("dims", "said"),
+    [
+        (("t", "y", "channel"), "give one channel, as a stack"),
+        (("y", "row", "t"), "name frames, rows and columns differently"),
+        (("x", "a", "b"), "the others are not known: name them t, y and x"),
+    ],
+)
+def test_names_that_contradict_a_stack_are_refused(path, dims, said):
+    written(path, stack(), dims=dims)
+    with pytest.raises(io.InputError, match=said):
+        opened(path)
+
+
+@pytest.mark.parametrize(
+    "names", [("t", "y", "x"), ("a", "b", "c"), ("z", "y", "x"), ("t", "a", "b"), ("a", "y", "b")]
+)
+def test_names_that_agree_or_say_nothing_change_nothing(names):
+    assert order_of([name if name != "c" else "d" for name in names], "here") == (0, 1, 2)
+
+
+def test_labels_and_nexus_axes_name_the_dimensions(tmp_path):
+    frames = stack()
+    with h5py.File(tmp_path / "labels.h5", "w") as file:
+        file["x"] = frames.transpose(1, 2, 0)
+        for axis, name in enumerate(("y", "x", "t")):
+            file["x"].dims[axis].label = name
+    with h5py.File(tmp_path / "nexus.h5", "w") as file:
+        group = file.create_group("entry/data")
+        group["frames"] = frames.transpose(1, 2, 0)
+        group.attrs["signal"], group.attrs["axes"] = "frames", ["y", "x", "t"]
+    for name in ("labels.h5", "nexus.h5"):
+        np.testing.assert_array_equal(read(tmp_path / name), frames)
+
+
+def matlab(path, frames):
+    """Write what MATLAB 7.3 does of an array (H, W, T): a block before the file, and the opposite order."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        file["frames"] = frames.transpose(0, 2, 1)
+        file["frames"].attrs["MATLAB_class"] = np.bytes_(frames.dtype.name)
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512))
+
+
+def test_a_stack_of_matlab_is_not_mirrored(tmp_path):
+    frames = stack()
+    matlab(tmp_path / "stack.mat", frames)
+    with opened(tmp_path / "stack.mat") as recording:
+        assert "frames, rows, columns are third, first, second" in recording.findings[0].text
+        np.testing.assert_array_equal(read_all(recording, 4).frames, frames)
+
+
+@pytest.mark.parametrize(
+    ("start", "said"),
+    [
+        (b"MATLAB 5.0 MAT-file, Platform: GLNXA64", "MATLAB before version 7.3: write it with save"),
+        (b"CDF\x01\0\0\0\0", "netCDF file of version 3, .*: convert it with 'nccopy -k nc4'"),
+    ],
+)
+def test_older_files_of_other_programs_have_a_remedy(tmp_path, start, said):
+    path = tmp_path / "stack.mat"
+    path.write_bytes(start.ljust(512, b" "))
+    with pytest.raises(io.InputError, match=said):
+        opened(path)
+
+
+EXACT = [("?", "u1", 2), ("i1", "u1", 128), ("i2", "u2", 30000), ("i4", "u2", 65536), ("u4", "u2", 65536)]
+EXACT += [
+    ("i8", "u2", 65536),
+    ("u8", "u2", 65536),
+    ("f2", "f4", 2048),
+    ("f8", "f4", 1 << 24),
+    (">u2", "u2", 65536),
+]
+
+
+def files_of(folder, frames):
+    np.save(folder / "stack.npy", frames)
+    np.savez(folder / "stack.npz", frames=frames)
+    with h5py.File(folder / "stack.h5", "w") as file:
+        file["x"] = frames
+    return [folder / f"stack.{ending}" for ending in ("npy", "npz", "h5")]
+
+
+@pytest.mark.parametrize(("stored", "dtype", "top"), EXACT)
+def test_samples_that_have_an_exact_equivalent_are_converted(tmp_path, stored, dtype, top):
+    frames = stack(stored, top)
+    for path in files_of(tmp_path, frames):
+        with opened(path) as recording:
+            assert recording.dtype == np.dtype(dtype)
+            kinds = [one.kind for one in recording.findings]
+            assert kinds == ([] if stored[0] == ">" else ["converted samples"])
+            np.testing.assert_array_equal(read_all(recording, 4).frames, frames)
+
+
+@pytest.mark.parametrize(
+    ("stored", "wrong", "said"),
+    [
+        ("i1", -1, "a sample of -1; int8 is read as uint8, 0 to 127: divide them, or write them as float32"),
+        ("i2", -5, "a sample of -5; int16 is read as uint16, 0 to 65535"),
+        ("i4", 70000, "a sample of 70000; int32 is read as uint16"),
+        ("f8", 1e9, "a sample of 1e\\+09; float64 is read as float32, -16777216 to 16777216: divide them"),
+    ],
+)
+def test_samples_without_an_equivalent_are_refused_with_their_frame(tmp_path, stored, wrong, said):
+    frames = stack(stored, 100)
+    frames[6, 2, 2] = wrong
+    for path in files_of(tmp_path, frames):
+        with pytest.raises(io.InputError, match=f"frame 6 has {said}".replace("0 to 127", "0 to 255")):
+            read(path)
+
+
+def test_a_sample_that_is_not_read_is_not_refused(tmp_path):
+    frames = stack("i2")
+    frames[7] = -1
+    for path in files_of(tmp_path, frames)[::2]:
+        np.testing.assert_array_equal(read(path, frames=(0, 7)), frames[:7])
+
+
+def test_doubles_that_are_not_finite_stay_so(tmp_path):
+    frames = stack("f8")
+    frames[0, 0, :2] = np.nan, np.inf
+    for path in files_of(tmp_path, frames):
+        np.testing.assert_array_equal(read(path), frames)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "said"),
+    [
+        ({"scale_factor": "two"}, "its attribute scale_factor is not a number"),
+        ({"scale_factor": 0.0}, "scale_factor 0"),
+    ],
+)
+def test_attributes_that_make_no_sense_are_refused(tmp_path, attributes, said):
+    with h5py.File(tmp_path / "stack.h5", "w") as file:
+        file["x"] = stack()
+        file["x"].attrs.update(attributes)
+    with pytest.raises(io.InputError, match=said):
+        opened(tmp_path / "stack.h5")
+
+
+def test_references_and_positions_of_a_recording_are_unpacked(tmp_path):
+    path = tmp_path / "press.h5"
+    with h5py.File(path, "w") as file:
+        file["/entry/instrument/detector/data"] = stack()
+        file["/entry/instrument/stage/motion"] = "vertical"
+        file["/entry/instrument/stage/travel"] = np.arange(SHAPE[0], dtype="i2")
+        file["/entry/instrument/stage/travel"].attrs.update(scale_factor=50.0, units="um")
+        file["/entry/instrument/detector/dark"] = np.full(SHAPE[1:], 7, "i2")
+        file["/entry/instrument/detector/dark"][0, 0] = -1
+        file["/entry/instrument/detector/dark"].attrs["_FillValue"] = np.int16(-1)
+        file["/entry"].attrs["mirrorskin_recording"] = 1
+    with io.open_recording(path) as recording:
+        assert recording.travel == pytest.approx(TRAVEL)
+        assert np.isnan(recording.header.dark[0, 0])
+        assert (recording.header.dark.reshape(-1)[1:] == 7).all()
