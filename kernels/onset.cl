@@ -166,7 +166,7 @@ float2 answer(
     { \
         const FRAME last = first > 0 ? SEE(lasts[p]) : 0; \
         darks[p] = last_below(frames + (p), from, pixels, first, release, sures[p], last, darks[p]); \
-        feet[p] = last_below(frames + (p), from, pixels, first, release, nears[p], last, feet[p]); \
+        feet[p] = last_below(frames + (p), darks[p], pixels, first, release, nears[p], last, feet[p]); \
         const int next = feet[p] + 1 - first; \
         if (next >= 0 && next <= from - first) risens[p] = SEE(frames[(size_t)next * pixels + (p)]); \
     }
@@ -305,52 +305,72 @@ __kernel void onset_scan(
                 continue;
             }
 
-            // Runs that began before `now` are known by the samples that were kept, and by the next two.
-            FRAME dim[CHUNK], bright[CHUNK], later[CHUNK];
-            int old = 0, running = 0, unsure = 0;
+            // The samples around onsets within these frames. Those of other pixels mean nothing: simple loops over all are
+            // faster than a choice.
+            FRAME dim[CHUNK], bright[CHUNK], later[CHUNK], second[CHUNK];
+            int at[CHUNK], old = 0, running = 0, unsure = 0;
             for (int p = low; p < high; ++p) {
-                const int looked_at = (before[p - low] > 0) & (times[p] > 0);
-                old |= looked_at & (times[p] < now);
+                const int looked_at = (before[p - low] > 0) & (times[p] > 0), t = times[p] - now;
+                old |= looked_at & (t < 0);
                 running |= looked_at & (remain[p] > 0);
+                at[p - low] = t > 0 ? t : 0;
             }
+            for (int p = low, i = 0; p < high; ++p, ++i) bright[i] = span[(long)at[i] * pixels + p];
+            for (int p = low, i = 0; p < high; ++p, ++i) dim[i] = span[(long)(at[i] - (start + at[i] > 0)) * pixels + p];
+            for (int p = low, i = 0; p < high; ++p, ++i) later[i] = span[(long)LESSER(at[i] + 1, length - 1) * pixels + p];
+            for (int p = low, i = 0; p < high; ++p, ++i) second[i] = span[(long)LESSER(at[i] + 2, length - 1) * pixels + p];
+            for (int p = low, i = 0; p < high; ++p, ++i) {
+                const FRAME one = SEE(later[i]), two = SEE(second[i]), last = lasts[p], sample = dim[i];
+                bright[i] = SEE(bright[i]);
+                dim[i] = start + at[i] > 0 ? SEE(sample) : SEE(last);
+                later[i] = LEAST(one, two);
+            }
+            // Runs that began before `now` are known by the samples that were kept, and by the next two.
             for (int p = low; p < high && old; ++p) {
+                if ((before[p - low] == 0) | (times[p] <= 0) | (times[p] >= now)) continue;
                 const FRAME kept = laters[p], one = SEE(span[p]), two = SEE(span[length > 1 ? p + pixels : p]);
                 const int since = now - times[p];
                 dim[p - low] = lows[p];
                 bright[p - low] = highs[p];
                 later[p - low] = since == 1 ? LEAST(one, two) : since == 2 ? LEAST(kept, one) : kept;
             }
-            for (int p = low; p < high; ++p) {
-                const int t = times[p] - now;
-                if ((before[p - low] == 0) | (t < 0) | (now + t == 0)) continue;
-                __global const FRAME *restrict at = span + (size_t)t * pixels + p;
-                const FRAME one = SEE(at[t + 1 < length ? pixels : 0]);
-                const FRAME two = SEE(at[t + 2 < length ? 2 * pixels : t + 1 < length ? pixels : 0]);
-                dim[p - low] = start + t > 0 ? SEE(at[-pixels]) : SEE(lasts[p]);
-                bright[p - low] = SEE(at[0]);
-                later[p - low] = LEAST(one, two);
-            }
 
-            // Where the sample before is near the level, one has to look further back.
+            // Where the sample before is near the level, one has to look further back: mostly by one sample.
             float waited[CHUNK], doubt[CHUNK];
-            int frame[CHUNK], jumped[CHUNK];
+            int frame[CHUNK], jumped[CHUNK], waits[CHUNK], hard = 0;
             for (int p = low; p < high; ++p) {
                 waited[p - low] = 1;
                 doubt[p - low] = 0;
                 frame[p - low] = times[p] < 1 ? 1 : times[p];
                 jumped[p - low] = 0;
-                unsure |= (before[p - low] > 0) & (times[p] > 0) & !(dim[p - low] < nears[p]);
+                waits[p - low] = (before[p - low] > 0) & (times[p] > 0) & !(dim[p - low] < nears[p]);
+                unsure |= waits[p - low];
             }
-            for (int p = low; p < high && unsure; ++p) {
-                const int begin = times[p], i = p - low;
-                if (before[i] == 0 || begin < 1 || dim[i] < nears[p]) continue;
-                if (begin >= now) LOOK_BACK(p, begin - 1)
-                waited[i] = begin - darks[p];
-                doubt[i] = travel[2 * room + begin - 1] - travel[2 * room + darks[p]];
-                const float way = levels[p] - levels[stride + p];
-                const int risen = risens[p] >= later[i] - way * 0.125f;
-                jumped[i] = risen & (feet[p] + 1 < begin) & (way >= SURE_WAY * noise);
-                if (jumped[i]) frame[i] = feet[p] + 1;
+            if (unsure) {
+                int looks[CHUNK];
+                for (int p = low, i = 0; p < high; ++p, ++i) second[i] = span[(long)(start + at[i] > 1 ? at[i] - 2 : 0) * pixels + p];
+                for (int p = low, i = 0; p < high; ++p, ++i) {
+                    const FRAME sample = dim[i], earlier = SEE(second[i]), sure = sures[p], near = nears[p], risen = risens[p];
+                    const int begin = times[p], dark = darks[p], foot = feet[p];
+                    const int new = waits[i] & (begin >= now), next = new & (start + at[i] > 1) & (earlier < near);
+                    const int dimmed = begin - 2 + (sample < sure);
+                    darks[p] = next ? dimmed : dark;
+                    feet[p] = next ? begin - 2 : foot;
+                    risens[p] = next ? sample : risen;
+                    looks[i] = new & !next;
+                    hard |= looks[i];
+                }
+                for (int p = low; p < high && hard; ++p)
+                    if (looks[p - low]) LOOK_BACK(p, times[p] - 1)
+                for (int p = low, i = 0; p < high; ++p, ++i) {
+                    const int begin = times[p], kept = waits[i], from = kept ? begin - 1 : 0, dark = kept ? darks[p] : 0;
+                    waited[i] = kept ? begin - dark : 1;
+                    doubt[i] = travel[2 * room + from] - travel[2 * room + dark];
+                    const float way = levels[p] - levels[stride + p], light = later[i], risen = risens[p];
+                    const int rises = risen >= light - way * 0.125f;
+                    jumped[i] = kept & rises & (feet[p] + 1 < begin) & (way >= SURE_WAY * noise);
+                    frame[i] = jumped[i] ? feet[p] + 1 : frame[i];
+                }
             }
 
             float sigma[CHUNK];
