@@ -171,16 +171,20 @@ float2 answer(
         if (next >= 0 && next <= from - first) risens[p] = SEE(frames[(size_t)next * pixels + (p)]); \
     }
 
-// One of the frames that are taken side by side: where it is dark, the pixel starts again, until it has held.
+// One of the frames that are taken side by side: where it is dark, the pixel starts again, until it has held. Both are so
+// where neither difference is 0: bytes have no comparison without a sign on many processors, but such a difference.
+#if BITS == 32
 #define TAKE(i) \
     sample = SEE(group[(size_t)(i) * pixels + p]); \
     again = (end_of_run > clock##i) & (sample < light[p]); \
-    NOTE_BROKEN(i) \
+    bad[p] |= (end_of_run > clock##i) & BROKEN(sample); \
     end_of_run = again ? next##i : end_of_run;
-#if BITS == 32
-#define NOTE_BROKEN(i) bad[p] |= (end_of_run > clock##i) & BROKEN(sample);
 #else
-#define NOTE_BROKEN(i)
+#define LACK(a, b) ((a) > (b) ? (a) - (b) : 0)
+#define TAKE(i) \
+    sample = SEE(group[(size_t)(i) * pixels + p]); \
+    again = LESSER((Count)LACK(light[p], sample), (Count)LACK(end_of_run, clock##i)); \
+    end_of_run = again ? next##i : end_of_run;
 #endif
 // Read from an array: compilers widen to 32 bits what is computed.
 #define TIMES(i) const Count clock##i = CLOCK(t + i), next##i = CLOCK(t + i + 1) + most;
@@ -192,7 +196,7 @@ float2 answer(
 #define PIXELS(take) \
     for (int p = 0; p < width; ++p) { \
         FRAME sample; \
-        int again; \
+        Count again; \
         Count end_of_run = held[p]; \
         take \
         held[p] = end_of_run; \
