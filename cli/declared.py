@@ -76,7 +76,7 @@ class Term:
             if self.unit in _UNITS:
                 from mirrorskin.cli.quantity import refuse_decimal_comma
 
-                refuse_decimal_comma(text, where)
+                refuse_decimal_comma(text, where, several=True)
             return [self.read_one(part, where) for part in text.split(",")]
         return self.read_one(text, where)
 

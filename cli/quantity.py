@@ -37,7 +37,7 @@ def length(text: str, option: str = "") -> float:
 
 def lengths(text: str, option: str = "") -> tuple[float, float]:
     """Return lengths along x and y, as in ``0.03mm,0.04mm``, or one for both, in millimetres."""
-    refuse_decimal_comma(text, option)
+    refuse_decimal_comma(text, option, several=True)
     values = [length(part, option) for part in text.split(",")]
     if len(values) > 2:
         raise _error(text, option, "one or two lengths are needed", "0.03mm,0.04mm")
@@ -46,7 +46,7 @@ def lengths(text: str, option: str = "") -> tuple[float, float]:
 
 def vector(text: str, count: int, option: str = "") -> tuple[float, ...]:
     """Return ``count`` lengths, as in ``0mm,0mm,40mm``, in millimetres."""
-    refuse_decimal_comma(text, option)
+    refuse_decimal_comma(text, option, several=True)
     values = tuple(length(part, option) for part in text.split(","))
     if len(values) != count:
         raise _error(text, option, f"{count} lengths are needed", ",".join(["0mm"] * (count - 1) + ["1mm"]))
@@ -192,12 +192,13 @@ def decimal_comma(text: str) -> str:
     return f"{found[1]}.{found[2]}{found[3]}" if found else ""
 
 
-def refuse_decimal_comma(text: str, option: str) -> None:
-    """Raise InputError if quantities are written with a decimal comma: 0,05mm or 0,03mm,0,04mm."""
-    for part in text.split(":"):
+def refuse_decimal_comma(text: str, option: str, several: bool = False) -> None:
+    """Raise InputError for a decimal comma: 0,05mm or, of ``several`` quantities, 0,3mm,0,4mm."""
+    for part in text.split(":") if several else [text]:
         numbers = part.split(",")
         pairs = [",".join(numbers[first : first + 2]) for first in range(0, len(numbers), 2)]
-        if found := next(filter(None, map(decimal_comma, pairs)), ""):
+        found = next(filter(None, map(decimal_comma, pairs if several else [part])), "")
+        if found and not (several and found[-1].isdigit()):
             given = " ".join(f"{option} {shortened(text)}".split())
             raise InputError(f"{given}: write the number with a decimal point, {found}")
 

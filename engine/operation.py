@@ -300,9 +300,8 @@ class Operation(ThreadSafe, OnDevice):
             array = convert_samples(array, frame_dtype(array.dtype, "frames"), "frames", self.count)
         if self.dtype is None:
             if array.ndim == 2 and 0 not in array.shape:
-                shape = f"({', '.join(map(str, array.shape))})"
                 raise InputError(
-                    f"frames are one frame {shape}: a stack (n, H, W) is needed, such as frame[None]"
+                    f"frames are {array.dtype} {array.shape}: for a single frame, pass frame[None]"
                 )
             if array.ndim != 3 or 0 in array.shape or array.dtype.kind not in "uif":
                 raise InputError(f"frames are {array.dtype} {array.shape}: numbers (n, H, W) are needed")

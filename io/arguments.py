@@ -12,6 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io.samples import order_of
 from mirrorskin.io.types import InputError
 
 P = ParamSpec("P")
@@ -64,12 +65,15 @@ def as_array(name: str, value: Any) -> NDArray[Any]:
     """Return an argument as an array of numbers; an array of numbers is returned unchanged.
 
     Masked values become NaN (frames and references of integers then become float32), or 0 in other maps of
-    integers. Arrays on a device are copied to the host.
+    integers. Arrays on a device are copied to the host. Frames of xarray are transposed to (T, H, W) if their
+    dimensions are in another order.
     """
     if type(value) is np.ndarray and value.dtype.kind in "buif":
         return value
     if type(value).__module__ == "pyopencl.array":  # np.asarray would take it for a sequence of arrays
         value = value.get()
+    if name == "frames" and type(value).__module__.startswith("xarray.") and value.ndim == 3:
+        value = value.to_numpy().transpose(order_of([str(one) for one in value.dims], name))
     masked = isinstance(value, np.ma.MaskedArray)
     try:
         array = np.asarray(value)

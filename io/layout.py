@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io.atomic import is_locked
+from mirrorskin.io.coordinates import Coordinates
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
 from mirrorskin.io.maps import TWIST, declaration_of
 from mirrorskin.io.os_errors import as_input_error
@@ -101,10 +102,18 @@ def _width(name: str) -> Shape:
 
 
 class Layout:
-    """Reader of the properties of a part of a stack; for a file of another program there are none."""
+    """Reader of the properties of a part of a stack; those of another program's are its coordinates."""
 
-    def __init__(self, file: Hdf5File, ours: bool, shape: tuple[int, int, int], part: Selection) -> None:
+    def __init__(
+        self,
+        file: Hdf5File,
+        ours: bool,
+        shape: tuple[int, int, int],
+        part: Selection,
+        coordinates: Coordinates | None = None,
+    ) -> None:
         self._file, self._ours, self._part = file, ours, part
+        self._coordinates = coordinates or Coordinates()
         self._count, self._frame = shape[0], shape[1:]
 
     def header(
@@ -121,7 +130,7 @@ class Layout:
                 f"{self._file.path} states the motion {own}, but --motion is {motion}: leave --motion out,"
                 " or correct the file"
             )
-        motion = motion or cast(Motion, own)
+        motion = motion or cast(Motion, own) or self._coordinates.motion
         if motion not in MOTIONS:
             problem = (
                 f"states the unknown motion {motion!r}" if motion else "does not state how the sensor moved"
@@ -212,6 +221,8 @@ class Layout:
         self, name: str, places: Mapping[str, tuple[str, str]] = SERIES, remedy: str = ""
     ) -> Floats | None:
         """Read a series; while a recording is written, it may be longer than needed."""
+        if not self._ours:
+            return self._coordinates.series.get(name)
         place, unit = places[name]
         rows = self._count if self._find(STATE) is not None else None
         return self._read(place, (self._count, *_width(name)), unit=unit, remedy=remedy, rows=rows)
@@ -219,7 +230,8 @@ class Layout:
     def _pixel_size(self) -> tuple[float, float] | None:
         x, y = (self._scalar(f"{DETECTOR}/{axis}_pixel_size", "mm", "give --pixel-size") for axis in "xy")
         if x is y is None:
-            return None
+            size = self._coordinates.pixel_size
+            return size and self._above_zero(size)
         if x is None or y is None:
             raise InputError(
                 f"{self._file.path} states the pixel size along one axis only: give --pixel-size"

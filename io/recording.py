@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.io.arguments import check_count, check_flag, check_number, check_path, checked
 from mirrorskin.io.calibration.file import carried_by
 from mirrorskin.io.calibration.types import Calibration
+from mirrorskin.io.coordinates import Coordinates, read_coordinates
 from mirrorskin.io.fingerprint import check_unchanged, fingerprint, modified, origins
 from mirrorskin.io.hdf5 import Hdf5File
 from mirrorskin.io.layout import CHECKSUM, MARK, SERIES, STACK, Layout, RecordingState, read_state
@@ -320,7 +321,8 @@ def open_recording(
         stack, state, decoding = _find_stack(file, dataset, ours)
         shape = (state.count, *decoding.shape(stack.shape)[1:])
         cut = cut_out(str(path), shape, frames, region)
-        layout = Layout(file, ours, shape, cut)
+        coordinates = Coordinates() if ours else read_coordinates(file, stack, decoding)
+        layout = Layout(file, ours, shape, cut, coordinates)
         header = layout.header(motion, tilt, pixel_size, override_motion)
         state, numbers = state.of(slice(*cut.frames)), np.arange(*cut.frames)
         if live:
@@ -335,7 +337,7 @@ def open_recording(
             stack, str(path), shape[0], numbers, cut.region, memory_limit, threads, decoding, opened
         )
         recording = Recording(file, stack, frames_of, cut, header, positions, layout, state, shape, live)
-        recording.findings = decoding.findings
+        recording.findings = (*decoding.findings, *coordinates.findings)
         opening.pop_all()  # the recording closes the file from now on
     return recording
 

@@ -148,8 +148,7 @@ def open_result(path: str | Path) -> Result:
             declared = _AXES.get(name) or declaration_of(name, declarations)
             if declared.axes == "pieces" and "component" in stored:
                 shape = (int(maps["component"].max(initial=-1)) + 1,)
-            unit = declared.unit if declared.axes == "none" else None
-            values = file.read(node, shape, unit=unit, remedy=_AGAIN)
+            values = file.read(node, shape, unit=declared.unit or None, remedy=_AGAIN)
             dtype = values.dtype if declared is UNDECLARED else declared.dtype
             maps[name] = values.astype(dtype, copy=False) if declared.axes != "none" else float(values)
             if name == "component" and maps[name].min(initial=-1) < -1:

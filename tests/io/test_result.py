@@ -254,3 +254,12 @@ def test_values_of_different_numbers_of_frames_are_refused(path):
     io.save_result(io.Result(**maps), path)
     with pytest.raises(io.InputError, match=r"different numbers of frames \(.* of [45], .* of [45]\)"):
         io.open_result(path)
+
+
+def test_heights_in_another_unit_are_converted(tmp_path):
+    path = tmp_path / "result.h5"
+    io.save_result(io.Result(height=np.full((2, 3), 1.5, np.float32)), path)
+    with h5py.File(path, "r+") as file:
+        file["/entry/result/height"][...] = 1500
+        file["/entry/result/height"].attrs["units"] = "um"
+    np.testing.assert_allclose(io.open_result(path).height, 1.5, rtol=1e-6)

@@ -8,7 +8,7 @@ import pytest
 import xarray
 from stacks import read_all
 
-from mirrorskin import io
+from mirrorskin import engine, io
 from mirrorskin.io.samples import order_of
 
 SHAPE = 9, 6, 5
@@ -278,3 +278,80 @@ def test_references_and_positions_of_a_recording_are_unpacked(tmp_path):
         assert recording.travel == pytest.approx(TRAVEL)
         assert np.isnan(recording.header.dark[0, 0])
         assert (recording.header.dark.reshape(-1)[1:] == 7).all()
+
+
+def along_axes(travel=None, units="um", name="travel"):
+    return {
+        name: (name, 1000 * TRAVEL if travel is None else travel, {"units": units}),
+        "y": ("y", -30.0 * np.arange(SHAPE[1]), {"units": "um"}),
+        "x": ("x", 0.04 * np.arange(SHAPE[2]), {"units": "mm"}),
+    }
+
+
+def test_coordinates_with_units_are_positions_and_the_pixel_size(path):
+    written(path, stack(), dims=("travel", "y", "x"), **along_axes())
+    with io.open_recording(path) as recording:
+        assert recording.motion == "vertical"
+        assert recording.travel == pytest.approx(TRAVEL)
+        assert recording.header.pixel_size == pytest.approx((0.04, 0.03))
+        assert not any(one.warning for one in recording.findings)
+
+
+def test_times_are_in_seconds_from_milliseconds_or_dates(path):
+    written(path, stack(), dims=("t", "y", "x"), **along_axes(20.0 * np.arange(SHAPE[0]), "ms", "t"))
+    with opened(path) as recording:
+        assert recording.time == pytest.approx(0.02 * np.arange(SHAPE[0]))
+
+
+def test_dates_are_seconds_from_the_first(path):
+    dates = np.datetime64("2026-01-02T03:04:05", "ns") + np.arange(SHAPE[0]) * np.timedelta64(20, "ms")
+    written(path, stack(), time=("time", dates), dims=("time", "y", "x"))
+    with opened(path) as recording:
+        assert recording.time == pytest.approx(0.02 * np.arange(SHAPE[0]))
+
+
+def test_options_take_precedence_over_coordinates(path):
+    written(path, stack(), dims=("travel", "y", "x"), **along_axes())
+    with opened(path, pixel_size=(0.1, 0.1)) as recording:
+        assert recording.travel[1] == pytest.approx(0.3)
+        assert recording.header.pixel_size == (0.1, 0.1)
+
+
+def test_coordinates_without_units_are_not_used(path):
+    written(path, stack(), dims=("t", "y", "x"), y=("y", np.arange(SHAPE[1])), x=("x", np.arange(SHAPE[2])))
+    with opened(path) as recording:
+        assert recording.header.pixel_size is None
+        assert recording.findings == ()
+
+
+def test_rows_that_rise_are_reported(path):
+    axes = along_axes() | {"y": ("y", 0.03 * np.arange(SHAPE[1]), {"units": "mm"})}
+    written(path, stack(), dims=("travel", "y", "x"), **axes)
+    with io.open_recording(path) as recording:
+        warned = [one.text for one in recording.findings if one.warning]
+        assert len(warned) == 1
+        assert "its coordinate y rises with the row, and the first one is taken as the top" in warned[0]
+
+
+def test_uneven_pixels_are_reported(path):
+    axes = along_axes() | {"x": ("x", np.arange(SHAPE[2]) ** 2.0, {"units": "mm"})}
+    written(path, stack(), dims=("travel", "y", "x"), **axes)
+    with io.open_recording(path) as recording:
+        assert recording.header.pixel_size is None
+        assert [one.kind for one in recording.findings if one.warning] == ["uneven pixels"]
+
+
+def test_the_voxel_size_of_fiji_is_the_pixel_size(tmp_path):
+    with h5py.File(tmp_path / "stack.h5", "w") as file:
+        file["x"] = stack()
+        file["x"].attrs["element_size_um"] = [1.0, 30.0, 40.0]
+    with opened(tmp_path / "stack.h5") as recording:
+        assert recording.header.pixel_size == pytest.approx((0.04, 0.03))
+
+
+def test_frames_of_xarray_are_in_the_order_of_their_names():
+    frames = np.zeros((5, 2, 3), np.uint8)
+    frames[3:, 1] = 255
+    transposed = xarray.DataArray(frames.transpose(1, 2, 0), dims=("y", "x", "t"))
+    found = engine.find_onset(transposed, [0.0, 0.1, 0.2, 0.3, 0.4])
+    np.testing.assert_array_equal(np.isfinite(found.height), [[False] * 3, [True] * 3])
