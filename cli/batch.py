@@ -9,6 +9,7 @@ import re
 import sys
 import threading
 import time
+import warnings
 from collections import Counter, deque
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -70,10 +71,11 @@ def command(
         Option(metavar="K/N", help="Do only the K-th of N parts: 1/4 on one machine, 2/4 on the next, ..."),
     ] = None,
     memory: options.Memory = "256MB",
+    strict: options.Strict = False,
     as_json: options.Json = False,
 ) -> None:
     """Reconstruct many recordings; results that exist are kept, so that a batch can be resumed."""
-    from mirrorskin.io import InputError
+    from mirrorskin.io import InputError, MirrorskinWarning
 
     workers_of = {"--device": device, "--workers": workers, "--scheduler": scheduler}
     names = [name for name, value in workers_of.items() if value]
@@ -88,7 +90,8 @@ def command(
     from mirrorskin.cli.settings import read_settings
     from mirrorskin.engine.batch.jobs import make_jobs
 
-    plan = read_settings(settings, bytes_of(memory, "--memory"))
+    plan = dataclasses.replace(read_settings(settings, bytes_of(memory, "--memory")), strict=strict)
+    warnings.simplefilter("ignore", MirrorskinWarning)  # outcomes contain them
     # All are named before they are divided, so that every machine gives a result the same name.
     jobs = make_jobs(found, output)
     if parts > 1:

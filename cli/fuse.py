@@ -26,16 +26,18 @@ def command(
     ] = True,
     memory: options.Memory = "256MB",
     device: options.Devices = None,
+    strict: options.Strict = False,
     as_json: options.Json = False,
     **chosen: Annotated[Any, STACK.without("motion", "frames", "tilt"), declared("fuse")],
 ) -> None:
     """Fuse a press and a rotation to one surface."""
     from mirrorskin import io
-    from mirrorskin.cli.output import progress, report_levels, save_and_report
+    from mirrorskin.cli.output import make_strict, progress, report_levels, report_notes, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.engine.fusion import frames_to_read, fuse_recordings
     from mirrorskin.engine.reconstruction import calibrated
 
+    make_strict(strict)
     files = [value for value in chosen.values() if isinstance(value, Path)]
     known = stack_options(chosen)
     robust = chosen.pop("robust", False)
@@ -59,9 +61,11 @@ def command(
                 progress=show,
             )
     save_and_report(result, target, device, as_json)
-    report_levels(
-        str(vertical), {name.removeprefix("vertical_"): said for name, said in result.process.items()}
-    )
+    for path, prefix in ((vertical, "vertical_"), (axial, "axial_")):
+        process = {name.removeprefix(prefix): said for name, said in result.process.items()}
+        report_notes(str(path), process)
+        if path == vertical:
+            report_levels(str(path), process)
 
 
 def _open(path: Path, place: Motion, known: StackOptions, limit: int) -> Recording:

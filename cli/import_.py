@@ -24,11 +24,15 @@ def command(
     topic: Annotated[str | None, Option(metavar="TOPIC", help="Of an MCAP file: that of the images.")] = None,
     compression: options.Compression = options.CompressionName.raw,
     overwrite: options.Overwrite = False,
+    strict: options.Strict = False,
     **given: Annotated[Any, POSITIONS],
 ) -> None:
     """Convert a video or pictures to a recording."""
     from mirrorskin import io
-    from mirrorskin.cli.output import printable, progress
+    from mirrorskin.cli.output import make_strict, printable, progress, report_notes
+    from mirrorskin.io.findings import in_process, warn
+
+    make_strict(strict)
 
     files = [value for value in given.values() if isinstance(value, Path)]
     io.check_output(output, frames, *files, replaces="anything" if overwrite else "nothing")
@@ -42,7 +46,10 @@ def command(
         io.Recorder(source, output, compression.value, overwrite=overwrite) as recorder,
         progress("importing", source.shape[0]) as show,
     ):
-        recorder.drain(show)
+        found = recorder.drain(show)
+        process = in_process(found.findings, {})
+        warn(str(frames), process)
+    report_notes(str(frames), process)
     if header.pixel_size is None:
         message = (
             f"{output}: no pixel size: holes are not filled, and normals, slip and measures need it;"

@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 import traceback
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedWriter, FileIO, TextIOWrapper
@@ -53,6 +54,7 @@ PURPOSES = {
     "export": "Write a result as meshes, points, pictures, tables or arrays.",
     "score": "Compare a result with the ground truth of a simulation.",
     "info": "Show what a file contains.",
+    "check": "Check whether frames and their positions are plausible.",
     "devices": "List the OpenCL devices of this machine.",
     "rig": "Check a stage and a camera before they are used.",
     "calibrate": "Calibrate brightness, scale, tilt and elasticity of a sensor.",
@@ -77,6 +79,15 @@ def _common(
     handler = logging.StreamHandler()
     handler.setFormatter(Formatter("%(message)s"))
     logging.basicConfig(level=logging.INFO if debug else logging.WARNING, handlers=[handler])
+    shown = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        if category.__module__.startswith("mirrorskin."):
+            click.echo(printable(f"warning: {message}"), err=True)
+        else:
+            shown(message, category, *where, **more)
+
+    warnings.showwarning = show
 
 
 def _check_address_space() -> None:

@@ -69,6 +69,7 @@ Calibration = Annotated[
     Option(metavar="CAL.h5", help="Calibration of the sensor, by 'mirrorskin calibrate'."),
 ]
 Memory = Annotated[str, Option(metavar="SIZE", help="Memory for frames on the move.")]
+Strict = Annotated[bool, Option("--strict", help="Warnings are errors: nothing is written, exit code 2.")]
 Compression = Annotated[CompressionName, Option(help="How to pack the frames.")]
 NewRecording = Annotated[Path, Option("--output", "-o", metavar="REC.h5", help="Recording to write.")]
 Overwrite = Annotated[bool, Option("--overwrite", help="Replace an existing file of that name.")]

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -113,6 +114,20 @@ def report_missing_maps(name: str, process: Mapping[str, object], remedies: Mapp
     if gel and gel != _NO_GEL:
         what = f"not corrected for the gel: {gel.removeprefix(_UNTOLD)}" if gel.startswith(_UNTOLD) else gel
         click.echo(printable(f"{name}: heights {what}"), err=True)
+
+
+def make_strict(strict: bool) -> None:
+    """Turn warnings of mirrorskin into errors, if that was asked for."""
+    if strict:
+        from mirrorskin.io import MirrorskinWarning
+
+        warnings.simplefilter("error", MirrorskinWarning)
+
+
+def report_notes(name: str, process: Mapping[str, object]) -> None:
+    """Print what else was found about the frames; warnings are printed when they occur."""
+    if "notes" in process:
+        click.echo(printable(f"{name}: {process['notes']}"), err=True)
 
 
 def report_levels(name: str, process: Mapping[str, object]) -> None:

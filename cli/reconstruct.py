@@ -23,6 +23,7 @@ def command(
     calibration: options.Calibration = None,
     memory: options.Memory = "256MB",
     device: options.Devices = None,
+    strict: options.Strict = False,
     as_json: options.Json = False,
     **chosen: Annotated[Any, RECORDING, declared("reconstruct")],
 ) -> None:
@@ -32,6 +33,7 @@ def command(
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.engine.reconstruction import calibrated
 
+    outputs.make_strict(strict)
     files = [value for value in chosen.values() if isinstance(value, Path)]
     stack = stack_options(chosen)
     limit = bytes_of(memory, "--memory")
@@ -47,6 +49,7 @@ def command(
             del chosen["tilt"]
         with outputs.progress("reconstructing", source.shape[0]) as show:
             result = engine.reconstruct(source, memory_limit=limit, device=device, progress=show, **chosen)
+    outputs.report_notes(str(recording), result.process)
     outputs.report_missing_maps(str(recording), result.process, _REMEDIES)
     outputs.report_contact(str(recording), result.process)
     outputs.save_and_report(result, target, device, as_json)

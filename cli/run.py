@@ -20,6 +20,7 @@ def command(
     live: options.LiveFrames = False,
     memory: options.Memory = "256MB",
     device: options.Devices = None,
+    strict: options.Strict = False,
     as_json: options.Json = False,
     **chosen: Annotated[Any, RECORDING],
 ) -> None:
@@ -29,11 +30,12 @@ def command(
     mirrorskin.engine.Operation. 'mirrorskin run MODULE:CLASS --help' shows its options.
     """
     from mirrorskin import io
-    from mirrorskin.cli.output import progress, save_and_report
+    from mirrorskin.cli.output import make_strict, progress, report_notes, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.engine.running import load_operation, run_class
     from mirrorskin.kernels.device import open_devices
 
+    make_strict(strict)
     kind = load_operation(class_name)
     if device is not None:
         open_devices(device)  # raises if there is none, even if the operation does not use it
@@ -45,6 +47,7 @@ def command(
         io.check_output(target, recording, *files, or_zarr=True)
         with progress("running", source.shape[0]) as show:
             result = run_class(kind, source, show, memory_limit=limit, device=device, **chosen)
+    report_notes(str(recording), result.process)
     save_and_report(result, target, device, as_json)
 
 

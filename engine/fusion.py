@@ -23,6 +23,7 @@ from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Motion, Result, Source, pixel_axes
 from mirrorskin.io.arguments import as_array_or_number, check_count, check_flag, checked
+from mirrorskin.io.findings import in_process, warn
 from mirrorskin.io.result import absolute_heights
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.device import Choice, Device, open_device, open_devices
@@ -230,6 +231,7 @@ def fuse_recordings(
     if surface.height_sigma is None:
         surface = solver.surface(slopes)
     surface = solver.filled(surface)
+    warn(axial.name, turned.process)
     if progress:
         progress(frames_to_read(vertical, axial, register))
     signed = attach_provenance(Result(), axial, opened, dict(turned.process))
@@ -269,10 +271,12 @@ def _rotate(method: Rotation, axial: Source, progress: Progress | None) -> tuple
     with naming(axial):
         plan = method.plan(axial)
         stream = plan.stream or axial
-        feed(stream, plan.operation, plan.frames, progress)
+        found = feed(stream, plan.operation, plan.frames, progress)
         result = plan.operation.finish()
     context = Context(axial, plan.operation, stream)
-    result = result.assign(dict.fromkeys(plan.omit), process={**plan.process, **result.process})
+    result = result.assign(
+        dict.fromkeys(plan.omit), process={**plan.process, **result.process, **in_process(found, {})}
+    )
     slopes = None
     for step in plan.steps:
         if isinstance(step, Integration):

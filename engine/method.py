@@ -14,6 +14,7 @@ from mirrorskin.engine.options import Configured
 from mirrorskin.engine.provenance import attach_provenance, naming
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.io import Calibrated, InputError, Result
+from mirrorskin.io.findings import in_process, warn
 
 if TYPE_CHECKING:
     from mirrorskin.io import Source
@@ -139,8 +140,10 @@ class Method(OnDevice):
         check_motion(source, self)
         with naming(source):
             plan = self.plan(source)
-            feed(plan.stream or source, plan.operation, plan.frames, progress)
+            found = feed(plan.stream or source, plan.operation, plan.frames, progress)
             result = plan.finish(plan.operation.finish(), source)
+        result = result.assign(process={**result.process, **in_process(found, result.process)})
+        warn(source.name, result.process)
         return undistorted(result, source) if undistort else result
 
     def with_options(self, **options: Any) -> Self:

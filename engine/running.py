@@ -17,6 +17,7 @@ from mirrorskin.engine.provenance import attach_provenance, describe, naming, si
 from mirrorskin.engine.reconstruction import calibrated
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.io import InputError, Result
+from mirrorskin.io.findings import in_process, warn
 from mirrorskin.io.own_class import load_class
 from mirrorskin.kernels.array import Array
 
@@ -136,10 +137,12 @@ def _run_source(
     check_motion(source, operation)
     with naming(source):
         configured = operation.configured_for(source)
-        feed(source, configured, progress=progress)
+        found = feed(source, configured, progress=progress)
         result = configured.finish()
-    process = {**describe(configured, source), **result.process}
-    return attach_provenance(result, source, configured.opened_devices, process)
+    process = {**describe(configured, source), **result.process, **in_process(found, result.process)}
+    result = attach_provenance(result, source, configured.opened_devices, process)
+    warn(source.name, result.process)
+    return result
 
 
 def _run_frames(

@@ -12,6 +12,8 @@ import numpy as np
 
 from mirrorskin.engine.operation import Operation
 from mirrorskin.io import Block, InputError, Source
+from mirrorskin.io.findings import Finding
+from mirrorskin.io.watch import Watch
 
 Progress = Callable[[int], None]
 Reader = Callable[[Source, Operation, int], Iterator[Block]]
@@ -30,8 +32,8 @@ class Receiver(Protocol):
 
 def feed(
     source: Source, operation: Operation, frames: range | None = None, progress: Progress | None = None
-) -> None:
-    """Push frames of a source into an operation, once or twice.
+) -> tuple[Finding, ...]:
+    """Push frames of a source into an operation, once or twice, and watch them.
 
     A device that shares the host's memory computes on frames where they are: in an array, or where they were
     read. Frames of files for a device with its own memory, and compressed ones in Zarr, are read and decoded
@@ -47,6 +49,11 @@ def feed(
     progress : callable, optional
         Called with the number of frames read so far.
 
+    Returns
+    -------
+    tuple of Finding
+        What a user should know about the frames.
+
     Raises
     ------
     mirrorskin.io.InputError
@@ -58,18 +65,22 @@ def feed(
         )
     operation.begin(source.shape[1:], source.dtype)
     chosen = range(source.shape[0]) if frames is None else frames
+    watch = Watch(source, moved=bool(operation.motions))
     with ThreadPoolExecutor(1, "mirrorskin-fingerprint") as worker:
         # The result needs it, and it takes about as long as the frames.
         fingerprint = worker.submit(source.fingerprint) if hasattr(source, "fingerprint") else None
         for number in range(operation.passes):
             if number:
                 operation.next_pass()
-            _feed_once(source, operation, chosen, progress)
+            _feed_once(source, operation, chosen, None if number else watch, progress)
     if fingerprint is not None:
         fingerprint.result()
+    return watch.check().findings
 
 
-def _feed_once(source: Source, operation: Operation, frames: range, progress: Progress | None) -> None:
+def _feed_once(
+    source: Source, operation: Operation, frames: range, watch: Watch | None, progress: Progress | None
+) -> None:
     if source.rewindable:
         source.rewind()
     done = 0
@@ -79,6 +90,8 @@ def _feed_once(source: Source, operation: Operation, frames: range, progress: Pr
             progress(done)
     for block in _reader(source, operation)(source, operation, len(frames)):
         push_block(operation, block)
+        if watch:
+            watch.push(block)
         done += len(block.frames)
         if progress:
             progress(done)

@@ -13,10 +13,12 @@ from .calibration.types import (
 )
 from .description import describe
 from .export import export_result, save_table
+from .findings import Finding, MirrorskinWarning
 from .frames import open_frames
 from .maps import Map
 from .mcap import save_messages
 from .mesh import Mesh, surface_mesh
+from .plausibility import check
 from .positions import Steps
 from .recorder import Recorder
 from .recording import Recording, open_heights, open_recording
@@ -26,16 +28,15 @@ from .selection import Region
 from .streaming import StreamRecorder
 from .types import (
     Block,
-    Finding,
     Header,
     InputError,
     LiveSource,
-    MirrorskinWarning,
     Motion,
     Source,
     Truth,
     pixel_axes,
 )
+from .watch import Check
 from .zarr_export import save_zarr
 
 __all__ = [
@@ -43,6 +44,7 @@ __all__ = [
     "Calibrated",
     "Calibration",
     "CameraId",
+    "Check",
     "Finding",
     "Gel",
     "Header",
@@ -65,6 +67,7 @@ __all__ = [
     "StreamRecorder",
     "Truth",
     "WallResponse",
+    "check",
     "check_output",
     "describe",
     "export_result",

@@ -7,11 +7,13 @@ from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any, TypeGuard, cast
 
 import h5py
+import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io.atomic import is_locked
 from mirrorskin.io.coordinates import Coordinates
+from mirrorskin.io.findings import Finding
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
 from mirrorskin.io.maps import TWIST, declaration_of
 from mirrorskin.io.os_errors import as_input_error
@@ -37,6 +39,7 @@ SERIES = {
 # Datasets of recordings that are written live: the positions estimated when the frames arrived, whether a
 # frame was used, the number of frames lost before it, and the state of the recording.
 LIVE = {name: (f"{place}_live", unit) for name, (place, unit) in SERIES.items() if name != "time"}
+FINDINGS = "/entry/findings"
 USED, DROPPED, STATE = f"{DETECTOR}/used", f"{DETECTOR}/dropped", "/entry/state"
 # The CRC-32 of each frame's bytes when it was recorded.
 CHECKSUM = f"{DETECTOR}/frame_checksum"
@@ -184,6 +187,14 @@ class Layout:
             where = f"{self._file.path}: {LIVE[one][0]} of the frames that were used"
             found[one] = check_finite(values[chosen], len(chosen), where, width=_width(one))
         return found
+
+    def findings(self) -> tuple[Finding, ...]:
+        """Read what was found about the frames when they were imported."""
+        text = self._text(FINDINGS)
+        try:
+            return msgspec.json.decode(text, type=tuple[Finding, ...]) if text else ()
+        except msgspec.DecodeError as error:
+            raise InputError(f"{self._file.path}: {FINDINGS} is damaged ({error}): import again") from error
 
     def truth(self) -> Truth | None:
         """Read the truth of a simulation, if there is one."""

@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Any, Generic, Literal, Self, TypeVar, get_args
 
 import h5py
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,9 +19,10 @@ from mirrorskin.io.atomic import fixed_text, new_hdf5
 from mirrorskin.io.calibration.file import CARRIED, write_calibration
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.existing import Replaces
-from mirrorskin.io.layout import CHECKSUM, MARK, POSITIONS, SERIES, STACK, TRUTH, TRUTH_MAPS
+from mirrorskin.io.layout import CHECKSUM, FINDINGS, MARK, POSITIONS, SERIES, STACK, TRUTH, TRUTH_MAPS
 from mirrorskin.io.maps import TWIST, declaration_of
 from mirrorskin.io.types import Block, Floats, Header, InputError, Motion, Source, Truth
+from mirrorskin.io.watch import Check, Watch
 
 Compression = Literal["raw", "bitshuffle", "blosc", "gzip", "lzf"]
 COMPRESSIONS: tuple[Compression, ...] = get_args(Compression)
@@ -210,6 +212,8 @@ class Recorder(TeeSource[Source]):
             opening.push(self._finish)
             opening.enter_context(self.source)
             write_header(self._new.root, self.header, self._calibration)
+            found = getattr(self.source, "findings", ())
+            put(self._new.root, FINDINGS, None, msgspec.json.encode(found).decode() if found else None)
             chunks = None if self._compression == "raw" else (1, *self.shape[1:])
             storage = {"chunks": chunks, **packing(self._compression)}
             self._frames = new_stack(self._new.root, self.shape, self.dtype, **storage)
@@ -233,12 +237,15 @@ class Recorder(TeeSource[Source]):
             self._new.check()
         return block
 
-    def drain(self, progress: Callable[[int], None]) -> None:
-        """Write all frames without returning them; ``progress`` is called with the number so far."""
+    def drain(self, progress: Callable[[int], None]) -> Check:
+        """Write all frames, and return what they show; ``progress`` is called with the number so far."""
+        watch = Watch(self.source)
         length = max(1, _BLOCK // (self.shape[1] * self.shape[2] * self.dtype.itemsize))
         room = np.empty((min(length, self.shape[0]), *self.shape[1:]), self.dtype)
-        while self.read(room) is not None:
+        while (block := self.read(room)) is not None:
+            watch.push(block)
             progress(self._count)
+        return watch.check()
 
     def _finish(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /

@@ -16,6 +16,7 @@ from mirrorskin.io.arguments import check_count, check_flag, check_number, check
 from mirrorskin.io.calibration.file import carried_by
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.coordinates import Coordinates, read_coordinates
+from mirrorskin.io.findings import Finding
 from mirrorskin.io.fingerprint import check_unchanged, fingerprint, modified, origins
 from mirrorskin.io.hdf5 import Hdf5File
 from mirrorskin.io.layout import CHECKSUM, MARK, SERIES, STACK, Layout, RecordingState, read_state
@@ -32,7 +33,6 @@ from mirrorskin.io.types import (
     UNDISTORTED,
     Block,
     Closing,
-    Finding,
     Floats,
     Header,
     InputError,
@@ -136,6 +136,7 @@ class Recording(Closing):
         self._stack, self._next = stack, 0
         self._closed = False
         self.truth_maps: list[str] = list(layout.truth_nodes())
+        self.findings = layout.findings()
 
     def __repr__(self) -> str:
         from mirrorskin.io.notebook import recording_as_text

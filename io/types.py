@@ -24,29 +24,6 @@ class InputError(ValueError):
     exit_code = 2
 
 
-class MirrorskinWarning(UserWarning):
-    """Input or a result that may not mean what it seems to; the message is one line with the remedy."""
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """Something about frames or a result that its user should know.
-
-    Attributes
-    ----------
-    kind : str
-        A few words that stay the same: "lost frames". docs/troubleshooting.md lists all kinds.
-    text : str
-        One line: what was found, and the remedy if there is one.
-    warning : bool
-        Whether an answer may be wrong because of it; otherwise it is only a note.
-    """
-
-    kind: str
-    text: str
-    warning: bool = True
-
-
 @dataclass(frozen=True, slots=True)
 class Block:
     """Consecutive frames, and the position of the sensor body in each of them.

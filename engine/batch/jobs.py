@@ -106,6 +106,7 @@ class Plan:
     slip: Mapping[str, Any] = field(default_factory=dict)  # of `engine.Sliding`
     operation: str = ""  # MODULE:CLASS of an operation that is run instead of all methods
     operation_options: Mapping[str, Any] = field(default_factory=dict)
+    strict: bool = False  # whether warnings are errors
 
     def kind(self, motion: Motion) -> type[Operation | Method]:
         """Return the class that is run over recordings of a motion."""

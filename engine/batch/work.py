@@ -100,12 +100,15 @@ def _compute(
         result = run_class(
             plan.kind(source.motion), source, progress, device=opened, **plan.options(source.motion)
         )
+    said = str(result.process.get("warnings", ""))
+    if plan.strict and said:
+        raise InputError(f"{source.name}: {said}")
     process: dict[str, ProcessValue] = {**result.process, "batch_parameters": digest}
     io.save_result(result.assign(process=process), target)
     return replace(
         outcome,
         state="done",
-        message="; ".join(filter(None, (str(summarise(result)), missing_levels(result.process)))),
+        message="; ".join(filter(None, (str(summarise(result)), missing_levels(result.process), said))),
         bytes=math.prod(source.shape) * source.dtype.itemsize,
         device=opened.info.title,
     )

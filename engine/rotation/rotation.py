@@ -31,7 +31,13 @@ from mirrorskin.engine.rotation.normals_kernel import NormalMethod
 from mirrorskin.engine.rotation.poses import even_windows, rocks
 from mirrorskin.engine.rotation.registration import Registered, check_heights
 from mirrorskin.engine.rotation.response import HALF_WAY, Response, initial_response, wall_response_of
-from mirrorskin.engine.rotation.steps import CalibrationErrors, Edges, Integration, RegistrationErrors
+from mirrorskin.engine.rotation.steps import (
+    CalibrationErrors,
+    Edges,
+    Integration,
+    PhaseSign,
+    RegistrationErrors,
+)
 from mirrorskin.engine.streaming import feed
 from mirrorskin.io import Block, Calibrated, Header, InputError, Recording, Source, WallResponse, open_heights
 from mirrorskin.io.frames import FrameSequence
@@ -250,7 +256,7 @@ class Rotation(Method):
         )
 
     def _steps(self) -> list[Step]:
-        return [Edges(), RegistrationErrors(), self.make(Integration), CalibrationErrors()]
+        return [Edges(), RegistrationErrors(), PhaseSign(), self.make(Integration), CalibrationErrors()]
 
     def _process(self) -> dict[str, ProcessValue]:
         origin = "estimate" if self.tilt == "estimate" else "recording" if self.tilt is None else "given"

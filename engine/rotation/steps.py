@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,8 +14,11 @@ from mirrorskin.engine.rotation.normals import Normals
 from mirrorskin.engine.rotation.normals_to_height import Slopes, integrate_normals, slopes_of
 from mirrorskin.engine.rotation.registration import Registered
 from mirrorskin.io import Result
+from mirrorskin.io.findings import Finding, in_process
 
 _NO_PIXEL_SIZE = "none: the recording has no pixel size"
+_POINTS = 64  # along each side, where slopes are compared
+_FEWEST, _CLEAR = 100, 8.0  # points, and standard errors, that decide
 _REACH = 5  # pixels: size of the neighbourhood whose loss of contact affects a registered sample
 
 
@@ -98,6 +103,34 @@ class CalibrationErrors(Step):
         if not isinstance(operation, Normals) or operation.response is None:
             return result
         return result.assign(normals_sigma=np.hypot(result.normals_sigma, operation.response.sigma))
+
+
+class PhaseSign(Step):
+    """Warn if the phases seem to run the wrong way round, so that the surface is mirrored.
+
+    Slopes p and q of a surface satisfy dp/dy = dq/dx; with the phases reversed, q has the other sign. The mean of dp/dy times dq/dx is positive for a surface, and negative for a mirrored one.
+    """
+
+    def apply(self, result: Result, context: Context) -> Result:
+        """Return the result with a warning in ``process``, if the slopes contradict the phases."""
+        if result.normals is None:
+            return result
+        normals = np.asarray(result.normals, np.float64)
+        normals = normals if normals.ndim == 3 else normals[0]
+        step = max(1, min(normals.shape[:2]) // _POINTS)
+        x, y, z = np.moveaxis(normals[::step, ::step], -1, 0)
+        with np.errstate(all="ignore"):
+            p, q = -x / z, -y / z
+        both = -np.diff(p, axis=0)[:, :-1] * np.diff(q, axis=1)[:-1]  # y points up
+        both = both[np.isfinite(both)]
+        if len(both) < _FEWEST or np.mean(both) > -_CLEAR * np.std(both) / math.sqrt(len(both)):
+            return result
+        found = Finding(
+            "mirrored",
+            "the slopes fit together better with the phases reversed: do phases count counter-clockwise in"
+            " the picture?",
+        )
+        return result.assign(process={**result.process, **in_process([found], result.process)})
 
 
 def _independent_sigma(result: Result, context: Context) -> NDArray[np.float32]:

@@ -184,6 +184,7 @@ def test_what_memory_held_before_and_what_comes_after_changes_nothing(device, na
         np.asarray(values)[...] = 1  # it is the caller's
 
 
+@pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")
 @EACH
 def test_running_it_over_a_recording_gives_the_same(name):
     case = replace(CASES[name], weights={})

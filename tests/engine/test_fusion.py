@@ -552,6 +552,7 @@ def test_turns_are_not_fused_one_by_one():
         fused_anew(rotation={"per_turn": True})
 
 
+@pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")
 def test_a_press_that_touched_nothing_has_no_height_to_fuse():
     dark = MadeUp(np.full((4, *SMALL), 20, np.uint8), DOWN.header, travel=np.arange(4.0))
     with pytest.raises(io.InputError, match="made up: no pixel turned light"):

@@ -9,6 +9,7 @@ import json
 import os
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -16,6 +17,7 @@ from unittest import mock
 
 from mirrorskin.cli import demo
 from mirrorskin.cli.main import main
+from mirrorskin.io import MirrorskinWarning
 
 # Pixels across and down of what is small; the press and the rotation on the sphere are fused.
 _SIZE, _SPHERE = 24, 48
@@ -33,7 +35,12 @@ def run(line: object, *words: object) -> Ended:
     """Run the command line with the words of a line and further words, in the working directory."""
     out, said = io.StringIO(), io.StringIO()
     given = mock.patch.object(sys, "argv", ["mirrorskin", *str(line).split(), *map(str, words)])
-    with given, contextlib.redirect_stdout(out), contextlib.redirect_stderr(said):
+    with (
+        given,
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(said),
+        warnings.catch_warnings(action="always", category=MirrorskinWarning),  # printed, as for a user
+    ):
         try:
             main()
         except SystemExit as ended:

@@ -98,6 +98,7 @@ def test_numbers_out_of_range_are_refused(press, ball_size, cells, message):
         check_ball(press, calibration(), ball_size, cells=cells)
 
 
+@pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")
 def test_a_press_on_nothing_is_told(press):
     source = Frames("nothing", np.full((len(TRAVEL), *SHAPE), 16, np.uint8), press.header, travel=TRAVEL)
     with pytest.raises(io.InputError, match="too little of a ball"):

@@ -97,6 +97,7 @@ def test_loads_are_those_of_the_twin():
     assert fit.stiffness.error < 0.03
 
 
+@pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")
 def test_what_shows_no_force_is_one_line():
     press = pressed(Vertical(np.arange(0.04, 0.5, 0.04)))
     for force in (0.0, -1.0, float("nan")):

@@ -71,6 +71,7 @@ def test_levels_that_are_given_are_used_as_they_are():
     np.testing.assert_array_equal(result.height_sigma, onset.height_sigma)
 
 
+@pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")
 def test_where_nothing_turns_light_the_range_of_the_type_is_taken_and_told():
     frames, _ = press(high=14.0)
     result = engine.reconstruct(frames, travel=TRAVEL, fill=False)

@@ -93,6 +93,7 @@ def test_a_recording_can_be_reconstructed_again_and_after_a_look_into_it():
     np.testing.assert_array_equal(engine.reconstruct(source, event="release").height, first.height)
 
 
+@pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")
 def test_a_body_that_rests_may_be_asked_for_either():
     for event in ("onset", "release"):
         result = engine.reconstruct(ball((40, 40), 0.3, np.ones(5), noise=0), event=event)
@@ -222,6 +223,7 @@ class Spiked:
         return block
 
 
+@pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")
 @pytest.mark.parametrize(("step", "count", "rms"), [(0.1, 30, 0.030), (0.01, 300, 0.0035)])
 def test_the_sphere_is_measured_to_the_limit_of_its_steps(step, count, rms):
     shape, pixel, noise, (dark, bright) = (480, 480), 0.025, 1.5, geometry.LEVELS["uint8"]

@@ -1,0 +1,54 @@
+"""``mirrorskin check``: whether frames and their positions are plausible."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import click
+
+from mirrorskin.cli import options
+from mirrorskin.cli.groups import Argument, Option
+from mirrorskin.cli.stack import RECORDING, stack_options
+
+
+def command(
+    recording: Annotated[Path, Argument(metavar="FRAMES", help="Frames in any format that is read.")],
+    field: Annotated[
+        str, Option(metavar="LEAST,MOST", help="Plausible sides of the field of view.")
+    ] = "0.05mm,200mm",
+    extent: Annotated[
+        str, Option(metavar="LEAST,MOST", help="Plausible travel of a press.")
+    ] = "0.005mm,20mm",
+    memory: options.Memory = "256MB",
+    strict: options.Strict = False,
+    as_json: options.Json = False,
+    **chosen: Annotated[Any, RECORDING],
+) -> None:
+    """Check whether frames and their positions are plausible.
+
+    The brightness of a grid of pixels in all frames shows their order, the light and the noise, and frames
+    that are missing or repeated; lengths, times and the file show the rest. With --strict, warnings end the
+    command with exit code 2.
+    """
+    from mirrorskin import io
+    from mirrorskin.cli.output import make_strict, print_json, printable, progress
+    from mirrorskin.cli.quantity import lengths
+    from mirrorskin.cli.quantity import memory as bytes_of
+    from mirrorskin.io.findings import in_process, warn
+
+    sides, travels = lengths(field, "--field"), lengths(extent, "--extent")
+    stack = stack_options(chosen)
+    with (
+        io.open_recording(recording, memory_limit=bytes_of(memory, "--memory"), **stack) as source,
+        progress("checking", source.shape[0]) as show,
+    ):
+        found = io.check(source, field_limits=sides, travel_limits=travels, progress=show)
+    if as_json:
+        print_json(found)
+    else:
+        for line in str(found).splitlines():
+            click.echo(printable(line))
+    if strict:
+        make_strict(strict)
+        warn(found.name, in_process(found.warnings, {}))

@@ -1,0 +1,64 @@
+"""What users should know about frames and results: as warnings, and in ``process``."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+_BETWEEN = "; "
+
+
+class MirrorskinWarning(UserWarning):
+    """Input or a result that may not mean what it seems to; the message is one line with the remedy."""
+
+    exit_code = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something about frames or a result that its user should know.
+
+    Attributes
+    ----------
+    kind : str
+        A few words that stay the same: "lost frames". the documentation lists all.
+    text : str
+        One line: what was found, and the remedy if there is one.
+    warning : bool
+        Whether an answer may be wrong because of it; otherwise it is only a note.
+    """
+
+    kind: str
+    text: str
+    warning: bool = True
+
+
+def in_process(findings: Iterable[Finding], process: Mapping[str, Any]) -> dict[str, str]:
+    """Return ``warnings`` and ``notes`` of a process: those that it has, and those of findings.
+
+    Examples
+    --------
+    >>> in_process([Finding("flicker", "the light flickers by 3 %")], {})
+    {'warnings': 'the light flickers by 3 %'}
+    """
+    known = {}
+    for name, wanted in (("warnings", True), ("notes", False)):
+        texts = [str(process[name])] if name in process else []
+        texts += [one.text for one in findings if one.warning is wanted]
+        if texts:
+            known[name] = _BETWEEN.join(dict.fromkeys(texts))
+    return known
+
+
+def warn(name: str, process: Mapping[str, Any]) -> None:
+    """Issue a `MirrorskinWarning` with the ``warnings`` of a process, and the name of the source."""
+    said = process.get("warnings")
+    if not said:
+        return
+    level, frame = 1, sys._getframe()  # the line of the first caller outside of mirrorskin is shown
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("mirrorskin."):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(f"{name}: {said}", MirrorskinWarning, stacklevel=level)

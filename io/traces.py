@@ -1,0 +1,311 @@
+"""What the brightness of a grid of pixels over all frames shows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.io.findings import Finding
+from mirrorskin.io.types import Floats, Motion
+
+_SIDE = 24  # pixels of the grid along each side
+_MOST = 1 << 22  # samples kept in all
+_FEWEST = 64  # pixels that are needed to tell anything
+_QUANTUM = 1 / math.sqrt(12)  # standard deviation of rounding, counts
+_MAD = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
+_CLEAR = 10.0  # noise deviations by which the brightness of a pixel must change to count as a response
+_FEW = 0.05  # share of pixels below which their common behaviour means nothing
+_MOST_OF = 0.8  # share of pixels that decides
+_CLIPPED = 0.1  # share of responding pixels that may reach the end of the scale
+_FLICKER, _DRIFT = 0.01, 2.0  # share of the light; counts of 8 bits
+_HARMONICS = 3  # of the phase, that describe the brightness of a pixel
+_THIN = 4  # times by which an axis is shorter than both others if it is a wrong one
+
+
+class FrameSamples:
+    """Brightness of a grid of pixels in all frames.
+
+    Parameters
+    ----------
+    shape : (int, int, int)
+        Frames, rows and columns of the source.
+
+    Examples
+    --------
+    >>> samples = FrameSamples((3, 2, 2))
+    >>> samples.push(np.arange(12, dtype=np.uint8).reshape(3, 2, 2))
+    >>> samples.values.shape
+    (3, 2, 2)
+    """
+
+    def __init__(self, shape: tuple[int, int, int]) -> None:
+        side = max(2, min(_SIDE, math.isqrt(_MOST // max(1, shape[0]))))
+        self._cut = (
+            slice(None),
+            *(slice((n - 1) % s // 2, None, s) for n in shape[1:] for s in [-(-n // side)]),
+        )
+        self._parts: list[NDArray[Any]] = []
+
+    def push(self, frames: NDArray[Any]) -> None:
+        """Add the next frames, (n, H, W)."""
+        self._parts.append(frames[self._cut].copy())
+
+    @property
+    def values(self) -> NDArray[Any]:
+        """Samples, (T, rows, columns), in the type of the frames."""
+        return np.concatenate(self._parts)
+
+    @property
+    def count(self) -> int:
+        """Number of frames so far."""
+        return sum(map(len, self._parts))
+
+
+def named_frames(numbers: Sequence[int] | NDArray[np.intp]) -> str:
+    """Return the names of some frames for a message."""
+    shown = ", ".join(str(number) for number in numbers[:3]) + (", ..." if len(numbers) > 3 else "")
+    return f"frame {shown}" if len(numbers) == 1 else f"frames {shown}"
+
+
+class Traces:
+    """The brightness of each pixel of the grid over the frames, and what it shows."""
+
+    def __init__(self, samples: NDArray[Any], motion: Motion, series: Mapping[str, Floats]) -> None:
+        self._grid = samples.shape
+        self._stored = samples.reshape(len(samples), math.prod(samples.shape[1:]))
+        self._integer = samples.dtype.kind == "u"
+        self._counts = self._stored.astype(np.float32)
+        self._counts = self._counts[:, np.isfinite(self._counts).all(axis=0)]
+        self._motion, self._series = motion, series
+        self._known = self._counts.shape[1] >= _FEWEST and len(self._counts) > 2
+        if self._known:
+            self._lowest, self._highest = self._counts.min(axis=0), self._counts.max(axis=0)
+            self._range = self._highest - self._lowest
+            self.span = float(self._highest.max() - self._lowest.min())
+            self._fit = self._harmonics()
+            self.noise = self._noise()
+            needed = max(_CLEAR * self.noise, 0.02 * self.span)
+            self._responding = self._range > needed
+            self._share = float(self._responding.mean())
+
+    def facts(self) -> dict[str, str]:
+        """Return numbers to print."""
+        if not self._known:
+            return {}
+        low, high = float(self._lowest.min()), float(self._highest.max())
+        facts = {"brightness": f"{low:.4g} to {high:.4g} counts{self._depth(high)}"}
+        facts["noise"] = f"about {self.noise:.2g} counts"
+        facts["cut off"] = f"{_percent(self._clipped())} of the pixels reach the end of the scale"
+        facts["respond"] = f"{_percent(self._share)} of the pixels"
+        if (flicker := self._flicker()) is not None:
+            facts["flicker"] = f"{_percent(flicker[0])} of the light"
+        if (drift := self._drift()) is not None:
+            facts["drift"] = f"{drift[0]:.2g} counts of the dark level"
+        return facts
+
+    def findings(self, shape: tuple[int, int, int], moved: bool) -> Iterator[Finding]:
+        """Yield what is doubtful."""
+        if not self._known:
+            return
+        yield from self._repeated()
+        if not moved:
+            return
+        if self._share == 0:
+            yield Finding(
+                "no response", "the brightness changes at no pixel: was there light, and did the body move?"
+            )
+            return
+        yield from self._axes(shape)
+        if self._share > _FEW:
+            yield from self._press() if self._motion == "vertical" else self._turn()
+        if (clipped := self._clipped()) > _CLIPPED:
+            yield Finding(
+                "cut off",
+                f"{_percent(clipped)} of the pixels reach the end of the scale: shorten the exposure",
+            )
+        if (flicker := self._flicker()) is not None and flicker[0] > max(_FLICKER, 5 * flicker[1]):
+            yield Finding(
+                "flicker",
+                f"the light flickers by {_percent(flicker[0])} from frame to frame: use a steady lamp",
+            )
+        if (drift := self._drift()) is not None and drift[0] > max(_DRIFT * self._scale(), 10 * drift[1]):
+            yield Finding(
+                "drift",
+                f"the dark level drifts by {drift[0]:.2g} counts: let the camera warm up, and keep stray"
+                " light away",
+            )
+
+    def _scale(self) -> float:
+        """Return counts per count of 8 bits."""
+        return self.span / 255 if not self._integer or self.span > 255 else 1.0
+
+    def _depth(self, high: float) -> str:
+        """Return which bits of integers are in use."""
+        if not self._integer:
+            return ""
+        used = int(np.bitwise_or.reduce(self._stored, axis=None))
+        if not used:
+            return ""
+        idle = (used & -used).bit_length() - 1
+        lower = f", the lowest {idle} of them 0" if idle else ""
+        return f" ({int(high).bit_length()} bits in use{lower})"
+
+    def _end(self) -> float:
+        """Return the end of the scale: that of the fewest usual bits that hold all counts."""
+        if not self._integer:
+            return math.inf
+        bits = next(bits for bits in (8, 10, 12, 14, 16) if self._highest.max() < 2**bits)
+        return float(2**bits - 1)
+
+    def _clipped(self) -> float:
+        return float(np.mean(self._highest >= self._end()))
+
+    def _harmonics(self) -> Floats | None:
+        """Return the brightness as fitted by harmonics of the phase, (T, n); None without a fit."""
+        phase = self._series.get("phase")
+        if self._motion != "axial" or phase is None:
+            return None
+        order = min(_HARMONICS, (len(phase) - 2) // 2)
+        if order < 1:
+            return None
+        angles = phase[:, np.newaxis] * np.arange(1, order + 1)
+        columns = np.column_stack([np.ones(len(phase)), np.cos(angles), np.sin(angles)])
+        basis = np.linalg.qr(columns)[0].astype(np.float32)
+        return np.asarray(basis @ (basis.T @ self._counts))
+
+    def _noise(self) -> float:
+        """Return about the standard deviation of a sample: what changes least explains."""
+        steps = np.diff(self._counts, axis=0)
+        found = [_MAD * float(np.median(np.median(np.abs(steps), axis=1))) / math.sqrt(2)]
+        if self._fit is not None:
+            left = np.abs(self._counts - self._fit)
+            found.append(_MAD * float(np.median(left)))
+            if len(steps) > 1:
+                found.append(_MAD * float(np.median(np.abs(np.diff(steps, axis=0)))) / math.sqrt(6))
+        return max(min(found), _QUANTUM if self._integer else 0.0)
+
+    def _repeated(self) -> Iterator[Finding]:
+        """Yield frames that equal the one before them, if others differ everywhere."""
+        counts = self._counts
+        inside = (counts[1:] > 0) & (counts[1:] < self._end())  # where noise is not cut off
+        differ = np.count_nonzero((counts[1:] != counts[:-1]) & inside, axis=1)
+        again = np.flatnonzero((differ == 0) & (inside.sum(axis=1) >= _FEWEST)) + 1
+        if len(again) and np.median(differ) > 0.1 * counts.shape[1]:
+            yield Finding(
+                "repeated frames",
+                f"{named_frames(again)}: identical to the one before, so later positions may be wrong:"
+                " remove it, or give the position of each frame",
+            )
+
+    def _axes(self, shape: tuple[int, int, int]) -> Iterator[Finding]:
+        """Yield that the last axis seems to be the frames: it is short, and the light changes along it."""
+        thin = min(shape[1:])
+        if _THIN * thin > min(shape[0], max(shape[1:])):
+            return
+        samples = self._stored.reshape(self._grid).astype(np.float32)
+        over_time = samples.mean(axis=(1, 2))
+        along = samples.mean(axis=(0, 1 if shape[2] == thin else 2))
+        if np.nanvar(along) > 4 * np.nanvar(over_time):
+            yield Finding(
+                "axes",
+                f"{shape[0]} frames of {shape[2]} x {shape[1]} pixels, whose light changes along their"
+                f" {thin} pixels rather than over time: is the order of the axes (T, H, W)?",
+            )
+
+    def _press(self) -> Iterator[Finding]:
+        if not self._goes_down():
+            return
+        travel = self._series["travel"]
+        few = max(1, len(self._counts) // 10)
+        counts, extent = self._counts[:, self._responding], self._range[self._responding]
+        change = (counts[-few:].mean(axis=0) - counts[:few].mean(axis=0)) / extent
+        change *= np.sign(travel[-1] - travel[0])
+        rises, falls = float(np.mean(change > 0.5)), float(np.mean(change < -0.5))
+        if falls > _MOST_OF * (rises + falls) and falls > 0.2:
+            yield Finding(
+                "reversed",
+                f"brightness falls with travel at {_percent(falls)} of the pixels that respond: are the"
+                " frames reversed, or is it a release (--event release)?",
+            )
+        elif rises + falls < 1 - _MOST_OF:
+            yield Finding(
+                "not a press",
+                f"brightness returns to where it began at {_percent(1 - rises - falls)} of the pixels that"
+                " respond, although the travel does not: is this a rotation?",
+            )
+
+    def _turn(self) -> Iterator[Finding]:
+        phase = self._series.get("phase")
+        if self._motion != "axial" or phase is None or len(phase) < 5:
+            return
+        turned = np.abs(phase - phase[0])
+        last = int(np.argmin(np.abs(turned - 2 * math.pi)))
+        if abs(turned[last] - 2 * math.pi) > 1.5 * float(np.median(np.abs(np.diff(phase)))):
+            return
+        counts, extent = self._counts[:, self._responding], self._range[self._responding]
+        jump = float(np.median(np.abs(counts[last] - counts[0]) / extent))
+        if jump > 0.5:
+            yield Finding(
+                "not a rotation",
+                f"brightness does not return after a whole turn: half of the pixels that respond end"
+                f" {_percent(jump)} of their range away: is this a press?",
+            )
+
+    def _common(self, counts: NDArray[np.float32]) -> tuple[Floats, Floats, float] | None:
+        """Return by how much each frame differs from usual, its error, and the level; NaN is left out."""
+        counted = np.sum(np.isfinite(counts), axis=1)
+        enough = counted >= _FEWEST // 2
+        if np.sum(enough) < 5:
+            return None
+        levels = np.nanmedian(counts[enough], axis=0)
+        offset = np.nanmedian(counts[enough] - levels, axis=1).astype(np.float64)
+        errors = 1.25 * self.noise / np.sqrt(counted[enough])
+        return offset, errors, float(np.nanmedian(levels))
+
+    def _flicker(self) -> tuple[float, float] | None:
+        """Return the standard deviation of the common light, and that of its noise, as shares."""
+        if self._fit is not None and len(self._counts) >= 2 * (2 * _HARMONICS + 1):
+            left = self._counts - self._fit
+            if float(np.mean(left**2)) > 0.02 * float(np.var(self._counts)):
+                return None  # harmonics do not describe it
+            gain = np.sum(left * self._fit, axis=1) / np.sum(self._fit**2, axis=1)
+            error = self.noise / math.sqrt(float(np.mean(np.sum(self._fit**2, axis=1))))
+            return float(np.std(gain)), error
+        if not self._goes_down() or self._share < _FEW:
+            return None
+        counts = self._counts[:, self._responding]
+        lit = counts - self._lowest[self._responding] > 0.8 * self._range[self._responding]
+        lit[2:] &= lit[:-2]  # for two frames
+        lit[:2] = False
+        counts = np.where(lit, counts, np.nan)[:, lit.sum(axis=0) >= 5]
+        found = self._common(counts)
+        if found is None or found[2] <= 0:
+            return None
+        offset, errors, level = found
+        return float(np.std(np.diff(offset)) / math.sqrt(2) / level), float(np.mean(errors) / level)
+
+    def _drift(self) -> tuple[float, float] | None:
+        """Return the range of the smoothed level of pixels that do not respond, and its error, counts."""
+        if not self._goes_down():
+            return None
+        found = self._common(self._counts[:, ~self._responding])
+        if found is None:
+            return None
+        offset, errors, _ = found
+        parts = [float(np.mean(part)) for part in np.array_split(offset, 5)]
+        return max(parts) - min(parts), float(np.mean(errors)) / math.sqrt(len(offset) / 5)
+
+    def _goes_down(self) -> bool:
+        """Return whether the travel of a press only rises, or only falls."""
+        travel = self._series.get("travel")
+        if self._motion != "vertical" or travel is None:
+            return False
+        return bool(np.all(np.diff(travel) * (travel[-1] - travel[0]) >= 0))
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"

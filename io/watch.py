@@ -1,0 +1,181 @@
+"""Watching frames while they are read: facts, and what a person who saw the numbers would object to."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mirrorskin.io.findings import Finding
+from mirrorskin.io.traces import FrameSamples, Traces, named_frames
+from mirrorskin.io.types import Block, Floats, Source
+
+FIELD = (0.05, 200.0)
+"""Usual sides of the field of view, mm; the body of the sensor in the paper measures 35 mm."""
+TRAVEL = (0.005, 20.0)
+"""Usual travel of a press, mm."""
+
+_EVEN = 1e-3  # steps of a position that differ by less than this share are even
+_GAP = 1.5  # intervals: a longer time between two frames means that frames are missing
+
+Limits = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Check:
+    """What is known of frames, and what is doubtful; ``print`` shows it.
+
+    Attributes
+    ----------
+    name : str
+        Name of the source.
+    facts : dict of str
+        Names and values to print.
+    findings : tuple of Finding
+        What a user should know.
+    """
+
+    name: str
+    facts: dict[str, str]
+    findings: tuple[Finding, ...] = field(default=())
+
+    @property
+    def warnings(self) -> tuple[Finding, ...]:
+        """The findings because of which an answer may be wrong."""
+        return tuple(one for one in self.findings if one.warning)
+
+    def __str__(self) -> str:
+        width = max(map(len, self.facts), default=0)
+        lines = [f"{name:<{width}}  {value}" for name, value in self.facts.items()]
+        lines += [f"{'warning' if one.warning else 'note'}: {one.text}" for one in self.findings]
+        return "\n".join([self.name, *lines] if lines else [self.name, "nothing is known"])
+
+
+class Watch:
+    """The frames of a source while they are read: samples of them, and their positions.
+
+    ``moved``: whether the brightness must respond to the motion.
+    """
+
+    def __init__(self, source: Source, moved: bool = True) -> None:
+        self._source, self._moved = source, moved
+        self._samples = FrameSamples(source.shape)
+        self._series: dict[str, list[Floats]] = {"time": [], "travel": [], "phase": []}
+        self._lost = 0
+
+    def push(self, block: Block) -> None:
+        """Add the next frames."""
+        self._samples.push(block.frames)
+        self._lost += block.dropped
+        for name, parts in self._series.items():
+            values = getattr(block, name)
+            if values is not None:
+                parts.append(values)
+
+    def check(
+        self, field_limits: tuple[float, float] = FIELD, travel_limits: tuple[float, float] = TRAVEL
+    ) -> Check:
+        """Return what the frames so far show."""
+        source = self._source
+        samples = self._samples.values if self._samples.count else np.empty((0, 0, 0), source.dtype)
+        series = {
+            name: np.concatenate(parts)
+            for name, parts in self._series.items()
+            if parts and sum(map(len, parts)) == len(samples)
+        }
+        traces = Traces(samples, source.motion, series)
+        facts = {"frames": f"{len(samples)} of {source.shape[2]} x {source.shape[1]}, {source.dtype}"}
+        facts |= _facts(source, series, traces)
+        dropped = getattr(source, "dropped", None)
+        lost = self._lost if dropped is None else int(np.sum(dropped))
+        found = [
+            *getattr(source, "findings", ()),
+            *_geometry(source, series, field_limits, travel_limits),
+            *_order(source, series, lost),
+            *traces.findings(source.shape, self._moved),
+        ]
+        return Check(source.name, facts, tuple(found))
+
+
+def _facts(source: Source, series: Mapping[str, Floats], traces: Traces) -> dict[str, str]:
+    facts = {}
+    size = source.header.pixel_size
+    if size is not None:
+        width, height = source.shape[2] * size[0], source.shape[1] * size[1]
+        facts["field"] = f"{width:.4g} x {height:.4g} mm, {size[0]:.4g} x {size[1]:.4g} mm a pixel"
+    for name, factor, unit in (("travel", 1.0, "mm"), ("phase", math.degrees(1), "deg")):
+        if name in series:
+            facts[name] = _range_of(series[name] * factor, unit)
+    if "time" in series and len(series["time"]) > 1:
+        facts["time"] = f"{series['time'][-1] - series['time'][0]:.4g} s"
+    levels = [
+        "given" if getattr(source.header, one) is not None else "not given" for one in ("dark", "bright")
+    ]
+    return {**facts, **traces.facts(), "levels": f"dark {levels[0]}, bright {levels[1]}"}
+
+
+def _range_of(values: Floats, unit: str) -> str:
+    steps = np.abs(np.diff(values))
+    text = f"{values[0]:.4g} to {values[-1]:.4g} {unit}"
+    if not len(steps):
+        return text
+    even = np.ptp(steps) <= _EVEN * max(float(np.max(steps)), 1e-12)
+    return f"{text}, {'' if even else 'about '}{np.median(steps):.4g} {unit} a frame"
+
+
+def _geometry(
+    source: Source,
+    series: Mapping[str, Floats],
+    field_limits: tuple[float, float],
+    travel_limits: tuple[float, float],
+) -> Iterator[Finding]:
+    """Yield what is wrong with lengths: a wrong unit is a factor of 1000."""
+    size = source.header.pixel_size
+    if size is not None:
+        _, rows, columns = getattr(source, "full_shape", source.shape)
+        sides = columns * size[0], rows * size[1]
+        if max(sides) > field_limits[1] or max(sides) < field_limits[0]:
+            yield Finding(
+                "field",
+                f"the field is {sides[0]:.4g} x {sides[1]:.4g} mm, and {_from_to(field_limits)} are usual:"
+                " is the pixel size in mm?",
+            )
+    if source.motion == "vertical" and "travel" in series:
+        extent = float(np.ptp(series["travel"]))
+        if 0 < extent < travel_limits[0] or extent > travel_limits[1]:
+            yield Finding(
+                "travel",
+                f"the travel is {extent:.4g} mm in all, and {_from_to(travel_limits)} are usual:"
+                " is it in mm?",
+            )
+    phase = series.get("phase")
+    if phase is not None and len(phase) > 2 and (step := float(np.median(np.abs(np.diff(phase))))) > math.pi:
+        yield Finding("phases", f"phases step by {step:.4g} rad from frame to frame: are they in degrees?")
+
+
+def _from_to(limits: Limits) -> str:
+    return f"{limits[0]:g} to {limits[1]:g} mm"
+
+
+def _order(source: Source, series: Mapping[str, Floats], lost: int) -> Iterator[Finding]:
+    """Yield which frames are missing."""
+    if lost:
+        yield Finding("lost frames", f"{lost} frame{'s were' if lost > 1 else ' was'} lost", False)
+    time = series.get("time")
+    position = series.get({"vertical": "travel", "axial": "phase"}.get(source.motion, ""))
+    if time is None or position is None or len(time) < 4 or lost:
+        return
+    steps = np.diff(time)
+    usual = float(np.median(steps))
+    late = np.flatnonzero(steps > _GAP * usual)
+    moves = np.diff(position)
+    even = np.ptp(moves) <= _EVEN * float(np.max(np.abs(moves)))  # computed, not measured
+    if even and usual > 0 and 0 < len(late) <= len(steps) // 4:
+        missing = round(float(np.sum(steps[late]) / usual)) - len(late)
+        yield Finding(
+            "time gap",
+            f"{named_frames(late + 1)} came late, as if {missing} frames were missing, but positions are"
+            " evenly spaced: give the position of each frame",
+        )

@@ -1,0 +1,218 @@
+"""The plausibility report: what a person who saw the numbers would object to is found, and nothing else."""
+
+import numpy as np
+import pytest
+
+from mirrorskin import io
+
+SHAPE, PIXEL, STEP = (60, 80), 0.1, 0.05
+TRAVEL = STEP * np.arange(30)
+PHASE = 2 * np.pi * np.arange(24) / 24
+
+
+def gap():
+    """Distance of a ball of 20 mm from the sheet, mm."""
+    x, y = io.pixel_axes(SHAPE, (PIXEL, PIXEL))
+    return 10 - np.sqrt(np.maximum(100 - x**2 - y[:, np.newaxis] ** 2, 0))
+
+
+def noisy(brightness, noise=1.0):
+    counts = brightness + np.random.default_rng(1).normal(0, noise, brightness.shape)
+    return np.clip(np.rint(counts), 0, 255).astype(np.uint8)
+
+
+def pressed():
+    """Brightness of a press: the sheet turns light where the ball touches it."""
+    above = TRAVEL[:, np.newaxis, np.newaxis] - gap()
+    return 20 + 160 * np.clip(above / 0.04 + 0.5, 0, 1)
+
+
+def turned(phase=PHASE):
+    """Brightness of a rotation: a cosine of the phase whose phase and amplitude differ between pixels."""
+    x, y = io.pixel_axes(SHAPE, (PIXEL, PIXEL))
+    y = y[:, np.newaxis]
+    return 90 + 15 * np.hypot(x, y) * np.cos(phase[:, np.newaxis, np.newaxis] - np.arctan2(y, x))
+
+
+def found(frames, *, pixel_size=(PIXEL, PIXEL), where=None, **series):
+    from mirrorskin.io.arrays import ArrayRecording
+
+    names = series or {"travel": TRAVEL}
+    return io.check(ArrayRecording(frames, names, {"pixel_size": pixel_size}), **(where or {}))
+
+
+def kinds(check):
+    return [one.kind for one in check.findings]
+
+
+@pytest.mark.parametrize(
+    ("brightness", "series"),
+    [
+        (pressed(), {"travel": TRAVEL}),
+        (pressed()[::-1], {"travel": TRAVEL[::-1]}),
+        (turned(), {"phase": PHASE}),
+    ],
+    ids=["press", "release", "rotation"],
+)
+def test_what_is_plausible_has_no_findings(brightness, series):
+    assert kinds(found(noisy(brightness), **series)) == []
+
+
+@pytest.mark.parametrize("factor", [1000, 0.001], ids=["in micrometres", "in metres"])
+def test_travel_in_another_unit_is_found(factor):
+    assert kinds(found(noisy(pressed()), travel=factor * TRAVEL)) == ["travel"]
+
+
+@pytest.mark.parametrize("factor", [1000, 0.001])
+def test_a_pixel_size_in_another_unit_is_found(factor):
+    assert kinds(found(noisy(pressed()), pixel_size=(factor * PIXEL, factor * PIXEL))) == ["field"]
+
+
+def test_the_limits_can_be_chosen():
+    large = {"field_limits": (1.0, 1e6), "travel_limits": (0.1, 1e4)}
+    frames, size = noisy(pressed()), (100.0, 100.0)
+    assert kinds(found(frames, pixel_size=size, travel=1000 * TRAVEL, where=large)) == []
+
+
+def test_phases_in_degrees_are_found():
+    assert kinds(found(noisy(turned()), phase=np.degrees(PHASE)))[0] == "phases"
+
+
+def test_frames_in_reverse_order_are_found():
+    (finding,) = found(noisy(pressed()[::-1])).findings
+    assert finding.kind == "reversed"
+    assert "--event release" in finding.text
+
+
+def test_a_rotation_with_travels_is_no_press():
+    brightness = turned(2 * np.pi * np.arange(30) / 30)
+    assert kinds(found(noisy(brightness))) == ["not a press"]
+
+
+def test_a_press_with_phases_is_no_rotation():
+    assert kinds(found(noisy(pressed()), phase=2 * np.pi * np.arange(30) / 30)) == ["not a rotation"]
+
+
+def test_axes_in_the_order_of_matlab_are_found():
+    rows = np.repeat(pressed(), 2, axis=2)[:, :, :150]
+    stack = np.moveaxis(noisy(np.repeat(rows, 3, axis=1)), 0, -1)  # (H, W, T)
+    assert "axes" in kinds(found(stack, travel=STEP * np.arange(len(stack))))
+
+
+def test_a_frame_that_is_there_twice_is_found():
+    frames = noisy(pressed())
+    frames[12] = frames[11]
+    (finding,) = found(frames).findings
+    assert finding.kind == "repeated frames"
+    assert finding.text.startswith("frame 12: identical to the one before")
+
+
+def test_frames_that_came_late_are_found_if_positions_were_computed():
+    time = np.arange(30) / 30
+    time[20:] += 2 / 30
+    source = Timed(noisy(pressed()), TRAVEL, time)
+    (finding,) = io.check(source).findings
+    assert finding.text.startswith("frame 20 came late, as if 2 frames were missing")
+
+
+def test_frames_that_came_late_are_no_matter_if_positions_were_measured():
+    time = np.arange(30) / 30
+    time[20:] += 2 / 30
+    travel = TRAVEL + np.random.default_rng(0).normal(0, 0.002, 30)
+    travel[20:] += 2 * STEP
+    assert kinds(io.check(Timed(noisy(pressed()), np.sort(travel), time))) == []
+
+
+def test_lost_frames_are_a_note():
+    source = Timed(noisy(pressed()), TRAVEL, np.arange(30) / 30)
+    source.dropped = np.eye(30, dtype=np.int32)[7]
+    check = io.check(source)
+    assert (kinds(check), check.warnings) == (["lost frames"], ())
+
+
+def test_flicker_is_found():
+    lamp = 1 + np.random.default_rng(3).normal(0, 0.03, 30)
+    assert kinds(found(noisy(pressed() * lamp[:, np.newaxis, np.newaxis]))) == ["flicker"]
+
+
+def test_flicker_of_a_rotation_is_found():
+    lamp = 1 + np.random.default_rng(3).normal(0, 0.03, 24)
+    assert kinds(found(noisy(turned() * lamp[:, np.newaxis, np.newaxis]), phase=PHASE)) == ["flicker"]
+
+
+def test_a_dark_level_that_drifts_is_found():
+    drift = np.linspace(0, 8, 30)[:, np.newaxis, np.newaxis]
+    far = np.pad(pressed(), ((0, 0), (20, 20), (20, 20)), constant_values=20)
+    assert kinds(found(noisy(far + drift))) == ["drift"]
+
+
+def test_light_beyond_the_scale_is_found():
+    assert kinds(found(noisy(1.6 * pressed()))) == ["cut off"]
+
+
+@pytest.mark.parametrize("level", [20.0, 200.0])
+def test_frames_that_never_change_are_found(level):
+    assert kinds(found(noisy(np.full((30, *SHAPE), level)))) == ["no response"]
+
+
+@pytest.mark.parametrize(
+    ("frames", "bits"),
+    [
+        (noisy(pressed()).astype(np.uint16) * 16, "(12 bits in use, the lowest 4 of them 0)"),
+        (noisy(pressed()).astype(np.uint16) * 20 + 1, "(12 bits in use)"),
+    ],
+)
+def test_the_bits_in_use_are_a_fact(frames, bits):
+    assert found(frames).facts["brightness"].endswith(bits)
+
+
+def test_few_pixels_tell_nothing():
+    assert kinds(found(np.zeros((5, 3, 4), np.uint8), travel=TRAVEL[:5])) == []
+
+
+def test_pixels_that_are_unknown_are_left_out():
+    frames = pressed().astype(np.float32)
+    frames[3, 10:20] = np.nan
+    frames += np.random.default_rng(0).normal(0, 1, frames.shape).astype(np.float32)
+    assert kinds(found(frames)) == []
+
+
+def test_the_report_is_printed_line_by_line():
+    lines = str(found(noisy(pressed()), travel=1000 * TRAVEL)).splitlines()
+    assert lines[1] == "frames      30 of 80 x 60, uint8"
+    assert lines[-1].startswith("warning: the travel is 1450 mm in all")
+
+
+def test_a_path_is_opened_with_what_is_given(tmp_path):
+    np.save(tmp_path / "press.npy", noisy(pressed()))
+    check = io.check(tmp_path / "press.npy", travel=TRAVEL, pixel_size=(0.1, 0.1))
+    assert check.facts["field"] == "8 x 6 mm, 0.1 x 0.1 mm a pixel"
+
+
+def test_what_belongs_to_the_opening_is_refused_for_an_open_source():
+    from mirrorskin.io.arrays import ArrayRecording
+
+    source = ArrayRecording(noisy(pressed()), {"travel": TRAVEL}, {})
+    with pytest.raises(io.InputError, match=r"is open: give pixel_size to io\.open_recording"):
+        io.check(source, pixel_size=(0.1, 0.1))
+
+
+class Timed:
+    """A source of an array with times."""
+
+    rewindable, name, motion, header = True, "timed", "vertical", io.Header("vertical")
+    dropped = None
+
+    def __init__(self, frames, travel, time):
+        self._frames, self._travel, self._time = frames, travel, time
+        self.shape, self.dtype = frames.shape, frames.dtype
+        self.rewind()
+
+    def rewind(self):
+        self._left = True
+
+    def read(self, out=None, /):
+        if not self._left:
+            return None
+        self._left = False
+        return io.Block(self._frames, 0, time=self._time, travel=self._travel)
