@@ -10,7 +10,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.types import Finding, Floats, Motion
+from mirrorskin.io.findings import Finding
+from mirrorskin.io.types import Floats, Motion
 from mirrorskin.io.units import Kind, in_base
 
 if TYPE_CHECKING:

@@ -338,7 +338,7 @@ def open_recording(
             stack, str(path), shape[0], numbers, cut.region, memory_limit, threads, decoding, opened
         )
         recording = Recording(file, stack, frames_of, cut, header, positions, layout, state, shape, live)
-        recording.findings = (*decoding.findings, *coordinates.findings)
+        recording.findings += (*decoding.findings, *coordinates.findings)
         opening.pop_all()  # the recording closes the file from now on
     return recording
 

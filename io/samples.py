@@ -10,8 +10,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from mirrorskin.io.findings import Finding
 from mirrorskin.io.selection import Span
-from mirrorskin.io.types import FRAME_DTYPES, Closing, Finding, InputError
+from mirrorskin.io.types import FRAME_DTYPES, Closing, InputError
 
 ATTRIBUTES = (
     "_Unsigned",

@@ -108,7 +108,8 @@ class CalibrationErrors(Step):
 class PhaseSign(Step):
     """Warn if the phases seem to run the wrong way round, so that the surface is mirrored.
 
-    Slopes p and q of a surface satisfy dp/dy = dq/dx; with the phases reversed, q has the other sign. The mean of dp/dy times dq/dx is positive for a surface, and negative for a mirrored one.
+    Slopes p and q of a surface satisfy dp/dy = dq/dx; with the phases reversed, q has the other sign. So the
+    mean of their product is positive for a surface, and negative for a mirrored one.
     """
 
     def apply(self, result: Result, context: Context) -> Result:
