@@ -63,6 +63,7 @@ JOINED = 3e-3
 _FINEST = 0.0, 4.7682, -2.5894, -0.9665, -2.4153, 0.255
 _COARSER = 0.0, -0.2621, -0.1186, -0.6233, 0.0, 0.0
 _MODES = 64  # along each axis, for integrals over all modes of a plane
+_ROWS = 64  # of modes that are transformed at once, and stay in a core's cache
 _LOOSE = 1e-7  # regularisation of components without a known height, relative to their links
 _BORDER = 0.12  # reduction of the misfit per loop, for each loop that a pixel lacks at the border
 
@@ -133,15 +134,19 @@ def _modes(length: int) -> tuple[Floats, Floats]:
 
 
 def _sum_squares(power: Floats) -> Floats:
-    """Return sums over modes of their squares times their power, (n, m), at the first half of n points."""
-    length = len(power)
+    """Return sums over modes, (m, n), of their squares times their power, at the first half of n points."""
+    count, length = power.shape
     half = (length + 1) // 2
-    waves = np.zeros((length // 2 + 1, power.shape[1]), np.complex64)
-    waves[0] = power.sum(axis=0)
     # The square of mode k is 1 plus mode 2 k, which equals minus mode 2 (length - k).
-    turns = np.exp(1j * np.pi / length * np.arange(1, half)).astype(np.complex64) / 2
-    waves[1:half] = turns[:, np.newaxis] * (power[1:half] - power[:-half:-1])
-    return np.asarray(np.fft.irfft(waves, length, axis=0)[:half], np.float32)
+    turns = (np.exp(1j * np.pi / length * np.arange(1, half)) / 2).astype(np.complex64)
+    sums = np.empty((count, half), np.float32)
+    for start in range(0, count, _ROWS):
+        rows = power[start : start + _ROWS]
+        waves = np.zeros((len(rows), length // 2 + 1), np.complex64)
+        waves[:, 0] = rows.sum(axis=1)
+        waves[:, 1:half] = turns * (rows[:, 1:half] - rows[:, :-half:-1])
+        sums[start : start + _ROWS] = np.fft.irfft(waves, length, axis=1)[:, :half]
+    return sums
 
 
 def _plane(weight: float, axis: int) -> tuple[Doubles, Doubles]:
