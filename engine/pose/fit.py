@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import STILL, Motion, cross_matrix
 from mirrorskin.io import InputError
+from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.pose import BLOCK, PARTS
@@ -23,7 +24,8 @@ from mirrorskin.kernels.pose import BLOCK, PARTS
 FEWEST_SHARED = 20
 """Smallest number of pixels that two maps must share."""
 
-_UPPER = np.triu_indices(6)
+_UPPER = np.zeros((6, 6), np.intp)  # of a symmetric matrix, the place of each element in the upper triangle
+_UPPER[np.triu_indices(6)] = _UPPER.T[np.triu_indices(6)] = np.arange(21)
 _FLOOR = 1e-5  # share of the mean information that is added to all directions, for rounding errors
 _LIKELY = 0.5, 0.02  # noise that `Equations.free` assumes during steps, near the solution and far from it
 _AWAY = 3.0  # chi square above which a motion is far from the solution
@@ -114,9 +116,7 @@ def _scale_of(size: float) -> Doubles:
 
 def _symmetric(upper: Doubles, scale: Doubles) -> Doubles:
     """Return the matrices, (..., 6, 6), whose upper triangles are given, scaled along rows and columns."""
-    matrix = np.zeros((*upper.shape[:-1], 6, 6))
-    matrix[..., *_UPPER] = upper
-    return (matrix + np.triu(matrix, 1).swapaxes(-1, -2)) * np.outer(scale, scale)
+    return np.asarray(upper[..., _UPPER] * np.outer(scale, scale))
 
 
 def complement(free: Doubles) -> Doubles:
@@ -133,6 +133,7 @@ class PairFit:
 
     def __init__(self, first: PoseMap, second: PoseMap, device: Device) -> None:
         self.first, self.second, self.device = first, second, device
+        self._arrays: dict[tuple[int, ...], tuple[Array, Array]] = {}  # poses and sums, by the sums' shape
 
     def equations(self, motion: Motion, unbiased: bool = False, step: int = 1) -> Equations:
         """Return the sums at a motion."""
@@ -146,9 +147,13 @@ class PairFit:
         blocks = -(-rows // side) * -(-columns // side)
         maps = *second.middle, *first.grid, *second.grid, first.least, second.least
         rows_of_poses = [[*motion.turn.ravel(), *motion.shift, *maps] for motion in motions]
-        poses = self.device.from_host("poses", rows_of_poses)
         shape = len(motions), blocks, PARTS[-1 if unbiased else -2]
-        sums = self.device.array("sums", shape, np.float32, zeroed=False)
+        if shape not in self._arrays:
+            poses = self.device.from_host("poses", rows_of_poses)
+            self._arrays[shape] = poses, self.device.array("sums", shape, np.float32, zeroed=False)
+        else:
+            self._arrays[shape][0].write(np.asarray(rows_of_poses, np.float32))
+        poses, sums = self._arrays[shape]
         self.device.kernel("pose", "pose_equations", BESIDE=int(unbiased))(
             len(motions) * blocks,
             count=len(motions),

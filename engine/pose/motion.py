@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from mirrorskin.kernels.array_types import Doubles
 
@@ -31,7 +31,7 @@ class Motion:
 
     def small_step(self, step: Doubles, centre: Doubles) -> Motion:
         """Return this motion followed by a small rotation about a point and a translation, (6,)."""
-        turn = np.asarray(Rotation.from_rotvec(step[:3]).as_matrix())
+        turn: Doubles = cv2.Rodrigues(step[:3])[0]
         moved = self.then(Motion(turn, centre - turn @ centre + step[3:]))
         # Rounding errors would grow from motion to motion, because the transpose is used as the inverse.
         # A Newton step towards the nearest rotation squares them.
