@@ -31,7 +31,7 @@ class Motion:
 
     def small_step(self, step: Doubles, centre: Doubles) -> Motion:
         """Return this motion followed by a small rotation about a point and a translation, (6,)."""
-        turn: Doubles = cv2.Rodrigues(step[:3])[0]
+        turn = np.asarray(cv2.Rodrigues(step[:3])[0], np.float64)
         moved = self.then(Motion(turn, centre - turn @ centre + step[3:]))
         # Rounding errors would grow from motion to motion, because the transpose is used as the inverse.
         # A Newton step towards the nearest rotation squares them.
