@@ -33,7 +33,10 @@ _UNWRAPPED |= {"order": _ORDER, "risk": _RISK}
 _STRIPES = {
     "stripe": Map("number of the stripe, from 0", dtype="int32"),
     "risk": Map("upper bound of the probability that the number is wrong by more than 1"),
+    "border": Map("number of the stripe that begins at the pixel", dtype="int32", undefined=-1),
+    "border_risk": Map("probability that the number is wrong by 1 where there is no border, or the reverse"),
 }
+_UNCLEAR = 0.5  # distance of a bit from the threshold, RMS distances, below which the pixel is on a border
 
 
 class Fringes(Operation):
@@ -258,7 +261,8 @@ def decode_gray(frames: NDArray[Any], threshold: ArrayLike, *, noise: ArrayLike)
     Result
         ``stripe``, int32, from 0. ``risk`` is an upper bound of the probability that the number is wrong by
         more than 1, and 1 where a sample is not a number. On the border of two stripes one bit is uncertain,
-        and the number may be that of the other stripe; `unwrap_gray` tolerates that.
+        and the number may be that of the other stripe: ``border`` is then the larger of the two numbers, and
+        -1 elsewhere. ``border_risk`` is the probability that noise makes or hides a border.
 
     Raises
     ------
@@ -284,28 +288,42 @@ def decode_gray(frames: NDArray[Any], threshold: ArrayLike, *, noise: ArrayLike)
         stripe = 2 * stripe + (bit ^ stripe & 1)
     variance = np.maximum(spread**2, 1e-24)
     contrast = np.sqrt(np.maximum(np.mean(above**2, axis=0) - variance, 0))
-    risk = np.zeros(shape)
+    risk, border_risk = np.zeros(shape), np.zeros(shape)
+    border = np.full(shape, -1, np.int32)
+    false_border = ndtr(-(1 - _UNCLEAR) * contrast / np.sqrt(variance))
     for left, distance in zip(range(len(frames), 0, -1), np.abs(above), strict=True):
         other = stripe ^ (1 << left) - 1  # if this bit is wrong, all later ones are
-        risk += expit(-2 * contrast * distance / variance) * (np.abs(other - stripe) > 1)
-    return Result(stripe=stripe, risk=_probability(risk), declarations=_STRIPES)
+        far, wrong = np.abs(other - stripe) > 1, expit(-2 * contrast * distance / variance)
+        unclear = ~far & (distance < _UNCLEAR * contrast)
+        border = np.where(unclear, np.maximum(stripe, other), border)
+        risk += wrong * far
+        border_risk += (wrong * ~unclear + false_border) * ~far
+    return Result(
+        stripe=stripe,
+        risk=_probability(risk),
+        border=border,
+        border_risk=_probability(border_risk),
+        declarations=_STRIPES,
+    )
 
 
 @checked(width=check_number, start=check_number)
 def unwrap_gray(fringes: Maps, stripes: Maps, *, width: float = np.pi, start: float = 0.0) -> Result:
-    """Unwrap fringes by the numbers of stripes that are narrower than a fringe.
+    """Unwrap fringes by the numbers of stripes that are as wide as a fringe, or narrower.
 
     The order brings the phase nearest to the middle of the stripe. With stripes of half a fringe, a number
-    that is wrong by one at the border of two stripes does not matter.
+    that is wrong by one at the border of two stripes does not matter. With wider ones, the order of a pixel
+    on a border brings the phase nearest to that of the border.
 
     Parameters
     ----------
     fringes : Result, mapping, xarray.Dataset or path
         Maps ``phase`` and ``phase_sigma``, (H, W), radians, such as those of `fit_fringes`.
     stripes : Result, mapping, xarray.Dataset or path
-        Maps ``stripe`` and ``risk``, (H, W), such as those of `decode_gray`.
+        Maps ``stripe`` and ``risk``, (H, W), such as those of `decode_gray`; for stripes wider than half a
+        fringe also its ``border`` and ``border_risk``.
     width : float
-        Radians of phase that a stripe is wide, above 0 and at most pi.
+        Radians of phase that a stripe is wide, above 0 and at most 2 pi.
     start : float
         Radians: the phase where stripe 0 begins.
 
@@ -329,16 +347,28 @@ def unwrap_gray(fringes: Maps, stripes: Maps, *, width: float = np.pi, start: fl
     >>> stripes = {"stripe": true // np.pi, "risk": 0 * true}
     >>> engine.fringes.unwrap_gray(fringes, stripes).phase.round(2).tolist()
     [[0.1, 5.08, 10.06, 15.04, 20.02, 25.0]]
+
+    Stripes as wide as a fringe, with a pixel on a border whose number is wrong:
+
+    >>> true = np.array([[0.1, 6.3, 12.0]])
+    >>> fringes = {"phase": true % (2 * np.pi), "phase_sigma": np.full(true.shape, 0.05)}
+    >>> stripes = {"stripe": [[0, 0, 1]], "risk": 0 * true, "border": [[-1, 1, -1]], "border_risk": 0 * true}
+    >>> engine.fringes.unwrap_gray(fringes, stripes, width=2 * np.pi).phase.round(2).tolist()
+    [[0.1, 6.3, 12.0]]
     """
     wrapped, errors = _phase_of(fringes, "fringes")
     number, wrong = _maps_of(stripes, "stripes", "stripe", "risk")
     if number.shape != wrapped.shape:
         raise InputError(f"stripes have shape {number.shape}, fringes {wrapped.shape}: give maps of one size")
-    if not 0 < width <= np.pi:
-        raise InputError(f"width {width}: stripes of at most half a fringe, pi, are needed")
-    middle = start + (number + 0.5) * width
-    whole = _nearest(wrapped, middle)
-    error = (np.pi - np.abs(whole - middle)) / np.maximum(errors, 1e-12)
+    if not 0 < width <= _TURN * (1 + 1e-9):
+        raise InputError(f"width {width}: stripes of at most a fringe, 2 pi, are needed")
+    guess = start + (number + 0.5) * width
+    if width > np.pi:
+        border, border_risk = _maps_of(stripes, "stripes", "border", "border_risk")
+        guess = np.where(border < 0, guess, start + border * width)
+        wrong = wrong + border_risk
+    whole = _nearest(wrapped, guess)
+    error = (np.pi - np.abs(whole - guess)) / np.maximum(errors, 1e-12)
     return _unwrapped(wrapped, whole, errors, wrong + ndtr(-error))
 
 

@@ -156,6 +156,18 @@ def test_a_gray_code_unwraps_the_whole_field(noise):
     assert (found.risk <= 1e-3).all()
 
 
+@pytest.mark.parametrize("width", [0.75 * TURN, TURN])
+@pytest.mark.parametrize("noise", [0.0, 5.0])
+def test_stripes_up_to_the_width_of_a_fringe_unwrap_the_whole_field(width, noise):
+    true = width * 2**BITS * FIELD
+    fringes = fit_fringes(shown(true, EVEN, noise), EVEN, noise=noise)
+    stripes = decode_gray(coded(noise), fringes.mean, noise=fringes.process["noise"])
+    found = unwrap_gray(fringes, stripes, width=width)
+    right = np.abs(found.phase - true) < np.pi
+    assert right[found.risk <= 1e-3].all()
+    assert (found.risk <= 1e-3).mean() > 0.98
+
+
 def test_the_risk_of_a_gray_code_is_a_little_more_than_how_often_the_number_is_off():
     found = decode_gray(coded(14.0), 100, noise=14)
     risk, off = found.risk, np.abs(found.stripe - np.floor(2**BITS * FIELD)) > 1
@@ -213,7 +225,8 @@ STRIPES = {"stripe": np.ones((1, 1)), "risk": np.ones((1, 1))}
             lambda: unwrap_gray(ONE, {"stripe": FIELD, "risk": FIELD}),
             "stripes have shape (50, 400)",
         ),
-        (lambda: unwrap_gray(ONE, STRIPES, width=TURN), "at most half a fringe"),
+        (lambda: unwrap_gray(ONE, STRIPES, width=1.1 * TURN), "at most a fringe"),
+        (lambda: unwrap_gray(ONE, STRIPES, width=TURN), "stripes has no border and no border_risk"),
     ],
 )
 def test_bad_input_is_one_line(call, line):
