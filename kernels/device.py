@@ -464,7 +464,10 @@ class Device:
                 with waiting:
                     program = self._recall_or_compile(source, ["-cl-std=CL1.2", OPTION, *options])
         except cl.RuntimeError as error:
-            raise DeviceError(_explain_build(path, source, str(error), self.info)) from error
+            cause = embedded.why_no_kernel(_is_pocl(self.context.devices[0]))
+            raise DeviceError(
+                _explain_build(path, source, str(error), self.info) + (f" ({cause})" if cause else "")
+            ) from error
         self.profile.add("compile", path.stem, time.perf_counter() - start)
         return program
 

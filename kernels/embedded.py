@@ -59,6 +59,7 @@ def prepare() -> None:
         if library is None:
             return
         _check_address_space()
+        _check_threads()
         _provide_caches()
         try:
             _processor, _patched = ensure_name(library)
@@ -106,6 +107,9 @@ def verify(device: cl.Device) -> None:
 
 def why_no_device() -> str | None:
     """Return in one line why OpenCL shows no device, or not the one wanted; None where that is unknown."""
+    choice = os.environ.get("POCL_DEVICES")
+    if choice is not None and not _shows_pocl():
+        return f"POCL_DEVICES is {choice!r}, by which PoCL shows no device; unset it"
     vendors = os.environ.get("OCL_ICD_VENDORS")
     place = Path(vendors or "/etc/OpenCL/vendors")
     if vendors and not place.exists():
@@ -117,8 +121,35 @@ def why_no_device() -> str | None:
         try:
             ctypes.CDLL(library)
         except OSError as error:
-            return f"OpenCL's library {library} cannot be loaded: {error}"
+            named = "; OCL_ICD_VENDORS names it" if vendors and library in libraries else ""
+            return f"OpenCL's library {library} cannot be loaded: {error}{named}"
     return None if own is None else _why_no_cache()
+
+
+def why_no_kernel(is_pocl: bool) -> str | None:
+    """Return in one line which environment variable may be the reason that a kernel does not compile."""
+    problem = _why_no_cache() if is_pocl else None
+    names = ("PYOPENCL_BUILD_OPTIONS", *(("POCL_EXTRA_BUILD_FLAGS",) if is_pocl else ()))
+    added = [f"{name} adds {os.environ[name]!r}" for name in names if os.environ.get(name)]
+    return problem or ("; ".join(added) or None)
+
+
+def _shows_pocl() -> bool:
+    """Return whether OpenCL shows a device of PoCL."""
+    try:
+        platforms = [one for one in cl.get_platforms() if "Portable Computing Language" in one.name]
+        return any(platform.get_devices() for platform in platforms)
+    except (cl.LogicError, cl.RuntimeError):
+        return False
+
+
+def _check_threads() -> None:
+    """Raise DeviceError for a number of threads with which PoCL would end the process."""
+    threads = os.environ.get("POCL_MAX_PTHREAD_COUNT", "1")
+    if not threads.isdecimal() or int(threads) < 1:
+        raise DeviceError(
+            f"POCL_MAX_PTHREAD_COUNT is {threads!r}: a whole number above 0 is needed; unset it"
+        )
 
 
 def _named_in(list_: Path) -> str:
@@ -239,6 +270,8 @@ def _explain(status: int, complaints: str) -> str:
         )
     lines.insert(0, f"its process ended with status {status}")
     complaint = next((line for line in lines if line.startswith("error:")), lines[-1])
+    if cause := why_no_kernel(is_pocl=True):
+        return f"PoCL cannot run kernels here: {cause}; unset it"
     return f"PoCL cannot run kernels here ({complaint}); choose another device"
 
 

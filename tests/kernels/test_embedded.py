@@ -249,11 +249,39 @@ def test_hidden_drivers_and_broken_libraries_are_named(tmp_path, monkeypatch):
     (tmp_path / "vendor.icd").write_text(f"{broken}\n")
     for named in (broken, tmp_path / "vendor.icd", tmp_path):
         monkeypatch.setenv("OCL_ICD_VENDORS", str(named))
-        with pytest.raises(UnknownDeviceError, match=f"library {broken} cannot be loaded: .*file too short"):
+        with pytest.raises(UnknownDeviceError, match=f"{broken} cannot be loaded: .*file too short; OCL_ICD"):
             open_device("vendor's")
     monkeypatch.setattr(device_layer, "_find", list)
     with pytest.raises(DeviceError, match=f"no OpenCL device found: OpenCL's library {broken} cannot be"):
         open_device()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        (
+            "POCL_DEVICES",
+            "bogus",
+            "no OpenCL device found: POCL_DEVICES is 'bogus', by which PoCL shows",
+        ),
+        ("POCL_DEVICES", "", "no OpenCL device found: POCL_DEVICES is '', by which PoCL shows"),
+        ("POCL_MAX_PTHREAD_COUNT", "-3", "POCL_MAX_PTHREAD_COUNT is '-3': a whole number above 0 is needed"),
+        ("PYOPENCL_BUILD_OPTIONS", "-bogus", "kernels here: PYOPENCL_BUILD_OPTIONS adds '-bogus'; unset it"),
+    ],
+)
+def test_the_variable_that_hides_the_device_or_breaks_it_is_named(tmp_path, name, value, said):
+    run = "from mirrorskin.kernels.device import open_device; open_device()"
+    environment = {key: text for key, text in os.environ.items() if not key.startswith("POCL_")}
+    ended = subprocess.run(
+        [sys.executable, "-P", "-c", run],
+        env={**environment, "MIRRORSKIN_CACHE": str(tmp_path), name: value},
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+    last = ended.stderr.strip().splitlines()[-1]
+    assert re.search(said, ended.stderr), last
 
 
 def test_a_pocl_that_cannot_run_leaves_the_work_to_a_sound_one(pocl, monkeypatch, caplog):
