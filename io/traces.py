@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -24,6 +25,9 @@ _CLIPPED = 0.1  # share of responding pixels that may reach the end of the scale
 _FLICKER, _DRIFT = 0.01, 2.0  # share of the light; counts of 8 bits
 _HARMONICS = 3  # of the phase, that describe the brightness of a pixel
 _THIN = 4  # times by which an axis is shorter than both others if it is a wrong one
+
+
+Samples = NDArray[np.float32]
 
 
 class FrameSamples:
@@ -99,11 +103,11 @@ class Traces:
         low, high = float(self._lowest.min()), float(self._highest.max())
         facts = {"brightness": f"{low:.4g} to {high:.4g} counts{self._depth(high)}"}
         facts["noise"] = f"about {self.noise:.2g} counts"
-        facts["cut off"] = f"{_percent(self._clipped())} of the pixels reach the end of the scale"
+        facts["cut off"] = f"{_percent(self._clipped)} of the pixels reach the end of the scale"
         facts["respond"] = f"{_percent(self._share)} of the pixels"
-        if (flicker := self._flicker()) is not None:
+        if (flicker := self._flicker) is not None:
             facts["flicker"] = f"{_percent(flicker[0])} of the light"
-        if (drift := self._drift()) is not None:
+        if (drift := self._drift) is not None:
             facts["drift"] = f"{drift[0]:.2g} counts of the dark level"
         return facts
 
@@ -122,17 +126,17 @@ class Traces:
         yield from self._axes(shape)
         if self._share > _FEW:
             yield from self._press() if self._motion == "vertical" else self._turn()
-        if (clipped := self._clipped()) > _CLIPPED:
+        if (clipped := self._clipped) > _CLIPPED:
             yield Finding(
                 "cut off",
                 f"{_percent(clipped)} of the pixels reach the end of the scale: shorten the exposure",
             )
-        if (flicker := self._flicker()) is not None and flicker[0] > max(_FLICKER, 5 * flicker[1]):
+        if (flicker := self._flicker) is not None and flicker[0] > max(_FLICKER, 5 * flicker[1]):
             yield Finding(
                 "flicker",
                 f"the light flickers by {_percent(flicker[0])} from frame to frame: use a steady lamp",
             )
-        if (drift := self._drift()) is not None and drift[0] > max(_DRIFT * self._scale(), 10 * drift[1]):
+        if (drift := self._drift) is not None and drift[0] > max(_DRIFT * self._scale(), 10 * drift[1]):
             yield Finding(
                 "drift",
                 f"the dark level drifts by {drift[0]:.2g} counts: let the camera warm up, and keep stray"
@@ -161,6 +165,7 @@ class Traces:
         bits = next(bits for bits in (8, 10, 12, 14, 16) if self._highest.max() < 2**bits)
         return float(2**bits - 1)
 
+    @functools.cached_property
     def _clipped(self) -> float:
         return float(np.mean(self._highest >= self._end()))
 
@@ -255,17 +260,18 @@ class Traces:
                 f" {_percent(jump)} of their range away: is this a press?",
             )
 
-    def _common(self, counts: NDArray[np.float32]) -> tuple[Floats, Floats, float] | None:
-        """Return by how much each frame differs from usual, its error, and the level; NaN is left out."""
-        counted = np.sum(np.isfinite(counts), axis=1)
+    def _common(self, counts: Samples, used: NDArray[np.bool_]) -> tuple[Floats, Floats, float] | None:
+        """Return by how much used pixels differ from usual in each frame, the error, and their level."""
+        counted = np.count_nonzero(used, axis=1)
         enough = counted >= _FEWEST // 2
-        if np.sum(enough) < 5:
+        if np.count_nonzero(enough) < 5:
             return None
-        levels = np.nanmedian(counts[enough], axis=0)
-        offset = np.nanmedian(counts[enough] - levels, axis=1).astype(np.float64)
-        errors = 1.25 * self.noise / np.sqrt(counted[enough])
-        return offset, errors, float(np.nanmedian(levels))
+        counts, used, counted = counts[enough], used[enough], counted[enough]
+        levels = np.sum(counts, axis=0, where=used) / np.maximum(np.count_nonzero(used, axis=0), 1)
+        offset = np.sum(counts - levels, axis=1, where=used) / counted
+        return offset, self.noise / np.sqrt(counted), float(np.sum(levels * used) / np.sum(counted))
 
+    @functools.cached_property
     def _flicker(self) -> tuple[float, float] | None:
         """Return the standard deviation of the common light, and that of its noise, as shares."""
         if self._fit is not None and len(self._counts) >= 2 * (2 * _HARMONICS + 1):
@@ -281,18 +287,20 @@ class Traces:
         lit = counts - self._lowest[self._responding] > 0.8 * self._range[self._responding]
         lit[2:] &= lit[:-2]  # for two frames
         lit[:2] = False
-        counts = np.where(lit, counts, np.nan)[:, lit.sum(axis=0) >= 5]
-        found = self._common(counts)
+        lit &= np.count_nonzero(lit, axis=0) >= 5
+        found = self._common(counts, lit)
         if found is None or found[2] <= 0:
             return None
         offset, errors, level = found
         return float(np.std(np.diff(offset)) / math.sqrt(2) / level), float(np.mean(errors) / level)
 
+    @functools.cached_property
     def _drift(self) -> tuple[float, float] | None:
         """Return the range of the smoothed level of pixels that do not respond, and its error, counts."""
         if not self._goes_down():
             return None
-        found = self._common(self._counts[:, ~self._responding])
+        counts = self._counts[:, ~self._responding]
+        found = self._common(counts, np.ones(counts.shape, bool))
         if found is None:
             return None
         offset, errors, _ = found

@@ -15,10 +15,14 @@ from mirrorskin.engine.rotation.normals_to_height import Slopes, integrate_norma
 from mirrorskin.engine.rotation.registration import Registered
 from mirrorskin.io import Result
 from mirrorskin.io.findings import Finding, in_process
+from mirrorskin.kernels.least_squares import mad_sigma
 
 _NO_PIXEL_SIZE = "none: the recording has no pixel size"
-_POINTS = 64  # along each side, where slopes are compared
-_FEWEST, _CLEAR = 100, 8.0  # points, and standard errors, that decide
+_PARTS, _POINTS = (
+    8,
+    128,
+)  # of the extent of the normals: distance between slopes, and number of them, along a side
+_FEWEST, _CLEAR, _ALIKE = 100, 6.0, 0.1  # points, standard errors, and correlation that decide
 _REACH = 5  # pixels: size of the neighbourhood whose loss of contact affects a registered sample
 
 
@@ -116,15 +120,27 @@ class PhaseSign(Step):
         """Return the result with a warning in ``process``, if the slopes contradict the phases."""
         if result.normals is None:
             return result
-        normals = np.asarray(result.normals, np.float64)
-        normals = normals if normals.ndim == 3 else normals[0]
-        step = max(1, min(normals.shape[:2]) // _POINTS)
-        x, y, z = np.moveaxis(normals[::step, ::step], -1, 0)
-        with np.errstate(all="ignore"):
-            p, q = -x / z, -y / z
-        both = -np.diff(p, axis=0)[:, :-1] * np.diff(q, axis=1)[:-1]  # y points up
-        both = both[np.isfinite(both)]
-        if len(both) < _FEWEST or np.mean(both) > -_CLEAR * np.std(both) / math.sqrt(len(both)):
+        normals = result.normals if result.normals.ndim == 3 else result.normals[0]
+        known = int(np.count_nonzero(np.isfinite(normals[..., 2])))
+        reach, thin = max(1, math.isqrt(known) // _PARTS), max(1, math.isqrt(known) // _POINTS)
+        here, across, down = (
+            normals[rows, columns][::thin, ::thin].astype(np.float64)
+            for rows, columns in (
+                (slice(None, -reach), slice(None, -reach)),
+                (slice(None, -reach), slice(reach, None)),
+                (slice(reach, None), slice(None, -reach)),
+            )
+        )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            dp_dy = down[..., 0] / down[..., 2] - here[..., 0] / here[..., 2]  # y points up
+            dq_dx = here[..., 1] / here[..., 2] - across[..., 1] / across[..., 2]
+        defined = np.isfinite(dp_dy) & np.isfinite(dq_dx)
+        if np.count_nonzero(defined) < _FEWEST:
+            return result
+        dp_dy, dq_dx = (_clip_outliers(one[defined]) for one in (dp_dy, dq_dx))
+        product = dp_dy * dq_dx
+        sure = -float(np.mean(product)) > _CLEAR * float(np.std(product)) / math.sqrt(len(product))
+        if not sure or -np.sum(product) < _ALIKE * math.sqrt(np.sum(dp_dy**2) * np.sum(dq_dx**2)):
             return result
         found = Finding(
             "mirrored",
@@ -132,6 +148,11 @@ class PhaseSign(Step):
             " the picture?",
         )
         return result.assign(process={**result.process, **in_process([found], result.process)})
+
+
+def _clip_outliers(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    limit = 3 * mad_sigma(values)
+    return np.clip(values, -limit, limit)
 
 
 def _independent_sigma(result: Result, context: Context) -> NDArray[np.float32]:

@@ -166,6 +166,15 @@ def test_the_bits_in_use_are_a_fact(frames, bits):
     assert found(frames).facts["brightness"].endswith(bits)
 
 
+def test_what_was_found_at_an_import_stays_in_the_recording(tmp_path):
+    source = Timed(noisy(pressed()), TRAVEL, np.arange(30) / 30)
+    source.findings = (io.Finding("lossy", "the frames were compressed"), io.Finding("grey", "a note", False))
+    with io.Recorder(source, tmp_path / "rec.h5") as recorder:
+        recorder.drain(lambda done: None)
+    with io.open_recording(tmp_path / "rec.h5") as recording:
+        assert recording.findings == source.findings
+
+
 def test_few_pixels_tell_nothing():
     assert kinds(found(np.zeros((5, 3, 4), np.uint8), travel=TRAVEL[:5])) == []
 
@@ -207,6 +216,12 @@ class Timed:
         self._frames, self._travel, self._time = frames, travel, time
         self.shape, self.dtype = frames.shape, frames.dtype
         self.rewind()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        pass
 
     def rewind(self):
         self._left = True

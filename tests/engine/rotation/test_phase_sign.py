@@ -1,0 +1,34 @@
+"""Phases that run the wrong way round are told by slopes that do not fit together."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from mirrorskin import engine, hw, io
+from mirrorskin.hw.twin import Axial
+from mirrorskin.io.arrays import ArrayRecording
+
+
+def warnings_of(shape, sign):
+    """Return the warnings of a rotation whose phases have a sign."""
+    phase = np.arange(8) * np.pi / 4
+    movement = Axial(phase, np.radians(2.5), 1.0)
+    twin = hw.Twin(object=shape, shape=(160, 160), pixel_size=0.04, movement=movement, pattern="linear")
+    header = twin.header
+    known = {name: getattr(header, name) for name in ("pixel_size", "tilt", "zenith_gain", "zenith_offset")}
+    frames = twin.read(np.empty(twin.shape, twin.dtype)).frames
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", io.MirrorskinWarning)
+        result = engine.reconstruct(ArrayRecording(frames, {"phase": sign * phase}, known))
+    return str(result.process.get("warnings", ""))
+
+
+@pytest.mark.parametrize("shape", ["coin", "cone"])
+def test_a_mirrored_surface_is_told(shape):
+    assert "the slopes fit together better with the phases reversed" in warnings_of(shape, -1)
+
+
+@pytest.mark.parametrize("shape", ["coin", "cone", "sphere", "texture", "plane"])
+def test_a_surface_as_it_is_has_no_warning(shape):
+    assert warnings_of(shape, 1) == ""
