@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io import Result
 from mirrorskin.io.maps import SIGMA, is_builtin, is_deviation, place_of
+from mirrorskin.io.units import numbers_with_unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,13 +67,13 @@ class Summary:
             yield f"{self.what} at {self.answered} of {self.pixels} pixels{turns}{filled}"
             quantity = self.quantity.replace("_", " ")
             quantity = "" if quantity == self.what else f"{quantity} "
-            yield f"{quantity}from {self.lowest:.3f} to {self.highest:.3f} {self.unit}".rstrip()
+            yield f"{quantity}{_from_to(self.lowest, self.highest, self.unit)}"
         else:
             yield f"no {self.what} at any of {self.pixels} pixels{turns}"
         if self.in_contact is not None and self.answered:
             yield f"in contact at {self.in_contact}"
         if self.relief is not None:
-            yield "relative height from {:.3f} to {:.3f} mm".format(*self.relief)
+            yield f"relative height {_from_to(*self.relief, 'mm')}"
         yield from (f"{count} {name}" for name, count in self.counts.items())
         for name, (value, sigma, unit) in self.numbers.items():
             spread = "" if sigma is None else f" ± {sigma:.2g}"
@@ -90,6 +91,11 @@ class Summary:
             facts[name] = value
             facts |= {} if sigma is None else {f"{name}{SIGMA}": sigma}
         return facts
+
+
+def _from_to(lowest: float, highest: float, unit: str) -> str:
+    (low, high), unit = numbers_with_unit((lowest, highest), unit)
+    return f"from {low} to {high} {unit}".rstrip()
 
 
 def summarise(result: Result) -> Summary:

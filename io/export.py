@@ -227,7 +227,7 @@ def _encode_xyz(result: Result) -> _Encoded:
     columns = points_of(result)
     names = [f"{name}[{_POINT_UNITS[name]}]" if name in _POINT_UNITS else name for name in columns]
     head = [*(f"{name}: {note}" for name, note in _notes_of(result).items()), " ".join(names)]
-    formats = ["%d" if values.dtype.kind == "u" else "%.6f" for values in columns.values()]
+    formats = ["%d" if values.dtype.kind == "u" else "%.9g" for values in columns.values()]
     file = BytesIO()
     rows = np.stack([values.astype(np.float64) for values in columns.values()], axis=1)
     np.savetxt(file, rows, formats, header="\n".join(head), encoding="utf-8")

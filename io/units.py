@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import re
+from collections.abc import Sequence
 from typing import Any, Literal
 
 from mirrorskin.io.types import InputError
@@ -48,6 +49,7 @@ _NOUN: dict[Kind, str] = {
     "pressure": "a pressure",
 }
 _ANGLES = ("radian", "degree", "arcminute", "arcsecond", "grade", "turn")
+_MOST_DECIMALS = 9
 _LONGEST = 40  # characters of a unit that are quoted
 _SYMBOL = re.compile(r"[^\W\d]+|°")  # pint evaluates arithmetic, so only single names are passed to it
 
@@ -115,6 +117,29 @@ def ratio(unit: str, other: str) -> float:
     raise InputError(
         f"{unit[:_LONGEST]!r} cannot be converted to {other[:_LONGEST]!r}. Use units of one quantity"
     )
+
+
+def numbers_with_unit(values: Sequence[float], unit: str) -> tuple[list[str], str]:
+    """Return values as texts with as many decimals as distinguish them, at least three, and their unit.
+
+    Lengths in mm below 0.1 mm are in µm, below 0.1 µm in nm.
+
+    Examples
+    --------
+    >>> numbers_with_unit((-1.95, 0.0), "mm")
+    (['-1.950', '0.000'], 'mm')
+    >>> numbers_with_unit((-0.0000014, 0.0000032), "mm")
+    (['-1.400', '3.200'], 'nm')
+    """
+    largest = max((abs(value) for value in values), default=0.0)
+    if unit == "mm" and 0 < largest < 0.1:
+        factor, unit = (1e3, "\u00b5m") if largest >= 1e-4 else (1e6, "nm")
+        values = [factor * value for value in values]
+    extent = max(values, default=0.0) - min(values, default=0.0)
+    digits = 3
+    if 0 < extent < math.inf:
+        digits = min(max(digits, 2 - math.floor(math.log10(extent))), _MOST_DECIMALS)
+    return [f"{value:.{digits}f}" for value in values], unit
 
 
 def _pint_factor(symbol: str, kind: Kind) -> float:

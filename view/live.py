@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.live.status import SHOWN, Status, Update
 from mirrorskin.io import pixel_axes
+from mirrorskin.io.units import numbers_with_unit
 from mirrorskin.view.colours import Colours, grey, height_colours, normal_colours
 from mirrorskin.view.viewer import close_stream, load_rerun, open_stream
 
@@ -86,9 +87,9 @@ class LiveView:
                 f"from frame to map {1e3 * shown.median:.1f} ms, 99 % below {1e3 * shown.p99:.1f} ms"
             )
         if update.height is not None:
-            low, high = self._heights.ends
+            (low, high), unit = numbers_with_unit(self._heights.ends, "mm")
             kind = ", each piece about its mean" if update.offset_unknown else ""
-            lines.append(f"heights from {low:.3f} (violet) to {high:.3f} mm (yellow){kind}")
+            lines.append(f"heights from {low} (violet) to {high} {unit} (yellow){kind}")
         if update.displacement is not None:
             low, high = (1e3 * end for end in self._lengths.ends)
             lines.append(f"displacement from {low:.1f} (violet) to {high:.1f} µm (yellow)")

@@ -11,6 +11,7 @@ import numpy as np
 from mirrorskin.engine.summary import summarise
 from mirrorskin.io import InputError, Mesh, Result, select_turn, surface_mesh
 from mirrorskin.io.mesh import normals_around
+from mirrorskin.io.units import numbers_with_unit
 from mirrorskin.view.colours import FILLED_RGB, Colours, height_colours, span
 from mirrorskin.view.viewer import close_stream, load_rerun, open_stream
 
@@ -80,11 +81,11 @@ def _colours(result: Result, mesh: Mesh) -> Colours:
 def _description(result: Result, name: str) -> Iterator[str]:
     """Yield a description in paragraphs."""
     assert result.height is not None
-    low, high = span(result.height)
+    (low, high), unit = numbers_with_unit(span(result.height), "mm")
     yield f"**{name}**"
     yield str(summarise(result))
     yield "x to the right, y up the picture, z towards the camera; all in millimetres"
-    yield f"heights from {low:.3f} (violet) to {high:.3f} mm (yellow)"
+    yield f"heights from {low} (violet) to {high} {unit} (yellow)"
     if result.filled is not None and result.filled.any():
         yield "orange: not measured but filled"
     if result.offset_unknown is not None and result.offset_unknown.any():

@@ -301,3 +301,20 @@ def test_undistorted_maps_are_not_of_the_truth_s_pixels():
     result = io.Result(height=np.zeros((2, 3), np.float32), process={UNDISTORTED: True})
     with pytest.raises(io.InputError, match="the result is undistorted"):
         engine.score(result, truth_of(np.zeros((2, 3), np.float32)))
+
+
+@pytest.mark.parametrize(
+    ("heights", "said"),
+    [
+        ([-1.95, 0.0], "from -1.950 to 0.000 mm"),
+        ([-0.0019, 0.0123], "from -1.900 to 12.300 \u00b5m"),
+        ([-1.4e-6, 3.2e-6], "from -1.400 to 3.200 nm"),
+        ([-1.9500031, -1.9500012], "from -1.95000315 to -1.95000124 mm"),
+        ([-0.25, -0.25], "from -0.250 to -0.250 mm"),
+    ],
+)
+def test_the_summary_has_units_and_digits_that_show_the_relief(heights, said):
+    text = str(summarise(io.Result(height=np.array([sorted(heights)], np.float32))))
+    assert text == f"height at 2 of 2 pixels, {said}".replace(
+        "-1.95000124 to -1.95000315", "-1.95000315 to -1.95000124"
+    )

@@ -12,6 +12,7 @@ from mirrorskin.io import Result, pixel_axes, select_turn
 from mirrorskin.io.maps import Map
 from mirrorskin.io.result import map_shape
 from mirrorskin.io.types import Floats
+from mirrorskin.io.units import numbers_with_unit
 from mirrorskin.view.canvas import Extent, draw_image, extent
 
 if TYPE_CHECKING:
@@ -75,7 +76,10 @@ class Sheet:
     def height_text(self, height: float) -> str:
         """Return a height, given in mm, as text in the unit of figures."""
         unit, value = self.of_height.figure_unit, self.of_height.figure_scale * height
-        return f"{value:.3f} mm" if unit == "mm" else f"{value:.4g} {unit}"
+        if unit != "mm":
+            return f"{value:.4g} {unit}"
+        (text,), unit = numbers_with_unit([value], unit)
+        return f"{text} {unit}"
 
 
 def sheet_of(result: Result) -> Sheet:
