@@ -6,9 +6,13 @@ import sys
 from numbers import Real
 from typing import Any
 
-from mirrorskin.io import InputError
+import numpy as np
+from numpy.typing import DTypeLike
+
+from mirrorskin.io import InputError, Result
 from mirrorskin.io.arguments import as_array
-from mirrorskin.kernels.array import Array, adopt
+from mirrorskin.io.result import shape_of
+from mirrorskin.kernels.array import Array, Operand, adopt
 from mirrorskin.kernels.device import Choice, Device, are_several, open_device, opened_devices
 
 AnyArray = Any
@@ -59,6 +63,35 @@ def device_of(choice: Choice, *arrays: Any) -> Device:
                 "or pass a NumPy array"
             )
     return device
+
+
+def device_of_maps(choice: Choice, *results: Result) -> Device:
+    """Return the device that is chosen, by default that of the first map of the results that is on one."""
+    maps = (result.on_device(name) for result in results for name in result)
+    there = next((one for one in maps if isinstance(one, Array)), None)
+    return there.device if there is not None and choice is None else open_device(choice)
+
+
+def operand_of(
+    result: Result, quantity: str, dtype: DTypeLike, shape: tuple[int, ...], device: Device
+) -> Operand | None:
+    """Return a map of a result for kernels, or None if there is none; InputError if it has another shape.
+
+    A map that is on the device in this type is used as it is. Any other is converted on the host, where flags
+    (uint8) are 1 for all values but 0.
+    """
+    name = result.name_of(quantity)
+    if name is None:
+        return None
+    own = shape_of(result, name)
+    if own != shape:
+        raise InputError(f"{name} has shape {own}, but the height needs {shape}: give maps of one size")
+    there = result.on_device(name)
+    if isinstance(there, Array) and there.dtype == dtype and there.device.context == device.context:
+        return there
+    values = np.asarray(result[name])
+    flags = values != 0 if dtype == np.uint8 else values
+    return device.share(name, np.ascontiguousarray(flags, dtype))
 
 
 def on_host(value: Any) -> Any:

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any, TypeAlias, Union
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.device_arrays import as_any_array
 from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.io import InputError, Result, open_result, pixel_axes
 from mirrorskin.io.arguments import as_array
 from mirrorskin.io.maps import declaration_of
-from mirrorskin.io.result import FIELDS, map_shape, size_of_maps
+from mirrorskin.io.result import FIELDS, map_shape, shape_of, size_of_maps
 
 if TYPE_CHECKING:
     import xarray
@@ -116,7 +117,7 @@ def _of_mapping(maps: Mapping[Any, Any], name: str) -> Result:
     for one, value in maps.items():
         if one in fields or value is None:
             continue
-        values = value if isinstance(value, str) else as_array(f"{name}[{one!r}]", value)
+        values = value if isinstance(value, str) else as_any_array(f"{name}[{one!r}]", value)
         if isinstance(values, str) or (
             not values.ndim and declaration_of(one, fields.get("declarations")).axes != "none"
         ):
@@ -131,9 +132,10 @@ def _of_one_size(result: Result, name: str) -> Result:
     size = map_shape(result)[-2:]
     if len(size) < 2:
         raise InputError(f"the maps of {name} are not of size (H, W)")
-    for one, values in result.maps().items():
-        own = size_of_maps(result.declaration(one), np.shape(values))[-2:]
-        if own != size:
+    for one in result:
+        declared = result.declaration(one)
+        own = size_of_maps(declared, shape_of(result, one))[-2:]
+        if declared.axes == "pixels" and own != size:
             raise InputError(f"map {one} of {name} has size {own}, others have {size}: give maps of one size")
     for axis, length in zip("yx", size, strict=True):
         places = getattr(result, axis)

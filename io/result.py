@@ -427,9 +427,16 @@ def may_name_a_map(name: str) -> bool:
 
 def map_shape(result: Result) -> tuple[int, ...]:
     """Return the shape of a result's maps: (H, W), or (turns, H, W)."""
-    for name, values in result.maps().items():
-        return size_of_maps(result.declaration(name), values.shape)
+    for name in result:
+        if result.declaration(name).axes == "pixels":
+            return size_of_maps(result.declaration(name), shape_of(result, name))
     return (0, 0)
+
+
+def shape_of(result: Result, name: str) -> tuple[int, ...]:
+    """Return the shape of a map, which is not copied if it is on a device."""
+    there = result.on_device(name)
+    return np.shape(result[name]) if there is None else tuple(there.shape)
 
 
 def size_of_maps(declared: Map, shape: tuple[int, ...]) -> tuple[int, ...]:

@@ -1,6 +1,6 @@
 // Normal equations of a rigid motion between two maps. Specification: pose.py.
 //
-// TILE     pixels of one work-item of pose_gradient; 1 where an item is a lane, many where it is a core's loop
+// TILE     1 where an item is a lane; otherwise it processes a row of LANES pixels at once
 // BESIDE   1 where the Jacobian by the first map's own curvature is wanted too
 
 #include "common.clh"
@@ -14,51 +14,11 @@
 
 #define UNROLL _Pragma("unroll")
 
-#define AROUND 2
-#define LEAST 7
-#define FLAT 1e-3f
 #define BLOCK 8
 #define SUMS (BESIDE ? 67 : 31)
 #define POSE 25
 #define NEAR 1e20f
 #define VAGUE 100.0f
-
-__kernel void pose_gradient(
-    const int rows, const int columns, const float step_x, const float step_y, MAP values, OUT gradient)
-{
-    const int first = (int)get_global_id(0) * TILE;
-    for (int p = first; p < LESSER(first + TILE, rows * columns); ++p) {
-        const int row = p / columns, column = p % columns;
-        const int left = LESSER(AROUND, column), right = LESSER(AROUND, columns - 1 - column);
-        const float here = values[p];
-        float count = 0, x = 0, y = 0, xx = 0, xy = 0, yy = 0, z = 0, xz = 0, yz = 0;
-        for (int below = -LESSER(AROUND, row); below <= LESSER(AROUND, rows - 1 - row); ++below)
-            for (int beside = -left; beside <= right; ++beside) {
-                const float value = values[p + below * columns + beside] - here;
-                const int known = value == value;
-                const float one = known ? 1.0f : 0.0f, rise = known ? value : 0.0f, i = beside * one, j = below * one;
-                count += one;
-                x += i;
-                y += j;
-                xx += i * beside;
-                xy += i * below;
-                yy += j * below;
-                z += rise;
-                xz += rise * beside;
-                yz += rise * below;
-            }
-        const float mean_x = x / count, mean_y = y / count;
-        xx -= x * mean_x;
-        xy -= x * mean_y;
-        yy -= y * mean_y;
-        xz -= z * mean_x;
-        yz -= z * mean_y;
-        const float area = xx * yy - xy * xy;
-        const int good = count >= LEAST && area > FLAT * count * count;
-        gradient[2 * p] = good ? (yy * xz - xy * yz) / area / step_x : NAN;
-        gradient[2 * p + 1] = good ? -(xx * yz - xy * xz) / area / step_y : NAN;
-    }
-}
 
 #define LOAD(map, p) (*(__global const Loose *)((map) + 8 * (p)))
 #define KEEP(values, room) (*(Lanes *)(room) = (values))

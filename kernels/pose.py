@@ -24,12 +24,10 @@ PARTS = (0, 21, 27, 28, 29, 30, 31, 67)
 heights; compared normals; and J'WK, K being the Jacobian by the first map's own normals and curvature, which
 is the only part that a block may lack."""
 FAR = 1e30
-_NEAR = 1e20  # of FAR, the smallest share between pixels is more
-AROUND = 2
+NEAR = 1e20
+"""Variance from which on a height is not compared: of FAR, the smallest share between pixels is more."""
 VAGUE = 100.0
 """Radians^2 from which on a normal is not compared."""
-_LEAST = 7  # pixels that a gradient is taken from
-_FLAT = 1e-3  # of a singular arrangement of them
 
 
 class Shape(NamedTuple):
@@ -41,34 +39,6 @@ class Shape(NamedTuple):
     xx: Doubles
     xy: Doubles
     yy: Doubles
-
-
-def pose_gradient(step_x: float, step_y: float, values: Array, gradient: Array) -> None:
-    """Write the slopes along x and y, (H, W, 2), of the plane that fits what is known of 5 x 5 pixels best.
-
-    NaN where the pixel itself is unknown, or fewer than seven are known, or these lie along a line.
-    """
-    rows, columns = values.shape
-    wide = np.pad(values.astype(np.float64), AROUND, constant_values=np.nan)
-    sums = np.zeros((9, rows, columns))
-    for row in range(-AROUND, AROUND + 1):
-        for column in range(-AROUND, AROUND + 1):
-            top, left = AROUND + row, AROUND + column
-            value = wide[top : top + rows, left : left + columns] - values
-            known = np.isfinite(value)
-            value = np.where(known, value, 0)
-            for number, factor in enumerate((1, column, row, column**2, column * row, row**2)):
-                sums[number] += known * factor
-            for number, factor in enumerate((1, column, row), 6):
-                sums[number] += value * factor
-    count, x, y, xx, xy, yy, z, xz, yz = sums
-    with np.errstate(invalid="ignore", divide="ignore"):
-        xx, xy, yy = xx - x * x / count, xy - x * y / count, yy - y * y / count
-        xz, yz = xz - x * z / count, yz - y * z / count
-        area = xx * yy - xy * xy
-        good = (count >= _LEAST) & (area > _FLAT * count**2)
-        gradient[..., 0] = np.where(good, (yy * xz - xy * yz) / area / step_x, np.nan)
-        gradient[..., 1] = np.where(good, -(xx * yz - xy * xz) / area / step_y, np.nan)
 
 
 def pose_equations(step: int, first: Array, second: Array, poses: Array, sums: Array) -> None:
@@ -120,7 +90,7 @@ def _equations_at(step: int, first: Array, second: Array, pose: Array, sums: Arr
     lift = turn[:, 2] @ n / n[2]
     own_height = lift**2 * mine[:, 4]
     sure = 1 / np.sqrt(own_height + theirs[4])
-    compared = (mine[:, 4] < _NEAR) & (theirs[4] < _NEAR)
+    compared = (mine[:, 4] < NEAR) & (theirs[4] < NEAR)
     sure = np.where(compared, sure, 0)
     residual = np.stack([*_whiten(turned[0] - n[0], turned[1] - n[1], lower), sure * (place[2] - theirs[3])])
     jacobian, beside = (_jacobian(one, arm, lower, sure) for one in (shape, own))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
-from mirrorskin.engine.pose.maps import PoseMap
+from mirrorskin.engine.pose.maps import PoseMap, coarser
 from mirrorskin.engine.pose.motion import STILL, Motion, cross_matrix
 from mirrorskin.io import InputError
 from mirrorskin.kernels.array import Array
@@ -137,15 +137,15 @@ class PairFit:
 
     def equations(self, motion: Motion, unbiased: bool = False, step: int = 1) -> Equations:
         """Return the sums at a motion."""
-        return Equations(self._sums([motion], unbiased, step)[0], self.second.size, unbiased)
+        return Equations(self._sums([motion], unbiased, step)[0], self.second.extent.size, unbiased)
 
     def _sums(self, motions: Sequence[Motion], unbiased: bool = False, step: int = 1) -> NDArray[np.float32]:
         """Return the sums of each block at each motion, (n, blocks, numbers); J'WK only if ``unbiased``."""
         first, second = self.first, self.second
-        rows, columns = first.records.shape[:2]
+        rows, columns = first.shape
         side = BLOCK * step
         blocks = -(-rows // side) * -(-columns // side)
-        maps = *second.middle, *first.grid, *second.grid, first.least, second.least
+        maps = *second.extent.middle, *first.grid, *second.grid, first.least, second.least
         rows_of_poses = [[*motion.turn.ravel(), *motion.shift, *maps] for motion in motions]
         shape = len(motions), blocks, PARTS[-1 if unbiased else -2]
         if shape not in self._arrays:
@@ -159,11 +159,11 @@ class PairFit:
             count=len(motions),
             rows=rows,
             columns=columns,
-            other_rows=second.records.shape[0],
-            other_columns=second.records.shape[1],
+            other_rows=second.shape[0],
+            other_columns=second.shape[1],
             step=step,
-            first=first.array,
-            second=second.array,
+            first=first.records,
+            second=second.records,
             poses=poses,
             sums=sums,
             moved=32 * rows * columns // step**2 * len(motions),
@@ -195,9 +195,8 @@ class PairFit:
     def _levels(self) -> list[PairFit]:
         """Return the maps from fine to coarse."""
         levels = [self]
-        while min(levels[-1].first.records.shape[:2]) >= 2 * _COARSEST:
-            first, second = (map_.halved(self.device) for map_ in (levels[-1].first, levels[-1].second))
-            if min(len(first.points), len(second.points)) < FEWEST_SHARED:
+        for first, second in coarser([self.first, self.second], _COARSEST):
+            if min(first.extent.pixels, second.extent.pixels) < FEWEST_SHARED:
                 break
             levels.append(PairFit(first, second, self.device))
         return levels
@@ -215,11 +214,11 @@ class PairFit:
     def search(self) -> Motion | None:
         """Return the best motion from a grid of rotations about z and shifts."""
         candidates: list[tuple[float, Motion]] = []
-        scale = _scale_of(self.second.size)
+        scale = _scale_of(self.second.extent.size)
         for starts in self._starts():
             sums = self._sums(starts).sum(axis=1, dtype=np.float64)
             upper, right, chi, compared, heights, normals = _split(sums)
-            overlap = np.maximum(heights, normals)[:, 0] > _SHARED * len(self.first.points)
+            overlap = np.maximum(heights, normals)[:, 0] > _SHARED * self.first.extent.pixels
             matrix, slope = _symmetric(upper[overlap], scale), right[overlap] * scale
             matrix += _FLOOR * np.trace(matrix, axis1=1, axis2=2)[:, np.newaxis, np.newaxis] / 6 * np.eye(6)
             gain = np.vecdot(slope, np.linalg.solve(matrix, slope[..., np.newaxis])[..., 0])
@@ -231,7 +230,7 @@ class PairFit:
             motion = self.refine(start)
             if motion is not None:
                 now = self.equations(motion)
-                if now.pixels > _SHARED * len(self.first.points) and now.typical < least:
+                if now.pixels > _SHARED * self.first.extent.pixels and now.typical < least:
                     best, least = motion, now.typical
         return best
 
@@ -240,7 +239,7 @@ class PairFit:
         extent, shifts = np.ptp(self.first.points, axis=0), np.linspace(-_REACH, _REACH, _SHIFTS)
         for angle in np.linspace(0, 2 * math.pi, _ANGLES, endpoint=False):
             turn = Rotation.from_rotvec([0, 0, angle]).as_matrix()
-            middle = self.first.middle - turn @ self.first.middle
+            middle = self.first.extent.middle - turn @ self.first.extent.middle
             yield [
                 Motion(turn, middle + np.array([along, up, 0]) * extent) for along in shifts for up in shifts
             ]
@@ -264,13 +263,13 @@ class PairFit:
         matrix = directions.T @ now.normal_matrix @ directions
         matrix += _FLOOR / 10 * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
         step = -directions @ np.linalg.solve(matrix, directions.T @ now.right)
-        step /= max(float(np.linalg.norm(step)) / (_LONGEST * self.second.size), 1.0)
+        step /= max(float(np.linalg.norm(step)) / (_LONGEST * self.second.extent.size), 1.0)
         sigmas = math.sqrt(step @ now.normal_matrix @ step / max(now.chi_square, 1.0))
-        return motion.small_step(step * _scale_of(self.second.size), self.second.middle), sigmas
+        return motion.small_step(step * _scale_of(self.second.extent.size), self.second.extent.middle), sigmas
 
     def at_origin(self) -> Doubles:
         """Return the matrix, (6, 6), that converts steps of these equations to motions about the origin."""
         moved = np.eye(6)
-        moved[3:, :3] = cross_matrix(self.second.middle)
-        moved[:, :3] /= self.second.size
+        moved[3:, :3] = cross_matrix(self.second.extent.middle)
+        moved[:, :3] /= self.second.extent.size
         return moved

@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from mirrorskin.engine.device_arrays import device_of_maps
 from mirrorskin.engine.inputs import Maps, as_result
 from mirrorskin.engine.pose.fit import Equations, PairFit
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import Motion
 from mirrorskin.io.arguments import as_array_or_number, checked
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.device import Device, open_device
+from mirrorskin.kernels.device import Device
 
 _SHARE = 1e-3  # component of an undetermined direction above which the parameter is undetermined
 _ALIKE = 0.01  # directions that differ by less are equal
@@ -84,9 +85,14 @@ class Pose:
         """Return another motion with its errors, and orthonormal undetermined directions."""
         directions, sizes, _ = np.linalg.svd(free.T, full_matrices=False)
         vector = np.asarray(Rotation.from_matrix(motion.turn).as_rotvec(), np.float64)
-        kept = directions[:, sizes > _ALIKE].T
+        kept = directions[:, sizes > _ALIKE]
+        others = np.eye(6) - kept @ kept.T
         return replace(
-            self, rotation=vector, translation=motion.shift, covariance=covariance, undetermined=kept
+            self,
+            rotation=vector,
+            translation=motion.shift,
+            covariance=others @ covariance @ others,
+            undetermined=kept.T,
         )
 
 
@@ -122,7 +128,7 @@ def estimate_pose(
     ----------
     first, second : Result, mapping, xarray.Dataset or path
         ``height``, (H, W), mm, with ``height_sigma``, or ``normals``, (H, W, 3), with ``normals_sigma``, or
-        both. The sizes may differ.
+        both. The sizes may differ. Maps that are on a device are used there.
     pixel_size : float or (float, float), optional
         Millimetres along x and y; by default that of the results.
     start : Pose, optional
@@ -155,8 +161,8 @@ def estimate_pose(
     >>> len(pose.undetermined)
     3
     """
-    opened = open_device(device)
     results = as_result(first, "first"), as_result(second, "second")
+    opened = device_of_maps(device, *results)
     before, after = (PoseMap.of(result, pixel_size, opened) for result in results)
     fit = PairFit(before, after, opened)
     return pose_of(fit, *fit.solve(None if start is None else start.motion))

@@ -170,7 +170,7 @@ class _Graph:
             self.links[first, second] = pose
 
     def _smaller(self, *numbers: int) -> int:
-        return min(len(self._maps[number].points) for number in numbers)
+        return min(self._maps[number].extent.pixels for number in numbers)
 
     def _is_link(self, pose: Pose, first: int, second: int) -> bool:
         return pose.chi_square < _ALIKE and pose.pixels >= _SHARED * self._smaller(first, second)

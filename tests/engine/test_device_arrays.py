@@ -218,6 +218,55 @@ def test_frames_of_a_texture_on_a_card_are_not_copied_and_displacements_only_whe
     np.testing.assert_array_equal(found.displacement, expected.displacement)
 
 
+def surfaces(shape):
+    """Return maps of a wavy surface, and of the same one when it has moved."""
+    y, x = np.indices(shape) * 0.05
+    for shift in (0.0, 0.02):
+        z = 0.3 * np.sin(2 * (x - shift)) * np.cos(1.3 * y)
+        across, up = (np.gradient(z, 0.05, axis=axis) for axis in (1, 0))
+        normals = np.dstack([-across, up, np.ones(shape)])
+        normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+        sigma = np.full(shape, 0.01)
+        maps = {"height": z, "height_sigma": 0.1 * sigma, "normals": normals, "normals_sigma": sigma}
+        maps = {name: values.astype(np.float32) for name, values in maps.items()}
+        yield maps | {"contact": (RANDOM.random(shape) < 0.999).astype(np.uint8)}
+
+
+@pytest.mark.parametrize("put", [ours, of_pyopencl])
+@pytest.mark.parametrize(
+    "names", [{"height", "height_sigma"}, {"normals", "normals_sigma"}, {"contact"}, None]
+)
+def test_maps_on_the_device_give_the_same_motion(device, put, names):
+    pair = [*surfaces(SHAPE)]
+    expected = engine.pose.estimate_pose(*pair, 0.05, device=device)
+    placed = [
+        {
+            name: put(device, values) if names is None or name in names else values
+            for name, values in maps.items()
+        }
+        for maps in pair
+    ]
+    found = engine.pose.estimate_pose(*placed, 0.05)
+    np.testing.assert_array_equal(found.translation, expected.translation)
+    np.testing.assert_array_equal(found.covariance, expected.covariance)
+
+
+def test_maps_of_other_types_on_the_device_give_the_same_motion(device):
+    pair = [{name: values.astype(np.float64) for name, values in maps.items()} for maps in surfaces(SHAPE)]
+    expected = engine.pose.estimate_pose(*pair, 0.05, device=device)
+    placed = [{name: ours(device, values) for name, values in maps.items()} for maps in pair]
+    found = engine.pose.estimate_pose(*placed, 0.05)
+    np.testing.assert_array_equal(found.translation, expected.translation)
+
+
+def test_maps_on_a_card_are_not_copied_for_a_motion(card):
+    shape = SHAPE[0] * LARGER[0], SHAPE[1] * LARGER[1]
+    placed = [{name: ours(card, values) for name, values in maps.items()} for maps in surfaces(shape)]
+    up, _, found = copies(card, lambda: engine.pose.estimate_pose(*placed, 0.05))
+    assert up < TABLES
+    np.testing.assert_allclose(found.translation, [0.02, 0, 0], atol=1e-3)
+
+
 def test_a_result_keeps_maps_on_the_device_when_others_are_assigned(device):
     fit = engine.correlate(ours(device, TURNS), PHASE)
     changed = fit.assign(mean=None, sine=np.zeros(SHAPE))

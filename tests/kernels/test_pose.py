@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mirrorskin.kernels.pose import BLOCK, PARTS, pose_equations, pose_gradient
+from mirrorskin.kernels.pose import BLOCK, PARTS, pose_equations
+from mirrorskin.kernels.pose_maps import pose_gradient
 
 PIXEL = 0.05, 0.06
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from speckle import Speckle
 
 from mirrorskin.cli.bench.limits import CHAINS, CORES, LANES
-from mirrorskin.kernels import correlation, displacement, focus, lambert, pose, registration
+from mirrorskin.kernels import correlation, displacement, focus, lambert, pose, pose_maps, registration
 from mirrorskin.kernels.breaks import DOWN, RIGHT
 from mirrorskin.kernels.device import C_TYPES
 from mirrorskin.kernels.skin import FLAKES
@@ -575,7 +575,57 @@ def _(size, least, beside):
 @case("pose_gradient", {"shape": ((1, 1), (3, 50), (40, 37))}, atol=1e-4)
 def _(shape):
     maps = {"values": waves(shape, 0.2)[..., 3], "gradient": np.zeros((*shape, 2)), "shape": shape}
-    return maps | {"step_x": 0.05, "step_y": 0.06, "macros": {"BESIDE": 0}}
+    return maps | {"step_x": 0.05, "step_y": 0.06}
+
+
+MAPS = {"shape": ((1, 1), (3, 50), (40, 37))}
+NONE_BUT_HEIGHTS = dict.fromkeys(
+    ("height_sigma", "component", "offset_unknown", "normals", "normals_sigma", "filled", "contact", "edges")
+)
+
+
+@case("pose_records", MAPS | {"maps": ("heights", "normals", "all")})
+def _(shape, maps):
+    rng, records = np.random.default_rng(3), waves(shape, 0.2)
+    x, y = records[..., 0], records[..., 1]
+    given = NONE_BUT_HEIGHTS | {"height": records[..., 3], "gradient": None, "shape": shape}
+    given |= named("records slopes", np.zeros((*shape, 8)), np.zeros((2, *shape)))
+    if maps == "heights":
+        return given | {"gradient": np.stack([-x, -y], axis=-1), "height_sigma": np.sqrt(records[..., 4])}
+    given |= {"normals": np.dstack([x, y, np.sqrt(1 - x * x - y * y)])}
+    given |= {"normals_sigma": np.where(rng.random(shape) < 0.1, 0.0, 0.01)}
+    if maps == "normals":
+        return given
+    flags = ((rng.random(shape) < share).astype(np.uint8) for share in (0.1, 0.98, 0.02))
+    given |= named("filled contact edges", *flags)
+    apart = {"component": rng.integers(-1, 3, shape, dtype=np.int32)}
+    return given | apart | {"height_sigma": x**2, "offset_unknown": np.array([0, 1, 0], np.uint8)}
+
+
+@case("pose_curvature", MAPS, checks={"records": near(1e-4, 1e-4)})
+def _(shape):
+    records = waves(shape, 0.2)
+    slopes = -np.moveaxis(records[..., :2], -1, 0)
+    return named("slopes records step_x step_y shape", slopes, records, 0.05, 0.06, shape)
+
+
+@case("pose_halve", MAPS | {"odd": (0, 1)}, checks={"records": near(1e-5, 1e-7)})
+def _(shape, odd):
+    fine = waves((2 * shape[0] + odd, 2 * shape[1] + odd), 0.2)
+    return {"fine": fine, "wide": fine.shape[1], "records": np.zeros((*shape, 8)), "shape": shape}
+
+
+@case(
+    "pose_summary",
+    MAPS | {"known": (True, False)},
+    per=lambda device, values: len(values["summary"]),
+    checks={"summary": near(1e-5, 1e-5)},
+)
+def _(shape, known):
+    records = waves(shape, 0.2) if known else np.full((*shape, 8), np.nan)
+    strips = shape[0] * math.ceil(shape[1] / pose_maps.STRIP)
+    grid = named("x0 y0 step_x step_y", 100.0, -50.0, 0.05, 0.06)
+    return {"records": records, "summary": np.zeros((strips, pose_maps.SUMMARY)), "shape": shape, **grid}
 
 
 # --- Registration

@@ -153,6 +153,11 @@ def others(shape: Shape, device: Device) -> Iterator[tuple[str, Call]]:
     )
     first, second = (surface((240, 320), 0.05 * n, 0.03 * n, 0.02 * n, n) for n in (0, 1))
     yield "estimate_pose, 240 x 320", lambda: engine.pose.estimate_pose(first, second, device=device)
+    there = [
+        one.assign({name: placed(values, device) for name, values in one.maps().items()})
+        for one in (first, second)
+    ]
+    yield "estimate_pose, 240 x 320 on the device", lambda: engine.pose.estimate_pose(*there)
     yield "live press, one frame of VGA", live_press(device)
     yield "live rotation, one frame of VGA", live_rotation(device)
     steps = cycle(drifting_slopes(VGA, 16, 0.01))

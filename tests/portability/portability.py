@@ -46,7 +46,7 @@ UNOPTIMISED = {"OCLGRIND_BUILD_OPTIONS": "-cl-opt-disable -Dalways_inline=noinli
 # Tests on few pixels that still reach all kernels and types.
 SMALL = (
     "odd_sizes or references_of_each_pixel or used_again or is_light or (read_all and 127)"
-    " or (triad_all and 127) or displacement_ or pose_equations or pose_gradient"
+    " or (triad_all and 127) or displacement_ or pose_equations or pose_gradient or pose_records"
 )
 
 

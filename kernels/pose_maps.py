@@ -1,0 +1,143 @@
+"""Records of a map for the fit of a motion: what ``pose_maps.cl`` computes, in NumPy with float64.
+
+Records are those of `mirrorskin.kernels.pose`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.kernels.pose import FAR, NEAR, VAGUE
+
+Array = NDArray[Any]
+
+STEEPEST = 0.17
+"""Cosine of the largest zenith at which slopes are used."""
+NOT_COMPARED = 1e6
+"""Mean square error of normals that are not compared, radians^2."""
+SUMMARY, STRIP = 6, 16
+"""Numbers of a strip in `pose_summary`, and its pixels."""
+AROUND = 2  # pixels around edges and the border of contact that are not used; reach of a gradient
+_LEAST = 7  # pixels that a gradient is taken from
+_FLAT = 1e-3  # of a singular arrangement of them
+
+
+def pose_gradient(step_x: float, step_y: float, values: Array, gradient: Array) -> None:
+    """Write the slopes along x and y, (H, W, 2), of the plane that fits what is known of 5 x 5 pixels best.
+
+    NaN where the pixel itself is unknown, or fewer than seven are known, or these lie along a line.
+    """
+    rows, columns = values.shape
+    wide = np.pad(values.astype(np.float64), AROUND, constant_values=np.nan)
+    sums = np.zeros((9, rows, columns))
+    for row in range(-AROUND, AROUND + 1):
+        for column in range(-AROUND, AROUND + 1):
+            top, left = AROUND + row, AROUND + column
+            value = wide[top : top + rows, left : left + columns] - values
+            known = np.isfinite(value)
+            value = np.where(known, value, 0)
+            for number, factor in enumerate((1, column, row, column**2, column * row, row**2)):
+                sums[number] += known * factor
+            for number, factor in enumerate((1, column, row), 6):
+                sums[number] += value * factor
+    count, x, y, xx, xy, yy, z, xz, yz = sums
+    with np.errstate(invalid="ignore", divide="ignore"):
+        xx, xy, yy = xx - x * x / count, xy - x * y / count, yy - y * y / count
+        xz, yz = xz - x * z / count, yz - y * z / count
+        area = xx * yy - xy * xy
+        good = (count >= _LEAST) & (area > _FLAT * count**2)
+        gradient[..., 0] = np.where(good, (yy * xz - xy * yz) / area / step_x, np.nan)
+        gradient[..., 1] = np.where(good, -(xx * yz - xy * xz) / area / step_y, np.nan)
+
+
+def pose_records(
+    height: Array,
+    height_sigma: Array | None,
+    component: Array | None,
+    offset_unknown: Array | None,
+    normals: Array | None,
+    gradient: Array | None,
+    normals_sigma: Array | None,
+    filled: Array | None,
+    contact: Array | None,
+    edges: Array | None,
+    records: Array,
+    slopes: Array,
+) -> None:
+    """Write the records of a map without second derivatives, (H, W, 8), and its slopes, (2, H, W).
+
+    Records and slopes of a pixel that is not used are NaN. All maps but the height may be missing (None).
+    Normals are those of the ``gradient``, (H, W, 2), if there are none. Heights of components whose offset is
+    unknown are not compared. A pixel is not used if it is filled, steep, or at most two pixels away from an
+    edge or a pixel without contact.
+    """
+    if normals is None:
+        assert gradient is not None
+        normals = np.dstack([-gradient, np.ones(height.shape)])
+        normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+    square, variance = np.full(height.shape, NOT_COMPARED), np.full(height.shape, FAR)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        if normals_sigma is not None:
+            square = np.where(normals_sigma > 0, normals_sigma, np.nan) ** 2
+        if height_sigma is not None:
+            variance = np.where(height_sigma**2 > 0, height_sigma**2, FAR)
+        if component is not None and offset_unknown is not None:
+            variance = np.where(np.append(offset_unknown, 1).astype(bool)[component], FAR, variance)
+        used = np.isfinite(height) & (normals[..., 2] > STEEPEST) & np.isfinite(square)
+        if filled is not None:
+            used &= filled == 0
+        for border in (None if edges is None else edges != 0, None if contact is None else contact == 0):
+            if border is not None:
+                used &= ~_near(border)
+        slopes[...] = np.where(used, -np.moveaxis(normals[..., :2], -1, 0) / normals[..., 2], np.nan)
+    records[...] = 0
+    records[..., :2], records[..., 2], records[..., 3] = normals[..., :2], square, height
+    records[..., 4] = variance
+    records[~used] = np.nan
+
+
+def pose_curvature(step_x: float, step_y: float, slopes: Array, records: Array) -> None:
+    """Write the second derivatives xx, xy and yy of the height, from slopes; NaN records where unknown."""
+    across, up = np.zeros((2, *slopes.shape[1:], 2))
+    pose_gradient(step_x, step_y, slopes[0], across)
+    pose_gradient(step_x, step_y, slopes[1], up)
+    second = across[..., 0], (across[..., 1] + up[..., 0]) / 2, up[..., 1]
+    records[..., 5:] = np.stack(second, axis=-1)
+    records[~np.isfinite(across[..., 0])] = np.nan
+
+
+def pose_halve(fine: Array, records: Array) -> None:
+    """Write records at half the resolution: means of 2 x 2 pixels, if all four are known."""
+    rows, columns = records.shape[:2]
+    records[...] = fine[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2, 8).mean(axis=(1, 3))
+    records[..., [2, 4]] /= 4
+
+
+def pose_summary(x0: float, y0: float, step_x: float, step_y: float, records: Array, summary: Array) -> None:
+    """Write what each strip of 16 pixels of a row contains, (strips, 6), row after row.
+
+    The number of known pixels, and of those with a height or a normal to compare; the sums of x, y and z; and
+    the sum of squared distances from the strip's mean, mm^2. ``x0`` and ``y0`` are those of the first pixel.
+    """
+    rows, columns = records.shape[:2]
+    row, column = np.indices((rows, columns))
+    places = np.stack([x0 + column * step_x, y0 - row * step_y, records[..., 3]], axis=-1)
+    known = np.isfinite(records[..., 0])
+    compared = known & ((records[..., 2] < VAGUE) | (records[..., 4] < NEAR))
+    strip = row * -(-columns // STRIP) + column // STRIP
+    for number, out in enumerate(summary):
+        here = (strip == number) & known
+        points = places[here]
+        spread = np.sum((points - points.mean(axis=0)) ** 2) if len(points) else 0.0
+        out[:] = len(points), np.count_nonzero(compared[here]), *points.sum(axis=0), spread
+
+
+def _near(border: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the pixels within two pixels of a border."""
+    wide = np.pad(border, AROUND)
+    rows, columns = border.shape
+    shifts = np.ndindex(2 * AROUND + 1, 2 * AROUND + 1)
+    return np.asarray(np.any([wide[i : i + rows, k : k + columns] for i, k in shifts], axis=0))
