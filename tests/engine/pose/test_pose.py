@@ -114,6 +114,23 @@ def test_integrated_heights_leave_z_open() -> None:
     np.testing.assert_allclose(np.abs(free), [0, 0, 0, 0, 0, 1], atol=1e-6)
 
 
+def test_the_covariance_is_0_along_undetermined_directions_wherever_the_object_is() -> None:
+    rng = np.random.default_rng(4)
+    part = slice(0, 25), slice(30, None)  # whose middle is not the origin
+    pair = []
+    for way in ((), draw(rng)):
+        made = sampled(bumpy, *way, rng=rng)
+        apart = {"component": np.zeros(made.height.shape, np.int32), "offset_unknown": np.ones(1, np.uint8)}
+        maps = {name: np.full_like(values, np.nan) for name, values in made.maps().items()}
+        for name, values in maps.items():
+            values[part] = made[name][part]
+        pair.append(made.assign(maps | apart))
+    pose = engine.pose.estimate_pose(*pair)
+    assert len(pose.undetermined) == 1
+    along = pose.undetermined @ pose.covariance
+    assert np.abs(along).max() < 1e-9 * np.abs(pose.covariance).max()
+
+
 def test_pixels_near_the_border_of_contact_do_not_count() -> None:
     rng = np.random.default_rng(5)
     vector, shift = draw(rng)
