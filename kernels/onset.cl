@@ -70,11 +70,13 @@ __kernel void onset_levels(
     const int bright_step, MAP darks, const int dark_step, OUT levels, __global FRAME *restrict marks)
 {
     const int base = get_global_id(0) * TILE, width = min(TILE, pixels - base);
+    const int different = bright_step | dark_step ? width : 1;  // pixels; the others are like the first
+    if (width <= 0) return;
     // Compilers make no vector code of unknown steps, nor (Intel's) of writes to two planes of one array.
     float high[TILE], low[TILE];
-    for (int p = 0; p < width; ++p) high[p] = brights[bright_step ? base + p : 0];
-    for (int p = 0; p < width; ++p) low[p] = darks[dark_step ? base + p : 0];
-    for (int p = 0; p < width; ++p) {
+    for (int p = 0; p < different; ++p) high[p] = brights[bright_step ? base + p : 0];
+    for (int p = 0; p < different; ++p) low[p] = darks[dark_step ? base + p : 0];
+    for (int p = 0; p < different; ++p) {
         const float bright = high[p], dark = low[p], range = bright - dark;
         const int usable = (range > 0) & (range - range == 0);  // the last: finite
         const float between = level_between(dark, bright, share, share_rest), level = usable ? between : NAN;
@@ -91,7 +93,12 @@ __kernel void onset_levels(
         low[p] = release ? top - bright : dark;
 #endif
     }
-    for (int p = 0; p < width; ++p) levels[stride + base + p] = low[p];
+    const FRAME mark = marks[base];
+    const float level = levels[base], dark = low[0];
+    for (int p = different; p < width; ++p) marks[base + p] = mark;
+    for (int p = different; p < width; ++p) levels[base + p] = level;
+    for (int p = 0; p < different; ++p) levels[stride + base + p] = low[p];
+    for (int p = different; p < width; ++p) levels[stride + base + p] = dark;
 }
 
 // Finds what is surely dark: samples that miss the level by `tolerance` counts; and what is near the level: all that
