@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.device_arrays import device_of_maps
 from mirrorskin.engine.fusion_solver import AbsoluteHeights, FusionSolver
 from mirrorskin.engine.inputs import Maps, as_result, pixel_size_of
 from mirrorskin.engine.method import Context, Method, undistorted
@@ -26,7 +27,7 @@ from mirrorskin.io.arguments import as_array_or_number, check_count, check_flag,
 from mirrorskin.io.findings import in_process, warn
 from mirrorskin.io.result import absolute_heights
 from mirrorskin.io.types import ProcessValue
-from mirrorskin.kernels.device import Choice, Device, open_device, open_devices
+from mirrorskin.kernels.device import Choice, Device, open_devices
 
 Mask = NDArray[np.bool_]
 
@@ -62,7 +63,8 @@ def fuse(
     Parameters
     ----------
     heights : Result, mapping, xarray.Dataset or path
-        With ``height`` and ``height_sigma``, (H, W), mm; NaN where unknown. A map that is declared with the
+        With ``height`` and ``height_sigma``, (H, W), mm; NaN where unknown. Maps that are on a device are
+        copied to the host once, and the surface is computed on that device. A map that is declared with the
         quantity "height" serves as well. Heights of components whose offset is unknown are not used.
     normals : Result, mapping, xarray.Dataset or path
         With ``normals``, (H, W, 3), and ``normals_sigma``, (H, W), radians; NaN where unknown. If there is
@@ -117,7 +119,7 @@ def fuse(
     assert height is not None
     known = AbsoluteHeights.of(height, height_maps.height_sigma, wanted)
     size = pixel_size_of(height_maps, "heights", pixel_size)
-    solver = FusionSolver(known, size, robust, open_device(device))
+    solver = FusionSolver(known, size, robust, device_of_maps(device, height_maps, normal_maps))
     surface = solver.filled(solver.surface(slopes))
     x, y = pixel_axes(wanted.shape, size)
     if height_maps.x is not None and height_maps.y is not None:

@@ -267,6 +267,21 @@ def test_maps_on_a_card_are_not_copied_for_a_motion(card):
     np.testing.assert_allclose(found.translation, [0.02, 0, 0], atol=1e-3)
 
 
+def test_a_surface_is_fused_on_the_device_of_its_maps_which_are_copied_once(card):
+    maps = next(surfaces(SHAPE))
+    heights, normals = (
+        {name: values for name, values in maps.items() if name.startswith(kind)}
+        for kind in ("height", "normal")
+    )
+    up, down, expected = copies(card, lambda: engine.fuse(heights, normals, 0.05, device=card))
+    placed = [{name: ours(card, values) for name, values in kind.items()} for kind in (heights, normals)]
+    same_up, more_down, found = copies(card, lambda: engine.fuse(*placed, 0.05))
+    assert same_up == up
+    nbytes = sum(values.nbytes for kind in (heights, normals) for values in kind.values())
+    assert more_down - down == pytest.approx(nbytes / 288_000)
+    np.testing.assert_array_equal(found.height, expected.height)
+
+
 def test_a_result_keeps_maps_on_the_device_when_others_are_assigned(device):
     fit = engine.correlate(ours(device, TURNS), PHASE)
     changed = fit.assign(mean=None, sine=np.zeros(SHAPE))

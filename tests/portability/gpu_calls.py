@@ -136,6 +136,10 @@ def others(shape: Shape, device: Device) -> Iterator[tuple[str, Call]]:
     onset = engine.find_onset(tiled(half, 64, fill_press), travel_of(64), **levels)
     normals = engine.estimate_normals(tiled(half, 16, fill_turns), phases(16), device=device, **TURN)
     yield "fuse, 512 x 512", partial(engine.fuse, onset, normals, PIXEL, device=device)
+    there = [
+        {name: placed(values, device) for name, values in one.maps().items()} for one in (onset, normals)
+    ]
+    yield "fuse, 512 x 512, maps on the device", lambda: engine.fuse(*there, PIXEL)
     heap = SCENES["leaves"]((256, 256))
     steep: dict[str, Any] = {"normals": heap.normals, "mask": heap.mask, "pixel_size": heap.pixel_size}
     robustly = partial(engine.integrate, **steep, robust=True, device=device)
