@@ -459,10 +459,8 @@ class Device:
             ) from error
         start = time.perf_counter()
         try:
-            with warnings.catch_warnings():  # of a log that is not empty: some compilers always write one
-                warnings.simplefilter("ignore", cl.CompilerWarning)
-                with waiting:
-                    program = self._recall_or_compile(source, ["-cl-std=CL1.2", OPTION, *options])
+            with _without_build_logs, waiting:
+                program = self._recall_or_compile(source, ["-cl-std=CL1.2", OPTION, *options])
         except cl.RuntimeError as error:
             cause = embedded.why_no_kernel(_is_pocl(self.context.devices[0]))
             raise DeviceError(
@@ -513,6 +511,34 @@ class Device:
     def _load(self, binary: bytes, options: list[str]) -> cl.Program:
         loaded: cl.Program = cl.Program(self.context, self.context.devices, [binary]).build(options)
         return loaded
+
+
+class _WithoutBuildLogs:
+    """The context in which pyopencl does not warn of build logs: some compilers always write one.
+
+    The filters of warnings belong to the process. `warnings.catch_warnings` in two threads at once may leave
+    those of the other one behind; here the first thread sets them, and the last one restores them.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._threads = threading.Lock(), 0
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._threads == 0:
+                self._filters = warnings.catch_warnings()
+                self._filters.__enter__()
+                warnings.simplefilter("ignore", cl.CompilerWarning)
+            self._threads += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._threads -= 1
+            if self._threads == 0:
+                self._filters.__exit__(None, None, None)
+
+
+_without_build_logs = _WithoutBuildLogs()
 
 
 class _Program(NamedTuple):

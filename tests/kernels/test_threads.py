@@ -3,10 +3,15 @@
 import subprocess
 import sys
 import threading
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+import pyopencl as cl
 import pytest
+
+from mirrorskin.kernels import device as device_layer
+from mirrorskin.kernels.device import Device
 
 FILL = "__kernel void fill(__global int *values, const int number) { values[get_global_id(0)] = number; }"
 SIZE = 256  # items, a multiple of every work group
@@ -36,6 +41,30 @@ def test_a_kernel_is_compiled_once_for_all_threads(device):
     with ThreadPoolExecutor(1) as pool:
         assert pool.submit(device.kernel, FILL, "fill").result() is mine
     assert not device.profile.records()
+
+
+def test_devices_that_compile_at_the_same_time_leave_the_filters_of_warnings_as_they_were(monkeypatch):
+    both, first_is_built = threading.Barrier(2), threading.Event()
+    devices = [Device(device_layer._find()[0]) for _ in range(2)]
+    build, ignored = Device._recall_or_compile, []
+
+    def in_turn(device, *given):
+        both.wait(60)
+        if device is devices[1]:
+            assert first_is_built.wait(60)
+            ignored.append(any(kind is cl.CompilerWarning for _, _, kind, *_ in warnings.filters))
+        return build(device, *given)
+
+    def compile_on(device):
+        device.kernel(FILL, "fill")
+        first_is_built.set()
+
+    monkeypatch.setattr(Device, "_recall_or_compile", in_turn)
+    before = [*warnings.filters]
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(compile_on, devices))
+    assert ignored == [True]
+    assert warnings.filters == before
 
 
 OPENED = """

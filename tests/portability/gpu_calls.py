@@ -137,7 +137,8 @@ def others(shape: Shape, device: Device) -> Iterator[tuple[str, Call]]:
     normals = engine.estimate_normals(tiled(half, 16, fill_turns), phases(16), device=device, **TURN)
     yield "fuse, 512 x 512", partial(engine.fuse, onset, normals, PIXEL, device=device)
     there = [
-        {name: placed(values, device) for name, values in one.maps().items()} for one in (onset, normals)
+        {name: placed(values, device) for name, values in one.maps().items()} | {"process": one.process}
+        for one in (onset, normals)
     ]
     yield "fuse, 512 x 512, maps on the device", lambda: engine.fuse(*there, PIXEL)
     heap = SCENES["leaves"]((256, 256))
