@@ -282,11 +282,10 @@ float square(const int linked, const float weight, const float left)
     return linked ? all : 0.0f;
 }
 
-// Sums of an item each: squares of what is left over, times their weights.
-__kernel void links_misfit(GRAPH, MAP reliefs, const int place, OUT sums)
+// Sums of an item each, or of a group: squares of what is left over, times their weights.
+__kernel GROUP_SIZE void links_misfit(GRAPH, MAP reliefs, const int place, OUT sums)
 {
     PIECE(ROWS)
-    if (top >= rows) return;
     MAP relief = reliefs + (long)place * rows * columns;
     float squares[CHUNK];
     for (int i = 0; i < end - begin; ++i) squares[i] = 0.0f;
@@ -298,5 +297,12 @@ __kernel void links_misfit(GRAPH, MAP reliefs, const int place, OUT sums)
     }
     float sum = 0.0f;
     for (int i = 0; i < end - begin; ++i) sum += squares[i];
-    sums[item] = sum;
+#if GROUP > 1
+    __local float some[GROUP];
+    some[get_local_id(0)] = sum;
+    GROUP_SUM(some, GROUP)
+    if (get_local_id(0) == 0) sums[get_group_id(0)] = some[0];
+#else
+    if (top < rows) sums[item] = sum;
+#endif
 }

@@ -361,17 +361,6 @@ __kernel void multigrid_coarsen(COARSEN_ARGS)
     coarsen(BETWEEN, GRAPH, to, touched, level, moves, COARSE_GRAPH, changed, changes);
 }
 
-// One over the diagonal.
-__kernel void multigrid_invert(LEVEL_ARGS, GRAPH_ARGS, OUT inverse)
-{
-    ITEMS_NODES
-    EACH_NODE {
-        SIDES
-        const reals diagonal = SUM_OF_SIDES;
-        PUT(inverse + i) = INVERSE(diagonal);
-    }
-}
-
 // A kernel that is called by another is not portable: what both do is in functions.
 //
 // All levels from `from` on, by one group, and one over their diagonals: of blocks alone if `plain` is 1.
@@ -385,35 +374,6 @@ typedef struct {
 #define OF_LEVEL(l) const int base = levels[l].base, rows = levels[l].rows, stride = levels[l].stride;
 #define OF_COARSE(l) const int coarse_base = levels[l].base, coarse_rows = levels[l].rows, coarse_stride = levels[l].stride;
 #define FENCE barrier(CLK_GLOBAL_MEM_FENCE | CLK_LOCAL_MEM_FENCE);
-__kernel GROUP_SIZE void multigrid_build(
-    const int from, const int last, __global const Level *restrict levels, const int plain, const float strength,
-    __global float *right, __global float *down, __global float *falling, __global float *rising, __global float *anchor,
-    OUT inverse, __global uchar *parts, __global uchar *wanted, __global uchar *to, __global int *touched, __global int *splits,
-    __global int *moves, __global int *changed, __global int *changes)
-{
-    for (int l = from; l <= last; ++l) {
-        OF_LEVEL(l)
-        EACH_OF_LEVEL {
-            SIDES
-            const reals diagonal = SUM_OF_SIDES;
-            PUT(inverse + i) = INVERSE(diagonal);
-        }
-        if (l == last) break;
-        OF_COARSE(l + 1)
-        if (!plain) {
-            find_parts(BETWEEN, strength, GRAPH, parts, touched, l, splits);
-            FENCE
-            for (int turn = 0; turn < ROUNDS; ++turn) {
-                __global uchar *old = turn % 2 ? wanted : to, *new = turn % 2 ? to : wanted;
-                const int first = turn == 0, last_round = turn == ROUNDS - 1;
-                move_parts(BETWEEN, strength, GRAPH, parts, turn < 2, first, last_round, old, new, touched, l, splits, moves);
-                FENCE
-            }
-        }
-        coarsen(BETWEEN, GRAPH, to, touched, l, moves, GRAPH, changed, changes);
-        FENCE
-    }
-}
 
 // The inverse of the coarsest level's matrix, by one group. Elimination only adds, multiplies and divides positive numbers
 // (Grassmann, Taksar and Heyman, Operations Research 33, 1985): the sum of a node's links and anchor is its pivot. The last node
@@ -421,9 +381,9 @@ __kernel GROUP_SIZE void multigrid_build(
 // are u M, and 1 / d + u M u on the diagonal.
 #define EACH_LATER(j, k) for (int j = (k) + 1 + (int)get_local_id(0); j < nodes; j += (int)get_local_size(0))
 #define NEAR_BARRIER barrier(CLK_LOCAL_MEM_FENCE);
-__kernel GROUP_SIZE void multigrid_invert_coarsest(LEVEL_ARGS, GRAPH_ARGS, OUT matrix)
+INLINE void invert_coarsest(
+    LEVEL_ARGS, GRAPH_ARGS, OUT matrix, __local float *m, __local float *held, __local float *pivots)
 {
-    __local float m[COARSEST * COARSEST], held[COARSEST], pivots[COARSEST];
     const int nodes = rows * stride, first = base + stride;
     EACH_LATER(n, -1) {
         for (int k = 0; k < nodes; ++k) {
@@ -467,6 +427,38 @@ __kernel GROUP_SIZE void multigrid_invert_coarsest(LEVEL_ARGS, GRAPH_ARGS, OUT m
         NEAR_BARRIER
     }
     EACH_LATER(n, -1) for (int k = 0; k < nodes; ++k) matrix[k * nodes + n] = m[k * nodes + n];
+}
+__kernel GROUP_SIZE void multigrid_build(
+    const int from, const int last, __global const Level *restrict levels, const int plain, const float strength,
+    __global float *right, __global float *down, __global float *falling, __global float *rising, __global float *anchor,
+    OUT inverse, __global uchar *parts, __global uchar *wanted, __global uchar *to, __global int *touched, __global int *splits,
+    __global int *moves, __global int *changed, __global int *changes, OUT matrix)
+{
+    __local float m[COARSEST * COARSEST], held[COARSEST], pivots[COARSEST];
+    for (int l = from; l <= last; ++l) {
+        OF_LEVEL(l)
+        EACH_OF_LEVEL {
+            SIDES
+            const reals diagonal = SUM_OF_SIDES;
+            PUT(inverse + i) = INVERSE(diagonal);
+        }
+        if (l == last) break;
+        OF_COARSE(l + 1)
+        if (!plain) {
+            find_parts(BETWEEN, strength, GRAPH, parts, touched, l, splits);
+            FENCE
+            for (int turn = 0; turn < ROUNDS; ++turn) {
+                __global uchar *old = turn % 2 ? wanted : to, *new = turn % 2 ? to : wanted;
+                const int first = turn == 0, last_round = turn == ROUNDS - 1;
+                move_parts(BETWEEN, strength, GRAPH, parts, turn < 2, first, last_round, old, new, touched, l, splits, moves);
+                FENCE
+            }
+        }
+        coarsen(BETWEEN, GRAPH, to, touched, l, moves, GRAPH, changed, changes);
+        FENCE
+    }
+    OF_LEVEL(last)
+    invert_coarsest(base, rows, stride, GRAPH, matrix, m, held, pivots);
 }
 
 // --- Cycles -----------------------------------------------------------------------------------------------------
@@ -555,26 +547,27 @@ GATHERED(gathered, __global)
 #endif
 #define MINE (y >= 0 && y < ROWS && x >= 0 && x < wide)
 
-// Which tiles, one for a group, have nodes with links or anchors: all others are left out.
-__kernel void multigrid_find_live(LEVEL_ARGS, MAP inverse, const int first_tile, __global uchar *restrict live)
+// One over the diagonal, and which tiles, one for a group, have nodes with links or anchors: all others are left out.
+__kernel void multigrid_invert(LEVEL_ARGS, GRAPH_ARGS, OUT inverse, const int first_tile, __global uchar *restrict live)
 {
     const int across = (stride + COLUMNS - 1) / COLUMNS, tile = get_group_id(0), top = tile / across * ROWS;
     const int left = tile % across * COLUMNS, bottom = LESSER(top + ROWS, rows), right_end = LESSER(left + COLUMNS, stride);
-#if TILE > 1  // a group has one item, a core's loop
-    int any = 0;
-    for (int y = top; y < bottom && !any; ++y)
-        for (int x = left; x < right_end; ++x) any |= inverse[base + stride * (y + 1) + x] > 0;
-    live[first_tile + tile] = any;
-#else
     __local int any;
     if (get_local_id(0) == 0) any = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
-    for (int y = top; y < bottom; ++y)
-        for (int x = left + get_local_id(0); x < right_end; x += get_local_size(0))
-            if (inverse[base + stride * (y + 1) + x] > 0) atomic_or(&any, 1);
+    reals sum = 0;
+    for (int y = top; y < bottom; ++y) {
+        for (int x = left + (int)get_local_id(0) * WIDTH; x < right_end; x += (int)get_local_size(0) * WIDTH) {
+            const int i = base + stride * (y + 1) + x;
+            SIDES
+            const reals diagonal = SUM_OF_SIDES;
+            PUT(inverse + i) = INVERSE(diagonal);
+            sum += diagonal;
+        }
+    }
+    if (WHOLE(sum) > 0) atomic_or(&any, 1);
     barrier(CLK_LOCAL_MEM_FENCE);
     if (get_local_id(0) == 0) live[first_tile + tile] = any;
-#endif
 }
 
 // Steps of Jacobi's method, from heights x or from zero, to t; and the sums of the residual over blocks, the coarse right
@@ -890,6 +883,26 @@ __kernel void multigrid_take(LEVEL_ARGS, const int cycle, const int step, VALUES
     if (row >= rows) return;
 
 #if LANES == 1
+// The links of a picture, and the weights of known heights.
+#if ANCHORED
+#define ANCHORS MAP anchors, OUT anchor,
+#else
+#define ANCHORS
+#endif
+__kernel void multigrid_admit_graph(
+    LEVEL_ARGS, const int columns, ANCHORS MAP level, MAP map, OUT right, OUT down)
+{
+    PICTURE_ITEMS
+    for (int c = from; c < upto; ++c) {
+        const int i = base + (row + 1) * stride + c, p = row * columns + c;
+        right[i] = level[p];
+        down[i] = map[p];
+#if ANCHORED
+        anchor[i] = anchors[p];
+#endif
+    }
+}
+
 // A last step, and the map of the heights.
 __kernel void multigrid_finish(
     LEVEL_ARGS, const int columns, const int cycle, const int step, VALUES history, VALUES direction, OUT level, OUT map)
@@ -1025,29 +1038,165 @@ __kernel void multigrid_release(
 
 // --- Variances --------------------------------------------------------------------------------------------------
 
-// What the aggregates have, brought to their nodes; then spread by a step of Jacobi's method, and added to a part.
-__kernel void multigrid_inject(LEVEL_ARGS, COARSE_ARGS, VALUES e, const int moved_nodes, BYTES to, OUT_VALUES t)
+// The number of pixels with a flag of `wanted` in each node of a level: a pixel is followed from aggregate to aggregate.
+__kernel void multigrid_masses(
+    LEVEL_ARGS, const int columns, __global const Level *restrict levels, const int number, COUNTS changes, BYTES to,
+    const int wanted, BYTES map, __global int *restrict level)
 {
-    ITEMS_NODES
-    EACH_NODE {
-        const int n = i - base - stride, J = coarse_base + coarse_stride * (n / stride / 2 + 1) + n % stride / 2;
-        PUT(t + i) = injected(i, J, coarse_stride, e, moved_nodes, to);
+    PICTURE_ITEMS
+    int last = -1, sum = 0;
+    for (int c = from; c <= upto; ++c) {
+        int y = row, x = c, node = -1;
+        if (c < upto && map[row * columns + c] & wanted) {
+            for (int l = 0; l < number; ++l) {
+                const int i = levels[l].base + levels[l].stride * (y + 1) + x, moved = changes[l] > 0;
+                y = (y >> 1) + (moved ? WENT_DOWN(i) : 0);
+                x = (x >> 1) + (moved ? WENT_RIGHT(i) : 0);
+            }
+            node = levels[number].stride * (y + 1) + x;
+        }
+        if (node != last && last >= 0) atomic_add(level + last, sum);
+        sum = node == last ? sum + 1 : 1;
+        last = node;
     }
 }
 
-__kernel void multigrid_spread(LEVEL_ARGS, GRAPH_ARGS, MAP inverse, MAP t, MAP part, OUT x)
+// The variance on a level of at most LINE nodes a side: the diagonal of the inverse G of its matrix. Of a component without
+// anchors, the mean over its pixels is 0: with the masses m and their sum M, the diagonal is that of G, less 2 G m / M, plus
+// m G m / M^2, where G holds one node at 0.
+//
+// Rows are eliminated from the first to the last (block tridiagonal). In a row, the sweep of node k turns weights to later nodes
+// into shares p of what arrives at k that leaves to them, and adds p p / d for nodes that were swept. Nothing is subtracted, as in
+// `invert_coarsest`. Right sides are swept as further rows of m: weights to the next row, anchors, masses, and the sums
+// of squares m^2 / d, which are m G m in the end. The last node of a component without anchors has nothing left: it receives all
+// masses, and returns them (`whole`) with m G m (`squares`). From the last row to the first, G + (G L) G' (L G) is the inverse G of a
+// row with those after it, where G' is that of the next row, and L are the links to it.
+#define LINE 64
+#define EACH_ELEMENT(count)                                                                                \
+    for (int e = get_local_id(0) * WIDTH, a = e / stride, c = e % stride; e < (count) * stride;            \
+         e += GROUP * WIDTH, a = e / stride, c = e % stride)
+#define EACH_IN_ROW(a) for (int a = get_local_id(0), n = first + a; a < stride; a += GROUP, n += GROUP)
+#define OVER(w, v) ((w) > 0 ? (w) * (v) : 0)
+#define FROM_ABOVE(v) (OVER(falling[n - stride - 1], v[n - stride - 1]) + OVER(down[n - stride], v[n - stride])            \
+                       + OVER(rising[n - stride + 1], v[n - stride + 1]))
+#define FROM_BELOW(v) (OVER(rising[n], v[n + stride - 1]) + OVER(down[n], v[n + stride]) + OVER(falling[n], v[n + stride + 1]))
+#define ACROSS_LINKS(READ, p) (before * READ((p) - 1) + here * READ(p) + after * READ((p) + 1))
+#define BETWEEN_LINKS(READ, p, w, v, u)                                                                    \
+    ((w) * ACROSS_LINKS(READ, (p) - stride) + (v) * ACROSS_LINKS(READ, p) + (u) * ACROSS_LINKS(READ, (p) + stride))
+__kernel GROUP_SIZE void multigrid_exact(
+    LEVEL_ARGS, GRAPH_ARGS, COUNTS masses, __global float *restrict inverses, __global float *restrict work,
+    __global float *restrict held, __global float *restrict risen, __global float *restrict whole,
+    __global float *restrict squares, __global float *restrict variance)
 {
-    ITEMS_NODES
-    EACH_NODE {
-        SIDES
-        PUT(x + i) = AT(part + i) + AT(t + i) + AT(inverse + i) * FLOW(AT, t + i, stride);
+    __local float elements[LINE * (LINE + 7)], column[LINE + 4 + WIDTH], swept[LINE];
+    __local float *m = elements + 2 * LINE;
+    for (int k = get_local_id(0); k < LINE * (LINE + 7); k += GROUP) elements[k] = 0;
+    FENCE
+    for (int r = 0; r < rows; ++r) {
+        const int first = base + stride * (r + 1);
+        __global const float *G = inverses + 2 * LINE + (r - 1) * stride * stride;  // of the row above
+        EACH_ELEMENT(r ? stride : 0) {
+            const int i = first + c, n = first + a;
+            const reals before = AT(falling + i - stride - 1), here = AT(down + i - stride), after = AT(rising + i - stride + 1);
+            PUT_NEAR(m + e) =
+                BETWEEN_LINKS(AT, G + e, falling[n - stride - 1], down[n - stride], rising[n - stride + 1]);
+        }
+        EACH_IN_ROW(a) {
+            m[stride * stride + a] = rising[n] + down[n] + falling[n];
+            m[(stride + 1) * stride + a] = (r ? FROM_ABOVE(held) : 0) WITH_ANCHOR(anchor[n]);
+            m[(stride + 2) * stride + a] = (r ? FROM_ABOVE(risen) : 0) + GREATER(masses[n - base], 1);
+            m[(stride + 3) * stride + a] = r ? FROM_ABOVE(variance) : 0;
+            whole[n] = squares[n] = 0;
+        }
+        NEAR_BARRIER
+        EACH_IN_ROW(a) {
+            if (a + 1 == stride) continue;
+            m[a * stride + a + 1] += right[n];
+            m[(a + 1) * stride + a] += right[n];
+        }
+        NEAR_BARRIER
+        for (int k = 0; k < stride; ++k) {
+            float pivot = m[stride * stride + k] + m[(stride + 1) * stride + k];
+            for (int j = k + 1; j < stride; ++j) pivot += m[k * stride + j];
+            const float inverse = INVERSE(pivot);
+            NEAR_BARRIER
+            if (get_local_id(0) == 0) swept[k] = pivot > 0;
+            const int count = pivot > 0 ? stride + 4 : 0;  // no barrier is left out
+            for (int a = get_local_id(0); a < stride && count == 0; a += GROUP) {
+                const float share = a == k ? 1 : m[a * stride + k];
+                whole[first + a] += share * m[(stride + 2) * stride + k];
+                squares[first + a] += share * m[(stride + 3) * stride + k];
+            }
+            for (int a = get_local_id(0); a < count; a += GROUP) {
+                const float mass = m[(stride + 2) * stride + k];
+                column[a] = a == k ? 1 : m[a * stride + k] + (a == stride + 3 ? mass * mass * inverse : 0);
+            }
+            NEAR_BARRIER
+            for (int a = get_local_id(0); a < count; a += GROUP) {
+                m[a * stride + k] = 0;
+                if (a < stride) m[k * stride + a] = 0;
+            }
+            NEAR_BARRIER
+            EACH_ELEMENT(count) {
+                if (column[a] != 0) PUT_NEAR(m + e) = NEAR(m + e) + inverse * column[a] * NEAR(column + c);
+            }
+            NEAR_BARRIER
+        }
+        EACH_IN_ROW(a) {
+            held[n] = swept[a] * m[(stride + 1) * stride + a];
+            risen[n] = swept[a] * m[(stride + 2) * stride + a];
+            variance[n] = swept[a] * m[(stride + 3) * stride + a];
+        }
+        EACH_ELEMENT(stride) PUT(inverses + 2 * LINE + r * stride * stride + e) = swept[a] * NEAR(swept + c) * NEAR(m + e);
+        FENCE
+    }
+    for (int q = 0; q < rows; ++q) {
+        const int r = rows - 1 - q;
+        const int first = base + stride * (r + 1);
+        __global const float *G = inverses + 2 * LINE + r * stride * stride;
+        EACH_ELEMENT(r < rows - 1 ? stride : 0) {
+            const int i = first + c, n = first + a;
+            const reals before = AT(rising + i), here = AT(down + i), after = AT(falling + i);
+            PUT(work + e) = BETWEEN_LINKS(NEAR, m + e, rising[n], down[n], falling[n]);
+        }
+        EACH_IN_ROW(a) {
+            m[(stride + 2) * stride + a] = r < rows - 1 ? FROM_BELOW(risen) : 0;
+            column[a] = r < rows - 1 ? FROM_BELOW(whole) : 0;
+            m[(stride + 3) * stride + a] = r < rows - 1 ? FROM_BELOW(squares) : 0;
+        }
+        FENCE
+        EACH_ELEMENT(r < rows - 1 ? stride : 0) {
+            reals sum = 0;
+            for (int k = 0; k < stride; ++k) sum += G[a * stride + k] * AT(work + k * stride + c);
+            PUT_NEAR(m + e) = sum;
+        }
+        EACH_IN_ROW(a) {
+            for (int k = 0; k < stride; ++k) {
+                risen[n] += G[a * stride + k] * m[(stride + 2) * stride + k];
+                whole[n] += G[a * stride + k] * column[k];
+                squares[n] += G[a * stride + k] * m[(stride + 3) * stride + k];
+            }
+        }
+        FENCE
+        EACH_ELEMENT(stride) {
+            reals sum = AT(G + e);
+            for (int k = 0; k < stride && r < rows - 1; ++k) sum += m[a * stride + k] * AT(G + k * stride + c);
+            PUT(work + e) = sum;
+        }
+        FENCE
+        EACH_ELEMENT(stride) PUT_NEAR(m + e) = AT(work + e);
+        NEAR_BARRIER
+        EACH_IN_ROW(a) {
+            const float all = whole[n], centred = all > 0 ? (squares[n] / all - 2 * risen[n]) / all : 0;
+            variance[n] = m[a * stride + a] + centred;
+        }
     }
 }
 
 // The links, scaled along both axes so that those along x weigh as much on average as those along y.
 #define MEAN(a, b) (((a) + (b)) * ((((a) > 0) & ((b) > 0)) ? (reals)0.5f : (reals)1))
-#define EVENED_SIDES                                                                                       \
-    AXES                                                                                                  \
+#define EVENED_SIDES AXES EVENED_OF_SIDES
+#define EVENED_OF_SIDES                                                                                    \
     const reals along_x = MEAN(to_right, to_left), along_y = MEAN(to_below, to_above);                     \
     const reals both = sqrt(along_x * along_y), one = (reals)1;                                            \
     const reals by_x = both > 0 ? both / along_x : one, by_y = both > 0 ? both / along_y : one;            \
@@ -1065,11 +1214,15 @@ __kernel void multigrid_even(LEVEL_ARGS, GRAPH_ARGS, OUT evened)
     }
 }
 
-// How likely a walk along them, which takes each as often as it weighs, is back where it was after two steps.
-__kernel void multigrid_returns(LEVEL_ARGS, MAP right, MAP down, MAP evened, OUT returns)
+// How likely a walk along them, which takes each as often as it weighs, is back where it was after two steps; and what the
+// aggregates have, brought to their nodes.
+__kernel void multigrid_returns(
+    LEVEL_ARGS, COARSE_ARGS, MAP right, MAP down, MAP evened, VALUES e, const int moved_nodes, BYTES to, OUT returns, OUT_VALUES t)
 {
     ITEMS_NODES
     EACH_NODE {
+        const int n = i - base - stride, J = coarse_base + coarse_stride * (n / stride / 2 + 1) + n % stride / 2;
+        PUT(t + i) = injected(i, J, coarse_stride, e, moved_nodes, to);
         EVENED_SIDES
         PUT(returns + i) = AT(evened + i)
             * ((go_right * go_right * AT(evened + i + 1) + go_left * go_left * AT(evened + i - 1))
@@ -1077,19 +1230,22 @@ __kernel void multigrid_returns(LEVEL_ARGS, MAP right, MAP down, MAP evened, OUT
     }
 }
 
-// What a node's variance has that the coarse one does not.
-#define BESIDE(i) (AT(evened + (i)) * (c[3] + c[4] * AT(returns + (i))) + here * AT(returns + (i)))
-__kernel void multigrid_local(
-    LEVEL_ARGS, MAP right, MAP down, MAP evened, MAP returns, __global const float *restrict c, OUT local_part)
+// The variance: what the aggregates have, spread by a step of Jacobi's method, and what they do not.
+#define BESIDE(i) (AT(evened + (i)) * (c3 + c4 * AT(returns + (i))) + here * AT(returns + (i)))
+__kernel void multigrid_spread(
+    LEVEL_ARGS, GRAPH_ARGS, MAP inverse, MAP evened, MAP returns, const float c0, const float c1, const float c2, const float c3,
+    const float c4, const float c5, MAP t, OUT x)
 {
     ITEMS_NODES
     EACH_NODE {
-        EVENED_SIDES
-        const reals here = c[2] * AT(evened + i);
+        SIDES
+        EVENED_OF_SIDES
+        const reals here = c2 * AT(evened + i);
         const reals odd = both > 0 ? 1 - 2 * both / (along_x + along_y) : 1 - one;
-        PUT(local_part + i) = AT(evened + i)
-            * ((c[0] + c[1] * AT(returns + i) + c[5] * odd) + (go_right * BESIDE(i + 1) + go_left * BESIDE(i - 1))
+        const reals local_part = AT(evened + i)
+            * ((c0 + c1 * AT(returns + i) + c5 * odd) + (go_right * BESIDE(i + 1) + go_left * BESIDE(i - 1))
                + (go_below * BESIDE(i + stride) + go_above * BESIDE(i - stride)));
+        PUT(x + i) = local_part + AT(t + i) + AT(inverse + i) * FLOW(AT, t + i, stride);
     }
 }
 

@@ -303,6 +303,25 @@ def best_step(bz: float, zz: float, zp: float, pp: float, bp: float) -> tuple[fl
 # --- Variances ---
 
 
+def exact_variance(level: Level, masses: Doubles) -> Doubles:
+    """Return the diagonal of A's inverse; without anchors, the mean of a component, by masses, is 0."""
+    index: Any = np.arange(level.to.size).reshape(level.to.shape)
+    matrix, label = np.diag(level.diagonal.ravel()), index.copy()
+    for way, weights in level.sides():
+        matrix[index[weights > 0], shifted(index, *way)[weights > 0]] -= weights[weights > 0]
+    for _ in range(index.size):  # to the first node of each component
+        for way, weights in level.sides():
+            label = np.where(weights > 0, np.minimum(label, shifted(label, *way)), label)
+    variance, mass = np.zeros(index.size), np.maximum(masses, 1).ravel()
+    for first in np.unique(label):
+        nodes = np.flatnonzero(label.ravel() == first)
+        part, share = matrix[np.ix_(nodes, nodes)], mass[nodes] / mass[nodes].sum()
+        free = not level.anchor.ravel()[nodes].any()
+        whole = np.linalg.inv(part + free * np.outer(share, share)) - free
+        variance[nodes] = np.diag(whole)
+    return variance.reshape(index.shape)
+
+
 def evened_sides(level: Level) -> tuple[list[tuple[Way, Doubles]], Doubles]:
     """Return links along the axes, scaled to the same mean along both, and how uneven these were."""
     links = list(level.sides())[:4]  # right, left, below, above

@@ -59,15 +59,18 @@ class Cycle:
     def prepare(self) -> None:
         """Prepare for the current graph of the hierarchy."""
         self._factors: Callable[[Doubles], Doubles] | None = None
-        self.find_tiles()
+        self.follow(deep=True)
 
-    def find_tiles(self) -> None:
-        """Find the tiles that have nodes; cycles skip the others."""
+    def follow(self, *, deep: bool) -> None:
+        """Invert the diagonals, and find the tiles that have nodes; cycles skip the others.
+
+        Unless ``deep``, this is done for the finest level only.
+        """
         h = self._h
-        for number, level in enumerate(h.levels[: self._tail]):
-            kernel = self._kernel("find_live", level)
+        for number, level in enumerate(h.levels[: self._tail if deep else min(self._tail, 1)]):
+            kernel = self._kernel("invert", level)
             items, place = self._tiles(level) * kernel.group, level.place | self._live_of(number)
-            kernel(items, **place, inverse=h.inverse, moved=4 * level.nodes)
+            kernel(items, **place, **h.graph, inverse=h.inverse, moved=16 * level.nodes)
 
     def _live_of(self, number: int) -> dict[str, Any]:
         return {"live": self._live, "first_tile": int(self._first_tile[number])}

@@ -135,8 +135,10 @@ class PixelGraph:
         self, reliefs: Array, plane: Plane = LEVEL, links: Links | None = None, number: int = 0
     ) -> float:
         """Return the least-squares sum, without unit, of heights above a plane, ``reliefs`` at a number."""
-        sums = self.array("sums", shape=(self._items("links_misfit"),))
-        macros = {} if links is None else {"WEIGHTS": 3}
+        layout = self.device.layout
+        group = layout.group if layout.tile == 1 else 1
+        sums = self.array("sums", shape=(-(-self._items("links_misfit") // group),))
+        macros = {"GROUP": group} if links is None else {"GROUP": group, "WEIGHTS": 3}
         problem = self._problem(plane, links)
         self._run("links_misfit", macros, **problem, reliefs=reliefs, place=number, sums=sums)
         return float(sums.read().sum(dtype=np.float64)) / self.scale

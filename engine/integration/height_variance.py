@@ -40,16 +40,15 @@ from slopes".
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mirrorskin.engine.integration.hierarchy import Hierarchy, place_of_coarse
 from mirrorskin.engine.integration.validation import Floats
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
-
-Ints = NDArray[np.int64]
+from mirrorskin.kernels.links import KNOWN, SLOPE
 
 COARSE = 64
 """Largest number of nodes per side of the level whose variance is computed exactly."""
@@ -64,35 +63,30 @@ _FINEST = 0.0, 4.7682, -2.5894, -0.9665, -2.4153, 0.255
 _COARSER = 0.0, -0.2621, -0.1186, -0.6233, 0.0, 0.0
 _MODES = 64  # along each axis, for integrals over all modes of a plane
 _ROWS = 64  # of modes that are transformed at once, and stay in a core's cache
-_LOOSE = 1e-7  # regularisation of components without a known height, relative to their links
 _BORDER = 0.12  # reduction of the misfit per loop, for each loop that a pixel lacks at the border
 
 
 def find_graph_variance(
-    hierarchy: Hierarchy, answered: NDArray[np.bool_], arrays: tuple[Array, Array, Array, Array, Array]
+    hierarchy: Hierarchy, flags: Array, arrays: tuple[Array, Array, Array, Array, Array]
 ) -> None:
     """Write the heights' variance to the finest level of the first array; the others are scratch memory.
 
-    ``answered``, (H, W), are the pixels that have heights.
+    ``flags``, (H, W), are those of the pixels; see ``mirrorskin.kernels.links``.
     """
     h = hierarchy
     number = next(
         (k for k, level in enumerate(h.levels) if k > 0 and max(level.rows, level.columns) <= COARSE), 0
     )
-    nodes, coarse = _find_coarse(h, number, _masses(h, number, answered))
-    variance, evened, returns, part, prolonged = arrays
-    known = np.zeros(variance.shape, np.float32)
-    known[nodes] = coarse
-    variance.write(known)
+    variance, evened, returns, prolonged, _ = arrays
+    find_exact_variance(h, number, flags, *arrays)
     links = {name: h.graph[name] for name in ("right", "down")}
     for fine in reversed(range(number)):
-        level, places = h.levels[fine], place_of_coarse(h.levels[fine + 1])
+        level, moves = h.levels[fine], {"moved_nodes": h.moves[fine], "to": h.to}
+        walk: dict[str, Any] = {"evened": evened, "returns": returns, "t": prolonged}
         h.over("even", level, **h.graph, evened=evened)
-        h.over("returns", level, **links, evened=evened, returns=returns)
-        numbers = h.device.from_host("local", local_part(fine == 0))
-        h.over("local", level, **links, evened=evened, returns=returns, c=numbers, local_part=part)
-        h.over("inject", level, **places, e=variance, moved_nodes=h.moves[fine], to=h.to, t=prolonged)
-        h.over("spread", level, **h.graph, inverse=h.inverse, t=prolonged, part=part, x=variance)
+        h.over("returns", level, **place_of_coarse(h.levels[fine + 1]), **links, **walk, **moves, e=variance)
+        numbers = {f"c{k}": c for k, c in enumerate(local_part(fine == 0))}
+        h.over("spread", level, **h.graph, inverse=h.inverse, **walk, **numbers, x=variance)
 
 
 def local_part(finest: bool) -> Floats:
@@ -168,92 +162,22 @@ def expected_misfit(links: int, pixels: int, known: int, free: int, weights: tup
     return (loops + known) * (left - _BORDER * max(0.0, 1 - loops / pixels))
 
 
-def _masses(hierarchy: Hierarchy, number: int, answered: NDArray[np.bool_]) -> Floats:
-    """Return the number of pixels in each node of a level, (nodes,)."""
-    mass, moved = np.zeros(hierarchy.nodes, np.float32), hierarchy.to.read()
-    picture = answered.view(np.uint8).astype(np.float32)
-    levels = zip(hierarchy.levels[:number], hierarchy.levels[1:], hierarchy.moves, strict=False)
-    for fine, coarse, moves in levels:
-        padded = np.zeros((2 * coarse.rows, 2 * coarse.columns), np.float32)
-        padded[: fine.rows, : fine.columns] = picture
-        picture = (padded[::2, ::2] + padded[1::2, ::2]) + (padded[::2, 1::2] + padded[1::2, 1::2])
-        if moves:
-            to = moved[fine.first : fine.end - fine.stride].reshape(fine.rows, fine.stride)
-            row, column = np.nonzero(to)
-            down, right = np.divmod(to[row, column].astype(np.int64) - 1, 3)
-            share = padded[row, column]
-            np.subtract.at(picture, (row // 2, column // 2), share)
-            np.add.at(picture, (row // 2 + down - 1, column // 2 + right - 1), share)
-    level = hierarchy.levels[number]
-    inside = mass[level.first : level.end - level.stride].reshape(level.rows, level.stride)
-    inside[:, : level.columns] = picture
-    return mass
-
-
-def _find_coarse(hierarchy: Hierarchy, number: int, mass: Floats) -> tuple[Ints, Doubles]:
-    """Return a level's nodes, and the diagonal of the (pseudo)inverse of its matrix."""
-    level = hierarchy.levels[number]
-    node, a, b, weight, pull = hierarchy.equations(number)
-    row, column = np.divmod(node - level.first, level.stride)
-    used = np.zeros(hierarchy.nodes, bool)
-    used[a] = used[b] = True
-    chosen = used[node] | (pull > 0)
-    node, pull = node[chosen], pull[chosen]
-    line = (row if level.rows >= level.columns else column)[chosen]
-    index = np.zeros(hierarchy.nodes, np.int64)
-    index[node] = np.arange(len(node))
-    a, b = index[a], index[b]
-    count = len(node)
-    label = _connected(count, a, b)
-    diagonal = np.asarray(np.bincount(a, weight, count) + np.bincount(b, weight, count), np.float64)
-    free = np.bincount(label, pull, count) <= 0
-    pixels = np.maximum(mass[node], 1).astype(np.float64)
-    total, typical = np.bincount(label, pixels, count), np.bincount(label, diagonal, count)
-    extra = _LOOSE * typical / np.maximum(total, 1)
-    diagonal += pull + (extra * free)[label] * pixels
-    offset = np.where(free, 1 / np.where(extra > 0, extra * total, 1), 0)
-    return node, _invert_diagonal(line, diagonal, a, b, weight) - offset[label]
-
-
-def _invert_diagonal(line: Ints, diagonal: Doubles, a: Ints, b: Ints, weight: Doubles) -> Doubles:
-    """Return the diagonal of the inverse of a block tridiagonal matrix: links within and between lines.
-
-    A forward pass inverts each block given the previous ones; a backward pass adds the effect of later ones.
-    """
-    order = np.argsort(line, kind="stable")
-    sizes = np.bincount(line, minlength=1)
-    starts = np.cumsum(sizes) - sizes
-    place = np.empty(len(line), np.int64)
-    place[order] = np.arange(len(line)) - starts[line[order]]
-    width = int(sizes.max(initial=1))
-    block, link = (np.zeros((len(sizes), width, width)) for _ in range(2))
-    block[:, np.arange(width), np.arange(width)] = 1
-    block[line, place, place] = diagonal
-    within = line[a] == line[b]
-    for first, second in ((a, b), (b, a)):
-        block[line[first[within]], place[first[within]], place[second[within]]] = -weight[within]
-    first, second = (np.where(line[a] > line[b], *ends)[~within] for ends in ((a, b), (b, a)))
-    link[line[first], place[first], place[second]] = weight[~within]
-    product = np.empty_like(block)
-    block[0] = np.linalg.inv(block[0])
-    for k in range(1, len(sizes)):
-        np.matmul(link[k], block[k - 1], out=product[k])
-        block[k] = np.linalg.inv(block[k] - product[k] @ link[k].T)
-    for k in range(len(sizes) - 1, 0, -1):
-        block[k - 1] += product[k].T @ block[k] @ product[k]
-    variance: Doubles = block[line, place, place]
-    return variance
-
-
-def _connected(count: int, a: Ints, b: Ints) -> Ints:
-    """Return for each node the first node of its connected component; without the import of SciPy."""
-    label = np.arange(count)
-    while True:
-        lower = np.minimum(label[a], label[b])
-        merged = label.copy()
-        np.minimum.at(merged, a, lower)
-        np.minimum.at(merged, b, lower)
-        merged = merged[merged]
-        if np.array_equal(merged, label):
-            return label
-        label = merged
+def find_exact_variance(
+    hierarchy: Hierarchy,
+    number: int,
+    flags: Array,
+    variance: Array,
+    held: Array,
+    risen: Array,
+    whole: Array,
+    squares: Array,
+) -> None:
+    """Write the exact variance on a level of at most `COARSE` nodes per side; see ``multigrid_exact``."""
+    h, level = hierarchy, hierarchy.levels[number]
+    masses = h.array("masses", level.nodes + 2 * level.stride, dtype=np.int32)
+    levels: dict[str, Any] = {"levels": h.table, "number": number, "changes": h.changes, "to": h.to}
+    h.copy_picture("masses", masses, flags, wanted=SLOPE | KNOWN, **levels)
+    inverses = h.array("inverses", level.nodes * level.stride + 4 * COARSE)
+    arrays: dict[str, Any] = {"masses": masses, "inverses": inverses, "variance": variance}
+    arrays |= {"held": held, "risen": risen, "whole": whole, "squares": squares}
+    h.alone("exact", level, **level.place, **h.graph, work=h.array("work", level.stride**2), **arrays)

@@ -80,9 +80,10 @@ class Hierarchy:
     """All levels of a graph.
 
     ``graph`` has the nodes' links, and the weights of known heights as ``anchor`` (see
-    ``kernels/multigrid.cl``); ``inverse`` is the inverse of the diagonal. ``to`` marks nodes that belong to
-    the aggregate of another block. ``moves`` counts, for each level, the aggregates that differ from blocks
-    for this reason, and ``changed`` lists them; ``changes`` are the same numbers on the device.
+    ``kernels/multigrid.cl``); ``inverse`` is the inverse of the diagonal, which cycles compute for large
+    levels when they are prepared. ``to`` marks nodes that belong to the aggregate of another block.
+    ``moves`` counts, for each level, the aggregates that differ from blocks for this reason, and ``changed``
+    lists them; ``changes`` are the same numbers on the device.
     """
 
     device: Device
@@ -143,26 +144,18 @@ class Hierarchy:
             self._coarsen(number)
         self._build_tail(tail, plain=plain, strength=strength)
         self.moves[...] = 0 if plain else self.changes.read()
-        for level in self.levels[:tail]:
-            self.over("invert", level, **self.graph, inverse=self.inverse)
-        self._invert_coarsest()
 
     def follow(self, links: Links, *, deep: bool) -> None:
         """Update a plain hierarchy for a similar graph, without copies to the host.
 
-        Unless ``deep``, only the finest level is updated.
+        Unless ``deep``, only the finest level is updated. Cycles must be prepared again.
         """
         self._admit_graph(links)
         tail = self.first_of_tail(1)
-        for number, level in enumerate(self.levels[: tail if deep else 1]):
-            if number:
-                self._coarsen(number - 1)
-            self.over("invert", level, **self.graph, inverse=self.inverse)
         if deep:
-            if tail:
-                self._coarsen(tail - 1)
+            for number in range(tail):
+                self._coarsen(number)
             self._build_tail(tail, plain=True)
-            self._invert_coarsest()
 
     def equations(self, number: int) -> tuple[Ints, Ints, Ints, Doubles, Doubles]:
         """Return a level's nodes, both ends and weights of its links, and the anchor of each node."""
@@ -256,9 +249,10 @@ class Hierarchy:
         kernel(items, **sizes, level=level, map=map_, **arguments, moved=8 * lanes * finest.nodes)
 
     def _admit_graph(self, links: Links) -> None:
-        for name in ("right", "down", "anchor"):
-            if (map_ := getattr(links, name)) is not None:
-                self.copy_picture("admit", self.graph[name], map_)
+        arrays = {name: self.graph[name] for name in ("right", "down")}
+        if links.anchor is not None:
+            arrays |= {"anchors": links.anchor, "anchor": self.graph["anchor"]}
+        self.copy_picture("admit_graph", links.right, links.down, **arrays)
 
     def _coarsen(self, number: int) -> None:
         coarse = {f"coarse_{name}": array for name, array in self.graph.items()}
@@ -272,13 +266,8 @@ class Hierarchy:
         arguments |= {"plain": plain, "strength": strength, **self.graph, "inverse": self.inverse}
         arguments |= {"parts": self._parts, "wanted": self._wanted, "to": self.to, "touched": self._touched}
         arguments |= {"splits": self._splits, "moves": self._counts}
-        arguments |= {"changed": self.changed, "changes": self.changes}
+        arguments |= {"changed": self.changed, "changes": self.changes, "matrix": self.matrix}
         self.alone("build", self.levels[tail], 8, **arguments)
-
-    def _invert_coarsest(self) -> None:
-        last = self.levels[-1]
-        links = self.links_of(last)
-        self.alone("invert_coarsest", last, links, **last.place, **self.graph, matrix=self.matrix)
 
     def first_of_tail(self, lanes: int) -> int:
         """Return the number of the finest level that one work-group processes with all coarser ones."""

@@ -137,7 +137,7 @@ class Multigrid:
         h, solver = self._hierarchy, self._alone
         cycle = solver.cycle
         h.follow(links, deep=deep)
-        cycle.find_tiles()
+        cycle.follow(deep=deep)
         solver.started = True
         solver.copy("admit", solver.source, links.source)
         solver.find_residual()
@@ -154,17 +154,17 @@ class Multigrid:
         solver.copy("release", solver.x, self._height)
         return self._height
 
-    def deviation(self, answered: NDArray[np.bool_], flags: Array, uneven: bool) -> NDArray[np.float32]:
+    def deviation(self, flags: Array, uneven: bool) -> NDArray[np.float32]:
         """Return the heights' standard deviation, (H, W), if the weights are inverse variances.
 
-        ``answered`` are the pixels with heights, ``flags`` the same on the device. If links are ``uneven``,
-        the graph must be rebuilt before the next solution.
+        ``flags`` are those of the pixels. If links are ``uneven``, the graph must be rebuilt before the next
+        solution.
         """
         if uneven:
             self.rebuild(self._links, strength=JOINED)
         h, solver = self._hierarchy, self._alone
         cycle = solver.cycle
-        find_graph_variance(h, answered, (cycle.x, cycle.b, cycle.spare, solver.before, solver.p))
+        find_graph_variance(h, flags, (cycle.x, cycle.b, cycle.spare, solver.before, solver.p))
         sigma = self._device.array("sigma", self._links.shape, np.float32)
         limits: dict[str, Any] = {"least": LEAST, "wanted": SLOPE | KNOWN, "flags": flags}
         h.copy_picture("deviation", cycle.x, sigma, inverse=h.inverse, **limits)

@@ -284,7 +284,7 @@ class SurfaceSolver:
         uneven = inputs.weight_x is not None or max(ends) > _UNEVEN * min(ends)
         if uneven:
             self._cache.built = False  # other levels are built
-        return solver.deviation(components.labels >= 0, self._graph.flags, uneven)
+        return solver.deviation(self._graph.flags, uneven)
 
     def _excess(self, inputs: Inputs, relief: _Relief, components: Components) -> float:
         """Return the misfit over that expected for noise of variance 1; NaN without loops of links."""

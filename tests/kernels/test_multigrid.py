@@ -8,7 +8,7 @@ import pytest
 
 from mirrorskin.engine.integration.cycle import Cycle
 from mirrorskin.engine.integration.graph import Links
-from mirrorskin.engine.integration.height_variance import local_part
+from mirrorskin.engine.integration.height_variance import find_exact_variance, local_part
 from mirrorskin.engine.integration.hierarchy import (
     STRENGTH,
     Hierarchy,
@@ -33,6 +33,7 @@ class Case:
         right, down = (self.map(getattr(graph, name)) for name in ("right", "down"))
         anchor = self.map(graph.anchor) if anchored else None
         self.h.build(Links(device, SHAPE, right, down, anchor, right), plain=plain)
+        Cycle(self.h).prepare()
         given = [None if one is None else one.read() for one in (right, down, anchor)]
         self.levels = twin.build(*given, None if plain else STRENGTH)
 
@@ -244,22 +245,19 @@ def test_what_a_level_adds_to_variances(cases, graph, number):
     case = cases(*graph)
     h, fine, level = case.h, case.h.levels[number], case.levels[number]
     coarse, given = case.random(number + 1)
-    evened, returns, part, brought, found = (h.array(name) for name in "abcde")
+    evened, returns, brought, found = (h.array(name) for name in "abcd")
     links, c = {name: h.graph[name] for name in ("right", "down")}, local_part(number == 0)
+    walk = {"evened": evened, "returns": returns, "t": brought}
+    above = {**place_of_coarse(h.levels[number + 1]), "moved_nodes": h.moves[number], "to": h.to}
     h.over("even", fine, **h.graph, evened=evened)
-    h.over("returns", fine, **links, evened=evened, returns=returns)
-    numbers = h.device.from_host("local", c)
-    h.over("local", fine, **links, evened=evened, returns=returns, c=numbers, local_part=part)
-    arrays = {"e": given, "moved_nodes": h.moves[number], "to": h.to, "t": brought}
-    h.over("inject", fine, **place_of_coarse(h.levels[number + 1]), **arrays)
-    h.over("spread", fine, **h.graph, inverse=h.inverse, t=brought, part=part, x=found)
+    h.over("returns", fine, **links, **above, **walk, e=given)
+    numbers = {f"c{k}": one for k, one in enumerate(c)}
+    h.over("spread", fine, **h.graph, inverse=h.inverse, **walk, **numbers, x=found)
     d, r = twin.walk(level)
-    local = twin.local_part(level, c)
     close(case.get(evened, number), d)
     close(case.get(returns, number), r)
-    close(case.get(part, number), local)
     close(case.get(brought, number), twin.injected(level, coarse))
-    close(case.get(found, number), twin.spread(level, coarse, local))
+    close(case.get(found, number), twin.spread(level, coarse, twin.local_part(level, c)))
 
 
 def test_pictures_come_to_the_finest_level_and_back(cases):
@@ -276,3 +274,16 @@ def test_pictures_come_to_the_finest_level_and_back(cases):
     least = 0.12 * twin.inverse_of(case.levels[0].diagonal)
     expected = np.where(flags & 12, np.sqrt(np.maximum(picture, least)), np.nan)
     np.testing.assert_allclose(found.read(), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("kind", "anchored"), [*GRAPHS, ("isolated", False), ("isolated", True)])
+@pytest.mark.parametrize("number", [3, 4, 5])
+def test_the_variance_of_a_level_is_exact(cases, kind, anchored, number):
+    case = cases(kind, anchored)
+    flags = case.rng.choice([1, 4, 8, 12], SHAPE).astype(np.uint8)
+    arrays = [case.h.array(name) for name in "abcde"]
+    find_exact_variance(case.h, number, case.map(flags, np.uint8), *arrays)
+    masses = ((flags & 12) > 0).astype(float)
+    for level in case.levels[:number]:
+        masses = twin.gathered(level, masses)
+    close(case.get(arrays[0], number), twin.exact_variance(case.levels[number], masses), 1e-4)
