@@ -8,13 +8,13 @@ from typing import Annotated, Any
 from mirrorskin.cli import options
 from mirrorskin.cli.declared import declared
 from mirrorskin.cli.groups import Argument
-from mirrorskin.cli.stack import STACK, stack_options
+from mirrorskin.cli.stack import FORMATS, STACK, stack_options
 
 _TRAVEL = ("travel", "travel_step", "travel_start")
 
 
 def command(
-    stack: Annotated[Path, Argument(metavar="STACK", help="Frames in HDF5, of any layout.")],
+    stack: Annotated[Path, Argument(metavar="STACK", help=f"Frames: {FORMATS}.")],
     output: Annotated[Path | None, options.result_option("STACK-correlation.h5")] = None,
     memory: options.Memory = "256MB",
     device: options.Devices = None,

@@ -40,7 +40,7 @@ def command(
     from mirrorskin.cli.output import printable, progress
     from mirrorskin.cli.quantity import segment
     from mirrorskin.io.export import check_export
-    from mirrorskin.io.frames import MCAP_SUFFIX
+    from mirrorskin.io.foreign import MCAP_SUFFIX
     from mirrorskin.io.recording import is_recording
 
     suffixes = {path.suffix.lower() for path in output}

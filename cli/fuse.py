@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from mirrorskin.cli import options
 from mirrorskin.cli.declared import declared
 from mirrorskin.cli.groups import Argument, Option
-from mirrorskin.cli.stack import STACK, stack_options
+from mirrorskin.cli.stack import FORMATS, STACK, stack_options
 
 if TYPE_CHECKING:
     from mirrorskin.cli.stack import StackOptions
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 
 def command(
-    vertical: Annotated[Path, Argument(metavar="VERTICAL", help="Recording of a press, in HDF5.")],
-    axial: Annotated[Path, Argument(metavar="AXIAL", help="Recording of a rotation, in HDF5.")],
+    vertical: Annotated[Path, Argument(metavar="VERTICAL", help=f"Press: {FORMATS}.")],
+    axial: Annotated[Path, Argument(metavar="AXIAL", help="Rotation, of the same formats.")],
     output: Annotated[Path | None, options.result_option("VERTICAL-fused.h5")] = None,
     calibration: options.Calibration = None,
     register: Annotated[
@@ -71,13 +71,13 @@ def command(
 def _open(path: Path, place: Motion, known: StackOptions, limit: int) -> Recording:
     """Open a recording; a file in another layout has the motion of its place on the command line."""
     from mirrorskin import io
-    from mirrorskin.io.arrays import NUMPY_SUFFIXES
+    from mirrorskin.io.foreign import kind_of_frames
     from mirrorskin.io.layout import MARK
     from mirrorskin.io.zarr import open_file
 
     ours = False
-    if path.suffix.lower() not in NUMPY_SUFFIXES:
+    if not kind_of_frames(path):
         with open_file(path) as file:
             ours = file.marked(MARK)
-    mine: Any = {**known, "dataset": None} if ours else {**known, "motion": place}
+    mine: Any = {**known, "dataset": None, "channel": None} if ours else {**known, "motion": place}
     return io.open_recording(path, memory_limit=limit, **mine)

@@ -8,40 +8,33 @@ from typing import Annotated, Any
 import click
 
 from mirrorskin.cli import options
-from mirrorskin.cli.groups import Argument, Option
-from mirrorskin.cli.stack import POSITIONS, stack_options
+from mirrorskin.cli.groups import Argument, Option, refuse_foreign
+from mirrorskin.cli.stack import FORMATS, IMPORTED, stack_options
 
 
 def command(
-    frames: Annotated[
-        Path,
-        Argument(
-            metavar="FRAMES", help="AVI, MP4, NPY, NPZ, MCAP, or a folder of numbered PNG/TIFF pictures."
-        ),
-    ],
+    context: click.Context,
+    frames: Annotated[Path, Argument(metavar="FRAMES", help=f"Frames: {FORMATS}.")],
     output: options.NewRecording,
     motion: Annotated[options.MotionName, Option(help="How the body moved.")],
-    topic: Annotated[str | None, Option(metavar="TOPIC", help="Of an MCAP file: that of the images.")] = None,
     compression: options.Compression = options.CompressionName.raw,
     overwrite: options.Overwrite = False,
     strict: options.Strict = False,
-    **given: Annotated[Any, POSITIONS],
+    **given: Annotated[Any, IMPORTED],
 ) -> None:
-    """Convert a video or pictures to a recording."""
+    """Convert frames of another program to a recording."""
     from mirrorskin import io
     from mirrorskin.cli.output import make_strict, printable, progress, report_notes
     from mirrorskin.io.findings import in_process, warn
 
     make_strict(strict)
 
+    refuse_foreign(context, motion.value, str(frames))
     files = [value for value in given.values() if isinstance(value, Path)]
     io.check_output(output, frames, *files, replaces="anything" if overwrite else "nothing")
     known = stack_options(given)
-    header = io.Header(
-        motion.value, title=frames.stem, tilt=known.get("tilt"), pixel_size=known.get("pixel_size")
-    )
-    with progress("counting frames", None) as show:
-        source = io.open_frames(frames, header, known.get("travel"), known.get("phase"), topic, show)
+    known["motion"] = motion.value
+    source = io.open_recording(frames, **known)
     with (
         io.Recorder(source, output, compression.value, overwrite=overwrite) as recorder,
         progress("importing", source.shape[0]) as show,
@@ -50,7 +43,7 @@ def command(
         process = in_process(found.findings, {})
         warn(str(frames), process)
     report_notes(str(frames), process)
-    if header.pixel_size is None:
+    if source.header.pixel_size is None:
         message = (
             f"{output}: no pixel size: holes are not filled, and normals, slip and measures need it;"
             " give --pixel-size here or to 'reconstruct'"

@@ -8,10 +8,13 @@ from typing import Annotated
 from mirrorskin.cli import options
 from mirrorskin.cli.groups import Argument, Option
 from mirrorskin.cli.output import print_fields, print_json
+from mirrorskin.cli.stack import FORMATS
 
 
 def command(
-    file: Annotated[Path, Argument(metavar="FILE", help="Recording, result, or any file of HDF5 or Zarr.")],
+    file: Annotated[
+        Path, Argument(metavar="FILE", help=f"Recording, result, calibration or frames: {FORMATS}.")
+    ],
     verify: Annotated[
         bool, Option("--verify", help="Read all frames, and compare them with their checksums.")
     ] = False,

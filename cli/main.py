@@ -39,7 +39,7 @@ PURPOSES = {
     "demo": "Draw the figures of the paper from experiments on the twin.",
     "simulate": "Record what the twin sees, with the truth.",
     "sample": "Write example data.",
-    "import": "Convert a video or pictures to a recording.",
+    "import": "Convert frames of another program to a recording.",
     "capture": "Move the stage, and record what the camera sees.",
     "live": "Reconstruct while the stage moves.",
     "reconstruct": "Reconstruct heights from a press, normals and heights from a rotation, or slip.",

@@ -10,14 +10,14 @@ import click
 from mirrorskin.cli import options
 from mirrorskin.cli.declared import declared
 from mirrorskin.cli.groups import Argument, refuse_foreign
-from mirrorskin.cli.stack import RECORDING, stack_options
+from mirrorskin.cli.stack import FORMATS, RECORDING, stack_options
 
 _REMEDIES = {"zenith": "--zenith-gain", "height": "--pixel-size"}  # by maps that are missing
 
 
 def command(
     context: click.Context,
-    recording: Annotated[Path, Argument(metavar="REC.h5", help="Frames in HDF5, Zarr, NPY or NPZ.")],
+    recording: Annotated[Path, Argument(metavar="REC.h5", help=f"Frames: {FORMATS}.")],
     output: Annotated[Path | None, options.result_option("REC-result.h5")] = None,
     live: options.LiveFrames = False,
     calibration: options.Calibration = None,

@@ -8,14 +8,14 @@ from typing import Annotated, Any
 from mirrorskin.cli import options
 from mirrorskin.cli.declared import ClassCommand
 from mirrorskin.cli.groups import Argument, make_command
-from mirrorskin.cli.stack import RECORDING, stack_options
+from mirrorskin.cli.stack import FORMATS, RECORDING, stack_options
 
 
 def command(
     class_name: Annotated[
         str, Argument(metavar="MODULE:CLASS", help="Class in a module or file: mine:Sum, or mine.py:Sum.")
     ],
-    recording: Annotated[Path, Argument(metavar="REC.h5", help="Frames in HDF5, Zarr, NPY or NPZ.")],
+    recording: Annotated[Path, Argument(metavar="REC.h5", help=f"Frames: {FORMATS}.")],
     output: Annotated[Path | None, options.result_option("REC-CLASS.h5")] = None,
     live: options.LiveFrames = False,
     memory: options.Memory = "256MB",

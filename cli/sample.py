@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import click
@@ -28,6 +27,7 @@ _AT = ((0.0, 0.0), (-2.2, -2.2), (2.2, -2.2), (-2.2, 2.2), (2.2, 2.2))  # mm, wh
 _FLAT_FRAMES = 16
 _BOARD, _DPI = "dots:7x5:1mm", 1200  # as the README prints it
 _LEAN = 2e-5  # how obliquely the board's camera looks, 1/pixel
+_QUALITY = 3  # quantiser of the video, 2 to 31: the smaller, the better
 _BLUR, _NOISE = 0.5, 1.0  # of its picture: pixels and counts, one sigma
 
 
@@ -185,27 +185,23 @@ def _write_picture(path: Path, picture: NDArray[np.uint8], replaces: Replaces) -
 
 
 def _make_video(path: Path, replaces: Replaces) -> None:
-    import cv2
+    from io import BytesIO
 
-    from mirrorskin import io
-    from mirrorskin.io.atomic import MAKE_ROOM, write_new
+    from mirrorskin.io import InputError
+    from mirrorskin.io.atomic import write_new
+    from mirrorskin.io.video import load_av
 
-    refusal = io.InputError(f"{path}: cannot be written as a video. Choose a name that ends in .avi")
     if path.suffix.lower() != ".avi":
-        raise refusal
-    size = (_SHAPE[1], _SHAPE[0])
-    with TemporaryDirectory() as folder:
-        made = Path(folder, "video").with_suffix(path.suffix)
-        film = cv2.VideoWriter(str(made), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, size, isColor=False)
-        if not film.isOpened():
-            raise refusal
+        raise InputError(f"{path}: cannot be written as a video. Choose a name that ends in .avi")
+    av, file = load_av(path), BytesIO()
+    with av.open(file, "w", format="avi") as film:
+        stream = film.add_stream("mjpeg", rate=10)
+        stream.height, stream.width, stream.pix_fmt = *_SHAPE, "yuvj420p"
+        stream.codec_context.qmin = stream.codec_context.qmax = _QUALITY
         for frame in _frames():
-            film.write(frame)
-        film.release()
-        # OpenCV does not report a disk that is full.
-        if cv2.VideoCapture(str(made)).get(cv2.CAP_PROP_FRAME_COUNT) != _FRAMES:
-            raise io.InputError(f"{folder}: the video could not be written there; {MAKE_ROOM}")
-        write_new(path, [made.read_bytes()], replaces)
+            film.mux(stream.encode(av.VideoFrame.from_ndarray(frame, "gray").reformat(format="yuvj420p")))
+        film.mux(stream.encode(None))
+    write_new(path, [file.getvalue()], replaces)
 
 
 def _make_calibration(folder: Path, replaces: Replaces) -> None:

@@ -20,6 +20,7 @@ class StackOptions(TypedDict, total=False):
     """The keywords of ``io.open_recording`` that describe a stack; those not given are missing."""
 
     dataset: str
+    channel: int
     motion: Motion
     travel: Positions
     phase: Positions
@@ -33,7 +34,13 @@ _PRESS, _TURN = ("vertical",), ("axial",)
 
 STACK = Terms(
     [
-        term("dataset", "the stack in another program's file", "/entry/data", kind="text"),
+        term(
+            "dataset",
+            "the stack in another program's file: a dataset, array, topic, or number of a series or stream",
+            "/entry/data",
+            kind="text",
+        ),
+        Term("channel", "integer", "channel of a TIFF, or colour: 0 red, 1 green, 2 blue", least=0),
         Term("motion", "choice", "how the body moved, if the file does not say", choices=MOTIONS),
         term("travel_step", "travel from frame to frame: 0.1mm", "mm", motions=_PRESS),
         term("travel_start", "travel of the first frame; without it 0mm", "mm", motions=_PRESS),
@@ -60,7 +67,12 @@ STACK = Terms(
 )
 """What a recording may lack, and the part of it that is used."""
 RECORDING = STACK.without("tilt")
-POSITIONS = STACK.without("dataset", "motion", "region", "frames")
+IMPORTED = STACK.without("motion", "region", "frames")
+FORMATS = (
+    "HDF5, Zarr, NPY, NPZ, TIFF, MCAP, a video (AVI, MP4, MOV, MKV), or a folder of numbered pictures"
+    " (PNG, TIFF, BMP, PGM, JPEG)"
+)
+"""What frames are read from."""
 
 
 def stack_options(given: dict[str, Any], where: str = "--") -> StackOptions:
@@ -71,7 +83,7 @@ def stack_options(given: dict[str, Any], where: str = "--") -> StackOptions:
     names = [one.name for one in STACK.terms if one.name != "tilt"]
     values = {name: given.pop(name) for name in names if name in given}
     options = StackOptions()
-    for name in ("dataset", "motion", "pixel_size", "region", "frames"):
+    for name in ("dataset", "channel", "motion", "pixel_size", "region", "frames"):
         if name in values:
             options[name] = values[name]
     if isinstance(given.get("tilt"), float):

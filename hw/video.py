@@ -18,7 +18,7 @@ from mirrorskin.hw.clock import SYSTEM, Clock
 from mirrorskin.hw.reopened import OPEN_TIMEOUT, READ_TIMEOUT, ReopenedCamera, warn_of_other
 from mirrorskin.hw.rig_file import CameraSettings
 from mirrorskin.io import InputError
-from mirrorskin.io.pictures import quiet_opencv
+from mirrorskin.io.opencv import quiet_opencv
 
 _log = logging.getLogger("mirrorskin.hw")
 

@@ -14,7 +14,6 @@ from .calibration.types import (
 from .description import describe
 from .export import export_result, save_table
 from .findings import Finding, MirrorskinWarning
-from .frames import open_frames
 from .maps import Map
 from .mcap import save_messages
 from .mesh import Mesh, surface_mesh
@@ -72,7 +71,6 @@ __all__ = [
     "describe",
     "export_result",
     "open_calibration",
-    "open_frames",
     "open_heights",
     "open_recording",
     "open_result",

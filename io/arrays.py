@@ -7,7 +7,8 @@ import math
 import os
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from io import BufferedReader, BytesIO
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -15,8 +16,10 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io.fingerprint import State, check_unchanged, modified, state_of
-from mirrorskin.io.layout import COMPLETE, POSITIONS
+from mirrorskin.io.fingerprint import State, check_unchanged, fingerprint_of_files, modified, state_of
+from mirrorskin.io.foreign import kind_of_frames, open_reader
+from mirrorskin.io.frames import FrameReader, WholeFrames
+from mirrorskin.io.layout import COMPLETE, POSITIONS, REMEDIES
 from mirrorskin.io.os_errors import (
     MAX_UNPACKED_BYTES,
     as_input_error,
@@ -31,7 +34,6 @@ from mirrorskin.io.selection import Region
 from mirrorskin.io.stack import RawFrames
 from mirrorskin.io.types import MOTIONS, Block, Header, InputError, Motion, block_memory
 
-NUMPY_SUFFIXES = (".npy", ".npz")
 _KNOWN = {*POSITIONS.values(), "dark", "bright"}  # arrays of an archive that are not frames
 _NEEDED = "travel (--travel-step or --travel), phase (--phase-step or --phases)"
 _HASH_INTERVAL, _HASH_LENGTH = 4 << 20, 4 << 10  # bytes: of each 4 MiB of frames, the first 4 KiB are hashed
@@ -44,8 +46,8 @@ class ArrayRecording(Recording):
 
     Parameters
     ----------
-    frames : ndarray or RawFrames, (T, H, W)
-        An array, or frames of one in a file, which are read when they are used; see
+    frames : ndarray or FrameReader, (T, H, W)
+        An array, or frames in a file, which are read when they are used; see
         `mirrorskin.io.samples.frame_dtype` for their types.
     positions : mapping
         ``travel``, mm, (T,), ``phase`` or ``twist``, radians, (T,), or ``displacement``, mm, (T, 2).
@@ -68,7 +70,7 @@ class ArrayRecording(Recording):
 
     def __init__(
         self,
-        frames: NDArray[Any] | RawFrames,
+        frames: NDArray[Any] | FrameReader,
         positions: Mapping[str, ArrayLike | Positions | None],
         header: Mapping[str, Any],
         motion: Motion | None = None,
@@ -77,13 +79,17 @@ class ArrayRecording(Recording):
         name: str = "the array of frames",
         origins: Mapping[Path, State] | None = None,
     ) -> None:
+        reader = frames if isinstance(frames, FrameReader) else None
+        if reader is not None and reader.shape[0] < 2:
+            hints = "".join(f". {found.text}" for found in reader.findings if found.warning)
+            raise InputError(f"{name} holds {reader.shape[0]} frame: a stack has at least 2{hints}")
         if len(frames.shape) != 3 or frames.shape[0] < 2 or 0 in frames.shape:
             raise InputError(f"{name} has shape {frames.shape}: frames, (T, H, W), at least 2, are needed")
         decoding = Decoding(frames.dtype.newbyteorder("="), where=name)
-        self._frames: NDArray[Any] | RawFrames | DecodedFrames = frames
+        self._frames: NDArray[Any] | FrameReader | DecodedFrames = frames
         if isinstance(frames, np.ndarray) and frames.dtype != decoding.dtype:
             self._frames = decoding.decode(frames)
-        elif isinstance(frames, RawFrames) and not decoding.plain:
+        elif isinstance(frames, FrameReader) and not decoding.plain:
             self._frames = DecodedFrames(frames, decoding, frames.shape)
         self.findings = decoding.findings
         self.path, self.name, self.dataset, self._files = Path(name), name, "", dict(origins or {})
@@ -95,7 +101,8 @@ class ArrayRecording(Recording):
         self.shape: tuple[int, int, int] = (cut.frames[1] - cut.frames[0], *cut.region.shape)
         self.dtype: np.dtype[Any] = decoding.dtype
         self.time = self.travel = self.phase = self.displacement = self.twist = self.tilt = None
-        given = along(positions[series], self.full_shape[0])
+        lost = None if reader is None else reader.lost
+        given = along(positions[series], self.full_shape[0], lost)
         assert given is not None
         width = (2,) if series == "displacement" else ()
         where = f"{name}: the {series} given"
@@ -107,6 +114,10 @@ class ArrayRecording(Recording):
             raise InputError(f"{name}: pixel size {size} mm: give one above zero: 1e-9 to 1e6")
         self.header: Header = Header(self.motion, **{"title": self.path.stem, **header, **known})
         self.used, self.dropped, self.state = None, None, COMPLETE
+        if reader is not None:
+            self.time = None if reader.time is None else reader.time[slice(*cut.frames)]
+            self.dropped = None if lost is None else lost[slice(*cut.frames)]
+            self.left_out, self.findings = reader.left_out, (*reader.findings, *decoding.findings)
         self.storage, self._next, self._hash = "one piece", 0, ""
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
@@ -114,8 +125,14 @@ class ArrayRecording(Recording):
         out = block_memory(out, self.shape, self.dtype)
         if isinstance(self._frames, np.ndarray):
             return self.lend(len(out))
-        out = out[: self.shape[0] - self._next]
-        return self._block(self._part(self._next, out)) if len(out) else None
+        start, stop = self._next, min(self._next + len(out), self.shape[0])
+        if start == stop:
+            return None
+        lost = self.dropped
+        if lost is not None:  # frames of one block follow each other
+            stop = next((number for number in range(start + 1, stop) if lost[number]), stop)
+        block = self._block(self._part(start, out[: stop - start]))
+        return block if lost is None else replace(block, dropped=int(lost[start]))
 
     def lend(self, most: int) -> Block | None:
         """Return the next frames as a view of the array, at most ``most``; None at the end, or of a file."""
@@ -142,10 +159,16 @@ class ArrayRecording(Recording):
         return out
 
     def fingerprint(self) -> str:
-        """Return a SHA-256 of the array's shape and type, and of 4 KiB of each 4 MiB of its frames."""
+        """Return a SHA-256 of the array's shape and type, and of 4 KiB of each 4 MiB of its frames.
+
+        Where frames can only be decoded in order, it is that of the bytes of their files.
+        """
         check_unchanged(self._files)
         if not self._hash:
             digest = hashlib.sha256(f"{self.full_shape} {self.dtype} {self.which} {self.region}".encode())
+            if isinstance(self._frames, WholeFrames):
+                self._hash = fingerprint_of_files(self._files, digest)
+                return self._hash
             step = max(1, _HASH_INTERVAL // (math.prod(self.shape[1:]) * self.dtype.itemsize))
             for number in range(0, self.shape[0], step):
                 flat = np.ascontiguousarray(self.frame(number)).reshape(-1).view(np.uint8)
@@ -311,9 +334,10 @@ def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, head: _Head)
     return values
 
 
-def open_array(
+def open_stack(
     path: Path,
     dataset: str | None,
+    channel: int | None,
     positions: Mapping[str, ArrayLike | Positions | None],
     header: Mapping[str, Any],
     motion: Motion | None,
@@ -321,33 +345,52 @@ def open_array(
     wanted: tuple[int, int | None] | None,
     memory_limit: int | None = None,
 ) -> ArrayRecording:
-    """Open a stack written by ``numpy.save`` or ``numpy.savez``; see ``open_recording``.
+    """Open a stack that is neither HDF5 nor Zarr; see ``open_recording``.
 
-    An archive may also contain ``travel``, ``phase``, ``displacement`` or ``twist`` of each frame, and
-    ``dark`` and ``bright``. Arguments take precedence over them. Other arrays are not read. A compressed
-    archive is refused if these arrays take more than ``memory_limit`` and ``MAX_UNPACKED_BYTES``.
+    The file may contain ``travel``, ``phase``, ``displacement`` or ``twist`` of each frame, and an archive
+    ``dark`` and ``bright``. Arguments take precedence over them.
     """
-    held: dict[str, NDArray[Any]] = {}
-    with _naming(path):
-        check_regular(path)
-        origins = {path: state_of(path.stat())}
-        if path.suffix.lower() == ".npy":
-            frames = _open_frames(path)
+    with ExitStack() as opening:
+        kind = kind_of_frames(path)
+        if kind == "array":
+            with _naming(path):
+                check_regular(path)
+                files = {path: state_of(path.stat())}
+                frames, held = _open_array(path, dataset, memory_limit)
         else:
-            with open_regular(path) as file, zipfile.ZipFile(file) as archive:
-                members = _members(archive)
-                chosen = dataset or _stack_of(path, members)
-                if chosen not in members:
-                    names = ", ".join(members)
-                    raise InputError(f"{path} holds no array {chosen!r}: choose from {names}")
-                limit = max(MAX_UNPACKED_BYTES, memory_limit or 0)
-                needed = {name: one for name, one in members.items() if name in _KNOWN or name == chosen}
-                held = _read_members(path, archive, needed, limit)
-                frames = held.pop(chosen)
-    maps: dict[str, Any] = {one: held[one] for one in ("dark", "bright") if one in held}
-    given = {one: value for one, value in positions.items() if value is not None}
-    known = given or {one: value for one, value in held.items() if one in POSITIONS.values()}
-    return ArrayRecording(frames, known, {**maps, **header}, motion, region, wanted, str(path), origins)
+            if kind == "video":  # without positions, decoding would be in vain
+                _motion(str(path), positions, motion)
+            frames = opening.enter_context(open_reader(path, dataset, channel, memory_limit))
+            with as_input_error(str(path)):
+                files = {file: state_of(file.stat()) for file in frames.files}
+            held = dict(frames.positions)
+        maps: dict[str, Any] = {one: held[one] for one in ("dark", "bright") if one in held}
+        given = {one: value for one, value in positions.items() if value is not None}
+        known = given or {one: value for one, value in held.items() if one in POSITIONS.values()}
+        header = {**maps, **header}
+        recording = ArrayRecording(frames, known, header, motion, region, wanted, str(path), files)
+        opening.pop_all()  # the recording closes the file from now on
+    return recording
+
+
+def _open_array(
+    path: Path, dataset: str | None, memory_limit: int | None
+) -> tuple[NDArray[Any] | FrameReader, dict[str, NDArray[Any]]]:
+    """Open the frames in a file of ``numpy.save`` or ``numpy.savez``, and read the other known arrays.
+
+    A compressed archive is refused if these take more than ``memory_limit`` and ``MAX_UNPACKED_BYTES``.
+    """
+    if path.suffix.lower() == ".npy":
+        return _open_frames(path), {}
+    with open_regular(path) as file, zipfile.ZipFile(file) as archive:
+        members = _members(archive)
+        chosen = dataset or _stack_of(path, members)
+        if chosen not in members:
+            raise InputError(f"{path} holds no array {chosen!r}: choose from {', '.join(members)}")
+        limit = max(MAX_UNPACKED_BYTES, memory_limit or 0)
+        needed = {name: one for name, one in members.items() if name in _KNOWN or name == chosen}
+        held = _read_members(path, archive, needed, limit)
+        return held.pop(chosen), held
 
 
 def _stack_of(path: Path, names: Iterable[str]) -> str:
@@ -366,15 +409,14 @@ def _motion(
         raise InputError(f"{name}: unknown motion {motion!r}: give one of {', '.join(MOTIONS)}")
     given = [one for one, values in positions.items() if values is not None]
     fitting = [one for one in MOTIONS if POSITIONS[one] in given and motion in (None, one)]
+    if motion is not None and not fitting:
+        remedy = REMEDIES.get(POSITIONS[motion], "give it")
+        raise InputError(f"{name}: {motion} motion needs the {POSITIONS[motion]} of each frame: {remedy}")
     if len(fitting) != 1:
-        if motion is not None:
-            raise InputError(f"{name}: {motion} motion needs the {POSITIONS[motion]} of each frame: give it")
-        problem = (
-            "does not state the position of the body in each frame"
-            if not given
-            else f"has {' and '.join(given)}"
-        )
-        raise InputError(f"{name} {problem}: give one of {_NEEDED}")
+        where = "does not state the position of the body in each frame"
+        problem = f"has {' and '.join(given)}" if given else where
+        remedy = ", or --motion" if fitting else ""
+        raise InputError(f"{name} {problem}: give one of {_NEEDED}{remedy}")
     return fitting[0], POSITIONS[fitting[0]]
 
 

@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.arrays import NUMPY_SUFFIXES, list_arrays
+from mirrorskin.io.arrays import list_arrays
 from mirrorskin.io.calibration.file import MARK as CALIBRATION_MARK
 from mirrorskin.io.calibration.file import open_calibration
 from mirrorskin.io.calibration.types import PARTS, Calibration
+from mirrorskin.io.foreign import kind_of_frames, open_reader
+from mirrorskin.io.frames import FrameReader
 from mirrorskin.io.layout import MARK
 from mirrorskin.io.recording import Recording, open_recording
 from mirrorskin.io.result import Result
@@ -20,8 +22,10 @@ from mirrorskin.io.url import is_zarr, path_of
 from mirrorskin.io.zarr import open_file
 
 
-def describe(path: str | Path) -> dict[str, str]:
-    """Describe a file: a recording, a result, a calibration, stacks of another program, or NumPy arrays.
+def describe(path: str | Path, *, dataset: str | None = None, channel: int | None = None) -> dict[str, str]:
+    """Describe a file: a recording, a result, a calibration, or frames of another program.
+
+    ``dataset`` and ``channel`` choose frames as in ``open_recording``.
 
     Returns
     -------
@@ -39,8 +43,12 @@ def describe(path: str | Path) -> dict[str, str]:
     'vertical'
     """
     path = path_of(path)
-    if path.suffix.lower() in NUMPY_SUFFIXES:
+    kind = kind_of_frames(path)
+    if kind == "array":
         return {"kind": "NumPy array", **list_arrays(path)}
+    if kind:
+        with open_reader(path, dataset, channel) as frames:
+            return _frames(kind, frames)
     with open_file(path) as file:
         ours, result = file.marked(MARK), file.marked(RESULT_MARK)
         calibration = file.marked(CALIBRATION_MARK)
@@ -52,8 +60,23 @@ def describe(path: str | Path) -> dict[str, str]:
             return _recording(recording)
     if result:
         return _result(open_result(path))
-    kind = "Zarr" if is_zarr(path) else "HDF5 file"
-    return {"kind": f"{kind} of another layout", "stacks": str(len(stacks)), **stacks}
+    container = "Zarr" if is_zarr(path) else "HDF5 file"
+    return {"kind": f"{container} of another layout", "stacks": str(len(stacks)), **stacks}
+
+
+def _frames(kind: str, frames: FrameReader) -> dict[str, str]:
+    """Describe the frames of a folder, TIFF, video or MCAP file."""
+    count, rows, columns = frames.shape
+    facts = {"kind": "folder of pictures" if kind == "folder" else kind}
+    facts |= {"frames": f"{count} of {columns} x {rows}, {frames.dtype.name}", "storage": frames.how}
+    facts |= _range("time", frames.time, "s")
+    for name, unit in (("travel", "mm"), ("phase", "rad"), ("twist", "rad")):
+        facts |= _range(name, frames.positions.get(name), unit)
+    if frames.lost is not None:
+        facts["dropped"] = f"{np.sum(frames.lost)} frames"
+    if frames.left_out:
+        facts["left out"] = ", ".join(frames.left_out)
+    return facts | {f"finding: {found.kind}": found.text for found in frames.findings}
 
 
 def _recording(recording: Recording) -> dict[str, str]:
@@ -67,9 +90,10 @@ def _recording(recording: Recording) -> dict[str, str]:
         "frames": f"{count} of {columns} x {rows}, {recording.dtype}",
         "storage": recording.storage,
     }
-    if recording.used is not None and recording.dropped is not None:
+    if recording.used is not None:
         facts["state"] = recording.state
         facts["used"] = f"{np.count_nonzero(recording.used)} of {count} frames"
+    if recording.dropped is not None:
         facts["dropped"] = f"{np.sum(recording.dropped)} frames"
     if header.pixel_size is not None:
         x, y = header.pixel_size

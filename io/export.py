@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mirrorskin.io import pictures
 from mirrorskin.io.arguments import check_flag, check_kind, check_path, checked
 from mirrorskin.io.atomic import write_new
-from mirrorskin.io.frames import MCAP_SUFFIX
+from mirrorskin.io.foreign import MCAP_SUFFIX
 from mirrorskin.io.mesh import Mesh, face_vectors, normals_around, surface_mesh
 from mirrorskin.io.result import Result
 from mirrorskin.io.result_file import save_result

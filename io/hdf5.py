@@ -405,9 +405,7 @@ def _open_file(path: Path, real: str) -> h5py.File:
     if not path.exists():
         raise InputError(f"{path}: no such file")
     if path.is_dir():
-        raise InputError(
-            f"{path} is a folder: an HDF5 file is needed; 'mirrorskin import' reads picture folders"
-        )
+        raise InputError(f"{path} is a folder: an HDF5 file is needed")
     if not path.is_file():
         raise InputError(f"{path} is not a regular file: save what it gives in one first")
     try:

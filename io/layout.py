@@ -54,7 +54,7 @@ POSITIONS: dict[Motion, str] = {
 }
 """The series that contains the positions, for each motion."""
 
-_REMEDIES = {"travel": "give --travel-step or --travel", "phase": "give --phase-step or --phases"}
+REMEDIES = {"travel": "give --travel-step or --travel", "phase": "give --phase-step or --phases"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,8 @@ def read_state(file: Hdf5File, ours: bool, stack: h5py.Dataset, count: int) -> R
     """Read the state of a recording; stacks of other programs, of ``count`` frames, are complete."""
     node = file.find(STATE) if ours else None
     if node is None:
-        return RecordingState(count)
+        lost = file.find(DROPPED) if ours else None
+        return RecordingState(count, dropped=None if lost is None else file.read(lost, (count,)))
     state = str(file.value(node))
     if state == UNDER_WAY and not (file.root.swmr_mode and is_locked(file.path)):
         state = f"{CUT_SHORT}its writer was killed"
@@ -160,12 +161,12 @@ class Layout:
     def positions(self, motion: Motion, given: ArrayLike | None) -> dict[str, Floats | None]:
         """Read and check the times and positions of the frames; travel or phase may be given."""
         name, time = POSITIONS[motion], self._cut(self._series("time"))
-        if name not in _REMEDIES:
+        if name not in REMEDIES:
             return {"time": time, name: self._cut(self._series(name))}
         where = f"{self._file.path}: {SERIES[name][0] if given is None else f'the {name} given'}"
-        given = self._series(name, remedy=_REMEDIES[name]) if given is None else given
+        given = self._series(name, remedy=REMEDIES[name]) if given is None else given
         if given is None:
-            remedy = _REMEDIES[name]
+            remedy = REMEDIES[name]
             raise InputError(
                 f"{self._file.path} does not state the position of the body in each frame: {remedy}"
             )

@@ -13,15 +13,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from mirrorskin.io.arguments import check_path, checked
 from mirrorskin.io.atomic import MAKE_ROOM, new_file
 from mirrorskin.io.export import check_heights, points_of
-from mirrorskin.io.frames import FrameSequence
+from mirrorskin.io.frames import CONVERTED_COLOUR, WholeFrames, lost_frames
+from mirrorskin.io.opencv import is_coloured, to_grey
 from mirrorskin.io.os_errors import MAX_UNPACKED_BYTES, as_input_error, check_unpacked, open_regular
-from mirrorskin.io.pictures import decode_grey, quiet_opencv
-from mirrorskin.io.positions import Positions
+from mirrorskin.io.pictures import Picture, decode_bytes
 from mirrorskin.io.recording import Recording
 from mirrorskin.io.result import Result
 from mirrorskin.io.text import one_line
@@ -38,7 +38,8 @@ _METRE = 1e-3  # m per mm
 _SECOND = 1_000_000_000  # nanoseconds
 _FRAME = "sensor"  # coordinate frame: x right and y up in the picture, z towards the sensor
 _ENCODINGS = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2", "32FC1": "f4"}
-_COLOURS = {"rgb8": "RGB", "bgr8": "BGR", "rgba8": "RGBA", "bgra8": "BGRA"}
+# Where blue, green, red and opacity are.
+_COLOURS = {"rgb8": [2, 1, 0], "bgr8": [0, 1, 2], "rgba8": [2, 1, 0, 3], "bgra8": [0, 1, 2, 3]}
 _NAMES = {np.dtype(np.uint8): "mono8", np.dtype(np.uint16): "mono16", np.dtype(np.float32): "32FC1"}
 _FLOAT32 = 7  # datatype of a PointField
 _SERIES = {"travel": _METRE, "phase": 1.0, "tilt": 1.0, "twist": 1.0}  # topics, with factors to SI units
@@ -337,58 +338,62 @@ def _stamp(text: str) -> int:
     return 0
 
 
-class Messages(FrameSequence):
-    """The images of one topic of a ROS 2 MCAP file, as a source that can be rewound.
+class MessageFrames(WholeFrames):
+    """The images of one topic of a ROS 2 MCAP file.
 
-    Grey images are used unchanged; colours and compressed images are converted to luma. Positions that are
-    not given are read from ``/travel`` (m) or ``/phase`` (rad), one message per image.
+    Grey images are used unchanged; colours become grey as in ``to_grey``. ``positions`` are read from
+    ``/travel`` (m), ``/phase`` and ``/twist`` (rad), if there is one message per image. ``time`` is the log
+    time relative to the first image. A jump of the messages' sequence numbers is a gap of lost frames.
+
+    Parameters
+    ----------
+    path : Path
+    topic : str, optional
+        Topic of the images, if the file has more than one.
+    channel : int, optional
+        Colour to read: 0 red, 1 green, 2 blue; by default luma.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        header: Header,
-        travel: ArrayLike | Positions | None = None,
-        phase: ArrayLike | Positions | None = None,
-        topic: str | None = None,
-    ) -> None:
-        self._path = Path(path)
+    how = "message by message"
+
+    def __init__(self, path: Path, topic: str | None = None, channel: int | None = None) -> None:
+        self._path, self.files, self._channel = path, (path,), channel
         self._summary = self._read_summary()
-        self._times: dict[str, NDArray[np.uint64]] = {}
+        self._known: dict[str, _Stamps] = {}
         self._topic = self._choose(topic)
-        times = self._times_of(self._topic)
-        if not len(times):
-            raise InputError(f"{path}: {self._topic} has no messages: name another topic with --topic")
-        self._left = self._messages(self._topic)
-        first = self._next_frame()
-        if header.motion == "vertical" and travel is None:
-            travel = self._numbers("travel", len(times))
-        if header.motion == "axial" and phase is None:
-            phase = self._numbers("phase", len(times))
-        seconds = (np.sort(times) - times.min()) / _SECOND
-        known = seconds if len(times) == 1 or bool(np.all(np.diff(seconds) > 0)) else None
-        shape = (len(times), first.shape[0], first.shape[1])
-        super().__init__(str(path), header, shape, first.dtype, travel=travel, phase=phase, time=known)
-        self.rewind()
+        stamps = self._stamps_of(self._topic)
+        count = len(stamps.times)
+        if not count:
+            raise InputError(f"{path}: {self._topic} has no messages: name another topic with --dataset")
+        self._left, self._next = self._messages(self._topic), 0
+        first = self._picture()
+        frame = to_grey(first.samples, str(path), channel)
+        self.shape, self.dtype = (count, *frame.shape), frame.dtype
+        order = np.argsort(stamps.times, kind="stable")
+        seconds = (stamps.times[order] - stamps.times.min()) / _SECOND
+        self.time = seconds if bool(np.all(np.diff(seconds) > 0)) else None
+        self.lost = _lost(stamps.numbers[order])
+        self.positions = dict(self._numbers(count))
+        seen = [one for one in first.findings if channel is None or one.kind != "colour"]
+        self.findings = (*lost_frames(self.lost), *seen)
 
-    def rewind(self) -> None:
-        """Go back to the first frame."""
-        super().rewind()
-        self._left = self._messages(self._topic)
+    def frames(self, start: int, stop: int) -> Iterator[tuple[str, NDArray[Any]]]:
+        """Decode images, from the current one on or from the first."""
+        if start < self._next:
+            self._left, self._next = self._messages(self._topic), 0
+        while self._next < start:
+            with self._naming():
+                next(self._left)
+            self._next += 1
+        while self._next < stop:
+            name = f"{self._path}: {self._topic}, message {self._next}"
+            yield name, to_grey(self._picture().samples, name, self._channel)
 
-    def _fill(self, start: int, out: NDArray[Any]) -> None:
-        for number, frame in enumerate(out, start):
-            picture = self._next_frame()
-            if picture.shape != frame.shape or picture.dtype != frame.dtype:
-                raise InputError(
-                    f"{self.name}: image {number} of {self._topic} has another size or type than the first:"
-                    " cut it there"
-                )
-            frame[...] = picture
-
-    def _next_frame(self) -> NDArray[Any]:
+    def _picture(self) -> Picture:
+        """Decode the next image."""
+        number, self._next = self._next, self._next + 1
         with self._naming():
-            return _frame(next(self._left), f"{self._path}: {self._topic}")
+            return _decode(next(self._left), f"{self._path}: {self._topic}, message {number}")
 
     def _choose(self, topic: str | None) -> str:
         """Return the topic of the images: the requested one, or the only one."""
@@ -404,29 +409,29 @@ class Messages(FrameSequence):
         if topic in found:
             return str(topic)
         there = ", ".join(sorted(found)) or "none"
-        wrong = "name one with --topic" if topic is None else f"{topic} is none"
+        wrong = "name one with --dataset" if topic is None else f"{topic} is not one of them"
         raise InputError(f"{self._path}: its topics of images are {there}: {wrong}")
 
-    def _numbers(self, name: str, count: int) -> Floats:
-        with self._naming():
-            values = [float(message.data) for message in self._messages(f"/{name}")]
-        if len(values) != count:
-            option = {"travel": "--travel-step", "phase": "--phase-step or --phases"}[name]
-            raise InputError(
-                f"{self._path} has {len(values)} messages on /{name} for {count} frames: give {option}"
-            )
-        return np.asarray(values) / _SERIES[name]
+    def _numbers(self, count: int) -> Iterator[tuple[str, Floats]]:
+        """Yield the positions that the file contains for each image."""
+        topics = {one.topic for one in self._summary.channels.values() if one.kind == _NUMBER}
+        for name in ("travel", "phase", "twist"):
+            if f"/{name}" in topics and len(self._stamps_of(f"/{name}").times) == count:
+                with self._naming():
+                    values = [float(message.data) for message in self._messages(f"/{name}")]
+                yield name, np.asarray(values) / _SERIES[name]
 
-    def _times_of(self, topic: str) -> NDArray[np.uint64]:
-        """Return the log times of the messages of a topic, in the order of storage."""
-        if topic not in self._times:
+    def _stamps_of(self, topic: str) -> _Stamps:
+        """Return the log times and sequence numbers of the messages of a topic, in the order of storage."""
+        if topic not in self._known:
             with self._naming():
-                self._times[topic] = np.fromiter((one.log_time for one in self._stored(topic)), np.uint64)
-        return self._times[topic]
+                stamps = [(one.log_time, one.sequence) for one in self._stored(topic)]
+            self._known[topic] = _Stamps(*np.array(stamps, np.uint64).reshape(-1, 2).T)
+        return self._known[topic]
 
     def _messages(self, topic: str) -> Iterator[Any]:
         """Yield the messages of a topic in the order of their times, decoded."""
-        times, stored = self._times_of(topic), self._stored(topic)
+        times, stored = self._stamps_of(topic).times, self._stored(topic)
         if np.any(times[1:] < times[:-1]):
             stored = iter(sorted(self._hold(topic), key=lambda one: one.log_time))
         decoders = {name: _decoder(name) for name in _MESSAGES}
@@ -509,6 +514,11 @@ class Messages(FrameSequence):
             ) from error
 
 
+class _Stamps(NamedTuple):
+    times: NDArray[np.uint64]  # nanoseconds
+    numbers: NDArray[np.uint64]  # sequence numbers; 0 if the writer does not count
+
+
 class _Channel(NamedTuple):
     topic: str
     kind: str  # name of its message type; empty for one that is not read
@@ -571,22 +581,40 @@ def _decoder(kind: str) -> Callable[[bytes], Any]:
     return decoder
 
 
-def _frame(message: Any, name: str) -> NDArray[Any]:
-    """Return an image as grey samples, (H, W)."""
-    if not hasattr(message, "encoding"):
-        return decode_grey(bytes(message.data), f"{name}: an image of format {message.format!r}")
-    code, colours = _ENCODINGS.get(message.encoding, "u1"), len(_COLOURS.get(message.encoding, "Y"))
-    if message.encoding not in (*_ENCODINGS, *_COLOURS):
-        raise InputError(
-            f"{name}: images of encoding {message.encoding!r} are not read: save them as mono8 or mono16"
-        )
+def _lost(numbers: NDArray[np.uint64]) -> NDArray[np.int32]:
+    """Return the frames lost before each message, from their sequence numbers, if these count a topic."""
+    missing = np.concatenate([[0], np.diff(numbers.astype(np.int64)) - 1])
+    counted = bool(np.all(missing >= 0)) and missing.sum() <= len(numbers)
+    return (missing if counted else np.zeros(len(numbers))).astype(np.int32)
+
+
+def _decode(message: Any, name: str) -> Picture:
+    """Return an image: grey, or blue, green, red and opacity."""
+    compressed = not hasattr(message, "encoding")
+    encoding = message.format.partition(";")[0].strip() if compressed else message.encoding
+    if encoding.startswith("bayer_") or not (compressed or encoding in (*_ENCODINGS, *_COLOURS)):
+        raise InputError(f"{name}: encoding {encoding!r} is not supported: save images as mono8 or mono16")
+    data = bytes(message.data)
+    if not data or (not compressed and not (message.height and message.width)):
+        raise InputError(f"{name}: the image has no pixels: remove it")
+    if compressed:
+        return decode_bytes(data, name)
+    code, order = _ENCODINGS.get(encoding, "u1"), _COLOURS.get(encoding, [0])
     kind = np.dtype(code).newbyteorder(">" if message.is_bigendian else "<")
-    if not (message.height and message.width):
-        raise InputError(f"{name}: an image has no pixels: remove it")
-    rows = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)
-    samples = np.ascontiguousarray(rows[:, : message.width * colours * kind.itemsize]).view(kind)
-    frame = samples.astype(kind.newbyteorder("=")).reshape(message.height, message.width, colours)
-    if colours > 1:
-        with quiet_opencv() as cv2:
-            return np.asarray(cv2.cvtColor(frame, getattr(cv2, f"COLOR_{_COLOURS[message.encoding]}2GRAY")))
-    return frame[:, :, 0]
+    needed = message.width * len(order) * kind.itemsize
+    step = message.step
+    if step < needed and len(data) == needed * message.height:
+        step = needed
+    if step < needed or len(data) < step * (message.height - 1) + needed:
+        raise InputError(
+            f"{name}: {len(data)} bytes in steps of {message.step} are not {message.width} x {message.height}"
+            f" pixels of {encoding}: correct its step, width and height"
+        )
+    shape, strides = (
+        (message.height, message.width, len(order)),
+        (step, len(order) * kind.itemsize, kind.itemsize),
+    )
+    samples = np.ndarray(shape, kind, data, strides=strides)[..., order].astype(kind.newbyteorder("="))
+    if len(order) == 1:
+        return Picture(samples[..., 0])
+    return Picture(samples, (CONVERTED_COLOUR,) if is_coloured(samples) else ())

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.maps import Map, declaration_of
+from mirrorskin.io.opencv import encode
 from mirrorskin.io.result import Result, Shown, map_shape, may_name_a_map
 from mirrorskin.io.types import InputError
 from mirrorskin.io.units import ratio
@@ -217,7 +218,7 @@ def _picture(name: str, values: NDArray[Any], unit: str) -> str:
     grey = np.clip((np.where(known, flat, low) - low) / (high - low or 1.0), 0, 1)
     colours = cv2.applyColorMap((255 * grey).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
     picture = np.dstack([colours, 255 * known.astype(np.uint8)])
-    data = base64.b64encode(cv2.imencode(".png", picture)[1].tobytes()).decode()
+    data = base64.b64encode(encode(".png", picture)).decode()
     caption = escape(f"{name}, {low:.4g} to {high:.4g} {unit}".rstrip())
     image = f"<img alt='{caption}' src='data:image/png;base64,{data}'>"
     return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"

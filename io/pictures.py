@@ -1,13 +1,12 @@
-"""Picture files: PNG, TIFF with one or several pages; and pictures for printing."""
+"""Picture files: PNG, TIFF, BMP, PGM and JPEG; and pictures for printing."""
 
 from __future__ import annotations
 
-import logging
 import math
+import re
 import struct
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,80 +14,136 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.atomic import write_new
-from mirrorskin.io.os_errors import check_regular, check_unpacked, open_regular, read_regular
+from mirrorskin.io.findings import Finding
+from mirrorskin.io.frames import CONVERTED_COLOUR, lossy
+from mirrorskin.io.opencv import decode, encode, is_coloured, to_grey
+from mirrorskin.io.os_errors import check_unpacked, read_regular
+from mirrorskin.io.tiff import SMALLER, TIFF_SUFFIXES, TiffFrames, samples_of_table
 from mirrorskin.io.types import FRAME_DTYPES, InputError
 
-TIFF_SUFFIXES = (".tif", ".tiff")
-PICTURE_SUFFIXES = (".png", *TIFF_SUFFIXES)
+PICTURE_SUFFIXES = (".png", ".bmp", ".pgm", ".jpg", ".jpeg", *TIFF_SUFFIXES)
 
-_DTYPES = [dtype.name for dtype in FRAME_DTYPES]
+_DTYPES = tuple(dtype.name for dtype in FRAME_DTYPES)
 _PNG_MARK = b"\x89PNG\r\n\x1a\n"
-_TIFF_MARKS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _PNG_HEAD = 33  # bytes of the signature and the first chunk; the pixel size may follow
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
+_PNG_PALETTE = 3  # colour type
+_PNG_COMPRESSION = 16  # cv2.IMWRITE_PNG_COMPRESSION
 _ADAM7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
 _PIECE = 1 << 20  # bytes unpacked at a time
 _INCH = 0.0254  # m
-_FORMATS = {1: "uint", 2: "int", 3: "float"}  # sample formats (TIFF 6.0, section 19)
-_JPEG_MARK = b"\xff\xd8"
+_JPEG_MARK, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 _JPEG_BYTES = 8  # bytes per pixel in a decoder: a progressive JPEG has three coefficients of 2 bytes
-_SMALLER = "save it as smaller pictures"
-_UNDECODABLE = "cannot be decoded: it is damaged, or of a kind that OpenCV does not read"
+_BMP_HEAD = struct.Struct("<2x4s4xIIiiHHI12xI")  # file size, offset, then the header of Windows 3 or later
+_BLANK = rb"\s+(?:#[^\n]*\n\s*)*"
+_PGM_HEAD = re.compile(rb"P5%b(\d{1,9})%b(\d{1,9})%b(\d{1,5})\s" % (_BLANK, _BLANK, _BLANK))
+
+
+class Picture(NamedTuple):
+    """A decoded picture: (H, W), or (H, W, channels) of blue, green, red and opacity."""
+
+    samples: NDArray[Any]
+    findings: tuple[Finding, ...] = ()
 
 
 def read_picture(path: Path) -> NDArray[Any]:
-    """Read the only picture in a PNG or TIFF, (H, W), uint8, uint16 or float32.
+    """Read the only picture in a file as grey, (H, W), uint8, uint16 or float32; see ``to_grey``."""
+    return to_grey(decode_picture(path).samples, str(path))
 
-    Colour is converted to grey: to the common value of equal channels, otherwise to the luma of ITU-R BT.601,
-    0.299 R + 0.587 G + 0.114 B, as computed by OpenCV. Opacity is ignored.
+
+def decode_picture(path: Path, dtypes: Sequence[str] = _DTYPES) -> Picture:
+    """Decode the only picture in a file; ``dtypes`` are the accepted types of a TIFF's samples.
+
+    Indices of a colour table become samples as in a `TiffFrames`. Fewer than 8 bits are scaled to 0 to 255;
+    other samples are those stored, whatever the number of bits in use.
     """
-    return _grey(decode_picture(path))
+    if path.suffix.lower() not in TIFF_SUFFIXES:
+        return decode_bytes(read_regular(path), str(path))
+    with TiffFrames(path, None, None, dtypes) as tiff:
+        if tiff.shape[0] != 1:
+            raise InputError(f"{path} holds several pages, and one is needed: save each page as a picture")
+        return Picture(tiff.page(0), tiff.findings)
 
 
-def decode_picture(path: Path, dtypes: Sequence[str] = _DTYPES) -> NDArray[Any]:
-    """Decode the only picture in a PNG or TIFF as stored, (H, W) or (H, W, channels)."""
-    data = read_regular(path)
+def decode_bytes(data: bytes, name: str) -> Picture:
+    """Decode a PNG, JPEG, BMP or PGM in memory."""
     if data[:8] == _PNG_MARK:
-        return _decode_png(data, str(path), -1)
-    if count_pages(path, dtypes) != 1:
-        raise InputError(f"{path} holds several pages, and one is needed: save each page as a picture")
-    return _decode(data, str(path), -1)
+        picture = Picture(_decode_png(data, name))
+    elif data[:2] == _JPEG_MARK:
+        picture = Picture(_decode_jpeg(data, name), (lossy("JPEG"),))
+    elif data[:2] == b"BM":
+        picture = Picture(_decode_bmp(data, name))
+    elif data[:2] == b"P5":
+        picture = Picture(_decode_pgm(data, name))
+    else:
+        raise InputError(f"{name} is not a PNG, TIFF, BMP, binary PGM or JPEG, or is damaged: save it as PNG")
+    colour = (CONVERTED_COLOUR,) if is_coloured(picture.samples) else ()
+    return picture._replace(findings=picture.findings + colour)
 
 
-def decode_grey(data: bytes, name: str) -> NDArray[Any]:
-    """Decode a PNG or JPEG in memory as grey samples, (H, W), of 8 or 16 bits."""
-    import cv2
-
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
-    if data[:8] == _PNG_MARK:
-        return _decode_png(data, name, flags)
-    check_unpacked(_JPEG_BYTES * math.prod(_jpeg_size(data, name)), name, _SMALLER)
-    return _decode(data, name, flags)
+def _decode_jpeg(data: bytes, name: str) -> NDArray[Any]:
+    check_unpacked(_JPEG_BYTES * math.prod(_jpeg_size(data, name)), name, SMALLER)
+    if _JPEG_END not in data[-64:]:  # some cameras pad; OpenCV fills what is missing with grey
+        raise InputError(f"{name} is cut off: copy it again")
+    return decode(data, name, upright=True)
 
 
-def _decode(data: bytes, name: str, flags: int) -> NDArray[Any]:
-    with quiet_opencv() as cv2:
-        try:
-            picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-        except cv2.error:
-            picture = None
-    if picture is None:
-        raise InputError(f"{name} {_UNDECODABLE}")
-    return np.asarray(picture)
+def _decode_bmp(data: bytes, name: str) -> NDArray[Any]:
+    if len(data) < _BMP_HEAD.size:
+        raise InputError(f"{name} is cut off: copy it again")
+    _, start, head, width, height, _, bits, packing, colours = _BMP_HEAD.unpack_from(data)
+    if head < 40:
+        raise InputError(f"{name} is a BMP of OS/2: save it as PNG")
+    size = abs(width * height) * max(bits // 8, 1)
+    check_unpacked(size, f"{name}: a picture of {width} x {abs(height)}", SMALLER)
+    if packing == 0 and len(data) < start + -(-width * bits // 32) * 4 * abs(height):
+        raise InputError(f"{name} is cut off: copy it again")
+    if bits > 8:
+        return decode(data, name)
+    count, place = colours or 1 << bits, 14 + head
+    table = np.frombuffer(data[place : place + 4 * min(count, 256)], np.uint8).reshape(-1, 4)[:, 2::-1]
+    # With a table of equal colours OpenCV returns the indices.
+    equal = np.repeat(np.arange(len(table), dtype=np.uint8), 4).tobytes()
+    indices = decode(data[:place] + equal + data[place + len(equal) :], name)
+    indices = indices if indices.ndim == 2 else indices[..., 0]
+    return _looked_up(samples_of_table(name, table), indices, name)
 
 
-def _decode_png(data: bytes, name: str, flags: int) -> NDArray[Any]:
+def _looked_up(samples: NDArray[Any], indices: NDArray[Any], name: str) -> NDArray[Any]:
+    if indices.max(initial=0) >= len(samples):
+        raise InputError(f"{name} is damaged: its table has {len(samples)} colours. Copy it again")
+    looked_up: NDArray[Any] = samples[indices]
+    return looked_up
+
+
+def _decode_pgm(data: bytes, name: str) -> NDArray[Any]:
+    found = _PGM_HEAD.match(data)
+    columns, rows, most = map(int, found.groups()) if found else (0, 0, 0)
+    kind = np.dtype(">u2" if most > 255 else "u1")
+    if found is None or not 0 < most < 65536 or len(data) - found.end() < rows * columns * kind.itemsize:
+        raise InputError(f"{name} is damaged or cut off: copy it again")
+    samples = np.frombuffer(data, kind, rows * columns, found.end()).reshape(rows, columns)
+    return samples.astype(kind.newbyteorder("="))
+
+
+def _decode_png(data: bytes, name: str) -> NDArray[Any]:
     chunks = _essential_chunks(data, name)
-    essential = b"".join([_PNG_MARK, *chunks])
-    head = struct.unpack_from(">IIBB2xB", essential.ljust(_PNG_HEAD, b"\0"), 16)
+    head = struct.unpack_from(">IIBB2xB", b"".join([_PNG_MARK, *chunks]).ljust(_PNG_HEAD, b"\0"), 16)
     width, height, depth, colour, interlaced = head
     size = width * height * (2 if depth == 16 else 1) * (1 if colour == 0 else 4)
-    check_unpacked(size, f"{name}: a picture of {width} x {height}", _SMALLER)
+    check_unpacked(size, f"{name}: a picture of {width} x {height}", SMALLER)
     needed = _png_bytes(width, height, depth * _PNG_CHANNELS.get(colour, 1), bool(interlaced))
     packed = (chunk[8:-4] for chunk in chunks if chunk[4:8] == b"IDAT")
     if [chunk[4:8] for chunk in chunks].count(b"IHDR") != 1 or not _unpack_to(packed, needed):
         raise InputError(f"{name} is damaged: it is not one picture of {width} x {height}. Copy it again")
-    return _decode(essential, name, flags)
+    tables = [chunk[8:-4] for chunk in chunks if chunk[4:8] == b"PLTE"]
+    if colour != _PNG_PALETTE or len(tables) != 1 or len(tables[0]) % 3:
+        return decode(b"".join([_PNG_MARK, *chunks]), name)
+    # As a grey picture of the same bits, OpenCV returns the indices, scaled to 8 bits.
+    grey = _png_chunk(b"IHDR", chunks[0][8:17] + b"\0" + chunks[0][18:-4])
+    indices = decode(b"".join([_PNG_MARK, grey, *(one for one in chunks[1:] if one[4:8] != b"PLTE")]), name)
+    table = samples_of_table(name, np.frombuffer(tables[0], np.uint8).reshape(-1, 3))
+    return _looked_up(table, indices // (255 // ((1 << depth) - 1)), name)
 
 
 def _png_bytes(width: int, height: int, bits: int, interlaced: bool) -> int:
@@ -113,79 +168,14 @@ def _unpack_to(pieces: Iterable[bytes], size: int) -> bool:
 
 def _jpeg_size(data: bytes, name: str) -> tuple[int, int]:
     """Return the rows and columns stated by a JPEG (ITU-T T.81, B.2.2)."""
-    at = 2 if data[:2] == _JPEG_MARK else len(data)
+    at = 2
     while at + 9 <= len(data) and data[at] == 0xFF:
         marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             rows, columns = struct.unpack_from(">HH", data, at + 5)
             return rows, columns
         at += 1 if marker == 0xFF else 2 + length
-    raise InputError(f"{name} is neither a PNG nor a JPEG, or is damaged: save it as PNG or JPEG")
-
-
-def count_pages(path: Path, dtypes: Sequence[str] = _DTYPES) -> int:
-    """Count the pages of a TIFF, which must have one size and one of the supported data types."""
-    import tifffile
-
-    remedy = "copy it again, or save it again"
-    check_regular(path, remedy)
-    with _quiet_tifffile():
-        try:
-            with tifffile.TiffFile(path) as file:
-                kinds = [_page_kind(file.pages.get(number)) for number in range(len(file.pages))]
-                file.filehandle.seek(file.pages.next_page_offset or 0)
-                end = file.filehandle.read(file.tiff.offsetsize)
-                complete = len(end) == file.tiff.offsetsize and not any(end)
-        except OSError as error:
-            raise InputError(f"{path} cannot be read: {error.strerror or error}") from error
-        except Exception:  # of many types
-            complete = False
-    if not complete:
-        with open_regular(path) as unread:
-            known = unread.read(4) in _TIFF_MARKS
-        wrong = "is damaged or cut off" if known else "is neither a PNG nor a TIFF"
-        raise InputError(f"{path} {wrong}: {remedy}")
-    for number, kind in enumerate(kinds, 1):
-        if kind.samples not in (1, 3, 4) or kind.dtype not in dtypes:
-            raise InputError(
-                f"{path} (page {number}) has {kind.samples} {kind.dtype} a pixel: "
-                "save it in grey, as uint8, uint16 or float32"
-            )
-        size = kind.rows * kind.columns * kind.samples * np.dtype(kind.dtype).itemsize
-        check_unpacked(size, f"{path} (page {number}): a picture of {kind.columns} x {kind.rows}", _SMALLER)
-        if (kind.rows, kind.columns) != (kinds[0].rows, kinds[0].columns):
-            raise InputError(
-                f"{path} (page {number}) is {kind.columns} x {kind.rows} {kind.dtype}, but "
-                f"{path} (page 1) is {kinds[0].columns} x {kinds[0].rows} {kinds[0].dtype}: "
-                "all frames must have the same size and depth"
-            )
-    return len(kinds)
-
-
-class _PageKind(NamedTuple):
-    rows: int
-    columns: int
-    samples: int
-    dtype: str
-
-
-def _page_kind(page: Any) -> _PageKind:
-    dtype = f"{_FORMATS.get(page.sampleformat, '')}{page.bitspersample}"
-    return _PageKind(page.imagelength, page.imagewidth, page.samplesperpixel, dtype)
-
-
-def read_pages(path: Path, start: int, stop: int) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Read pages ``start`` to ``stop - 1`` of a TIFF, each with its name in messages."""
-    with quiet_opencv() as cv2:
-        try:
-            _, pages = cv2.imreadmulti(str(path), start, stop - start, flags=cv2.IMREAD_UNCHANGED)
-        except cv2.error:
-            pages = ()
-    for index in range(start, stop):
-        label = f"{path} (page {index + 1})"
-        if index - start >= len(pages):
-            raise InputError(f"{label} {_UNDECODABLE}")
-        yield label, _grey(pages[index - start])
+    raise InputError(f"{name} is damaged or cut off: copy it again")
 
 
 def save_print(picture: NDArray[np.uint8], path: str | Path, dots_per_inch: float) -> None:
@@ -198,9 +188,7 @@ def encode_png(
     picture: NDArray[Any], pixel_size: tuple[float, float], texts: Iterable[tuple[str, str]] = ()
 ) -> list[bytes]:
     """Encode a grey picture (H, W) as a PNG with the width and height of its pixels, m, and named texts."""
-    with quiet_opencv() as cv2:
-        _, encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 6])
-    png = encoded.tobytes()
+    png = encode(".png", picture, (_PNG_COMPRESSION, 6))
     x, y = (round(1 / size) for size in pixel_size)
     chunks = [_png_chunk(b"pHYs", struct.pack(">IIB", x, y, 1)), *(_png_text(*text) for text in texts)]
     return [png[:_PNG_HEAD], *chunks, png[_PNG_HEAD:]]
@@ -229,39 +217,3 @@ def _essential_chunks(data: bytes, name: str) -> list[bytes]:
         if kind[:1].isupper():
             kept.append(chunk)
     return kept
-
-
-@contextmanager
-def quiet_opencv() -> Iterator[Any]:
-    """Yield OpenCV with its messages turned off: callers report errors themselves."""
-    import cv2  # slower to import than the rest of mirrorskin.io together
-
-    # OpenCV 5 moved this function.
-    set_level = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel
-    level = set_level(0)
-    try:
-        yield cv2
-    finally:
-        set_level(level)
-
-
-@contextmanager
-def _quiet_tifffile() -> Iterator[None]:
-    """Keep tifffile's messages about damaged files off the terminal."""
-    logger = logging.getLogger("tifffile")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL + 1)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
-
-
-def _grey(picture: NDArray[Any]) -> NDArray[Any]:
-    if picture.ndim == 2:
-        return picture
-    first = picture[..., 0]
-    if all(np.array_equal(first, picture[..., channel], equal_nan=True) for channel in (1, 2)):
-        return first
-    with quiet_opencv() as cv2:
-        return np.asarray(cv2.cvtColor(picture[..., :3], cv2.COLOR_BGR2GRAY))

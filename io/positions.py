@@ -22,8 +22,15 @@ class Positions(Protocol):
         """Return the positions of ``count`` frames, mm or radians; InputError if the number differs."""
 
 
-def along(given: ArrayLike | Positions | None, count: int) -> ArrayLike | None:
-    """Return positions for ``count`` frames, from an array or an object that computes them."""
+def along(
+    given: ArrayLike | Positions | None, count: int, lost: NDArray[np.int32] | None = None
+) -> ArrayLike | None:
+    """Return positions for ``count`` frames, from an array or an object that computes them.
+
+    Even steps count the frames ``lost`` before each frame, too.
+    """
+    if isinstance(given, Steps) and lost is not None and lost.any():
+        return np.asarray(given.start + given.step * (np.arange(count) + np.cumsum(lost)))
     return given.positions(count) if isinstance(given, Positions) else given
 
 

@@ -19,7 +19,17 @@ from mirrorskin.io.atomic import fixed_text, new_hdf5
 from mirrorskin.io.calibration.file import CARRIED, write_calibration
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.existing import Replaces
-from mirrorskin.io.layout import CHECKSUM, FINDINGS, MARK, POSITIONS, SERIES, STACK, TRUTH, TRUTH_MAPS
+from mirrorskin.io.layout import (
+    CHECKSUM,
+    DROPPED,
+    FINDINGS,
+    MARK,
+    POSITIONS,
+    SERIES,
+    STACK,
+    TRUTH,
+    TRUTH_MAPS,
+)
 from mirrorskin.io.maps import TWIST, declaration_of
 from mirrorskin.io.types import Block, Floats, Header, InputError, Motion, Source, Truth
 from mirrorskin.io.watch import Check, Watch
@@ -205,6 +215,7 @@ class Recorder(TeeSource[Source]):
         self._count = 0
         self._series: dict[str, Floats] = {}
         self._checksums = np.zeros(self.shape[0], np.uint32)
+        self._dropped = np.zeros(self.shape[0], np.int32)
 
     def __enter__(self) -> Self:
         with ExitStack() as opening:
@@ -229,6 +240,7 @@ class Recorder(TeeSource[Source]):
             self._check_count(self._count <= self.shape[0])
             self._frames[part] = block.frames
             self._checksums[part] = checksums(block.frames)
+            self._dropped[part.start] = block.dropped
             for name in SERIES:
                 values = getattr(block, name)
                 if values is not None:
@@ -256,6 +268,7 @@ class Recorder(TeeSource[Source]):
             for name, values in self._series.items():
                 put(self._new.root, *SERIES[name], values)
             put(self._new.root, CHECKSUM, None, self._checksums)
+            put(self._new.root, DROPPED, None, self._dropped if self._dropped.any() else None)
             if self._truth is not None:
                 truth = self._truth() if callable(self._truth) else self._truth
                 _write_truth(self._new.root, truth, self.motion)

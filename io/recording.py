@@ -18,6 +18,7 @@ from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.coordinates import Coordinates, read_coordinates
 from mirrorskin.io.findings import Finding
 from mirrorskin.io.fingerprint import check_unchanged, fingerprint, modified, origins
+from mirrorskin.io.foreign import kind_of_frames
 from mirrorskin.io.hdf5 import Hdf5File
 from mirrorskin.io.layout import CHECKSUM, MARK, SERIES, STACK, Layout, RecordingState, read_state
 from mirrorskin.io.os_errors import as_input_error
@@ -249,6 +250,7 @@ def open_recording(
     path: str | Path,
     *,
     dataset: str | None = None,
+    channel: int | None = None,
     motion: Motion | None = None,
     travel: ArrayLike | Positions | None = None,
     phase: ArrayLike | Positions | None = None,
@@ -261,15 +263,17 @@ def open_recording(
     live: bool = False,
     override_motion: bool = False,
 ) -> Recording:
-    """Open a stack of frames in HDF5 or Zarr, or an array written by ``numpy.save`` or ``numpy.savez``.
+    """Open a stack of frames: HDF5, Zarr, NPY, NPZ, TIFF, MCAP, a video, or a folder of numbered pictures.
 
     Parameters
     ----------
     path : str or Path
         For Zarr a folder ``NAME.zarr``, a zipped one, or an address such as ``s3://bucket/NAME.zarr``.
     dataset : str, optional
-        Name of the stack, or of an archive's array; required if the file was not written by mirrorskin and
-        contains several.
+        Name of the stack, of an archive's array or of a topic, or number of a TIFF's series or a video's
+        stream; required if the file was not written by mirrorskin and contains several.
+    channel : int, optional
+        Channel of a TIFF with several, or colour (0 red, 1 green, 2 blue); by default colours become luma.
     motion : str, optional
         Motion, if the file does not contain it; one that contradicts the file is refused.
     travel, phase, tilt, pixel_size
@@ -284,7 +288,7 @@ def open_recording(
     threads : int, optional
         Number of threads that unpack chunks; by default the number of cores.
     memory_limit : int, optional
-        Limit of the memory for unpacked chunks of frames, in bytes.
+        Limit of the memory for unpacked chunks of frames, or decoded frames of a video, in bytes.
     live : bool, optional
         Only the frames used by a live run, with the positions it used.
     override_motion : bool, optional
@@ -307,14 +311,17 @@ def open_recording(
     vertical (240, 480, 640)
     """
     path = path_of(path)
-    if path.suffix.lower() in (".npy", ".npz"):
-        from mirrorskin.io.arrays import open_array
+    kind = kind_of_frames(path)
+    if channel is not None and kind in ("", "array"):
+        raise InputError(f"{path}: only pictures, videos and MCAP files have channels: leave --channel out")
+    if kind:
+        from mirrorskin.io.arrays import open_stack
 
         if live:
             raise InputError(f"{path} is not a recording of a live run: leave --live out")
         known = {"tilt": tilt, "pixel_size": pixel_size}
-        given_positions = {"travel": travel, "phase": phase}
-        return open_array(path, dataset, given_positions, known, motion, region, frames, memory_limit)
+        where = {"travel": travel, "phase": phase}
+        return open_stack(path, dataset, channel, where, known, motion, region, frames, memory_limit)
     with ExitStack() as opening:
         file = opening.enter_context(open_file(path, memory_limit))
         ours = file.marked(MARK)

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.chunks import Chunks, find_codecs
+from mirrorskin.io.frames import FrameReader
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.samples import DecodedFrames, Decoding, Reader
 from mirrorskin.io.selection import Place, Region, Span
@@ -40,18 +41,15 @@ def _close(file: int) -> None:
         os.close(file)
 
 
-class RawFrames(Closing):
+class RawFrames(FrameReader):
     """Contiguous frames at an offset of a file, which is closed with the last reference at the latest."""
 
-    length: int = 1
-    how: str = "directly"
-    scratch_bytes: int = 0
+    how = "directly"
 
     def __init__(self, file: int, offset: int, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> None:
         self.shape, self.dtype, self._file, self._offset = shape, dtype, file, offset
         self._close = weakref.finalize(self, _close, file)
         self._frame = math.prod(shape[1:]) * dtype.itemsize
-        self.chunk = (1, *shape[1:])
 
     def fetch(self, spans: Sequence[Span], out: NDArray[Any]) -> None:
         """Write frames, some rows and columns of each, into ``out``, a C-contiguous array."""

@@ -31,7 +31,7 @@ from mirrorskin.io.atomic import (
 )
 from mirrorskin.io.calibration.file import size_of
 from mirrorskin.io.calibration.types import Calibration
-from mirrorskin.io.frames import MCAP_SUFFIX
+from mirrorskin.io.foreign import MCAP_SUFFIX
 from mirrorskin.io.layout import (
     CHECKSUM,
     COMPLETE,

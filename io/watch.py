@@ -161,7 +161,8 @@ def _from_to(limits: Limits) -> str:
 
 def _order(source: Source, series: Mapping[str, Floats], lost: int) -> Iterator[Finding]:
     """Yield which frames are missing."""
-    if lost:
+    known = {one.kind for one in getattr(source, "findings", ())}
+    if lost and "lost frames" not in known:
         yield Finding("lost frames", f"{lost} frame{'s were' if lost > 1 else ' was'} lost", False)
     time = series.get("time")
     position = series.get({"vertical": "travel", "axial": "phase"}.get(source.motion, ""))

@@ -62,6 +62,8 @@ def test_samples(desk):
     done("sample", "stack", "-o", "stack.h5")
     done("sample", "pictures", "-o", "pictures")
     done("import", "pictures", "--motion", "vertical", "--travel-step", "0.1mm", "-o", "imported.h5")
+    done("sample", "video", "-o", "press.avi")
+    assert "31 of 320 x 320, uint8" in done("info", "press.avi")
 
 
 def test_fuse():

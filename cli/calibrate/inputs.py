@@ -17,7 +17,7 @@ from mirrorskin.cli.stack import stack_options
 if TYPE_CHECKING:
     from mirrorskin.cli.stack import StackOptions
     from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
-    from mirrorskin.io import Calibration, CameraId, Source
+    from mirrorskin.io import Calibration, CameraId, Recording, Source
     from mirrorskin.io.calibration.parameters import Part
     from mirrorskin.io.types import ProcessValue
 
@@ -89,6 +89,16 @@ def open_all(
     with ExitStack() as opening:
         sources = [opening.enter_context(io.open_recording(path, **options)) for path in paths]
         yield [*sources], _one_camera(sources, calibration, output)
+
+
+def open_still(path: Path) -> Recording:
+    """Open frames at rest; those of other programs have no positions, and need none here."""
+    from mirrorskin import io
+    from mirrorskin.io.foreign import kind_of_frames
+
+    if kind_of_frames(path):
+        return io.open_recording(path, motion="vertical", travel=io.Steps(1.0))
+    return io.open_recording(path)
 
 
 def camera_name(names: Sequence[str]) -> str:

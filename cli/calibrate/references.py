@@ -14,7 +14,7 @@ from mirrorskin.cli.groups import Option
 
 if TYPE_CHECKING:
     from mirrorskin.engine.calibration.references import Measured
-    from mirrorskin.io import CameraId, Source
+    from mirrorskin.io import CameraId
 
 _ROUNDS = 4  # of captures on a rig, at most, until a stated noise is reached
 
@@ -131,21 +131,13 @@ def _measure(darks: Sequence[Path], brights: Sequence[Path], rolled: bool) -> tu
     from mirrorskin.engine.calibration.references import measure_references
 
     with ExitStack() as opening:
-        low, high = ([opening.enter_context(_open(path)) for path in paths] for paths in (darks, brights))
+        low, high = (
+            [opening.enter_context(inputs.open_still(path)) for path in paths] for paths in (darks, brights)
+        )
         name = inputs.camera_name([source.header.camera for source in (*low, *high)])
         camera = io.CameraId(name, low[0].shape[1:], low[0].dtype)
         with progress("averaging", sum(source.shape[0] for source in (*low, *high))) as show:
             return measure_references(low, high, rolled=rolled, progress=show), camera
-
-
-def _open(path: Path) -> Source:
-    """Open a recording or a folder of pictures; the positions of the body are irrelevant."""
-    from mirrorskin import io
-    from mirrorskin.io.pictures import PICTURE_SUFFIXES
-
-    if path.is_dir() or path.suffix.lower() in PICTURE_SUFFIXES:
-        return io.open_frames(path, io.Header("vertical"), travel=io.Steps(1.0))
-    return io.open_recording(path)
 
 
 def _missing(measured: Measured, noise: float | None, refuse: bool) -> dict[str, int]:

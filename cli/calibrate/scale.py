@@ -127,18 +127,19 @@ def _read(paths: Sequence[Path], output: Path) -> tuple[list[tuple[str, NDArray[
     """Return pictures and the means of recordings with their names, and the camera."""
     from mirrorskin import io
     from mirrorskin.engine.calibration.board import mean_of_still
-    from mirrorskin.io.pictures import PICTURE_SUFFIXES, read_picture
+    from mirrorskin.io.foreign import kind_of_frames
+    from mirrorskin.io.pictures import read_picture
 
     pictures, names, dtypes = [], [], []
     for path in paths:
-        if path.is_dir() or path.suffix.lower() in (".avi", ".mp4"):
+        if path.is_dir():
             raise io.InputError(
                 f"{path} is a sequence: name pictures of the board one by one, or a recording"
             )
-        if path.suffix.lower() in PICTURE_SUFFIXES:
+        if kind_of_frames(path) in ("picture", "TIFF"):
             pictures.append(read_picture(path))
             continue
-        with io.open_recording(path) as recording:
+        with inputs.open_still(path) as recording:
             pictures.append(mean_of_still(recording))
             names.append(recording.header.camera)
             dtypes.append(recording.dtype)

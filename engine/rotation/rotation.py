@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -40,7 +40,7 @@ from mirrorskin.engine.rotation.steps import (
 )
 from mirrorskin.engine.streaming import feed
 from mirrorskin.io import Block, Calibrated, Header, InputError, Recording, Source, WallResponse, open_heights
-from mirrorskin.io.frames import FrameSequence
+from mirrorskin.io.arrays import ArrayRecording
 from mirrorskin.io.positions import check_phase
 from mirrorskin.io.result import absolute_heights
 from mirrorskin.kernels.array_types import Doubles
@@ -203,7 +203,7 @@ class Rotation(Method):
         pixel_size, press = header.pixel_size, header.press
         assert pixel_size is not None
         assert press is not None
-        turn, heights = FirstTurn(source), _half_way(source, press)
+        turn, heights = first_turn(source), _half_way(source, press)
         for _ in range(_ROUNDS):
             stream, response = self._placed(turn, header, response, heights)
             operation = self._turns(stream, header, response).with_options(per_turn=False)
@@ -312,22 +312,19 @@ def at_poses(source: Source, tilt: ArrayLike | None = None) -> bool:
     return first is not None and first.tilt is not None
 
 
-class FirstTurn(FrameSequence):
-    """The frames of a source's first turn, at most 64, in memory."""
-
-    def __init__(self, source: Source) -> None:
-        frames: list[NDArray[Any]] = []
-        phase = np.empty(0)
-        source.rewind()
-        while len(frames) < LONGEST and (block := source.read()) is not None:
-            more = check_phase(block.phase, len(block.frames), f"{source.name}: phase")
-            phase = np.concatenate([phase, more])
-            if len(cut_into_turns(phase)) > 1:
-                break
-            frames.extend(block.frames.copy())
-        self._frames = np.stack(frames) if frames else np.empty((0, *source.shape[1:]), source.dtype)
-        self.phase: NDArray[np.float64] = phase[: len(frames)]
-        super().__init__(source.name, source.header, self._frames.shape, source.dtype, phase=self.phase)
-
-    def _fill(self, start: int, out: NDArray[Any]) -> None:
-        out[:] = self._frames[start : start + len(out)]
+def first_turn(source: Source) -> Recording:
+    """Read the frames of a source's first turn, at most 64, into memory."""
+    frames: list[NDArray[Any]] = []
+    phase = np.empty(0)
+    source.rewind()
+    while len(frames) < LONGEST and (block := source.read()) is not None:
+        more = check_phase(block.phase, len(block.frames), f"{source.name}: phase")
+        phase = np.concatenate([phase, more])
+        if len(cut_into_turns(phase)) > 1:
+            break
+        frames.extend(block.frames.copy())
+    header = {
+        field.name: getattr(source.header, field.name) for field in fields(Header) if field.name != "motion"
+    }
+    stack = np.stack(frames) if frames else np.empty((0, *source.shape[1:]), source.dtype)
+    return ArrayRecording(stack, {"phase": phase[: len(frames)]}, header, name=source.name)

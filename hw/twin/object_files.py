@@ -124,7 +124,7 @@ def load_height_map(
 
 
 def _read_array(path: Path) -> NDArray[Any]:
-    return read_array(path) if path.suffix.lower() == ".npy" else decode_picture(path, _DTYPES)
+    return read_array(path) if path.suffix.lower() == ".npy" else decode_picture(path, _DTYPES).samples
 
 
 MESH_SUFFIXES = (".stl", ".ply", ".obj")

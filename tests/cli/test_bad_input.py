@@ -200,7 +200,7 @@ def test_a_process_ends_with_one_line(make, words, said):
         ),
         (change(f"{STAGE}/motion"), ["info", "bad.h5"], "does not state how the sensor moved"),
         (cut_to(900), ["info", "bad.h5"], "truncated"),
-        (lambda: None, ["reconstruct", "."], ". is a folder: an HDF5 file is needed"),
+        (lambda: None, ["reconstruct", "."], ". is a folder without numbered pictures"),
         (
             stack(),
             ["reconstruct", "bad.h5", *GIVEN, "-o", "bad.h5/r.h5"],

@@ -189,7 +189,7 @@ def test_a_claim_is_refused_before_memory_is_taken(tmp_path, monkeypatch):
         ("simulate vertical --pixel-size 0mm -o a.h5", "pixel"),
         ("simulate vertical -o no/such/a.h5", "no folder"),
         ("import nothing.avi --motion vertical --travel-step 1mm -o a.h5", "nothing.avi"),
-        ("import . --motion vertical -o a.h5", "--travel-step"),
+        ("import . --motion vertical -o a.h5", "without numbered pictures"),
         ("score nothing.h5 --truth nothing.h5", "no such file"),
         ("info nothing.h5", "no such file"),
         ("bench --against what.json", "no such file"),

@@ -27,15 +27,15 @@ def frames_of(source):
 
 def test_a_press_is_the_same_in_every_form(sample):
     with io.open_recording(sample("press", "press.h5")) as press:
-        frames, header = frames_of(press).copy(), io.Header("vertical")
+        frames = frames_of(press).copy()
         assert press.truth is not None
         assert press.header.pixel_size == (0.0375, 0.0375)
         np.testing.assert_allclose(press.travel, 0.1 * np.arange(31))  # from 0, as frames are taken to begin
     with h5py.File(sample("stack", "stack.h5")) as file:
         np.testing.assert_array_equal(file["raw/images"][:], frames)
-    with io.open_frames(sample("pictures", "frames"), header, travel=io.Steps(0.1)) as pictures:
+    with io.open_recording(sample("pictures", "frames"), travel=io.Steps(0.1)) as pictures:
         np.testing.assert_array_equal(frames_of(pictures), frames)
-    with io.open_frames(sample("video", "press.avi"), header, travel=io.Steps(0.1)) as video:
+    with io.open_recording(sample("video", "press.avi"), travel=io.Steps(0.1)) as video:
         assert np.abs(frames_of(video).astype(int) - frames).mean() < 2  # which JPEG costs
 
 

@@ -353,7 +353,7 @@ def test_what_is_no_file_of_frames_is_refused(tmp_path):
     refused(tmp_path / "text.h5" / "below.h5", r"below\.h5: no such file")
     refused(tmp_path / "loop.h5", r"loop\.h5: no such file")
     refused(tmp_path / ("x" * 300), "File name too long")
-    refused(tmp_path, "is a folder: an HDF5 file is needed; 'mirrorskin import' reads picture folders")
+    refused(tmp_path, "is a folder without numbered pictures")
     refused("/dev/null", "is not a regular file")
     refused(
         tmp_path / "text.h5", "is not an HDF5 file; 'mirrorskin import' turns other files into recordings"

@@ -115,9 +115,12 @@ def film(tmp_path):
     return write
 
 
+def opened(path, **known):
+    return io.open_recording(path, motion="vertical", travel=io.Steps(0.1), **known)
+
+
 def frames_of(path, **known):
-    header = io.Header("vertical")
-    with io.open_frames(path, header, travel=io.Steps(0.1), **known) as source:
+    with opened(path, **known) as source:
         assert source.shape[0] == 3
         return source.read(np.empty(source.shape, source.dtype))
 
@@ -138,9 +141,9 @@ def test_grey_colours_and_compressed_images_are_read(film):
 def test_of_several_topics_one_is_named(film):
     one, other = np.zeros((2, 3), np.uint8), np.full((2, 3), 9, np.uint8)
     path = film(("/left", one), ("/right", other))
-    with pytest.raises(io.InputError, match=r"topics of images are /left, /right: name one with --topic"):
+    with pytest.raises(io.InputError, match=r"topics of images are /left, /right: name one with --dataset"):
         frames_of(path)
-    assert frames_of(path, topic="/right").frames[0, 0, 0] == 9
+    assert frames_of(path, dataset="/right").frames[0, 0, 0] == 9
 
 
 def test_a_file_that_is_cut_off_or_none_is_refused(film, tmp_path):
@@ -227,8 +230,9 @@ def test_a_topic_without_messages_is_refused(tmp_path):
 @pytest.mark.parametrize(
     "changed",
     [
-        {"step": 0},
-        {"step": 2},
+        {"step": 0, "data": b"abcdefg"},
+        {"step": 2, "data": b"abcdefg"},
+        {"step": 1 << 31},
         {"height": 7},
         {"width": 1 << 31},
         {"height": 0, "width": 0, "step": 0, "data": b""},
@@ -242,6 +246,95 @@ def test_an_image_whose_fields_disagree_is_refused(tmp_path, changed):
     with pytest.raises(io.InputError) as refusal:
         frames_of(write_messages(tmp_path / "a.mcap", "/a", IMAGE, values))
     assert "\n" not in str(refusal.value)
+    assert "a.mcap: /a, message 0" in str(refusal.value)
+
+
+@pytest.mark.parametrize("step", [0, 2])
+def test_a_step_that_is_too_small_follows_from_the_number_of_bytes(tmp_path, step):
+    values = [(number, grey(0, step=step, data=bytes(range(number, number + 6)))) for number in range(3)]
+    block = frames_of(write_messages(tmp_path / "a.mcap", "/a", IMAGE, values))
+    assert block.frames[1].tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+@pytest.mark.parametrize("data", [b"abc_def_", b"abc_def"])
+def test_a_step_may_be_longer_than_a_row(tmp_path, data):
+    values = [(number, grey(0, step=4, data=data)) for number in range(3)]
+    block = frames_of(write_messages(tmp_path / "a.mcap", "/a", IMAGE, values))
+    assert block.frames[0].tolist() == [[97, 98, 99], [100, 101, 102]]
+
+
+def write_packed(path, images):
+    """Write compressed images: the format of each, and its bytes."""
+    values = [
+        (number * 10_000_000, {"format": kind, "data": data}) for number, (kind, data) in enumerate(images)
+    ]
+    return write_messages(path, "/a", "sensor_msgs/msg/CompressedImage", values)
+
+
+PICTURE = np.add.outer(2 * np.arange(24, dtype=np.uint8), np.arange(32, dtype=np.uint8))
+PNG = cv2.imencode(".png", PICTURE)[1].tobytes()
+JPEG = cv2.imencode(".jpg", PICTURE)[1].tobytes()
+
+
+def test_a_compressed_image_without_bytes_is_named(tmp_path):
+    path = write_packed(tmp_path / "a.mcap", [("png", PNG), ("png", b""), ("png", PNG)])
+    with pytest.raises(io.InputError, match=r"a\.mcap: /a, message 1: the image has no pixels: remove it"):
+        frames_of(path)
+
+
+@pytest.mark.parametrize("kind", ["bayer_rggb8; png compressed", "bayer_rggb8; jpeg compressed bgr8"])
+def test_a_compressed_mosaic_is_refused_like_one_that_is_not(tmp_path, kind):
+    path = write_packed(tmp_path / "a.mcap", [(kind, PNG)] * 3)
+    with pytest.raises(io.InputError, match="message 0: encoding 'bayer_rggb8' is not supported"):
+        opened(path)
+
+
+def test_a_loss_is_reported(tmp_path):
+    with opened(write_packed(tmp_path / "a.mcap", [("mono8; jpeg compressed ", JPEG)] * 3)) as source:
+        (found,) = source.findings
+    assert (found.kind, found.warning) == ("lossy compression", True)
+
+
+def test_colours_are_reported_once_and_a_channel_is_one_of_them(film):
+    colours = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)
+    path = film(("/a", colours), encoding="rgb8")
+    with opened(path) as source:
+        assert [(one.kind, one.warning) for one in source.findings] == [("colour", False)]
+    for channel in range(3):
+        np.testing.assert_array_equal(frames_of(path, channel=channel).frames[1], colours[..., channel] + 1)
+
+
+def write_numbered(path, numbers):
+    """Write images whose messages are numbered."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        definition = f"std_msgs/Header header\n{FIELDS[IMAGE]}\n{HEAD}"
+        schema = writer.register_msgdef(IMAGE, definition)
+        for stamp, number in enumerate(numbers):
+            writer.write_message("/a", schema, TIME | grey(stamp), stamp * 10_000_000, sequence=number)
+        writer.finish()
+    return path
+
+
+def test_a_jump_of_the_sequence_numbers_is_lost_frames(tmp_path):
+    with opened(write_numbered(tmp_path / "a.mcap", [3, 4, 7])) as source:
+        assert source.dropped.tolist() == [0, 0, 2]
+        assert source.travel.tolist() == pytest.approx([0.0, 0.1, 0.4])
+        assert [one.kind for one in source.findings] == ["lost frames"]
+
+
+@pytest.mark.parametrize("numbers", [[0, 0, 0], [9, 3, 4], [0, 100, 200]])
+def test_sequence_numbers_that_do_not_count_images_are_ignored(tmp_path, numbers):
+    with opened(write_numbered(tmp_path / "a.mcap", numbers)) as source:
+        assert not source.dropped.any()
+        assert source.findings == ()
+
+
+def test_images_can_be_read_in_any_order(film):
+    grey = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    with opened(film(("/a", grey)), frames=(0, 3), region=io.Region((1, 3), (1, 4))) as source:
+        for number in (2, 0, 1, 1):
+            np.testing.assert_array_equal(source.frame(number), (grey + number)[1:3, 1:4])
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))

@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from PIL import Image
 
-from mirrorskin.io import Header, InputError, Source, Steps, open_frames
-from mirrorskin.io.frames import Pictures
+from mirrorskin.io import InputError, Source, Steps, open_recording
+from mirrorskin.io.pictures import read_picture
 
-HEADER = Header("vertical", pixel_size=(0.03, 0.03))
 SHAPE = (6, 9)
 
 
@@ -41,6 +41,11 @@ def drain(source, size=None):
     return np.concatenate(frames), blocks
 
 
+def opened(path, **options):
+    """Open frames as a press."""
+    return open_recording(path, **({"motion": "vertical", "travel": Steps(0.1)} | options))
+
+
 def tiff(path, pages, **options):
     """Save pages as a TIFF, uncompressed unless options of tifffile say so."""
     tifffile.imwrite(path, np.stack(pages), photometric="minisblack", metadata=None, **options)
@@ -53,10 +58,10 @@ def tiff(path, pages, **options):
 )
 def test_frames_come_back_exactly(tmp_path, suffix, dtype):
     save(tmp_path, [f"image{k}.{suffix}" for k in range(4)], dtype)
-    source: Source = Pictures(tmp_path, HEADER)
+    source: Source = opened(tmp_path, pixel_size=(0.03, 0.03))
     frames, _ = drain(source)
     assert (source.shape, source.dtype, source.motion) == ((4, *SHAPE), dtype, "vertical")
-    assert (source.name, source.header, source.rewindable) == (str(tmp_path), HEADER, True)
+    assert (source.name, source.header.pixel_size, source.rewindable) == (str(tmp_path), (0.03, 0.03), True)
     np.testing.assert_array_equal(frames, [frame(k, dtype) for k in range(4)])
 
 
@@ -71,7 +76,7 @@ def test_frames_come_back_exactly(tmp_path, suffix, dtype):
 )
 def test_frames_are_in_the_order_of_their_numbers(tmp_path, names):
     save(tmp_path, names)
-    frames, _ = drain(Pictures(tmp_path, HEADER))
+    frames, _ = drain(opened(tmp_path))
     np.testing.assert_array_equal(frames, [frame(k) for k in range(3)])
 
 
@@ -79,7 +84,7 @@ def test_what_does_not_fit_the_pattern_is_left_out_and_named(tmp_path):
     save(tmp_path, ["image0.png", "image1.png", "image_ambient.png", "._image0.png", "dark7.png"])
     (tmp_path / "image3.txt").write_text("not a picture")
     (tmp_path / "image4.png").mkdir()
-    source = Pictures(tmp_path, HEADER)
+    source = opened(tmp_path)
     assert source.shape[0] == 2
     assert source.left_out == ("._image0.png", "dark7.png", "image3.txt", "image_ambient.png")
 
@@ -88,11 +93,10 @@ def test_what_does_not_fit_the_pattern_is_left_out_and_named(tmp_path):
 def test_blocks_of_any_size_give_the_same_frames(tmp_path, size):
     save(tmp_path, [f"image{k}.png" for k in range(5)])
     travel = 0.1 * np.arange(1, 6)
-    source = Pictures(tmp_path, HEADER, travel=travel, phase=-travel)
+    source = opened(tmp_path, travel=travel)
     frames, blocks = drain(source, size)
     np.testing.assert_array_equal(frames, [frame(k) for k in range(5)])
     np.testing.assert_array_equal(np.concatenate([b.travel for b in blocks]), travel)
-    np.testing.assert_array_equal(np.concatenate([b.phase for b in blocks]), -travel)
     assert [b.index for b in blocks] == list(range(0, 5, size or 1))
     assert {b.time for b in blocks} == {None}
     assert {b.dropped for b in blocks} == {0}
@@ -100,7 +104,7 @@ def test_blocks_of_any_size_give_the_same_frames(tmp_path, size):
 
 def test_no_block_spans_a_gap_and_the_next_says_how_many_were_lost(tmp_path):
     save(tmp_path, ["image5.png", "image6.png", "image9.png", "image10.png", "image12.png"])
-    source = Pictures(tmp_path, HEADER, travel=Steps(0.5, 1.0))
+    source = opened(tmp_path, travel=Steps(0.5, 1.0))
     for _ in range(2):
         frames, blocks = drain(source, 8)
         np.testing.assert_array_equal(frames, [frame(k) for k in range(5)])
@@ -113,8 +117,8 @@ def test_no_block_spans_a_gap_and_the_next_says_how_many_were_lost(tmp_path):
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        ([], "no numbered PNG or TIFF"),
-        (["ambient.png"], "no numbered PNG or TIFF"),
+        ([], "without numbered pictures"),
+        (["ambient.png"], "without numbered pictures"),
         (["img1.png", "img01.png"], "img01.png and img1.png have the same number"),
         (["img1.png", "img1.tif", "img2.png"], "img1.png and img1.tif have the same number"),
         (["a1.png", "a2.png", "b1.png", "b2.png", "b3.png"], "2 sequences, a#, b#"),
@@ -125,7 +129,7 @@ def test_no_block_spans_a_gap_and_the_next_says_how_many_were_lost(tmp_path):
 def test_a_folder_without_one_clear_sequence_is_refused(tmp_path, names, message):
     save(tmp_path, names)
     with pytest.raises(InputError, match=message) as caught:
-        Pictures(tmp_path, HEADER)
+        opened(tmp_path)
     assert str(tmp_path) in str(caught.value)
 
 
@@ -136,8 +140,8 @@ def test_a_folder_without_one_clear_sequence_is_refused(tmp_path, names, message
 def test_a_frame_unlike_the_first_is_named(tmp_path, odd, kind):
     save(tmp_path, ["image0.png", "image1.png"])
     cv2.imwrite(str(tmp_path / "image2.png"), odd)
-    source = Pictures(tmp_path, HEADER)
-    with pytest.raises(InputError, match=rf"image2\.png is {kind}, but .*image0\.png is 9 x 6 uint8"):
+    source = opened(tmp_path)
+    with pytest.raises(InputError, match=rf"image2\.png is {kind}, but the first frame is 9 x 6 uint8"):
         drain(source, 3)
 
 
@@ -167,15 +171,14 @@ def test_a_damaged_picture_is_named(tmp_path, suffix, damage, number):
     file = tmp_path / f"image{number}.{suffix}"
     file.write_bytes(damage(file.read_bytes()))
     with pytest.raises(InputError, match=str(file)):
-        drain(Pictures(tmp_path, HEADER))
+        drain(opened(tmp_path))
 
 
-@pytest.mark.parametrize("path", [".", "image0.tif"])
 @pytest.mark.parametrize("dtype", [np.int8, np.int16, np.int32, np.float64])
-def test_other_types_of_sample_are_refused(tmp_path, dtype, path):
+def test_other_types_of_sample_are_refused(tmp_path, dtype):
     cv2.imwrite(str(tmp_path / "image0.tif"), np.zeros(SHAPE, dtype))
     with pytest.raises(InputError, match=rf"image0\.tif \(page 1\) has 1 {np.dtype(dtype)} a pixel"):
-        Pictures(tmp_path / path, HEADER)
+        opened(tmp_path)
 
 
 @pytest.mark.parametrize("channels", [3, 4])
@@ -184,7 +187,7 @@ def test_colour_with_equal_channels_is_taken_exactly(tmp_path, suffix, dtype, ch
     picture = np.repeat(frame(1, dtype)[..., np.newaxis], channels, axis=2)
     picture[..., 3:] = 7
     cv2.imwrite(str(tmp_path / f"image0.{suffix}"), picture, [cv2.IMWRITE_TIFF_COMPRESSION, 1])
-    np.testing.assert_array_equal(Pictures(tmp_path, HEADER).read().frames[0], frame(1, dtype))
+    np.testing.assert_array_equal(read_picture(tmp_path / f"image0.{suffix}"), frame(1, dtype))
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.uint8, 0.51), (np.uint16, 1.5)])
@@ -192,41 +195,182 @@ def test_true_colour_becomes_luma(tmp_path, dtype, tolerance):
     blue, green, red = (frame(k, dtype) for k in (1, 5, 9))
     cv2.imwrite(str(tmp_path / "image0.png"), np.dstack([blue, green, red]))
     luma = 0.299 * red.astype(float) + 0.587 * green + 0.114 * blue
-    np.testing.assert_allclose(Pictures(tmp_path, HEADER).read().frames[0], luma, atol=tolerance)
+    np.testing.assert_allclose(read_picture(tmp_path / "image0.png"), luma, atol=tolerance)
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"byteorder": ">"}, {"bigtiff": True}, {"rowsperstrip": 2}, {"compression": "zlib"}]
+    "numbers",
+    [
+        range(0, 1320, 33),  # milliseconds at 30 Hz
+        range(100, 140),
+        [f"z{position / 100:.2f}" for position in range(0, 200, 5)],
+    ],
+    ids=["times", "numbers", "positions"],
 )
-def test_the_pages_of_a_tiff_are_frames(tmp_path, options):
-    pages = [frame(k, np.uint16) for k in range(5)]
-    source = Pictures(tiff(tmp_path / "stack.tif", pages, **options), HEADER, travel=Steps(0.1))
-    assert (source.shape, source.left_out) == ((5, *SHAPE), ())
-    np.testing.assert_array_equal(drain(source, 2)[0], pages)
+def test_numbers_with_a_common_step_are_consecutive_frames(tmp_path, numbers):
+    save(tmp_path, [f"frame_{number}.png" for number in numbers])
+    with opened(tmp_path, travel=Steps(0.05)) as source:
+        frames, blocks = drain(source, 64)
+    np.testing.assert_array_equal(frames, [frame(k) for k in range(40)])
+    np.testing.assert_allclose(np.concatenate([b.travel for b in blocks]), 0.05 * np.arange(40))
+    assert not source.dropped.any()
+    assert [found for found in source.findings if found.warning] == []
 
 
-@pytest.mark.parametrize("kept", [0.1, 0.4, 0.9])
-def test_a_stack_of_pages_that_is_cut_off_is_refused(tmp_path, kept):
-    cv2.imwritemulti(str(tmp_path / "stack.tif"), [frame(k, np.uint16) for k in range(5)])
-    data = (tmp_path / "stack.tif").read_bytes()
-    (tmp_path / "stack.tif").write_bytes(data[: int(len(data) * kept)])
-    with pytest.raises(InputError, match="cut off"):
-        Pictures(tmp_path / "stack.tif", HEADER)
+def test_a_common_step_is_reported(tmp_path):
+    save(tmp_path, [f"frame_{33 * k:06d}.png" for k in range(5)])
+    with opened(tmp_path) as source:
+        (found,) = source.findings
+    assert (found.kind, found.warning) == ("numbering", False)
+    assert "the names step by 33" in found.text
 
 
-def test_a_page_unlike_the_first_is_named(tmp_path):
-    tiff(tmp_path / "stack.tif", [frame(0, np.uint16)])
-    tiff(tmp_path / "stack.tif", [np.zeros((5, 4), np.uint16)], append=True)
-    with pytest.raises(InputError, match=r"\(page 2\) is 4 x 5 uint16, but .* \(page 1\) is 9 x 6 uint16"):
-        drain(Pictures(tmp_path / "stack.tif", HEADER), 3)
+def test_a_gap_in_numbers_with_a_common_step_counts_in_steps(tmp_path):
+    save(tmp_path, [f"frame_{number}.png" for number in (0, 10, 20, 40, 50)])
+    with opened(tmp_path) as source:
+        assert source.dropped.tolist() == [0, 0, 0, 1, 0]
 
 
-def test_open_frames_takes_folders_and_tiffs_as_pictures(tmp_path):
-    save(tmp_path, ["image0.tif", "image1.tif"])
-    for path in (tmp_path, str(tmp_path / "image0.tif")):
-        source = open_frames(path, HEADER, travel=Steps(0.1))
-        assert isinstance(source, Pictures)
-        assert source.read().travel.tolist() == [0.0]
+def test_numbers_that_are_mostly_missing_give_the_order_and_a_warning(tmp_path):
+    save(tmp_path, [f"frame_{number}.png" for number in (7, 40, 73, 107, 140)])
+    with opened(tmp_path) as source:
+        (found,) = source.findings
+        assert source.travel.tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
+    assert (found.kind, found.warning) == ("numbering", True)
+
+
+def test_missing_numbers_are_reported_as_lost_frames(tmp_path):
+    save(tmp_path, [f"frame_{number}.png" for number in (1, 2, 3, 5, 8)])
+    with opened(tmp_path) as source:
+        (found,) = source.findings
+    assert (found.kind, found.warning) == ("lost frames", True)
+    assert "3 frames are missing, before frames 3, 4" in found.text
+
+
+def pgm(path, picture):
+    depth = np.iinfo(picture.dtype).max
+    head = b"P5\n# a camera\n%d %d\n%d\n" % (*picture.shape[::-1], depth)
+    path.write_bytes(head + picture.astype(picture.dtype.newbyteorder(">")).tobytes())
+
+
+def test_bmp_and_pgm_are_read_exactly(tmp_path):
+    cv2.imwrite(str(tmp_path / "frame1.bmp"), frame(1))
+    pgm(tmp_path / "frame2.pgm", frame(2))
+    with opened(tmp_path) as source:
+        np.testing.assert_array_equal(drain(source)[0], [frame(1), frame(2)])
+
+
+def test_a_deep_pgm_is_read_exactly(tmp_path):
+    pgm(tmp_path / "a.pgm", frame(3, np.uint16))
+    np.testing.assert_array_equal(read_picture(tmp_path / "a.pgm"), frame(3, np.uint16))
+
+
+def smooth(number):
+    return (np.add.outer(2 * np.arange(32), 3 * np.arange(40)) + number).astype(np.uint8)
+
+
+def test_jpeg_is_read_with_a_warning(tmp_path):
+    for number in range(10):
+        cv2.imwrite(str(tmp_path / f"frame{number}.jpg"), smooth(number), [cv2.IMWRITE_JPEG_QUALITY, 95])
+    with opened(tmp_path) as source:
+        frames, _ = drain(source)
+        (found,) = source.findings
+    assert np.abs(frames - np.stack([smooth(k) for k in range(10)]).astype(int)).max() <= 6
+    assert (found.kind, found.warning) == ("lossy compression", True)
+
+
+def test_a_jpeg_is_turned_as_it_states(tmp_path):
+    _, data = cv2.imencode(".jpg", smooth(0), [cv2.IMWRITE_JPEG_QUALITY, 100])
+    tag = struct.pack(">HHIHH", 0x0112, 3, 1, 6, 0)  # orientation: turned clockwise
+    exif = b"Exif\0\0MM\0*" + struct.pack(">IH", 8, 1) + tag + bytes(4)
+    body = data.tobytes()
+    segment = b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif
+    (tmp_path / "a.jpg").write_bytes(body[:2] + segment + body[2:])
+    np.testing.assert_allclose(read_picture(tmp_path / "a.jpg"), np.rot90(smooth(0), -1), atol=4)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "bmp", "pgm"])
+def test_a_picture_that_is_cut_off_is_named(tmp_path, suffix):
+    for number in range(2):
+        if suffix == "pgm":
+            pgm(tmp_path / f"frame{number}.pgm", frame(number))
+        else:
+            cv2.imwrite(str(tmp_path / f"frame{number}.{suffix}"), frame(number))
+    file = tmp_path / f"frame1.{suffix}"
+    file.write_bytes(file.read_bytes()[:-9])
+    with opened(tmp_path) as source, pytest.raises(InputError, match=rf"frame1\.{suffix} is .*cut off"):
+        drain(source)
+
+
+def test_colour_is_reported_once(tmp_path):
+    for number in range(3):
+        picture = np.dstack([frame(number), frame(number + 1), frame(number + 2)])
+        cv2.imwrite(str(tmp_path / f"frame{number}.png"), picture)
+    with opened(tmp_path) as source:
+        (found,) = source.findings
+    assert (found.kind, found.warning) == ("colour", False)
+
+
+@pytest.mark.parametrize(("channel", "number"), [(0, 9), (1, 5), (2, 1)])
+def test_a_channel_is_one_of_the_colours(tmp_path, channel, number):
+    for name in ("frame1.png", "frame2.png"):
+        cv2.imwrite(str(tmp_path / name), np.dstack([frame(1), frame(5), frame(9)]))
+    with opened(tmp_path, channel=channel) as source:
+        np.testing.assert_array_equal(drain(source)[0], [frame(number)] * 2)
+        assert source.findings == ()
+
+
+def test_a_channel_of_grey_pictures_is_refused(tmp_path):
+    save(tmp_path, ["frame1.png", "frame2.png"])
+    with pytest.raises(InputError, match="no channel 1: it is grey: leave --channel out"):
+        opened(tmp_path, channel=1)
+
+
+INDICES = np.arange(54, dtype=np.uint8).reshape(SHAPE) % 16
+
+
+def with_table(path, table):
+    """Save indices with a table of 16 colours."""
+    picture = Image.fromarray(INDICES)
+    picture.putpalette(np.asarray(table, np.uint8).tobytes())
+    picture.save(path)
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["png", "bmp", "tif"])
+@pytest.mark.parametrize(
+    ("table", "expected"),
+    [
+        ([(0, 12 * k, 0) for k in range(16)], INDICES),
+        ([(240 - 7 * k,) * 3 for k in range(16)], 240 - 7 * INDICES),
+    ],
+    ids=["green", "grey"],
+)
+def test_a_table_of_colours_gives_indices_or_its_greys(tmp_path, suffix, table, expected):
+    np.testing.assert_array_equal(read_picture(with_table(tmp_path / f"a.{suffix}", table)), expected)
+
+
+@pytest.mark.parametrize("suffix", ["png", "bmp", "tif"])
+def test_a_table_that_is_not_a_scale_of_brightness_is_refused(tmp_path, suffix):
+    table = [((97 * k) % 256, 0, (31 * k) % 256) for k in range(16)]
+    with pytest.raises(InputError, match="not a scale of brightness: save it in grey"):
+        read_picture(with_table(tmp_path / f"a.{suffix}", table))
+
+
+def test_a_picture_of_one_bit_is_black_and_white(tmp_path):
+    Image.fromarray(INDICES > 7).save(tmp_path / "a.png")
+    np.testing.assert_array_equal(read_picture(tmp_path / "a.png"), np.where(INDICES > 7, 255, 0))
+
+
+def test_twelve_bits_in_sixteen_stay_as_they_are(tmp_path):
+    counts = (frame(1, np.uint16) % 4096).astype(np.uint16)
+    cv2.imwrite(str(tmp_path / "a.png"), counts)
+    np.testing.assert_array_equal(read_picture(tmp_path / "a.png"), counts)
+
+
+def test_opacity_is_ignored(tmp_path):
+    Image.merge("LA", [Image.fromarray(frame(1)), Image.fromarray(frame(7))]).save(tmp_path / "a.png")
+    np.testing.assert_array_equal(read_picture(tmp_path / "a.png"), frame(1))
 
 
 def test_decoders_print_nothing(tmp_path):
@@ -240,11 +384,11 @@ def test_decoders_print_nothing(tmp_path):
     stack.write_bytes(stack.read_bytes()[:-50])
     program = """
 import sys
-from mirrorskin.io import Header, InputError, Steps, open_frames
+from mirrorskin.io import InputError, Steps, open_recording
 assert "cv2" not in sys.modules
 for path in sys.argv[1:]:
     try:
-        source = open_frames(path, Header("vertical"), travel=Steps(0.1))
+        source = open_recording(path, motion="vertical", travel=Steps(0.1))
         while source.read() is not None:
             print("read")
     except InputError:

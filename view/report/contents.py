@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mirrorskin.engine.metrology import Quantity
 from mirrorskin.engine.summary import summarise
 from mirrorskin.io import InputError, Result
+from mirrorskin.io.opencv import encode
 from mirrorskin.view.report.surface import surface_data
 from mirrorskin.view.report.words import PIXELS, UNITS, Rows, map_rows, picture_texts, split_process
 
@@ -254,11 +255,11 @@ def _trimmed(pixels: Pixels) -> Pixels:
 
 def packed(pixels: Pixels) -> tuple[str, bytes]:
     """Encode a picture in at most ``MOST_BYTES``: losslessly if possible, else lossily, else smaller."""
-    png = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 4])[1].tobytes()
+    png = encode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 4])
     if len(png) <= MOST_BYTES:
         return "png", png
     for quality in _QUALITIES:
-        webp = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, quality])[1].tobytes()
+        webp = encode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, quality])
         if len(webp) <= MOST_BYTES:
             return "webp", webp
     return packed(

@@ -15,7 +15,7 @@ from stacks import MadeUp
 from mirrorskin import engine, hw, io
 from mirrorskin.engine.live import LiveOperation
 from mirrorskin.engine.rotation.registration import Registered, Sight
-from mirrorskin.engine.rotation.rotation import FirstTurn
+from mirrorskin.engine.rotation.rotation import first_turn
 from mirrorskin.engine.streaming import push_block
 from mirrorskin.hw.twin import Axial, Body, Camera
 
@@ -182,7 +182,7 @@ def test_live_normals_are_those_of_the_calibration():
 
 
 def test_the_first_turn_ends_before_the_second_begins():
-    turn = FirstTurn(scene().source(turns=3))
+    turn = first_turn(scene().source(turns=3))
     np.testing.assert_array_equal(turn.phase, EIGHTHS)
     assert turn.shape == (8, *SHAPE)
     for _ in range(2):

@@ -8,7 +8,7 @@ import pytest
 from mirrorskin import engine, io
 from mirrorskin.engine.lock_in import Correlation
 from mirrorskin.engine.rotation import estimate_frequency
-from mirrorskin.io.frames import FrameSequence
+from mirrorskin.io.arrays import ArrayRecording
 
 RATE, COUNT, HERTZ = 60.0, 150, 7.321
 TIME = np.arange(COUNT) / RATE
@@ -46,15 +46,11 @@ def test_it_reaches_the_cramer_rao_bound_and_says_so(case):
     assert abs(error.mean()) < 4 * bound(amplitude, time) / np.sqrt(len(found))
 
 
-class Stack(FrameSequence):
-    """Frames in memory, with times."""
-
-    def __init__(self, frames, time):
-        self.frames, self.time = frames, time
-        super().__init__("memory", io.Header("axial"), frames.shape, frames.dtype, time=time)
-
-    def _fill(self, start, out):
-        out[:] = self.frames[start : start + len(out)]
+def stack(frames, time):
+    """Return frames in memory, with times, as a source."""
+    source = ArrayRecording(frames, {"phase": np.zeros(len(frames))}, {})
+    source.phase, source.time = None, time
+    return source
 
 
 @pytest.mark.parametrize("harmonic", [1, 2])
@@ -62,13 +58,13 @@ def test_a_lock_in_finds_the_waves_of_an_estimated_frequency(harmonic, device):
     phase = np.linspace(-1, 1, 12)
     clean = waves(np.full(12, 20.0), phase, harmonic=8.0)
     frames = np.clip(np.rint(clean), 0, 255).astype(np.uint8).reshape(COUNT, 3, 4)
-    result = Correlation(harmonic=harmonic, frequency="estimate", device=device).run(Stack(frames, TIME))
+    result = Correlation(harmonic=harmonic, frequency="estimate", device=device).run(stack(frames, TIME))
     assert result.process["frequency"] == pytest.approx(HERTZ, abs=4 * result.process["frequency_sigma"])
     assert result.process.get("harmonic", 1) == harmonic
     expected = {1: phase, 2: np.full(12, 0.4)}[harmonic].reshape(3, 4)
     np.testing.assert_allclose(result.modulation, {1: 20.0, 2: 8.0}[harmonic], atol=1.2)
     np.testing.assert_allclose(result.azimuth, expected, atol=0.2)
-    given = Correlation(harmonic=harmonic, frequency=HERTZ, frame_rate=RATE).run(Stack(frames, None))
+    given = Correlation(harmonic=harmonic, frequency=HERTZ, frame_rate=RATE).run(stack(frames, None))
     np.testing.assert_allclose(given.modulation, result.modulation, rtol=1e-2)
 
 
@@ -108,8 +104,8 @@ def test_a_harmonic_is_the_fit_of_a_multiple_of_the_phase(harmonic, dtype, devic
             "harmonic 0: a number of at least 1",
         ),
         (
-            lambda: Correlation(frequency=1.0).run(Stack(np.zeros((9, 2, 2), "u1"), None)),
-            "memory: the time of each frame is unknown: give the frame rate",
+            lambda: Correlation(frequency=1.0).run(stack(np.zeros((9, 2, 2), "u1"), None)),
+            "the array of frames: the time of each frame is unknown: give the frame rate",
         ),
         (
             lambda: Correlation(frequency="estimate", frame_rate=-1.0),

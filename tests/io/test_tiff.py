@@ -1,0 +1,270 @@
+"""Stacks in TIFF: what their metadata say is a frame, value by value."""
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+from mirrorskin.io import InputError, Region, Steps, describe, open_recording
+
+SHAPE = (7, 9)
+BITS8, BITS16 = np.dtype(np.uint8), np.dtype(np.uint16)
+
+
+def stack(count, dtype=BITS16, channels=0):
+    """Return frames (T, H, W), or (T, C, H, W), whose samples all differ from each other."""
+    shape = (count, channels, *SHAPE) if channels else (count, *SHAPE)
+    return (np.arange(np.prod(shape)).reshape(shape) * 11 % np.iinfo(dtype).max).astype(dtype)
+
+
+def opened(path, **options):
+    return open_recording(path, **({"motion": "vertical", "travel": Steps(0.1)} | options))
+
+
+def frames_of(path, **options):
+    with opened(path, **options) as source:
+        return source.read(np.empty(source.shape, source.dtype)).frames, source
+
+
+def write(path, frames, **options):
+    tifffile.imwrite(path, frames, **({"photometric": "minisblack"} | options))
+    return path
+
+
+PLAIN = {"metadata": None}
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        PLAIN,
+        {"byteorder": ">", **PLAIN},
+        {"bigtiff": True, **PLAIN},
+        {"rowsperstrip": 2, **PLAIN},
+        {"compression": "zlib", **PLAIN},
+        {"compression": "zlib", "byteorder": ">", **PLAIN},
+        {"tile": (16, 16), **PLAIN},
+        {"tile": (16, 16), "compression": "zlib", **PLAIN},
+        {},  # tifffile's own description of the shape
+        {"metadata": {"axes": "TYX"}},
+        {"metadata": {"axes": "ZYX"}},
+        {"imagej": True},
+        {"imagej": True, "truncate": True},
+        {"imagej": True, "metadata": {"axes": "TYX"}},
+        {"ome": True, "metadata": {"axes": "ZYX"}},
+        {"ome": True, "compression": "zlib", "metadata": {"axes": "TYX"}},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("dtype", [BITS8, BITS16])
+def test_the_frames_of_a_stack_come_back_exactly(tmp_path, dtype, options):
+    frames = stack(5, dtype)
+    np.testing.assert_array_equal(frames_of(write(tmp_path / "a.tif", frames, **options))[0], frames)
+
+
+def test_float32_comes_back_exactly(tmp_path):
+    frames = (stack(5) / 7).astype(np.float32)
+    path = write(tmp_path / "a.tif", frames)
+    with opened(path) as source:
+        np.testing.assert_array_equal(source.read(np.empty(source.shape, source.dtype)).frames, frames)
+
+
+@pytest.mark.parametrize("dtype", ["int8", "int16", "uint32", "int32", "float64"])
+def test_other_types_are_converted_where_that_is_exact(tmp_path, dtype):
+    frames = stack(5, BITS8) // 2
+    found, source = frames_of(write(tmp_path / "a.tif", frames.astype(dtype)))
+    np.testing.assert_array_equal(found, frames)
+    assert [(one.kind, one.warning) for one in source.findings] == [("converted samples", False)]
+
+
+def test_a_sample_that_cannot_be_converted_is_named(tmp_path):
+    frames = stack(5).astype(np.int32)
+    frames[3] -= 5000
+    with (
+        opened(write(tmp_path / "a.tif", frames)) as source,
+        pytest.raises(InputError, match=r"a\.tif: frame 3 has a sample of .*; int32 is read as uint16"),
+    ):
+        source.read(np.empty(source.shape, source.dtype))
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".tiff", ".TIF"])
+def test_lzw_with_a_predictor_comes_back_exactly(tmp_path, suffix):
+    frames = stack(4)
+    assert cv2.imwritemulti(str(tmp_path / f"a{suffix}"), [*frames])  # OpenCV compresses by LZW
+    np.testing.assert_array_equal(frames_of(tmp_path / f"a{suffix}")[0], frames)
+
+
+@pytest.mark.parametrize(
+    "options", [PLAIN, {"compression": "zlib"}, {"imagej": True, "truncate": True}], ids=str
+)
+def test_a_part_is_read_as_a_part_of_the_whole(tmp_path, options):
+    frames = stack(6)
+    part = {"frames": (2, 5), "region": Region((1, 5), (3, 8))}
+    found, source = frames_of(write(tmp_path / "a.tif", frames, **options), **part)
+    np.testing.assert_array_equal(found, frames[2:5, 1:5, 3:8])
+    assert source.travel.tolist() == pytest.approx([0.2, 0.3, 0.4])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"imagej": True, "metadata": {"axes": "TCYX"}},
+        {"ome": True, "metadata": {"axes": "TCYX"}},
+        {"metadata": {"axes": "TCYX"}},
+        {"metadata": {"axes": "ZCYX"}, "compression": "zlib"},
+    ],
+    ids=str,
+)
+def test_channels_are_refused_unless_one_is_chosen(tmp_path, options):
+    frames = stack(5, channels=3)
+    path = write(tmp_path / "a.tif", frames, **options)
+    with pytest.raises(InputError, match=r"a\.tif has 3 channels: --channel 0 to 2 takes one of them"):
+        opened(path)
+    np.testing.assert_array_equal(frames_of(path, channel=1)[0], frames[:, 1])
+
+
+def test_a_channel_that_is_not_there_is_refused(tmp_path):
+    path = write(tmp_path / "a.tif", stack(5, channels=3), metadata={"axes": "TCYX"})
+    with pytest.raises(InputError, match="3 channels, and none is number 3: --channel 0 to 2"):
+        opened(path, channel=3)
+
+
+def test_a_channel_of_a_stack_with_one_is_refused(tmp_path):
+    with pytest.raises(InputError, match="has one channel: leave --channel out"):
+        opened(write(tmp_path / "a.tif", stack(5)), channel=0)
+
+
+def test_channels_that_may_be_the_colours_of_one_picture_are_not_frames(tmp_path):
+    path = write(tmp_path / "a.tif", stack(4), metadata={"axes": "CYX"})
+    with pytest.raises(InputError, match=r"4 channels: .*; if they are frames, save them with the axes TYX"):
+        opened(path)
+
+
+def test_more_channels_without_time_or_depth_are_frames(tmp_path):
+    """What tifffile writes for ImageJ where no axes are given."""
+    found, source = frames_of(write(tmp_path / "a.tif", stack(5), imagej=True))
+    np.testing.assert_array_equal(found, stack(5))
+    assert [(one.kind, one.warning) for one in source.findings] == [("channels", False)]
+
+
+@pytest.mark.parametrize("options", [{"imagej": True}, {"ome": True}, {}], ids=str)
+def test_frames_with_two_orders_are_refused(tmp_path, options):
+    path = write(tmp_path / "a.tif", stack(4, channels=3), metadata={"axes": "TZYX"}, **options)
+    with pytest.raises(InputError, match=r"has the axes TZYX \(4 T x 3 Z\), but frames have one order"):
+        opened(path)
+
+
+def test_of_several_series_one_is_chosen(tmp_path):
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        file.write(stack(3), photometric="minisblack", metadata=None)
+        file.write(stack(4)[:, :5], photometric="minisblack", metadata=None)
+    with pytest.raises(InputError, match=r"holds 2 series of pictures, 0: 3 x 7 x 9 uint16.*, 1: 4 x 5 x 9"):
+        opened(tmp_path / "a.tif")
+    np.testing.assert_array_equal(frames_of(tmp_path / "a.tif", dataset="1")[0], stack(4)[:, :5])
+
+
+@pytest.mark.parametrize("dtype", [BITS8, BITS16])
+@pytest.mark.parametrize("options", [PLAIN, {"compression": "zlib"}], ids=str)
+def test_where_white_is_zero_samples_are_inverted(tmp_path, dtype, options):
+    frames = stack(3, dtype)
+    found, source = frames_of(write(tmp_path / "a.tif", frames, photometric="miniswhite", **options))
+    np.testing.assert_array_equal(found, np.iinfo(dtype).max - frames)
+    assert [(one.kind, one.warning) for one in source.findings] == [("white is zero", False)]
+
+
+def test_floats_whose_white_is_zero_are_refused(tmp_path):
+    path = write(tmp_path / "a.tif", stack(3).astype(np.float32), photometric="miniswhite")
+    with pytest.raises(InputError, match="white is zero, but samples are float32"):
+        opened(path)
+
+
+@pytest.mark.parametrize("options", [PLAIN, {"compression": "zlib"}], ids=str)
+def test_a_microscope_s_table_of_colours_gives_indices(tmp_path, options):
+    frames, green = stack(3, BITS8), np.zeros((3, 256), np.uint16)
+    green[1] = np.arange(256) * 257
+    found, source = frames_of(
+        write(tmp_path / "a.tif", frames, photometric="palette", colormap=green, **options)
+    )
+    np.testing.assert_array_equal(found, frames)
+    assert [(one.kind, one.warning) for one in source.findings] == [("colour table", False)]
+
+
+@pytest.mark.filterwarnings("ignore:.*writing.*photometric:DeprecationWarning")
+def test_three_frames_in_one_planar_picture_get_a_hint(tmp_path):
+    tifffile.imwrite(
+        tmp_path / "a.tif", stack(3, BITS8), photometric="rgb", planarconfig="separate", metadata=None
+    )
+    with pytest.raises(InputError, match=r"holds 1 frame.* planes of a picture .* photometric='minisblack'"):
+        opened(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("planar", ["contig", "separate"])
+@pytest.mark.parametrize("options", [PLAIN, {"compression": "zlib"}], ids=str)
+def test_colours_become_luma_and_are_reported(tmp_path, planar, options):
+    frames = stack(4, BITS8, channels=3)
+    pages = frames if planar == "separate" else np.moveaxis(frames, 1, -1)
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, pages, photometric="rgb", planarconfig=planar, **options)
+    luma = np.tensordot([0.299, 0.587, 0.114], frames.astype(float), axes=(0, 1))
+    found, source = frames_of(path)
+    np.testing.assert_allclose(found, luma, atol=0.51)
+    assert "colour" in [one.kind for one in source.findings]
+    np.testing.assert_array_equal(frames_of(path, channel=2)[0], frames[:, 2])
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (
+            {"imagej": True, "resolution": (2.0, 2.0), "metadata": {"unit": "um", "axes": "TYX"}},
+            "pixels of 0.5 x 0.5 µm",
+        ),
+        (
+            {
+                "ome": True,
+                "metadata": {"axes": "TYX", "PhysicalSizeX": 0.65, "PhysicalSizeY": 0.7},
+            },
+            "pixels of 0.65 x 0.7 µm",
+        ),
+    ],
+    ids=["ImageJ", "OME"],
+)
+def test_a_pixel_size_in_the_metadata_is_reported(tmp_path, options, text):
+    _, source = frames_of(write(tmp_path / "a.tif", stack(3), **options))
+    (found,) = source.findings
+    assert (found.kind, found.warning) == ("pixel size", False)
+    assert text in found.text
+    assert "--pixel-size" in found.text
+    assert source.header.pixel_size is None
+
+
+@pytest.mark.parametrize(
+    ("options", "kept"),
+    [(options, kept) for options in (PLAIN, {"imagej": True, "truncate": True}) for kept in (0.1, 0.4, 0.9)]
+    + [({"ome": True}, 0.1), ({"ome": True}, 0.4)],  # the text of OME is at the end
+    ids=str,
+)
+def test_a_stack_that_is_cut_off_is_refused(tmp_path, options, kept):
+    path = write(tmp_path / "a.tif", stack(20), **options)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * kept)])
+    with pytest.raises(InputError, match="cut off"):
+        opened(path)
+
+
+def test_no_other_file_is_opened(tmp_path):
+    """The metadata of OME may name further files."""
+    write(tmp_path / "other.tif", stack(3))
+    write(tmp_path / "a.ome.tif", stack(3), ome=True, metadata={"axes": "TYX"})
+    data = (tmp_path / "a.ome.tif").read_bytes()
+    at = data.index(b"<TiffData")
+    end = data.index(b"/>", at) + 2
+    tag = b'<TiffData><UUID FileName="other.tif">urn:uuid:1</UUID></TiffData>'
+    (tmp_path / "a.ome.tif").write_bytes(data[:at] + tag[: end - at].ljust(end - at) + data[end:])
+    (tmp_path / "other.tif").chmod(0)
+    np.testing.assert_array_equal(frames_of(tmp_path / "a.ome.tif")[0], stack(3))
+
+
+def test_a_stack_is_described_without_positions(tmp_path):
+    facts = describe(write(tmp_path / "a.tif", stack(5), imagej=True, truncate=True))
+    assert facts["frames"] == "5 of 9 x 7, uint16"
