@@ -22,6 +22,9 @@ QUANTUM = 1 / math.sqrt(12)
 """Standard deviation of the rounding of integer counts."""
 
 _AT_ONCE = 65536  # pixels processed at once
+_PAIRS, _FEWEST = 16, 64  # pairs of frames from which noise is estimated, and samples that are enough of each
+_MEDIAN = 0.6745  # magnitude of half of the values of a normal distribution, standard deviations
+_ROUNDS = 3  # of clipping, after which the noise changes by less than a percent
 _CLIP = 4.0  # standard deviations beyond which differences are clipped
 
 
@@ -115,6 +118,34 @@ def estimate_noise(first: NDArray[np.float64], second: NDArray[np.float64], inte
             break
     noise = spread / np.sqrt(2)
     return float(max(noise, QUANTUM) if integer else noise)
+
+
+def estimate_noise_of_all(samples: NDArray[Any]) -> float:
+    """Estimate the standard deviation of a sample, counts, from the same pixels of all frames, (T, n).
+
+    It is the median over pairs of consecutive frames, at most 16, so that a frame that is there twice, a
+    lamp that settles, or a plate that turns light at once are outliers. Samples at an end of the scale, where
+    noise is cut off, are left out.
+    """
+    integer = samples.dtype.kind == "u"
+    pairs = np.unique(np.linspace(0, len(samples) - 2, _PAIRS).round().astype(int))
+    first, second = (samples[pairs + step].astype(np.float32) for step in (0, 1))
+    usable = np.isfinite(first) & np.isfinite(second)
+    if integer:
+        top = samples.max()
+        usable &= (first > 0) & (second > 0) & (first < top) & (second < top)
+    enough = np.count_nonzero(usable, axis=1) >= _FEWEST
+    if not enough.any():
+        return math.nan
+    usable, difference = usable[enough], np.abs(second - first)[enough]
+    middle = np.sort(np.where(usable, difference, np.inf), axis=1)
+    spread = middle[np.arange(len(middle)), np.count_nonzero(usable, axis=1) // 2] / _MEDIAN
+    spread = np.maximum(spread, 1.0 if integer else 0.0)
+    for _ in range(_ROUNDS):
+        kept = usable & (difference <= _CLIP * spread[:, np.newaxis])
+        spread = np.sqrt(np.mean(difference**2, axis=1, where=kept))
+    noise = float(np.median(spread)) / math.sqrt(2)
+    return max(noise, QUANTUM) if integer else noise
 
 
 def noise_of_residual(residual: NDArray[Any], freedom: ArrayLike) -> float:

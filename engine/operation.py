@@ -20,6 +20,7 @@ from mirrorskin.io.arguments import as_array
 from mirrorskin.io.maps import declaration_of
 from mirrorskin.io.result import check_maps, result_of
 from mirrorskin.io.samples import convert_samples, frame_dtype
+from mirrorskin.io.traces import FrameSamples
 from mirrorskin.io.types import Motion, ProcessValue
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Choice, Device, open_devices
@@ -248,6 +249,14 @@ class Operation(ThreadSafe, OnDevice):
         """Return the maps of all frames; only `reset` may follow, so that buffers need not be copied."""
         return cast(Result, self.result())
 
+    def reconsider(self, samples: FrameSamples) -> bool:
+        """Return whether all frames must be pushed again, as an assumption about them was wrong.
+
+        It is called after the last frame, with samples of all of them; the operation has forgotten the frames
+        if it returns True.
+        """
+        return False
+
     def preview(self, seconds: float) -> Mapping[str, Any]:
         """Return the maps that a display shows while the body moves, if possible within some seconds."""
         return self.result()  # type: ignore[no-any-return]
@@ -445,10 +454,16 @@ _WRAPPERS: Mapping[str, Callable[[Any], Any]] = {
 
 def apply(operation: Operation, frames: NDArray[Any], **given: Any) -> Result:
     """Return the maps of a stack that fits in memory."""
-    for number in range(operation.passes):
-        if number:
-            operation.next_pass()
-        operation.push(frames, lent=True, **given)
+
+    def push_all() -> None:
+        for number in range(operation.passes):
+            if number:
+                operation.next_pass()
+            operation.push(frames, lent=True, **given)
+
+    push_all()
+    if isinstance(frames, np.ndarray) and operation.reconsider(FrameSamples.of(frames)):
+        push_all()
     return operation.finish()
 
 

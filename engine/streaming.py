@@ -69,13 +69,21 @@ def feed(
     with ThreadPoolExecutor(1, "mirrorskin-fingerprint") as worker:
         # The result needs it, and it takes about as long as the frames.
         fingerprint = worker.submit(source.fingerprint) if hasattr(source, "fingerprint") else None
-        for number in range(operation.passes):
-            if number:
-                operation.next_pass()
-            _feed_once(source, operation, chosen, None if number else watch, progress)
+        _feed_passes(source, operation, chosen, watch, progress)
+        if source.rewindable and watch.samples.count and operation.reconsider(watch.samples):
+            _feed_passes(source, operation, chosen, None, progress)
     if fingerprint is not None:
         fingerprint.result()
     return watch.check().findings
+
+
+def _feed_passes(
+    source: Source, operation: Operation, frames: range, watch: Watch | None, progress: Progress | None
+) -> None:
+    for number in range(operation.passes):
+        if number:
+            operation.next_pass()
+        _feed_once(source, operation, frames, None if number else watch, progress)
 
 
 def _feed_once(

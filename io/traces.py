@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ _FEW = 0.05  # share of pixels below which their common behaviour means nothing
 _MOST_OF = 0.8  # share of pixels that decides
 _CLIPPED = 0.1  # share of responding pixels that may reach the end of the scale
 _FLICKER, _DRIFT = 0.01, 2.0  # share of the light; counts of 8 bits
+_NOISY = 0.3  # share of the pixels that differ between frames because of noise
+_AS_ONE = 0.5  # mean direction of the pixels' phases above which all respond alike
 _HARMONICS = 3  # of the phase, that describe the brightness of a pixel
 _THIN = 4  # times by which an axis is shorter than both others if it is a wrong one
 
@@ -53,6 +55,13 @@ class FrameSamples:
             *(slice((n - 1) % s // 2, None, s) for n in shape[1:] for s in [-(-n // side)]),
         )
         self._parts: list[NDArray[Any]] = []
+
+    @classmethod
+    def of(cls, frames: NDArray[Any]) -> Self:
+        """Return samples of a stack."""
+        samples = cls((len(frames), frames.shape[1], frames.shape[2]))
+        samples.push(frames)
+        return samples
 
     def push(self, frames: NDArray[Any]) -> None:
         """Add the next frames, (n, H, W)."""
@@ -199,7 +208,7 @@ class Traces:
         inside = (counts[1:] > 0) & (counts[1:] < self._end())  # where noise is not cut off
         differ = np.count_nonzero((counts[1:] != counts[:-1]) & inside, axis=1)
         again = np.flatnonzero((differ == 0) & (inside.sum(axis=1) >= _FEWEST)) + 1
-        if len(again) and np.median(differ) > 0.1 * counts.shape[1]:
+        if len(again) and np.median(differ) > _NOISY * counts.shape[1]:
             yield Finding(
                 "repeated frames",
                 f"{named_frames(again)}: identical to the one before, so later positions may be wrong:"
@@ -278,8 +287,11 @@ class Traces:
             left = self._counts - self._fit
             if float(np.mean(left**2)) > 0.02 * float(np.var(self._counts)):
                 return None  # harmonics do not describe it
-            gain = np.sum(left * self._fit, axis=1) / np.sum(self._fit**2, axis=1)
-            error = self.noise / math.sqrt(float(np.mean(np.sum(self._fit**2, axis=1))))
+            wave = np.exp(1j * self._series["phase"]) @ self._counts[:, self._responding]
+            if abs(np.mean(wave / np.abs(wave))) > _AS_ONE:
+                return None  # of a flat object, light that is not a cosine would look the same
+            gain = np.median(left / np.maximum(self._fit, 1e-3 * self._highest.max()), axis=1)
+            error = 1.25 * self.noise / math.sqrt(self._fit.shape[1]) / float(np.mean(self._fit))
             return float(np.std(gain)), error
         if not self._goes_down() or self._share < _FEW:
             return None

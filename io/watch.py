@@ -61,13 +61,13 @@ class Watch:
 
     def __init__(self, source: Source, moved: bool = True) -> None:
         self._source, self._moved = source, moved
-        self._samples = FrameSamples(source.shape)
+        self.samples = FrameSamples(source.shape)
         self._series: dict[str, list[Floats]] = {"time": [], "travel": [], "phase": []}
         self._lost = 0
 
     def push(self, block: Block) -> None:
         """Add the next frames."""
-        self._samples.push(block.frames)
+        self.samples.push(block.frames)
         self._lost += block.dropped
         for name, parts in self._series.items():
             values = getattr(block, name)
@@ -79,7 +79,7 @@ class Watch:
     ) -> Check:
         """Return what the frames so far show."""
         source = self._source
-        samples = self._samples.values if self._samples.count else np.empty((0, 0, 0), source.dtype)
+        samples = self.samples.values if self.samples.count else np.empty((0, 0, 0), source.dtype)
         series = {
             name: np.concatenate(parts)
             for name, parts in self._series.items()

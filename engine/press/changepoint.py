@@ -78,6 +78,15 @@ class ChangePoint(PressOperation):
             self._fill(dark=np.nan_to_num(first), gain=1 / np.where(np.isnan(first), 1, second - first))
         self.clear()
 
+    @property
+    def used_noise(self) -> float | None:
+        """Standard deviation of a sample, counts."""
+        return self._noise.value
+
+    def use_noise(self, noise: float) -> None:
+        """Replace the estimated noise before the first frame."""
+        self._noise.reset(noise)
+
     @cached_property
     def room(self) -> NDArray[Any]:
         """Array in which the next frames may be written before they are pushed, (n, H, W)."""

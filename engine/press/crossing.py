@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
@@ -9,13 +10,14 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.frames import Noise, reference_maps
+from mirrorskin.engine.frames import Noise, estimate_noise_of_all, reference_maps
 from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.options import option
 from mirrorskin.engine.tiling import Band, Planes, Staged, cut_into_bands, for_each_band, join_rows, room_of
 from mirrorskin.io import Map
 from mirrorskin.io.maps import TABLE, PressStatus, ReleaseStatus, status_of
 from mirrorskin.io.positions import check_travel
+from mirrorskin.io.traces import FrameSamples
 from mirrorskin.io.types import FRAME_DTYPES
 from mirrorskin.kernels.device import C_TYPES, Device
 from mirrorskin.kernels.onset import DARK, complement
@@ -32,6 +34,7 @@ _PLATEAU = 3.0  # standard deviations: tolerance of a sample that belongs to a d
 _CLEARLY_DARK = 6.0  # standard deviations below the threshold: a sample whose plateau is not near it
 _ROUNDING = 1e-12  # tolerance of a threshold such as 0.55, which has no exact binary value
 _TILE = 4096  # pixels of a work-item on a CPU; 0.8 times the run time of 1024 for long rows
+_MISLED = 1.6  # ratio of two estimates of the noise that chance, or shot noise, hardly explains
 _LONGEST = 2**30  # frames: limit of `hold`, so that sums of frame numbers do not overflow
 
 
@@ -73,7 +76,7 @@ class PressOperation(Operation):
         unit="counts",
         within=(0, None),
         help="standard deviation of a sample",
-        shown_default="estimated from the first two frames",
+        shown_default="estimated from the frames",
     )
 
     def configured_for(self, source: Source) -> Self:
@@ -82,6 +85,27 @@ class PressOperation(Operation):
         return self.with_options(
             **{name: level for name, level in levels.items() if getattr(self, name) is None}
         )
+
+    def reconsider(self, samples: FrameSamples) -> bool:
+        """Return whether the first two frames misled about the noise; all frames tell it then."""
+        used = self.used_noise
+        if self.noise is not None or used is None or samples.count < 3:
+            return False
+        values = samples.values
+        noise = estimate_noise_of_all(values.reshape(len(values), -1))
+        if not noise or used / _MISLED <= noise <= used * _MISLED or math.isnan(noise):
+            return False
+        self.reset()
+        self.use_noise(noise)
+        return True
+
+    @property
+    def used_noise(self) -> float | None:
+        """Standard deviation of a sample, counts, that was estimated from the first two frames, or given."""
+        return None
+
+    def use_noise(self, noise: float) -> None:
+        """Replace the estimated noise before the first frame."""
 
     @property
     def declarations(self) -> Mapping[str, Map]:

@@ -37,6 +37,16 @@ class ThresholdOperation(CrossingOperation):
         ]
 
     @property
+    def used_noise(self) -> float:
+        """Standard deviation of a sample, counts."""
+        return self._searches[0].noise
+
+    def use_noise(self, noise: float) -> None:
+        """Replace the estimated noise before the first frame."""
+        for search in self._searches:
+            search.reset(noise)
+
+    @property
     def room(self) -> NDArray[Any]:
         """Array in which the next frames may be written before they are pushed, (n, H, W)."""
         return self._searches[0].room

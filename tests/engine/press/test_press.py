@@ -198,13 +198,13 @@ def test_a_result_outlives_its_recording(tmp_path):
     path = tmp_path / "press.h5"
     with io.Recorder(MadeUp(frames, io.Header("vertical"), travel=travel), path) as recorder:
         recorder.drain(lambda done: None)
-    search = engine.Onset(device=open_device())
+    search = engine.Onset(noise=5.0, device=open_device())
     with io.open_recording(path) as recording:
         search.begin(recording.shape[1:], recording.dtype)
         while (block := recording.read(search.room)) is not None:
             push_block(search, block)
     path.unlink()
-    np.testing.assert_array_equal(search.result().height, engine.find_onset(frames, travel).height)
+    np.testing.assert_array_equal(search.result().height, engine.find_onset(frames, travel, noise=5.0).height)
 
 
 class Spiked:
