@@ -111,7 +111,7 @@ class Focus(Operation):
         found = fetch([(array, slice(None)) for array in maps.values()])
         height, spread, gain, misfit, sharpness, status = found
         misfit = misfit[np.isfinite(misfit)]
-        excess = max(0.0, float(np.median(misfit))) if misfit.size else 0.0
+        excess = max(0.0, float(np.median(misfit))) if misfit.size else np.nan
         sigma = np.sqrt(np.float32(variance) * spread + np.float32(excess) * gain)
         return {"height": height, "height_sigma": sigma, "status": status, "sharpness": sharpness}
 
@@ -125,7 +125,8 @@ find_focus = travel_function(
     minus the contribution (N - 1) noise^2 of noise. A Gaussian is fitted to the peak and its neighbours, that
     is, a parabola through log S (Nayar and Nakagawa 1994), weighted by the inverse of the variance of log S,
     noise^2 (2 (N - 1) noise^2 + 4 S) / S^2 (a non-central chi-square). The standard error follows from these
-    and, if reach is 2 or more, from the median misfit of such curves in the picture.
+    and from the median misfit of such curves in the picture. With ``reach=1``, which fits three samples
+    exactly, it is unknown: NaN.
 
     Returns
     -------

@@ -5,6 +5,7 @@ The least-squares fit is that of a rotation: `mirrorskin.engine.rotation.correla
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -36,6 +37,7 @@ _STRIPES = {
     "border": Map("number of the stripe that begins at the pixel", dtype="int32", undefined=-1),
     "border_risk": Map("probability that the number is wrong by 1 where there is no border, or the reverse"),
 }
+_MISFIT = 4.0  # noise: residual of samples that are no cosine of the shift
 _UNCLEAR = 0.5  # distance of a bit from the threshold, RMS distances, below which the pixel is on a border
 
 
@@ -111,15 +113,13 @@ class Fringes(Operation):
         used = weights > 0
         freedom = np.count_nonzero(used) - 3
         modulation, phase = fit.modulation, fit.azimuth
-        if self._noise is None:
-            if freedom < 1:
-                raise InputError(
-                    "3 frames leave no residual to estimate the noise from: specify noise, counts"
-                )
+        seen = np.asarray(math.nan)  # noise that the residuals of the half with more modulation show
+        if freedom > 0:
             strong = modulation >= np.median(modulation[np.isfinite(modulation)])
-            noise = np.asarray(noise_of_residual(fit.residual[strong], freedom))
-        else:
-            noise = self._noise
+            seen = np.asarray(noise_of_residual(fit.residual[strong], freedom))
+        elif self._noise is None:
+            raise InputError("3 frames leave no residual to estimate the noise from: specify noise, counts")
+        noise = seen if self._noise is None else self._noise
         matrix = fit_matrix(self.pushed("phase")[used], weights[used])
         (cc, cs), (_, ss) = ((matrix @ (matrix / weights[used]).T)[1:, 1:]).tolist()
         # sin p = sine / modulation, and so for the cosine; without modulation there is no error bound.
@@ -127,9 +127,11 @@ class Fringes(Operation):
         square = modulation * modulation
         spread = np.full(square.shape, np.inf, np.float32)
         np.divide(noise.astype(np.float32) * np.sqrt(variance), square, out=spread, where=square != 0)
+        # No cosine fits these samples: one of them is of a hot pixel, or of a reflection that moved.
+        misfit = fit.residual > _MISFIT * np.fmax(noise, seen)
         maps = {
-            "phase": phase,
-            "phase_sigma": spread,
+            "phase": np.where(misfit, np.float32(np.nan), phase),
+            "phase_sigma": np.where(misfit, np.float32(np.inf), spread),
             "mean": fit.mean,
             "modulation": modulation,
             "residual": fit.residual,
@@ -151,8 +153,8 @@ fit_fringes = phase_function(
     -------
     Result
         ``phase`` and ``phase_sigma``, radians; ``mean``, ``modulation`` and ``residual``, counts. Pixels
-        without modulation have the phase NaN with an infinite standard deviation. ``process`` contains the
-        ``noise``, counts, if it is one number.
+        without modulation, or with a residual of more than four times the noise, have the phase NaN with an
+        infinite standard deviation. ``process`` contains the ``noise``, counts, if it is one number.
 
     Raises
     ------

@@ -73,7 +73,13 @@ def test_a_slope_is_followed():
     assert np.sqrt(np.mean(error**2)) < 0.03
 
 
-@pytest.mark.parametrize(("noise", "reach"), [(0.5, 2), (3.0, 2), (0.5, 1)])
+def test_three_samples_leave_no_standard_error():
+    found = engine.focus.find_focus(noisy(FRAMES, 0.5, 1), TRAVEL, noise=0.5, reach=1)
+    assert np.isfinite(found.height).any()
+    assert np.isnan(found.height_sigma).all()
+
+
+@pytest.mark.parametrize(("noise", "reach"), [(0.5, 2), (3.0, 2)])
 def test_the_standard_error_is_the_scatter(noise, reach):
     frames, square = textured(), []
     for seed in range(40):

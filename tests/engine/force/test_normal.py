@@ -59,12 +59,23 @@ def test_errors_of_travel_and_modulus_are_propagated():
 
 def test_independent_errors_of_heights_give_the_scatter_that_is_expected():
     generator, ball = np.random.default_rng(4), -(distances(48) ** 2) / 6
-    expected = find_force(ball, 0.4, PIXEL, MODULUS, sigma=0.002).force_sigma
+    expected = find_force(ball, 0.4, PIXEL, MODULUS, sigma=0.0003).force_sigma
     drawn = [
-        find_force(ball + generator.normal(0, 0.002, ball.shape), 0.4, PIXEL, MODULUS).force
+        find_force(ball + generator.normal(0, 0.0003, ball.shape), 0.4, PIXEL, MODULUS).force
         for _ in range(60)
     ]
     assert np.std(drawn) == pytest.approx(expected, rel=0.3)  # 9 % is the error of 60 draws
+
+
+@pytest.mark.parametrize("noise", [0.002, 0.005, 0.01, 0.02])
+def test_errors_of_heights_do_not_raise_the_force(noise):
+    generator, ball = np.random.default_rng(4), -(distances(64) ** 2) / 6
+    expected = find_force(ball, 0.4, PIXEL, MODULUS).force
+    drawn = []
+    for _ in range(12):
+        found = find_force(ball + generator.normal(0, noise, ball.shape), 0.4, PIXEL, MODULUS, sigma=noise)
+        drawn.append((found.force - expected) / found.force_sigma)
+    assert np.mean(np.square(drawn)) < 2
 
 
 @pytest.mark.parametrize("kind", ["declared", "mapping", "dataset", "metres", "upwards", "file"])
