@@ -32,6 +32,7 @@ _OVERSTATED = 2.0  # ratio of errors of heights to their sigmas up to which the 
 _SEVERAL = 6.0  # smallest range of heights, in half intervals, for uniformly distributed errors
 _NEARLY_ALL = 0.9  # quantile of the errors from which the used share of the intervals is estimated
 _LEAST_USED = 0.5  # smallest used share of the intervals
+_FIRST = 1e-4  # tolerance of the surfaces before the last; with 1e-5, errors are the same within 0.1 %
 _ITERATIONS = 5  # largest number of updates of the components' offsets
 _SETTLED = 1e-3  # change of an offset, in half intervals, that ends them
 
@@ -82,12 +83,12 @@ class FusionSolver:
         if not (slopes.known | press.known).any():
             raise InputError("there is nothing to fuse: no pixel has a height or a normal")
         if near is None:
-            near = self._solve(slopes, press.height, press.weight, sigma=False)
+            near = self._solve(slopes, press.height, press.weight, sigma=False, tolerance=_FIRST)
         press = _correct_overstated(press, near, slopes)
         extended = _extend(slopes, near, press, self._pixel_size)
         if self._near is None and extended is not slopes:
-            start = near.height
-            near = self._solve(extended, press.height, press.weight, initial_heights=start, sigma=False)
+            first: dict[str, Any] = {"initial_heights": near.height, "sigma": False, "tolerance": _FIRST}
+            near = self._solve(extended, press.height, press.weight, **first)
         height, weight = _use_intervals(near, press, slopes)
         surface = self._solve(extended, height, weight, initial_heights=near.height, sigma=sigma)
         # Outliers are not part of the surface, but may count in the next call.
