@@ -1,6 +1,7 @@
 // Links that let go where the surface breaks. Specification: breaks.py.
 //
 // TILE   pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
+// GROUP  work-items that add up what links cost together, 1 where an item does
 //
 // No pixel of the last column has a link to the right, and none of the last row one down: so the pixel before the
 // first of a row, and the one above the first row, may be any of those. PoCL makes vector code of loops without
@@ -19,10 +20,9 @@
 // An item has a piece of a row: what ACTION does to pixel p with those before, after, above and below.
 #define PIECE(ACTION)                                                                            \
     const int pieces = (columns + CHUNK - 1) / CHUNK, item = get_global_id(0), row = item / pieces; \
-    if (row >= rows) return;                                                                     \
     const int count = rows * columns, up = row > 0 ? -columns : count - columns;                 \
     const int next = row + 1 < rows ? columns : 0, first = row * columns + item % pieces * CHUNK; \
-    const int stop = LESSER(first + CHUNK, (row + 1) * columns);                                 \
+    const int stop = row < rows ? LESSER(first + CHUNK, (row + 1) * columns) : 0;                \
     for (int p = first + (first == 0); p < stop - (stop == count); ++p) {                        \
         ACTION(p, p - 1, p + 1, p + up, p + next)                                                \
     }                                                                                            \
@@ -88,7 +88,7 @@ __kernel void breaks_trust(
     PIECE(ONE_TRUST)
 }
 
-__kernel void breaks_links(
+__kernel GROUP_SIZE void breaks_links(
     SIZE, MAP weight_x, MAP weight_y, MAP rise_x, MAP rise_y, MAP slope_x, MAP slope_y, MAP held, MAP heights, const float width, const float height,
     const float slack, const float sharpness, const float most, OUT right, OUT down, OUT source, OUT sums)
 {
@@ -113,5 +113,12 @@ __kernel void breaks_links(
     PIECE(ONE_LINK)
     float sum = 0;
     for (int i = 0; i < stop - start; ++i) sum += costs[i];
-    sums[mine] = sum;
+#if GROUP > 1
+    __local float some[GROUP];
+    some[get_local_id(0)] = sum;
+    GROUP_SUM(some, GROUP)
+    if (get_local_id(0) == 0) sums[get_group_id(0)] = some[0];
+#else
+    if (row < rows) sums[mine] = sum;
+#endif
 }

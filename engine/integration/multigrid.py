@@ -201,7 +201,8 @@ class _Gradients:
         count = -(-finest.nodes // part_of(h.device))
         # Partial sums: of products, and of the residual's squares. Rows of the history have three numbers of
         # a cycle: product, length of the step, and the squared residual before it.
-        self.parts, self._squares = (h.array(name, count, lanes=lanes) for name in ("parts", "squares"))
+        names = "parts", "squares", "squares of right sides"
+        self.parts, self._squares, self._sides = (h.array(name, count, lanes=lanes) for name in names)
         self._history = h.device.array("history", (_LONGEST, 3, lanes), np.float32)
         self._moving, self._active = h.device.array("moving", (lanes,), np.float32), np.zeros(lanes, bool)
         self._taken: int | None = None  # the cycle whose step is not yet added to the heights
@@ -224,16 +225,10 @@ class _Gradients:
         self._fresh = start is None
         if start is not None:
             self.copy("admit", self.source, sources)
-            self._dot(b, b, self.parts)
+            self._dot(b, b, self._sides)
             self.copy("admit", self.x, start)
             self.find_residual()
         self._dot(b, b, self._squares)
-        if start is not None:
-            self._given, rest = map(_sum, self._read(self.parts, self._squares))
-            self._fresh = not (rest <= self._given).all()  # ignore a start that is worse than 0
-            if self._fresh:
-                self.copy("admit", b, sources)
-                self._dot(b, b, self._squares)
 
     def solve(self, tolerance: float | None, limit: int, deadline: float | None) -> tuple[int, Doubles]:
         """Solve; return the number of cycles, and the residuals."""
@@ -298,9 +293,15 @@ class _Gradients:
             count = min(_CYCLES if unseen else untested if deadline is None else 1, limit - done)
             for number in range(count):
                 self._step(first + number)
-            history, parts = self._read(self._history, self._squares, rows=slice(first, first + count))
+            arrays = (self._sides,) if self._given is None and self.started else ()
+            history, parts, *sides = self._read(
+                self._history, self._squares, *arrays, rows=slice(first, first + count)
+            )
             if self._given is None:
-                self._given = history[0, 2]
+                self._given = _sum(sides[0]) if sides else history[0, 2]
+                if sides and not (history[0, 2] <= self._given).all():  # ignore a start that is worse than 0
+                    self.begin(self._sources, None, self._batch)
+                    return self._iterate(goal, limit, deadline)
             # Steps of no length, where a product is not positive, leave heights and residual as they are.
             steps = int((history[:, 0] > 0).any(axis=1).sum())
             done = first + steps

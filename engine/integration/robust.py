@@ -112,7 +112,9 @@ class _Search:
         self._items = rows * -(-columns // min(links.device.layout.tile, 256))
         names = "tears", "weight_x", "weight_y", "rise_x", "rise_y", "right", "down", "source"
         self._maps = {name: self._array(name, links.shape) for name in names}
-        self._sums = self._array("sums", (self._items,))
+        layout = links.device.layout
+        self._group = layout.group if layout.tile == 1 else 1
+        self._sums = self._array("sums", (-(-self._items // self._group),))
         self._slopes, self._facing = self._find_slopes(inputs, plane)
         self._held = self._find_held(inputs, plane)
         self._curl, self._noise = self._find_curl(flags)
@@ -242,5 +244,6 @@ class _Search:
     def _run(self, name: str, **arguments: Any) -> None:
         rows, columns = self._shape
         moved = sum(value.nbytes for value in arguments.values() if isinstance(value, Array))
-        kernel = self._links.device.kernel("breaks", f"breaks_{name}")
+        macros = {"GROUP": self._group} if name == "links" else {}
+        kernel = self._links.device.kernel("breaks", f"breaks_{name}", **macros)
         kernel(self._items, rows=rows, columns=columns, **arguments, moved=moved)
