@@ -18,7 +18,9 @@ from mirrorskin.kernels.device import C_TYPES, Device
 
 SOURCES = {file.stem: file.read_text(encoding="utf-8") for file in Path(*kernels.__path__).glob("*.cl")}
 KERNELS = {
-    name: file for file, text in SOURCES.items() for name in re.findall(r"__kernel(?: GROUP_SIZE| SUM_GROUP)? void\s+(\w+)", text)
+    name: file
+    for file, text in SOURCES.items()
+    for name in re.findall(r"__kernel(?: GROUP_SIZE| SUM_GROUP)? void\s+(\w+)", text)
 }
 """The file of each kernel."""
 CASES: list[Any] = []
