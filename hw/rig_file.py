@@ -205,6 +205,9 @@ class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
         0.07
     )
     press: Annotated[float, Meta(description="a finite number of mm", examples=[2.0])]
+    travel_sigma: Annotated[
+        float | None, Meta(ge=0, le=1, description="a standard deviation from 0 to 1 mm", examples=[0.002])
+    ] = None
     pivot: Annotated[
         tuple[float, float, float] | None,
         Meta(description="a list of x, y and z, in mm,", examples=[[0.0, 0.0, 0.0]]),
@@ -453,6 +456,7 @@ home = true                     # the stage has switches, and must home before i
 # report_rate = 20.0            # Hz: how often its position is asked for at rest
 # silence = 0.07                # s without an answer, in motion, after which it is stopped
 press = 2.0                     # mm: greatest travel, whatever the axis could do
+# travel_sigma = 0.002          # mm: how well the travel of a frame is known; it is added to that of heights
 # pivot = [0.0, 0.0, 0.0]       # mm from the centre of the sheet: what the body turns about
 
 [stage.travel]                  # mm, positive down, 0 where the skin is just above the object

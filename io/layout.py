@@ -150,6 +150,7 @@ class Layout:
             pixel_size=pixel_size,
             dark=self._reference("dark"),
             bright=self._reference("bright"),
+            travel_sigma=self._scalar(f"{STAGE}/travel_sigma", "mm", "correct it"),
             press=self._one("travel", "correct it") if pressed else None,
             tilt=self._one("tilt", "give --tilt") if tilt is None else tilt,
             pivot=self._pivot(pixel_size),

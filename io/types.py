@@ -92,6 +92,8 @@ class Header:
         Millimetres at the sheet along x and y.
     dark, bright : ndarray, (H, W), float32, or None
         Counts of each pixel without light and with full light.
+    travel_sigma : float or None
+        Standard deviation of the travel of each frame, mm, independent from frame to frame.
     press : float or None
         Travel in mm at which the other motions take place.
     tilt : float or None
@@ -110,6 +112,7 @@ class Header:
     pixel_size: tuple[float, float] | None = None
     dark: NDArray[np.float32] | None = None
     bright: NDArray[np.float32] | None = None
+    travel_sigma: float | None = None
     press: float | None = None
     tilt: float | None = None
     pivot: tuple[float, float, float] | None = None

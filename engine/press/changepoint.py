@@ -179,7 +179,8 @@ class ChangePoint(PressOperation):
         status = _RELEASED[status] if self._release else status
         frame = np.where(answered, frame, np.int32(-1))
         named: dict[str, Any] = dict(zip(EVENT_MAPS, (height, sigma, status, frame), strict=True))
-        return Result(named, process={"noise": noise}, declarations=self.declarations)
+        result = Result(named, process={"noise": noise}, declarations=self.declarations)
+        return self.with_travel_errors(result)
 
     def _finish(self, band: Band, *, noise: float) -> list[Any]:
         """Return height, sigma, status and frame of a band's rows; the heights stay where the frames were."""

@@ -14,7 +14,7 @@ from mirrorskin.engine.frames import Noise, estimate_noise_of_all, reference_map
 from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.options import option
 from mirrorskin.engine.tiling import Band, Planes, Staged, cut_into_bands, for_each_band, join_rows, room_of
-from mirrorskin.io import Map
+from mirrorskin.io import Map, Result
 from mirrorskin.io.maps import TABLE, PressStatus, ReleaseStatus, status_of
 from mirrorskin.io.positions import check_travel
 from mirrorskin.io.traces import FrameSamples
@@ -79,12 +79,34 @@ class PressOperation(Operation):
         shown_default="estimated from the frames",
     )
 
+    travel_sigma: float | None = option(
+        default=None,
+        unit="mm",
+        within=(0, None),
+        help="standard deviation of the travel of each frame, independent from frame to frame, which is added"
+        " to that of the heights",
+        shown_default="that of the recording, or 0",
+    )
+
     def configured_for(self, source: Source) -> Self:
-        """Return the operation with the source's levels of dark and light, where none are given."""
-        levels = {name: getattr(source.header, name) for name in ("dark", "bright")}
+        """Return the operation with the source's levels and travel error, where none are given."""
+        levels = {name: getattr(source.header, name) for name in ("dark", "bright", "travel_sigma")}
         return self.with_options(
             **{name: level for name, level in levels.items() if getattr(self, name) is None}
         )
+
+    def with_travel_errors(self, result: Result) -> Result:
+        """Return a result whose heights also have the errors of the travel.
+
+        The variance of a height between two frames, at the share w, is (w^2 + (1 - w)^2) travel_sigma^2:
+        on average 2/3 travel_sigma^2.
+        """
+        if not self.travel_sigma:
+            return result
+        error = np.float32(math.sqrt(2 / 3) * self.travel_sigma)
+        names = [name for name in ("height_sigma", "hysteresis_sigma") if name in result]
+        more = {name: error * (math.sqrt(2) if name != "height_sigma" else 1) for name in names}
+        return result.assign({name: np.hypot(result[name], np.float32(more[name])) for name in names})
 
     def reconsider(self, samples: FrameSamples) -> bool:
         """Return whether the first two frames misled about the noise; all frames tell it then."""

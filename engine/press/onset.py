@@ -65,7 +65,8 @@ class ThresholdOperation(CrossingOperation):
         """Return the maps of the event, and others, as a result."""
         maps: dict[str, NDArray[Any]] = dict(zip(EVENT_MAPS, event_maps, strict=True))
         process = {"noise": self._searches[0].noise}
-        return Result(maps | others, process=process, declarations=self.declarations)
+        result = Result(maps | others, process=process, declarations=self.declarations)
+        return self.with_travel_errors(result)
 
 
 class Onset(ThresholdOperation):

@@ -163,6 +163,7 @@ class Press(Method):
     dark: ArrayLike | None = Onset.dark
     bright: ArrayLike | None = Onset.bright
     noise: float | None = Onset.noise
+    travel_sigma: float | None = Onset.travel_sigma
     thresholds: Sequence[float] | None = Levels.thresholds
     inclinations: Sequence[float] | None = Levels.inclinations
     modulus: float | None = Elastomer.modulus
@@ -243,6 +244,8 @@ class Press(Method):
             "dark": level_origin(source, "dark", self.dark),
             "bright": level_origin(source, "bright", self.bright),
         }
+        if operation.travel_sigma is not None:
+            process["travel_sigma"] = operation.travel_sigma
         if isinstance(operation, Levels):
             process |= {name: str(list(getattr(self, name))) for name in ("thresholds", "inclinations")}
         return process

@@ -98,7 +98,8 @@ class Strokes(CrossingOperation):
             maps["hysteresis_sigma"] = np.hypot(onset.sigma, release.sigma)
             maps["strokes"] = strokes.count
             process["strokes"] = count
-        return Result(maps, process=process, declarations=self.declarations)
+        result = Result(maps, process=process, declarations=self.declarations)
+        return self.with_travel_errors(result)
 
     def preview(self, seconds: float) -> Mapping[str, Any]:
         """Return height and contact, without the other maps."""

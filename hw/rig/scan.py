@@ -176,6 +176,7 @@ class Scan(Closing):
             zenith_gain=_scalar(camera.counts_per_radian),
             zenith_offset=_scalar(camera.zenith_offset),
             camera=camera.name,
+            travel_sigma=stage.travel_sigma,
         )
         if isinstance(self.plan, AxialPlan):
             return replace(header, press=self.plan.press, tilt=self.plan.tilt, pivot=stage.pivot)

@@ -41,6 +41,7 @@ timeout = 1
 report_rate = 10
 silence = 0.25
 press = 2
+travel_sigma = 0.002
 pivot = [0, 1, -10.5]
 
 [stage.travel]
@@ -489,4 +490,4 @@ def test_the_template_loads_with_all_its_keys_and_says_their_defaults(rig, tmp_p
         assert {field.encode_name for field in structs.fields(model)} == set(tables[table]), table
     axes = {name: structs.replace(axis, steps=250.0) for name, axis in plain.stage.axes.items()}
     axes |= {name: getattr(rig(whole).stage, name) for name in ("x", "y", "twist")}
-    assert rig(whole).stage == structs.replace(plain.stage, pivot=(0.0, 0.0, 0.0), **axes)
+    assert rig(whole).stage == structs.replace(plain.stage, pivot=(0.0, 0.0, 0.0), travel_sigma=0.002, **axes)

@@ -1,0 +1,66 @@
+"""Errors of the travel are part of the standard deviation of heights."""
+
+import numpy as np
+import pytest
+
+from mirrorskin import engine, io
+
+STEP, SIGMA = 0.02, 0.002
+LEVELS = {"dark": 30.0, "bright": 230.0}
+
+
+def jittered(seed):
+    """Frames of a press that was not quite where it should be, the travel it should have, and the onset."""
+    generator = np.random.default_rng(seed)
+    travel = STEP * np.arange(60)
+    onset = generator.uniform(0.2, 1.0, (40, 50))
+    actual = travel + generator.normal(0, SIGMA, 60)
+    light = np.clip((actual[:, None, None] - onset) / (5 * STEP) + 0.5, 0, 1)
+    counts = 30 + 200 * light + generator.normal(0, 1, light.shape)
+    return np.clip(np.rint(counts), 0, 255).astype(np.uint8), travel, onset
+
+
+@pytest.mark.parametrize(("find", "least"), [(engine.find_onset, 0.5), (engine.find_change_point, 0.2)])
+def test_heights_of_a_travel_that_jitters_have_honest_errors(find, least):
+    squares = []
+    for seed in range(8):
+        frames, travel, onset = jittered(seed)
+        found = find(frames, travel, travel_sigma=SIGMA, **LEVELS)
+        known = found.status == 1
+        squares.append(np.mean(((-found.height - onset) / found.height_sigma)[known] ** 2))
+    assert least < np.mean(squares) < 1.5  # a change-point averages over frames
+
+
+def test_without_it_the_travel_is_exact():
+    frames, travel, _ = jittered(0)
+    exact = engine.find_onset(frames, travel, **LEVELS).height_sigma
+    found = engine.find_onset(frames, travel, travel_sigma=SIGMA, **LEVELS).height_sigma
+    expected = np.hypot(exact, np.sqrt(2 / 3) * SIGMA)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+def test_a_recording_knows_it(tmp_path):
+    frames, travel, _ = jittered(0)
+
+    class Source:
+        name, motion, rewindable = "jittered", "vertical", False
+        levels = {name: np.full((40, 50), value, np.float32) for name, value in LEVELS.items()}
+        header = io.Header("vertical", travel_sigma=SIGMA, **levels)
+        shape, dtype, blocks = frames.shape, frames.dtype, [io.Block(frames, 0, travel=travel)]
+
+        def read(self, out=None, /):
+            return self.blocks.pop() if self.blocks else None
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error):
+            pass
+
+    with io.Recorder(Source(), tmp_path / "press.h5") as recorder:
+        recorder.drain(lambda done: None)
+    with io.open_recording(tmp_path / "press.h5") as recording:
+        result = engine.reconstruct(recording)
+    assert result.process["travel_sigma"] == SIGMA
+    expected = engine.find_onset(frames, travel, travel_sigma=SIGMA, **LEVELS)
+    np.testing.assert_array_equal(result.height_sigma, expected.height_sigma)
