@@ -315,8 +315,8 @@ WRONG = [
     ),
     (
         "dark = 12",
-        'dark = "dark.jpg"',
-        'camera.dark is "dark.jpg": a number of counts, or a file (.npy, .png',
+        'dark = "dark.gif"',
+        'camera.dark is "dark.gif": a number of counts, or a file (.npy, .png',
     ),
     ("dark = 12", "dark = -1", "camera.dark: it is -1, and counts of uint16 go from 0 to 65535"),
     ("dark = 12", "dark = 4001", "camera.bright is not above camera.dark at most of the pixels"),
