@@ -80,7 +80,7 @@ __kernel void changepoint_scan(
         __global const FRAME *restrict frame = frames + (size_t)t * pixels + base;
         __global FRAME *restrict slot = ring + (size_t)(number % SLOTS) * pixels + base;
         for (int p = 0; p < width; ++p) {
-            const FRAME sample = frame[p];
+            const FRAME sample = frame[p], kept = slot[p];  // what is loaded in a condition stays scalar
             const int undecided = sum[p] != DECIDED;
             const float share = share_of(sample, low[p], rate[p]);
             const int units = round_even((share < 0 ? 0 : share > 1 ? 1 : share) * UNIT);
@@ -93,7 +93,7 @@ __kernel void changepoint_scan(
             sum[p] = (!undecided | certain) ? DECIDED : grown;
 
             const int taken = number - change[p] <= REACH;
-            slot[p] = taken ? sample : slot[p];
+            slot[p] = taken ? sample : kept;
             broken[p] |= taken & !USABLE(sample);
         }
     }
