@@ -9,11 +9,11 @@ import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.groups import Argument, Option
-from mirrorskin.cli.stack import RECORDING, stack_options
+from mirrorskin.cli.stack import FORMATS, RECORDING, stack_options
 
 
 def command(
-    recording: Annotated[Path, Argument(metavar="FRAMES", help="Frames in any format that is read.")],
+    recording: Annotated[Path, Argument(metavar="FRAMES", help=f"Frames: {FORMATS}.")],
     field: Annotated[
         str, Option(metavar="LEAST,MOST", help="Plausible sides of the field of view.")
     ] = "0.05mm,200mm",

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from mirrorskin.cli import options
 from mirrorskin.cli.groups import Argument, Option
 from mirrorskin.cli.output import print_fields, print_json
-from mirrorskin.cli.stack import FORMATS
+from mirrorskin.cli.stack import CHOICE, FORMATS
 
 
 def command(
@@ -19,11 +19,12 @@ def command(
         bool, Option("--verify", help="Read all frames, and compare them with their checksums.")
     ] = False,
     as_json: options.Json = False,
+    **chosen: Annotated[Any, CHOICE],
 ) -> None:
     """Show what a file contains."""
     from mirrorskin import io
 
-    facts = io.describe(file)
+    facts = io.describe(file, **chosen)
     if verify:
         facts["checksums"] = _verify(file)
     if as_json:

@@ -67,6 +67,7 @@ STACK = Terms(
 )
 """What a recording may lack, and the part of it that is used."""
 RECORDING = STACK.without("tilt")
+CHOICE = STACK.only("dataset", "channel")
 IMPORTED = STACK.without("motion", "region", "frames")
 FORMATS = (
     "HDF5, Zarr, NPY, NPZ, TIFF, MCAP, a video (AVI, MP4, MOV, MKV), or a folder of numbered pictures"

@@ -18,6 +18,7 @@ from mirrorskin.io.recording import Recording, open_recording
 from mirrorskin.io.result import Result
 from mirrorskin.io.result_file import MARK as RESULT_MARK
 from mirrorskin.io.result_file import open_result
+from mirrorskin.io.types import InputError
 from mirrorskin.io.url import is_zarr, path_of
 from mirrorskin.io.zarr import open_file
 
@@ -44,6 +45,8 @@ def describe(path: str | Path, *, dataset: str | None = None, channel: int | Non
     """
     path = path_of(path)
     kind = kind_of_frames(path)
+    if (dataset, channel) != (None, None) and kind in ("", "array"):
+        raise InputError(f"{path}: all stacks of such a file are listed: leave --dataset and --channel out")
     if kind == "array":
         return {"kind": "NumPy array", **list_arrays(path)}
     if kind:

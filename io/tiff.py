@@ -6,7 +6,7 @@ import logging
 import re
 import struct
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,10 @@ from mirrorskin.io.types import FRAME_DTYPES, InputError
 TIFF_SUFFIXES = (".tif", ".tiff")
 
 SMALLER = "save it as smaller pictures"
+_REMEDY = "copy it again, or save it again"
 _DTYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "float32", "float64")
 _MARKS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-_KINDS = ("frame", "imagej", "multipage", "ome", "shaped", "tiled", "uniform", "virtual")
+_KINDS = ("frame", "imagej", "multipage", "ome", "shaped", "sis", "tiled", "uniform", "virtual")
 """Kinds of TIFF whose metadata are read; others are read page by page: theirs may name other files."""
 
 _FRAME_AXES = "TZIQ"  # time, depth, and pages in order
@@ -37,7 +38,8 @@ _SEPARATE = 2  # planar configuration: one plane per colour
 _MICROMETRE = ("micron", "um", "\\u00B5m")  # as ImageJ writes it
 # Tags of a page that say how its samples are packed: type and number.
 _PACKING = {266: "H", 317: "H", 322: "I", 323: "I", 278: "I"}
-_JPEG_TABLES, _SUBSAMPLING = 347, 530
+_JPEG_TABLES, _SUBSAMPLING, _ORIENTATION = 347, 530, 274
+_LAST_UPRIGHT = 4  # orientation; in the others rows and columns are exchanged
 
 
 class TiffFrames(WholeFrames):
@@ -70,31 +72,26 @@ class TiffFrames(WholeFrames):
         import tifffile
 
         self._path, self.files, self._channel = path, (path,), channel
-        remedy = "copy it again, or save it again"
-        check_regular(path, remedy)
+        check_regular(path, _REMEDY)
         others = tifffile.TIFF.FILE_FLAGS - {*_KINDS}
         flags: dict[str, Any] = {f"is_{kind}": False for kind in others}
-        with _quiet_tifffile():
+        with _quiet_tifffile(), ExitStack() as opening:
             try:
-                self._file = tifffile.TiffFile(path, _multifile=False, **flags)
-            except OSError as error:
-                raise InputError(f"{path} cannot be read: {error.strerror or error}") from error
-            except Exception as error:  # of many types
-                raise self._damaged(remedy) from error
-            try:
+                self._file = opening.enter_context(tifffile.TiffFile(path, _multifile=False, **flags))
                 found = list(self._file.series)
                 complete = bool(found) and self._ends()
                 if self._file.is_imagej:  # without the samples that its metadata state, it is a plain TIFF
                     complete = complete and found[0].kind == "imagej"
-            except Exception:
-                complete, found = False, []
-            try:
                 if not complete:
-                    raise self._damaged(remedy)
+                    raise self._damaged()
                 self._take(_chosen(path, found, series), dtypes)
-            except BaseException:
-                self._file.close()
+            except InputError:
                 raise
+            except OSError as error:
+                raise InputError(f"{path} cannot be read: {error.strerror or error}") from error
+            except Exception as error:  # of many types
+                raise self._damaged() from error
+            opening.pop_all()  # until it is closed
 
     def close(self) -> None:
         """Close the file."""
@@ -120,13 +117,13 @@ class TiffFrames(WholeFrames):
             samples = self._table[samples]
         if self._inverted:
             samples = ~samples
-        return samples
+        return _upright(samples, self._orientation)
 
-    def _damaged(self, remedy: str) -> InputError:
+    def _damaged(self) -> InputError:
         with open_regular(self._path) as unread:
             known = unread.read(4) in _MARKS
         wrong = "is damaged or cut off" if known else "is not a TIFF"
-        return InputError(f"{self._path} {wrong}: {remedy}")
+        return InputError(f"{self._path} {wrong}: {_REMEDY}")
 
     def _ends(self) -> bool:
         """Return whether the chain of pages has an end: it is missing in a file that was cut off."""
@@ -151,7 +148,9 @@ class TiffFrames(WholeFrames):
         size = rows * columns * page.samplesperpixel * self.dtype.itemsize
         check_unpacked(size, f"{name} (page {page.index + 1}): a picture of {columns} x {rows}", SMALLER)
         self._numbers, self._colour = _numbers(name, series, self._channel)
-        self.shape = (len(self._numbers), rows, columns)
+        self._orientation = _orientation(page)
+        turned = self._orientation > _LAST_UPRIGHT
+        self.shape = (len(self._numbers), *((columns, rows) if turned else (rows, columns)))
         self._page, self._pages, self._offset = page, series.pages, series.dataoffset
         self._size, self._stored_size = self._file.filehandle.size, size
         self._check_complete()
@@ -168,13 +167,13 @@ class TiffFrames(WholeFrames):
         if self._offset is not None:
             end = self._offset + self._stored_size * (int(self._numbers.max(initial=0)) + 1)
             if end > self._size:
-                raise self._damaged("copy it again, or save it again")
+                raise self._damaged()
             return
         for number in self._numbers.tolist():
             page = self._pages[number]
             missing = page is None or not page.dataoffsets
             if missing or max(map(sum, zip(page.dataoffsets, page.databytecounts, strict=True))) > self._size:
-                raise self._damaged("copy it again, or save it again")
+                raise self._damaged()
 
     def _find(self, series: Any) -> Iterator[Finding]:
         page = self._page
@@ -208,7 +207,7 @@ class TiffFrames(WholeFrames):
 
     def _stored(self, index: int, name: str) -> NDArray[Any]:
         """Return the samples of a page, (H, W) or (H, W, channels): blue, green, red, opacity."""
-        page, rows, columns = self._page, *self.shape[1:]
+        page, rows, columns = self._page, self._page.imagelength, self._page.imagewidth
         samples = page.samplesperpixel
         planar = samples > 1 and page.planarconfig == _SEPARATE
         shape = (samples, rows, columns) if planar else (rows, columns, samples)
@@ -341,6 +340,20 @@ def _numbers(name: str, series: Any, channel: int | None) -> tuple[NDArray[np.in
     if channel is not None and series.keyframe.samplesperpixel == 1:
         raise InputError(f"{name} has one channel: leave --channel out")
     return pages.reshape(-1), channel
+
+
+def _orientation(page: Any) -> int:
+    """Return the orientation of a page, 1 to 8 (TIFF 6.0, section 8)."""
+    tag = page.tags.get(_ORIENTATION)
+    value = 1 if tag is None else tag.value
+    return int(value) if value in range(1, 9) else 1
+
+
+def _upright(picture: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """Turn and mirror a picture as it is displayed."""
+    if orientation > _LAST_UPRIGHT:  # the first stored row is a column of the displayed picture
+        picture = picture.swapaxes(0, 1)
+    return picture[:: -1 if orientation in (3, 4, 7, 8) else 1, :: -1 if orientation in (2, 3, 6, 7) else 1]
 
 
 def _table(name: str, page: Any) -> NDArray[Any]:

@@ -170,12 +170,8 @@ def _make_frames(folder: Path) -> None:
     cv2.imwrite(str(folder / "picture.png"), frames[-1])
     cv2.imwrite(str(folder / "deep.png"), frames[-1].astype(np.uint16) * 200)
     tifffile.imwrite(folder / "pages.tif", frames[:4], photometric="minisblack", compression="zlib")
+    _make_stacks(folder, frames)
     tifffile.imwrite(folder / "heights.tif", np.linspace(-1, 0, 480, dtype=np.float32).reshape(20, 24))
-    for name, code in (("film.avi", "MJPG"), ("film.mp4", "mp4v")):
-        writer = cv2.VideoWriter(str(folder / name), cv2.VideoWriter.fourcc(*code), 25.0, (64, 48), True)
-        for number in range(8):
-            writer.write(np.full((48, 64, 3), 20 * number, np.uint8))
-        writer.release()
     image = "std_msgs/Header header\nstring format\nuint8[] data\n" + "=" * 80
     image += "\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id"
     with (folder / "compressed.mcap").open("wb") as file:
@@ -187,6 +183,38 @@ def _make_frames(folder: Path) -> None:
             message = {"header": head, "format": "png", "data": data}
             messages.write_message("/camera", schema, message, number * 10**7)
         messages.finish()
+
+
+def _make_stacks(folder: Path, frames: np.ndarray[Any, Any]) -> None:
+    """Write TIFFs, pictures and videos of several kinds."""
+    import av
+    import cv2
+    import tifffile
+
+    grey: dict[str, Any] = {"photometric": "minisblack"}
+    tifffile.imwrite(folder / "imagej.tif", frames, imagej=True, truncate=True, **grey)
+    tifffile.imwrite(
+        folder / "channels.tif", np.stack([frames, frames], 1), ome=True, metadata={"axes": "TCYX"}, **grey
+    )
+    cv2.imwritemulti(str(folder / "lzw.tif"), [*frames[:4]])
+    table = np.arange(256, dtype=np.uint16)[None].repeat(3, 0) * 257
+    tifffile.imwrite(folder / "table.tif", frames[:4], photometric="palette", colormap=table)
+    for name in ("picture.jpg", "picture.bmp", "picture.pgm"):
+        cv2.imwrite(str(folder / name), frames[-1])
+    kinds = {
+        "film.avi": ("mjpeg", "yuvj420p"),
+        "film.mp4": ("mpeg4", "yuv420p"),
+        "film.mkv": ("ffv1", "gray16le"),
+        "film.mov": ("png", "gray16be"),
+    }
+    for name, (codec, pixels) in kinds.items():
+        with av.open(str(folder / name), "w") as container:
+            stream = container.add_stream(codec, rate=25)
+            stream.height, stream.width, stream.pix_fmt = 48, 64, pixels
+            for number in range(8):
+                picture = av.VideoFrame.from_ndarray(np.full((48, 64), 20 * number, np.uint8), "gray")
+                container.mux(stream.encode(picture.reformat(format=pixels)))
+            container.mux(stream.encode(None))
 
 
 def _make_texts(folder: Path) -> None:
@@ -251,6 +279,8 @@ def _of_frames(path: Path, sound: Path, out: Path) -> list[Line]:
     press = ("--motion", "vertical", "--pixel-size", "0.4mm", "-o", out / "a.h5")
     return [
         ("info", path),
+        ("info", path, "--channel", 1),
+        ("check", path, "--travel-step", "0.1mm", "--dataset", 0, "--channel", 0),
         ("import", path, *press, "--travel-step", "0.1mm"),
         ("import", path, *press),
         ("import", path, *press, "--travel", sound / "travel.csv"),
@@ -264,7 +294,7 @@ def _of_objects(path: Path, sound: Path, out: Path) -> list[Line]:
     """Return the commands that read meshes, height maps and pictures."""
     small = ("--size", "24x20", "--pixel-size", "0.4mm", "--frames", 3, "-o", out / "a.h5")
     given = [("simulate", "vertical", "--object", path, *small)]
-    if path.suffix in (".png", ".tif"):
+    if path.suffix in (".png", ".tif", ".jpg", ".bmp", ".pgm"):
         folder = out / "frames"
         folder.mkdir()
         shutil.copy(sound / "picture.png", folder / "frame1.png")
@@ -320,8 +350,8 @@ COMMANDS: dict[str, list[Commands]] = {
     ".npy": [_of_frames, _of_objects, _of_tables],
     ".png": [_of_objects],
     ".tif": [_of_frames, _of_objects],
-    ".avi": [_of_frames],
-    ".mp4": [_of_frames],
+    **{key: [_of_objects] for key in (".jpg", ".bmp", ".pgm")},
+    **{key: [_of_frames] for key in (".avi", ".mp4", ".mkv", ".mov")},
     ".stl": [_of_objects],
     ".ply": [_of_objects],
     ".obj": [_of_objects],

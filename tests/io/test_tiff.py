@@ -1,5 +1,7 @@
 """Stacks in TIFF: what their metadata say is a frame, value by value."""
 
+import struct
+
 import cv2
 import numpy as np
 import pytest
@@ -178,6 +180,26 @@ def test_floats_whose_white_is_zero_are_refused(tmp_path):
         opened(path)
 
 
+@pytest.mark.parametrize(
+    ("orientation", "upright"),
+    [
+        (1, lambda frames: frames),
+        (2, lambda frames: frames[:, :, ::-1]),
+        (3, lambda frames: np.rot90(frames, 2, (1, 2))),
+        (4, lambda frames: frames[:, ::-1]),
+        (5, lambda frames: frames.transpose(0, 2, 1)),
+        (6, lambda frames: np.rot90(frames, -1, (1, 2))),
+        (7, lambda frames: np.rot90(frames, 2, (1, 2)).transpose(0, 2, 1)),
+        (8, lambda frames: np.rot90(frames, 1, (1, 2))),
+    ],
+)
+@pytest.mark.parametrize("options", [PLAIN, {"compression": "zlib"}], ids=str)
+def test_frames_are_turned_as_they_are_displayed(tmp_path, options, orientation, upright):
+    tag = (274, "H", 1, orientation, False)
+    path = write(tmp_path / "a.tif", stack(3), extratags=[tag], **options)
+    np.testing.assert_array_equal(frames_of(path)[0], upright(stack(3)))
+
+
 @pytest.mark.parametrize("options", [PLAIN, {"compression": "zlib"}], ids=str)
 def test_a_microscope_s_table_of_colours_gives_indices(tmp_path, options):
     frames, green = stack(3, BITS8), np.zeros((3, 256), np.uint16)
@@ -249,6 +271,17 @@ def test_a_stack_that_is_cut_off_is_refused(tmp_path, options, kept):
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * kept)])
     with pytest.raises(InputError, match="cut off"):
+        opened(path)
+
+
+def test_a_page_whose_strips_disagree_is_refused(tmp_path):
+    path = write(tmp_path / "a.tif", stack(2), rowsperstrip=2, compression="zlib", metadata=None)
+    with tifffile.TiffFile(path) as file:
+        tag = file.pages[1].tags[279]  # the sizes of the strips
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<I", data, tag.offset + 4, tag.count - 1)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"a\.tif is damaged or cut off"):
         opened(path)
 
 
