@@ -1,0 +1,408 @@
+"""Each estimator against each fault of a camera: is its standard deviation still true, or does it warn?
+
+``python tests/support/fault_matrix.py`` (in the environment) prints the cells; ``--freeze`` stores them in
+``tests/support/fault_matrix.json`` and writes the tables of docs/faults.md. It refuses if a standard
+deviation became wrong that was right.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from independent_camera import DARK, FAULTS, SPAN, Fault, Floats, centres, points, record, references
+from numpy.typing import NDArray
+
+from mirrorskin import engine
+from mirrorskin.engine.fusion import fuse_recordings
+from mirrorskin.io import MirrorskinWarning, Result
+from mirrorskin.io.arrays import ArrayRecording
+
+SHAPE, PIXEL = (48, 64), 0.05  # pixels; mm
+LIMITS = 2.0, 0.02  # of an honest cell: chi^2, and the share of errors beyond three standard deviations
+_STORED = Path(__file__).with_suffix(".json")
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "faults.md"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """How an estimator fared with a fault.
+
+    Attributes
+    ----------
+    error : float
+        RMS error over that without a fault.
+    chi2 : float
+        Mean of the square errors over the variances; 1 is right.
+    beyond : float
+        Share of the errors beyond three standard deviations.
+    kept : float
+        Share of the pixels that have an answer.
+    warned : bool
+        Whether the result has a warning.
+    """
+
+    error: float
+    chi2: float
+    beyond: float
+    kept: float
+    warned: bool
+
+    def __str__(self) -> str:
+        notes = ("  warned" if self.warned else "") + ("" if self.honest else "  <--")
+        return (
+            f"error {self.error:6.2f}  chi2 {self.chi2:8.2f}  beyond {100 * self.beyond:6.2f} %"
+            f"  kept {100 * self.kept:5.1f} %{notes}"
+        )
+
+    @property
+    def honest(self) -> bool:
+        """Whether the standard deviation is true, or something is said about it."""
+        return self.warned or self.kept == 0 or (self.chi2 <= LIMITS[0] and self.beyond <= LIMITS[1])
+
+    @property
+    def clearly_honest(self) -> bool:
+        """Whether a cell is so far from the limits that rounding on another device does not change it."""
+        return self.honest and (
+            self.warned or (self.chi2 <= 0.8 * LIMITS[0] and self.beyond <= LIMITS[1] / 2)
+        )
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Errors of an estimator and their standard deviations; NaN where there is no answer."""
+
+    error: Floats
+    sigma: Floats
+    warned: bool
+
+
+# --- Scenes --------------------------------------------------------------------------------------------
+
+
+def _waves(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return heights of a wavy surface, and how they change along x and y."""
+    u, v = 2 * np.pi * x / 1.6, 2 * np.pi * y / 1.9
+    height = 0.2 * np.sin(u) * np.cos(v) - 0.6
+    return (
+        height,
+        0.2 * 2 * np.pi / 1.6 * np.cos(u) * np.cos(v),
+        -0.2 * 2 * np.pi / 1.9 * np.sin(u) * np.sin(v),
+    )
+
+
+def _crater(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return heights of a plate with a round bowl whose rim is sharp, and how they change."""
+    radius = np.hypot(x, y)
+    inside = radius < 0.9
+    height = np.where(inside, -0.5 - 0.4 * (1 - (radius / 0.9) ** 2), -0.5)
+    slope = np.where(inside, 0.8 / 0.81, 0.0)
+    return height, slope * x, slope * y
+
+
+Surface = Callable[[Floats, Floats], tuple[Floats, Floats, Floats]]
+
+
+def _touched(surface: Surface) -> Callable[[Floats], Floats]:
+    """Return the light of a press: the share of the surroundings of a point that the sheet touches."""
+    height, along_x, along_y = surface(*points(SHAPE, PIXEL))
+    width = (np.abs(along_x) + np.abs(along_y)) * PIXEL / 4 + 1e-9
+    return lambda travel: np.clip((travel + height) / width + 0.5, 0, 1)
+
+
+def _normals(surface: Surface, x: Floats, y: Floats) -> Floats:
+    _, along_x, along_y = surface(x, y)
+    normal = np.stack([-along_x, -along_y, np.ones_like(along_x)], axis=-1)
+    return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
+
+
+STEEPEST, TILT = np.radians(55), np.radians(2.5)
+
+
+def _leaning(surface: Surface) -> Callable[[Floats], Floats]:
+    """Return the light of a rotation: proportional to the angle between the normal and the body's axis."""
+    normal = _normals(surface, *points(SHAPE, PIXEL))
+
+    def light(phase: Floats) -> Floats:
+        lean = math.sin(TILT) * (normal[..., 0] * np.cos(phase) + normal[..., 1] * np.sin(phase))
+        return np.arccos(np.clip(normal[..., 2] * math.cos(TILT) - lean, -1, 1)) / STEEPEST
+
+    return light
+
+
+def _fringes(x: Floats, y: Floats) -> Floats:
+    return 2 * np.pi * x / 0.8 + 1.2 * np.sin(2 * np.pi * y / 2.1)
+
+
+ZENITH = np.radians(35)
+
+
+def _lit(phase: Floats) -> Floats:
+    """Return the light of a matt surface under a lamp at an azimuth."""
+    normal = _normals(_waves, *points(SHAPE, PIXEL))
+    lamp = math.sin(ZENITH) * (normal[..., 0] * np.cos(phase) + normal[..., 1] * np.sin(phase))
+    return 0.8 * np.maximum(lamp + math.cos(ZENITH) * normal[..., 2], 0)
+
+
+# --- Estimators ----------------------------------------------------------------------------------------
+
+
+def _press(surface: Surface, step: float, fault: Fault, seed: int) -> ArrayRecording:
+    travel = np.arange(0.2, 1.1, step)
+    frames = record(_touched(surface), travel, fault, seed)
+    dark, bright = references(SHAPE, fault, seed + 1)
+    header = {"pixel_size": (PIXEL, PIXEL), "dark": dark.astype("f4"), "bright": bright.astype("f4")}
+    return ArrayRecording(frames, {"travel": travel}, header)
+
+
+def _turn(surface: Surface, fault: Fault, seed: int, count: int = 16) -> ArrayRecording:
+    phase = np.arange(count) * 2 * np.pi / count
+    frames = record(_leaning(surface), phase, fault, seed)
+    return ArrayRecording(frames, {"phase": phase}, {"pixel_size": (PIXEL, PIXEL), "tilt": TILT})
+
+
+def _scale(fault: Fault) -> dict[str, float]:
+    """Return the options of a rotation that state how brightness depends on the zenith."""
+    return {"zenith_gain": fault.scale * SPAN / STEEPEST, "zenith_offset": fault.scale * DARK}
+
+
+def _onset(surface: Surface, step: float, **options: Any) -> Callable[[Fault, int], Answer]:
+    truth = surface(*centres(SHAPE, PIXEL))[0]
+
+    def answer(fault: Fault, seed: int) -> Answer:
+        result, warned = _watched(
+            lambda: engine.reconstruct(_press(surface, step, fault, seed), fill=False, **options)
+        )
+        return Answer(result.height - truth, result.height_sigma, warned)
+
+    return answer
+
+
+def _angle(found: NDArray[Any], true: Floats) -> Floats:
+    across = np.linalg.norm(np.cross(found.astype(np.float64), true), axis=-1)
+    return np.arctan2(across, np.sum(found * true, axis=-1))
+
+
+def _rotation(fault: Fault, seed: int) -> Answer:
+    truth = _normals(_waves, *centres(SHAPE, PIXEL))
+    result, warned = _watched(lambda: engine.reconstruct(_turn(_waves, fault, seed), **_scale(fault)))
+    return Answer(_angle(result.normals, truth), result.normals_sigma, warned)
+
+
+def _integrated(fault: Fault, seed: int) -> Answer:
+    truth = _waves(*centres(SHAPE, PIXEL))[0]
+    result, warned = _watched(lambda: engine.reconstruct(_turn(_waves, fault, seed), **_scale(fault)))
+    error = result.height - truth
+    return Answer(error - np.nanmean(error), result.height_sigma, warned)
+
+
+def _fused(fault: Fault, seed: int) -> Answer:
+    truth = _waves(*centres(SHAPE, PIXEL))[0]
+    press, turn = _press(_waves, 0.05, fault, seed), _turn(_waves, fault, seed + 2)
+    result, warned = _watched(lambda: fuse_recordings(press, turn, rotation=_scale(fault), register=False))
+    return Answer(result.height - truth, result.height_sigma, warned)
+
+
+def _of_fringes(fault: Fault, seed: int) -> Answer:
+    phase = _fringes(*points(SHAPE, PIXEL))
+    shift = np.arange(8) * np.pi / 4
+    frames = record(lambda at: 0.5 + 0.4 * np.cos(phase - at), shift, fault, seed)
+    source = ArrayRecording(frames, {"phase": shift}, {})
+    result, warned = _watched(lambda: engine.run(source, engine.fringes.Fringes))
+    error = result.phase - _fringes(*centres(SHAPE, PIXEL))
+    return Answer(np.arctan2(np.sin(error), np.cos(error)), result.phase_sigma, warned)
+
+
+def _photometric(fault: Fault, seed: int) -> Answer:
+    truth, azimuth = _normals(_waves, *centres(SHAPE, PIXEL)), np.arange(12) * np.pi / 6
+    frames = record(_lit, azimuth, fault, seed)
+    source = ArrayRecording(frames, {"phase": azimuth}, {"dark": np.float32(DARK * fault.scale)})
+    operation = engine.photometric.PhotometricStereo(zenith=ZENITH, shadow=6 * fault.scale)
+    result, warned = _watched(lambda: engine.run(source, operation))
+    return Answer(_angle(result.normals, truth), result.normals_sigma, warned)
+
+
+def _watched(compute: Callable[[], Result]) -> tuple[Result, bool]:
+    """Return a result, and whether it has a warning."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", MirrorskinWarning)
+        result = compute()
+    warned = any(issubclass(one.category, MirrorskinWarning) for one in caught)
+    return result, warned or "warnings" in result.process
+
+
+ESTIMATORS: Mapping[str, Callable[[Fault, int], Answer]] = {
+    "threshold, steps of 20 µm": _onset(_waves, 0.02),
+    "threshold, steps of 100 µm": _onset(_waves, 0.1),
+    "threshold, rim of a crater": _onset(_crater, 0.02),
+    "change-point, steps of 20 µm": _onset(_waves, 0.02, method="change-point"),
+    "change-point, steps of 50 µm": _onset(_waves, 0.05, method="change-point"),
+    "normals of a rotation": _rotation,
+    "heights of a rotation": _integrated,
+    "press and rotation, fused": _fused,
+    "fringes": _of_fringes,
+    "photometric stereo": _photometric,
+}
+
+
+PRESS = [name for name in ESTIMATORS if name.startswith(("threshold", "change-point"))]
+
+
+# --- Cells ---------------------------------------------------------------------------------------------
+
+
+def applies(estimator: str, fault: Fault) -> bool:
+    """Return whether a fault can occur; projectors and lamps do not move while a frame is exposed."""
+    return not (fault.shutter and estimator in ("fringes", "photometric stereo"))
+
+
+def row(estimator: str, faults: Iterable[Fault] = FAULTS, seed: int = 1) -> dict[str, Cell]:
+    """Return the cells of an estimator by the name of the fault."""
+    usual = _rms(_inside(ESTIMATORS[estimator](FAULTS[0], seed).error))
+    return {
+        fault.name: _cell(ESTIMATORS[estimator](fault, seed), usual)
+        for fault in faults
+        if applies(estimator, fault)
+    }
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.nanmean(np.square(values))))
+
+
+def _inside(values: Floats) -> Floats:
+    """Return what is not near the border, which has no light from outside of the picture."""
+    return np.asarray(values, np.float64)[3:-3, 3:-3]
+
+
+def _cell(answer: Answer, usual: float) -> Cell:
+    error, sigma = _inside(answer.error), _inside(answer.sigma)
+    usable = np.isfinite(error) & np.isfinite(sigma)
+    if not usable.any():
+        return Cell(math.nan, math.nan, 0.0, 0.0, answer.warned)
+    ratio = np.abs(error[usable]) / sigma[usable]
+    return Cell(
+        error=_rms(error[usable]) / usual,
+        chi2=float(np.mean(ratio**2)),
+        beyond=float(np.mean(ratio > 3)),
+        kept=float(np.mean(usable)),
+        warned=answer.warned,
+    )
+
+
+# --- What is stored ------------------------------------------------------------------------------------
+
+
+def open_cells() -> dict[str, list[str]]:
+    """Return the faults of each estimator because of which its standard deviation is wrong without a word."""
+    return {name: faults for name, faults in _stored()["open"].items() if name in ESTIMATORS}
+
+
+def _stored() -> dict[str, Any]:
+    return (
+        dict(json.loads(_STORED.read_text(encoding="utf-8")))
+        if _STORED.exists()
+        else {"open": {}, "cells": {}}
+    )
+
+
+def freeze(table: Mapping[str, Mapping[str, Cell]]) -> None:
+    """Store cells, and write the page; SystemExit if a standard deviation became wrong.
+
+    ``first`` keeps the chi^2 with which a cell was first stored.
+    """
+    stored = _stored()
+    before, known, worse = stored["cells"], stored["open"], []
+    for name, cells in table.items():
+        opened = [fault for fault, cell in cells.items() if not cell.honest]
+        worse += [
+            f"{name}: {fault}"
+            for fault in opened
+            if name in known and fault not in known[name] and fault in before[name]
+        ]
+        known[name] = opened
+        before[name] = {
+            fault: _rounded(cell)
+            | {"first": before.get(name, {}).get(fault, {}).get("first", _number(cell.chi2))}
+            for fault, cell in cells.items()
+        }
+    if worse:
+        raise SystemExit("not stored, as these became wrong:\n" + "\n".join(worse))
+    _STORED.write_text(json.dumps({"open": known, "cells": before}, indent=1) + "\n", encoding="utf-8")
+    text = PAGE.read_text(encoding="utf-8")
+    PAGE.write_text(with_tables(text), encoding="utf-8")
+
+
+def _rounded(cell: Cell) -> dict[str, float | bool | None]:
+    return {
+        name: value if value is True or value is False else _number(value)
+        for name, value in asdict(cell).items()
+    }
+
+
+def _number(value: float) -> float | None:
+    return None if math.isnan(value) else float(f"{value:.3g}")
+
+
+def with_tables(page: str) -> str:
+    """Return the text of the page with the stored cells in its tables."""
+    cells, opened = _stored()["cells"], open_cells()
+    for number, names in enumerate((PRESS, [name for name in ESTIMATORS if name not in PRESS])):
+        start, end = f"<!-- cells {number} -->\n", f"<!-- end {number} -->"
+        head, rest = page.split(start)
+        table = [["fault", *names], ["---"] * (len(names) + 1)]
+        table += [
+            [fault.name, *(_shown(cells, opened, name, fault.name) for name in names)] for fault in FAULTS
+        ]
+        lines = "".join(f"| {' | '.join(line)} |\n" for line in table)
+        page = head + start + "\n" + lines + "\n" + end + rest.split(end, 1)[1]
+    return page
+
+
+def _shown(cells: Mapping[str, Any], opened: Mapping[str, list[str]], estimator: str, fault: str) -> str:
+    """Return error and chi^2 of a cell, bold if the standard deviation is wrong."""
+    cell = cells[estimator].get(fault)
+    if cell is None:
+        return ""
+    if cell["chi2"] is None:
+        return "no answer"
+    text = f"{_digits(cell['error'])}; {_digits(cell['chi2'])}"
+    if cell["first"] is not None and not 0.5 < cell["chi2"] / cell["first"] < 2:
+        text += f" (was {_digits(cell['first'])})"
+    if fault in opened[estimator]:
+        return f"**{text}**"
+    return f"{text}, warned" if cell["warned"] else text
+
+
+def _digits(value: float) -> str:
+    return f"{value:.0f}" if value >= 100 else f"{value:.2g}" if value < 1 or value >= 10 else f"{value:.1f}"
+
+
+def main() -> None:
+    """Print the cells of some estimators, or store them."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("estimator", nargs="*", help="parts of the names of estimators")
+    parser.add_argument("--fault", default="", help="part of the name of a fault")
+    parser.add_argument("--freeze", action="store_true", help="store all cells of these, and write the page")
+    asked = parser.parse_args()
+    names = [one for one in ESTIMATORS if not asked.estimator or any(part in one for part in asked.estimator)]
+    faults = [fault for fault in FAULTS if asked.freeze or asked.fault in fault.name]
+    table = {}
+    for name in names:
+        table[name] = row(name, faults)
+        print(name)
+        for fault, cell in table[name].items():
+            print(f"  {fault:18} {cell}")
+    if asked.freeze:
+        freeze(table)
+
+
+if __name__ == "__main__":
+    main()
