@@ -69,7 +69,8 @@ __kernel void pose_gradient(
 }
 
 // Whether an edge, or a pixel without contact, is within two pixels; each of the maps may be missing.
-INLINE int is_near_border(BYTES edges, BYTES contact, const int rows, const int columns, const int p)
+INLINE int is_near_border(
+    __global const uchar *edges, __global const uchar *contact, const int rows, const int columns, const int p)
 {
     const int row = p / columns, column = p % columns;
     int found = 0;
