@@ -87,9 +87,9 @@ class LiveView:
                 f"from frame to map {1e3 * shown.median:.1f} ms, 99 % below {1e3 * shown.p99:.1f} ms"
             )
         if update.height is not None:
-            (low, high), unit = numbers_with_unit(self._heights.ends, "mm")
+            ends, unit = numbers_with_unit(self._heights.ends, "mm")
             kind = ", each piece about its mean" if update.offset_unknown else ""
-            lines.append(f"heights from {low} (violet) to {high} {unit} (yellow){kind}")
+            lines.append(f"heights from {ends[0]} (violet) to {ends[1]} {unit} (yellow){kind}")
         if update.displacement is not None:
             low, high = (1e3 * end for end in self._lengths.ends)
             lines.append(f"displacement from {low:.1f} (violet) to {high:.1f} µm (yellow)")

@@ -314,7 +314,5 @@ def test_undistorted_maps_are_not_of_the_truth_s_pixels():
     ],
 )
 def test_the_summary_has_units_and_digits_that_show_the_relief(heights, said):
-    text = str(summarise(io.Result(height=np.array([sorted(heights)], np.float32))))
-    assert text == f"height at 2 of 2 pixels, {said}".replace(
-        "-1.95000124 to -1.95000315", "-1.95000315 to -1.95000124"
-    )
+    text = str(summarise(io.Result(height=np.array([heights], np.float32))))
+    assert text == f"height at 2 of 2 pixels, {said}"
