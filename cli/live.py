@@ -209,7 +209,7 @@ class _Live:
         result = self._operation.result()
         report_missing_maps(self._settings.name, result.process, _REMEDIES)
         report_contact(self._settings.name, result.process)
-        save_and_report(result, output, self._given["device"], as_json=False)
+        save_and_report(result, output, self._given["device"], as_json=False, must_answer=False)
         report_levels(self._settings.name, result.process)
 
 

@@ -23,10 +23,16 @@ _NO_GEL = "none: the calibration has no gel"
 _UNTOLD = "none: "  # begins the reason for a missing map in a process
 
 
-def save_and_report(result: Result, path: Path, device: str | None, as_json: bool) -> None:
-    """Write a result and print its summary in a line, or with its process as JSON."""
+def save_and_report(
+    result: Result, path: Path, device: str | None, as_json: bool, must_answer: bool = True
+) -> None:
+    """Write a result and print its summary in a line, or with its process as JSON.
+
+    Without an answer at any pixel, the command then ends with exit code 1 and the reason, if it
+    ``must_answer``.
+    """
     from mirrorskin import io
-    from mirrorskin.engine.summary import summarise
+    from mirrorskin.engine.summary import status_shares, summarise
     from mirrorskin.kernels.device import open_devices
 
     io.save_result(result, path)
@@ -38,6 +44,11 @@ def save_and_report(result: Result, path: Path, device: str | None, as_json: boo
         print_json({"output": str(path), **facts, "profile": profile})
     else:
         click.echo(printable(", ".join([f"{path}: {summary}", *_words(**pieces)])))
+    if must_answer and summary.is_empty:
+        shares = status_shares(result)
+        if shares and "warnings" not in result.process:
+            click.echo(printable(f"{path}: no {summary.what} at any pixel: {shares}"), err=True)
+        click.get_current_context().exit(1)
 
 
 def _pieces(result: Result) -> dict[str, int]:

@@ -52,5 +52,5 @@ def command(
     outputs.report_notes(str(recording), result.process)
     outputs.report_missing_maps(str(recording), result.process, _REMEDIES)
     outputs.report_contact(str(recording), result.process)
-    outputs.save_and_report(result, target, device, as_json)
     outputs.report_levels(str(recording), result.process)
+    outputs.save_and_report(result, target, device, as_json)

@@ -155,6 +155,9 @@ def command(
         references=values["references"],
         device=device,
     )
+    for name in ("friction", "modulus"):
+        if name in given and values["contact"] != "elastic":
+            raise io.InputError(f"--{name} needs --contact elastic: a sheet that only conforms has no forces")
     count, rows, columns = twin.shape
     with (
         io.Recorder(

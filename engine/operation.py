@@ -452,6 +452,15 @@ _WRAPPERS: Mapping[str, Callable[[Any], Any]] = {
 }
 
 
+Compute = Callable[[Any, dict[str, Any], dict[str, Any]], Result]
+"""Function of frames, positions by name and options by name that returns the maps."""
+
+
+def limit_of(frames: AnyArray) -> int:
+    """Return the memory limit of an operation on a stack in memory, bytes."""
+    return max(1, min(MEMORY_LIMIT, 2 * int(frames.nbytes)))
+
+
 def apply(operation: Operation, frames: NDArray[Any], **given: Any) -> Result:
     """Return the maps of a stack that fits in memory."""
 
@@ -489,10 +498,10 @@ class PhaseFunction(Protocol[P]):
 
 
 def travel_function(
-    operation: Callable[P, Operation], name: str, text: str, about_travel: str
+    operation: Callable[P, Operation], name: str, text: str, about_travel: str, compute: Compute | None = None
 ) -> TravelFunction[P]:
-    """Return the function on arrays of an operation whose ``push`` takes ``travel``."""
-    function = array_function(cast(Any, operation), name, text, {"travel": about_travel})
+    """Return the function on arrays of an operation whose ``push`` takes ``travel``; see `array_function`."""
+    function = array_function(cast(Any, operation), name, text, {"travel": about_travel}, compute=compute)
     return cast(TravelFunction[P], function)
 
 
@@ -529,7 +538,7 @@ def array_function(
     text: str,
     positions: Mapping[str, str],
     optional: Mapping[str, str] | None = None,
-    compute: Callable[[NDArray[Any], dict[str, Any], dict[str, Any]], Result] | None = None,
+    compute: Compute | None = None,
 ) -> Callable[..., Result]:
     """Return a function of frames, positions and options, with signature and docstring.
 
@@ -550,9 +559,8 @@ def array_function(
     signature = signature_of(options, ("frames", *positions), tuple(optional))
 
     def run(frames: NDArray[Any], where: dict[str, Any], given: dict[str, Any]) -> Result:
-        limit = max(1, min(MEMORY_LIMIT, 2 * frames.nbytes))
         given_positions = {one: values for one, values in where.items() if values is not None}
-        return apply(operation(memory_limit=limit, **given), frames, **given_positions)
+        return apply(operation(memory_limit=limit_of(frames), **given), frames, **given_positions)
 
     def function(*args: Any, **kwargs: Any) -> Result:
         given = signature.bind(*args, **kwargs).arguments

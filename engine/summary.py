@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import Result
-from mirrorskin.io.maps import SIGMA, is_builtin, is_deviation, place_of
+from mirrorskin.io.maps import SIGMA, SlipStatus, is_builtin, is_deviation, place_of, status_of
 from mirrorskin.io.units import numbers_with_unit
+
+_STICKS = status_of(SlipStatus).codes[SlipStatus.STICKS]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +62,11 @@ class Summary:
     def __str__(self) -> str:
         return ", ".join(self._parts())
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether no pixel has an answer; of slip, none is known to stick either."""
+        return not self.answered and not self.counts.get(_STICKS)
+
     def _parts(self) -> Iterator[str]:
         turns = "" if self.turns is None else f" in {self.turns} turns"
         if self.answered:
@@ -91,6 +98,22 @@ class Summary:
             facts[name] = value
             facts |= {} if sigma is None else {f"{name}{SIGMA}": sigma}
         return facts
+
+
+def status_shares(result: Result) -> str:
+    """Return the meaning of each code of the status of a result, and its share of the pixels; "" without.
+
+    Examples
+    --------
+    >>> status_shares(Result(height=np.zeros((1, 2)), status=np.array([[1, 2]], np.uint8)))
+    'onset at 50 %, never light at 50 %'
+    """
+    status = result.get("status")
+    if status is None or not np.size(status):
+        return ""
+    codes = result.declaration("status").codes
+    shares = {text: 100 * float(np.mean(np.asarray(status) == code)) for code, text in codes.items()}
+    return ", ".join(f"{text} at {share:.3g} %" for text, share in shares.items() if share)
 
 
 def _from_to(lowest: float, highest: float, unit: str) -> str:

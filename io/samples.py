@@ -179,9 +179,10 @@ def convert_samples(
             limits, remedy = (-_EXACT, _EXACT), "divide them"
         if low < limits[0] or high > limits[1]:
             wrong = low if low < limits[0] else high
-            frame = first + int(np.argmax((values == wrong).reshape(len(values), -1).any(axis=1)))
+            place = np.argwhere(values == wrong)[0]
+            which = f"frame {first + int(place[0])}" if values.ndim == 3 else "it"
             raise InputError(
-                f"{where}: frame {frame} has a sample of {wrong:g}; {values.dtype} is read as {dtype}, "
+                f"{where}: {which} has a sample of {wrong:g}; {values.dtype} is read as {dtype}, "
                 f"{limits[0]} to {limits[1]}: {remedy}"
             )
     if out is None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -50,7 +52,29 @@ def estimate_levels(
     """
     travel: NDArray[np.float64] | None = getattr(source, "travel", None)
     read = getattr(source, "frame", None)
-    if travel is None or read is None or source.dtype.kind != "u" or len(frames) < 2:
+    if travel is None or read is None or source.dtype.kind != "u":
+        return None
+    return _estimate(read, travel, frames, dark, bright)
+
+
+def estimate_levels_of(
+    stack: NDArray[Any],
+    travel: NDArray[np.float64],
+    dark: ArrayLike | None = None,
+    bright: ArrayLike | None = None,
+) -> EstimatedLevels | None:
+    """Do what `estimate_levels` does for frames in memory, (T, H, W), and their travel, (T,), mm."""
+    return _estimate(stack.__getitem__, travel, range(len(stack)), dark, bright)
+
+
+def _estimate(
+    read: Callable[[int], NDArray[Any]],
+    travel: NDArray[np.float64],
+    frames: range,
+    dark: ArrayLike | None,
+    bright: ArrayLike | None,
+) -> EstimatedLevels | None:
+    if len(frames) < 2:
         return None
     part = travel[frames.start : frames.stop]
     least, most = (frames.start + int(number) for number in (np.argmin(part), np.argmax(part)))

@@ -9,10 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.operation import travel_function
+from mirrorskin.engine.device_arrays import AnyArray
+from mirrorskin.engine.operation import apply, limit_of, travel_function
 from mirrorskin.engine.options import option
 from mirrorskin.engine.press.crossing import EVENT_MAPS, Crossing, CrossingOperation, Event, EventMaps
+from mirrorskin.engine.press.estimated_levels import estimate_levels_of
+from mirrorskin.engine.press.no_answer import with_reason
 from mirrorskin.io import Result
+from mirrorskin.io.findings import Finding, in_process, warn
+from mirrorskin.io.samples import convert_samples, frame_dtype
 
 
 class ThresholdOperation(CrossingOperation):
@@ -136,6 +141,38 @@ class Onset(ThresholdOperation):
         return self.as_result(maps)
 
 
+def _find_onset(frames: AnyArray, where: dict[str, Any], options: dict[str, Any]) -> Result:
+    """Return the maps of a stack in memory, with estimated levels where none are given."""
+    assumed = {}
+    missing = [name for name in ("dark", "bright") if options.get(name) is None]
+    if isinstance(frames, np.ndarray) and frames.ndim == 3:
+        frames = convert_samples(frames, frame_dtype(frames.dtype, "frames"), "frames")
+        fits = np.shape(where["travel"]) == (len(frames),)
+    else:
+        fits = False
+    if missing and fits and frames.dtype.kind == "u":
+        levels = estimate_levels_of(frames, where["travel"], options.get("dark"), options.get("bright"))
+        if levels is not None:
+            assumed = {name: getattr(levels, name) for name in missing}
+            options = {
+                "dark_sigma": levels.dark_sigma,
+                "bright_sigma": levels.bright_sigma,
+                **options,
+                **assumed,
+            }
+    operation = Onset(memory_limit=limit_of(frames), **options)
+    result = apply(operation, frames, travel=where["travel"])
+    if assumed:
+        counts = " and ".join(f"{name} {value:.4g}" for name, value in assumed.items())
+        text = f"{counts} counts are estimated from the frames; give {'= and '.join(assumed)}="
+        found = in_process([Finding("estimated levels", text)], result.process)
+        result = result.assign(process={**result.process, **found})
+    if isinstance(frames, np.ndarray):
+        result = with_reason(result, operation, operation.threshold, frames[:: max(1, len(frames) - 1)])
+    warn("find_onset", result.process)
+    return result
+
+
 find_onset = travel_function(
     Onset,
     "find_onset",
@@ -148,6 +185,12 @@ find_onset = travel_function(
     Result
         ``height``, ``height_sigma`` and ``frame`` are undefined where ``status`` is not 1; ``process``
         contains the ``noise``, counts, that was given or estimated.
+
+    Warns
+    -----
+    mirrorskin.io.MirrorskinWarning
+        ``dark`` or ``bright`` is not given, and is estimated from the first and the last frames of integers;
+        or there is no height at any pixel, with the reason.
 
     Raises
     ------
@@ -165,4 +208,5 @@ find_onset = travel_function(
     array([[-0.25,   nan]], dtype=float32)
     """,
     "Millimetres that the body has been lowered: never decreasing in a press, never increasing in a release.",
+    _find_onset,
 )

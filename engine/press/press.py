@@ -16,6 +16,7 @@ from mirrorskin.engine.press.changepoint import ChangePoint
 from mirrorskin.engine.press.crossing import Event, PressOperation
 from mirrorskin.engine.press.estimated_levels import estimate_levels
 from mirrorskin.engine.press.levels import Levels
+from mirrorskin.engine.press.no_answer import with_reason
 from mirrorskin.engine.press.onset import Onset
 from mirrorskin.engine.press.strokes import Strokes
 from mirrorskin.engine.provenance import estimated_level, level_origin
@@ -119,6 +120,20 @@ class HoleFilling(Step):
             result.height, result.height_sigma, pixel_size, above=above, deepest=-float(np.max(travel))
         )
         return result.assign(height=height, filled=filled, process={**result.process, "fill": "holes"})
+
+
+class NoAnswer(Step):
+    """Add the reason to the warnings of a result without any height."""
+
+    threshold: float = Onset.threshold
+
+    def apply(self, result: Result, context: Context) -> Result:
+        """Return the result; its process says why there is no height at any pixel."""
+        read, count = getattr(context.stream, "frame", None), context.stream.shape[0]
+        numbers = (0, count // 2, count - 1) if count else ()
+        frames = () if read is None else (read(number) for number in numbers)
+        assert isinstance(context.operation, PressOperation)
+        return with_reason(result, context.operation, self.threshold, frames)
 
 
 class Press(Method):
@@ -251,7 +266,12 @@ class Press(Method):
         return process
 
     def _steps(self, operation: PressOperation) -> list[Step]:
-        return [self.make(Elastomer, threshold=self._lowest(operation)), self.make(HoleFilling)]
+        lowest = self._lowest(operation)
+        return [
+            self.make(NoAnswer, threshold=lowest),
+            self.make(Elastomer, threshold=lowest),
+            self.make(HoleFilling),
+        ]
 
     def _lowest(self, operation: PressOperation) -> float:
         """Return the threshold of the heights."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Literal
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from mirrorskin.engine.errors import NotConverged
@@ -12,7 +13,10 @@ from mirrorskin.engine.inputs import Maps
 from mirrorskin.engine.method import Context, Method, Plan, Step
 from mirrorskin.engine.options import option
 from mirrorskin.engine.slip.search import Slip
+from mirrorskin.engine.summary import status_shares
 from mirrorskin.io import Calibrated, InputError, Result, Source
+from mirrorskin.io.findings import Finding, in_process
+from mirrorskin.io.maps import SlipStatus
 
 
 class Traction(Step):
@@ -50,6 +54,21 @@ class Traction(Step):
             return result.assign(process={**result.process, "force": f"none: {error}"})
         process = {**result.process, "modulus": f"{modulus:.4g} MPa, {origin}"}
         return result.assign(force, process=process)
+
+
+class NoContact(Step):
+    """Add the reason to the warnings of a result without any pixel that sticks or slips."""
+
+    def apply(self, result: Result, context: Context) -> Result:
+        """Return the result; its process says why nothing is known about slip."""
+        if np.isin(result.status, (SlipStatus.SLIPPED, SlipStatus.STICKS)).any():
+            return result
+        text = (
+            f"slip is known at no pixel ({status_shares(result)}): the skin must follow the object by its"
+            " texture while they are pressed together"
+        )
+        known = in_process([Finding("no contact", text)], result.process)
+        return result.assign(process={**result.process, **known})
 
 
 class Sliding(Method):
@@ -94,4 +113,4 @@ class Sliding(Method):
         """Return the search for slip, with the source's motion and pixel size, and the step for the force."""
         slip: Slip = self.make(Slip).configured_for(source)
         process = {"window_size": slip.window_size, "window_step": slip.window_step}
-        return Plan(slip, [self.make(Traction)], process)
+        return Plan(slip, [self.make(NoContact), self.make(Traction)], process)

@@ -215,3 +215,23 @@ def test_levels_that_the_frames_do_not_show_are_warned_of():
     np.save("dark.npy", np.full((4, 5, 6), 12, np.uint8))
     said = run("reconstruct dark.npy", *STEPS, *SIZE, "-o", "out.h5").said
     assert "the range of the frames' type is taken, and heights may be wrong" in said
+
+
+def test_a_result_without_an_answer_ends_with_the_reason():
+    ended = run("reconstruct", "ball.npy", *STEPS, *SIZE, "--dark", 3000, "--bright", 4000, "-o", "none.h5")
+    assert ended.code == 1
+    assert "none.h5: no height at any of 192 pixels" in ended.out
+    assert "no height at any pixel (never light at 100 %): samples are" in ended.said
+    assert (
+        "below the threshold of 3500 between dark 3000 and bright 4000: are these counts of the frames"
+        in ended.said
+    )
+
+
+def test_a_slide_without_contact_ends_with_the_reason():
+    np.save("still.npy", np.random.default_rng(1).integers(80, 120, (6, 40, 40)).astype(np.uint8))
+    path = np.outer(np.arange(6), [0.1, 0.0])
+    np.savez("slide.npz", frames=np.repeat(np.load("still.npy")[:1], 6, axis=0), displacement=path)
+    ended = run("reconstruct", "slide.npz", "--pixel-size", "0.1mm", "-o", "none.h5")
+    assert ended.code == 1
+    assert "slip is known at no pixel (" in ended.said

@@ -92,7 +92,11 @@ CASES = {
     "no rows": (lambda path: foreign(path, frames=FRAMES[:, :0]), GIVEN, "no pixels"),
     "complex": (lambda path: foreign(path, frames=FRAMES.astype("c8")), GIVEN, "uint8, uint16 or float32"),
     "strings": (lambda path: foreign(path, frames=TEXT), GIVEN, "uint8, uint16 or float32"),
-    "float64": (lambda path: foreign(path, frames=FRAMES.astype("f8")), GIVEN, "uint8, uint16 or float32"),
+    "negative": (
+        lambda path: foreign(path, frames=-1 - FRAMES.astype("i2")),
+        GIVEN,
+        "int16 is read as uint16",
+    ),
     "travel with NaN": (lambda path: ours(path, travel=NAN_TRAVEL), [], "nan at frame 3"),
     "an oscillation for a change-point": (
         lambda path: ours(path, travel=np.abs(TRAVEL - 0.2)),

@@ -240,8 +240,8 @@ WALL = ["--optics", "cylinder"]
         ([*WALL, "--air-gap", "0.5mm"], "body", Body(air_gap=0.5)),
         ([*WALL, "--asymmetry", "0.2"], "body", Body(asymmetry=0.2)),
         (["--scatter", "5deg"], "body", Body(scatter=math.radians(5))),
-        (["--friction", "0.3"], "body", Body(friction=0.3)),
-        (["--modulus", "0.4"], "body", Body(modulus=0.4)),
+        (["--contact", "elastic", "--friction", "0.3"], "body", Body(friction=0.3)),
+        (["--contact", "elastic", "--modulus", "0.4"], "body", Body(modulus=0.4)),
         (["--texture", "none"], "texture", None),
         (["--texture", "flakes", "--texture-size", "0.9mm"], "texture", SheetTexture("flakes", 0.9)),
         (
@@ -368,6 +368,11 @@ BAD = {
     "lamps for ideal optics": (["vertical", "--asymmetry", "0.1"], "not of lamps that light one side more"),
     "a gap below zero": (["vertical", *WALL, "--air-gap=-1mm"], "air gap -1.0"),
     "scatter below zero": (["vertical", "--scatter=-1deg"], "scatter"),
+    "friction without forces": (
+        ["horizontal", "--friction", "0.5"],
+        "--friction needs --contact elastic: a sheet that only conforms has no forces",
+    ),
+    "a modulus without forces": (["vertical", "--modulus", "0.5"], "--modulus needs --contact elastic"),
     "friction below zero": (["twist", "--friction=-0.1"], "friction -0.1"),
     "a fine texture": (
         ["vertical", "--texture", "dots"],

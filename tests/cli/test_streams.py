@@ -21,7 +21,10 @@ UNBUFFERED = pytest.mark.parametrize("unbuffered", ["", "1"])
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     path = tmp_path_factory.mktemp("streams") / "press.h5"
-    assert run("simulate vertical --size 8x8 --frames 4 -o", path).code == 0
+    assert (
+        run("simulate vertical --size 8x8 --pixel-size 0.4mm --frames 6 --travel-step 0.5mm -o", path).code
+        == 0
+    )
     return path
 
 

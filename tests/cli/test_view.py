@@ -147,7 +147,12 @@ def test_the_help_says_where_the_names_of_maps_are_listed():
 @pytest.mark.parametrize("name", [r"$\frac{$", "$x$ $", "\x1b[2J\x07", "\u5de5\u5177"])
 def test_a_name_that_is_a_formula_or_a_control_code_is_a_title_like_any_other(tmp_path, name):
     recording, result = tmp_path / "press.h5", tmp_path / f"{name}.h5"
-    assert run("simulate vertical --size 16x16 --frames 6 -o", recording).code == 0
+    assert (
+        run(
+            "simulate vertical --size 16x16 --pixel-size 0.4mm --frames 6 --travel-step 0.5mm -o", recording
+        ).code
+        == 0
+    )
     assert run("reconstruct", recording, "-o", result).code == 0
     ended = run("view", result, "-o", tmp_path / "a.png")
     assert (ended.code, ended.said) == (0, "")

@@ -5,6 +5,7 @@ import pytest
 from live_frames import PIXEL, paced, press_frames, press_header, turn_header
 from suite.scenes import references
 
+from mirrorskin import engine
 from mirrorskin.engine import Press, find_onset
 from mirrorskin.engine.live import LiveOperation, Loop
 from mirrorskin.hw.simulated_clock import SimulatedClock
@@ -72,7 +73,8 @@ def test_a_whole_run_uses_each_frame():
     source = paced(frames, press_header(), TRAVEL, 1000.0, SimulatedClock())
     live = LiveOperation(source, Press(fill=False))
     assert Loop(source, live).run().used == SHAPE[0]
-    np.testing.assert_array_equal(live.result().height, find_onset(frames, TRAVEL).height)
+    expected = engine.run(frames, engine.Onset, travel=TRAVEL)
+    np.testing.assert_array_equal(live.result().height, expected.height)
 
 
 def test_a_single_frame_has_no_result():

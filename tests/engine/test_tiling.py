@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from presses import LEVELS, SPEC, assert_equal, random_press
 
+from mirrorskin import engine
 from mirrorskin.engine import Onset, find_onset
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels.array import BorrowedBuffer
@@ -62,7 +63,8 @@ def test_frames_in_the_room_are_not_copied(device):
     if device.info.shares_memory:
         assert np.shares_memory(staged.array.host, search.room)
     search.push(search.room[:30:2], travel=TRAVEL[:15])
-    assert_equal(search.result(), find_onset(FRAMES[::2].copy(), TRAVEL[:15], device=device))
+    expected = engine.run(FRAMES[::2].copy(), engine.Onset(device=device), travel=TRAVEL[:15])
+    assert_equal(search.result(), expected)
 
 
 def test_the_room_of_a_picture_in_bands_holds_many_frames(small_device):

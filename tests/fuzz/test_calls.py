@@ -30,6 +30,7 @@ def test_an_odd_argument_is_answered_or_refused_in_a_line(name):
 
 def test_lists_are_taken_as_arrays():
     function, known = calls()["find_onset"]
+    known |= {"dark": 0.0, "bright": 255.0}
     listed = {name: value.tolist() for name, value in known.items() if isinstance(value, np.ndarray)}
     listed["frames"] = known["frames"]
     np.testing.assert_array_equal(function(**known).height, function(**{**known, **listed}).height)

@@ -32,6 +32,7 @@ from mirrorskin.engine.metrology import fit_sphere as engine_fit_sphere
 from mirrorskin.engine.metrology import roughness as engine_roughness
 from mirrorskin.engine.metrology import section as engine_section
 from mirrorskin.engine.metrology import step_height as engine_step_height
+from mirrorskin.engine.operation import apply
 from mirrorskin.engine.rotation.registration import Registered
 from mirrorskin.engine.streaming import push_block
 from mirrorskin.engine.summary import summarise as engine_summarise
@@ -125,7 +126,7 @@ def find_onset_with_one_level_for_all() -> Answer:
     frames, travel = press("uint8", (48, 64), 24)
     dark, bright = LEVELS["uint8"]
     wide = engine.find_onset(frames, travel, dark=dark, bright=bright)
-    bright_only = engine.find_onset(frames, travel, bright=bright)
+    bright_only = apply(engine.Onset(bright=bright), frames, travel=travel)
     return named(both=result_maps(wide), bright=result_maps(bright_only))
 
 

@@ -53,7 +53,7 @@ def truncated(path: Path) -> Path:
 def of_wrong_type(path: Path) -> Path:
     """Write a stack of samples that no camera gives."""
     with h5py.File(path, "w") as file:
-        file["frames"] = np.zeros((8, 5, 7), np.int64)
+        file["frames"] = np.zeros((8, 5, 7), np.complex64)
     return path
 
 
@@ -73,7 +73,7 @@ BAD = {
     damaged: "damaged",
     truncated: "truncated",
     horizontal: "the pixel size is missing, which slip needs: give ",
-    of_wrong_type: "of type int64",
+    of_wrong_type: "of type complex64",
     a_folder: "is a folder",
 }
 """Ways to be bad, and what is said of them."""

@@ -110,7 +110,7 @@ ON_TRAVEL, ON_PHASE = {"travel": TRAVEL}, {"phase": PHASE}
 LEVELS = {"dark": 20.0, "bright": 230.0}
 ROTATION: dict[str, Any] = {"motion": "axial"}
 CASES = {
-    "Onset": Case(engine.Onset, PRESS, ON_TRAVEL, function=engine.find_onset),
+    "Onset": Case(engine.Onset, PRESS, ON_TRAVEL, {"dark": 0, "bright": 255}, engine.find_onset),
     "Onset of a release": Case(
         engine.Onset, PRESS[::-1].copy(), {"travel": TRAVEL[::-1].copy()}, {"event": "release", **LEVELS},
         engine.find_onset,

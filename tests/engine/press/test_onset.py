@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from presses import LEVELS, SPEC, assert_equal, assert_within_an_ulp, first_run, numpy_onset, random_press
 
+from mirrorskin import engine, io
 from mirrorskin.engine import Onset, find_onset
 from mirrorskin.io import InputError
 from mirrorskin.kernels import onset as reference
@@ -238,6 +239,7 @@ def test_a_sample_that_is_lit_by_its_neighbours_does_not_tell_when_the_change_be
     assert found.height_sigma.item() == pytest.approx(0.1 / math.sqrt(12), rel=0.05)
 
 
+@pytest.mark.filterwarnings("ignore:find_onset. no height")
 def test_noise_is_estimated_from_the_first_two_frames():
     generator = np.random.default_rng(1)
     for noise in (0.6, 1.5, 6.0):
@@ -266,7 +268,8 @@ def test_a_spike_is_no_onset_unless_the_stack_ends_on_it_and_moves_no_plateau(de
 def test_what_never_changes_has_no_height(device, dtype):
     for value, status in ((20, 2), (200, 3)):
         frames = np.full((6, 5, 7), value, dtype)
-        found = find_onset(frames, np.arange(6.0), dark=20, bright=220, device=device)
+        with pytest.warns(io.MirrorskinWarning, match="find_onset: no height at any pixel"):
+            found = find_onset(frames, np.arange(6.0), dark=20, bright=220, device=device)
         assert np.all(found.status == status)
         assert np.all(found.frame == (0 if status == 3 else -1))
         assert np.isnan(found.height).all()
@@ -481,8 +484,8 @@ def test_a_release_of_the_complement_is_an_onset(device):
     frames, travel = stroke("uint8", 40, ODD, "release", seed=11, noise=0.1)
     frames = frames[::-1].copy()
     known = {"noise": 2.0, "device": device}
-    onset = find_onset(frames, -travel, bright=221, **known)  # the level is 110.5
-    release = find_onset(~frames, travel, dark=255 - 221, **known, **RELEASE)
+    onset = engine.run(frames, engine.Onset(bright=221, **known), travel=-travel)  # the level is 110.5
+    release = engine.run(~frames, engine.Onset(dark=255 - 221, **known, **RELEASE), travel=travel)
     assert {1, 2, 3} <= set(onset.status.flat)
     np.testing.assert_array_equal(release.frame, onset.frame)
     np.testing.assert_array_equal(release.status, np.array([0, 1, 3, 2])[onset.status])
@@ -495,7 +498,8 @@ def test_a_release_of_the_complement_is_an_onset(device):
     [
         ({"frames": np.zeros((1, 3, 3), np.uint8), "travel": [0.0]}, "at least 2 frames"),
         ({"frames": np.zeros((5, 0, 3), np.uint8)}, r"numbers \(n, H, W\)"),
-        ({"frames": np.zeros((5, 3, 3), np.int32)}, "uint8, uint16 or float32"),
+        ({"frames": np.zeros((5, 3, 3), np.complex64)}, "numbers are needed"),
+        ({"frames": np.full((5, 3, 3), -1, np.int32)}, "frame 0 has a sample of -1; int32 is read as uint16"),
         ({"frames": np.zeros((5, 3, 3), np.float32), "dark": None}, "dark and bright"),
         ({"travel": [0.0, 1.0]}, "5 frames"),
         ({"travel": [0.0, 1.0, np.nan, 2.0, 3.0]}, "nan at frame 2"),
@@ -533,3 +537,34 @@ def test_frames_that_do_not_follow_are_refused():
 def test_a_threshold_is_a_share(threshold):
     with pytest.raises(InputError, match="a share from 0"):
         find_onset(np.zeros((3, 2, 2), np.uint8), np.arange(3.0), threshold=threshold)
+
+
+def twelve_bits():
+    """Return frames of 12 bits in which all but one column turn light, and their travel."""
+    frames = np.random.default_rng(3).normal(200, 5, (9, 20, 20))
+    for column in range(19):
+        frames[2 + column // 4 :, :, column] += 3000
+    return np.rint(frames).astype(np.uint16), 0.1 * np.arange(9)
+
+
+def test_levels_that_are_not_given_are_estimated_with_a_warning():
+    frames, travel = twelve_bits()
+    said = r"dark 2\d\d and bright 32\d\d counts are estimated from the frames; give dark= and bright="
+    with pytest.warns(io.MirrorskinWarning, match=said) as seen:
+        found = find_onset(frames, travel)
+    assert seen[0].filename == __file__
+    expected = engine.reconstruct(frames, travel=travel)
+    np.testing.assert_array_equal(found.height, expected.height)
+    np.testing.assert_array_equal(found.height_sigma, expected.height_sigma)
+    right = np.broadcast_to(-0.15 - 0.1 * (np.arange(19) // 4), (20, 19))
+    np.testing.assert_allclose(found.height[:, :19], right, atol=0.06)
+
+
+def test_levels_of_other_counts_than_the_frames_are_said():
+    frames, travel = twelve_bits()
+    shares = (frames / 4096).astype(np.float32)
+    said = r"samples are 0\.\d+ to 0\.\d+, below the threshold of 1700 between dark 200 and bright 3200: are"
+    with pytest.warns(io.MirrorskinWarning, match=said):
+        find_onset(shares, travel, dark=200, bright=3200)
+    with pytest.warns(io.MirrorskinWarning, match=said):
+        engine.reconstruct(shares, travel=travel, dark=200, bright=3200)

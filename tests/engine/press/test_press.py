@@ -204,7 +204,8 @@ def test_a_result_outlives_its_recording(tmp_path):
         while (block := recording.read(search.room)) is not None:
             push_block(search, block)
     path.unlink()
-    np.testing.assert_array_equal(search.result().height, engine.find_onset(frames, travel, noise=5.0).height)
+    expected = engine.run(frames, engine.Onset(noise=5.0), travel=travel)
+    np.testing.assert_array_equal(search.result().height, expected.height)
 
 
 class Spiked:
