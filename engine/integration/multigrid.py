@@ -20,6 +20,7 @@ from mirrorskin.kernels.links import KNOWN, SLOPE
 _USUAL = 40  # cycles after which coarse levels are replaced by a direct solver
 _CYCLES = 2  # cycles without a tolerance
 _DEEP = 3e-4  # tolerance that one cycle from 0 does not reach: two are done before the first test
+_DEEPEST = 1e-5  # tolerance that two hardly ever reach: three are done first where a wait takes long
 _LONGEST = 100  # cycles of a solution, at most
 _PATIENCE, _PROGRESS = 8, 0.7  # iterations in which the residual must decrease to this share of the best one
 _SOONER = 0.75  # share of the expected cycles, as later ones reduce more
@@ -290,7 +291,8 @@ class _Gradients:
                 self._moving.write(moving.astype(np.float32))
                 self._active = moving.copy()
             unseen = not (done or self.started) and deadline is None and goal < _DEEP
-            count = min(_CYCLES if unseen else untested if deadline is None else 1, limit - done)
+            least = _CYCLES + (self._waits_long and goal <= _DEEPEST)
+            count = min(least if unseen else untested if deadline is None else 1, limit - done)
             for number in range(count):
                 self._step(first + number)
             arrays = (self._sides,) if self._given is None and self.started else ()
