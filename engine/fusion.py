@@ -13,6 +13,7 @@ from mirrorskin.engine.fusion_solver import AbsoluteHeights, FusionSolver
 from mirrorskin.engine.inputs import Maps, as_result, pixel_size_of
 from mirrorskin.engine.method import Context, Method, undistorted
 from mirrorskin.engine.nearest_fill import fill_with_nearest
+from mirrorskin.engine.press.intervals import heights_as_intervals
 from mirrorskin.engine.press.press import Press
 from mirrorskin.engine.provenance import attach_provenance, naming
 from mirrorskin.engine.reconstruction import calibrated
@@ -212,13 +213,10 @@ def fuse_recordings(
     common: dict[str, Any] = {"memory_limit": memory_limit, "device": opened}
     turn = Rotation(**{**_options_of(rotation), **common})
     _check_rotation(axial, turn)
-    pressed = Press(**{**_options_of(press), **common, "fill": False}).run(
-        vertical, progress, undistort=False
-    )
+    pressed, known = _press(Press(**{**_options_of(press), **common, "fill": False}), vertical, progress)
     if not np.isfinite(pressed.height).any():
         raise InputError(f"{vertical.name}: no pixel turned light, so no height is known to fuse")
     before = fill_with_nearest(pressed.height)
-    known = AbsoluteHeights.of(pressed.height, pressed.height_sigma)
     solver, passes = FusionSolver(known, pixel_size, robust, opened[0]), _passes(axial, register)
     for number in range(passes):
         method = turn.with_options(heights=before) if register else turn
@@ -266,6 +264,22 @@ def _passes(axial: Source, register: bool) -> int:
 def _options_of(method: Method | Mapping[str, Any] | None) -> Mapping[str, Any]:
     """Return the options of a method, or a mapping of options."""
     return method.chosen() if isinstance(method, Method) else method or {}
+
+
+def _press(method: Press, vertical: Source, progress: Progress | None) -> tuple[Result, AbsoluteHeights]:
+    """Return the maps of a press, and its heights as intervals between frames."""
+    with naming(vertical):
+        plan = method.plan(vertical)
+        found = feed(vertical, plan.operation, plan.frames, progress)
+        onsets = plan.operation.finish()
+        result = plan.finish(onsets, vertical)
+    result = result.assign(process={**result.process, **in_process(found, result.process)})
+    warn(vertical.name, result.process)
+    height, sigma = (np.asarray(onsets[name], np.float64) for name in ("height", "height_sigma"))
+    middle, between = heights_as_intervals(height, sigma, plan.operation.pushed("travel"))
+    # Steps, such as the correction for the elastomer, move heights and change their sigma.
+    sigma = result.height_sigma * (between / sigma)
+    return result, AbsoluteHeights.of(result.height + (middle - height), sigma)
 
 
 def _rotate(method: Rotation, axial: Source, progress: Progress | None) -> tuple[Result, Slopes]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.kernels.array_types import Doubles
 
+_USUAL = 0.9, 1.5  # range of the sigma of a height between two frames, in that of the interval
 _LEAST = 0.02  # least blur of an interval's ends, as a share of its half-width
 _FAR = 6.0  # blurs outside an interval beyond which an onset is an outlier
 _SPAN = 20.0  # half-widths: least range over which outliers are distributed
@@ -44,6 +45,40 @@ class Evidence(NamedTuple):
 
     height: Doubles
     weight: Doubles
+
+
+class Intervals(NamedTuple):
+    """Middles and standard deviations of heights, mm, both (H, W) float64."""
+
+    middle: Doubles
+    sigma: Doubles
+
+
+def heights_as_intervals(height: Doubles, sigma: Doubles, travel: Doubles) -> Intervals:
+    """Return heights of a press that are at the middles of their intervals between two frames.
+
+    Where light from neighbours reaches a pixel, a sample near the threshold moves the height off the middle,
+    by up to a quarter of the interval, although its error is still that of the interval. These errors differ
+    at both ends of an interval, so an interval around such a height would shift the surface. Heights whose
+    sigma is not about that of the interval are returned as they are.
+
+    Parameters
+    ----------
+    height, sigma : ndarray, (H, W), float64
+        Heights before any correction, and their standard deviations, mm; NaN where unknown.
+    travel : ndarray, (T,), float64
+        Travel of the frames, mm.
+    """
+    ends = np.unique(travel)
+    if ends.size < 2:
+        return Intervals(height, sigma)
+    place = np.clip(np.searchsorted(ends, -np.nan_to_num(height)), 1, ends.size - 1)
+    width = ends[place] - ends[place - 1]
+    usual = width / math.sqrt(12)
+    between = (sigma > _USUAL[0] * usual) & (sigma < _USUAL[1] * usual)
+    between &= (-height >= ends[0]) & (-height <= ends[-1])
+    middle = -(ends[place] + ends[place - 1]) / 2
+    return Intervals(np.where(between, middle, height), np.where(between, usual, sigma))
 
 
 class IntervalErrors(NamedTuple):

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 import rotations
 from rotations import EIGHTHS, TILT, Setup
+from scipy.stats import norm
 from stacks import MadeUp, record
 
 from mirrorskin import engine, hw, io
 from mirrorskin.engine.fusion import frames_to_read, fuse_recordings
 from mirrorskin.hw.twin import Axial, Body, Camera, Vertical
+from mirrorskin.io.arrays import ArrayRecording
 
 NAN = np.float32(np.nan)
 RADIUS = 5.0
@@ -569,3 +571,61 @@ def test_other_regions_of_one_size_are_refused(tmp_path):
         pytest.raises(io.InputError, match="regions from column 5, row 0 and regions from column 5, row 2"),
     ):
         fuse_recordings(vertical, axial)
+
+
+# Analytic recordings: a wavy surface that a lens shows to a camera with noise.
+
+WAVES_PIXEL = 0.05
+WAVES_TURN = Setup(gain=3.6, noise=1.5, offset=20.0)
+
+
+@cache
+def waves(shape=(96, 96)):
+    """Return heights of a wavy surface, and its slopes along x and y, (H, W)."""
+    x, y = np.meshgrid(*io.pixel_axes(shape, (WAVES_PIXEL, WAVES_PIXEL)))
+    u, v = 2 * np.pi * x / 1.6, 2 * np.pi * y / 1.9
+    along_x, along_y = (
+        0.2 * 2 * np.pi / 1.6 * np.cos(u) * np.cos(v),
+        -0.2 * 2 * np.pi / 1.9 * np.sin(u) * np.sin(v),
+    )
+    return 0.2 * np.sin(u) * np.cos(v) + 0.07 * x - 0.6173, along_x + 0.07, along_y
+
+
+def pressed_waves(seed, blur=0.5, step=0.1):
+    """Return a press on them through a lens of some pixels: an edge of light is an error function."""
+    height, *slope = waves()
+    travel = np.arange(0.2, 1.1, step)
+    width = np.hypot(*slope) * WAVES_PIXEL * max(blur, 0.3)  # of a pixel that averages over itself
+    light = norm.cdf((travel[:, np.newaxis, np.newaxis] + height) / width)
+    counts = 20 + 200 * light + np.random.default_rng(seed).normal(0, 1.0, light.shape)
+    levels = {"dark": np.float32(20), "bright": np.float32(220)}
+    header = {"pixel_size": (WAVES_PIXEL, WAVES_PIXEL), **levels}
+    return ArrayRecording(np.rint(counts).clip(0, 255).astype(np.uint8), {"travel": travel}, header)
+
+
+def turned_waves(seed, gain=1.0, offset=0.0, light=lambda counts: counts):
+    """Return a turn of them, by eq. 10; its header states another gain and offset than the sensor had."""
+    _, along_x, along_y = waves()
+    normal = np.stack([-along_x, -along_y, np.ones_like(along_x)], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    sensor = replace(WAVES_TURN, gain=WAVES_TURN.gain * gain, offset=WAVES_TURN.offset + offset, noise=0.0)
+    exact = rotations.expose(normal, replace(sensor, dtype="float32"), seed)
+    counts = light(exact) + np.random.default_rng(seed).normal(0, WAVES_TURN.noise, exact.shape)
+    header = {"pixel_size": (WAVES_PIXEL, WAVES_PIXEL), "tilt": WAVES_TURN.tilt}
+    header |= {"zenith_gain": WAVES_TURN.slope, "zenith_offset": WAVES_TURN.offset}
+    frames = np.rint(counts).clip(0, 255).astype(np.uint8)
+    return ArrayRecording(frames, {"phase": np.array(WAVES_TURN.phase)}, header)
+
+
+def chi_square(result):
+    error = result.height - waves()[0]
+    known = np.isfinite(result.height_sigma) & (result.contact > 0)
+    return float(np.mean((error / result.height_sigma)[known] ** 2))
+
+
+def test_light_of_neighbours_does_not_shift_the_fused_surface():
+    chi2 = [
+        chi_square(fuse_recordings(pressed_waves(seed), turned_waves(seed + 100), register=False))
+        for seed in range(6)
+    ]
+    assert 0.7 < np.mean(chi2) < 1.3

@@ -8,6 +8,7 @@ from mirrorskin.engine.press.intervals import (
     IntervalErrors,
     estimate_interval_errors,
     fit_paraboloids,
+    heights_as_intervals,
     interval_evidence,
     normal_distribution,
 )
@@ -152,3 +153,12 @@ def test_the_normal_distribution_is_scipys():
     np.testing.assert_allclose(normal_distribution(x), norm.cdf(x), rtol=2e-7, atol=1e-16)
     near = np.linspace(-3, 3, 4001)
     np.testing.assert_allclose(normal_distribution(near), norm.cdf(near), rtol=1e-13)
+
+
+def test_a_height_of_a_pixel_lit_by_its_neighbours_goes_to_the_middle_of_its_frames():
+    travel, usual = np.array([0.2, 0.3, 0.5]), 0.1 / np.sqrt(12)
+    height = np.array([-0.22, -0.3 + 1e-9, -0.41, -0.22, -0.22, np.nan])
+    sigma = np.array([usual, usual, 2.1 * usual, usual / 2, 4 * usual, np.nan])
+    found = heights_as_intervals(height, sigma, travel)
+    assert found.middle == pytest.approx([-0.25, -0.25, -0.4, -0.22, -0.22, np.nan], nan_ok=True)
+    assert found.sigma == pytest.approx([usual, usual, 2 * usual, usual / 2, 4 * usual, np.nan], nan_ok=True)
