@@ -296,6 +296,9 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
         Meta(description="a time from 0 to 10 s", examples=[0.03]),
     ] = None
     stall: Annotated[float, Meta(ge=0.02, le=5, description="a time from 0.02 to 5 s", examples=[0.1])] = 0.1
+    line_time: Annotated[
+        float | None, Meta(ge=-0.01, le=0.01, description="a time from -0.01 to 0.01 s", examples=[1.5e-5])
+    ] = None
     pixel_size: Annotated[
         _Side | tuple[_Side, _Side] | None,
         Meta(description="a length above 0, in mm, or a list of a width and a height", examples=[0.03]),
@@ -526,6 +529,7 @@ size = [640, 480]               # columns, rows
 # trigger_input = "Line0"       # the input of a genicam: camera that the line is wired to
 # stall = 0.1                   # s without a frame, in motion, after which the stage is stopped
 # delay = 0.03                  # s from the middle of the exposure to the arrival; a stream's is measured
+# line_time = 15e-6             # s from row to row of a rolling shutter; negative if the last is the first
 pixel_size = 0.03               # mm at the sheet
 # dark = 12                     # counts without light, or a picture's file
 # bright = "bright.tif"         # counts in full light, or a picture's file

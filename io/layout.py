@@ -156,6 +156,7 @@ class Layout:
             pivot=self._pivot(pixel_size),
             zenith_gain=self._map(f"{DETECTOR}/zenith_gain", "1/rad"),
             zenith_offset=self._map(f"{DETECTOR}/zenith_offset"),
+            line_time=self._scalar(f"{DETECTOR}/line_time", "s", "correct it"),
             camera=self._text(f"{DETECTOR}/local_name"),
         )
 

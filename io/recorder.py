@@ -78,6 +78,7 @@ def write_header(file: h5py.File, header: Header, calibration: Calibration | Non
     put(detector, "bright", "counts", header.bright)
     put(detector, "zenith_gain", "1/rad", header.zenith_gain)
     put(detector, "zenith_offset", "counts", header.zenith_offset)
+    put(detector, "line_time", "s", header.line_time)
     put(stage, "travel_sigma", "mm", header.travel_sigma)
     put(stage, "tilt", "rad", header.tilt)
     put(stage, "pivot", "mm", header.pivot)

@@ -102,6 +102,9 @@ class Header:
         Pivot of the body, mm, from the centre of the sheet at rest, with the body pressed and upright.
     zenith_gain, zenith_offset : ndarray, scalar or (H, W), float64, or None
         Counts per radian of zenith, and counts at zenith zero.
+    line_time : float or None
+        Seconds from the exposure of a row to that of the next one, of a rolling shutter; negative if the last
+        row is the first. The time and the position of a frame are those of its middle row.
     camera : str
         Name of the camera; empty if unknown.
     """
@@ -118,6 +121,7 @@ class Header:
     pivot: tuple[float, float, float] | None = None
     zenith_gain: Floats | None = None
     zenith_offset: Floats | None = None
+    line_time: float | None = None
     camera: str = ""
 
 

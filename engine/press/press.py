@@ -18,6 +18,7 @@ from mirrorskin.engine.press.estimated_levels import estimate_levels
 from mirrorskin.engine.press.levels import Levels
 from mirrorskin.engine.press.no_answer import with_reason
 from mirrorskin.engine.press.onset import Onset
+from mirrorskin.engine.press.rolling_shutter import RollingShutter
 from mirrorskin.engine.press.strokes import Strokes
 from mirrorskin.engine.provenance import estimated_level, level_origin
 from mirrorskin.io import Calibrated, InputError, Result
@@ -181,6 +182,7 @@ class Press(Method):
     travel_sigma: float | None = Onset.travel_sigma
     thresholds: Sequence[float] | None = Levels.thresholds
     inclinations: Sequence[float] | None = Levels.inclinations
+    line_time: float | None = RollingShutter.line_time
     modulus: float | None = Elastomer.modulus
     fill: bool = HoleFilling.fill
 
@@ -233,7 +235,7 @@ class Press(Method):
         operation: PressOperation = self.make(Strokes).configured_for(source)
         process = self._process(source, range(0), operation)
         del process["frames"]  # the operation counts them
-        return Plan(operation, self._steps(operation), process, omit=_OMIT)
+        return Plan(operation, self._steps(operation, live=True), process, omit=_OMIT)
 
     def _kind(self, source: Source, oscillates: bool) -> type[PressOperation]:
         """Return the class of the operation."""
@@ -265,10 +267,12 @@ class Press(Method):
             process |= {name: str(list(getattr(self, name))) for name in ("thresholds", "inclinations")}
         return process
 
-    def _steps(self, operation: PressOperation) -> list[Step]:
+    def _steps(self, operation: PressOperation, live: bool = False) -> list[Step]:
         lowest = self._lowest(operation)
+        shutter = [] if live else [self.make(RollingShutter)]  # live, times come with the frames
         return [
             self.make(NoAnswer, threshold=lowest),
+            *shutter,
             self.make(Elastomer, threshold=lowest),
             self.make(HoleFilling),
         ]

@@ -177,6 +177,7 @@ class Scan(Closing):
             zenith_offset=_scalar(camera.zenith_offset),
             camera=camera.name,
             travel_sigma=stage.travel_sigma,
+            line_time=None if isinstance(self, StepScan) else camera.line_time,
         )
         if isinstance(self.plan, AxialPlan):
             return replace(header, press=self.plan.press, tilt=self.plan.tilt, pivot=stage.pivot)

@@ -111,6 +111,7 @@ delay = 0.03
 stall = 0.2
 trigger = "spindle"
 trigger_input = "Line2"
+line_time = 2e-5
 pixel_size = [0.03, 0.04]
 dark = 12
 bright = 4000.5

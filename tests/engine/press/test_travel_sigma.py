@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from stacks import MadeUp
 
 from mirrorskin import engine, io
 
@@ -42,22 +43,9 @@ def test_without_it_the_travel_is_exact():
 def test_a_recording_knows_it(tmp_path):
     frames, travel, _ = jittered(0)
 
-    class Source:
-        name, motion, rewindable = "jittered", "vertical", False
-        levels = {name: np.full((40, 50), value, np.float32) for name, value in LEVELS.items()}
-        header = io.Header("vertical", travel_sigma=SIGMA, **levels)
-        shape, dtype, blocks = frames.shape, frames.dtype, [io.Block(frames, 0, travel=travel)]
-
-        def read(self, out=None, /):
-            return self.blocks.pop() if self.blocks else None
-
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *error):
-            pass
-
-    with io.Recorder(Source(), tmp_path / "press.h5") as recorder:
+    levels = {name: np.full((40, 50), value, np.float32) for name, value in LEVELS.items()}
+    source = MadeUp(frames, io.Header("vertical", travel_sigma=SIGMA, **levels), travel=travel)
+    with io.Recorder(source, tmp_path / "press.h5") as recorder:
         recorder.drain(lambda done: None)
     with io.open_recording(tmp_path / "press.h5") as recording:
         result = engine.reconstruct(recording)
