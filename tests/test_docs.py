@@ -117,3 +117,12 @@ def understood(words):
             return
         _, command, words = command.resolve_command(context, rest)
         above = context
+
+
+def test_every_kind_of_finding_is_explained():
+    """Warnings and notes about frames and results are in one table of the documentation."""
+    sources = [path for folder in ("io", "engine") for path in (ROOT / folder).rglob("*.py")]
+    kinds = {kind for path in sources for kind in re.findall(r'\bFinding\(\s*"([^"]+)"', path.read_text())}
+    page = (DOCS / "troubleshooting.md").read_text()
+    assert len(kinds) > 20
+    assert {kind for kind in kinds if f"`{kind}`" not in page} == set()
