@@ -26,6 +26,8 @@ _log = logging.getLogger("mirrorskin.hw")
 _ENVIRONMENT = {"OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT": f"{READ_TIMEOUT:.0f}"}
 _RAW = {"GREY", "Y16", "Y10", "Y12", "YUYV"}  # formats that OpenCV hands on as they are, if asked to
 _GREY8, _GREY16 = b"Y800", b"Y1\0\x10"  # what FFmpeg calls the grey ones
+# Tags of RGB with 48 or 64 bits a pixel, which end in that number or begin with it.
+_DEEP_COLOURS = {b"RGB0", b"BGR0", b"0RGB", b"0BGR", b"RBA@", b"BRA@", b"@RBA", b"@BRA"}
 _JPEG, _JPEG_END = "MJPG", b"\xff\xd9"
 _FROZEN, _CHANGES = 5, 16  # pictures in a row without a changed pixel, after so many that had some
 _MANUAL = 1.0  # V4L2's "manual exposure"
@@ -328,10 +330,12 @@ def _check_size(video: Any, source: VideoSource, settings: CameraSettings) -> No
 def _is_grey(video: Any, source: VideoSource) -> bool:
     """Whether FFmpeg decodes to grey of 8 or 16 bits, which needs no conversion."""
     tag = _tag(video.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT))
-    # FFmpeg's tags of the deeper formats end in the number of bits.
-    if 8 < tag[3] < 16 or (tag[3] == 16 and tag != _GREY16):
+    # FFmpeg's tags of deeper formats end in the number of bits, or begin with it if they are big-endian.
+    bits = 16 if tag in _DEEP_COLOURS else next((bits for bits in (tag[3], tag[0]) if 8 < bits <= 16), 8)
+    if bits > 8 and tag != _GREY16:
         raise InputError(
-            f"{source.name} has {tag[3]} bits a sample, but only 8 would be read: send grey of 8 or 16 bits"
+            f"{source.name} has {bits} bits a sample, but only 8 would be read: send grey of 8 bits, or of 16"
+            " bits in little-endian order"
         )
     return tag in (_GREY8, _GREY16)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -122,6 +123,21 @@ def test_a_file_of_another_size_is_refused(open_camera, tmp_path) -> None:
     write_y4m(tmp_path / "film.y4m", noise(2), 50)
     with pytest.raises(InputError, match="32 x 24, and 640 x 480 is asked for"):
         open_camera(tmp_path / "film.y4m", SHAPE)
+
+
+@pytest.mark.parametrize("pixels", ["gray16be", "rgb48be", "yuv420p10le", "gray12le"])
+def test_a_file_of_more_bits_than_are_read_is_refused(open_camera, tmp_path, pixels) -> None:
+    codec, suffix = ("png", ".mov") if pixels.endswith("be") else ("ffv1", ".mkv")
+    with av.open(str(tmp_path / f"film{suffix}"), "w") as container:
+        stream = container.add_stream(codec, rate=25)
+        stream.height, stream.width, stream.pix_fmt = *SMALL, pixels
+        for picture in noise(3, dtype=np.uint16):
+            container.mux(
+                stream.encode(av.VideoFrame.from_ndarray(picture, "gray16le").reformat(format=pixels))
+            )
+        container.mux(stream.encode(None))
+    with pytest.raises(InputError, match="bits a sample, but only 8 would be read"):
+        open_camera(tmp_path / f"film{suffix}")
 
 
 def test_no_file_no_device_and_no_video_are_refused(open_camera, tmp_path, monkeypatch) -> None:

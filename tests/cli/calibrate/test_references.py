@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import tifffile
 from commands import done, refused, run
 from reference_frames import expose, pixels, rolled, source
 from stacks import record
@@ -60,6 +61,18 @@ def test_a_folder_of_pictures_will_do(scene, tmp_path):
     ended = references(scene, tmp_path / "cal.h5", dark=folder)
     assert ended.code == 0, ended.said
     assert "6 frames" in ended.out
+
+
+@pytest.mark.parametrize("name", ["dark.npy", "dark.tif"])
+def test_frames_without_positions_will_do(scene, tmp_path, name):
+    frames = expose(pixels(SHAPE)[0], NOISE, 6)
+    if name.endswith(".npy"):
+        np.save(tmp_path / name, frames)
+    else:
+        tifffile.imwrite(tmp_path / name, frames, photometric="minisblack")
+    ended = references(scene, tmp_path / "cal.h5", dark=tmp_path / name)
+    assert ended.code == 0, ended.said
+    assert io.open_calibration(tmp_path / "cal.h5").process["references.dark_frames"] == 6
 
 
 def test_too_few_frames_for_a_stated_noise_are_counted(scene, tmp_path):
