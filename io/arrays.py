@@ -344,11 +344,12 @@ def open_stack(
     region: Region | None,
     wanted: tuple[int, int | None] | None,
     memory_limit: int | None = None,
+    override_motion: bool = False,
 ) -> ArrayRecording:
     """Open a stack that is neither HDF5 nor Zarr; see ``open_recording``.
 
-    The file may contain ``travel``, ``phase``, ``displacement`` or ``twist`` of each frame, and an archive
-    ``dark`` and ``bright``. Arguments take precedence over them.
+    The file may contain ``travel``, ``phase``, ``displacement`` or ``twist`` of each frame, and properties
+    such as ``dark`` and ``bright``. Arguments take precedence over them.
     """
     with ExitStack() as opening:
         kind = kind_of_frames(path)
@@ -356,18 +357,26 @@ def open_stack(
             with _naming(path):
                 check_regular(path)
                 files = {path: state_of(path.stat())}
-                frames, held = _open_array(path, dataset, memory_limit)
+                frames, arrays = _open_array(path, dataset, memory_limit)
+            held: dict[str, Any] = {**arrays}
         else:
             if kind == "video":  # without positions, decoding would be in vain
                 _motion(str(path), positions, motion)
             frames = opening.enter_context(open_reader(path, dataset, channel, memory_limit))
             with as_input_error(str(path)):
                 files = {file: state_of(file.stat()) for file in frames.files}
-            held = dict(frames.positions)
-        maps: dict[str, Any] = {one: held[one] for one in ("dark", "bright") if one in held}
+            held = {**frames.positions, **frames.header}
         given = {one: value for one, value in positions.items() if value is not None}
         known = given or {one: value for one, value in held.items() if one in POSITIONS.values()}
-        header = {**maps, **header}
+        stated = held.pop("motion", motion)
+        if motion not in (None, stated) and not override_motion:
+            raise InputError(
+                f"{path} states the motion {stated}, but --motion is {motion}: leave --motion out, or correct"
+                " the file"
+            )
+        motion = motion or (None if given else stated)
+        own = {name: value for name, value in held.items() if name not in POSITIONS.values()}
+        header = own | {name: value for name, value in header.items() if value is not None}
         recording = ArrayRecording(frames, known, header, motion, region, wanted, str(path), files)
         opening.pop_all()  # the recording closes the file from now on
     return recording

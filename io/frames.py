@@ -33,6 +33,8 @@ class FrameReader(Closing, ABC):
         Frames lost before each frame.
     positions : mapping
         The positions in the file, as in a `Block`.
+    header : mapping
+        The properties in the file, as in a `Header`.
     left_out : tuple of str
         Files of a folder that are not frames.
     findings : tuple of Finding
@@ -50,6 +52,7 @@ class FrameReader(Closing, ABC):
     time: Floats | None = None
     lost: NDArray[np.int32] | None = None
     positions: Mapping[str, Floats] = MappingProxyType({})
+    header: Mapping[str, Any] = MappingProxyType({})
     left_out: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import struct
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -25,7 +26,7 @@ from mirrorskin.io.pictures import Picture, decode_bytes
 from mirrorskin.io.recording import Recording
 from mirrorskin.io.result import Result
 from mirrorskin.io.text import one_line
-from mirrorskin.io.types import Block, Closing, Floats, Header, InputError
+from mirrorskin.io.types import MOTIONS, Block, Closing, Floats, Header, InputError
 
 if TYPE_CHECKING:
     from mcap.records import Chunk, ChunkIndex, Message
@@ -51,6 +52,8 @@ _CLOUD, _NUMBER, _WRENCH = (
 )
 _INSTALL = "MCAP needs packages that are not installed: pip install 'mirrorskin[mcap]'"
 
+_NOTES, _MOST_NOTES = "mirrorskin", 8  # name of the metadata; records of it that are read
+_NUMERAL = re.compile(r"[-+]?[0-9]+\.?[0-9]*(?:[eE][-+]?[0-9]+)?")
 _LONGEST = 100  # characters quoted of an error message of a package
 _MOST_PACKED = 255  # largest compression ratio accepted for all chunks of a file, the limit of LZ4
 
@@ -120,7 +123,7 @@ class _File:
 
     def note(self, notes: Mapping[str, Any]) -> None:
         """Add texts to the file's metadata."""
-        self._writer.add_metadata("mirrorskin", {name: one_line(value) for name, value in notes.items()})
+        self._writer.add_metadata(_NOTES, {name: one_line(value) for name, value in notes.items()})
 
     def finish(self) -> None:
         """Write the index."""
@@ -374,6 +377,7 @@ class MessageFrames(WholeFrames):
         self.time = seconds if bool(np.all(np.diff(seconds) > 0)) else None
         self.lost = _lost(stamps.numbers[order])
         self.positions = dict(self._numbers(count))
+        self.header = dict(self._properties(frame.shape))
         seen = [one for one in first.findings if channel is None or one.kind != "colour"]
         self.findings = (*lost_frames(self.lost), *seen)
 
@@ -420,6 +424,26 @@ class MessageFrames(WholeFrames):
                 with self._naming():
                     values = [float(message.data) for message in self._messages(f"/{name}")]
                 yield name, np.asarray(values) / _SERIES[name]
+
+    def _properties(self, shape: tuple[int, ...]) -> Iterator[tuple[str, Any]]:
+        """Yield the properties of a recording that was exported; see ``save_messages``."""
+        for name in ("title", "camera"):
+            if name in self._summary.notes:
+                yield name, self._summary.notes[name]
+        if self._summary.notes.get("motion") in MOTIONS:
+            yield "motion", self._summary.notes["motion"]
+        for name, count in (("tilt", 1), ("press", 1), ("pixel_size", 2)):
+            values = _NUMERAL.findall(self._summary.notes.get(name, ""))
+            if len(values) == count:
+                yield name, tuple(map(float, values)) if count > 1 else float(values[0])
+        images = {one.topic for one in self._summary.channels.values() if one.kind == _IMAGE}
+        for name in ("dark", "bright"):
+            topic = f"/camera/{name}"
+            if topic in images and self._topic == IMAGES:
+                with self._naming():
+                    found = [to_grey(_decode(one, topic).samples, topic) for one in self._messages(topic)]
+                if len(found) == 1 and found[0].shape in (shape, (1, 1)):
+                    yield name, found[0] if found[0].shape == shape else found[0][0, 0]
 
     def _stamps_of(self, topic: str) -> _Stamps:
         """Return the log times and sequence numbers of the messages of a topic, in the order of storage."""
@@ -478,12 +502,12 @@ class MessageFrames(WholeFrames):
     def _read_summary(self) -> _Summary:
         """Read the channels and chunks from the file's index."""
         try:
-            from mcap.records import Channel, ChunkIndex, Schema
+            from mcap.records import Channel, ChunkIndex, Metadata, MetadataIndex, Schema
             from mcap.stream_reader import StreamReader
         except ImportError as error:
             raise InputError(_INSTALL) from error
         schemas: dict[int, str] = {}
-        summary = _Summary({}, [])
+        summary, notes = _Summary({}, [], {}), list[int]()
         with self._naming(), open_regular(self._path) as file:
             file.seek(-_FOOTER.size, os.SEEK_END)
             code, _, start, *_ = _FOOTER.unpack(file.read(_FOOTER.size))
@@ -498,6 +522,13 @@ class MessageFrames(WholeFrames):
                     summary.channels[record.id] = _Channel(record.topic, kind if kind in _MESSAGES else "")
                 elif isinstance(record, ChunkIndex):
                     summary.chunks.append(record)
+                elif isinstance(record, MetadataIndex) and record.name == _NOTES:
+                    notes.append(record.offset)
+            for offset in notes[:_MOST_NOTES]:
+                file.seek(offset)
+                note = next(iter(StreamReader(file, skip_magic=True).records))
+                if isinstance(note, Metadata):
+                    summary.notes.update(note.metadata)
         return summary
 
     @contextlib.contextmanager
@@ -527,6 +558,7 @@ class _Channel(NamedTuple):
 class _Summary(NamedTuple):
     channels: dict[int, _Channel]
     chunks: list[ChunkIndex]
+    notes: dict[str, str]  # metadata of this program
 
 
 def _unpack(chunk: Chunk) -> bytes:

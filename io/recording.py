@@ -321,7 +321,8 @@ def open_recording(
             raise InputError(f"{path} is not a recording of a live run: leave --live out")
         known = {"tilt": tilt, "pixel_size": pixel_size}
         where = {"travel": travel, "phase": phase}
-        return open_stack(path, dataset, channel, where, known, motion, region, frames, memory_limit)
+        part = region, frames
+        return open_stack(path, dataset, channel, where, known, motion, *part, memory_limit, override_motion)
     with ExitStack() as opening:
         file = opening.enter_context(open_file(path, memory_limit))
         ours = file.marked(MARK)

@@ -88,6 +88,26 @@ def test_a_recording_comes_back_through_the_command_line(tmp_path, monkeypatch):
         np.testing.assert_allclose(after.travel, before.travel, rtol=1e-12)
 
 
+def test_an_exported_recording_needs_no_options(tmp_path):
+    path = record(sphere(), tmp_path / "rec.h5")
+    with io.open_recording(path) as before:
+        io.save_messages(before, tmp_path / "rec.mcap")
+        with io.open_recording(tmp_path / "rec.mcap") as after:
+            assert after.motion == before.motion
+            for name in ("title", "pixel_size", "camera"):
+                assert getattr(after.header, name) == getattr(before.header, name)
+            np.testing.assert_array_equal(after.header.dark, before.header.dark)
+            np.testing.assert_array_equal(after.header.bright, before.header.bright)
+            np.testing.assert_allclose(after.travel, before.travel, rtol=1e-12)
+
+
+def test_a_motion_that_contradicts_the_file_is_refused(tmp_path):
+    with io.open_recording(record(sphere(), tmp_path / "rec.h5")) as recording:
+        io.save_messages(recording, tmp_path / "rec.mcap")
+    with pytest.raises(io.InputError, match=r"rec\.mcap states the motion vertical, but --motion is axial"):
+        io.open_recording(tmp_path / "rec.mcap", motion="axial", phase=io.Steps(0.1))
+
+
 @pytest.fixture
 def film(tmp_path):
     """Write pictures as images of an encoding on topics, by the packages' own writer."""
