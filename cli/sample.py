@@ -239,7 +239,7 @@ def _record_flat(path: Path, camera: hw.twin.Camera, light: float, replaces: Rep
     phase = np.linspace(0, math.tau, _FLAT_FRAMES, endpoint=False)
     source = ArrayRecording(frames, {"phase": phase}, header)
     with io.Recorder(source, path, overwrite=replaces == "anything") as recorder:
-        recorder.drain(lambda _: None)
+        recorder.drain()
 
 
 def _photograph() -> NDArray[np.uint8]:

@@ -16,8 +16,10 @@ from mirrorskin.engine.options import RESERVED, Configured, Option, documented, 
 from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Map, Result
-from mirrorskin.io.arguments import as_array
+from mirrorskin.io.arguments import as_array, unknown_argument
+from mirrorskin.io.findings import warn
 from mirrorskin.io.maps import declaration_of
+from mirrorskin.io.positions import step_in_degrees
 from mirrorskin.io.result import check_maps, result_of
 from mirrorskin.io.samples import convert_samples, frame_dtype
 from mirrorskin.io.traces import FrameSamples
@@ -563,10 +565,15 @@ def array_function(
         return apply(operation(memory_limit=limit_of(frames), **given), frames, **given_positions)
 
     def function(*args: Any, **kwargs: Any) -> Result:
+        if unknown := next((one for one in kwargs if one not in signature.parameters), ""):
+            raise TypeError(unknown_argument(f"{name}()", unknown, [*signature.parameters]))
         given = signature.bind(*args, **kwargs).arguments
         frames = as_any_array("frames", given.pop("frames"))
         where = {one: given.pop(one, None) for one in (*positions, *optional)}
         where = {one: None if values is None else as_array(one, values) for one, values in where.items()}
+        if where.get("phase") is not None and (step := step_in_degrees(where["phase"])):
+            text = f"phase is in radians; yours steps by {step:.4g} rad: are they degrees?"
+            warn(name, {"warnings": text})
         return (compute or run)(frames, where, given)
 
     before = "frames : array_like or device array, (T, H, W)\n    Raw counts.\n"

@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Literal, dataclass_transform
 import numpy as np
 
 from mirrorskin.io import InputError
-from mirrorskin.io.arguments import as_array, check_flag, shown
+from mirrorskin.io.arguments import as_array, check_flag, shown, unknown_argument
 
 Kind = Literal["number", "integer", "flag", "choice", "numbers", "map", "file", "object"]
 
@@ -299,10 +299,7 @@ class Configured:
     def __init__(self, **options: Any) -> None:
         unknown = options.keys() - self.options
         if unknown:
-            names = ", ".join(sorted(unknown))
-            raise InputError(
-                f"{type(self).__name__} has no option {names}. It has {', '.join(self.options) or 'none'}"
-            )
+            raise InputError(unknown_argument(type(self).__name__, min(unknown), [*self.options], "option"))
         for name, one in self.options.items():
             value = options.get(name, one.default)
             one.store(self, one.check(list(value) if isinstance(value, list) else value))

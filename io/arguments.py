@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import functools
 import inspect
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from numbers import Real
 from typing import Any, ParamSpec, TypeVar
 
@@ -21,6 +22,37 @@ Check = Callable[[str, Any], Any]
 """Function of an argument's name and value that returns the value, perhaps converted; or InputError."""
 
 _COUNTS = ("frames", "reference", "dark", "bright", "zenith_offset")  # arguments whose numbers are counts
+
+_PRESSES = "an option of presses: engine.reconstruct, engine.Press, engine.find_onset"
+_ROTATIONS = "an option of rotations: engine.reconstruct, engine.Rotation, engine.estimate_normals"
+_POSITIONS = "given to io.open_recording, or with frames in an array to engine.reconstruct"
+_ELSEWHERE = {
+    **dict.fromkeys(("dark", "bright"), f"{_PRESSES}; or part of a recording or calibration"),
+    **dict.fromkeys(("threshold", "hold", "event"), _PRESSES),
+    **dict.fromkeys(("zenith_gain", "zenith_offset"), f"{_ROTATIONS}; or part of a calibration"),
+    **dict.fromkeys(("travel", "phase", "pixel_size"), _POSITIONS),
+    "tilt": f"{_ROTATIONS}; or given to io.open_recording",
+    "calibration": "given to engine.reconstruct",
+    "device": "given to what computes: engine.reconstruct, engine.find_onset, ...",
+}
+"""Where arguments belong that are often given to other functions."""
+
+
+def unknown_argument(owner: str, name: str, known: Collection[str], what: str = "argument") -> str:
+    """Return a message about an argument or option that a function or a class does not have.
+
+    Examples
+    --------
+    >>> unknown_argument("find_onset()", "treshold", ["threshold", "hold"])
+    'find_onset() has no argument treshold: did you mean threshold?'
+    """
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.75)
+    remedy = f"it has {', '.join(known) or 'none'}"
+    if close:
+        remedy = f"did you mean {close[0]}?"
+    elif name in _ELSEWHERE:
+        remedy = f"it is {_ELSEWHERE[name]}"
+    return f"{owner} has no {what} {name}: {remedy}"
 
 
 def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
@@ -44,6 +76,7 @@ def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
         places = {one.name: index for index, one in enumerate(parameters)}
         optional = {one.name for one in parameters if one.default is None}
         known = [(places[name], name, check) for name, check in checks.items()]
+        takes_any = any(one.kind is one.VAR_KEYWORD for one in parameters)
 
         @functools.wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -54,6 +87,12 @@ def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
                         given[index] = check(name, given[index])
                 elif name in kwargs and (kwargs[name] is not None or name not in optional):
                     kwargs[name] = check(name, kwargs[name])
+            if (
+                kwargs
+                and not takes_any
+                and (unknown := next((one for one in kwargs if one not in places), ""))
+            ):
+                raise TypeError(unknown_argument(f"{function.__name__}()", unknown, [*places]))
             return function(*given, **kwargs)
 
         return call

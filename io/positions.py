@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io.types import Floats, InputError
 
+_ROUNDING = 1e-6  # radians
 _GREATEST = 1e12  # largest value accepted, in mm, rad or s
 
 
@@ -117,6 +118,20 @@ def check_phase(phase: ArrayLike | None, count: int, name: str) -> NDArray[np.fl
     if phase is None:
         raise InputError(f"{name} is missing: an axial rotation needs the phase of each frame, in radians")
     return check_finite(phase, count, name)
+
+
+def step_in_degrees(phase: NDArray[np.float64]) -> float:
+    """Return the usual step of phases, radians, if it is more than a turn, as in degrees; else 0.
+
+    Examples
+    --------
+    >>> step_in_degrees(np.arange(8) * 45.0), step_in_degrees(np.arange(8) * 0.785)
+    (45.0, 0.0)
+    """
+    if phase.ndim != 1 or len(phase) < 3:
+        return 0.0
+    step = float(np.median(np.abs(np.diff(phase))))
+    return step if step > 2 * np.pi + _ROUNDING else 0.0
 
 
 def check_finite(

@@ -195,7 +195,7 @@ class Recorder(TeeSource[Source]):
     Examples
     --------
     >>> with Recorder(source, "press.h5") as recorder:  # doctest: +SKIP
-    ...     recorder.drain(print)
+    ...     recorder.drain()
     """
 
     header: Header
@@ -251,14 +251,15 @@ class Recorder(TeeSource[Source]):
             self._new.check()
         return block
 
-    def drain(self, progress: Callable[[int], None]) -> Check:
+    def drain(self, progress: Callable[[int], None] | None = None) -> Check:
         """Write all frames, and return what they show; ``progress`` is called with the number so far."""
         watch = Watch(self.source)
         length = max(1, _BLOCK // (self.shape[1] * self.shape[2] * self.dtype.itemsize))
         room = np.empty((min(length, self.shape[0]), *self.shape[1:]), self.dtype)
         while (block := self.read(room)) is not None:
             watch.push(block)
-            progress(self._count)
+            if progress is not None:
+                progress(self._count)
         return watch.check()
 
     def _finish(

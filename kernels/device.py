@@ -10,6 +10,7 @@ import functools
 import itertools
 import json
 import logging
+import operator
 import os
 import re
 import threading
@@ -18,7 +19,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeAlias, cast
+from typing import Any, Literal, NamedTuple, SupportsIndex, TypeAlias, cast
 from weakref import WeakSet
 
 import numpy as np
@@ -37,7 +38,7 @@ from mirrorskin.kernels.transfer import Transfers
 from mirrorskin.kernels.waiting import close_at_exit, waiting
 
 DeviceKind = Literal["gpu", "cpu", "other"]
-Choice: TypeAlias = "str | Device | Sequence[str | Device] | None"
+Choice: TypeAlias = "str | int | Device | Sequence[str | int | Device] | None"
 """What names one device or several; see `open_devices`."""
 ALL = "all"
 """The choice of all devices of a kind."""
@@ -101,7 +102,7 @@ def open_device(choice: Choice = None) -> Device:
 
     Parameters
     ----------
-    choice : str, Device, sequence of them, or None
+    choice : str, int, Device, list of them, or None
         A number of ``list_devices``, ``"gpu"``, ``"cpu"``, or a part of the platform's and device's
         names. None takes what ``PYOPENCL_CTX`` names, else the best GPU that works, else the best CPU. The
         best of a kind is one with its own memory, then the one with the largest product of compute units and
@@ -120,6 +121,7 @@ def open_device(choice: Choice = None) -> Device:
             "this process was forked from one that had used OpenCL, whose threads it lacks: start it with "
             "multiprocessing.get_context('spawn')"
         )
+    choice = _checked(choice)
     if isinstance(choice, Device):
         return choice
     if not isinstance(choice, str | None):
@@ -151,6 +153,7 @@ def open_devices(choice: Choice = None) -> list[Device]:
     >>> open_devices("all")[0] is open_device()
     True
     """
+    choice = _checked(choice)
     if not isinstance(choice, str | Device | None):
         opened = [device for one in choice for device in open_devices(one)]
         if not opened:
@@ -167,9 +170,21 @@ def open_devices(choice: Choice = None) -> list[Device]:
 
 def are_several(choice: Choice) -> bool:
     """Return whether a choice means several devices, even if there is only one of the kind."""
+    choice = _checked(choice)
     if isinstance(choice, str | Device | None):
         return _is_all(choice)
     return len(choice) > 1 or any(map(are_several, choice))
+
+
+def _checked(choice: Choice) -> str | Device | Sequence[str | int | Device] | None:
+    """Return a choice, a number as text; UnknownDeviceError for what cannot name a device."""
+    if isinstance(choice, SupportsIndex) and not isinstance(choice, bool):
+        return str(operator.index(choice))
+    if isinstance(choice, int | bytes) or not isinstance(choice, str | Device | Sequence | None):
+        raise UnknownDeviceError(
+            f"device is {choice!r:.60}: give a number of list_devices, a part of a name, 'gpu' or 'cpu'"
+        )
+    return choice
 
 
 def opened_devices() -> list[Device]:

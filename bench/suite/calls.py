@@ -115,7 +115,7 @@ def run_commands(device: Device, quick: bool) -> Case:
             sensor: dict[str, Any] = {"pixel_size": _FIELD / shape[0], "movement": movement, "device": device}
             twin = Twin(object="sphere", shape=shape, pattern="linear", **sensor)
             with Recorder(twin, recordings[what]) as recorder:
-                recorder.drain(lambda count: None)
+                recorder.drain()
         inputs = {f"reconstruct {what}": [str(path)] for what, path in recordings.items()}
         for what, words in {**inputs, "fuse": [str(path) for path in recordings.values()]}.items():
             output = folder / "result.h5"

@@ -118,7 +118,7 @@ def record(source: Frames, path: Path, compression: Compression = "raw") -> None
     """Write a recording and wait for the disk, so that nothing is written while others are timed."""
     source.rewind()
     with io.Recorder(source, path, compression, overwrite=True) as recorder:
-        recorder.drain(lambda count: None)
+        recorder.drain()
     sync(path)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io import InputError
-from mirrorskin.io.positions import check_phase
+from mirrorskin.io.positions import check_phase, step_in_degrees
 from mirrorskin.kernels.array_types import Doubles
 
 LONGEST = 64
@@ -59,7 +59,9 @@ def check_phases(phase: ArrayLike, frame_weights: ArrayLike | None = None) -> Do
         )
     different = max(1, int(np.count_nonzero(_gaps(used) > _SAME))) if len(used) else 0
     if different < 3:
-        problem = f"{len(used)} frames at {different} different phases do not determine a fit"
+        frames = "1 frame" if len(used) == 1 else f"{len(used)} frames"
+        phases = "1 phase" if different == 1 else f"{different} different phases"
+        problem = f"{frames} at {phases} do not determine a fit"
         raise InputError(f"{problem} of mean, cosine and sine: at least 3 are needed")
     weighted = basis(used) * np.sqrt(weight[weight > 0] / weight.max())[:, np.newaxis]
     condition = float(np.linalg.cond(weighted)) ** 2
@@ -68,6 +70,16 @@ def check_phases(phase: ArrayLike, frame_weights: ArrayLike | None = None) -> Do
         problem = f"the phases are too close together to separate mean, cosine and sine ({limit})"
         raise InputError(f"{problem}: spread them over more of the turn")
     return alpha
+
+
+def check_turning(phase: Doubles, name: str = "phase") -> None:
+    """Raise InputError if phases, radians, step by more than a turn, so that no turn has two frames."""
+    step = step_in_degrees(phase)
+    if step:
+        raise InputError(
+            f"{name} is in radians; yours steps by {step:.4g} rad, more than a turn: convert degrees with"
+            " numpy.radians, or leave whole turns out"
+        )
 
 
 def fit_matrix(phase: ArrayLike, frame_weights: ArrayLike | None = None) -> Doubles:

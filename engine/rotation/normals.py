@@ -16,6 +16,7 @@ from mirrorskin.engine.rotation.design_matrix import (
     LONGEST,
     TurnFit,
     check_phases,
+    check_turning,
     check_weights,
     cut_into_turns,
     longest_turn,
@@ -186,8 +187,10 @@ class NormalsOperation(SensorOptions, Operation):
         where, weights = self._phase.copy(), self._weights.copy()
         self._estimate(self._turns_in(self._phase))
         if self._turns == 0:
+            check_turning(self.pushed("phase"))
             self._explain(where, weights)
-        assert self._model is not None
+        if self._model is None:
+            raise InputError("no turn of these phases has three frames or more: turn more slowly")
         if self.per_turn:
             maps = [np.stack(turns) for turns in zip(*self._each, strict=True)]
         else:

@@ -22,7 +22,7 @@ from mirrorskin.engine.options import option
 from mirrorskin.engine.provenance import level_origin, parameter_origin
 from mirrorskin.engine.rotation.coarse_height import coarse_heights
 from mirrorskin.engine.rotation.correlation import Correlate
-from mirrorskin.engine.rotation.design_matrix import LONGEST, cut_into_turns
+from mirrorskin.engine.rotation.design_matrix import LONGEST, check_turning, cut_into_turns
 from mirrorskin.engine.rotation.edited import EditedSource
 from mirrorskin.engine.rotation.last_turn import LastTurn
 from mirrorskin.engine.rotation.moving_normals import MovingNormals
@@ -110,6 +110,9 @@ class Rotation(Method):
 
     def plan(self, source: Source) -> Plan:
         """Return the operation for a source, depending on the poses and on the response."""
+        phase = getattr(source, "phase", None)
+        if phase is not None:
+            check_turning(phase)
         wall = self._wall_of(source)
         if self.zenith_gain is None and source.header.zenith_gain is None and wall is None:
             return self._correlation(source)

@@ -223,7 +223,7 @@ def test_what_is_no_operation_is_refused_in_a_line(operation, line):
 @pytest.mark.parametrize(
     ("options", "line"),
     [
-        ({"factr": 2.0}, "Moments has no option factr. It has factor, device, memory_limit"),
+        ({"factr": 2.0}, "Moments has no option factr: did you mean factor?"),
         ({"factor": "2"}, "factor is '2': a number is needed"),
         ({"factor": 11.0}, "factor 11.0: a number in mm from 0 to 10 is needed"),
         ({"factor": np.nan}, "factor nan: a number in mm"),
@@ -434,3 +434,20 @@ def test_what_is_not_of_each_frame_is_refused_with_its_place(tmp_path, given, li
         frames = recording if "pixel_size" in given else FRAMES
         with pytest.raises(io.InputError, match=line):
             engine.run(frames, Moments, **given)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (
+            lambda: engine.find_onset(np.zeros((3, 2, 2), np.uint8), [0, 1, 2], zenith_gain=200.0),
+            r"find_onset\(\) has no argument zenith_gain: it is an option of rotations: engine.reconstruct",
+        ),
+        (lambda: engine.Onset(treshold=0.5), "Onset has no option treshold: did you mean threshold?"),
+        (lambda: io.open_recording("a.h5", dark=3), "it is an option of presses: .*; or part of a recording"),
+        (lambda: io.open_recording("a.h5", pixelsize=3), "did you mean pixel_size?"),
+    ],
+)
+def test_an_argument_of_something_else_names_where_it_belongs(call, said):
+    with pytest.raises((TypeError, io.InputError), match=said):
+        call()

@@ -463,3 +463,14 @@ def test_memory_of_the_host_is_exported_without_a_copy_and_other_memory_refused(
     else:
         with pytest.raises(BufferError, match=r"other libraries cannot use: copy it with read\(\)"):
             np.from_dlpack(array)
+
+
+def test_a_device_may_be_given_by_its_number():
+    assert open_device(0) is open_device("0")
+    assert open_devices([np.int64(0)]) == [open_device("0")]
+
+
+@pytest.mark.parametrize("choice", [1.5, True, b"0", {}])
+def test_what_cannot_name_a_device_is_refused_with_the_remedy(choice):
+    with pytest.raises(UnknownDeviceError, match="give a number of list_devices, a part of a name"):
+        open_device(choice)

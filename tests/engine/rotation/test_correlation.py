@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mirrorskin.engine import Correlate, correlate
-from mirrorskin.io import InputError
+from mirrorskin.io import InputError, MirrorskinWarning
 from mirrorskin.kernels.errors import DeviceError
 
 MEASURED = np.deg2rad([178.1, 133.4, 91.0, 44.6, 1.9, 313.7, 268.8, 226.2])
@@ -196,7 +196,7 @@ def test_a_window_answers_as_soon_as_its_phases_determine_a_fit(device):
     frames = swing("uint8", MEASURED)
     operation = Correlate(window_frames=8, device=device)
     for count in range(3):
-        message = f"{count} frames at {count} different phases" if count else "none have been pushed"
+        message = f"{count} frames? at {count}.* phases?" if count else "none have been pushed"
         with pytest.raises(InputError, match=message):
             operation.result()
         push(operation, frames[count : count + 1], MEASURED[count : count + 1])
@@ -243,8 +243,13 @@ def test_less_room_gives_the_same_answer(small_device, dtype, window, weights):
 @pytest.mark.parametrize(
     ("frames", "phase", "weights", "message"),
     [
-        (np.zeros((8, 2, 2), np.int16), MEASURED, None, "type int16"),
-        (np.zeros((8, 2), np.uint8), MEASURED, None, "uint8 .8, 2.: numbers"),
+        (
+            np.full((8, 2, 2), -1, np.int16),
+            MEASURED,
+            None,
+            "a sample of -1; int16 is read as uint16",
+        ),
+        (np.zeros((8, 2), np.uint8), MEASURED, None, "uint8 .8, 2.: for a single frame"),
         (np.zeros((8, 0, 2), np.uint8), MEASURED, None, "uint8 .8, 0, 2.: numbers"),
         (np.zeros((8, 2, 2), np.uint8), MEASURED[:7], None, "shape .7,. for 8 frames"),
         (np.zeros((4, 2, 2), np.uint8), [0, 1, 0, 1], None, "4 frames at 2 different phases"),
@@ -284,3 +289,9 @@ def test_a_block_that_does_not_fit_is_refused_and_changes_nothing(window, monkey
         with pytest.raises(InputError, match=message):
             operation.push(block, phase=phase, frame_weights=weights)
     same(operation.result(), before)
+
+
+def test_phases_in_degrees_are_said():
+    frames = swing("uint8", MEASURED)
+    with pytest.warns(MirrorskinWarning, match="phase is in radians; yours steps by 4[0-9.]* rad: are they"):
+        correlate(frames, np.degrees(MEASURED))

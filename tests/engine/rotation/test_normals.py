@@ -8,6 +8,7 @@ import pytest
 import rotations
 from rotations import EIGHTHS, TILT, Setup
 
+from mirrorskin import engine
 from mirrorskin.engine import Normals, estimate_normals
 from mirrorskin.io import InputError
 from mirrorskin.kernels.errors import DeviceError
@@ -297,12 +298,12 @@ def stack(count=8, dtype=np.uint16):
 
 REFUSED = {
     "an empty stack": (stack(0), [], {}, r"frames are uint16 \(0, 5, 7\): numbers \(n, H, W\)"),
-    "one frame": (stack()[0], EIGHTHS[:5], {}, r"frames are uint16 \(5, 7\): numbers"),
+    "one frame": (stack()[0], EIGHTHS[:5], {}, r"frames are uint16 \(5, 7\): for a single"),
     "another type": (
-        stack(dtype=np.float64),
+        -1 - stack(dtype=np.int32),
         EIGHTHS,
         {},
-        "frames of type float64: uint8, uint16 or float32 are needed",
+        "frame 0 has a sample of -[0-9]+; int32 is read as uint16",
     ),
     "phases of others": (stack(), EIGHTHS[:7], {}, r"phase has shape \(7,\) for 8 frames"),
     "two phases": (stack(), [0, 3] * 4, {}, "8 frames at 2 different phases do not determine a fit"),
@@ -393,3 +394,12 @@ def test_a_pixel_without_a_scale_has_no_answer(device):
         if name != "contact":
             np.testing.assert_array_equal(np.isnan(getattr(found, name))[lost], True)
         np.testing.assert_array_equal(getattr(found, name)[~lost], getattr(others, name)[~lost])
+
+
+@pytest.mark.filterwarnings("ignore:estimate_normals. phase is in radians")
+def test_phases_in_degrees_are_refused_with_the_remedy():
+    said = r"phase is in radians; yours steps by 45 rad, more than a turn: convert degrees with"
+    with pytest.raises(InputError, match=said):
+        engine.estimate_normals(stack(), np.degrees(EIGHTHS), tilt=0.05, zenith_gain=200.0)
+    with pytest.raises(InputError, match=said):
+        engine.reconstruct(stack(), phase=np.degrees(EIGHTHS), tilt=0.05, zenith_gain=200.0)
