@@ -25,6 +25,9 @@ SIGMA = "_sigma"
 LONGEST_DECLARATION = 60_000
 """Limit of the size of a declaration in a file: attributes in HDF5 have at most 64 kB."""
 
+FILLED_SHADES = "#331a00", "#ffb266"
+"""Shades of orange of heights that were not measured but filled, from the lowest to the highest height."""
+
 Axes = Literal["pixels", "frames", "pieces", "none"]
 Sampling = Literal["linear", "nearest", "angle", "direction"]
 Colours = Literal["sequential", "positive", "signed", "error"]

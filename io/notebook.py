@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.maps import Map, declaration_of
+from mirrorskin.io.maps import FILLED_SHADES, Map, declaration_of
 from mirrorskin.io.opencv import encode
 from mirrorskin.io.result import Result, Shown, map_shape, may_name_a_map
 from mirrorskin.io.types import InputError
@@ -38,7 +38,8 @@ def as_html(result: Shown) -> str:
     )
     shown = _first(result)
     unit = "" if shown is None else _unit(shown, result)
-    picture = "" if shown is None else _picture(shown, result.maps()[shown], unit)
+    filled = None if shown is None else _filled(result, shown)
+    picture = "" if shown is None else _picture(shown, result.maps()[shown], unit, filled)
     title = f"<p><b>{type(result).__name__}</b>{escape(_origin(result))}</p>"
     return f"{title}<div style='display:flex;gap:2em'>{picture}<table>{rows}</table></div>"
 
@@ -74,6 +75,14 @@ def plot(result: Shown, name: str | None, axes: Axes | None) -> Axes:
         extent = (x[0] - a, x[-1] + a, y[-1] + b, y[0] - b)
     axes = plt.subplots()[1] if axes is None else axes
     image = axes.imshow(maps[chosen], extent=extent, interpolation="nearest")
+    filled = _filled(result, chosen)
+    if filled is not None:
+        from matplotlib.colors import LinearSegmentedColormap
+
+        shades = LinearSegmentedColormap.from_list("filled", FILLED_SHADES)
+        marked = np.ma.masked_where(~filled, maps[chosen])
+        axes.imshow(marked, shades, extent=extent, interpolation="nearest", clim=image.get_clim())
+        axes.set_title(_filled_note(filled), fontsize="medium")
     places = ("column", "row") if extent is None else ("x [mm]", "y [mm]")
     axes.set(xlabel=places[0], ylabel=places[1])
     label = f"{chosen} {_unit(chosen, result)}".strip()
@@ -193,10 +202,25 @@ def _rows(result: Shown) -> list[tuple[str, str, str]]:
         known = values.ravel() if declared.codes else values[declared.has_answer(values)]
         span = f"{known.min():.4g} to {known.max():.4g}" if known.size else "nothing known"
         share = f", {known.size / values.size:.0%} known" if 0 < known.size < values.size else ""
+        filled = _filled(result, name)
+        share += "" if filled is None else f", {np.mean(filled):.2g} filled"
         unit = f" {declared.unit}".rstrip() if known.size else ""
         rows.append((name, shape, f"{span}{unit}{share}"))
     numbers = result.numbers().items()
     return rows + [(name, "", f"{value:.4g} {_unit(name, result)}".rstrip()) for name, value in numbers]
+
+
+def _filled(result: Shown, name: str) -> NDArray[np.bool_] | None:
+    """Return which heights of a map were filled, (H, W); None if none were, or the map is another."""
+    filled = result.maps().get("filled")
+    heights = isinstance(result, Result) and name == result.name_of("height")
+    if filled is None or not heights or not np.any(filled > 0):
+        return None
+    return np.asarray(filled > 0)
+
+
+def _filled_note(filled: NDArray[np.bool_]) -> str:
+    return f"orange: filled, not measured ({np.mean(filled):.2g} of the pixels)"
 
 
 def _origin(result: Shown) -> str:
@@ -204,8 +228,11 @@ def _origin(result: Shown) -> str:
     return f" of {source}" if source else ""
 
 
-def _picture(name: str, values: NDArray[Any], unit: str) -> str:
-    """Return a map, or its last turn, in colours from dark (low) to light (high); NaN is transparent."""
+def _picture(name: str, values: NDArray[Any], unit: str, filled: NDArray[np.bool_] | None = None) -> str:
+    """Return a map, or its last turn, in colours from dark (low) to light (high); NaN is transparent.
+
+    Filled heights are in shades of orange.
+    """
     import cv2
 
     flat = values.reshape(-1, *values.shape[-2:])[-1].astype(np.float64)
@@ -217,8 +244,15 @@ def _picture(name: str, values: NDArray[Any], unit: str) -> str:
     low, high = np.percentile(flat[known], (1, 99))
     grey = np.clip((np.where(known, flat, low) - low) / (high - low or 1.0), 0, 1)
     colours = cv2.applyColorMap((255 * grey).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
+    note = ""
+    if filled is not None:
+        marks = filled.reshape(-1, *filled.shape[-2:])[-1][::step, ::step]
+        ends = np.array([[int(shade[at : at + 2], 16) for at in (5, 3, 1)] for shade in FILLED_SHADES])
+        shades = ends[0] + grey[..., np.newaxis] * (ends[1] - ends[0])  # blue, green, red
+        colours = np.where(marks[..., np.newaxis], shades, colours).astype(np.uint8)
+        note = f"; {_filled_note(filled)}"
     picture = np.dstack([colours, 255 * known.astype(np.uint8)])
     data = base64.b64encode(encode(".png", picture)).decode()
-    caption = escape(f"{name}, {low:.4g} to {high:.4g} {unit}".rstrip())
+    caption = escape(f"{name}, {low:.4g} to {high:.4g} {unit}".rstrip() + note)
     image = f"<img alt='{caption}' src='data:image/png;base64,{data}'>"
     return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"

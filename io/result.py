@@ -288,6 +288,20 @@ class Result(Shown, Mapping[str, Any]):
     def _along(self, axes: str) -> dict[str, Any]:
         return {name: self[name] for name in self if self.declaration(name).axes == axes}
 
+    def measured(self) -> NDArray[np.float32]:
+        """Return the heights that were measured, (H, W): NaN where they are unknown or were filled.
+
+        Examples
+        --------
+        >>> Result(height=np.zeros((1, 2)), filled=np.array([[0, 1]], np.uint8)).measured()
+        array([[ 0., nan]])
+        """
+        height = self.height
+        if height is None:
+            raise InputError("the result has no heights")
+        filled = self.filled
+        return np.asarray(height if filled is None else np.where(np.asarray(filled) > 0, np.nan, height))
+
     def to_xarray(self) -> xarray.Dataset:
         """Return the result as an `xarray.Dataset`: coordinates ``x`` and ``y`` in mm, units as attributes.
 

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from mirrorskin.io import InputError
 from mirrorskin.io.atomic import write_new
+from mirrorskin.io.maps import FILLED_SHADES
 from mirrorskin.io.text import printable
 from mirrorskin.io.types import Floats
-from mirrorskin.view.colours import FILLED_SHADES, MISSING
+from mirrorskin.view.colours import MISSING
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

@@ -16,8 +16,6 @@ FILLED = "tab:orange"
 """Colour of filled heights."""
 FILLED_RGB = (255, 127, 14)
 """The same as red, green and blue."""
-FILLED_SHADES = "#331a00", "#ffb266"
-"""Its shades, from the lowest to the highest height."""
 EDGE_RGB = (0, 0, 0)
 """Colour of edges, as red, green and blue."""
 

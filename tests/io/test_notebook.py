@@ -89,7 +89,7 @@ def test_what_is_no_picture_is_not_drawn(result):
 def test_what_functions_return_shows_itself_in_a_few_lines():
     frames = np.zeros((5, 30, 40), np.uint8)
     frames[3:] = 255
-    onset = engine.find_onset(frames, [0.0, 0.1, 0.2, 0.3, 0.4])
+    onset = engine.find_onset(frames, [0.0, 0.1, 0.2, 0.3, 0.4], dark=0, bright=255)
     assert repr(onset).splitlines()[:2] == ["Result", "  height        30 x 40         -0.25 to -0.25 mm"]
     assert "<img" in onset._repr_html_()
     assert onset.plot().get_xlabel() == "column"
@@ -103,3 +103,36 @@ def test_a_recording_shows_itself_in_a_line_and_a_picture(tmp_path):
         count, rows, columns = recording.shape
         assert f"rec.h5: {count} frames of {columns} x {rows} uint8, vertical motion" in repr(recording)
         assert "<img alt='last frame" in recording._repr_html_()
+
+
+@pytest.fixture
+def filled(result):
+    return result.assign(filled=np.array([[0, 1, 0], [0, 0, 1]], np.uint8))
+
+
+def picture_in(html):
+    (data,) = re.findall(r"base64,([^']+)'", html)
+    return cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+def test_filled_heights_are_orange_in_a_notebook(filled, result):
+    html = filled._repr_html_()
+    assert "orange: filled, not measured (0.33 of the pixels)" in html
+    marked, plain = picture_in(html), picture_in(result._repr_html_())
+    np.testing.assert_array_equal((marked != plain).any(axis=-1), filled.filled > 0)
+    blue, _, red, _ = marked[0, 1]
+    assert red > blue
+
+
+def test_filled_heights_are_orange_in_a_plot(filled):
+    axes = filled.plot()
+    heights, marks = axes.images
+    np.testing.assert_array_equal(marks.get_array().mask, filled.filled == 0)
+    assert marks.get_clim() == heights.get_clim()
+    assert axes.get_title() == "orange: filled, not measured (0.33 of the pixels)"
+    assert len(filled.plot("height_sigma").images) == 1
+
+
+def test_the_text_of_a_result_states_what_is_filled_and_measured_leaves_it_out(filled):
+    assert repr(filled).splitlines()[1].endswith("-2 to 0 mm, 83% known, 0.33 filled")
+    np.testing.assert_array_equal(filled.measured(), [[0.0, np.nan, np.nan], [-1.0, -1.5, np.nan]])
