@@ -39,7 +39,7 @@ def estimate_levels(
     Parameters
     ----------
     source : Source
-        A recording whose frames can be read in any order; of integers.
+        A recording whose frames can be read in any order.
     frames : range
         The press, or the release.
     dark, bright : array_like, scalar or (H, W), optional
@@ -52,7 +52,7 @@ def estimate_levels(
     """
     travel: NDArray[np.float64] | None = getattr(source, "travel", None)
     read = getattr(source, "frame", None)
-    if travel is None or read is None or source.dtype.kind != "u":
+    if travel is None or read is None:
         return None
     return _estimate(read, travel, frames, dark, bright)
 
@@ -79,24 +79,27 @@ def _estimate(
     part = travel[frames.start : frames.stop]
     least, most = (frames.start + int(number) for number in (np.argmin(part), np.argmax(part)))
     neighbour = least + (1 if least + 1 < frames.stop else -1)
-    first, second, last = (thin_out(read(number)) for number in (least, neighbour, most))
+    pictures = [read(number) for number in (least, neighbour, most)]
+    samples = np.stack([thin_out(picture) for picture in pictures])
+    first, second, last = samples[:, np.isfinite(samples).all(axis=0)]
+    integer = pictures[0].dtype.kind == "u"
     rise = last - first
     if rise.size < _FEWEST:
         return None
     top = float(np.partition(rise, -_FEWEST)[-_FEWEST])
-    noise = estimate_noise(first, second, integer=True)
+    noise = estimate_noise(first, second, integer)
     if top < _RISE * noise:
         return None
     lit = rise >= top / 2
-    low, low_sigma = _middle(first[lit], noise) if dark is None else (_median(dark), 0.0)
-    high, high_sigma = _middle(last[lit], noise) if bright is None else (_median(bright), 0.0)
+    low, low_sigma = _middle(first[lit], noise, integer) if dark is None else (_median(dark), 0.0)
+    high, high_sigma = _middle(last[lit], noise, integer) if bright is None else (_median(bright), 0.0)
     return EstimatedLevels(low, high, low_sigma, high_sigma) if high > low else None
 
 
-def _middle(counts: NDArray[np.float64], noise: float) -> tuple[float, float]:
+def _middle(counts: NDArray[np.float64], noise: float, integer: bool) -> tuple[float, float]:
     """Return the median of counts, and their robust standard deviation without the noise."""
     middle = _median(counts)
-    spread = math.sqrt(2) * estimate_noise(np.full_like(counts, middle), counts, integer=True)
+    spread = math.sqrt(2) * estimate_noise(np.full_like(counts, middle), counts, integer)
     return middle, math.sqrt(max(0.0, spread**2 - noise**2) + noise**2 / counts.size)
 
 

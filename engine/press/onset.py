@@ -150,7 +150,7 @@ def _find_onset(frames: AnyArray, where: dict[str, Any], options: dict[str, Any]
         fits = np.shape(where["travel"]) == (len(frames),)
     else:
         fits = False
-    if missing and fits and frames.dtype.kind == "u":
+    if missing and fits:
         levels = estimate_levels_of(frames, where["travel"], options.get("dark"), options.get("bright"))
         if levels is not None:
             assumed = {name: getattr(levels, name) for name in missing}
@@ -189,7 +189,7 @@ find_onset = travel_function(
     Warns
     -----
     mirrorskin.io.MirrorskinWarning
-        ``dark`` or ``bright`` is not given, and is estimated from the first and the last frames of integers;
+        ``dark`` or ``bright`` is not given, and is estimated from the first and the last frames;
         or there is no height at any pixel, with the reason.
 
     Raises

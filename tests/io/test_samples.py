@@ -355,3 +355,35 @@ def test_frames_of_xarray_are_in_the_order_of_their_names():
     transposed = xarray.DataArray(frames.transpose(1, 2, 0), dims=("y", "x", "t"))
     found = engine.find_onset(transposed, [0.0, 0.1, 0.2, 0.3, 0.4])
     np.testing.assert_array_equal(np.isfinite(found.height), [[False] * 3, [True] * 3])
+
+
+def ball_stack():
+    """Return frames of 12 bits of a slope that turns light column by column, the travel, and the heights."""
+    travel = 0.05 * np.arange(24)
+    heights = -0.1 - 0.04 * np.arange(20)
+    light = travel[:, np.newaxis, np.newaxis] > -heights[np.newaxis, np.newaxis, :]
+    noise = np.random.default_rng(5).normal(0, 4, (24, 20, 20))
+    return np.rint(200 + 3000 * light + noise).astype("u2"), travel, np.broadcast_to(heights, (20, 20))
+
+
+def test_unknown_pixels_have_no_height_and_the_others_the_right_one(path):
+    frames, travel, heights = ball_stack()
+    frames[:, 3, 4] = 65535
+    frames[10:, 7, :] = 65535
+    written(path, frames, {"_FillValue": np.uint16(65535)}, dims=("t", "y", "x"))
+    with opened(path, travel=travel, pixel_size=(0.1, 0.1)) as recording:
+        found = engine.reconstruct(recording, fill=False)
+    assert np.isnan(found.height[3, 4])
+    unknown = np.zeros(heights.shape, bool)
+    unknown[3, 4] = unknown[7] = True
+    np.testing.assert_allclose(found.height[~unknown], heights[~unknown], atol=0.03)
+
+
+@pytest.mark.parametrize("order", [(1, 2, 0), (2, 1, 0)])
+def test_the_surface_of_transposed_frames_is_neither_mirrored_nor_turned(path, order):
+    frames, travel, heights = ball_stack()
+    frames, heights = frames[:, :12], heights[:12]
+    written(path, frames.transpose(order), dims=tuple("tyx"[axis] for axis in order))
+    with opened(path, travel=travel) as recording:
+        found = engine.reconstruct(recording)
+    np.testing.assert_allclose(found.height, heights, atol=0.03)
