@@ -288,7 +288,7 @@ class Traces:
             if float(np.mean(left**2)) > 0.02 * float(np.var(self._counts)):
                 return None  # harmonics do not describe it
             wave = np.exp(1j * self._series["phase"]) @ self._counts[:, self._responding]
-            if abs(np.mean(wave / np.abs(wave))) > _AS_ONE:
+            if wave.size and abs(np.mean(wave / np.abs(wave))) > _AS_ONE:
                 return None  # of a flat object, light that is not a cosine would look the same
             gain = np.median(left / np.maximum(self._fit, 1e-3 * self._highest.max()), axis=1)
             error = 1.25 * self.noise / math.sqrt(self._fit.shape[1]) / float(np.mean(self._fit))
