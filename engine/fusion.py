@@ -125,7 +125,9 @@ def fuse(
     x, y = pixel_axes(wanted.shape, size)
     if height_maps.x is not None and height_maps.y is not None:
         x, y = height_maps.x, height_maps.y
-    return surface.assign(x=x, y=y, process=describe_integration([surface]))
+    process = describe_integration([surface]) | solver.process
+    warn("fuse", process)
+    return surface.assign(x=x, y=y, process=process)
 
 
 def _maps_of(name: str, maps: Maps, *needed: str) -> Result:
@@ -232,10 +234,16 @@ def fuse_recordings(
         surface = solver.surface(slopes)
     surface = solver.filled(surface)
     warn(axial.name, turned.process)
+    warn(f"{vertical.name} and {axial.name}", solver.process)
     if progress:
         progress(frames_to_read(vertical, axial, register))
     signed = attach_provenance(Result(), axial, opened, dict(turned.process))
-    process = _both(pressed.process, signed.process) | describe_integration([surface]) | {"heights": "none"}
+    process = (
+        _both(pressed.process, signed.process)
+        | describe_integration([surface])
+        | solver.process
+        | {"heights": "none"}
+    )
     if register:
         process |= {"heights": "fused", "registrations": number + 1, "last_move_in_pixels": moved}
     if surface.edges is not None:

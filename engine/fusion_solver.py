@@ -9,12 +9,19 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.fusion_agreement import (
+    Disagreement,
+    SlopeError,
+    describe_disagreement,
+    find_disagreement,
+)
 from mirrorskin.engine.integration.integration import integrate
 from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.press.holes import fill_holes
 from mirrorskin.engine.press.intervals import estimate_interval_errors, fit_paraboloids, interval_evidence
 from mirrorskin.engine.rotation.normals_to_height import Slopes
 from mirrorskin.io import InputError, Result
+from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 
@@ -33,6 +40,7 @@ _SEVERAL = 6.0  # smallest range of heights, in half intervals, for uniformly di
 _NEARLY_ALL = 0.9  # quantile of the errors from which the used share of the intervals is estimated
 _LEAST_USED = 0.5  # smallest used share of the intervals
 _FIRST = 1e-4  # tolerance of the surfaces before the last; with 1e-5, errors are the same within 0.1 %
+_CORRECTIONS = 3  # largest number of corrections of the slopes
 _ITERATIONS = 5  # largest number of updates of the components' offsets
 _SETTLED = 1e-3  # change of an offset, in half intervals, that ends them
 
@@ -76,12 +84,39 @@ class FusionSolver:
         self._press, self._pixel_size = press, check_pixel_size(pixel_size)
         self._robust, self._device = robust, device
         self._near: Result | None = None
+        self._slope_error, self._disagreement = SlopeError(), Disagreement()
 
     def surface(self, slopes: Slopes, *, sigma: bool = True) -> Result:
-        """Return the surface of the heights and given slopes."""
-        press, near = self._press, self._near
-        if not (slopes.known | press.known).any():
+        """Return the surface of the heights and given slopes.
+
+        If heights and slopes contradict each other, the error of the zenith that explains it best is removed
+        from the slopes, and what is left is added to ``height_sigma``.
+        """
+        if not (slopes.known | self._press.known).any():
             raise InputError("there is nothing to fuse: no pixel has a height or a normal")
+        surface, self._disagreement = self._fit(self._slope_error.corrected(slopes), sigma)
+        for _ in range(_CORRECTIONS):
+            if not self._disagreement.clear or self._disagreement.slope_error is None:
+                break
+            before, near = (surface, self._disagreement, self._slope_error), self._near
+            self._slope_error = self._disagreement.slope_error.after(self._slope_error)
+            surface, self._disagreement = self._fit(self._slope_error.corrected(slopes), sigma)
+            if not self._disagreement.chi2 < before[1].chi2:
+                (surface, self._disagreement, self._slope_error), self._near = before, near
+                break
+        if not self._disagreement.clear or surface.height_sigma is None:
+            return surface
+        larger = np.hypot(surface.height_sigma, np.float32(self._disagreement.rms))
+        return surface.assign(height_sigma=larger)
+
+    @property
+    def process(self) -> dict[str, ProcessValue]:
+        """What is known of the last surface: how heights and slopes contradict each other."""
+        return describe_disagreement(self._disagreement, self._slope_error)
+
+    def _fit(self, slopes: Slopes, sigma: bool) -> tuple[Result, Disagreement]:
+        """Return the surface of heights and slopes, and their disagreement."""
+        press, near = self._press, self._near
         if near is None:
             near = self._solve(slopes, press.height, press.weight, sigma=False, tolerance=_FIRST)
         press = _correct_overstated(press, near, slopes)
@@ -93,7 +128,10 @@ class FusionSolver:
         surface = self._solve(extended, height, weight, initial_heights=near.height, sigma=sigma)
         # Outliers are not part of the surface, but may count in the next call.
         self._near = near.assign(height=np.where(surface.component < 0, near.height, surface.height))
-        return surface if surface.height_sigma is None else _set_sigma_of_lone_pixels(surface, weight)
+        found = find_disagreement(surface.height, height, weight, slopes, self._pixel_size)
+        if surface.height_sigma is not None:
+            surface = _set_sigma_of_lone_pixels(surface, weight)
+        return surface, found
 
     def filled(self, surface: Result) -> Result:
         """Return a surface with its holes filled."""

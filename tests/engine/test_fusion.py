@@ -629,3 +629,51 @@ def test_light_of_neighbours_does_not_shift_the_fused_surface():
         for seed in range(6)
     ]
     assert 0.7 < np.mean(chi2) < 1.3
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [{"gain": 1.02}, {"gain": 0.98}, {"offset": 2.0}, {"offset": -2.0}, {"light": lambda c: bent(c, 0.95)}],
+    ids=["gain", "less gain", "offset", "less offset", "gamma"],
+)
+@pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")
+def test_a_wrong_scale_of_the_zenith_is_corrected_as_the_press_shows_it(fault):
+    chi2 = [
+        chi_square(fuse_recordings(pressed_waves(seed), turned_waves(seed + 100, **fault), register=False))
+        for seed in range(3)
+    ]
+    assert np.mean(chi2) < 2  # 9 to 21 without a correction
+
+
+def bent(counts, gamma):
+    """Return what a camera with a gamma makes of light."""
+    return 20 + 200 * (np.maximum(counts - 20, 0) / 200) ** gamma
+
+
+def test_a_wrong_scale_of_the_zenith_is_reported():
+    with pytest.warns(io.MirrorskinWarning, match=r"zeniths are wrong by .* %"):
+        result = fuse_recordings(pressed_waves(1), turned_waves(2, gain=1.05), register=False)
+    gain, offset = (result.process[f"slope_{name}_error"] for name in ("gain", "offset"))
+    middle = np.radians(30)
+    assert (1 + gain) * middle + offset == pytest.approx(1.05 * middle, rel=0.01)
+
+
+def drifting(counts):
+    """Return frames whose dark level rises."""
+    return counts + np.linspace(0, 4, len(counts))[:, np.newaxis, np.newaxis]
+
+
+def test_what_a_press_and_a_rotation_disagree_about_is_part_of_the_standard_deviation():
+    with pytest.warns(io.MirrorskinWarning, match=r"disagree by \d+ µm"):
+        result = fuse_recordings(pressed_waves(1), turned_waves(2, light=drifting), register=False)
+    assert chi_square(result) < 2  # 42 without it
+    error = (result.height - waves()[0])[result.contact > 0]
+    assert 0.7 * rms(error) < result.process["disagreement"] < 2 * rms(error)
+
+
+def test_maps_that_contradict_each_other_are_told_of():
+    height, *slope = waves()
+    normals = np.stack([-slope[0] * 1.1, -slope[1], np.ones_like(height)], axis=-1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    with pytest.warns(io.MirrorskinWarning, match="heights and normals disagree"):
+        engine.fuse(heights(height, 0.003), directions(normals, sigma=0.005), WAVES_PIXEL)

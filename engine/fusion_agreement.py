@@ -1,0 +1,201 @@
+"""Whether heights and slopes of the same surface contradict each other, and by which error of the slopes.
+
+A wrong gain or offset of the zenith, a response that is not linear, or light that changes during the rotation
+bends the surface by far more than the noise: its error is common to neighbours. Heights of a press show it
+where they overlap with slopes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.engine.rotation.normals_to_height import Slopes
+from mirrorskin.io.findings import Finding, in_process
+from mirrorskin.io.types import ProcessValue
+from mirrorskin.kernels.array_types import Doubles
+
+_CELL, _IN_CELL = 16, 64  # pixels along the side of a cell, and least number of them with both
+_FEWEST, _CLEAR = 4, 3.0  # least number of cells, and standard deviations of their mean square that decide
+_LINES, _APART = 48, 4  # largest number of lines in each direction; least pixels between them
+_LONGEST, _SHORTEST = 64, 8  # pixels of a part of a line
+_WITH_HEIGHT = 4  # pixels with a height that a part needs
+_FEWEST_PARTS = 12
+_SIGNIFICANT = 30.0  # chi^2 of a gain and an offset
+_MOST_GAIN, _MOST_OFFSET = 0.25, math.radians(10)  # larger errors than these are something else
+_LEVEL = 0.05  # least slope at which an offset of the zenith has a direction
+
+
+@dataclass(frozen=True, slots=True)
+class SlopeError:
+    """Error of the zenith of slopes: it is (1 + gain) times the true zenith, plus the offset, radians."""
+
+    gain: float = 0.0
+    offset: float = 0.0
+
+    def corrected(self, slopes: Slopes) -> Slopes:
+        """Return slopes without this error."""
+        if self == SlopeError():
+            return slopes
+        steepness = np.hypot(slopes.dz_dx, slopes.dz_dy)
+        zenith = np.arctan(steepness)
+        true = np.maximum(zenith - np.where(steepness > _LEVEL, self.offset, 0.0), 0.0) / (1 + self.gain)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            factor = np.where(steepness > 0, np.tan(true) / steepness, 1.0).astype(np.float32)
+        return replace(slopes, dz_dx=slopes.dz_dx * factor, dz_dy=slopes.dz_dy * factor)
+
+    def after(self, other: SlopeError) -> SlopeError:
+        """Return this error and another one, which was removed before."""
+        return SlopeError(
+            (1 + self.gain) * (1 + other.gain) - 1, self.offset * (1 + other.gain) + other.offset
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Disagreement:
+    """Difference of heights from the surface of these heights and of slopes.
+
+    Attributes
+    ----------
+    chi2 : float
+        Mean over cells of the square of the mean difference over its variance, if errors of pixels are
+        independent: below 1 unless heights and slopes contradict each other. NaN with too few cells.
+    clear : bool
+        Whether this mean is above 1 by more than chance.
+    rms : float
+        RMS difference, weighted as in the surface, mm.
+    slope_error : SlopeError, optional
+        The error of the slopes, if they disagree and one is significant.
+    """
+
+    chi2: float = math.nan
+    clear: bool = False
+    rms: float = math.nan
+    slope_error: SlopeError | None = None
+
+
+def find_disagreement(
+    surface: NDArray[np.floating],
+    height: Doubles,
+    weight: Doubles,
+    slopes: Slopes,
+    pixel_size: tuple[float, float],
+) -> Disagreement:
+    """Compare a surface, (H, W), with the heights and weights from which it was computed with slopes."""
+    both = slopes.known & (weight > 0) & np.isfinite(surface)
+    firm = np.where(both, weight, 0.0)
+    error = np.where(both, height - surface, 0.0)
+    pixels, total, first = (_cells(values) for values in (both, firm, firm * error))
+    enough = (pixels >= _IN_CELL) & (total > 0)
+    count = int(np.count_nonzero(enough))
+    if count < _FEWEST:
+        return Disagreement()
+    chi2 = float(np.mean(first[enough] ** 2 / total[enough]))
+    rms = math.sqrt(float(np.sum(firm * error**2) / np.sum(firm)))
+    clear = chi2 > 1 + _CLEAR * math.sqrt(2 / count)
+    return Disagreement(
+        chi2, clear, rms, find_slope_error(slopes, height, firm, pixel_size) if clear else None
+    )
+
+
+def describe_disagreement(found: Disagreement, error: SlopeError) -> dict[str, ProcessValue]:
+    """Return what a result's process says of a disagreement, and of the error that was removed before."""
+    process: dict[str, ProcessValue] = {}
+    findings = []
+    if error != SlopeError():
+        process |= {"slope_gain_error": error.gain, "slope_offset_error": error.offset}
+        findings.append(
+            Finding(
+                "slope error",
+                f"heights show that the normals' zeniths are wrong by {100 * error.gain:+.2g} % plus"
+                f" {math.degrees(error.offset):+.2g} degrees: this is corrected in the surface, not in the"
+                " normals. Calibrate the zenith's gain and offset",
+            )
+        )
+    if found.clear:
+        process["disagreement"] = found.rms
+        findings.append(
+            Finding(
+                "disagreement",
+                f"heights and normals disagree by {1000 * found.rms:.2g} µm, which height_sigma includes:"
+                " do both show the same surface, is the zenith's response calibrated, and is the light"
+                " steady?",
+            )
+        )
+    return process | in_process(findings, {})
+
+
+def find_slope_error(
+    slopes: Slopes, height: Doubles, weight: Doubles, pixel_size: tuple[float, float]
+) -> SlopeError | None:
+    """Return the error of the zenith that heights and their weights show; None if it is not significant.
+
+    Slopes are summed along parts of rows and columns. To first order, an error of the zenith theta by
+    g theta + o changes the slope t = tan(theta) by (1 + t^2) (g theta + o). Both are fitted to the heights,
+    with a free height of each part; their covariance is from the scatter of the parts, within which errors
+    are correlated.
+    """
+    dz_dx, dz_dy = (values.astype(np.float64) for values in (slopes.dz_dx, slopes.dz_dy))
+    steepness = np.hypot(dz_dx, dz_dy)
+    rise = 1 + steepness**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        factors = (
+            np.where(steepness > 0, rise * np.arctan(steepness) / steepness, 0.0),
+            np.where(steepness > _LEVEL, rise / steepness, 0.0),
+        )
+    parts = []
+    for slope, size, turned in ((dz_dx, pixel_size[0], False), (-dz_dy, pixel_size[1], True)):
+        maps = [slope * size, *(factor * slope * size for factor in factors), slopes.known, height, weight]
+        parts += _parts([values.T for values in maps] if turned else maps)
+    if len(parts) < _FEWEST_PARTS:
+        return None
+    matrix = np.sum([normal for normal, _ in parts], axis=0)
+    right = np.sum([values for _, values in parts], axis=0)
+    if np.linalg.cond(matrix) > 1e12:
+        return None
+    error = np.linalg.solve(matrix, right)
+    scatter = np.stack([values - normal @ error for normal, values in parts])
+    inverse = np.linalg.inv(matrix)
+    covariance = inverse @ (scatter.T @ scatter) @ inverse
+    chi2 = float(error @ np.linalg.solve(covariance, error))
+    gain, offset = (float(value) for value in error)
+    if not chi2 > _SIGNIFICANT or abs(gain) > _MOST_GAIN or abs(offset) > _MOST_OFFSET:
+        return None
+    return SlopeError(gain, offset)
+
+
+def _parts(maps: Sequence[NDArray[Any]]) -> list[tuple[Doubles, Doubles]]:
+    """Return the normal equations of parts of rows: of errors that raise the slopes, less a common height."""
+    slope, by_gain, by_offset, known, height, weight = maps
+    rows = slope.shape[0]
+    parts = []
+    step = max(_APART, -(-rows // _LINES))
+    for row in range(step // 2, rows, step):
+        ends = np.flatnonzero(np.diff(known[row].astype(np.int8), prepend=0, append=0))
+        for start, end in zip(ends[::2], ends[1::2], strict=True):
+            for first in range(start, end, _LONGEST):
+                part = row, slice(first, min(first + _LONGEST, end))
+                used = weight[part]
+                if len(used) < _SHORTEST or np.count_nonzero(used) < _WITH_HEIGHT:
+                    continue
+                values = np.stack([by_gain[part], by_offset[part], slope[part]])
+                sums = np.zeros(values.shape)
+                np.cumsum((values[:, 1:] + values[:, :-1]) / 2, axis=1, out=sums[:, 1:])
+                # Slopes that contain the error rise by too much: heights less sums are minus its sums.
+                sums[2] -= np.where(used > 0, height[part], 0.0)
+                sums -= (sums @ used / used.sum())[:, np.newaxis]
+                normal = (sums * used) @ sums.T
+                parts.append((normal[:2, :2], normal[:2, 2]))
+    return parts
+
+
+def _cells(values: NDArray[Any]) -> Doubles:
+    """Return the sums over square cells; the last rows and columns that fill none are left out."""
+    rows, columns = (size // _CELL for size in values.shape)
+    whole = values[: rows * _CELL, : columns * _CELL].astype(np.float64)
+    return np.asarray(whole.reshape(rows, _CELL, columns, _CELL).sum(axis=(1, 3)))
