@@ -118,7 +118,8 @@ class ArrayRecording(Recording):
             self.time = None if reader.time is None else reader.time[slice(*cut.frames)]
             self.dropped = None if lost is None else lost[slice(*cut.frames)]
             self.left_out, self.findings = reader.left_out, (*reader.findings, *decoding.findings)
-        self.storage, self._next, self._hash = "one piece", 0, ""
+        self.storage = reader.how if isinstance(reader, WholeFrames) else "one piece"
+        self._next, self._hash = 0, ""
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
         """Return the next frames, at most as many as ``out`` holds: a view of the array, or in ``out``."""

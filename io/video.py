@@ -37,6 +37,7 @@ _OPTIONS = {
     "protocol_whitelist": "file",
     "format_whitelist": "avi,mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,mpeg,mpegts,asf,flv,ogg,nut",
 }
+_LIMIT = {"max_pixels": str(MAX_UNPACKED_BYTES // 3)}  # also while the file is opened
 _ALL_FRAMES = {"ignore_editlist": "1"}
 _INSTALL = "videos need mirrorskin[video]: pip install 'mirrorskin[video]'"
 _KEPT = 256_000_000  # bytes of decoded frames that are kept in memory, by default
@@ -137,9 +138,8 @@ class VideoFrames(WholeFrames):
         av = load_av(self._path)
         try:
             place = str(self._path.absolute())
-            container = av.open(
-                place, "r", container_options={**_OPTIONS, **options}, metadata_errors="replace"
-            )
+            given = _OPTIONS | options | _LIMIT
+            container = av.open(place, "r", options=given, metadata_errors="replace")
         except Exception as error:  # of many types
             raise self._not_a_video() from error
         try:
@@ -150,7 +150,7 @@ class VideoFrames(WholeFrames):
             check_unpacked(
                 3 * context.width * context.height, f"{self._path}: a frame", "encode it in a smaller size"
             )
-            context.options = {"max_pixels": str(MAX_UNPACKED_BYTES // 3)}
+            context.options = _LIMIT
         except BaseException:
             container.close()
             raise

@@ -27,12 +27,14 @@ def frames(tmp_path_factory):
         return read_all(recording, 12).frames
 
 
-def write_video(path, frames):
+def write_video(path, frames, stamps=None):
     with av.open(str(path), "w") as container:
         stream = container.add_stream("ffv1", rate=25)
         stream.height, stream.width, stream.pix_fmt = *frames.shape[1:], "gray"
-        for picture in frames:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "gray")))
+        for number, picture in enumerate(frames):
+            one = av.VideoFrame.from_ndarray(picture, "gray")
+            one.pts = number if stamps is None else int(stamps[number])
+            container.mux(stream.encode(one))
         container.mux(stream.encode(None))
 
 
@@ -145,6 +147,15 @@ def test_arrays_have_no_channels(tmp_path, monkeypatch, frames, name):
     np.save("ball.npy", frames)
     record(ball((12, 16), (0.4, 0.4), TRAVEL), "ball.h5")
     refused("have channels: leave --channel out", "reconstruct", name, *STEPS, "--channel", 1)
+
+
+def test_time_stamps_of_an_import_stay_in_the_recording(tmp_path, monkeypatch, frames):
+    monkeypatch.chdir(tmp_path)
+    stamps = np.cumsum([0, 1, 1, 1, 2, 1, 1, 1, 1, 1, 3, 1])
+    write_video("film.mkv", frames, stamps)
+    assert run("import", "film.mkv", "--motion", "vertical", *STEPS, *SIZE, "-o", "rec.h5").code == 0
+    with io.open_recording("rec.h5") as recording:
+        np.testing.assert_allclose(recording.time, stamps / 25, atol=1e-9)
 
 
 def test_lost_frames_of_an_import_stay_in_the_recording(tmp_path, monkeypatch, frames):

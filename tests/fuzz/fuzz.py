@@ -136,7 +136,8 @@ def _make_recordings(folder: Path) -> None:
         for compression in ("raw", "gzip", "bitshuffle"):
             path = folder / f"{motion}-{compression}.h5"
             _do(run("simulate", motion, "--compression", compression, "--frames", 12, *small, path))
-        _do(run("reconstruct", folder / f"{motion}-raw.h5", "-o", folder / f"{motion}-result.h5"))
+        ended = run("reconstruct", folder / f"{motion}-raw.h5", "-o", folder / f"{motion}-result.h5")
+        assert ended.code in (0, 1), ended.said  # 1: there is a result, without an answer
     io.save_calibration(a_calibration(), folder / "calibration.h5")
     result = folder / "vertical-result.h5"
     for suffix in (".ply", ".stl", ".zarr", ".npz"):
@@ -428,7 +429,10 @@ def _command(path: Path, sound: Path) -> bool:
         if ended.code not in (0, 1, 2) or not said.replace("\n", "").isprintable():
             raise AssertionError(f"mirrorskin {' '.join(map(str, words))[:200]}: {ended.code} {said[:200]!r}")
         lines = ended.said.splitlines()
-        if ended.code and words[0] != "batch" and not (lines and lines[-1].startswith("mirrorskin: ")):
+        stated = bool(lines) and lines[-1].startswith("mirrorskin: ")
+        if ended.code == 1:  # a result without an answer
+            stated = stated or any(line.startswith("warning: ") for line in lines)
+        if ended.code and words[0] != "batch" and not stated:
             raise AssertionError(
                 f"mirrorskin {' '.join(map(str, words))[:200]}: no reason {ended.said[:200]!r}"
             )
