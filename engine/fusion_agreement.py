@@ -21,7 +21,10 @@ from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.array_types import Doubles
 
 _CELL, _IN_CELL = 16, 64  # pixels along the side of a cell, and least number of them with both
-_FEWEST, _CLEAR = 4, 3.0  # least number of cells, and standard deviations of their mean square that decide
+_FEWEST, _CLEAR = (
+    4,
+    1.0,
+)  # least number of cells, and standard deviations of their mean square above 1 that decide
 _LINES, _APART = 48, 4  # largest number of lines in each direction; least pixels between them
 _LONGEST, _SHORTEST = 64, 8  # pixels of a part of a line
 _WITH_HEIGHT = 4  # pixels with a height that a part needs
@@ -68,7 +71,7 @@ class Disagreement:
     clear : bool
         Whether this mean is above 1 by more than chance.
     rms : float
-        RMS difference, weighted as in the surface, mm.
+        RMS difference, weighted as in the surface, mm; without contradiction, that of the means of cells.
     slope_error : SlopeError, optional
         The error of the slopes, if they disagree and one is significant.
     """
@@ -96,8 +99,10 @@ def find_disagreement(
     if count < _FEWEST:
         return Disagreement()
     chi2 = float(np.mean(first[enough] ** 2 / total[enough]))
-    rms = math.sqrt(float(np.sum(firm * error**2) / np.sum(firm)))
     clear = chi2 > 1 + _CLEAR * math.sqrt(2 / count)
+    mean = first[enough] / total[enough]
+    square = np.sum(firm * error**2) / np.sum(firm) if clear else np.average(mean**2, weights=total[enough])
+    rms = math.sqrt(float(square))
     return Disagreement(
         chi2, clear, rms, find_slope_error(slopes, height, firm, pixel_size) if clear else None
     )

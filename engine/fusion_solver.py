@@ -41,6 +41,7 @@ _NEARLY_ALL = 0.9  # quantile of the errors from which the used share of the int
 _LEAST_USED = 0.5  # smallest used share of the intervals
 _FIRST = 1e-4  # tolerance of the surfaces before the last; with 1e-5, errors are the same within 0.1 %
 _CORRECTIONS = 3  # largest number of corrections of the slopes
+_IMPROVED = 0.5  # share of the disagreement that a correction must leave at most
 _ITERATIONS = 5  # largest number of updates of the components' offsets
 _SETTLED = 1e-3  # change of an offset, in half intervals, that ends them
 
@@ -90,21 +91,22 @@ class FusionSolver:
         """Return the surface of the heights and given slopes.
 
         If heights and slopes contradict each other, the error of the zenith that explains it best is removed
-        from the slopes, and what is left is added to ``height_sigma``.
+        from the slopes, and the difference that is left is part of ``height_sigma``.
         """
         if not (slopes.known | self._press.known).any():
             raise InputError("there is nothing to fuse: no pixel has a height or a normal")
         surface, self._disagreement = self._fit(self._slope_error.corrected(slopes), sigma)
+        contradict = self._disagreement.clear or self._slope_error != SlopeError()
         for _ in range(_CORRECTIONS):
             if not self._disagreement.clear or self._disagreement.slope_error is None:
                 break
             before, near = (surface, self._disagreement, self._slope_error), self._near
             self._slope_error = self._disagreement.slope_error.after(self._slope_error)
             surface, self._disagreement = self._fit(self._slope_error.corrected(slopes), sigma)
-            if not self._disagreement.chi2 < before[1].chi2:
+            if not self._disagreement.chi2 < _IMPROVED * before[1].chi2:
                 (surface, self._disagreement, self._slope_error), self._near = before, near
                 break
-        if not self._disagreement.clear or surface.height_sigma is None:
+        if not contradict or surface.height_sigma is None:
             return surface
         larger = np.hypot(surface.height_sigma, np.float32(self._disagreement.rms))
         return surface.assign(height_sigma=larger)
