@@ -123,9 +123,10 @@ def estimate_noise(first: NDArray[np.float64], second: NDArray[np.float64], inte
 def estimate_noise_of_all(samples: NDArray[Any]) -> float:
     """Estimate the standard deviation of a sample, counts, from the same pixels of all frames, (T, n).
 
-    It is the median over pairs of consecutive frames, at most 16, so that a frame that is there twice, a
-    lamp that settles, or a plate that turns light at once are outliers. Samples at an end of the scale, where
-    noise is cut off, are left out.
+    It is the median over pairs of consecutive frames, at most 16, so that a frame that is there twice, or a
+    lamp that settles, counts little. Pixels that turn light, or dark, all change in one direction, and noise
+    changes as many in the other: the direction with the smaller changes tells the noise. Samples at an end of
+    the scale, where noise is cut off, are left out.
     """
     integer = samples.dtype.kind == "u"
     pairs = np.unique(np.linspace(0, len(samples) - 2, _PAIRS).round().astype(int))
@@ -137,15 +138,25 @@ def estimate_noise_of_all(samples: NDArray[Any]) -> float:
     enough = np.count_nonzero(usable, axis=1) >= _FEWEST
     if not enough.any():
         return math.nan
-    usable, difference = usable[enough], np.abs(second - first)[enough]
-    middle = np.sort(np.where(usable, difference, np.inf), axis=1)
-    spread = middle[np.arange(len(middle)), np.count_nonzero(usable, axis=1) // 2] / _MEDIAN
-    spread = np.maximum(spread, 1.0 if integer else 0.0)
-    for _ in range(_ROUNDS):
-        kept = usable & (difference <= _CLIP * spread[:, np.newaxis])
-        spread = np.sqrt(np.mean(difference**2, axis=1, where=kept))
+    change = np.where(usable, second - first, np.nan)[enough]
+    spread = np.minimum(_side(change, integer), _side(-change, integer))
     noise = float(np.median(spread)) / math.sqrt(2)
     return max(noise, QUANTUM) if integer else noise
+
+
+def _side(change: NDArray[np.float32], integer: bool) -> NDArray[np.float64]:
+    """Return the standard deviation of changes, (P, n), from those below 0, without outliers."""
+    below, same = change < 0, np.count_nonzero(change == 0, axis=1) / 2
+    count = np.count_nonzero(below, axis=1)
+    square = np.where(below, change * change, 0)
+    ordered = np.sort(np.where(below, square, np.inf), axis=1)
+    place = np.clip(((count + same) / 2 - same).astype(int), 0, None)  # of the median, after the zeros
+    middle = np.sqrt(ordered[np.arange(len(ordered)), np.minimum(place, np.maximum(count - 1, 0))])
+    spread = np.maximum(np.where(count > 0, middle, 0) / _MEDIAN, 1.0 if integer else 0.0)
+    for _ in range(_ROUNDS):
+        kept = below & (square <= (_CLIP * spread[:, np.newaxis]) ** 2)
+        spread = np.sqrt(np.sum(square, axis=1, where=kept) / np.maximum(kept.sum(axis=1) + same, 1))
+    return np.asarray(spread)
 
 
 def noise_of_residual(residual: NDArray[Any], freedom: ArrayLike) -> float:

@@ -105,7 +105,10 @@ def status_shares(result: Result) -> str:
 
     Examples
     --------
-    >>> status_shares(Result(height=np.zeros((1, 2)), status=np.array([[1, 2]], np.uint8)))
+    >>> from mirrorskin import engine
+    >>> frames = np.zeros((4, 1, 2), np.uint8)
+    >>> frames[2:, 0, 0] = 255
+    >>> status_shares(engine.find_onset(frames, [0.0, 0.1, 0.2, 0.3], dark=0, bright=255))
     'onset at 50 %, never light at 50 %'
     """
     status = result.get("status")

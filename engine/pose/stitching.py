@@ -97,7 +97,7 @@ def stitch(
     ...     height = 0.2 * np.sin(x - at) * np.cos(y)
     ...     return io.Result(height=height, height_sigma=0.1 * sigma, normals=normals, normals_sigma=sigma)
     >>> whole = engine.pose.stitch([waves(0.0), waves(-1.0)], pixel_size=0.1)
-    >>> whole.result.height.shape, whole.poses[1].translation.round(2).tolist()
+    >>> whole.result.height.shape, (whole.poses[1].translation.round(2) + 0.0).tolist()
     ((41, 71), [-1.0, 0.0, 0.0])
     """
     if not isinstance(results, Sequence) or isinstance(results, str):

@@ -64,7 +64,7 @@ def refused(path):
     [
         (b"", "input data was truncated"),
         (b"# a page\n", "the JSON is malformed"),
-        (b"\x89PNG\r\n\xff\xfe", "JSON is malformed"),
+        (b"\x89PNG\r\n\xff\xfe", "is not text"),
         (b'{"date": NaN}', "JSON is malformed"),
         (b"[" * 100_000, "expected `object`, got `array`"),
         (b'{"cases": ' + b"[" * 100_000, "expected `object`, got `array`"),

@@ -88,7 +88,7 @@ def test_unusable_values_are_refused(tmp_path: Path, name: str, values: NDArray[
 def test_files_that_are_not_what_they_claim(tmp_path: Path, name: str, content: bytes) -> None:
     path = tmp_path / name
     path.write_bytes(content)
-    refused(path, "is not a NumPy array|is neither a PNG nor a TIFF|is damaged")
+    refused(path, "is not a NumPy array|is neither a PNG nor a TIFF|is not a TIFF|is damaged")
 
 
 @pytest.mark.parametrize("name", ["missing.npy", "missing.png"])
