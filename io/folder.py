@@ -43,11 +43,13 @@ class FolderFrames(WholeFrames):
         numbers, self.files, self.left_out = _find_sequence(folder)
         self._channel = channel
         self.lost, numbering = _lost(numbers)
-        first = decode_picture(self.files[0])
-        frame = to_grey(first.samples, str(self.files[0]), channel)
+        first_of_each = {file.suffix.lower(): file for file in reversed(self.files)}
+        pictures = {file: decode_picture(file) for file in sorted(first_of_each.values())}
+        frame = to_grey(pictures[self.files[0]].samples, str(self.files[0]), channel)
         self.shape, self.dtype = (len(self.files), *frame.shape), frame.dtype
-        seen = [one for one in first.findings if channel is None or one.kind != "colour"]
-        self.findings = (*numbering, *lost_frames(self.lost), *seen)
+        seen = dict.fromkeys(found for picture in pictures.values() for found in picture.findings)
+        kept = [found for found in seen if channel is None or found.kind != "colour"]
+        self.findings = (*numbering, *lost_frames(self.lost), *kept)
 
     def frames(self, start: int, stop: int) -> Iterator[tuple[str, NDArray[Any]]]:
         """Decode pictures."""

@@ -59,6 +59,7 @@ _MOST_PACKED = 255  # largest compression ratio accepted for all chunks of a fil
 
 # From the file format (https://mcap.dev/spec): opcode and length, then the fields.
 _RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
+_HEADER_BYTES = 12  # of a message in CDR: encapsulation, seconds and nanoseconds
 _FOOTER, _FOOTER_CODE = struct.Struct("<BQQQI8s"), 2
 
 # The fields of standard ROS 2 messages.
@@ -345,8 +346,9 @@ class MessageFrames(WholeFrames):
     """The images of one topic of a ROS 2 MCAP file.
 
     Grey images are used unchanged; colours become grey as in ``to_grey``. ``positions`` are read from
-    ``/travel`` (m), ``/phase`` and ``/twist`` (rad), if there is one message per image. ``time`` is the log
-    time relative to the first image. A jump of the messages' sequence numbers is a gap of lost frames.
+    ``/travel`` (m), ``/phase`` and ``/twist`` (rad), if there is one message per image. ``time`` is the time
+    stamp in the header of each image, relative to the first, or its log time if these do not increase. A jump
+    of the messages' sequence numbers is a gap of lost frames.
 
     Parameters
     ----------
@@ -373,8 +375,14 @@ class MessageFrames(WholeFrames):
         frame = to_grey(first.samples, str(path), channel)
         self.shape, self.dtype = (count, *frame.shape), frame.dtype
         order = np.argsort(stamps.times, kind="stable")
-        seconds = (stamps.times[order] - stamps.times.min()) / _SECOND
-        self.time = seconds if bool(np.all(np.diff(seconds) > 0)) else None
+        self.time = next(
+            (
+                (times - times[0]) / _SECOND
+                for times in (stamps.stamps[order], stamps.times[order])
+                if bool(np.all(times[1:] > times[:-1]))
+            ),
+            None,
+        )
         self.lost = _lost(stamps.numbers[order])
         self.positions = dict(self._numbers(count))
         self.header = dict(self._properties(frame.shape))
@@ -446,11 +454,11 @@ class MessageFrames(WholeFrames):
                     yield name, found[0] if found[0].shape == shape else found[0][0, 0]
 
     def _stamps_of(self, topic: str) -> _Stamps:
-        """Return the log times and sequence numbers of the messages of a topic, in the order of storage."""
+        """Return the times and sequence numbers of the messages of a topic, in the order of storage."""
         if topic not in self._known:
             with self._naming():
-                stamps = [(one.log_time, one.sequence) for one in self._stored(topic)]
-            self._known[topic] = _Stamps(*np.array(stamps, np.uint64).reshape(-1, 2).T)
+                found = [(one.log_time, one.sequence, _stamp_in(one.data)) for one in self._stored(topic)]
+            self._known[topic] = _Stamps(*np.array(found, np.uint64).reshape(-1, 3).T)
         return self._known[topic]
 
     def _messages(self, topic: str) -> Iterator[Any]:
@@ -546,8 +554,9 @@ class MessageFrames(WholeFrames):
 
 
 class _Stamps(NamedTuple):
-    times: NDArray[np.uint64]  # nanoseconds
+    times: NDArray[np.uint64]  # nanoseconds, when a message was logged
     numbers: NDArray[np.uint64]  # sequence numbers; 0 if the writer does not count
+    stamps: NDArray[np.uint64]  # nanoseconds, in the header of an image
 
 
 class _Channel(NamedTuple):
@@ -600,6 +609,14 @@ def _messages_in(records: bytes, wanted: set[int]) -> Iterator[Message]:
             data = records[start + _MESSAGE.size : at]
             if number in wanted:
                 yield Message(number, logged, data, published, sequence)
+
+
+def _stamp_in(data: bytes) -> int:
+    """Return the time stamp of a message that begins with a header, in nanoseconds; 0 if it has none."""
+    if len(data) < _HEADER_BYTES:
+        return 0
+    seconds, rest = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
+    return int(max(0, seconds) * _SECOND + rest)
 
 
 def _decoder(kind: str) -> Callable[[bytes], Any]:

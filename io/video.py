@@ -286,6 +286,13 @@ class VideoFrames(WholeFrames):
         name, codec = str(self._path), stream.codec
         if codec.lossy and not (codec.lossless and stream.codec_context.profile in _LOSSLESS_PROFILES):
             yield lossy(codec.canonical_name)
+        if frame.interlaced_frame:
+            text = "a frame has two fields of different times, in alternate rows: record progressive frames"
+            yield Finding("interlaced", text)
+        aspect = float(stream.sample_aspect_ratio or 1)
+        if aspect > 0 and aspect != 1:
+            text = f"pixels are displayed {aspect:.4g} times as wide as high: give --pixel-size X,Y"
+            yield Finding("pixel aspect", text)
         bits = max(part.bits for part in frame.format.components)
         if bits < 8:
             text = f"{bits} bits a sample are scaled to 8: small changes of brightness are lost"

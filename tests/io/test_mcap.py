@@ -350,6 +350,15 @@ def test_sequence_numbers_that_do_not_count_images_are_ignored(tmp_path, numbers
         assert source.findings == ()
 
 
+def test_times_are_those_at_which_the_images_were_taken(tmp_path):
+    values = []
+    for number, logged in enumerate((5, 9, 10)):
+        head = {"header": {"stamp": {"sec": 100 + number, "nanosec": 250}, "frame_id": "camera"}}
+        values.append((logged * 10**7, grey(number) | head))
+    with opened(write_messages(tmp_path / "a.mcap", "/a", IMAGE, values)) as source:
+        np.testing.assert_allclose(source.time, [0, 1, 2])
+
+
 def test_images_can_be_read_in_any_order(film):
     grey = np.arange(12, dtype=np.uint8).reshape(3, 4)
     with opened(film(("/a", grey)), frames=(0, 3), region=io.Region((1, 3), (1, 4))) as source:

@@ -279,6 +279,13 @@ def test_jpeg_is_read_with_a_warning(tmp_path):
     assert (found.kind, found.warning) == ("lossy compression", True)
 
 
+def test_a_loss_is_reported_wherever_it_is(tmp_path):
+    cv2.imwrite(str(tmp_path / "frame1.png"), smooth(0))
+    cv2.imwrite(str(tmp_path / "frame2.jpg"), smooth(0))
+    with opened(tmp_path) as source:
+        assert [found.kind for found in source.findings] == ["lossy compression"]
+
+
 def test_a_jpeg_is_turned_as_it_states(tmp_path):
     _, data = cv2.imencode(".jpg", smooth(0), [cv2.IMWRITE_JPEG_QUALITY, 100])
     tag = struct.pack(">HHIHH", 0x0112, 3, 1, 6, 0)  # orientation: turned clockwise
@@ -355,6 +362,23 @@ def test_a_table_that_is_not_a_scale_of_brightness_is_refused(tmp_path, suffix):
     table = [((97 * k) % 256, 0, (31 * k) % 256) for k in range(16)]
     with pytest.raises(InputError, match="not a scale of brightness: save it in grey"):
         read_picture(with_table(tmp_path / f"a.{suffix}", table))
+
+
+@pytest.mark.parametrize("bits", [1, 4])
+def test_a_bmp_of_few_bits_gives_its_greys(tmp_path, bits):
+    count, head = 1 << bits, 54 + 4 * (1 << bits)
+    greys = (255 // (count - 1) * np.arange(count)).astype(np.uint8)
+    indices = INDICES[:, :8] % count
+    rows = np.packbits(
+        np.unpackbits(indices[..., None], axis=2)[..., 8 - bits :].reshape(len(indices), -1), axis=1
+    )
+    data = np.pad(rows, ((0, 0), (0, -rows.shape[1] % 4)))[::-1].tobytes()
+    start = struct.pack(
+        "<2sIIIIiiHHIIIIII", b"BM", head + len(data), 0, head, 40, 8, 6, 1, bits, 0, 0, 0, 0, 0, 0
+    )
+    table = np.column_stack([greys, greys, greys, 0 * greys]).tobytes()
+    (tmp_path / "a.bmp").write_bytes(start + table + data)
+    np.testing.assert_array_equal(read_picture(tmp_path / "a.bmp"), greys[indices])
 
 
 def test_a_picture_of_one_bit_is_black_and_white(tmp_path):

@@ -331,6 +331,26 @@ def test_few_bits_are_reported(tmp_path):
     assert [one.kind for one in source.findings] == ["few bits", "colour"]
 
 
+def test_pixels_that_are_not_square_are_reported(tmp_path):
+    with av.open(str(tmp_path / "a.mp4"), "w") as container:
+        stream = container.add_stream("mpeg4", rate=int(RATE))
+        stream.height, stream.width, stream.pix_fmt = *SHAPE, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = Fraction(16, 15)
+        for picture in GREY:
+            one = av.VideoFrame.from_ndarray(picture, "gray").reformat(format="yuv420p")
+            container.mux(stream.encode(one))
+        container.mux(stream.encode(None))
+    _, source = frames_of(tmp_path / "a.mp4")
+    (found,) = [one for one in source.findings if one.kind == "pixel aspect"]
+    assert "1.067 times as wide as high" in found.text
+
+
+def test_interlaced_frames_are_reported(tmp_path):
+    path = film(tmp_path / "a.mkv", "mpeg2video", "yuv420p", GREY, flags="+ildct+ilme", field_order="tt")
+    _, source = frames_of(path)
+    assert "interlaced" in [found.kind for found in source.findings]
+
+
 def test_a_palette_gives_its_greys(tmp_path):
     table = np.zeros((256, 4), np.uint8)
     table[:, 0], table[:, 1:] = 255, (255 - np.arange(256))[:, None]
