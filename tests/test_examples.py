@@ -5,9 +5,11 @@ import importlib
 import inspect
 import re
 import runpy
+import sys
 from pathlib import Path
 
 import pytest
+from commands import done
 
 from mirrorskin import engine, io
 
@@ -105,7 +107,21 @@ SLOW = {
     "slip": slipped,
     "vibration": vibrated,
 }
-QUICK = {"coin": measured, "fused": fused, "own_data": measured, "sphere": measured, "steepest_rise": rose}
+
+
+def streamed(printed):
+    ((frames, lowest, highest),) = numbers(printed, r"(\d+) frames: from (\S+) to (\S+) mm")
+    assert (frames, lowest, highest) == (31, pytest.approx(-1.5, abs=0.05), pytest.approx(-0.03, abs=0.05))
+
+
+QUICK = {
+    "coin": measured,
+    "fused": fused,
+    "own_camera": streamed,
+    "own_data": measured,
+    "sphere": measured,
+    "steepest_rise": rose,
+}
 
 
 def test_every_script_of_the_examples_is_tested():
@@ -116,6 +132,9 @@ def test_every_script_of_the_examples_is_tested():
 def test_a_script_of_the_examples_runs_and_prints_what_is_true(name, monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")
+    if name == "own_camera":  # a video takes the place of a camera
+        done("sample video -o press.avi")
+        monkeypatch.setattr(sys, "argv", ["own_camera.py", "press.avi"])
     runpy.run_path(str(ROOT / "examples" / f"{name}.py"), run_name="__main__")
     (SLOW | QUICK)[name](capsys.readouterr().out)
-    assert list(tmp_path.glob("*.png")) or name == "steepest_rise"
+    assert list(tmp_path.glob("*.png")) or name in ("own_camera", "steepest_rise")

@@ -25,7 +25,7 @@ _ORDER = [
     "slip",
     "moving_object",
 ]
-_WITHOUT_FIGURE = {"steepest_rise"}  # described in docs/operations.md
+_WITHOUT_FIGURE = {"own_camera", "steepest_rise"}  # described in docs/live.md and docs/operations.md
 _LONGEST = 300  # seconds
 
 

@@ -1,6 +1,7 @@
 from .loop import LATENCY, Loop
 from .operation import LiveOperation
 from .status import PUSHED, RAISED, SHOWN, STAGES, UPDATED, WAITED, Latency, Maps, Status, Update
+from .stream import Stream
 
 __all__ = [
     "LATENCY",
@@ -15,5 +16,6 @@ __all__ = [
     "Loop",
     "Maps",
     "Status",
+    "Stream",
     "Update",
 ]

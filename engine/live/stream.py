@@ -1,0 +1,278 @@
+"""Frames of one's own camera: pushed from any thread, and looked at at any time."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any, Self, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from mirrorskin.engine.frames import check_dtype
+from mirrorskin.engine.live.loop import LATENCY, Loop
+from mirrorskin.engine.live.operation import LiveOperation
+from mirrorskin.engine.live.status import Status, Update
+from mirrorskin.engine.method import Method
+from mirrorskin.engine.operation import Operation
+from mirrorskin.io import Block, Header, InputError, Motion, Result
+from mirrorskin.io.layout import POSITIONS
+from mirrorskin.io.types import Floats
+
+_WAITING = 64  # frames at most that wait to be processed
+_ENDLESS = 1 << 40  # frames that a stream may have
+
+
+class Stream:
+    """Push frames of one's own camera and stage into an operation, and look at its maps at any time.
+
+    A thread of its own runs the operation by the policy of `Loop`: frames that waited longer than ``latency``
+    are skipped, except for the newest one.
+
+    Parameters
+    ----------
+    operation : Operation or Method
+        Such as ``engine.Press(dark=16, bright=223)``.
+    shape : (int, int)
+        Rows and columns of a frame.
+    dtype : dtype
+        uint8, uint16 or float32.
+    motion : {"vertical", "axial", "horizontal", "twist"}, optional
+        How the body moves; by default the motion that the operation applies to.
+    header : Header, optional
+        What is known of all frames, such as the pixel size; its motion is used.
+    latency : float
+        Seconds; infinite to use all frames: then `push` waits while 64 frames wait.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        The operation cannot run live, or does not apply to the motion.
+
+    Examples
+    --------
+    >>> from mirrorskin import engine
+    >>> press = engine.Press(dark=0, bright=255, fill=False)
+    >>> with engine.live.Stream(press, (2, 3), latency=math.inf) as stream:
+    ...     for travel in (0.0, 0.1, 0.2, 0.3):
+    ...         stream.push(np.full((2, 3), 255 * (travel > 0.15), np.uint8), travel=travel)
+    ...     height = stream.result().height
+    >>> height[0]
+    array([-0.15, -0.15, -0.15], dtype=float32)
+    """
+
+    def __init__(
+        self,
+        operation: Operation | Method,
+        shape: tuple[int, int],
+        dtype: DTypeLike = np.uint8,
+        *,
+        motion: Motion | None = None,
+        header: Header | None = None,
+        latency: float = LATENCY,
+    ) -> None:
+        self._source = _Pushed(_header(operation, motion, header), shape, check_dtype(dtype), latency)
+        self._operation = LiveOperation(self._source, operation)
+        self._operation.warm()
+        self._latest: Update | None = None
+        self._loop = Loop(self._source, self._operation, latency=latency, on_update=self._keep)
+        self._thread = threading.Thread(target=self._run, name="mirrorskin-stream", daemon=True)
+        self._thread.start()
+
+    def push(self, frames: ArrayLike, *, time: float | None = None, **positions: ArrayLike) -> None:
+        """Take in the next frame, (H, W), or frames, (n, H, W): they are copied, and processed later.
+
+        Parameters
+        ----------
+        frames : array_like
+        time : float, optional
+            Seconds, of the newest of them, on the scale of `now`; by default the time of this call.
+        **positions : float or array_like, (n,)
+            Of the body, one of each frame: ``travel``, mm, ``phase`` or ``twist``, radians, or
+            ``displacement``, mm, two numbers.
+
+        Raises
+        ------
+        mirrorskin.io.InputError
+            Frames of another size or type, a position that is missing, or whatever the operation refused.
+        """
+        self._source.put(frames, time, positions)
+
+    def now(self) -> float:
+        """Return the seconds since the stream was made."""
+        return self._source.now()
+
+    def latest(self) -> Update | None:
+        """Return the newest maps, for a display; None before there are any. It does not wait."""
+        self._source.check()
+        return self._latest
+
+    @property
+    def status(self) -> Status:
+        """How many frames were used, skipped and lost, and how long they took."""
+        return self._loop.status
+
+    def result(self) -> Result:
+        """Wait until all frames pushed so far are processed, and return all maps of the operation.
+
+        Raises
+        ------
+        mirrorskin.io.InputError
+            The frames do not determine them, or whatever the operation refused.
+        """
+        self._source.wait()
+        return self._operation.result()
+
+    def close(self) -> None:
+        """End the thread; frames that still wait are processed before."""
+        self._source.end()
+        self._thread.join()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
+    ) -> None:
+        self.close()
+
+    def _keep(self, update: Update, status: Status) -> None:
+        self._latest = update
+
+    def _run(self) -> None:
+        try:
+            self._loop.run()
+        except BaseException as error:  # it is raised by the next call of another thread
+            self._source.fail(error)
+
+
+def _header(operation: Operation | Method, motion: Motion | None, header: Header | None) -> Header:
+    """Return the header of a stream, with its motion."""
+    if header is not None:
+        if motion not in (None, header.motion):
+            raise InputError(f"motion {motion!r} contradicts the header's, {header.motion!r}: leave it out")
+        return header
+    possible = operation.motions or tuple(POSITIONS)
+    if motion is None and len(possible) > 1:
+        name, motions = type(operation).__name__, ", ".join(possible)
+        raise InputError(f"{name} applies to several motions: give motion, one of {motions}")
+    return Header(cast(Motion, motion or possible[0]))
+
+
+class _Pushed:
+    """A live source whose frames are put into it by another thread."""
+
+    name = "stream"
+    rewindable = False
+
+    def __init__(self, header: Header, shape: tuple[int, int], dtype: np.dtype[Any], latency: float) -> None:
+        self.header, self.motion = header, header.motion
+        self.shape, self.dtype = (_ENDLESS, *shape), dtype
+        self._start = time.monotonic()
+        self._keeps_all = latency == math.inf
+        self._changed = threading.Condition()
+        self._waiting: deque[tuple[NDArray[Any], float, dict[str, Floats]]] = deque()
+        self._count = self._lost = 0
+        self._idle = self._ended = False
+        self._error: BaseException | None = None
+
+    def now(self) -> float:
+        return time.monotonic() - self._start
+
+    def positions(self) -> Mapping[str, Floats]:
+        return {}
+
+    def rewind(self) -> None:
+        raise RuntimeError("a stream cannot be rewound")
+
+    def put(self, frames: ArrayLike, at: float | None, positions: Mapping[str, ArrayLike]) -> None:
+        array = np.asarray(frames)
+        single = array.ndim == 2
+        array = array[np.newaxis] if single else array
+        if array.ndim != 3 or array.shape[1:] != self.shape[1:] or array.dtype != self.dtype:
+            raise InputError(
+                f"frames are {array.dtype} {np.shape(frames)}: {self.dtype} {self.shape[1:]} are expected"
+            )
+        known = {name: np.asarray(value, np.float64) for name, value in positions.items()}
+        known = {name: value[np.newaxis] if single else value for name, value in known.items()}
+        needed = POSITIONS[self.motion]
+        wrong = [name for name, value in known.items() if value.shape[:1] != (len(array),)]
+        if needed not in known or wrong:
+            raise InputError(f"{(wrong or [needed])[0]} is needed of each frame: push(frame, {needed}=...)")
+        when = self.now() if at is None else at
+        with self._changed:
+            for number, frame in enumerate(array):
+                if self._keeps_all:
+                    self._changed.wait_for(lambda: len(self._waiting) < _WAITING or self._stopped)
+                self._check()
+                if len(self._waiting) == _WAITING:
+                    self._waiting.popleft()
+                    self._lost += 1
+                here = {name: value[number] for name, value in known.items()}
+                self._waiting.append((frame.copy(), when, here))
+                self._changed.notify_all()
+
+    def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
+        assert out is not None
+        with self._changed:
+            self._idle = True
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: self._waiting or self._ended)
+            self._idle = False
+            taken = [self._waiting.popleft() for _ in range(min(len(out), len(self._waiting)))]
+            lost, self._lost = self._lost, 0
+            self._changed.notify_all()
+        if not taken:
+            return None
+        frames, times, places = zip(*taken, strict=True)
+        part = out[: len(taken)]
+        np.stack(frames, out=part)
+        first, self._count = self._count, self._count + len(taken)
+        known: dict[str, Any] = {name: np.array([one[name] for one in places]) for name in places[0]}
+        return Block(part, first, time=np.array(times), dropped=lost, **known)
+
+    def wait(self) -> None:
+        """Wait until nothing waits and the reader asks for more."""
+        with self._changed:
+            self._changed.wait_for(lambda: (self._idle and not self._waiting) or self._stopped)
+            self._check()
+
+    def end(self) -> None:
+        """Let the reader end after the frames that wait."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+
+    def fail(self, error: BaseException) -> None:
+        """Raise an error at the next call of another thread."""
+        with self._changed:
+            self._error = error
+            self._changed.notify_all()
+
+    def check(self) -> None:
+        """Raise the error that ended the reader, if any."""
+        with self._changed:
+            if self._error is not None:
+                raise self._error
+
+    @property
+    def _stopped(self) -> bool:
+        return self._ended or self._error is not None
+
+    def _check(self) -> None:
+        if self._error is not None:
+            raise self._error
+        if self._ended:
+            raise InputError("the stream is closed: push frames, and ask for its result, before")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
+    ) -> None:
+        self.end()
