@@ -324,7 +324,8 @@ class Traces:
         travel = self._series.get("travel")
         if self._motion != "vertical" or travel is None:
             return False
-        return bool(np.all(np.diff(travel) * (travel[-1] - travel[0]) >= 0))
+        way = float(travel[-1] - travel[0])
+        return way != 0 and bool(np.all(np.diff(travel) * way >= 0))
 
 
 def _percent(share: float) -> str:

@@ -89,6 +89,11 @@ def test_a_rotation_with_travels_is_no_press():
     assert kinds(found(noisy(brightness))) == ["not a press"]
 
 
+def test_a_press_and_its_release_return():
+    there = np.concatenate([pressed()[::2], pressed()[::-2]])
+    assert kinds(found(noisy(there), travel=np.concatenate([TRAVEL[::2], TRAVEL[::2][::-1]]))) == []
+
+
 def test_a_press_with_phases_is_no_rotation():
     assert kinds(found(noisy(pressed()), phase=2 * np.pi * np.arange(30) / 30)) == ["not a rotation"]
 
