@@ -21,6 +21,8 @@
 #define SPREAD 0.3f
 #define SINGLE (1 / 3.0f)
 #define RAMP (1 / 5.0f)
+#define PLATEAU 3
+#define BENT 1.5f
 
 // Hypotheses that the samples miss by so many square sigmas more than the best weigh nothing beside it.
 #define NEGLIGIBLE 40
@@ -279,17 +281,36 @@ float3 weigh(const samples_t *samples, const query_t query)
     return (float3)(mean, square / weight, best);
 }
 
-// The same without the misfit, and with a variance that owns up to it.
+// The variance of a crossing between two samples under way by which an edge that a lens blurs may have crossed
+// elsewhere, beyond what noise explains.
+float variance_of_blur(const samples_t *samples, const query_t query, const float crossing)
+{
+    const int frame = (int)floor(crossing), slot = frame + REACH;
+    if (slot < samples->low || slot + 1 >= samples->high) return 0;
+    const float low = (samples->values[slot + 1] - samples->values[slot]) / STEP;
+    const float high = (samples->values[slot + 2] - samples->values[slot + 1]) / STEP, level = query.level;
+    const float margin = PLATEAU * query.noise;
+    if (low < margin || low >= level || high < level || high > 1 - margin) return 0;
+    // The quantile of a share is proportional to v + BENT v^3, with v the share less a half.
+    const float first = low - 0.5f, second = high - 0.5f, middle = level - 0.5f, rise = high - low;
+    const float both = first * first + first * second + second * second, share = (level - low) / rise;
+    const float bent = share * (1 + BENT * (middle * middle + middle * first + first * first)) / (1 + BENT * both);
+    const float off = frame + bent - crossing, known = query.noise / rise;
+    return fmax(off * off - known * known * (share * share + (1 - share) * (1 - share)), 0.0f);
+}
+
+// The same without the misfit, and with a variance that owns up to it and to a blur.
 float2 estimate(const samples_t *samples, query_t query)
 {
     const float3 found = weigh(samples, query);
     const int freedom = max(samples->high - samples->low - 4, 1);
-    if (found.z <= DOUBT * freedom) return found.xy;
+    const float blur = variance_of_blur(samples, query, found.x);
+    if (found.z <= DOUBT * freedom) return (float2)(found.x, found.y + blur);
     // Samples that no hypothesis fits are noisier than was said, or change in another way.
     query.noise *= sqrt(found.z / freedom);
     const float3 again = weigh(samples, query);
     const float moved = again.x - found.x;
-    return (float2)(found.x, again.y + moved * moved);
+    return (float2)(found.x, again.y + moved * moved + blur);
 }
 
 void gather(

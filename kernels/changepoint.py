@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.kernels.onset import BENT
+
 Array = NDArray[Any]
 Floats = NDArray[np.float64]
 
@@ -33,6 +35,7 @@ STRAIGHT = 0.005  # of the way from dark to bright: no transition is a straight 
 SPIKE = 8  # sigmas by which no sample exceeds both of its neighbours
 DOUBT = 2  # times the expected misfit that the best hypothesis may have
 SPREAD = 0.3  # of that way: by so much a pixel's own levels may differ from those given
+PLATEAU = 3  # sigmas by which a sample on a level may miss it
 SINGLE, RAMP = 1 / 3, 1 / 5  # prior odds, against a sudden change, of one frame under way and of a ramp
 
 
@@ -121,7 +124,9 @@ def changepoint_heights(start: Array, excess: Array, below: Array, since: Array,
     the light level. The levels may differ from those given; the samples under way lie on a straight line that
     meets both levels between the frames where it should. Each says when the level was crossed, and how likely
     the samples are. The answer is the mean over all hypotheses, and the standard deviation that of the
-    answers they give: the Bayes estimate, whose mean square error is the least. A pixel may also hover about
+    answers they give: the Bayes estimate, whose mean square error is the least. Behind a lens that blurs, no
+    change is a straight line: where the samples on both sides of the crossing are under way, its variance
+    contains the square distance to the crossing of a blurred edge between them. A pixel may also hover about
     its level, and noise say when it passes: where the samples do not rise, the change may be anywhere since
     the last frame that was nearer to dark.
 
@@ -148,10 +153,12 @@ def changepoint_heights(start: Array, excess: Array, below: Array, since: Array,
         hovered = (dim > REACH) & _flat(samples, spread)
         crossing, deviation, misfit = _weigh(samples, spread, level, own)
         # Samples that no hypothesis fits are noisier than was said, or change in another way.
+        blur = _variance_of_blur(samples, spread, level, crossing)
         odd = misfit > DOUBT * samples.freedom
         spread = np.where(odd, spread * np.sqrt(misfit / samples.freedom), spread)
         again = _weigh(samples, spread, level, own)
         deviation = np.where(odd, np.hypot(again[1], again[0] - crossing), deviation)
+        deviation = np.hypot(deviation, np.sqrt(blur))
         crossing, deviation = np.where(hovered, (-dim / 2, dim / np.sqrt(12)), (crossing, deviation))
         crossing = np.clip(crossing + start[found], 0, len(travel) - 1)
         height[found] = -_travel_at(travel, crossing)
@@ -330,6 +337,22 @@ def _ramp(
     off = np.clip(crossing - middle, -reach, reach)
     variance = duration**2 * (noise**2 * (1 / length + off**2 / spread) + levels.unsure)
     return np.where(rises, missed, np.inf), prior, middle + off, np.minimum(variance, reach**2 / 3)
+
+
+def _variance_of_blur(samples: _Samples, noise: Floats, level: float, crossing: Floats) -> Floats:
+    """Return by how much an edge that a lens blurs may have crossed elsewhere, beyond what noise explains."""
+    frame = np.floor(crossing).astype(np.intp)
+    slot = np.clip(frame + REACH, samples.low, samples.high - 2)
+    low, high = (samples.total(slot + side, slot + side + 1)[0] for side in (0, 1))
+    under_way = (slot == frame + REACH) & (low < level) & (high >= level)
+    under_way &= (low >= PLATEAU * noise) & (high <= 1 - PLATEAU * noise)
+    rise = np.where(under_way, high - low, 1)
+    first, second, middle, share = low - 0.5, high - 0.5, level - 0.5, (level - low) / rise
+    both = first**2 + first * second + second**2
+    # The quantile of a share is proportional to v + BENT v^3, with v the share less a half.
+    bent = share * (1 + BENT * (middle**2 + middle * first + first**2)) / (1 + BENT * both)
+    variance = (frame + bent - crossing) ** 2 - (noise / rise) ** 2 * (share**2 + (1 - share) ** 2)
+    return np.where(under_way, np.maximum(variance, 0), 0)
 
 
 def _travel_at(travel: Floats, frame: Floats) -> Floats:
