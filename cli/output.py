@@ -46,9 +46,7 @@ def save_and_report(
         click.echo(printable(", ".join([f"{path}: {summary}", *_words(**pieces)])))
     if must_answer and summary.is_empty:
         shares = status_shares(result)
-        if shares and "warnings" not in result.process:
-            click.echo(printable(f"{path}: no {summary.what} at any pixel: {shares}"), err=True)
-        click.get_current_context().exit(1)
+        raise click.ClickException(f"{path}: no {summary.what} at any pixel{shares and f': {shares}'}")
 
 
 def _pieces(result: Result) -> dict[str, int]:

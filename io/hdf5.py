@@ -34,6 +34,7 @@ many bytes as its own size, and ``memory_limit`` raises the limit.
 _LINKS_DEEP = 16
 _MOST_STEPS = 100_000  # through links, and to the sources of virtual datasets
 _GROUPS_DEEP = 64
+_SCALES = b"DIMENSION_LIST"  # attribute with references to the scales of each axis
 _MATLAB_5 = b"MATLAB 5.0 MAT-file"
 _LEAST_FILE = 512  # bytes that every HDF5 file with a dataset has
 _MOST_OBJECTS = 20_000  # groups and datasets in a file
@@ -195,10 +196,8 @@ class Hdf5File(Closing):
         They are those of its dimension scales, such as netCDF has, of its labels, or of NeXus.
         """
         with as_input_error(lambda: self.where(node)):
-            if h5py.h5a.exists(node.id, b"DIMENSION_LIST"):
-                self._check_heaps_of(node.id)
-                scales = [list(node.dims[axis].values())[:1] for axis in range(node.ndim)]
-                return tuple(str(one[0].name).rpartition("/")[2] if one else "" for one in scales)
+            if (scales := self._scales(node)) is not None:
+                return scales
         group = str(node.name).rpartition("/")[0]
         for owner, attribute in ((node, "DIMENSION_LABELS"), (self.find(group), "axes")):
             nexus = attribute == "axes" and owner is not None
@@ -208,6 +207,26 @@ class Hdf5File(Closing):
             if values is not None and values.shape == (node.ndim,):
                 return tuple(str(first_value(value) or "") for value in values)
         return ()
+
+    def _scales(self, node: h5py.Dataset) -> tuple[str, ...] | None:
+        """Return the names of the dimension scales of a dataset; None if it has none.
+
+        HDF5's own functions crash if the attribute has another type.
+        """
+        if not h5py.h5a.exists(node.id, _SCALES):
+            return None
+        attribute = h5py.h5a.open(node.id, _SCALES)
+        kind = attribute.get_type()
+        if attribute.shape != (node.ndim,) or not isinstance(kind, h5py.h5t.TypeVlenID):
+            return None
+        if not kind.get_super().equal(h5py.h5t.STD_REF_OBJ):
+            return None
+        self._check_heaps_of(attribute)
+        lists: NDArray[Any] = np.empty(attribute.shape, attribute.dtype)
+        attribute.read(lists)
+        references = [one[0] if len(one) else None for one in lists]
+        names = [h5py.h5r.get_name(one, node.id) if one else None for one in references]
+        return tuple((name or b"").decode(errors="replace").rpartition("/")[2] for name in names)
 
     def load(self, node: h5py.Dataset, rows: int | None = None) -> NDArray[Any]:
         """Read a dataset, or its first rows, if it is completely stored and within `VALUES_LIMIT`.

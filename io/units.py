@@ -63,6 +63,8 @@ def in_base(symbol: str, kind: Kind) -> float:
     10.0
     """
     known = _COMMON[kind].get(symbol)
+    if known is None and len(symbol) > _LONGEST:  # pint would take long
+        raise ValueError(f"{symbol[:_LONGEST]}... is not a known unit")
     return _pint_factor(symbol, kind) if known is None else known
 
 

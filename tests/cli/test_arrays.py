@@ -235,3 +235,4 @@ def test_a_slide_without_contact_ends_with_the_reason():
     ended = run("reconstruct", "slide.npz", "--pixel-size", "0.1mm", "-o", "none.h5")
     assert ended.code == 1
     assert "slip is known at no pixel (" in ended.said
+    assert "mirrorskin: none.h5: no slip onset at any pixel: " in ended.said

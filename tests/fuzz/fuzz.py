@@ -172,6 +172,8 @@ def _make_frames(folder: Path) -> None:
     cv2.imwrite(str(folder / "deep.png"), frames[-1].astype(np.uint16) * 200)
     tifffile.imwrite(folder / "pages.tif", frames[:4], photometric="minisblack", compression="zlib")
     _make_stacks(folder, frames)
+    assert travel is not None
+    _make_containers(folder, frames, travel)
     tifffile.imwrite(folder / "heights.tif", np.linspace(-1, 0, 480, dtype=np.float32).reshape(20, 24))
     image = "std_msgs/Header header\nstring format\nuint8[] data\n" + "=" * 80
     image += "\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id"
@@ -184,6 +186,24 @@ def _make_frames(folder: Path) -> None:
             message = {"header": head, "format": "png", "data": data}
             messages.write_message("/camera", schema, message, number * 10**7)
         messages.finish()
+
+
+def _make_containers(folder: Path, frames: np.ndarray[Any, Any], travel: np.ndarray[Any, Any]) -> None:
+    """Write stacks with coordinates, packed values and named axes, as xarray and MATLAB do."""
+    import h5py
+    import xarray
+
+    places = {"travel": ("travel", 1000 * travel, {"units": "um"})}
+    for name, count, unit in (("y", frames.shape[1], "mm"), ("x", frames.shape[2], "um")):
+        places[name] = (name, np.arange(count) * 0.4, {"units": unit})
+    known = xarray.Dataset({"frames": (("travel", "y", "x"), frames)}, places)
+    packed = {"frames": {"dtype": "i2", "scale_factor": 0.5, "add_offset": -3.0, "_FillValue": -1}}
+    known.astype("f8").to_netcdf(folder / "packed-netcdf.h5", engine="h5netcdf", encoding=packed)
+    known.transpose("y", "x", "travel").to_netcdf(folder / "named-netcdf.h5", engine="h5netcdf")
+    known.to_zarr(folder / "xarray.zarr", encoding={"frames": {"_FillValue": 255}}, consolidated=False)
+    with h5py.File(folder / "matlab.h5", "w", userblock_size=512) as file:
+        file["frames"] = frames.transpose(0, 2, 1).astype(np.float64)
+        file["frames"].attrs["MATLAB_class"] = np.bytes_("double")
 
 
 def _make_stacks(folder: Path, frames: np.ndarray[Any, Any]) -> None:
@@ -227,6 +247,7 @@ def _make_texts(folder: Path) -> None:
     (folder / "phases.csv").write_text(
         "".join(f"{30 * number}deg\n" for number in range(11)) + "5.7rad # last\n"
     )
+    (folder / "table.csv").write_text("frame;travel [um]\n" + "".join(f"{k};{50 * k}\n" for k in range(12)))
     (folder / "travel.csv").write_text("travel [mm]\n" + "".join(f"{0.1 * number}\n" for number in range(12)))
     (folder / "readings.csv").write_text("recording,newtons\nvertical-raw.h5,1.5\n")
     (folder / "ascii.stl").write_text(TRIANGLES)
@@ -265,6 +286,7 @@ def _of_hdf5(path: Path, sound: Path, out: Path) -> list[Line]:
         ("fuse", press, path, "-o", out / "a.h5"),
         ("correlate", path, "--phase-step", "45deg", "-o", out / "a.h5"),
         ("reconstruct", path, "-o", out / "a.h5"),
+        ("reconstruct", path, "--motion", "vertical", "--travel-step", "0.1mm", "-o", out / "a.h5"),
         ("reconstruct", path, "-o", out / "a.zarr"),
         ("reconstruct", path, "-o", out / "a.h5", "--json", "--method", "change-point"),
         ("reconstruct", press, "--calibration", path, "-o", out / "a.h5"),

@@ -171,7 +171,19 @@ def _change_node(file: h5py.File, name: str, node: Any, chance: random.Random) -
         if chance.random() < 0.5:
             del node.attrs[key]
         else:
-            value = chance.choice([1 << 40, np.nan, np.arange(3), "\x1b[2J", "mm", "\u5de5", np.float32(2)])
+            odd = [
+                1 << 40,
+                np.nan,
+                0,
+                -1.5,
+                np.arange(3),
+                np.empty(0),
+                "\x1b[2J",
+                "mm",
+                "\u5de5",
+                np.float32(2),
+            ]
+            value = chance.choice(odd)
             node.attrs[key] = value
         return
     kind = chance.choice(["drop", "group", "odd", "odd", "odd", "text", "text", "link", "packed"])

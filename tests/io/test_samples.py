@@ -387,3 +387,18 @@ def test_the_surface_of_transposed_frames_is_neither_mirrored_nor_turned(path, o
     with opened(path, travel=travel) as recording:
         found = engine.reconstruct(recording)
     np.testing.assert_allclose(found.height, heights, atol=0.03)
+
+
+@pytest.mark.parametrize("value", [np.arange(3), np.float32(2), "three", np.empty(0)])
+def test_a_list_of_scales_of_another_type_is_no_list(tmp_path, value):
+    with h5py.File(tmp_path / "stack.h5", "w") as file:
+        file["x"] = stack()
+        file["x"].attrs["DIMENSION_LIST"] = value
+    np.testing.assert_array_equal(read(tmp_path / "stack.h5"), stack())
+
+
+def test_a_unit_of_many_letters_is_not_looked_up(path):
+    axes = along_axes() | {"y": ("y", np.arange(SHAPE[1]), {"units": "x" * 100_000})}
+    written(path, stack(), dims=("travel", "y", "x"), **axes)
+    with io.open_recording(path) as recording:
+        assert recording.header.pixel_size is None
