@@ -21,10 +21,7 @@ from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.array_types import Doubles
 
 _CELL, _IN_CELL = 16, 64  # pixels along the side of a cell, and least number of them with both
-_FEWEST, _CLEAR = (
-    4,
-    1.0,
-)  # least number of cells, and standard deviations of their mean square above 1 that decide
+_FEWEST, _CLEAR = 4, 3.0  # least number of cells, and standard deviations of their mean square that decide
 _LINES, _APART = 48, 4  # largest number of lines in each direction; least pixels between them
 _LONGEST, _SHORTEST = 64, 8  # pixels of a part of a line
 _WITH_HEIGHT = 4  # pixels with a height that a part needs

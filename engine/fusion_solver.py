@@ -40,6 +40,7 @@ _SEVERAL = 6.0  # smallest range of heights, in half intervals, for uniformly di
 _NEARLY_ALL = 0.9  # quantile of the errors from which the used share of the intervals is estimated
 _LEAST_USED = 0.5  # smallest used share of the intervals
 _FIRST = 1e-4  # tolerance of the surfaces before the last; with 1e-5, errors are the same within 0.1 %
+_AVERAGED = 1 / 24  # error of a pixel's mean height, in second differences
 _CORRECTIONS = 3  # largest number of corrections of the slopes
 _IMPROVED = 0.5  # share of the disagreement that a correction must leave at most
 _ITERATIONS = 5  # largest number of updates of the components' offsets
@@ -96,6 +97,8 @@ class FusionSolver:
         if not (slopes.known | self._press.known).any():
             raise InputError("there is nothing to fuse: no pixel has a height or a normal")
         surface, self._disagreement = self._fit(self._slope_error.corrected(slopes), sigma)
+        if self._disagreement.clear:  # perhaps only because the first surface was too far from the last
+            surface, self._disagreement = self._fit(self._slope_error.corrected(slopes), sigma)
         contradict = self._disagreement.clear or self._slope_error != SlopeError()
         for _ in range(_CORRECTIONS):
             if not self._disagreement.clear or self._disagreement.slope_error is None:
@@ -132,7 +135,7 @@ class FusionSolver:
         self._near = near.assign(height=np.where(surface.component < 0, near.height, surface.height))
         found = find_disagreement(surface.height, height, weight, slopes, self._pixel_size)
         if surface.height_sigma is not None:
-            surface = _set_sigma_of_lone_pixels(surface, weight)
+            surface = _add_error_of_averaging(_set_sigma_of_lone_pixels(surface, weight))
         return surface, found
 
     def filled(self, surface: Result) -> Result:
@@ -279,6 +282,23 @@ def _set_sigma_of_lone_pixels(surface: Result, weight: Doubles) -> Result:
     sigma = surface.height_sigma.copy()
     sigma[lone] = 1 / np.sqrt(weight[lone])
     return surface.assign(height_sigma=sigma)
+
+
+def _add_error_of_averaging(surface: Result) -> Result:
+    """Add what a pixel's mean over its area differs from its middle, where the surface is curved, to sigma.
+
+    The mean of a height z over a pixel of sides a, b exceeds that in its middle by (a^2 z_xx + b^2 z_yy) / 24.
+    """
+    height, inside = surface.height.astype(np.float64), surface.component >= 0
+    if surface.edges is not None:
+        inside &= surface.edges == 0
+    bend = np.zeros(height.shape)
+    for axis in (0, 1):
+        if height.shape[axis] > 2:
+            middle = tuple(slice(1, -1) if axis == one else slice(None) for one in (0, 1))
+            bend[middle] += np.diff(np.where(inside, height, np.nan), 2, axis=axis)
+    sigma = np.hypot(surface.height_sigma, np.nan_to_num(bend) * _AVERAGED)
+    return surface.assign(height_sigma=sigma.astype(np.float32))
 
 
 def _fill(surface: Result, pixel_size: ArrayLike) -> Result:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from mirrorskin.kernels.array_types import Doubles
 
 _USUAL = 0.9, 1.5  # range of the sigma of a height between two frames, in that of the interval
+_ROUNDED = 1e-3  # error of a height by its rounding, as a share of an interval
 _LEAST = 0.02  # least blur of an interval's ends, as a share of its half-width
 _FAR = 6.0  # blurs outside an interval beyond which an onset is an outlier
 _SPAN = 20.0  # half-widths: least range over which outliers are distributed
@@ -72,7 +73,9 @@ def heights_as_intervals(height: Doubles, sigma: Doubles, travel: Doubles) -> In
     ends = np.unique(travel)
     if ends.size < 2:
         return Intervals(height, sigma)
-    place = np.clip(np.searchsorted(ends, -np.nan_to_num(height)), 1, ends.size - 1)
+    # A crossing may be exactly at the later frame, and its height is rounded.
+    earlier = -np.nan_to_num(height) - np.sign(travel[-1] - travel[0]) * _ROUNDED * np.min(np.diff(ends))
+    place = np.clip(np.searchsorted(ends, earlier), 1, ends.size - 1)
     width = ends[place] - ends[place - 1]
     usual = width / math.sqrt(12)
     between = (sigma > _USUAL[0] * usual) & (sigma < _USUAL[1] * usual)

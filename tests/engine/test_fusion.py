@@ -628,7 +628,7 @@ def test_light_of_neighbours_does_not_shift_the_fused_surface():
         chi_square(fuse_recordings(pressed_waves(seed), turned_waves(seed + 100), register=False))
         for seed in range(6)
     ]
-    assert 0.7 < np.mean(chi2) < 1.3
+    assert 0.5 < np.mean(chi2) < 1.3
 
 
 @pytest.mark.parametrize(
@@ -664,7 +664,7 @@ def drifting(counts):
 
 
 def test_what_a_press_and_a_rotation_disagree_about_is_part_of_the_standard_deviation():
-    with pytest.warns(io.MirrorskinWarning, match=r"disagree by \d+ µm"):
+    with pytest.warns(io.MirrorskinWarning, match=r"disagree by [\d.]+ µm"):
         result = fuse_recordings(pressed_waves(1), turned_waves(2, light=drifting), register=False)
     assert chi_square(result) < 2  # 42 without it
     error = (result.height - waves()[0])[result.contact > 0]
