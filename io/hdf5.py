@@ -449,7 +449,7 @@ def _open_file(path: Path, real: str) -> h5py.File:
                 f"{path} is a netCDF file of version 3, which is not HDF5: convert it with 'nccopy -k nc4'"
             ) from None
         raise InputError(
-            f"{path} is not an HDF5 file; 'mirrorskin import' turns other files into recordings"
+            f"{path} is not an HDF5 file; other formats have suffixes such as .avi, .tif and .npy"
         ) from None
 
 

@@ -33,6 +33,7 @@ _COLOURS = 4  # most channels that may be the colours of one picture; more are f
 _FORMATS = {1: "uint", 2: "int", 3: "float"}  # sample formats (TIFF 6.0, section 19)
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _PALETTE = 0, 1, 3  # photometric interpretations
 _PLAIN = tuple(dtype.name for dtype in FRAME_DTYPES)  # types of samples that are not only grey
+_DECODED = {1, 5, 6, 7, 8, 32773, 32946}  # compressions: none, LZW, JPEG, deflate, PackBits
 _NONE, _LOSSY = 1, {6: "JPEG", 7: "JPEG", 34892: "JPEG"}  # compressions
 _SEPARATE = 2  # planar configuration: one plane per colour
 _MICROMETRE = ("micron", "um", "\\u00B5m")  # as ImageJ writes it
@@ -69,16 +70,19 @@ class TiffFrames(WholeFrames):
         channel: int | None = None,
         dtypes: Sequence[str] = _DTYPES,
     ) -> None:
-        import tifffile
-
         self._path, self.files, self._channel = path, (path,), channel
         check_regular(path, _REMEDY)
-        others = tifffile.TIFF.FILE_FLAGS - {*_KINDS}
-        flags: dict[str, Any] = {f"is_{kind}": False for kind in others}
         with _quiet_tifffile(), ExitStack() as opening:
             try:
-                self._file = opening.enter_context(tifffile.TiffFile(path, _multifile=False, **flags))
+                self._file = opening.enter_context(_open(path))
                 found = list(self._file.series)
+                shaped = bool(found) and all(one.kind == "shaped" for one in found)
+                if shaped and len(found) > 1 and series is None:
+                    plain = opening.enter_context(_open(path, "shaped"))
+                    if sum(map(_frames_in, found)) == sum(map(_frames_in, plain.series)):  # were appended
+                        self._file, found = plain, list(plain.series)
+                elif shaped and sum(len(one.pages) for one in found) < len(self._file.pages):
+                    raise InputError(f"{path} has pages that its metadata do not describe: save it again")
                 complete = bool(found) and self._ends()
                 if self._file.is_imagej:  # without the samples that its metadata state, it is a plain TIFF
                     complete = complete and found[0].kind == "imagej"
@@ -91,11 +95,11 @@ class TiffFrames(WholeFrames):
                 raise InputError(f"{path} cannot be read: {error.strerror or error}") from error
             except Exception as error:  # of many types
                 raise self._damaged() from error
-            opening.pop_all()  # until it is closed
+            self._close = opening.pop_all().close  # until it is closed
 
     def close(self) -> None:
         """Close the file."""
-        self._file.close()
+        self._close()
 
     def frames(self, start: int, stop: int) -> Iterator[tuple[str, NDArray[Any]]]:
         """Decode frames."""
@@ -144,6 +148,9 @@ class TiffFrames(WholeFrames):
                 f"{name} (page {page.index + 1}) has {page.samplesperpixel} {dtype} a pixel: "
                 "save it in grey, as uint8, uint16 or float32"
             )
+        if page.compression not in _DECODED:
+            kind = getattr(page.compression, "name", page.compression)
+            raise InputError(f"{name} is compressed by {kind}: save it with LZW or deflate, or uncompressed")
         self.dtype, rows, columns = np.dtype(dtype), page.imagelength, page.imagewidth
         size = rows * columns * page.samplesperpixel * self.dtype.itemsize
         check_unpacked(size, f"{name} (page {page.index + 1}): a picture of {columns} x {rows}", SMALLER)
@@ -261,11 +268,25 @@ class TiffFrames(WholeFrames):
             if code in page.tags:
                 tags[code] = kind, page.tags[code].value
         if samples == 4:
-            tags[338] = "H", [2]  # opacity that was not multiplied
+            tags[338] = "H", [1]  # otherwise colours are multiplied by the opacity
         tiled = page.is_tiled
         tags[325 if tiled else 279] = "I", [len(one) for one in segments]
         tags[324 if tiled else 273] = "I", [0] * len(segments)
         return _write(tags, 324 if tiled else 273, segments, order)
+
+
+def _open(path: Path, *without: str) -> Any:
+    """Open a TIFF, whose metadata are read only if they are of one of some kinds."""
+    import tifffile
+
+    others = (tifffile.TIFF.FILE_FLAGS - {*_KINDS}) | {*without}
+    flags: dict[str, Any] = {f"is_{kind}": False for kind in others}
+    return tifffile.TiffFile(path, _multifile=False, **flags)
+
+
+def _frames_in(series: Any) -> int:
+    """Return the number of pictures in a series."""
+    return int(series.size) // max(1, int(series.keyframe.size))
 
 
 def _write(

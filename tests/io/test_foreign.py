@@ -356,7 +356,8 @@ def test_what_is_no_file_of_frames_is_refused(tmp_path):
     refused(tmp_path, "is a folder without numbered pictures")
     refused("/dev/null", "is not a regular file")
     refused(
-        tmp_path / "text.h5", "is not an HDF5 file; 'mirrorskin import' turns other files into recordings"
+        tmp_path / "text.h5",
+        "is not an HDF5 file; other formats have suffixes such as .avi, .tif and .npy",
     )
 
 

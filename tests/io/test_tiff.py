@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from PIL import Image
 
 from mirrorskin.io import InputError, Region, Steps, describe, open_recording
 
@@ -153,6 +154,41 @@ def test_more_channels_without_time_or_depth_are_frames(tmp_path):
 def test_frames_with_two_orders_are_refused(tmp_path, options):
     path = write(tmp_path / "a.tif", stack(4, channels=3), metadata={"axes": "TZYX"}, **options)
     with pytest.raises(InputError, match=r"has the axes TZYX \(4 T x 3 Z\), but frames have one order"):
+        opened(path)
+
+
+@pytest.mark.parametrize("options", [{}, {"compression": "zlib"}], ids=str)
+@pytest.mark.parametrize("length", [1, 2])
+def test_frames_that_were_appended_are_one_stack(tmp_path, options, length):
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        for part in np.split(stack(6), 6 // length):
+            file.write(part if length > 1 else part[0], photometric="minisblack", **options)
+    np.testing.assert_array_equal(frames_of(tmp_path / "a.tif")[0], stack(6))
+
+
+def test_frames_that_no_metadata_describe_are_not_left_out(tmp_path):
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        for _ in range(2):
+            file.write(stack(3), photometric="minisblack", truncate=True)
+    with pytest.raises(InputError, match="pages that its metadata do not describe"):
+        opened(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("compression", ["tiff_lzw", "packbits", "raw"])
+def test_opacity_does_not_change_colours(tmp_path, compression):
+    frames = stack(3, BITS8)
+    pages = [Image.fromarray(np.dstack([frame, frame, frame, 255 - frame])) for frame in frames]
+    path = tmp_path / "a.tif"
+    pages[0].save(path, save_all=True, append_images=pages[1:], compression=compression)
+    np.testing.assert_array_equal(frames_of(path)[0], frames)
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lzma"])
+def test_a_compression_that_is_not_read_is_named(tmp_path, compression):
+    pages = [Image.fromarray(frame) for frame in stack(3, BITS8)]
+    path = tmp_path / "a.tif"
+    pages[0].save(path, save_all=True, append_images=pages[1:], compression=compression)
+    with pytest.raises(InputError, match=rf"a\.tif is compressed by {compression.upper()}: save it with LZW"):
         opened(path)
 
 
