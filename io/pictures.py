@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.atomic import write_new
+from mirrorskin.io.colour_table import ColourTable
 from mirrorskin.io.findings import Finding
 from mirrorskin.io.frames import CONVERTED_COLOUR, lossy
 from mirrorskin.io.opencv import decode, encode, is_coloured, to_grey
 from mirrorskin.io.os_errors import check_unpacked, read_regular
-from mirrorskin.io.tiff import SMALLER, TIFF_SUFFIXES, TiffFrames, samples_of_table
+from mirrorskin.io.tiff import SMALLER, TIFF_SUFFIXES, TiffFrames
 from mirrorskin.io.types import FRAME_DTYPES, InputError
 
 PICTURE_SUFFIXES = (".png", ".bmp", ".pgm", ".jpg", ".jpeg", *TIFF_SUFFIXES)
@@ -68,11 +69,11 @@ def decode_picture(path: Path, dtypes: Sequence[str] = _DTYPES) -> Picture:
 def decode_bytes(data: bytes, name: str) -> Picture:
     """Decode a PNG, JPEG, BMP or PGM in memory."""
     if data[:8] == _PNG_MARK:
-        picture = Picture(_decode_png(data, name))
+        picture = _decode_png(data, name)
     elif data[:2] == _JPEG_MARK:
         picture = Picture(_decode_jpeg(data, name), (lossy("JPEG"),))
     elif data[:2] == b"BM":
-        picture = Picture(_decode_bmp(data, name))
+        picture = _decode_bmp(data, name)
     elif data[:2] == b"P5":
         picture = Picture(_decode_pgm(data, name))
     else:
@@ -88,7 +89,7 @@ def _decode_jpeg(data: bytes, name: str) -> NDArray[Any]:
     return decode(data, name, upright=True)
 
 
-def _decode_bmp(data: bytes, name: str) -> NDArray[Any]:
+def _decode_bmp(data: bytes, name: str) -> Picture:
     if len(data) < _BMP_HEAD.size:
         raise InputError(f"{name} is cut off: copy it again")
     _, start, head, width, height, _, bits, packing, colours = _BMP_HEAD.unpack_from(data)
@@ -99,21 +100,15 @@ def _decode_bmp(data: bytes, name: str) -> NDArray[Any]:
     if packing == 0 and len(data) < start + -(-width * bits // 32) * 4 * abs(height):
         raise InputError(f"{name} is cut off: copy it again")
     if bits > 8:
-        return decode(data, name)
+        return Picture(decode(data, name))
     count, place = colours or 1 << bits, 14 + head
     table = np.frombuffer(data[place : place + 4 * min(count, 256)], np.uint8).reshape(-1, 4)[:, 2::-1]
     # With a table of equal colours OpenCV returns the indices.
     equal = np.repeat(np.arange(len(table), dtype=np.uint8), 4).tobytes()
     indices = decode(data[:place] + equal + data[place + len(equal) :], name)
     indices = indices if indices.ndim == 2 else indices[..., 0]
-    return _looked_up(samples_of_table(name, table), indices, name)
-
-
-def _looked_up(samples: NDArray[Any], indices: NDArray[Any], name: str) -> NDArray[Any]:
-    if indices.max(initial=0) >= len(samples):
-        raise InputError(f"{name} is damaged: its table has {len(samples)} colours. Copy it again")
-    looked_up: NDArray[Any] = samples[indices]
-    return looked_up
+    colour_table = ColourTable(name, table)
+    return Picture(colour_table.look_up(indices), colour_table.findings)
 
 
 def _decode_pgm(data: bytes, name: str) -> NDArray[Any]:
@@ -126,7 +121,7 @@ def _decode_pgm(data: bytes, name: str) -> NDArray[Any]:
     return samples.astype(kind.newbyteorder("="))
 
 
-def _decode_png(data: bytes, name: str) -> NDArray[Any]:
+def _decode_png(data: bytes, name: str) -> Picture:
     chunks = _essential_chunks(data, name)
     head = struct.unpack_from(">IIBB2xB", b"".join([_PNG_MARK, *chunks]).ljust(_PNG_HEAD, b"\0"), 16)
     width, height, depth, colour, interlaced = head
@@ -138,12 +133,12 @@ def _decode_png(data: bytes, name: str) -> NDArray[Any]:
         raise InputError(f"{name} is damaged: it is not one picture of {width} x {height}. Copy it again")
     tables = [chunk[8:-4] for chunk in chunks if chunk[4:8] == b"PLTE"]
     if colour != _PNG_PALETTE or len(tables) != 1 or len(tables[0]) % 3:
-        return decode(b"".join([_PNG_MARK, *chunks]), name)
+        return Picture(decode(b"".join([_PNG_MARK, *chunks]), name))
     # As a grey picture of the same bits, OpenCV returns the indices, scaled to 8 bits.
     grey = _png_chunk(b"IHDR", chunks[0][8:17] + b"\0" + chunks[0][18:-4])
     indices = decode(b"".join([_PNG_MARK, grey, *(one for one in chunks[1:] if one[4:8] != b"PLTE")]), name)
-    table = samples_of_table(name, np.frombuffer(tables[0], np.uint8).reshape(-1, 3))
-    return _looked_up(table, indices // (255 // ((1 << depth) - 1)), name)
+    table = ColourTable(name, np.frombuffer(tables[0], np.uint8).reshape(-1, 3))
+    return Picture(table.look_up(indices // (255 // ((1 << depth) - 1))), table.findings)
 
 
 def _png_bytes(width: int, height: int, bits: int, interlaced: bool) -> int:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io.colour_table import ColourTable
 from mirrorskin.io.findings import Finding
 from mirrorskin.io.frames import CONVERTED_COLOUR, WholeFrames, lossy
 from mirrorskin.io.opencv import decode, is_coloured, to_grey
@@ -118,7 +119,7 @@ class TiffFrames(WholeFrames):
             except Exception as error:  # of many types
                 raise InputError(f"{name} cannot be read: it is damaged or cut off; copy it again") from error
         if self._table is not None:
-            samples = self._table[samples]
+            samples = self._table.look_up(samples)
         if self._inverted:
             samples = ~samples
         return _upright(samples, self._orientation)
@@ -189,13 +190,8 @@ class TiffFrames(WholeFrames):
         if self._inverted:
             text = "white is zero: samples are inverted, so that more light is more counts"
             yield Finding("white is zero", text, warning=False)
-        if (
-            self._table is not None
-            and self._table.ndim == 1
-            and np.array_equal(self._table, np.arange(len(self._table)))
-        ):
-            text = "the indices of a colour table are read as samples"
-            yield Finding("colour table", text, warning=False)
+        if self._table is not None:
+            yield from self._table.findings
         if page.samplesperpixel > 1 and page.planarconfig == _SEPARATE:
             yield Finding(
                 "planar colour",
@@ -377,27 +373,10 @@ def _upright(picture: NDArray[Any], orientation: int) -> NDArray[Any]:
     return picture[:: -1 if orientation in (3, 4, 7, 8) else 1, :: -1 if orientation in (2, 3, 6, 7) else 1]
 
 
-def _table(name: str, page: Any) -> NDArray[Any]:
-    """Return the samples of the indices in a page with a colour table."""
-    colours = np.asarray(page.colormap)  # (3, indices), 16 bits
-    return samples_of_table(name, (colours.T >> 8).astype(np.uint8), np.dtype(f"u{page.bitspersample // 8}"))
-
-
-def samples_of_table(
-    name: str, colours: NDArray[np.uint8], dtype: np.dtype[Any] | None = None
-) -> NDArray[Any]:
-    """Return the sample of each index of a colour table, (n, 3): red, green, blue.
-
-    These are the values of a grey table, and the indices of one that rises in brightness, such as the tables
-    in which microscopes show their samples.
-    """
-    if (colours == colours[:, :1]).all():
-        return colours[:, 0].astype(dtype or np.uint8)
-    used = np.flatnonzero(colours.any(axis=1))[-1] + 1  # programs fill up a table with black
-    luma = colours[:used] @ np.array([0.299, 0.587, 0.114])
-    if np.any(np.diff(luma) < 0):
-        raise InputError(f"{name} has a table of colours that is not a scale of brightness: save it in grey")
-    return np.arange(len(colours)).astype(dtype or np.uint8)
+def _table(name: str, page: Any) -> ColourTable:
+    """Return the colour table of a page."""
+    colours = (np.asarray(page.colormap).T >> 8).astype(np.uint8)  # of 16 bits
+    return ColourTable(name, colours, np.dtype(f"u{page.bitspersample // 8}"))
 
 
 def _pixel_size(file: Any) -> str:

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io.colour_table import ColourTable
 from mirrorskin.io.findings import Finding
 from mirrorskin.io.frames import CONVERTED_COLOUR, WholeFrames, lossy, lost_frames
 from mirrorskin.io.opencv import is_coloured, to_grey
 from mirrorskin.io.os_errors import MAX_UNPACKED_BYTES, check_regular, check_unpacked
 from mirrorskin.io.selection import Span
 from mirrorskin.io.text import one_line
-from mirrorskin.io.tiff import samples_of_table
 from mirrorskin.io.types import Floats, InputError
 
 if TYPE_CHECKING:
@@ -297,6 +297,8 @@ class VideoFrames(WholeFrames):
         if bits < 8:
             text = f"{bits} bits a sample are scaled to 8: small changes of brightness are lost"
             yield Finding("few bits", text)
+        if frame.format.has_palette:
+            yield from ColourTable(name, frame.to_ndarray()[1][:, 1:]).findings
         if self._channel is None and _shows_colour(frame, name):
             yield CONVERTED_COLOUR
 
@@ -326,8 +328,8 @@ def _stored(frame: VideoFrame, name: str, channel: int | None) -> NDArray[Any]:
             " gray16le, for example with ffmpeg -pix_fmt"
         )
     if kind.has_palette:
-        indices, table = frame.to_ndarray()
-        return np.asarray(samples_of_table(name, table[:, 1:])[indices])
+        indices, colours = frame.to_ndarray()
+        return ColourTable(name, colours[:, 1:]).look_up(indices)
     if luma and (channel is None or len(parts) < 3):
         return _luma(frame, bits)
     if bits <= 8:

@@ -10,7 +10,7 @@ import tifffile
 from PIL import Image
 
 from mirrorskin.io import InputError, Source, Steps, open_recording
-from mirrorskin.io.pictures import read_picture
+from mirrorskin.io.pictures import decode_picture, read_picture
 
 SHAPE = (6, 9)
 
@@ -354,7 +354,9 @@ def with_table(path, table):
     ids=["green", "grey"],
 )
 def test_a_table_of_colours_gives_indices_or_its_greys(tmp_path, suffix, table, expected):
-    np.testing.assert_array_equal(read_picture(with_table(tmp_path / f"a.{suffix}", table)), expected)
+    picture = decode_picture(with_table(tmp_path / f"a.{suffix}", table))
+    np.testing.assert_array_equal(picture.samples, expected)
+    assert [found.kind for found in picture.findings] == (["colour table"] if expected is INDICES else [])
 
 
 @pytest.mark.parametrize("suffix", ["png", "bmp", "tif"])

@@ -1,0 +1,44 @@
+"""Tables of colours: what the indices of a picture with one stand for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.io.findings import Finding
+from mirrorskin.io.types import InputError
+
+_LUMA = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
+
+
+class ColourTable:
+    """The samples that indices stand for, of a table (n, 3) of red, green and blue.
+
+    They are the values of a grey table, and the indices of one that rises in brightness, such as the tables
+    in which microscopes show their samples. InputError for any other table.
+    """
+
+    def __init__(self, name: str, colours: NDArray[np.uint8], dtype: np.dtype[Any] | None = None) -> None:
+        self._name, kind = name, dtype or np.dtype(np.uint8)
+        self.findings: tuple[Finding, ...] = ()
+        if (colours == colours[:, :1]).all():
+            self._samples = colours[:, 0].astype(kind)
+            return
+        used = np.flatnonzero(colours.any(axis=1))[-1] + 1  # programs fill up a table with black
+        if np.any(np.diff(colours[:used] @ _LUMA) < 0):
+            raise InputError(
+                f"{name} has a table of colours that is not a scale of brightness: save it in grey"
+            )
+        self._samples = np.arange(len(colours)).astype(kind)
+        text = "the indices of a colour table are read as samples"
+        self.findings = (Finding("colour table", text, warning=False),)
+
+    def look_up(self, indices: NDArray[Any]) -> NDArray[Any]:
+        """Return the samples of indices."""
+        if indices.max(initial=0) >= len(self._samples):
+            raise InputError(
+                f"{self._name} is damaged: its table has {len(self._samples)} colours. Copy it again"
+            )
+        return np.asarray(self._samples[indices])
