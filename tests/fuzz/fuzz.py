@@ -221,7 +221,7 @@ def _make_stacks(folder: Path, frames: np.ndarray[Any, Any]) -> None:
     table = np.arange(256, dtype=np.uint16)[None].repeat(3, 0) * 257
     tifffile.imwrite(folder / "table.tif", frames[:4], photometric="palette", colormap=table)
     for name in ("picture.jpg", "picture.bmp", "picture.pgm"):
-        cv2.imwrite(str(folder / name), frames[-1])
+        cv2.imwrite(str(folder / name), frames[-1].astype(np.uint8))
     kinds = {
         "film.avi": ("mjpeg", "yuvj420p"),
         "film.mp4": ("mpeg4", "yuv420p"),
