@@ -136,7 +136,9 @@ def make_strict(strict: bool) -> None:
 def report_notes(name: str, process: Mapping[str, object]) -> None:
     """Print what else was found about the frames; warnings are printed when they occur."""
     if "notes" in process:
-        click.echo(printable(f"{name}: {process['notes']}"), err=True)
+        from mirrorskin.io.findings import named
+
+        click.echo(printable(named(name, str(process["notes"]))), err=True)
 
 
 def report_levels(name: str, process: Mapping[str, object]) -> None:

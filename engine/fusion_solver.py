@@ -287,7 +287,8 @@ def _set_sigma_of_lone_pixels(surface: Result, weight: Doubles) -> Result:
 def _add_error_of_averaging(surface: Result) -> Result:
     """Add what a pixel's mean over its area differs from its middle, where the surface is curved, to sigma.
 
-    The mean of a height z over a pixel of sides a, b exceeds that in its middle by (a^2 z_xx + b^2 z_yy) / 24.
+    The mean of a height z over a pixel of sides a, b exceeds that in its middle by
+    (a^2 z_xx + b^2 z_yy) / 24.
     """
     height, inside = surface.height.astype(np.float64), surface.component >= 0
     if surface.edges is not None:

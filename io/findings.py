@@ -53,12 +53,17 @@ def in_process(findings: Iterable[Finding], process: Mapping[str, Any]) -> dict[
     return known
 
 
+def named(name: str, said: str) -> str:
+    """Return what was said of a source, after its name."""
+    return said if said.startswith(name) else f"{name}: {said}"
+
+
 def warn(name: str, process: Mapping[str, Any]) -> None:
     """Issue a `MirrorskinWarning` with the ``warnings`` of a process, and the name of the source."""
-    said = process.get("warnings")
+    said = str(process.get("warnings", ""))
     if not said:
         return
     level, frame = 1, sys._getframe()  # the line of the first caller outside of mirrorskin is shown
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("mirrorskin."):
         level, frame = level + 1, frame.f_back
-    warnings.warn(f"{name}: {said}", MirrorskinWarning, stacklevel=level)
+    warnings.warn(named(name, said), MirrorskinWarning, stacklevel=level)

@@ -234,16 +234,18 @@ class Traces:
         if not self._goes_down():
             return
         travel = self._series["travel"]
-        few = max(1, len(self._counts) // 10)
-        counts, extent = self._counts[:, self._responding], self._range[self._responding]
-        change = (counts[-few:].mean(axis=0) - counts[:few].mean(axis=0)) / extent
-        change *= np.sign(travel[-1] - travel[0])
-        rises, falls = float(np.mean(change > 0.5)), float(np.mean(change < -0.5))
+        rises, falls = self._changes(self._counts[:, self._responding], np.sign(travel[-1] - travel[0]))
         if falls > _MOST_OF * (rises + falls) and falls > 0.2:
             yield Finding(
                 "reversed",
                 f"brightness falls with travel at {_percent(falls)} of the pixels that respond: are the"
                 " frames reversed, or is it a release (--event release)?",
+            )
+        elif rises + falls < 1 - _MOST_OF and (axis := self._rising_axis()):
+            yield Finding(
+                "axes",
+                f"brightness rises along the {axis} of the pictures rather than over time: is the order of"
+                " the axes (T, H, W)?",
             )
         elif rises + falls < 1 - _MOST_OF:
             yield Finding(
@@ -251,6 +253,24 @@ class Traces:
                 f"brightness returns to where it began at {_percent(1 - rises - falls)} of the pixels that"
                 " respond, although the travel does not: is this a rotation?",
             )
+
+    @staticmethod
+    def _changes(counts: Samples, direction: float = 1.0) -> tuple[float, float]:
+        """Return the shares of series, (T, n), that end far above and far below where they begin."""
+        few = max(1, len(counts) // 10)
+        change = counts[-few:].mean(axis=0) - counts[:few].mean(axis=0)
+        change *= direction / np.ptp(counts, axis=0)
+        return float(np.mean(change > 0.5)), float(np.mean(change < -0.5))
+
+    def _rising_axis(self) -> str:
+        """Return along what the brightness of the pictures rises or falls as in a press; "" if nothing."""
+        samples = self._stored.reshape(self._grid).astype(np.float32)
+        for axis, name in ((2, "rows"), (1, "columns")):
+            series = np.moveaxis(samples, axis, 0).reshape(samples.shape[axis], -1)
+            series = series[:, np.ptp(series, axis=0) > max(_CLEAR * self.noise, 0.02 * self.span)]
+            if series.shape[1] >= _FEWEST and max(self._changes(series)) > _MOST_OF:
+                return name
+        return ""
 
     def _turn(self) -> Iterator[Finding]:
         phase = self._series.get("phase")

@@ -63,7 +63,7 @@ def slipped(printed):
 
 def vibrated(printed):
     for found, expected in numbers(printed, r"RMS error (\S+?)(?: µm)?, expected (\S+)"):
-        assert 0.2 * expected < found < 1.5 * expected  # the twin has no lens, whose blur is part of the sigma
+        assert 0.2 * expected < found < 1.5 * expected  # the twin has no lens, whose blur is in the sigma
     ((found, true),) = numbers(printed, r"hysteresis: (\S+) µm, true (\S+) µm")
     assert found == pytest.approx(true, abs=2)
     ((found, true),) = numbers(printed, r"grows by (\S+) .* true (\S+)")

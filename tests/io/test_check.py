@@ -104,6 +104,12 @@ def test_axes_in_the_order_of_matlab_are_found():
     assert "axes" in kinds(found(stack, travel=STEP * np.arange(len(stack))))
 
 
+@pytest.mark.parametrize("order", [(1, 2, 0), (2, 1, 0), (1, 0, 2)])
+def test_other_orders_of_the_axes_of_a_press_are_found(order):
+    stack = np.transpose(noisy(pressed()), order)
+    assert kinds(found(stack, travel=STEP * np.arange(len(stack)))) == ["axes"]
+
+
 def test_a_frame_that_is_there_twice_is_found():
     frames = noisy(pressed())
     frames[12] = frames[11]
