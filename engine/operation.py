@@ -335,7 +335,11 @@ class Operation(ThreadSafe, OnDevice):
                 raise InputError(f"{name} is missing: {type(self).__name__} needs it of each frame")
             if values is not None and np.shape(values)[:1] != (count,):
                 frames = "1 frame" if count == 1 else f"{count} frames"
-                raise InputError(f"{name} has shape {np.shape(values)} for {frames}: give one of each frame")
+                last = np.shape(values)[:1] == (self.shape[1],)
+                axes = "; if the frames are the last axis, use numpy.moveaxis(frames, -1, 0)" if last else ""
+                raise InputError(
+                    f"{name} has shape {np.shape(values)} for {frames}: give one of each frame{axes}"
+                )
         if foreign := given.keys() - {*self.positions, *_NOT_POSITIONS}:
             names = ", ".join(sorted(foreign))
             taken = ", ".join(self.positions) or "frames only"
@@ -452,6 +456,14 @@ _WRAPPERS: Mapping[str, Callable[[Any], Any]] = {
     "result": _checked_result,
     "finish": _checked_result,
 }
+
+
+def warn_of_degrees(name: str, phase: ArrayLike | None) -> None:
+    """Issue a warning if phases of frames, (T,), radians, seem to be degrees; ``name`` begins it."""
+    step = 0.0 if phase is None else step_in_degrees(np.asarray(phase))
+    if step:
+        text = f"phase is in radians; yours steps by {step:.4g} rad: are they degrees?"
+        warn(name, {"warnings": text})
 
 
 Compute = Callable[[Any, dict[str, Any], dict[str, Any]], Result]
@@ -571,9 +583,7 @@ def array_function(
         frames = as_any_array("frames", given.pop("frames"))
         where = {one: given.pop(one, None) for one in (*positions, *optional)}
         where = {one: None if values is None else as_array(one, values) for one, values in where.items()}
-        if where.get("phase") is not None and (step := step_in_degrees(where["phase"])):
-            text = f"phase is in radians; yours steps by {step:.4g} rad: are they degrees?"
-            warn(name, {"warnings": text})
+        warn_of_degrees(name, where.get("phase"))
         return (compute or run)(frames, where, given)
 
     before = "frames : array_like or device array, (T, H, W)\n    Raw counts.\n"

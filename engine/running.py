@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from mirrorskin.engine.device_arrays import AnyArray, as_any_array, is_on_device
 from mirrorskin.engine.inputs import as_result
 from mirrorskin.engine.method import Method, check_motion
-from mirrorskin.engine.operation import Operation
+from mirrorskin.engine.operation import Operation, warn_of_degrees
 from mirrorskin.engine.provenance import attach_provenance, describe, naming, signature
 from mirrorskin.engine.reconstruction import calibrated
 from mirrorskin.engine.streaming import Progress, feed
@@ -90,6 +90,7 @@ def run(
     if isinstance(source, str | os.PathLike) or not isinstance(source, Iterable):
         remedy = "open a path with io.open_recording, or give an array"
         raise InputError(f"frames are a {type(source).__name__}: {remedy}")
+    warn_of_degrees(type(operation).__name__, positions.get("phase"))
     result = _run_frames(source, operation, positions, progress)
     result = as_result(result, pixel_size=pixel_size)
     return result.assign(process={**signature(), **describe(operation), **result.process})

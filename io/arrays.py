@@ -106,6 +106,10 @@ class ArrayRecording(Recording):
         assert given is not None
         width = (2,) if series == "displacement" else ()
         where = f"{name}: the {series} given"
+        if np.shape(given)[:1] == (self.full_shape[2],) != (self.full_shape[0],):
+            count, _, columns = self.full_shape
+            problem = f"{where} has shape {np.shape(given)} for {count} frames of {columns} columns"
+            raise InputError(f"{problem}: if the frames are the last axis, use numpy.moveaxis(frames, -1, 0)")
         setattr(self, series, check_finite(given, self.full_shape[0], where, cut.frames, width))
         maps = {one: _map(name, one, header.get(one), self.full_shape[1:]) for one in ("dark", "bright")}
         known = {one: value[cut.region.slices] for one, value in maps.items() if value is not None}

@@ -62,3 +62,27 @@ def test_the_frame_that_cannot_be_converted_is_named_across_pushes():
 def test_one_frame_is_not_a_stack():
     with pytest.raises(InputError, match=r"uint8 \(4, 5\): for a single frame, pass frame\[None\]"):
         engine.find_onset(np.zeros((4, 5), np.uint8), [0.0])
+
+
+def test_frames_along_the_last_axis_have_a_remedy():
+    frames, travel = np.zeros((20, 30, 5), np.uint8), 0.1 * np.arange(5)
+    for call in (
+        lambda: engine.find_onset(frames, travel),
+        lambda: engine.reconstruct(frames, travel=travel),
+    ):
+        with pytest.raises(InputError, match=r"numpy\.moveaxis\(frames, -1, 0\)"):
+            call()
+
+
+@pytest.mark.parametrize("name", ["reference", "dark"])
+def test_masked_counts_are_unknown(name):
+    frames = np.zeros((5, 6, 8), np.uint8)
+    frames[3:] = 200
+    level = np.ma.masked_array(np.full((6, 8), 10, np.uint8), np.arange(48).reshape(6, 8) == 7)
+    if name == "dark":
+        found = engine.find_onset(frames, 0.1 * np.arange(5), dark=level, bright=200)
+        assert np.isnan(found.height[0, 7])
+        assert np.isfinite(found.height).sum() == 47
+    else:
+        with pytest.raises(InputError, match="the reference has samples that are not finite"):
+            engine.slip.find_displacement(level, frames.astype(np.float32), 0.1)
