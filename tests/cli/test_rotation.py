@@ -247,7 +247,7 @@ CASES = {
     "an offset of NaN": ({}, ["--zenith-offset", "nan"], "offset"),
     "a noise of 0": ({}, ["--noise", "0"], "noise"),
     "two phases": ({}, ["--phases", "two.txt"], "2 different phases"),
-    "one phase": ({}, ["--phase-step", "360deg"], "1 different phases"),
+    "one phase": ({}, ["--phase-step", "360deg"], "at 1 phase do not determine"),
     "phases side by side": ({}, ["--phase-step", "0.001deg"], "too close together"),
     "seven phases": ({}, ["--phases", "seven.txt"], "seven.txt lists 7 phases for 8 frames"),
     "phases twice": ({}, ["--phases", "seven.txt", "--phase-step", "45deg"], "Remove one of them"),
