@@ -91,7 +91,7 @@ class VideoFrames(WholeFrames):
     ) -> None:
         check_regular(path, "name a video, a TIFF or a folder of pictures")
         self._path, self.files, self._wanted, self._channel = path, (path,), stream, channel
-        self._next, self._kept = 0, list[NDArray[Any]]()
+        self._next, self._kept, self._closed = 0, list[NDArray[Any]](), False
         self._container: InputContainer | None = None
         try:
             self._survey(memory_limit or _KEPT)
@@ -103,7 +103,7 @@ class VideoFrames(WholeFrames):
         """Close the file, and release the frames."""
         if self._container is not None:
             self._container.close()
-        self._container, self._kept = None, []
+        self._container, self._kept, self._closed = None, [], True
 
     def fetch(self, spans: Sequence[Span], out: NDArray[Any]) -> None:
         """Copy or decode frames."""
@@ -117,6 +117,8 @@ class VideoFrames(WholeFrames):
 
     def frames(self, start: int, stop: int) -> Iterator[tuple[str, NDArray[Any]]]:
         """Decode frames, from the current one on or from the first."""
+        if self._closed:
+            raise ValueError("(it is closed)")
         if self._container is None or start < self._next:
             self._reopen()
         for number in range(self._next, stop):
@@ -252,8 +254,8 @@ class VideoFrames(WholeFrames):
         """Check that the frames reach to the end that the container states."""
         if avi:
             step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else float(stream.time_base or 0)
-            stated, there = stream.frames * float(stream.time_base or 0), stamps[-1] - stamps[0] + step
-            missing = round((stated - there) / step) if step > 0 else 0
+            stated = stream.frames * float(stream.time_base or 0)
+            missing = round((stated - stamps[-1]) / step) - 1 if step > 0 else 0
             if missing > 0:
                 raise InputError(
                     f"{self._path} should have {len(stamps) + missing} frames, but {len(stamps)} can be"

@@ -217,6 +217,13 @@ def test_a_jump_of_an_avi_s_time_stamps_is_lost_frames(tmp_path):
         assert "lost frames" in [one.kind for one in source.findings]
 
 
+def test_a_closed_video_is_not_opened_again(tmp_path):
+    source = opened(film(tmp_path / "a.mkv", "ffv1", "gray", GREY))
+    source.close()
+    with pytest.raises(InputError, match="it is closed"):
+        source.read()
+
+
 @pytest.mark.parametrize(("ticks", "hidden"), [(10, 1), (2048, 4)])
 @pytest.mark.parametrize("suffix", [".mp4", ".mov"])
 def test_all_frames_are_read_whatever_an_edit_list_leaves_out(tmp_path, suffix, ticks, hidden):
