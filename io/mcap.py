@@ -52,6 +52,7 @@ _CLOUD, _NUMBER, _WRENCH = (
 )
 _INSTALL = "MCAP needs packages that are not installed: pip install 'mirrorskin[mcap]'"
 
+_PROPERTIES = ("tilt", "press", "line_time", "travel_sigma")  # numbers of a recording, in the metadata
 _NOTES, _MOST_NOTES = "mirrorskin", 8  # name of the metadata; records of it that are read
 _NUMERAL = re.compile(r"[-+]?[0-9]+\.?[0-9]*(?:[eE][-+]?[0-9]+)?")
 _LONGEST = 100  # characters quoted of an error message of a package
@@ -223,9 +224,8 @@ def _put_header(file: _File, header: Header) -> None:
         if picture is not None:
             image = _picture(np.atleast_2d(np.asarray(picture, np.float32)))
             file.put(f"/camera/{name}", _IMAGE, image, _stamp(header.start_time))
-    notes = {
-        name: getattr(header, name) for name in ("motion", "title", "pixel_size", "tilt", "press", "camera")
-    }
+    names = ("motion", "title", "pixel_size", "camera", *_PROPERTIES)
+    notes = {name: getattr(header, name) for name in names}
     file.note({name: value for name, value in notes.items() if value not in (None, "")})
 
 
@@ -440,7 +440,7 @@ class MessageFrames(WholeFrames):
                 yield name, self._summary.notes[name]
         if self._summary.notes.get("motion") in MOTIONS:
             yield "motion", self._summary.notes["motion"]
-        for name, count in (("tilt", 1), ("press", 1), ("pixel_size", 2)):
+        for name, count in {**dict.fromkeys(_PROPERTIES, 1), "pixel_size": 2}.items():
             values = _NUMERAL.findall(self._summary.notes.get(name, ""))
             if len(values) == count:
                 yield name, tuple(map(float, values)) if count > 1 else float(values[0])

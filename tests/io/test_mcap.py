@@ -22,6 +22,7 @@ from mcap_ros2.writer import Writer
 from stacks import record, sphere
 
 from mirrorskin import io
+from mirrorskin.io.arrays import ArrayRecording
 
 HEIGHT = np.array([[1.0, np.nan, 0.5], [0.25, 0.0, -1.0]], np.float32)
 AXIS = {"x": np.array([-1.0, 0.0, 1.0]), "y": np.array([0.5, -0.5])}
@@ -99,6 +100,15 @@ def test_an_exported_recording_needs_no_options(tmp_path):
             np.testing.assert_array_equal(after.header.dark, before.header.dark)
             np.testing.assert_array_equal(after.header.bright, before.header.bright)
             np.testing.assert_allclose(after.travel, before.travel, rtol=1e-12)
+
+
+def test_numbers_of_an_exported_recording_come_back(tmp_path):
+    known = {"travel_sigma": 0.002, "line_time": -1.5e-05, "pixel_size": (0.1, 0.2)}
+    frames = np.zeros((3, 4, 5), np.uint8)
+    source = ArrayRecording(frames, {"travel": np.arange(3.0)}, known)
+    io.save_messages(source, tmp_path / "rec.mcap")
+    with io.open_recording(tmp_path / "rec.mcap") as after:
+        assert {name: getattr(after.header, name) for name in known} == known
 
 
 def test_a_motion_that_contradicts_the_file_is_refused(tmp_path):
