@@ -26,16 +26,24 @@ _UNTOLD = "none: "  # begins the reason for a missing map in a process
 def save_and_report(
     result: Result, path: Path, device: str | None, as_json: bool, must_answer: bool = True
 ) -> None:
-    """Write a result and print its summary in a line, or with its process as JSON.
+    """Write a result and print its summary; see `report_saved`."""
+    from mirrorskin import io
+
+    io.save_result(result, path)
+    report_saved(result, path, device, as_json, must_answer)
+
+
+def report_saved(
+    result: Result, path: Path, device: str | None, as_json: bool, must_answer: bool = True
+) -> None:
+    """Print the summary of a result in a line, or with its process as JSON.
 
     Without an answer at any pixel, the command then ends with exit code 1 and the reason, if it
     ``must_answer``.
     """
-    from mirrorskin import io
     from mirrorskin.engine.summary import status_shares, summarise
     from mirrorskin.kernels.device import open_devices
 
-    io.save_result(result, path)
     summary, pieces = summarise(result), _pieces(result)
     if as_json:
         devices = open_devices(device) if "device" in result.process else []

@@ -49,8 +49,9 @@ def command(
             del chosen["tilt"]
         with outputs.progress("reconstructing", source.shape[0]) as show:
             result = engine.reconstruct(source, memory_limit=limit, device=device, progress=show, **chosen)
+    io.save_result(result, target)  # if that fails, it is all that is said
     outputs.report_notes(str(recording), result.process)
     outputs.report_missing_maps(str(recording), result.process, _REMEDIES)
     outputs.report_contact(str(recording), result.process)
     outputs.report_levels(str(recording), result.process)
-    outputs.save_and_report(result, target, device, as_json)
+    outputs.report_saved(result, target, device, as_json)

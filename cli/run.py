@@ -47,8 +47,8 @@ def command(
         io.check_output(target, recording, *files, or_zarr=True)
         with progress("running", source.shape[0]) as show:
             result = run_class(kind, source, show, memory_limit=limit, device=device, **chosen)
-    report_notes(str(recording), result.process)
     save_and_report(result, target, device, as_json)
+    report_notes(str(recording), result.process)
 
 
 app = make_command("run", command, ClassCommand)
