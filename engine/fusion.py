@@ -215,7 +215,9 @@ def fuse_recordings(
     common: dict[str, Any] = {"memory_limit": memory_limit, "device": opened}
     turn = Rotation(**{**_options_of(rotation), **common})
     _check_rotation(axial, turn)
-    pressed, known = _press(Press(**{**_options_of(press), **common, "fill": False}), vertical, progress)
+    pressed, known = _press(
+        Press(**{"blur": 0.0, **_options_of(press), **common, "fill": False}), vertical, progress
+    )
     if not np.isfinite(pressed.height).any():
         raise InputError(f"{vertical.name}: no pixel turned light, so no height is known to fuse")
     before = fill_with_nearest(pressed.height)

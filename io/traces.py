@@ -40,6 +40,11 @@ class FrameSamples:
     shape : (int, int, int)
         Frames, rows and columns of the source.
 
+    Attributes
+    ----------
+    rows, columns : ndarray of int
+        Those of the grid in a frame.
+
     Examples
     --------
     >>> samples = FrameSamples((3, 2, 2))
@@ -54,6 +59,7 @@ class FrameSamples:
             slice(None),
             *(slice((n - 1) % s // 2, None, s) for n in shape[1:] for s in [-(-n // side)]),
         )
+        self.rows, self.columns = (np.arange(n)[cut] for n, cut in zip(shape[1:], self._cut[1:], strict=True))
         self._parts: list[NDArray[Any]] = []
 
     @classmethod

@@ -50,6 +50,8 @@ class PressOperation(Operation):
     status = TABLE["status"]
     frame = TABLE["frame"]
     event: Event
+    seen: FrameSamples | None = None
+    """Samples of all frames, once they are pushed; None of frames that come while the body moves."""
 
     hold: int = option(
         default=2,
@@ -110,6 +112,7 @@ class PressOperation(Operation):
 
     def reconsider(self, samples: FrameSamples) -> bool:
         """Return whether the first two frames misled about the noise; all frames tell it then."""
+        self.seen = samples
         used = self.used_noise
         if self.noise is not None or used is None or samples.count < 3:
             return False

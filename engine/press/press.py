@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.method import Context, Method, Plan, Step
 from mirrorskin.engine.options import option
+from mirrorskin.engine.press.blur import LensBlur
 from mirrorskin.engine.press.changepoint import ChangePoint
 from mirrorskin.engine.press.crossing import Event, PressOperation
 from mirrorskin.engine.press.estimated_levels import estimate_levels
@@ -183,6 +184,7 @@ class Press(Method):
     thresholds: Sequence[float] | None = Levels.thresholds
     inclinations: Sequence[float] | None = Levels.inclinations
     line_time: float | None = RollingShutter.line_time
+    blur: float | None = LensBlur.blur
     modulus: float | None = Elastomer.modulus
     fill: bool = HoleFilling.fill
 
@@ -273,6 +275,7 @@ class Press(Method):
         return [
             self.make(NoAnswer, threshold=lowest),
             *shutter,
+            self.make(LensBlur),
             self.make(Elastomer, threshold=lowest),
             self.make(HoleFilling),
         ]
