@@ -255,9 +255,18 @@ class Operation(ThreadSafe, OnDevice):
         """Return whether all frames must be pushed again, as an assumption about them was wrong.
 
         It is called after the last frame, with samples of all of them; the operation has forgotten the frames
-        if it returns True.
+        if it returns True. They are then pushed as `corrected` returns them.
         """
         return False
+
+    @property
+    def corrects(self) -> tuple[str, ...]:
+        """Kinds of findings about frames, such as "flicker", that `corrected` removes."""
+        return ()
+
+    def corrected(self, frames: NDArray[Any], first: int) -> NDArray[Any]:
+        """Return frames, the first of which has a number, in the operation's type and as it needs them."""
+        return frames
 
     def preview(self, seconds: float) -> Mapping[str, Any]:
         """Return the maps that a display shows while the body moves, if possible within some seconds."""
@@ -486,6 +495,7 @@ def apply(operation: Operation, frames: NDArray[Any], **given: Any) -> Result:
 
     push_all()
     if isinstance(frames, np.ndarray) and operation.reconsider(FrameSamples.of(frames)):
+        frames = operation.corrected(frames, 0)
         push_all()
     return operation.finish()
 

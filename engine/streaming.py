@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mirrorskin.engine.operation import Operation
+from mirrorskin.engine.rotation.edited import DerivedSource
 from mirrorskin.io import Block, InputError, Source
 from mirrorskin.io.findings import Finding
+from mirrorskin.io.types import block_memory
 from mirrorskin.io.watch import Watch
 
 Progress = Callable[[int], None]
@@ -71,10 +75,38 @@ def feed(
         fingerprint = worker.submit(source.fingerprint) if hasattr(source, "fingerprint") else None
         _feed_passes(source, operation, chosen, watch, progress)
         if source.rewindable and watch.samples.count and operation.reconsider(watch.samples):
-            _feed_passes(source, operation, chosen, None, progress)
+            again = _Corrected(source, operation, chosen.start) if operation.corrects else source
+            _feed_passes(again, operation, chosen, None, progress)
     if fingerprint is not None:
         fingerprint.result()
-    return watch.check().findings
+    return tuple(_as_corrected(one, operation.corrects) for one in watch.check().findings)
+
+
+def _as_corrected(finding: Finding, corrects: Collection[str]) -> Finding:
+    """Return a finding, as a note if it is of a kind that was corrected."""
+    if finding.kind not in corrects:
+        return finding
+    return replace(finding, text=f"{finding.text.split(':')[0]}, which is corrected", warning=False)
+
+
+class _Corrected(DerivedSource):
+    """Frames of a source as an operation corrects them; they are numbered from ``start`` on."""
+
+    def __init__(self, source: Source, operation: Operation, start: int) -> None:
+        super().__init__(source)
+        assert operation.dtype is not None
+        self._operation, self._start, self._dtype = operation, start, source.dtype
+        self.dtype = operation.dtype
+
+    def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
+        """Read the next frames and correct them; see ``Source.read``."""
+        out = block_memory(out, self.shape, self.dtype)
+        block = self._source.read(np.empty(out.shape, self._dtype))
+        if block is None:
+            return None
+        count = len(block.frames)
+        out[:count] = self._operation.corrected(block.frames, block.index - self._start)
+        return replace(block, frames=out[:count], lent=False)
 
 
 def _feed_passes(

@@ -73,6 +73,10 @@ class FrameSamples:
         """Add the next frames, (n, H, W)."""
         self._parts.append(frames[self._cut].copy())
 
+    def of_map(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return a map, (H, W), at the pixels of the grid."""
+        return values[self._cut[1:]]
+
     @property
     def values(self) -> NDArray[Any]:
         """Samples, (T, rows, columns), in the type of the frames."""

@@ -22,6 +22,7 @@ from mirrorskin.engine.rotation.design_matrix import (
     longest_turn,
     turn_fit,
 )
+from mirrorskin.engine.rotation.frame_light import FrameLight, find_frame_light
 from mirrorskin.engine.rotation.normals_kernel import (
     MAPS,
     NORMAL_METHODS,
@@ -40,6 +41,7 @@ from mirrorskin.engine.tiling import Band, cut_into_bands, for_each_band, join_r
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.maps import TABLE
 from mirrorskin.io.positions import check_phase
+from mirrorskin.io.traces import FrameSamples
 from mirrorskin.io.types import FRAME_DTYPES, ProcessValue
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.correlation import WINDOW
@@ -369,6 +371,8 @@ class Normals(NormalsOperation):
     """
 
     takes_device_arrays = True
+    _light: FrameLight | None = None  # of the frames that are pushed again
+    _weighted: bool = False  # whether frames had weights
 
     tilt: ArrayLike | None = option(  # of `estimate_normals`, an array is one of each frame
         default=None,
@@ -444,8 +448,58 @@ class Normals(NormalsOperation):
         """Array in which the next frames may be written before they are pushed, (n, H, W)."""
         return super().room if self.window_frames is None else self._window.room
 
+    def reconsider(self, samples: FrameSamples) -> bool:
+        """Return whether the light of the frames differs, so that they are pushed again in steady light."""
+        alone = self.per_turn or self.window_frames is not None or self.response is not None
+        if alone or self._weighted or self.zenith_gain is None or self._tilt_so_far is None:
+            return False
+        maps = self.zenith_gain, self.zenith_offset, self.dark
+        scale = [np.asarray(0.0 if one is None else one, np.float64) for one in maps]
+        at_grid = [one if one.ndim == 0 else samples.of_map(one).ravel() for one in scale]
+        values = samples.values
+        light = find_frame_light(
+            values.reshape(len(values), -1), self.pushed("phase"), self._tilt_so_far, *at_grid
+        )
+        if light is None:
+            return False
+        self.begin(self.shape, np.float32)
+        self._light = light
+        return True
+
+    @property
+    def _tilt_so_far(self) -> float | None:
+        """The tilt, if it is given, or was estimated from a complete turn."""
+        if isinstance(self.tilt, str):
+            return None if self._model is None else self._model.tilt
+        return None if self.tilt is None else float(np.asarray(self.tilt))
+
+    @property
+    def corrects(self) -> tuple[str, ...]:
+        """Kinds of findings about frames that are corrected."""
+        return () if self._light is None else self._light.kinds
+
+    def corrected(self, frames: NDArray[Any], first: int) -> NDArray[Any]:
+        """Return frames in steady light."""
+        if self._light is None:
+            return frames
+        return self._light.remove(frames, first, 0.0 if self.dark is None else self.dark)
+
+    def common_sigma(self, normals: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return the part of the standard deviation of normals that is common to all pixels, radians."""
+        if self._light is None:
+            return np.zeros(normals.shape[:-1], np.float32)
+        return self._light.sigma(normals)
+
+    def _as_result(self, maps: list[NDArray[Any]], model: TurnModel) -> Result:
+        result = super()._as_result(maps, model)
+        if self._light is None:
+            return result
+        sigma = np.hypot(result.normals_sigma, self.common_sigma(result.normals))
+        return result.assign(normals_sigma=sigma, process={**result.process, **self._light.process})
+
     def clear(self) -> None:
         """Forget the frames so far, and what was estimated from them."""
+        self._light, self._weighted = None, False
         if self.window_frames is None:
             super().clear()
         else:
@@ -461,6 +515,7 @@ class Normals(NormalsOperation):
     ) -> None:
         """Take in the next frames, (n, H, W), the phase of each, (n,) radians, and their weights, (n,)."""
         alpha = check_phase(phase, len(frames), "phase")
+        self._weighted |= frame_weights is not None
         if self.window_frames is None:
             self._push(frames, alpha, frame_weights, lent)
         elif frame_weights is not None:

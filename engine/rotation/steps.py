@@ -91,6 +91,7 @@ class Integration(Step):
         )
         if surface.edges is not None and result.edges is not None:
             surface = surface.assign(edges=result.edges | surface.edges)
+        surface = _with_common_errors(surface, result, context)
         return result.assign(surface, process={**result.process, **surface.process})
 
     def slopes(self, result: Result, context: Context) -> Slopes:
@@ -155,10 +156,30 @@ def _clip_outliers(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.clip(values, -limit, limit)
 
 
+def _with_common_errors(surface: Result, result: Result, context: Context) -> Result:
+    """Add errors of slopes that are common to all pixels, such as those of the light of a frame, to sigma.
+
+    They change slopes, and with them heights, by about the same share everywhere.
+    """
+    operation = context.operation
+    if not isinstance(operation, Normals) or not operation.corrects:
+        return surface
+    cosine = result.normals[..., 2].astype(np.float64)
+    error = operation.common_sigma(result.normals) / cosine**2
+    known = np.isfinite(error) & (result.contact > 0)
+    steepness = np.sqrt(1 / cosine[known] ** 2 - 1)
+    share = math.sqrt(float(np.mean(error[known] ** 2) / np.mean(steepness**2)))
+    sigma = np.hypot(surface.height_sigma, np.float32(share) * surface.height)
+    return surface.assign(height_sigma=sigma)
+
+
 def _independent_sigma(result: Result, context: Context) -> NDArray[np.float32]:
-    """Return the errors of normals without registration.
+    """Return the errors of normals that differ from pixel to pixel, without registration.
 
     Registration reduces errors but correlates those of neighbours: means over many pixels are not better.
     """
     sigma: NDArray[np.float32] = result.normals_sigma
+    if isinstance(context.operation, Normals) and context.operation.corrects:
+        common = context.operation.common_sigma(result.normals)
+        sigma = np.sqrt(np.maximum(sigma**2 - common**2, 0))
     return sigma / context.stream.noise_gain if isinstance(context.stream, Registered) else sigma

@@ -1,0 +1,108 @@
+"""Flicker and drift of a rotation are found and removed; the renderings share nothing with the twin."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import rotations
+from rotations import Setup
+
+from mirrorskin import engine, io
+from mirrorskin.io.arrays import ArrayRecording
+
+SIZE, PIXEL, COUNT = 72, 0.05, 16
+SETUP = Setup(noise=1.2, offset=20.0, dtype="float32", phase=tuple(np.arange(COUNT) * 2 * np.pi / COUNT))
+FLICKER = 1 + 0.02 * np.random.default_rng(3).standard_normal(COUNT)
+DRIFT = np.linspace(0, 4, COUNT)
+STEADY = np.ones(COUNT), np.zeros(COUNT)
+
+
+@cache
+def waves():
+    """Return the normals of a wavy surface, (H, W, 3)."""
+    x, y = np.meshgrid(*io.pixel_axes((SIZE, SIZE), (PIXEL, PIXEL)))
+    u, v = 2 * np.pi * x / 1.6, 2 * np.pi * y / 1.9
+    slope = 0.8 * np.cos(u) * np.cos(v) + 0.1, -0.7 * np.sin(u) * np.sin(v)
+    normal = np.stack([-slope[0], -slope[1], np.ones_like(x)], axis=-1)
+    return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+
+
+def plate():
+    """Return the normals of an inclined plate."""
+    return np.broadcast_to(rotations.direction(np.radians(20), 0.3), (SIZE, SIZE, 3))
+
+
+def turn(normals, gain, offset, seed, setup=SETUP):
+    """Return a turn in light with a gain and an offset of each frame."""
+    light = rotations.levels(normals, setup) - 20
+    counts = 20 + light * gain[:, np.newaxis, np.newaxis] + offset[:, np.newaxis, np.newaxis]
+    counts = np.rint(counts + np.random.default_rng(seed).normal(0, setup.noise, counts.shape))
+    header = {"tilt": setup.tilt, "zenith_gain": setup.slope, "zenith_offset": setup.offset}
+    frames = counts.clip(0, 255).astype(np.uint8)
+    return ArrayRecording(frames, {"phase": np.array(setup.phase)}, header | {"dark": np.float32(20)})
+
+
+def errors(result, normals):
+    """Return the angular errors and their standard deviations, radians."""
+    error = np.linalg.norm(np.cross(result.normals.astype(float), normals), axis=-1)
+    known = np.isfinite(error) & np.isfinite(result.normals_sigma)
+    return error[known], result.normals_sigma[known]
+
+
+def reconstruct(normals, gain, offset, seed=1):
+    return engine.reconstruct(turn(normals, gain, offset, seed))
+
+
+def test_flicker_is_removed_as_if_it_were_not_there():
+    steady, _ = errors(reconstruct(waves(), *STEADY), waves())
+    error, _ = errors(reconstruct(waves(), FLICKER, STEADY[1]), waves())
+    assert np.sqrt(np.mean(error**2)) < 1.03 * np.sqrt(np.mean(steady**2))  # 1.3 times without
+
+
+def test_normals_in_flickering_light_have_the_errors_that_they_state():
+    error, sigma = errors(reconstruct(waves(), FLICKER, STEADY[1]), waves())
+    assert 0.8 < np.mean((error / sigma) ** 2) < 1.2
+
+
+def test_drift_is_removed():
+    error, sigma = errors(reconstruct(waves(), STEADY[0], DRIFT), waves())
+    assert 0.8 < np.mean((error / sigma) ** 2) < 1.3  # 4 without
+
+
+def test_what_was_removed_is_stated():
+    process = reconstruct(waves(), FLICKER, STEADY[1]).process
+    assert process["flicker"] == f"{100 * np.std(FLICKER):.2g} %, corrected"
+    assert "drift" not in process
+
+
+def test_flicker_that_was_removed_is_a_note():
+    result = reconstruct(waves(), FLICKER, STEADY[1])
+    assert "warnings" not in result.process
+    assert "flickers" in result.process["notes"]
+    assert "corrected" in result.process["notes"]
+
+
+@pytest.mark.parametrize("normals", [waves(), plate()], ids=["waves", "plate"])
+def test_steady_light_is_left_alone(normals):
+    assert {"flicker", "drift"} & set(reconstruct(normals, *STEADY).process) == set()
+
+
+@pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")
+def test_a_plate_does_not_show_the_light():
+    assert "flicker" not in reconstruct(plate(), FLICKER, STEADY[1]).process
+
+
+def test_arrays_are_corrected_as_recordings_are():
+    source = turn(waves(), FLICKER, STEADY[1], 1)
+    options = {"tilt": SETUP.tilt, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset, "dark": 20.0}
+    frames = source.read(np.empty(source.shape, source.dtype)).frames
+    found = engine.estimate_normals(frames, SETUP.phase, **options)
+    assert np.array_equal(found.normals, engine.reconstruct(source).normals, equal_nan=True)
+
+
+def test_an_operation_forgets_the_light_with_the_frames():
+    operation = engine.Normals(tilt=SETUP.tilt, zenith_gain=SETUP.slope, zenith_offset=SETUP.offset)
+    results = [
+        engine.run(turn(waves(), gain, STEADY[1], 1), operation) for gain in (STEADY[0], FLICKER, STEADY[0])
+    ]
+    assert np.array_equal(results[0].normals, results[2].normals, equal_nan=True)
