@@ -16,6 +16,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.io.findings import Finding
 from mirrorskin.io.fingerprint import State, check_unchanged, fingerprint_of_files, modified, state_of
 from mirrorskin.io.foreign import kind_of_frames, open_reader
 from mirrorskin.io.frames import FrameReader, WholeFrames
@@ -124,6 +125,9 @@ class ArrayRecording(Recording):
             self.left_out, self.findings = reader.left_out, (*reader.findings, *decoding.findings)
         self.storage = reader.how if isinstance(reader, WholeFrames) else "one piece"
         self._next, self._hash = 0, ""
+        if self.twist is not None and (extent := float(np.ptp(self.twist))) > math.pi:
+            text = f"the twist spans {extent:.4g} rad, more than half a turn: is it in degrees?"
+            self.findings = (*self.findings, Finding("twist", text))
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
         """Return the next frames, at most as many as ``out`` holds: a view of the array, or in ``out``."""

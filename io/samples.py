@@ -24,7 +24,7 @@ ATTRIBUTES = (
     "scale_factor",
     "add_offset",
 )
-"""Attributes of the CF conventions, sections 2.5.1 and 8.1, that say what stored values mean."""
+"""Attributes of the CF conventions, sections 2.5.1 and 8.1, that define what stored values mean."""
 
 _EXACT = 1 << 24  # float32 is exact to half a count up to this number
 _PIECE = 8_000_000  # bytes of stored samples that are decoded at once

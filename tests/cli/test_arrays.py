@@ -236,3 +236,12 @@ def test_a_slide_without_contact_ends_with_the_reason():
     assert ended.code == 1
     assert "slip is known at no pixel (" in ended.said
     assert "mirrorskin: none.h5: no slip onset at any pixel: " in ended.said
+
+
+def test_a_twist_in_degrees_is_said():
+    frames = np.random.default_rng(1).integers(80, 120, (6, 40, 40)).astype(np.uint8)
+    np.savez("twist.npz", frames=frames, twist=2.0 * np.arange(6))
+    with io.open_recording("twist.npz") as recording:
+        assert [one.text for one in recording.findings] == [
+            "the twist spans 10 rad, more than half a turn: is it in degrees?"
+        ]
