@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from mirrorskin.io import Source
 
 
+_BEYOND = 4.0  # standard deviations of a residual that noise does not explain
+
+
 class PhotometricStereo(Operation):
     """Normals and albedo of a matt surface under one distant lamp after the other (Woodham 1980).
 
@@ -166,8 +169,9 @@ class PhotometricStereo(Operation):
         maps = dict(zip(arrays, found, strict=True))
         residual, samples = maps["residual"], maps["samples"]
         noise = noise_of_residual(residual, samples - 3) if self._noise is None else self._noise
+        scale = np.asarray(noise, np.float32) * _misfit(residual, samples - 3, noise)
         for name in ("normals", "albedo"):
-            maps[f"{name}_sigma"] = maps.pop(f"{name}_spread") * np.float32(noise)
+            maps[f"{name}_sigma"] = maps.pop(f"{name}_spread") * scale
         return maps if np.ndim(noise) or np.isnan(noise) else maps | {"noise": float(noise)}
 
     def finish(self) -> Result:
@@ -192,8 +196,9 @@ photometric_stereo = optional_phase_function(
     -------
     Result
         ``normals``, ``albedo`` and their standard deviations are undefined where fewer than three lamps lit
-        the pixel, or those that did are coplanar; ``residual`` where it was not more than three. ``process``
-        contains the ``noise``, counts, if it is one number.
+        the pixel, or those that did are coplanar; ``residual`` where it was not more than three. Standard
+        deviations are larger where noise does not explain the residual. ``process`` contains the ``noise``,
+        counts, if it is one number.
 
     Raises
     ------
@@ -212,6 +217,18 @@ photometric_stereo = optional_phase_function(
     """,
     "Azimuths of a lamp of brightness 1, radians, counter-clockwise from x; needed without ``light``.",
 )
+
+
+def _misfit(residual: NDArray[Any], freedom: NDArray[Any], noise: Any) -> NDArray[Any]:
+    """Return the residual over the noise where no noise explains it, as of gloss or a hot sample; else 1."""
+    freedom = np.maximum(freedom, 0)
+    # The cube root of chi^2 / n is nearly normal (Wilson and Hilferty, PNAS 17, 1931).
+    spread = 2 / (9 * np.maximum(np.arange(freedom.max() + 1), 1))
+    limit = ((1 - spread + _BEYOND * np.sqrt(spread)) ** 1.5).astype(np.float32)
+    limit[0] = np.inf
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = residual / np.asarray(noise, np.float32)
+        return np.where(ratio > limit[freedom], ratio, np.float32(1))
 
 
 def _vectors(light: ArrayLike) -> Doubles:

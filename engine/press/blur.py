@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.method import Context, Step
 from mirrorskin.engine.options import option
+from mirrorskin.engine.press.changepoint import ChangePoint
 from mirrorskin.engine.press.crossing import PressOperation
 from mirrorskin.engine.press.strokes import Strokes
 from mirrorskin.io import Result
@@ -37,8 +38,9 @@ class LensBlur(Step):
     heights. On a slope g that takes a travel whose standard deviation is g sqrt(v), by which v is estimated
     from the steep and the flat parts of the surface.
     Where the surface is curved, by H in each direction, the median differs from the height in the middle by
-    up to v H / 2. Nothing is added if the footprint is hardly larger than the pixel, or if the steps of the
-    travel do not resolve it.
+    up to v H / 2. If the footprint is hardly larger than the pixel, or if the steps of the travel do not
+    resolve it, nothing is added to thresholds, and what the pixel's own area moves to change-points, which
+    resolve more.
     """
 
     blur: float | None = option(
@@ -54,9 +56,10 @@ class LensBlur(Step):
         variance = self._variance(result, context)
         if variance is None:
             return result
+        blur = {"blur": round(math.sqrt(variance - _PIXEL), 2)} if variance >= _SHARP else {}
         return result.assign(
             height_sigma=_with_blur(result.height, result.height_sigma, variance),
-            process={**result.process, "blur": round(math.sqrt(variance - _PIXEL), 2)},
+            process={**result.process, **blur},
         )
 
     def _variance(self, result: Result, context: Context) -> float | None:
@@ -69,7 +72,8 @@ class LensBlur(Step):
         samples, travel = operation.seen, context.pushed("travel")
         if samples is None or samples.count != len(travel) or len(travel) < _LEAST_FRAMES:
             return None
-        return _footprint(samples, travel, operation, result.height)
+        found = _footprint(samples, travel, operation, result.height)
+        return _PIXEL if found is None and isinstance(operation, ChangePoint) else found
 
 
 def _footprint(

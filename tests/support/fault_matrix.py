@@ -170,7 +170,10 @@ def _turn(surface: Surface, fault: Fault, seed: int, count: int = 16) -> ArrayRe
 
 def _scale(fault: Fault) -> dict[str, float]:
     """Return the options of a rotation that state how brightness depends on the zenith."""
-    return {"zenith_gain": fault.scale * SPAN / STEEPEST, "zenith_offset": fault.scale * DARK}
+    return {
+        "zenith_gain": fault.scale * fault.exposure * SPAN / STEEPEST,
+        "zenith_offset": fault.scale * DARK,
+    }
 
 
 def _onset(surface: Surface, step: float, **options: Any) -> Callable[[Fault, int], Answer]:
@@ -199,7 +202,8 @@ def _rotation(fault: Fault, seed: int) -> Answer:
 def _integrated(fault: Fault, seed: int) -> Answer:
     truth = _waves(*centres(SHAPE, PIXEL))[0]
     result, warned = _watched(lambda: engine.reconstruct(_turn(_waves, fault, seed), **_scale(fault)))
-    error = result.height - truth
+    largest = np.bincount(result.component[result.component >= 0]).argmax()
+    error = np.where(result.component == largest, result.height - truth, np.nan)
     return Answer(error - np.nanmean(error), result.height_sigma, warned)
 
 
