@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.footprint import with_curvature
 from mirrorskin.engine.operation import Operation, travel_function
 from mirrorskin.engine.options import option
 from mirrorskin.io import InputError, Map
@@ -113,6 +115,9 @@ class Focus(Operation):
         misfit = misfit[np.isfinite(misfit)]
         excess = max(0.0, float(np.median(misfit))) if misfit.size else np.nan
         sigma = np.sqrt(np.float32(variance) * spread + np.float32(excess) * gain)
+        # The window shows the mean of its heights, which is not that of its middle on a curved surface.
+        footprint = ((2 * self.radius + 1) ** 2 - 1) / 12
+        sigma = with_curvature(height, sigma, footprint, math.ceil(math.sqrt(footprint)))
         return {"height": height, "height_sigma": sigma, "status": status, "sharpness": sharpness}
 
 
@@ -125,8 +130,9 @@ find_focus = travel_function(
     minus the contribution (N - 1) noise^2 of noise. A Gaussian is fitted to the peak and its neighbours, that
     is, a parabola through log S (Nayar and Nakagawa 1994), weighted by the inverse of the variance of log S,
     noise^2 (2 (N - 1) noise^2 + 4 S) / S^2 (a non-central chi-square). The standard error follows from these
-    and from the median misfit of such curves in the picture. With ``reach=1``, which fits three samples
-    exactly, it is unknown: NaN.
+    and from the median misfit of such curves in the picture. Where the surface is curved, half of the
+    window's variance, ((2 radius + 1)^2 - 1) / 12 square pixels, times its second derivatives is added. With
+    ``reach=1``, which fits three samples exactly, it is unknown: NaN.
 
     Returns
     -------

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.footprint import with_curvature
 from mirrorskin.engine.method import Context, Step
 from mirrorskin.engine.options import option
 from mirrorskin.engine.press.changepoint import ChangePoint
@@ -27,7 +27,6 @@ _PIXEL = 1 / 12  # square pixels: variance of a pixel's area
 _SHARP = 0.2  # square pixels: variance of a footprint that is hardly larger than the pixel
 _BLURRED = 9.0  # square pixels: what is larger is no lens
 _LEAST_FRAMES = 8
-_AT_ONCE = 32  # rows processed at once
 _RESOLVED = 0.35  # steps of the travel within a standard deviation of the footprint on a slope
 
 
@@ -58,7 +57,7 @@ class LensBlur(Step):
             return result
         blur = {"blur": round(math.sqrt(variance - _PIXEL), 2)} if variance >= _SHARP else {}
         return result.assign(
-            height_sigma=_with_blur(result.height, result.height_sigma, variance),
+            height_sigma=with_curvature(result.height, result.height_sigma, variance),
             process={**result.process, **blur},
         )
 
@@ -129,56 +128,3 @@ def _first(shares: NDArray[Any], travel: Doubles, level: float) -> Doubles:
     with np.errstate(divide="ignore", invalid="ignore"):
         where = travel[after - 1] + (travel[after] - travel[after - 1]) * (level - low) / (high - low)
     return np.where(crossed, where, np.nan)
-
-
-def _with_blur(height: NDArray[Any], sigma: NDArray[Any], variance: float) -> NDArray[np.float32]:
-    """Return standard deviations with that by which a footprint may move the heights of a curved surface, mm.
-
-    It is v / 2 times the root of the sum of all squared second derivatives. They are those over the width of
-    the footprint, and their squares are averaged over as much.
-    """
-    reach = max(1, round(math.sqrt(variance)))
-    rows = height.shape[0]
-    edge = 2 * reach
-    padded = cv2.copyMakeBorder(height.astype(np.float32), edge, edge, edge, edge, cv2.BORDER_REPLICATE)
-    found, factor = np.empty(height.shape, np.float32), np.float32((variance / (2 * reach**2)) ** 2)
-    for start in range(0, rows, _AT_ONCE):  # parts that stay in the cache
-        stop = min(start + _AT_ONCE, rows)
-        squares = _curvature(padded[start : stop + 4 * reach], reach) * factor
-        squares += np.square(sigma[start:stop])
-        np.sqrt(squares, out=found[start:stop])
-    return found
-
-
-def _curvature(height: NDArray[Any], reach: int) -> NDArray[Any]:
-    """Return the mean square second differences, without the outer 2 ``reach`` rows and columns."""
-    rows, columns = (size - 2 * reach for size in height.shape)
-
-    def at(down: int, right: int) -> NDArray[Any]:
-        down, right = reach * (down + 1), reach * (right + 1)
-        return height[down : down + rows, right : right + columns]
-
-    middle = at(0, 0) * np.float32(2)
-    squares = at(0, 1) + at(0, -1)
-    squares -= middle
-    squares *= squares
-    along = at(1, 0) + at(-1, 0)
-    along -= middle
-    along *= along
-    squares += along
-    mixed = at(1, 1) - at(1, -1)
-    mixed += at(-1, -1)
-    mixed -= at(-1, 1)
-    mixed *= mixed
-    mixed *= np.float32(1 / 8)  # 2 (mixed / 4)^2
-    squares += mixed
-    there = np.isfinite(squares)
-    window, inside = (2 * reach + 1, 2 * reach + 1), (slice(reach, -reach),) * 2
-    if there.all():
-        return np.asarray(cv2.blur(squares, window))[inside]
-    total, share = (
-        np.asarray(cv2.blur(part, window))[inside]
-        for part in (np.where(there, squares, np.float32(0)), there.astype(np.float32))
-    )
-    mean: NDArray[Any] = np.divide(total, share, out=np.zeros_like(total), where=share > 0)
-    return mean

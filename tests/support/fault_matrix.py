@@ -8,6 +8,7 @@ deviation became wrong that was right.
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import math
 import warnings
@@ -17,8 +18,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from independent_camera import DARK, FAULTS, SPAN, Fault, Floats, centres, points, record, references
+from independent_camera import (
+    DARK,
+    FAULTS,
+    READ_NOISE,
+    SPAN,
+    Fault,
+    Floats,
+    centres,
+    points,
+    record,
+    references,
+)
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from mirrorskin import engine
 from mirrorskin.engine.fusion import fuse_recordings
@@ -151,6 +164,47 @@ def _lit(phase: Floats) -> Floats:
     return 0.8 * np.maximum(lamp + math.cos(ZENITH) * normal[..., 2], 0)
 
 
+@functools.cache
+def _texture() -> Floats:
+    """Return directions, phases and amplitudes of the waves of a speckled surface, (3 + 1, n)."""
+    generator = np.random.default_rng(3)
+    angle, length = generator.uniform(0, 2 * np.pi, 60), generator.uniform(4, 10, 60) * PIXEL
+    phase = generator.uniform(0, 2 * np.pi, 60)
+    return np.stack([2 * np.pi * np.cos(angle) / length, 2 * np.pi * np.sin(angle) / length, phase])
+
+
+SHIFT = 0.4 * PIXEL  # mm along x, from the reference to the frame
+
+
+def _speckle(number: Floats) -> Floats:
+    """Return the light of a speckled surface that moves along x, by a shift a frame."""
+    x, y = points(SHAPE, PIXEL)
+    moved = x - number * SHIFT
+    waves = sum(np.cos(along * moved + up * y + phase) for along, up, phase in _texture().T)
+    return 0.5 + 0.35 * np.tanh(np.asarray(waves) / 8)
+
+
+_BLURS = np.arange(0, 8.1, 0.5)  # standard deviations of a defocused point, points
+
+
+@functools.cache
+def _defocused() -> Floats:
+    """Return the speckled surface out of focus, (blurs, points, points)."""
+    sharp = _speckle(np.zeros((1, 1, 1)))[0]
+    return np.stack([gaussian_filter(sharp, blur, mode="nearest") if blur else sharp for blur in _BLURS])
+
+
+def _focused(travel: Floats) -> Floats:
+    """Return the light of the wavy surface, speckled, through a lens in focus at the travel."""
+    height = _waves(*points(SHAPE, PIXEL))[0]
+    blur = np.clip(np.sqrt(1 + (15 * (travel + height)) ** 2), 0, _BLURS[-2])[0]
+    number = blur / _BLURS[1]
+    low = np.floor(number).astype(int)
+    levels, share = _defocused(), number - low
+    at = np.arange(blur.shape[0])[:, np.newaxis], np.arange(blur.shape[1])
+    return ((1 - share) * levels[low, *at] + share * levels[low + 1, *at])[np.newaxis]
+
+
 # --- Estimators ----------------------------------------------------------------------------------------
 
 
@@ -159,6 +213,8 @@ def _press(surface: Surface, step: float, fault: Fault, seed: int) -> ArrayRecor
     frames = record(_touched(surface), travel, fault, seed)
     dark, bright = references(SHAPE, fault, seed + 1)
     header = {"pixel_size": (PIXEL, PIXEL), "dark": dark.astype("f4"), "bright": bright.astype("f4")}
+    if fault.stated:
+        header["travel_sigma"] = fault.jitter * step
     return ArrayRecording(frames, {"travel": travel}, header)
 
 
@@ -233,6 +289,23 @@ def _photometric(fault: Fault, seed: int) -> Answer:
     return Answer(_angle(result.normals, truth), result.normals_sigma, warned)
 
 
+def _moved(fault: Fault, seed: int) -> Answer:
+    reference, frame = record(_speckle, np.arange(2.0), fault, seed)
+    result, warned = _watched(
+        lambda: engine.slip.find_displacement(reference, frame[np.newaxis], PIXEL, window_size=12)
+    )
+    return Answer(result.displacement[0, ..., 0] - SHIFT, result.displacement_sigma[0, ..., 0], warned)
+
+
+def _by_focus(fault: Fault, seed: int) -> Answer:
+    travel = np.arange(0.2, 1.0, 0.05)
+    frames = record(_focused, travel, fault, seed)
+    source = ArrayRecording(frames, {"travel": travel}, {})
+    noise = math.hypot(READ_NOISE, 0.8) * fault.scale
+    result, warned = _watched(lambda: engine.run(source, engine.focus.Focus(noise=noise)))
+    return Answer(result.height - _waves(*centres(SHAPE, PIXEL))[0], result.height_sigma, warned)
+
+
 def _watched(compute: Callable[[], Result]) -> tuple[Result, bool]:
     """Return a result, and whether it has a warning."""
     with warnings.catch_warnings(record=True) as caught:
@@ -253,6 +326,8 @@ ESTIMATORS: Mapping[str, Callable[[Fault, int], Answer]] = {
     "press and rotation, fused": _fused,
     "fringes": _of_fringes,
     "photometric stereo": _photometric,
+    "displacement": _moved,
+    "focus": _by_focus,
 }
 
 
@@ -264,6 +339,10 @@ PRESS = [name for name in ESTIMATORS if name.startswith(("threshold", "change-po
 
 def applies(estimator: str, fault: Fault) -> bool:
     """Return whether a fault can occur; projectors and lamps do not move while a frame is exposed."""
+    if fault.stated:
+        return estimator in PRESS
+    if estimator == "displacement":  # it answers for each frame alone
+        return not (fault.jitter or fault.dropped or fault.duplicated or fault.shutter)
     return not (fault.shutter and estimator in ("fringes", "photometric stereo"))
 
 

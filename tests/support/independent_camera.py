@@ -46,6 +46,8 @@ class Fault:
         Rise of the dark level over the recording, counts of 8 bits.
     jitter : float
         Standard deviation of the position, steps from frame to frame.
+    stated : bool
+        Whether the user states the jitter.
     dropped, duplicated : bool
         Whether the frame in the middle is missing, or is there twice; nobody noticed.
     hot : float
@@ -73,6 +75,7 @@ class Fault:
     flicker: float = 0.0
     drift: float = 0.0
     jitter: float = 0.0
+    stated: bool = False
     dropped: bool = False
     duplicated: bool = False
     hot: float = 0.0
@@ -99,6 +102,7 @@ FAULTS = (
     Fault("flicker 2 %", flicker=0.02),
     Fault("drift 4 counts", drift=4.0),
     Fault("jitter 0.1 steps", jitter=0.1),
+    Fault("the same, stated", jitter=0.1, stated=True),
     Fault("dropped frame", dropped=True),
     Fault("repeated frame", duplicated=True),
     Fault("rolling shutter", shutter=1.0),
