@@ -74,7 +74,9 @@ def feed(
         # The result needs it, and it takes about as long as the frames.
         fingerprint = worker.submit(source.fingerprint) if hasattr(source, "fingerprint") else None
         _feed_passes(source, operation, chosen, watch, progress)
-        if source.rewindable and watch.samples.count and operation.reconsider(watch.samples):
+        # Frames that a live run used give what they gave live.
+        again = source.rewindable and not getattr(source, "used_live", False) and watch.samples.count
+        if again and operation.reconsider(watch.samples):
             again = _Corrected(source, operation, chosen.start) if operation.corrects else source
             _feed_passes(again, operation, chosen, None, progress)
     if fingerprint is not None:

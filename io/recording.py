@@ -75,6 +75,8 @@ class Recording(Closing):
         Whether a live run used a frame, and the number of frames lost before it.
     which : str
         The frames of the whole stack that these are, as text.
+    used_live : bool
+        Whether these are only the frames that a live run used.
     storage : str
         How the frames are stored, as text.
     findings : tuple of Finding
@@ -131,6 +133,7 @@ class Recording(Closing):
         self.displacement, self.twist = positions.get("displacement"), positions.get("twist")
         self.tilt: Floats | None = positions.get("tilt")
         self.which: str = f"{cut.frames[0]}:{cut.frames[1]}{', used live' if live else ''}"
+        self.used_live = live
         self.storage, self._file, self._dataset = file.storage(dataset), file, dataset
         self._origins = file.origins() if isinstance(file, ZarrFile) else origins(file, dataset)
         self.read_ahead = isinstance(file, ZarrFile)

@@ -54,6 +54,7 @@ def test_a_case_runs_at_a_tiny_size(name, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")  # the press fused is not of the turn
 @pytest.mark.parametrize("name", [name for name in program.CASES if name not in QUICK])
 def test_every_other_case_runs_at_a_tiny_size(name, tmp_path):
     check_case(name, tmp_path / "run.json")
