@@ -6,16 +6,20 @@ import gpu_counts
 import pytest
 
 from mirrorskin.io import MirrorskinWarning
+from mirrorskin.kernels.device import open_device
 
 KNOWN = gpu_counts.load()
 
 
 @pytest.fixture(scope="module")
 def found():
-    with warnings.catch_warnings(
-        action="ignore", category=MirrorskinWarning
-    ):  # its press is not its rotation
-        return dict(gpu_counts.count_all())
+    device = open_device()
+    as_it_is = device.info, device.layout
+    with warnings.catch_warnings(action="ignore", category=MirrorskinWarning):  # its press is not its turn
+        try:
+            return dict(gpu_counts.count_all())
+        finally:
+            device.info, device.layout = as_it_is  # other tests use this device, too
 
 
 @pytest.mark.slow
