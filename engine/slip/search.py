@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, Self
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -43,6 +44,10 @@ _EXPECTED = {  # see docs/method/slip.md
 }
 # An estimated contact is too wide: at its rim in a slide, windows contain free skin.
 _BEND_ESTIMATED = {"horizontal": 64.0, "twist": 24.0}
+_RIM, _ENOUGH = (
+    1.5,
+    0.25,
+)  # windows from its rim that are left out, and least share of the nodes that are left
 _FOLLOWS = 0.5  # of the object's movement, above which skin is assumed to have been in contact with it
 _LEAST_STUCK = 4  # smallest number of nodes for the centre and the angle of a twist
 _STILL = 1e-9  # motion, relative to the body's path, up to which it is at rest
@@ -333,7 +338,7 @@ class Slip(Operation):
             expected, radius = _EXPECTED[self.motion], math.sqrt(touched.sum() / math.pi)
             if self._contact is None:
                 expected = replace(expected, onset_bend=_BEND_ESTIMATED[self.motion])
-            known = np.where(touched, overlap * sigma, np.nan)
+            known = np.where(self._inside(touched), overlap * sigma, np.nan)
             locking = -np.nan_to_num(course.along(drawn * np.identity(2)[:, None, None, None]))
             found = fit_onsets(
                 departure[: course.forward, *box],
@@ -346,6 +351,18 @@ class Slip(Operation):
             )
             onset[box], spread[box] = found.onset, found.sigma
         return OnsetMap(onset, spread)
+
+    def _inside(self, touched: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return the nodes of a contact whose windows contain no free skin: all, if the contact is given.
+
+        An estimated contact is too wide by about a window. All nodes are returned if this leaves few.
+        """
+        if self._contact is not None:
+            return touched
+        reach = math.ceil(_RIM * self.window_size / self.window_step)
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+        inside = cv2.erode(touched.view(np.uint8), disc, borderValue=1) > 0
+        return inside if np.mean(inside[touched]) > _ENOUGH else touched
 
     def _pixels(
         self,

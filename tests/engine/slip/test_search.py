@@ -271,3 +271,13 @@ def test_a_modulus_gives_traction_and_force(slid):
     np.testing.assert_array_equal(found.traction, expected.traction)
     assert (found.force_x, found.force_y_sigma) == (expected.force_x, expected.force_y_sigma)
     assert found.traction[..., 0].sum() * PIXEL**2 == pytest.approx(found.force_x, rel=0.1)
+
+
+def test_free_skin_in_windows_at_the_rim_of_an_estimated_contact_does_not_look_like_early_slip():
+    frames, places = slide(count=14)  # to 0.4 of the way at which all slides
+    operation = search(contact=None)
+    operation.push(frames, displacement=places)
+    found = operation.result()
+    error = (found.slip_onset - onset(COLUMN, ROW) * PIXEL)[INSIDE]
+    assert abs(np.nanmean(error)) < 0.3 * STEP * PIXEL  # 1.1 frames early with all windows
+    assert 0.2 < np.nanmean((error / found.slip_onset_sigma[INSIDE]) ** 2) < 1.5  # 12 with all windows
