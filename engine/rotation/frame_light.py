@@ -30,6 +30,7 @@ _STEADY = 1e-6  # standard deviation of gains and offsets that are left out
 _SWING = 2.0  # ratio of the swing of the brightness to that of the tilt, up to which a pixel is used
 _MOST = 0.2  # largest standard deviation of gains
 _AS_ONE = 0.5  # mean direction above which pixels face the same way, so that the light is not determined
+_ALIKE = 0.5  # largest difference of the light at steep and at other pixels, as a share of its change
 _OUTLIER = 3.0  # times the usual misfit, beyond which a pixel is left out
 _LEAST_NOISE = 1e-3  # counts
 
@@ -111,18 +112,42 @@ def find_frame_light(
     facing = np.exp(1j * np.arctan2(wave[2], wave[1]))[usable]
     if np.count_nonzero(usable) < _FEWEST_PIXELS or abs(np.mean(facing)) > _AS_ONE:
         return None
-    fit = _Fit(counts[:, usable], phase, tilt, per_angle[usable], base[usable], low[usable], wave[:, usable])
+    steep = wave[0] > np.median(wave[0][usable])
+    parts = [usable, usable & steep, usable & ~steep]
+    chosen = [
+        (counts[:, one], phase, tilt, per_angle[one], base[one], low[one], wave[:, one]) for one in parts
+    ]
+    whole_fit = _fitted(*chosen[0])
+    if whole_fit is None or not whole_fit.known.any():
+        return None
+    at_steep, at_level = (_fitted(*one, whole_fit.known) for one in chosen[1:])
+    if at_steep is None or at_level is None:
+        return None
+    # A response that is not as stated looks different at other zeniths; light does not.
+    middle = float(np.median(counts[:, usable] - low[usable]))
+    difference = np.std(at_steep.change(middle) - at_level.change(middle))
+    return whole_fit.light() if difference < _ALIKE * np.std(whole_fit.change(middle)) else None
+
+
+def _fitted(
+    counts: Doubles, phase: Doubles, tilt: float, gain: Doubles, base: Doubles, dark: Doubles, wave: Doubles,
+    known: NDArray[np.bool_] | None = None,
+) -> _Fit | None:  # fmt: skip
+    """Return the fit of what is known, or significant, to some pixels; None if too few pixels follow it."""
+    fit = _Fit(counts, phase, tilt, gain, base, dark, wave)
+    if known is not None:
+        fit.leave_out(~known)
     fit.keep(fit.misfit < _OUTLIER * float(np.median(fit.misfit)))
     for _ in range(_ROUNDS):
         fit.improve()
         fit.keep(fit.misfit < _OUTLIER * float(np.median(fit.misfit)))
-        if fit.pixels < _FEWEST_PIXELS:
+        if fit.pixels < _FEWEST_PIXELS // 3:
             return None
-    while (steady := fit.known & ~fit.significant).any():
+    while known is None and (steady := fit.known & ~fit.significant).any():
         fit.leave_out(steady)
         fit.improve()
         fit.improve()
-    return fit.light()
+    return fit
 
 
 def _is_suspect(samples: NDArray[Any], phase: Doubles) -> bool:
@@ -248,6 +273,11 @@ class _Fit:
         self._light[chosen], self._prior[chosen] = 0.0, _STEADY
         self.known &= ~chosen
         self._look()
+
+    def change(self, level: float) -> Doubles:
+        """Return by how much frames are brighter at a level of the light, counts, (T,)."""
+        excess, offset = self._light
+        return np.asarray(level * excess + offset)
 
     def light(self) -> FrameLight | None:
         """Return the light; None if it is steady."""

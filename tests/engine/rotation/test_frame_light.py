@@ -106,3 +106,13 @@ def test_an_operation_forgets_the_light_with_the_frames():
         engine.run(turn(waves(), gain, STEADY[1], 1), operation) for gain in (STEADY[0], FLICKER, STEADY[0])
     ]
     assert np.array_equal(results[0].normals, results[2].normals, equal_nan=True)
+
+
+def test_a_response_that_is_not_as_stated_is_no_flicker():
+    light = rotations.levels(waves(), SETUP)
+    floor = np.maximum(light, 20 + SETUP.slope * np.radians(12))  # level surfaces do not get darker
+    counts = np.rint(floor + np.random.default_rng(1).normal(0, SETUP.noise, light.shape))
+    header = {"tilt": SETUP.tilt, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset}
+    phase = {"phase": np.array(SETUP.phase)}
+    result = engine.reconstruct(ArrayRecording(counts.clip(0, 255).astype(np.uint8), phase, header))
+    assert {"flicker", "drift"} & set(result.process) == set()
