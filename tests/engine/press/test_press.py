@@ -47,7 +47,7 @@ def test_each_event_is_looked_for_in_its_part_of_a_recording(tmp_path, method):
     frames, levels = frames_of(source), {"dark": source.header.dark, "bright": source.header.bright}
     with io.open_recording(record(twin(), tmp_path / "both.h5", block=13)) as recording:
         for event, part in (("onset", slice(0, 31)), ("release", slice(29, 60))):
-            options = {"method": method, "fill": False, "memory_limit": 7 * frames[0].size}
+            options = {"method": method, "blur": 0, "fill": False, "memory_limit": 7 * frames[0].size}
             result = engine.reconstruct(recording, event=event, **options)
             assert_found(result, FIND[method](frames[part], STROKE[part], **levels, event=event))
             assert used(result) == (event, part.start, 31)
@@ -124,14 +124,14 @@ def test_what_cannot_be_done_is_refused_before_anything_is_read(travel, options,
 @pytest.mark.parametrize("missing", [{"dark": None}, {"dark": None, "bright": None}])
 def test_a_change_between_unknown_levels_is_read_twice(missing):
     done, source, limit = [], twin(DOWN, **missing), 2 * 16 * SHAPE[0] * SHAPE[1]
-    options = {"method": "change-point", "fill": False, "memory_limit": limit, "progress": done.append}
-    result = engine.reconstruct(source, **options)
+    options = {"method": "change-point", "blur": 0, "fill": False}
+    result = engine.reconstruct(source, **options, memory_limit=limit, progress=done.append)
     source.rewind()
     assert_found(result, engine.find_change_point(frames_of(source), DOWN))
     assert done == [16, 30, 16, 30]
     assert result.process["dark"] == result.process["bright"] == "each pixel's own"
     source = twin(**missing)
-    result = engine.reconstruct(source, event="release", method="change-point", fill=False)
+    result = engine.reconstruct(source, event="release", **options)
     source.rewind()
     assert_found(result, engine.find_change_point(frames_of(source)[29:], STROKE[29:], event="release"))
 
@@ -189,7 +189,8 @@ def test_storage_and_memory_do_not_change_a_result(device, tmp_path, dtype, comp
         recorder.drain(lambda done: None)
     for limit in (1, 10 * frames[0].nbytes, 10**9):
         with io.open_recording(tmp_path / "press.h5", memory_limit=limit) as recording:
-            result = engine.reconstruct(recording, method=method, device=device, memory_limit=limit)
+            options = {"method": method, "blur": 0, "device": device, "memory_limit": limit}
+            result = engine.reconstruct(recording, **options)
         assert_found(result, wanted)
 
 
