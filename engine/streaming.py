@@ -77,8 +77,8 @@ def feed(
         # Frames that a live run used give what they gave live.
         again = source.rewindable and not getattr(source, "used_live", False) and watch.samples.count
         if again and operation.reconsider(watch.samples):
-            again = _Corrected(source, operation, chosen.start) if operation.corrects else source
-            _feed_passes(again, operation, chosen, None, progress)
+            corrected = _Corrected(source, operation, chosen.start) if operation.corrects else source
+            _feed_passes(corrected, operation, chosen, None, progress)
     if fingerprint is not None:
         fingerprint.result()
     return tuple(_as_corrected(one, operation.corrects) for one in watch.check().findings)
