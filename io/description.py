@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from mirrorskin.io.arrays import list_arrays
 from mirrorskin.io.calibration.file import MARK as CALIBRATION_MARK
 from mirrorskin.io.calibration.file import open_calibration
 from mirrorskin.io.calibration.types import PARTS, Calibration
+from mirrorskin.io.findings import Finding
 from mirrorskin.io.foreign import kind_of_frames, open_reader
 from mirrorskin.io.frames import FrameReader
 from mirrorskin.io.layout import MARK
@@ -79,7 +81,11 @@ def _frames(kind: str, frames: FrameReader) -> dict[str, str]:
         facts["dropped"] = f"{np.sum(frames.lost)} frames"
     if frames.left_out:
         facts["left out"] = ", ".join(frames.left_out)
-    return facts | {f"finding: {found.kind}": found.text for found in frames.findings}
+    return facts | _findings(frames.findings)
+
+
+def _findings(findings: Iterable[Finding]) -> dict[str, str]:
+    return {f"finding: {found.kind}": found.text for found in findings}
 
 
 def _recording(recording: Recording) -> dict[str, str]:
@@ -121,7 +127,7 @@ def _recording(recording: Recording) -> dict[str, str]:
     for name in ("dark", "bright"):
         facts[f"{name} reference"] = _counts(getattr(header, name), "counts")
     facts["truth"] = ", ".join(recording.truth_maps) or "none"
-    return facts
+    return facts | _findings(recording.findings)
 
 
 def _counts(values: NDArray[np.floating] | None, unit: str) -> str:

@@ -184,6 +184,7 @@ def test_what_was_found_at_an_import_stays_in_the_recording(tmp_path):
         recorder.drain(lambda done: None)
     with io.open_recording(tmp_path / "rec.h5") as recording:
         assert recording.findings == source.findings
+    assert io.describe(tmp_path / "rec.h5")["finding: lossy"] == "the frames were compressed"
 
 
 def test_few_pixels_tell_nothing():
