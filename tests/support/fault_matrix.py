@@ -37,6 +37,7 @@ from mirrorskin import engine
 from mirrorskin.engine.fusion import fuse_recordings
 from mirrorskin.io import MirrorskinWarning, Result
 from mirrorskin.io.arrays import ArrayRecording
+from mirrorskin.io.frames import lossy
 
 SHAPE, PIXEL = (48, 64), 0.05  # pixels; mm
 LIMITS = 2.0, 0.02  # of an honest cell: chi^2, and the share of errors beyond three standard deviations
@@ -208,6 +209,14 @@ def _focused(travel: Floats) -> Floats:
 # --- Estimators ----------------------------------------------------------------------------------------
 
 
+def _opened(frames: Any, positions: dict[str, Any], header: dict[str, Any], fault: Fault) -> ArrayRecording:
+    """Return frames as a source, which says that they were compressed, as that of a file does."""
+    source = ArrayRecording(frames, positions, header)
+    if fault.codec:
+        source.findings = (lossy(fault.codec),)
+    return source
+
+
 def _press(surface: Surface, step: float, fault: Fault, seed: int) -> ArrayRecording:
     travel = np.arange(0.2, 1.1, step)
     frames = record(_touched(surface), travel, fault, seed)
@@ -215,13 +224,13 @@ def _press(surface: Surface, step: float, fault: Fault, seed: int) -> ArrayRecor
     header = {"pixel_size": (PIXEL, PIXEL), "dark": dark.astype("f4"), "bright": bright.astype("f4")}
     if fault.stated:
         header["travel_sigma"] = fault.jitter * step
-    return ArrayRecording(frames, {"travel": travel}, header)
+    return _opened(frames, {"travel": travel}, header, fault)
 
 
 def _turn(surface: Surface, fault: Fault, seed: int, count: int = 16) -> ArrayRecording:
     phase = np.arange(count) * 2 * np.pi / count
     frames = record(_leaning(surface), phase, fault, seed)
-    return ArrayRecording(frames, {"phase": phase}, {"pixel_size": (PIXEL, PIXEL), "tilt": TILT})
+    return _opened(frames, {"phase": phase}, {"pixel_size": (PIXEL, PIXEL), "tilt": TILT}, fault)
 
 
 def _scale(fault: Fault) -> dict[str, float]:
@@ -274,7 +283,7 @@ def _of_fringes(fault: Fault, seed: int) -> Answer:
     phase = _fringes(*points(SHAPE, PIXEL))
     shift = np.arange(8) * np.pi / 4
     frames = record(lambda at: 0.5 + 0.4 * np.cos(phase - at), shift, fault, seed)
-    source = ArrayRecording(frames, {"phase": shift}, {})
+    source = _opened(frames, {"phase": shift}, {}, fault)
     result, warned = _watched(lambda: engine.run(source, engine.fringes.Fringes))
     error = result.phase - _fringes(*centres(SHAPE, PIXEL))
     return Answer(np.arctan2(np.sin(error), np.cos(error)), result.phase_sigma, warned)
@@ -283,7 +292,7 @@ def _of_fringes(fault: Fault, seed: int) -> Answer:
 def _photometric(fault: Fault, seed: int) -> Answer:
     truth, azimuth = _normals(_waves, *centres(SHAPE, PIXEL)), np.arange(12) * np.pi / 6
     frames = record(_lit, azimuth, fault, seed)
-    source = ArrayRecording(frames, {"phase": azimuth}, {"dark": np.float32(DARK * fault.scale)})
+    source = _opened(frames, {"phase": azimuth}, {"dark": np.float32(DARK * fault.scale)}, fault)
     operation = engine.photometric.PhotometricStereo(zenith=ZENITH, shadow=6 * fault.scale)
     result, warned = _watched(lambda: engine.run(source, operation))
     return Answer(_angle(result.normals, truth), result.normals_sigma, warned)
@@ -300,7 +309,7 @@ def _moved(fault: Fault, seed: int) -> Answer:
 def _by_focus(fault: Fault, seed: int) -> Answer:
     travel = np.arange(0.2, 1.0, 0.05)
     frames = record(_focused, travel, fault, seed)
-    source = ArrayRecording(frames, {"travel": travel}, {})
+    source = _opened(frames, {"travel": travel}, {}, fault)
     noise = math.hypot(READ_NOISE, 0.8) * fault.scale
     result, warned = _watched(lambda: engine.run(source, engine.focus.Focus(noise=noise)))
     return Answer(result.height - _waves(*centres(SHAPE, PIXEL))[0], result.height_sigma, warned)
