@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from mirrorskin.io.findings import Finding
 from mirrorskin.io.types import Floats, Motion
 
-_SIDE = 24  # pixels of the grid along each side
+_SIDES = 24, 16  # pixels of the grid along each side; of a press, whose frames are not corrected by them
 _MOST = 1 << 22  # samples kept in all
 _FEWEST = 64  # pixels that are needed to tell anything
 _QUANTUM = 1 / math.sqrt(12)  # standard deviation of rounding, counts
+_PAIRS = 24  # of frames whose differences tell the noise
 _MAD = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
 _CLEAR = 10.0  # noise deviations by which the brightness of a pixel must change to count as a response
 _FEW = 0.05  # share of pixels below which their common behaviour means nothing
@@ -39,6 +40,8 @@ class FrameSamples:
     ----------
     shape : (int, int, int)
         Frames, rows and columns of the source.
+    press : bool
+        Whether the motion is vertical, of which fewer pixels are needed.
 
     Attributes
     ----------
@@ -53,8 +56,8 @@ class FrameSamples:
     (3, 2, 2)
     """
 
-    def __init__(self, shape: tuple[int, int, int]) -> None:
-        side = max(2, min(_SIDE, math.isqrt(_MOST // max(1, shape[0]))))
+    def __init__(self, shape: tuple[int, int, int], press: bool = False) -> None:
+        side = max(2, min(_SIDES[press], math.isqrt(_MOST // max(1, shape[0]))))
         self._cut = (
             slice(None),
             *(slice((n - 1) % s // 2, None, s) for n in shape[1:] for s in [-(-n // side)]),
@@ -63,9 +66,9 @@ class FrameSamples:
         self._parts: list[NDArray[Any]] = []
 
     @classmethod
-    def of(cls, frames: NDArray[Any]) -> Self:
+    def of(cls, frames: NDArray[Any], press: bool) -> Self:
         """Return samples of a stack."""
-        samples = cls((len(frames), frames.shape[1], frames.shape[2]))
+        samples = cls((len(frames), frames.shape[1], frames.shape[2]), press)
         samples.push(frames)
         return samples
 
@@ -203,13 +206,14 @@ class Traces:
 
     def _noise(self) -> float:
         """Return about the standard deviation of a sample: what changes least explains."""
-        steps = np.diff(self._counts, axis=0)
+        pairs = np.unique(np.linspace(0, len(self._counts) - 3, _PAIRS).astype(int))
+        steps = self._counts[pairs + 1] - self._counts[pairs]
         found = [_MAD * float(np.median(np.median(np.abs(steps), axis=1))) / math.sqrt(2)]
         if self._fit is not None:
             left = np.abs(self._counts - self._fit)
             found.append(_MAD * float(np.median(left)))
-            if len(steps) > 1:
-                found.append(_MAD * float(np.median(np.abs(np.diff(steps, axis=0)))) / math.sqrt(6))
+            following = self._counts[pairs + 2] - self._counts[pairs + 1]
+            found.append(_MAD * float(np.median(np.abs(following - steps))) / math.sqrt(6))
         return max(min(found), _QUANTUM if self._integer else 0.0)
 
     def _repeated(self) -> Iterator[Finding]:
