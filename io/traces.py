@@ -17,9 +17,9 @@ _SIDES = 24, 16  # pixels of the grid along each side; of a press, whose frames 
 _MOST = 1 << 22  # samples kept in all
 _FEWEST = 64  # pixels that are needed to tell anything
 _QUANTUM = 1 / math.sqrt(12)  # standard deviation of rounding, counts
-_PAIRS = 24  # of frames whose differences tell the noise
+_PAIRS = 24  # of frames from which the noise is estimated
 _MAD = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
-_CLEAR = 10.0  # noise deviations by which the brightness of a pixel must change to count as a response
+_CLEAR = 10.0  # least change of a pixel's brightness that is a response, standard deviations of the noise
 _FEW = 0.05  # share of pixels below which their common behaviour means nothing
 _MOST_OF = 0.8  # share of pixels that decides
 _CLIPPED = 0.1  # share of responding pixels that may reach the end of the scale
@@ -27,7 +27,7 @@ _FLICKER, _DRIFT = 0.01, 2.0  # share of the light; counts of 8 bits
 _NOISY = 0.3  # share of the pixels that differ between frames because of noise
 _AS_ONE = 0.5  # mean direction of the pixels' phases above which all respond alike
 _HARMONICS = 3  # of the phase, that describe the brightness of a pixel
-_THIN = 4  # times by which an axis is shorter than both others if it is a wrong one
+_THIN = 4  # an axis that is so many times shorter than both others may be a wrong one
 
 
 Samples = NDArray[np.float32]
@@ -41,7 +41,7 @@ class FrameSamples:
     shape : (int, int, int)
         Frames, rows and columns of the source.
     press : bool
-        Whether the motion is vertical, of which fewer pixels are needed.
+        Whether the motion is vertical: fewer pixels are kept.
 
     Attributes
     ----------

@@ -43,7 +43,7 @@ class Check:
 
     @property
     def warnings(self) -> tuple[Finding, ...]:
-        """The findings because of which an answer may be wrong."""
+        """The findings that are warnings: an answer may be wrong."""
         return tuple(one for one in self.findings if one.warning)
 
     def __str__(self) -> str:

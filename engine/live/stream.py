@@ -7,8 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping
-from types import TracebackType
-from typing import Any, Self, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -21,13 +20,13 @@ from mirrorskin.engine.method import Method
 from mirrorskin.engine.operation import Operation
 from mirrorskin.io import Block, Header, InputError, Motion, Result
 from mirrorskin.io.layout import POSITIONS
-from mirrorskin.io.types import Floats
+from mirrorskin.io.types import Closing, Floats
 
 _WAITING = 64  # frames at most that wait to be processed
 _ENDLESS = 1 << 40  # frames that a stream may have
 
 
-class Stream:
+class Stream(Closing):
     """Push frames of one's own camera and stage into an operation, and look at its maps at any time.
 
     A thread of its own runs the operation by the policy of `Loop`: frames that waited longer than ``latency``
@@ -129,16 +128,8 @@ class Stream:
 
     def close(self) -> None:
         """End the thread; frames that still wait are processed before."""
-        self._source.end()
+        self._source.close()
         self._thread.join()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
-    ) -> None:
-        self.close()
 
     def _keep(self, update: Update, status: Status) -> None:
         self._latest = update
@@ -163,7 +154,7 @@ def _header(operation: Operation | Method, motion: Motion | None, header: Header
     return Header(cast(Motion, motion or possible[0]))
 
 
-class _Pushed:
+class _Pushed(Closing):
     """A live source whose frames are put into it by another thread."""
 
     name = "stream"
@@ -241,7 +232,7 @@ class _Pushed:
             self._changed.wait_for(lambda: (self._idle and not self._waiting) or self._stopped)
             self._check()
 
-    def end(self) -> None:
+    def close(self) -> None:
         """Let the reader end after the frames that wait."""
         with self._changed:
             self._ended = True
@@ -268,11 +259,3 @@ class _Pushed:
             raise self._error
         if self._ended:
             raise InputError("the stream is closed: push frames, and ask for its result, before")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
-    ) -> None:
-        self.end()
