@@ -56,6 +56,7 @@ PURPOSES = {
     "info": "Show what a file contains.",
     "check": "Check whether frames and their positions are plausible.",
     "devices": "List the OpenCL devices of this machine.",
+    "doctor": "Show the device, versions, extras and caches of this installation, for reports of faults.",
     "rig": "Check a stage and a camera before they are used.",
     "calibrate": "Calibrate brightness, scale, tilt and elasticity of a sensor.",
     "twin": "Emulate a whole rig: its stage and its camera.",
