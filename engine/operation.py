@@ -494,9 +494,7 @@ def apply(operation: Operation, frames: NDArray[Any], **given: Any) -> Result:
             operation.push(frames, lent=True, **given)
 
     push_all()
-    if isinstance(frames, np.ndarray) and operation.reconsider(
-        FrameSamples.of(frames, "vertical" in operation.motions)
-    ):
+    if isinstance(frames, np.ndarray) and operation.reconsider(FrameSamples.of(frames)):
         frames = operation.corrected(frames, 0)
         push_all()
     return operation.finish()

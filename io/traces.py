@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from mirrorskin.io.findings import Finding
 from mirrorskin.io.types import Floats, Motion
 
-_SIDES = 24, 16  # pixels of the grid along each side; of a press, whose frames are not corrected by them
+_SIDE = 24  # pixels of the grid along each side
 _MOST = 1 << 22  # samples kept in all
 _FEWEST = 64  # pixels that are needed to tell anything
 _QUANTUM = 1 / math.sqrt(12)  # standard deviation of rounding, counts
-_PAIRS = 24  # of frames from which the noise is estimated
 _MAD = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
 _CLEAR = 10.0  # least change of a pixel's brightness that is a response, standard deviations of the noise
 _FEW = 0.05  # share of pixels below which their common behaviour means nothing
@@ -40,8 +39,6 @@ class FrameSamples:
     ----------
     shape : (int, int, int)
         Frames, rows and columns of the source.
-    press : bool
-        Whether the motion is vertical: fewer pixels are kept.
 
     Attributes
     ----------
@@ -56,8 +53,8 @@ class FrameSamples:
     (3, 2, 2)
     """
 
-    def __init__(self, shape: tuple[int, int, int], press: bool = False) -> None:
-        side = max(2, min(_SIDES[press], math.isqrt(_MOST // max(1, shape[0]))))
+    def __init__(self, shape: tuple[int, int, int]) -> None:
+        side = max(2, min(_SIDE, math.isqrt(_MOST // max(1, shape[0]))))
         self._cut = (
             slice(None),
             *(slice((n - 1) % s // 2, None, s) for n in shape[1:] for s in [-(-n // side)]),
@@ -66,9 +63,9 @@ class FrameSamples:
         self._parts: list[NDArray[Any]] = []
 
     @classmethod
-    def of(cls, frames: NDArray[Any], press: bool) -> Self:
+    def of(cls, frames: NDArray[Any]) -> Self:
         """Return samples of a stack."""
-        samples = cls((len(frames), frames.shape[1], frames.shape[2]), press)
+        samples = cls((len(frames), frames.shape[1], frames.shape[2]))
         samples.push(frames)
         return samples
 
@@ -206,14 +203,13 @@ class Traces:
 
     def _noise(self) -> float:
         """Return about the standard deviation of a sample: what changes least explains."""
-        pairs = np.unique(np.linspace(0, len(self._counts) - 3, _PAIRS).astype(int))
-        steps = self._counts[pairs + 1] - self._counts[pairs]
+        steps = np.diff(self._counts, axis=0)
         found = [_MAD * float(np.median(np.median(np.abs(steps), axis=1))) / math.sqrt(2)]
         if self._fit is not None:
             left = np.abs(self._counts - self._fit)
             found.append(_MAD * float(np.median(left)))
-            following = self._counts[pairs + 2] - self._counts[pairs + 1]
-            found.append(_MAD * float(np.median(np.abs(following - steps))) / math.sqrt(6))
+            if len(steps) > 1:
+                found.append(_MAD * float(np.median(np.abs(np.diff(steps, axis=0)))) / math.sqrt(6))
         return max(min(found), _QUANTUM if self._integer else 0.0)
 
     def _repeated(self) -> Iterator[Finding]:

@@ -61,7 +61,7 @@ class Watch:
 
     def __init__(self, source: Source, moved: bool = True) -> None:
         self._source, self._moved = source, moved
-        self.samples = FrameSamples(source.shape, source.motion == "vertical")
+        self.samples = FrameSamples(source.shape)
         self._series: dict[str, list[Floats]] = {"time": [], "travel": [], "phase": []}
         self._lost = 0
 
