@@ -37,6 +37,8 @@ class RollingShutter(Step):
         travel = context.pushed("travel")
         first = int(result.process.get("first_frame", 0))
         travel, kept = np.unique(travel, return_index=True)
+        if len(travel) < 2:  # the body rests
+            return result
         time = times[first + kept]
         rows, columns = result.height.shape
         top, whole = 0, rows

@@ -1,5 +1,7 @@
 """A rolling shutter exposes each row at another travel; heights are those of the travel of their row."""
 
+import warnings
+
 import numpy as np
 import pytest
 from stacks import MadeUp
@@ -61,3 +63,10 @@ def test_a_region_has_the_rows_of_the_whole_picture(error_of):
 def test_frames_without_times_are_refused():
     with pytest.raises(io.InputError, match="a rolling shutter needs the time of each frame"):
         engine.reconstruct(press(4e-4), noise=0.5)
+
+
+def test_a_body_that_rests_needs_no_correction(error_of):
+    source = press(4e-4)
+    source._series["travel"] = np.ones(36)
+    with warnings.catch_warnings(action="ignore", category=io.MirrorskinWarning):
+        np.testing.assert_allclose(error_of(source) - DEPTH, -1.0, atol=1e-6)
