@@ -81,7 +81,7 @@ def feed(
             _feed_passes(corrected, operation, chosen, None, progress)
     if fingerprint is not None:
         fingerprint.result()
-    return tuple(_as_corrected(one, operation.corrects) for one in watch.check().findings)
+    return tuple(_as_corrected(one, operation.corrects) for one in watch.findings())
 
 
 def _as_corrected(finding: Finding, corrects: Collection[str]) -> Finding:

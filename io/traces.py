@@ -55,10 +55,9 @@ class FrameSamples:
 
     def __init__(self, shape: tuple[int, int, int]) -> None:
         side = max(2, min(_SIDE, math.isqrt(_MOST // max(1, shape[0]))))
-        self._cut = (
-            slice(None),
-            *(slice((n - 1) % s // 2, None, s) for n in shape[1:] for s in [-(-n // side)]),
-        )
+        steps = [-(-length // side) for length in shape[1:]]
+        cuts = [slice((n - 1) % step // 2, None, step) for n, step in zip(shape[1:], steps, strict=True)]
+        self._cut = (slice(None), *cuts)
         self.rows, self.columns = (np.arange(n)[cut] for n, cut in zip(shape[1:], self._cut[1:], strict=True))
         self._parts: list[NDArray[Any]] = []
 
@@ -111,8 +110,8 @@ class Traces:
             self.span = float(self._highest.max() - self._lowest.min())
             self._fit = self._harmonics()
             self.noise = self._noise()
-            needed = max(_CLEAR * self.noise, 0.02 * self.span)
-            self._responding = self._range > needed
+            self._response = max(_CLEAR * self.noise, 0.02 * self.span)  # least change that is one
+            self._responding = self._range > self._response
             self._share = float(self._responding.mean())
 
     def facts(self) -> dict[str, str]:
@@ -230,7 +229,7 @@ class Traces:
         thin = min(shape[1:])
         if _THIN * thin > min(shape[0], max(shape[1:])):
             return
-        samples = self._stored.reshape(self._grid).astype(np.float32)
+        samples = self._pictures
         over_time = samples.mean(axis=(1, 2))
         along = samples.mean(axis=(0, 1 if shape[2] == thin else 2))
         if np.nanvar(along) > 4 * np.nanvar(over_time):
@@ -264,6 +263,11 @@ class Traces:
                 " respond, although the travel does not: is this a rotation?",
             )
 
+    @property
+    def _pictures(self) -> Samples:
+        """The brightness of all pixels of the grid, (T, rows, columns)."""
+        return self._stored.reshape(self._grid).astype(np.float32)
+
     @staticmethod
     def _changes(counts: Samples, direction: float = 1.0) -> tuple[float, float]:
         """Return the shares of series, (T, n), that end far above and far below where they begin."""
@@ -274,10 +278,10 @@ class Traces:
 
     def _rising_axis(self) -> str:
         """Return along what the brightness of the pictures rises or falls as in a press; "" if nothing."""
-        samples = self._stored.reshape(self._grid).astype(np.float32)
+        samples = self._pictures
         for axis, name in ((2, "rows"), (1, "columns")):
             series = np.moveaxis(samples, axis, 0).reshape(samples.shape[axis], -1)
-            series = series[:, np.ptp(series, axis=0) > max(_CLEAR * self.noise, 0.02 * self.span)]
+            series = series[:, np.ptp(series, axis=0) > self._response]
             if series.shape[1] >= _FEWEST and max(self._changes(series)) > _MOST_OF:
                 return name
         return ""

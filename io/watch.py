@@ -74,29 +74,41 @@ class Watch:
             if values is not None:
                 parts.append(values)
 
-    def check(
-        self, field_limits: tuple[float, float] = FIELD, travel_limits: tuple[float, float] = TRAVEL
-    ) -> Check:
+    def check(self, field_limits: Limits = FIELD, travel_limits: Limits = TRAVEL) -> Check:
         """Return what the frames so far show."""
+        series, traces = self._look()
         source = self._source
-        samples = self.samples.values if self.samples.count else np.empty((0, 0, 0), source.dtype)
+        facts = {"frames": f"{self.samples.count} of {source.shape[2]} x {source.shape[1]}, {source.dtype}"}
+        facts |= _facts(source, series, traces)
+        return Check(source.name, facts, self._findings(series, traces, field_limits, travel_limits))
+
+    def findings(self) -> tuple[Finding, ...]:
+        """Return what a user should know about the frames so far."""
+        return self._findings(*self._look(), FIELD, TRAVEL)
+
+    def _look(self) -> tuple[dict[str, Floats], Traces]:
+        """Return the positions and times of the frames so far, and their brightness."""
+        source, count = self._source, self.samples.count
+        samples = self.samples.values if count else np.empty((0, 0, 0), source.dtype)
         series = {
             name: np.concatenate(parts)
             for name, parts in self._series.items()
-            if parts and sum(map(len, parts)) == len(samples)
+            if parts and sum(map(len, parts)) == count
         }
-        traces = Traces(samples, source.motion, series)
-        facts = {"frames": f"{len(samples)} of {source.shape[2]} x {source.shape[1]}, {source.dtype}"}
-        facts |= _facts(source, series, traces)
+        return series, Traces(samples, source.motion, series)
+
+    def _findings(
+        self, series: Mapping[str, Floats], traces: Traces, field_limits: Limits, travel_limits: Limits
+    ) -> tuple[Finding, ...]:
+        source = self._source
         dropped = getattr(source, "dropped", None)
         lost = self._lost if dropped is None else int(np.sum(dropped))
-        found = [
+        return (
             *getattr(source, "findings", ()),
             *_geometry(source, series, field_limits, travel_limits),
             *_order(source, series, lost),
             *traces.findings(source.shape, self._moved),
-        ]
-        return Check(source.name, facts, tuple(found))
+        )
 
 
 def _facts(source: Source, series: Mapping[str, Floats], traces: Traces) -> dict[str, str]:
@@ -128,8 +140,8 @@ def _range_of(values: Floats, unit: str) -> str:
 def _geometry(
     source: Source,
     series: Mapping[str, Floats],
-    field_limits: tuple[float, float],
-    travel_limits: tuple[float, float],
+    field_limits: Limits,
+    travel_limits: Limits,
 ) -> Iterator[Finding]:
     """Yield what is wrong with lengths: a wrong unit is a factor of 1000."""
     size = source.header.pixel_size
