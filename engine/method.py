@@ -14,7 +14,7 @@ from mirrorskin.engine.options import Configured
 from mirrorskin.engine.provenance import attach_provenance, naming
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.io import Calibrated, InputError, Result
-from mirrorskin.io.findings import in_process, warn
+from mirrorskin.io.findings import warn, with_findings
 
 if TYPE_CHECKING:
     from mirrorskin.io import Source
@@ -142,7 +142,7 @@ class Method(OnDevice):
             plan = self.plan(source)
             found = feed(plan.stream or source, plan.operation, plan.frames, progress)
             result = plan.finish(plan.operation.finish(), source)
-        result = result.assign(process={**result.process, **in_process(found, result.process)})
+        result = with_findings(result, *found)
         warn(source.name, result.process)
         return undistorted(result, source) if undistort else result
 

@@ -6,7 +6,10 @@ import sys
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mirrorskin.io.result import Result
 
 _BETWEEN = "; "
 
@@ -51,6 +54,11 @@ def in_process(findings: Iterable[Finding], process: Mapping[str, Any]) -> dict[
         if texts:
             known[name] = _BETWEEN.join(dict.fromkeys(texts))
     return known
+
+
+def with_findings(result: Result, *findings: Finding) -> Result:
+    """Return a result whose process contains findings, too."""
+    return result.assign(process={**result.process, **in_process(findings, result.process)})
 
 
 def named(name: str, said: str) -> str:

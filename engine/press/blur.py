@@ -34,8 +34,8 @@ class LensBlur(Step):
     """Add to the standard deviation of heights what a lens that blurs may have moved.
 
     A pixel sees the surface through a footprint, of variance v in square pixels, and shows the median of its
-    heights. On a slope g that takes a travel whose standard deviation is g sqrt(v), by which v is estimated
-    from the steep and the flat parts of the surface.
+    heights. On a slope g it turns light over a travel with the standard deviation g sqrt(v), so that steep
+    and flat parts of the surface show v.
     Where the surface is curved, by H in each direction, the median differs from the height in the middle by
     up to v H / 2. If the footprint is hardly larger than the pixel, or if the steps of the travel do not
     resolve it, nothing is added to thresholds, and what the pixel's own area moves to change-points, which

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.press.crossing import PressOperation
 from mirrorskin.engine.summary import status_shares
 from mirrorskin.io import Result
-from mirrorskin.io.findings import Finding, in_process
+from mirrorskin.io.findings import Finding, with_findings
 
 
 def with_reason(
@@ -35,9 +35,7 @@ def with_reason(
     parts = [frame[np.isfinite(frame)] for frame in frames]
     counts = np.concatenate(parts) if parts else np.empty(0)
     reason = _reason(result, operation, threshold, counts)
-    return result.assign(
-        process={**result.process, **in_process([Finding("no height", reason)], result.process)}
-    )
+    return with_findings(result, Finding("no height", reason))
 
 
 def _reason(result: Result, operation: PressOperation, threshold: float, counts: NDArray[Any]) -> str:

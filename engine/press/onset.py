@@ -16,7 +16,7 @@ from mirrorskin.engine.press.crossing import EVENT_MAPS, Crossing, CrossingOpera
 from mirrorskin.engine.press.estimated_levels import estimate_levels_of
 from mirrorskin.engine.press.no_answer import with_reason
 from mirrorskin.io import Result
-from mirrorskin.io.findings import Finding, in_process, warn
+from mirrorskin.io.findings import Finding, warn, with_findings
 from mirrorskin.io.samples import convert_samples, frame_dtype
 
 
@@ -165,8 +165,7 @@ def _find_onset(frames: AnyArray, where: dict[str, Any], options: dict[str, Any]
     if assumed:
         counts = " and ".join(f"{name} {value:.4g}" for name, value in assumed.items())
         text = f"{counts} counts are estimated from the frames; give {'= and '.join(assumed)}="
-        found = in_process([Finding("estimated levels", text)], result.process)
-        result = result.assign(process={**result.process, **found})
+        result = with_findings(result, Finding("estimated levels", text))
     if isinstance(frames, np.ndarray):
         result = with_reason(result, operation, operation.threshold, frames[:: max(1, len(frames) - 1)])
     warn("find_onset", result.process)

@@ -14,7 +14,7 @@ from mirrorskin.engine.rotation.normals import Normals
 from mirrorskin.engine.rotation.normals_to_height import Slopes, integrate_normals, slopes_of
 from mirrorskin.engine.rotation.registration import Registered
 from mirrorskin.io import Result
-from mirrorskin.io.findings import Finding, in_process
+from mirrorskin.io.findings import Finding, with_findings
 from mirrorskin.kernels.least_squares import mad_sigma
 
 _NO_PIXEL_SIZE = "none: the recording has no pixel size"
@@ -148,7 +148,7 @@ class PhaseSign(Step):
             "the slopes fit together better with the phases reversed: do phases count counter-clockwise in"
             " the picture?",
         )
-        return result.assign(process={**result.process, **in_process([found], result.process)})
+        return with_findings(result, found)
 
 
 def _clip_outliers(values: NDArray[np.float64]) -> NDArray[np.float64]:

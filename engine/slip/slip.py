@@ -15,7 +15,7 @@ from mirrorskin.engine.options import option
 from mirrorskin.engine.slip.search import Slip
 from mirrorskin.engine.summary import status_shares
 from mirrorskin.io import Calibrated, InputError, Result, Source
-from mirrorskin.io.findings import Finding, in_process
+from mirrorskin.io.findings import Finding, with_findings
 from mirrorskin.io.maps import SlipStatus
 
 
@@ -67,8 +67,7 @@ class NoContact(Step):
             f"slip is known at no pixel ({status_shares(result)}): the skin must follow the object by its"
             " texture while they are pressed together"
         )
-        known = in_process([Finding("no contact", text)], result.process)
-        return result.assign(process={**result.process, **known})
+        return with_findings(result, Finding("no contact", text))
 
 
 class Sliding(Method):
