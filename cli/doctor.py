@@ -11,6 +11,7 @@ from importlib import metadata
 
 from mirrorskin.cli import options
 from mirrorskin.cli.output import print_fields, print_json
+from mirrorskin.io.system import usable_cores
 
 _VARIABLES = re.compile(r"(OCL|POCL|PYOPENCL|XDG_CACHE|MIRRORSKIN)\w*$")
 _DEVELOPMENT = ("bench", "browser", "dev", "docs", "ptxas")  # extras that users do not need
@@ -24,7 +25,7 @@ def command(as_json: options.Json = False) -> None:
         "mirrorskin": metadata.version("mirrorskin"),
         "Python": f"{platform.python_version()}, {sys.executable}",
         "system": platform.platform(),
-        "processors": f"{len(os.sched_getaffinity(0))}, {platform.machine()}",
+        "processors": f"{usable_cores()}, {platform.machine()}",
         "device": _device(),
         "linker": shutil.which("ld")
         or "none; the embedded device needs one: pip install 'mirrorskin[linker]'",

@@ -92,6 +92,8 @@ def _common(
 
 
 def _check_address_space() -> None:
+    if sys.platform == "win32":
+        return
     import resource
 
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import functools
 import os
 import shutil
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.existing import Replaces, check_replaced
 from mirrorskin.io.os_errors import as_input_error, legible
+from mirrorskin.io.system import check_writable_system, lock
 from mirrorskin.io.types import Closing, InputError, ProcessValue
 from mirrorskin.io.url import ZARR_SUFFIX, is_zarr
 
@@ -73,6 +73,7 @@ def check_output(
     --------
     >>> check_output(Path("result.h5"), Path("press.h5"))  # doctest: +SKIP
     """
+    check_writable_system()
     with as_input_error(f"{path} cannot be written", "choose another place with -o"):
         if or_zarr and is_zarr(path) and path.suffix.lower() == ZARR_SUFFIX:
             from mirrorskin.io.zarr_export import check_store
@@ -118,7 +119,7 @@ def is_locked(path: Path) -> bool:
     """Return whether a program has a file open with a lock, as every program that writes HDF5 does."""
     with suppress(OSError), path.open("rb") as file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(file, wait=False)
         except OSError:  # or the file system does not support locks
             return True
     return False
@@ -255,7 +256,7 @@ def remove_leftovers(folder: Path) -> list[Path]:
         with suppress(OSError):  # locked, not accessible, or removed meanwhile
             descriptor = os.open(part, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW)
             try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                lock(descriptor, wait=False)
                 if part.is_dir():
                     shutil.rmtree(part)
                 else:
@@ -274,7 +275,7 @@ def _make(part: Path) -> int:
     while True:
         descriptor = os.open(part, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         with suppress(OSError):  # a file system without locks
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            lock(descriptor)
         if os.fstat(descriptor).st_nlink:  # otherwise it was removed as a leftover before it was locked
             return descriptor
         os.close(descriptor)
@@ -298,7 +299,7 @@ def _make_folder(part: Path) -> int:
         with suppress(FileNotFoundError):  # removed as a leftover before it was locked
             descriptor = os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
             with suppress(OSError):  # a file system without locks
-                fcntl.flock(descriptor, fcntl.LOCK_EX)
+                lock(descriptor)
             if os.path.samestat(os.fstat(descriptor), part.stat()):
                 return descriptor
             os.close(descriptor)

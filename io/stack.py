@@ -26,6 +26,7 @@ from mirrorskin.io.frames import FrameReader
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.samples import DecodedFrames, Decoding, Reader
 from mirrorskin.io.selection import Place, Region, Span
+from mirrorskin.io.system import reserve_space, usable_cores
 from mirrorskin.io.types import Closing, InputError
 from mirrorskin.io.zarr import ZarrFrames
 
@@ -72,7 +73,7 @@ class RawFrames(FrameReader):
 
     def _read_whole(self, start: int, out: NDArray[Any]) -> None:
         """Read whole frames, several parts at once if there are many bytes: a thread copies a few GB/s."""
-        parts = np.array_split(out, len(os.sched_getaffinity(0)) if out.nbytes > _MANY else 1)
+        parts = np.array_split(out, usable_cores() if out.nbytes > _MANY else 1)
         places = start + np.cumsum([0, *(part.nbytes for part in parts[:-1])])
         if len(parts) == 1:
             self._read(start, out)
@@ -221,7 +222,7 @@ class Stack:
         what = f"{self._place.path}: {self._place.dataset} is unpacked to disk, {size / 1e9:.3g} GB"
         remedy = "name a folder with more room in TMPDIR, raise --memory, or repack it in chunks of one frame"
         with as_input_error(what, remedy), tempfile.TemporaryFile(buffering=0) as file:
-            os.posix_fallocate(file.fileno(), 0, size)
+            reserve_space(file.fileno(), 0, size)
             return mmap.mmap(file.fileno(), size)
 
 
@@ -235,7 +236,7 @@ def _open(
     if dataset.chunks:
         # The number of threads is limited so that a quarter of the memory suffices for them.
         most = max(1, limit // (4 * math.prod(dataset.chunks) * dataset.dtype.itemsize))
-        return Chunks(dataset.id, codecs, place.name, min(threads or len(os.sched_getaffinity(0)), most))
+        return Chunks(dataset.id, codecs, place.name, min(threads or usable_cores(), most))
     offset = dataset.id.get_offset()
     if offset is None:
         return Hdf5Frames(dataset, "in its header")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import errno
-import fcntl
 import itertools
 import math
 import os
@@ -55,6 +54,7 @@ from mirrorskin.io.recorder import (
     write_header,
     write_plot,
 )
+from mirrorskin.io.system import lock, reserve_space
 from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, LiveSource
 
 _POLL = 0.5  # seconds between checks whether the main program is still running
@@ -543,7 +543,7 @@ class GrowingRecording(Closing):
         self.flush()
         self._file.swmr_mode = True
         with suppress(OSError):  # a file system without locks
-            fcntl.flock(self._descriptor, fcntl.LOCK_SH)
+            lock(self._descriptor, shared=True)
 
     def finish(self, positions: Mapping[str, Floats], state: str) -> None:
         """Write the values that are only known at the end."""
@@ -607,7 +607,7 @@ class GrowingRecording(Closing):
             return
         for reach in (end + self._step, end):
             try:
-                os.posix_fallocate(self._descriptor, start, reach - start)
+                reserve_space(self._descriptor, start, reach - start)
                 self._reserved = reach
                 return
             except OSError as error:

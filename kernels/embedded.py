@@ -13,7 +13,6 @@ import importlib.util
 import logging
 import mmap
 import os
-import resource
 import shlex
 import shutil
 import subprocess
@@ -329,6 +328,8 @@ _PLACE, _PLACE_PER_CORE = 800 << 20, 80 << 20  # bytes; a thread has a stack (8 
 
 def _check_address_space() -> None:
     """Raise DeviceError if a limit to the address space is too low for PoCL."""
+    import resource
+
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit == resource.RLIM_INFINITY:
         return
@@ -343,6 +344,8 @@ def _check_address_space() -> None:
 
 def _run_probe(number: int) -> None:
     """Run one kernel on each device of a platform: what the child process does."""
+    import resource
+
     resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
     prepare()
     for device in cl.get_platforms()[number].get_devices():

@@ -17,9 +17,10 @@ import numpy as np
 
 from mirrorskin.io import InputError
 from mirrorskin.io.os_errors import read_text
+from mirrorskin.io.system import usable_cores
 from mirrorskin.kernels.device import Device
 
-THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+THREADS = usable_cores()
 
 _PACKAGES = (
     "mirrorskin",

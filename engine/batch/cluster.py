@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import fcntl
 import functools
 import logging
 import queue
@@ -26,6 +25,7 @@ from mirrorskin.engine.provenance import program_version
 from mirrorskin.io import InputError
 from mirrorskin.io.atomic import remove_leftovers
 from mirrorskin.io.os_errors import as_input_error
+from mirrorskin.io.system import lock
 
 PATIENCE = 30.0
 """Timeout, s, of a scheduler after the first contact, and of a cluster without workers."""
@@ -271,7 +271,7 @@ def _trace(folder: Path) -> Iterator[Path]:
                 tempfile.NamedTemporaryFile(prefix=".mirrorskin-", suffix=".part", dir=folder)
             )
         with suppress(OSError):  # the file system may not support locks
-            fcntl.flock(file, fcntl.LOCK_EX)  # so that it is not removed as a leftover
+            lock(file)  # so that it is not removed as a leftover
         yield Path(file.name)
 
 

@@ -18,6 +18,7 @@ from distributed import WorkerPlugin, get_worker
 
 from mirrorskin.engine.batch.jobs import Job, Plan
 from mirrorskin.engine.batch.work import Outcome, keep_memory, run_job
+from mirrorskin.io.system import usable_cores
 from mirrorskin.kernels.device import Device, list_devices, open_device
 from mirrorskin.kernels.errors import DeviceError
 
@@ -25,7 +26,8 @@ RESOURCE = "mirrorskin"
 """Dask resource: an enlisted worker has one and each job needs one, so that a worker runs one job at a time.
 Also the topic of the events with the reasons why workers are left out."""
 
-_NUMBERS = f"\0mirrorskin-{os.getuid()}-worker-"  # names of abstract sockets, which are not files (unix(7))
+# Names of abstract sockets, which are not files (unix(7)).
+_NUMBERS = f"\0mirrorskin-{getattr(os, 'getuid', int)()}-worker-"
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +91,7 @@ def take_share(workers: int) -> Share:
     """
     keep_memory()
     number, held = _take_number()
-    cores = len(os.sched_getaffinity(0))
+    cores = usable_cores()
     threads = max(1, cores // workers + (number < cores % workers))
     os.environ.setdefault("POCL_MAX_PTHREAD_COUNT", str(threads))
     gpus = [str(index) for index, device in enumerate(list_devices()) if device.kind == "gpu"]

@@ -8,7 +8,6 @@ import os
 import random
 import select
 import threading
-import tty
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -222,6 +221,8 @@ class GrblPort(GrblLine):
     def __init__(self, machine: GrblMachine) -> None:
         super().__init__(machine)
         self.timeout = _LOOK
+        import tty  # absent on Windows
+
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)

@@ -1,5 +1,6 @@
 """Files that exist whole or not at all, and what is left of those whose writers were killed."""
 
+import fcntl
 import re
 import subprocess
 import sys
@@ -7,7 +8,6 @@ import sys
 import pytest
 
 from mirrorskin import io
-from mirrorskin.io import atomic
 from mirrorskin.io.atomic import new_hdf5, remove_leftovers, write_new
 
 # Begins a file, says so, and waits to be killed.
@@ -70,17 +70,17 @@ def test_the_next_file_in_a_folder_takes_the_place_of_what_was_killed(tmp_path):
 
 
 def test_a_file_that_was_taken_for_a_leftover_is_begun_again(tmp_path, monkeypatch):
-    lock, locked = atomic.fcntl.flock, []
+    lock, locked = fcntl.flock, []
 
     def late(file, how):
         if not locked:
             locked.append(file)
             assert len(remove_leftovers(tmp_path)) == 1
-        elif how == atomic.fcntl.LOCK_EX:
+        elif how == fcntl.LOCK_EX:
             locked.append(file)
         lock(file, how)
 
-    monkeypatch.setattr(atomic.fcntl, "flock", late)
+    monkeypatch.setattr(fcntl, "flock", late)
     with new_hdf5(tmp_path / "a.h5") as new:
         new.root["x"] = 1
     assert len(locked) == 2
@@ -91,7 +91,7 @@ def test_a_program_that_is_ended_while_the_file_is_made_leaves_none(tmp_path, mo
     def end(*_):
         raise SystemExit(143)
 
-    monkeypatch.setattr(atomic.fcntl, "flock", end)
+    monkeypatch.setattr(fcntl, "flock", end)
     with pytest.raises(SystemExit), new_hdf5(tmp_path / "a.h5"):
         pass
     assert not list(tmp_path.iterdir())
