@@ -1,10 +1,10 @@
-# make [demo|test|test-all|test-lowest|test-browser|test-cameras|test-hardware|docs|lint|types|fuzz|bench|portability|gpu-check|gpu|gpu-wheels|clean]; each installs what it needs in .venv first.
+# make [demo|test|test-all|test-lowest|test-browser|test-cameras|test-hardware|docs|package|lint|types|fuzz|bench|portability|gpu-check|gpu|gpu-wheels|clean]; each installs what it needs in .venv first.
 # PYTHON=/path/to/python3.12 chooses the interpreter (3.11 or newer).
 
 SHELL := /bin/sh
 .SHELLFLAGS := -ec
 .ONESHELL:
-.PHONY: demo test test-all test-lowest test-browser test-cameras test-hardware docs lint types fuzz bench portability gpu-check gpu gpu-wheels clean
+.PHONY: demo test test-all test-lowest test-browser test-cameras test-hardware docs package lint types fuzz bench portability gpu-check gpu gpu-wheels clean
 
 PYTHON ?= $(shell for python in python3.13 python3.12 python3.11 python3; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
@@ -33,7 +33,7 @@ test: lint
 test-all: $(READY)
 	@$(BIN)/python -m pytest --ignore tests/browser -m 'slow and real_time'
 	$(PYTEST) -m 'slow and not real_time'
-	$(MAKE) --no-print-directory docs test-browser
+	$(MAKE) --no-print-directory docs package test-browser
 
 # Each command with the lowest versions of all dependencies that pyproject.toml allows, from the package index, in
 # an environment of their own; it needs Python 3.11.
@@ -67,6 +67,19 @@ test-cameras: .venv/.genicam
 docs: .venv/.docs
 	@(cd tests && MYPYPATH=../docs/site ../$(BIN)/mypy --strict --no-error-summary --config-file ../pyproject.toml -m hooks -m declared_options -m option_tables)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+# The distribution packages, in dist/; the wheel is tried in an environment of its own, outside of this folder.
+package: .venv/.package
+	@rm -rf dist build/package build/lib
+	$(BIN)/python -m build --quiet --outdir dist
+	$(BIN)/twine check --strict dist/*
+	"$$($(BIN)/python -c 'import sys; print(sys._base_executable)')" -m venv build/package
+	cd build/package
+	bin/python -m pip --disable-pip-version-check --quiet install "$$(echo ../../dist/*.whl)[view]"
+	bin/mirrorskin sample press -o press.h5
+	bin/mirrorskin reconstruct press.h5
+	bin/mirrorskin score press-result.h5 --truth press.h5
+	bin/mirrorskin report press-result.h5 -o press.html
 
 lint: $(READY)
 	@$(BIN)/ruff check --quiet
@@ -150,6 +163,6 @@ $(READY): $(DEMO)
 	touch $@
 
 # What only some need comes with the first of them.
-.venv/.browser .venv/.docs .venv/.genicam .venv/.ptxas: $(READY)
+.venv/.browser .venv/.docs .venv/.genicam .venv/.package .venv/.ptxas: $(READY)
 	@$(INSTALL) '.[$(@F:.%=%)]'
 	touch $@

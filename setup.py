@@ -1,9 +1,14 @@
 """The package ``mirrorskin``: this folder, the packages in it, and the packages in these."""
 
+import re
+import tomllib
 from pathlib import Path
 
 from setuptools import find_packages, setup
 from setuptools.command.build_py import build_py
+
+_HERE = Path(__file__).parent
+_LINK = re.compile(r"(!?)\[([^\]]*)\]\((?!\w+:|#)([^)]+)\)")
 
 
 class BuildModules(build_py):
@@ -15,9 +20,23 @@ class BuildModules(build_py):
         return [module for module in modules if module[1] != "setup"]
 
 
-folders = [path.parent.name for path in Path(__file__).parent.glob("*/__init__.py")]
+def long_description() -> str:
+    """Return README.md with links and pictures that work outside of the repository."""
+    project = tomllib.loads((_HERE / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    home = project["urls"]["Homepage"]
+
+    def absolute(link: re.Match[str]) -> str:
+        picture, words, path = link.groups()
+        return f"{picture}[{words}]({home}/{'raw' if picture else 'blob'}/main/{path})"
+
+    return _LINK.sub(absolute, (_HERE / "README.md").read_text(encoding="utf-8"))
+
+
+folders = [path.parent.name for path in _HERE.glob("*/__init__.py")]
 packages = find_packages(include=[*folders, *(f"{folder}.*" for folder in folders)])
 setup(
+    long_description=long_description(),
+    long_description_content_type="text/markdown",
     packages=["mirrorskin", *(f"mirrorskin.{name}" for name in packages)],
     package_dir={"mirrorskin": "."},
     cmdclass={"build_py": BuildModules},

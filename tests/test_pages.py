@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import runpy
+import tomllib
 from pathlib import Path
 
 import h5py
@@ -115,3 +116,9 @@ def test_a_table_of_the_sensor_is_what_the_report_prints(name):
     printed = [line for line in str(sensor_report.TABLES[name]()).splitlines() if line.startswith("|")]
     start = page.index(printed[0])
     assert page[start : start + len(printed)] == printed
+
+
+def test_the_citation_names_the_version_of_the_package():
+    root = DOCS.parent
+    version = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    assert f"\nversion: {version}\n" in (root / "CITATION.cff").read_text(encoding="utf-8")
