@@ -2,7 +2,7 @@
 
 ``gpu_check.py [FILE...] [--freeze]``: only these of the kernels' files; keep what is found as the new table.
 Options are those of programs that are built while the frozen cases run on a device that is cut as a GPU
-(docs/decisions/0009-other-opencl.md).
+(tests/portability/README.md).
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 ``portability.py [--whole] [NAME...]``: every device test, not the part that takes 20 minutes; only those with
 one of these in their names. Each runs in a process of its own that sees no other device. Intel's runtime, and
 a root of Debian's testing that holds Mesa and a younger PoCL, are looked for in the folder
-MIRRORSKIN_PORTABILITY, else in the user's cache (docs/decisions/0009-other-opencl.md).
+MIRRORSKIN_PORTABILITY, else in the user's cache (tests/portability/README.md).
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Check:
 
 
 RACES = tuple(name for name in FAULTS if name != NEVER_SET)
-BUILT = "make the root of Debian's testing that docs/decisions/0009-other-opencl.md tells of"
+BUILT = "make the root of Debian testing as described in tests/portability/README.md"
 
 CHECKS = (
     Check("PoCL, the wheel", "pip install pocl-binary-distribution", f"{WHEELS}/libpocl-*.so"),
