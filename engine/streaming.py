@@ -69,7 +69,7 @@ def feed(
         )
     operation.begin(source.shape[1:], source.dtype)
     chosen = range(source.shape[0]) if frames is None else frames
-    watch = Watch(source, moved=bool(operation.motions))
+    watch = Watch(source, moved=bool(operation.motions), phased="phase" in operation.positions)
     with ThreadPoolExecutor(1, "mirrorskin-fingerprint") as worker:
         # The result needs it, and it takes about as long as the frames.
         fingerprint = worker.submit(source.fingerprint) if hasattr(source, "fingerprint") else None

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.findings import Finding
+from mirrorskin.io.phase_check import PhaseCheck
 from mirrorskin.io.types import Floats, Motion
 
 _SIDE = 24  # pixels of the grid along each side
@@ -129,11 +130,14 @@ class Traces:
             facts["drift"] = f"{drift[0]:.2g} counts of the dark level"
         return facts
 
-    def findings(self, shape: tuple[int, int, int], moved: bool) -> Iterator[Finding]:
+    def findings(self, shape: tuple[int, int, int], moved: bool, phased: bool) -> Iterator[Finding]:
         """Yield what is doubtful."""
         if not self._known:
             return
-        yield from self._repeated()
+        repeated = list(self._repeated())
+        yield from repeated
+        if phased:
+            yield from self._phases(bool(repeated))
         if not moved:
             return
         if self._share == 0:
@@ -222,6 +226,30 @@ class Traces:
                 "repeated frames",
                 f"{named_frames(again)}: identical to the one before, so later positions may be wrong:"
                 " remove it, or give the position of each frame",
+            )
+
+    def _phases(self, repeated: bool) -> Iterator[Finding]:
+        """Yield that later frames fit to other phases, and that all pixels grow brighter or darker."""
+        phase = self._series.get("phase")
+        if self._motion != "axial" or phase is None:
+            return
+        check = PhaseCheck(self._counts, phase)
+        if not repeated and (jump := check.jump()) is not None:
+            frame, steps, step = jump
+            cause = "there twice" if steps < 0 else "missing"
+            frames = "a frame" if abs(steps) == 1 else f"{steps} frames"
+            yield Finding(
+                "phase jump",
+                f"from frame {frame} on, the brightness fits phases {abs(math.degrees(steps * step)):.3g}"
+                f" degrees {'further' if steps > 0 else 'back'}, as if {frames} before it"
+                f" {'was' if abs(steps) == 1 else 'were'} {cause}: give the phase of each frame",
+            )
+        drift = check.drift()
+        if drift is not None and abs(drift[0]) > max(_DRIFT * self._scale(), 10 * drift[1]):
+            yield Finding(
+                "drift",
+                f"the brightness of all pixels drifts by {drift[0]:.2g} counts: let camera and lamp warm up,"
+                " and keep stray light away",
             )
 
     def _axes(self, shape: tuple[int, int, int]) -> Iterator[Finding]:

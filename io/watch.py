@@ -56,11 +56,11 @@ class Check:
 class Watch:
     """The frames of a source while they are read: samples of them, and their positions.
 
-    ``moved``: whether the brightness must respond to the motion.
+    ``moved``: whether the brightness must respond to the motion. ``phased``: whether it must fit to phases.
     """
 
-    def __init__(self, source: Source, moved: bool = True) -> None:
-        self._source, self._moved = source, moved
+    def __init__(self, source: Source, moved: bool = True, phased: bool = True) -> None:
+        self._source, self._moved, self._phased = source, moved, phased
         self.samples = FrameSamples(source.shape)
         self._series: dict[str, list[Floats]] = {"time": [], "travel": [], "phase": []}
         self._lost = 0
@@ -107,7 +107,7 @@ class Watch:
             *getattr(source, "findings", ()),
             *_geometry(source, series, field_limits, travel_limits),
             *_order(source, series, lost),
-            *traces.findings(source.shape, self._moved),
+            *traces.findings(source.shape, self._moved, self._phased),
         )
 
 

@@ -264,16 +264,21 @@ def conclude(normal: Doubles, sums: Sums, samples: Samples, usable: Array, tilt:
     samples, squared; ``rest`` is where the sheet is at rest.
     """
     det = sums.m11 * sums.m22 - sums.m12**2
+    touching, misfit = touches(sums, det, samples, tilt, limits, model, rest)
     with np.errstate(divide="ignore", invalid="ignore"):
-        sigma = samples.error * np.sqrt(np.where(det > 0, (sums.m11 + sums.m22) / det, np.inf))
+        sigma = samples.error * misfit * np.sqrt(np.where(det > 0, (sums.m11 + sums.m22) / det, np.inf))
     unknown = (usable < _LEAST) | ~(sigma < _NO_ANSWER)
-    touching = touches(sums, det, samples, tilt, limits, model, rest)
     return _answer(normal, np.where(unknown, np.nan, sigma), touching, samples)
 
 
-def touches(sums: Sums, det: Doubles, samples: Samples, tilt: float, limits: Limits,
-            model: float | Doubles, rest: NDArray[np.bool_]) -> NDArray[np.bool_]:  # fmt: skip
-    """Tell where residuals are those of a lasting contact; ``det`` is that of the answer's equations."""
+def touches(
+    sums: Sums, det: Doubles, samples: Samples, tilt: float, limits: Limits, model: float | Doubles,
+    rest: NDArray[np.bool_],
+) -> tuple[NDArray[np.bool_], Doubles]:  # fmt: skip
+    """Return where residuals are those of a lasting contact, and by how much errors are larger than by noise.
+
+    ``det`` is that of the answer's equations.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         more_tilt, information, residual = _free_tilt(sums, det)
         uncertainty = 3 * samples.error / np.sqrt(information)
@@ -281,7 +286,8 @@ def touches(sums: Sums, det: Doubles, samples: Samples, tilt: float, limits: Lim
             tilt + more_tilt - uncertainty > limits.most
         )
         like_noise = _like_noise(residual, samples, limits.noise, model)
-    return np.asarray(like_noise & ~off_tilt & ~rest)
+        misfit = _misfit(residual, samples, limits.noise)
+    return np.asarray(like_noise & ~off_tilt & ~rest), misfit
 
 
 @dataclass(frozen=True, slots=True)
@@ -426,6 +432,13 @@ def _like_noise(square: Doubles, samples: Samples, noise: float, model: float | 
         return np.ones(len(square), bool)
     found: NDArray[np.bool_] = square <= noise * samples.error**2 + model
     return found
+
+
+def _misfit(square: Doubles, samples: Samples, noise: float) -> Doubles:
+    """Return the residual over the noise where noise does not explain the sum of squares; 1 elsewhere."""
+    chi2 = square / samples.error**2
+    unexplained = (chi2 > noise) & (samples.freedom > 0)
+    return np.where(unexplained, np.sqrt(np.abs(chi2) / np.maximum(samples.freedom, 1)), 1.0)
 
 
 def _answer(normal: Doubles, sigma: Doubles, touching: NDArray[np.bool_], samples: Samples) -> Answer:

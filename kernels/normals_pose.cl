@@ -237,11 +237,12 @@ __kernel void normals_rock(ARGUMENTS, const int presses, OUT slopes, OUT slope_e
         const F det = sums.m11 * sums.m22 - sums.m12 * sums.m12, scaled = 1.0f / det, per_up = 1.0f / found.z;
         const F slope = -found.x * per_up, across = 1.0f - found.z * found.z;
         const F variance = (sums.m22 - 2.0f * slope * sums.m12 + slope * slope * sums.m11) * scaled * per_up * per_up;
-        const F error = known.error_of_one * roots(variance);
-        const I answered = (kept.usable >= LEAST) & (det > 0.0f) & (error < NO_ANSWER) & (found.z > 0.0f);
         const F zenith = atan2(roots(GREATER(across, (F)0.0f)), found.z), none = NAN;
         const I at_rest = presses ? (I)0 : known.wave.mean < limits.rest;
-        const I touches = lasts(sums, scaled, known.error_of_one, count, at_rest, limits, limits.model);
+        F remains;
+        const I touches = lasts(sums, scaled, known.error_of_one, count, at_rest, limits, limits.model, &remains);
+        const F error = known.error_of_one * misfit(remains, known.error_of_one, count, limits.noise) * roots(variance);
+        const I answered = (kept.usable >= LEAST) & (det > 0.0f) & (error < NO_ANSWER) & (found.z > 0.0f);
         keep_slope(p, turns, answered ? slope : none, answered ? error : none, answered ? zenith : none, slopes, slope_errors,
                    zeniths);
         B flags = WIDE(convert_uchar)(answered & touches & 1);

@@ -114,14 +114,15 @@ def normals_rock(
         part = np.where(moves[:, np.newaxis], _within(part) + _step(latest), part)
     assert sums is not None
     det = sums.m11 * sums.m22 - sums.m12**2
+    rests = _rests(samples, limits, presses)
+    found, misfit = touches(sums, det, samples, tilt, limits, limits.model, rests)
     with np.errstate(divide="ignore", invalid="ignore"):
         p, q = part.T
         slope = -p / q
         variance = (sums.m22 - 2 * slope * sums.m12 + slope**2 * sums.m11) / det / q**2
-        sigma = samples.error * np.sqrt(np.where(det > 0, variance, np.inf))
+        sigma = samples.error * misfit * np.sqrt(np.where(det > 0, variance, np.inf))
         answered = (samples.usable >= _LEAST) & (sigma < _NO_ANSWER) & (q > 0)
         zenith = np.arctan2(np.sqrt(np.maximum(1 - q**2, 0)), q)
-    found = touches(sums, det, samples, tilt, limits, limits.model, _rests(samples, limits, presses))
     slope, sigma, zenith = (np.where(answered, one, np.nan) for one in (slope, sigma, zenith))
     return Slopes(slope, sigma, zenith, found & answered)
 

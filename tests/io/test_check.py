@@ -134,6 +134,33 @@ def test_frames_that_came_late_are_no_matter_if_positions_were_measured():
     assert kinds(io.check(Timed(noisy(pressed()), np.sort(travel), time))) == []
 
 
+def jumped(steps, count=24):
+    """Phases of a rotation of which frames were lost, or one is there twice, before frame 10."""
+    return np.where(np.arange(count) >= 10, PHASE + steps * PHASE[1], PHASE)
+
+
+@pytest.mark.parametrize(
+    ("steps", "text"),
+    [
+        (1, "from frame 10 on, the brightness fits phases 15 degrees further, as if a frame before it was"),
+        (2, "from frame 10 on, the brightness fits phases 30 degrees further, as if 2 frames before it were"),
+        (-1, "from frame 10 on, the brightness fits phases 15 degrees back, as if a frame before it was"),
+    ],
+)
+def test_a_lost_frame_of_a_rotation_is_found_by_the_brightness(steps, text):
+    (finding,) = found(noisy(turned(jumped(steps))), phase=PHASE).findings
+    assert (finding.kind, finding.text[: len(text)]) == ("phase jump", text)
+
+
+def test_phases_that_are_measured_may_jump():
+    assert kinds(found(noisy(turned(jumped(1))), phase=jumped(1))) == []
+
+
+def test_phases_are_not_judged_by_pixels_that_all_respond_alike():
+    counts = np.broadcast_to(90 + 30 * np.cos(jumped(1))[:, np.newaxis, np.newaxis], (24, *SHAPE))
+    assert kinds(found(noisy(counts), phase=PHASE)) == []
+
+
 def test_lost_frames_are_a_note():
     source = Timed(noisy(pressed()), TRAVEL, np.arange(30) / 30)
     source.dropped = np.eye(30, dtype=np.int32)[7]
@@ -155,6 +182,11 @@ def test_a_dark_level_that_drifts_is_found():
     drift = np.linspace(0, 8, 30)[:, np.newaxis, np.newaxis]
     far = np.pad(pressed(), ((0, 0), (20, 20), (20, 20)), constant_values=20)
     assert kinds(found(noisy(far + drift))) == ["drift"]
+
+
+def test_brightness_that_drifts_during_a_rotation_is_found():
+    drift = np.linspace(0, 6, 24)[:, np.newaxis, np.newaxis]
+    assert kinds(found(noisy(turned() + drift), phase=PHASE)) == ["drift"]
 
 
 def test_light_beyond_the_scale_is_found():

@@ -259,6 +259,17 @@ def test_frames_without_light_full_of_it_or_of_no_numbers_have_no_answer(device,
         assert found.process["noise"] > 0
 
 
+@pytest.mark.parametrize("dtype", ["uint8", "float32"])
+def test_a_sample_far_off_the_others_makes_the_normal_as_uncertain_as_it_is(device, dtype):
+    setup = Setup(gain=3.6, noise=1.2, offset=20.0, dtype=dtype, phase=tuple(np.arange(16) * np.pi / 8))
+    normals = facing((30, 40), (15, 50))
+    frames = rotations.expose(normals, setup, 3)
+    frames[5] = 250  # as of a hot pixel
+    found = estimate_normals(frames, setup.phase, device=device, **known(setup))
+    error = np.linalg.norm(np.cross(found.normals.astype(float), normals), axis=-1)
+    assert 0.5 < np.nanmean((error / found.normals_sigma) ** 2) < 2  # 400 by noise alone
+
+
 def test_the_noise_and_the_tilt_are_estimated_from_the_first_turn(device):
     setup = replace(SETUP, tilt=np.radians(3))
     frames, phase = frames_of(setup, 2, (20, 20)), phases(setup, 2)

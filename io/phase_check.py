@@ -1,0 +1,79 @@
+"""Whether the brightness of pixels fits to the phases of the frames: lost frames, and drift.
+
+Each pixel is fitted by a sinusoid of the phase. Whether other phases fit better is decided by the squares of
+all residuals together, which the products of the frames determine.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.io.types import Floats
+
+_FEWEST, _FEWEST_FRAMES, _MOST_FRAMES = 64, 6, 128  # pixels; frames
+_SHIFTS = -1, 1, 2, 3  # steps of the phase by which later frames may be wrong
+_BETTER = 0.85  # largest ratio of the squares of residuals with and without a jump
+_STEADY = 0.7  # least share of a linear rise in the square of what is common to all pixels
+_OUTLYING = 4.0  # median residuals, beyond which a pixel is left out
+_SWINGS = 0.25  # median swings, from which on a pixel has a direction
+_AS_ONE = 0.5  # mean direction above which all pixels respond alike, so that light looks like a phase
+
+
+class PhaseCheck:
+    """Brightness of pixels without NaN, (T, n), and the phases of its frames, (T,) radians."""
+
+    def __init__(self, counts: NDArray[np.float32], phase: Floats) -> None:
+        self._phase = phase
+        self.possible = _FEWEST_FRAMES <= len(phase) <= _MOST_FRAMES and counts.shape[1] >= _FEWEST
+        if not self.possible:
+            return
+        waves = np.linalg.qr(_waves(phase))[0].astype(np.float32)
+        swing = (np.exp(1j * phase) @ counts)[:, np.newaxis]
+        size = np.abs(swing)
+        swings = size > max(_SWINGS * float(np.median(size)), 1e-6)
+        self.possible = bool(swings.any()) and abs(np.mean(swing[swings] / size[swings])) < _AS_ONE
+        left = counts - waves @ (waves.T @ counts)
+        square = np.sum(left**2, axis=0)
+        used = square <= _OUTLYING**2 * np.median(square)
+        self._counts, self._left = counts[:, used], left[:, used]
+
+    def jump(self) -> tuple[int, int, float] | None:
+        """Return from which frame on phases are wrong, by how many steps, and the step; None if nowhere."""
+        step = float(np.median(np.diff(self._phase))) if self.possible else 0.0
+        if step == 0:
+            return None
+        count = len(self._phase)
+        frames, shifts = np.repeat(np.arange(1, count), len(_SHIFTS)), np.tile(_SHIFTS, count - 1)
+        later = np.arange(count) >= frames[:, np.newaxis]
+        waves = _waves(self._phase + step * shifts[:, np.newaxis] * later)
+        centred = self._counts - self._counts.mean(axis=0)
+        products = (centred @ centred.T).astype(np.float64)
+        turned = np.swapaxes(waves, 1, 2)
+        explained = np.trace(np.linalg.pinv(turned @ waves) @ (turned @ (products @ waves)), axis1=1, axis2=2)
+        best = int(np.argmax(explained))
+        least = float(np.trace(products) - explained[best])
+        if not least < _BETTER * float(np.sum(self._left**2)):
+            return None
+        return int(frames[best]), int(shifts[best]), step
+
+    def drift(self) -> tuple[float, float] | None:
+        """Return the rise of all pixels over the recording, and its error, counts; None if it is not one."""
+        if not self.possible:
+            return None
+        waves = np.linalg.qr(_waves(self._phase))[0]
+        ramp = np.linspace(-0.5, 0.5, len(self._phase))
+        ramp -= waves @ (waves.T @ ramp)
+        size = float(ramp @ ramp)
+        if size < 1e-6:
+            return None
+        each = ramp @ self._left / size
+        rise, common = float(np.mean(each)), np.mean(self._left, axis=1, dtype=np.float64)
+        if rise**2 * size < _STEADY * float(np.sum(common**2)):
+            return None
+        return rise, float(np.std(each)) / len(each) ** 0.5
+
+
+def _waves(phase: Floats) -> Floats:
+    """Return 1, cosine and sine of phases, (..., 3)."""
+    return np.stack([np.ones_like(phase), np.cos(phase), np.sin(phase)], axis=-1)
