@@ -16,6 +16,7 @@ _TRAVEL = ("travel", "travel_step", "travel_start")
 def command(
     stack: Annotated[Path, Argument(metavar="STACK", help=f"Frames: {FORMATS}.")],
     output: Annotated[Path | None, options.result_option("STACK-correlation.h5")] = None,
+    overwrite: options.Overwrite = False,
     memory: options.Memory = "256MB",
     device: options.Devices = None,
     as_json: options.Json = False,
@@ -42,8 +43,8 @@ def command(
     override = not chosen.get("dither", False)
     with io.open_recording(stack, memory_limit=limit, override_motion=override, **known) as source:
         target = output or stack.with_name(f"{stack.stem}-correlation.h5")
-        io.check_output(target, stack, phases, or_zarr=True)
+        io.check_result_output(target, stack, phases, overwrite=overwrite)
         method = Correlation(**{**chosen, "memory_limit": limit, "device": device})
         with progress("correlating", source.shape[0]) as show:
             result = method.run(source, show)
-    save_and_report(result, target, device, as_json)
+    save_and_report(result, target, device, as_json, overwrite=overwrite)

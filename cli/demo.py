@@ -109,7 +109,7 @@ def command(
         "demo"
     ),
     overwrite: Annotated[
-        bool, Option("--overwrite", help="Replace recordings of an earlier demo in that folder.")
+        bool, Option("--overwrite", help="Replace recordings and results of an earlier demo in that folder.")
     ] = False,
     device: options.Device = None,
     as_json: options.Json = False,
@@ -133,7 +133,7 @@ def command(
         truth, results = _turn(output, device, overwrite, draw)
         scores[_TURN] = _judge(results, truth)
         _announce(_STEPS, "a press and a rotation, fused")
-        scores |= _surfaces(results, truth, output, device, draw)
+        scores |= _surfaces(results, truth, output, device, overwrite, draw)
     if as_json:
         print_json(scores)
         return
@@ -176,7 +176,7 @@ def _press(name: str, press: Press, folder: Path, device: str | None, overwrite:
                 results[method] = engine.reconstruct(
                     recording, subframe=subframe, device=device, progress=show
                 )
-    io.save_result(results["sub-frame"], folder / f"{name}-result.h5")
+    io.save_result(results["sub-frame"], folder / f"{name}-result.h5", overwrite=overwrite)
     figure = folder / f"{name}.png"
     draw(
         view.height_figure,
@@ -198,13 +198,14 @@ def _turn(folder: Path, device: str | None, overwrite: bool, draw: Draw) -> tupl
         for name, (method, registered) in _METHODS.items():
             heights = truth.height if registered else None
             results[name] = engine.reconstruct(recording, method=method, heights=heights, device=device)
-            io.save_result(results[name], folder / f"{_TURN}-{name.replace(', ', '-')}-result.h5")
+            target = folder / f"{_TURN}-{name.replace(', ', '-')}-result.h5"
+            io.save_result(results[name], target, overwrite=overwrite)
     draw(view.normal_figure, results, truth, TURN.title, path.with_suffix(".png"))
     return truth, results
 
 
 def _surfaces(
-    turned: Results, truth: io.Truth, folder: Path, device: str | None, draw: Draw
+    turned: Results, truth: io.Truth, folder: Path, device: str | None, overwrite: bool, draw: Draw
 ) -> dict[str, Scores]:
     """Draw the heights of the rotation, and those of the press and the rotation fused."""
     from mirrorskin import io, view
@@ -215,7 +216,7 @@ def _surfaces(
     fused = {
         "press": io.open_result(folder / f"{_FUSED_PRESS}-result.h5"),
         "rotation": turned["exact"],
-        "press and rotation": _fuse(folder, device),
+        "press and rotation": _fuse(folder, device, overwrite),
     }
     title = "Fig. 5 and Fig. 10 fused: sphere, 10 mm, from a press and a rotation"
     draw(view.surface_figure, fused, truth, title, folder / "fused.png")
@@ -223,7 +224,7 @@ def _surfaces(
     return {"fig10b": _judge(rotation, truth), "fused": _judge(judged, truth)}
 
 
-def _fuse(folder: Path, device: str | None) -> io.Result:
+def _fuse(folder: Path, device: str | None, overwrite: bool) -> io.Result:
     """Fuse the recordings of the press and of the rotation, and save the result."""
     from mirrorskin import io
     from mirrorskin.engine.fusion import frames_to_read, fuse_recordings
@@ -234,7 +235,7 @@ def _fuse(folder: Path, device: str | None) -> io.Result:
         progress("fusing", frames_to_read(vertical, axial, register=True)) as show,
     ):
         result = fuse_recordings(vertical, axial, device=device, progress=show)
-    io.save_result(result, folder / "fused-result.h5")
+    io.save_result(result, folder / "fused-result.h5", overwrite=overwrite)
     return result
 
 

@@ -19,6 +19,7 @@ def command(
     vertical: Annotated[Path, Argument(metavar="VERTICAL", help=f"Press: {FORMATS}.")],
     axial: Annotated[Path, Argument(metavar="AXIAL", help="Rotation, of the same formats.")],
     output: Annotated[Path | None, options.result_option("VERTICAL-fused.h5")] = None,
+    overwrite: options.Overwrite = False,
     calibration: options.Calibration = None,
     register: Annotated[
         bool,
@@ -47,7 +48,7 @@ def command(
         _open(vertical, "vertical", known, limit) as pressed,
         _open(axial, "axial", known, limit) as turned,
     ):
-        io.check_output(target, vertical, axial, calibration, *files, or_zarr=True)
+        io.check_result_output(target, vertical, axial, calibration, *files, overwrite=overwrite)
         shared = None if calibration is None else io.open_calibration(calibration)
         with progress("fusing", frames_to_read(pressed, turned, register)) as show:
             result = fuse_recordings(
@@ -60,7 +61,7 @@ def command(
                 device=device,
                 progress=show,
             )
-    save_and_report(result, target, device, as_json)
+    save_and_report(result, target, device, as_json, overwrite=overwrite)
     for path, prefix in ((vertical, "vertical_"), (axial, "axial_")):
         process = {name.removeprefix(prefix): said for name, said in result.process.items()}
         report_notes(str(path), process)

@@ -50,7 +50,7 @@ def command(
         ),
     ] = None,
     overwrite: Annotated[
-        bool, Option("--overwrite", help="Replace an existing recording of that name.")
+        bool, Option("--overwrite", help="Replace an existing recording or result of that name.")
     ] = False,
     output: Annotated[
         Path | None,
@@ -88,13 +88,13 @@ def command(
     shared = () if operation is None else kind.options
     chosen = {name: one for name, one in given.items() if name in shared or name not in planned}
     computed = kind(device=device, **chosen)
-    if overwrite and record is None:
-        raise io.InputError("--overwrite is for --record: leave it out")
+    if overwrite and record is None and output is None:
+        raise io.InputError("--overwrite is for --record and -o: leave it out")
     inputs = rig_file, calibration, *(one for one in chosen.values() if isinstance(one, Path))
     if record is not None:
         io.check_output(record, *inputs, replaces="anything" if overwrite else "nothing")
     if output is not None:
-        io.check_output(output, *inputs, record, or_zarr=True)
+        io.check_result_output(output, *inputs, record, overwrite=overwrite)
     if "contact" in chosen:
         io.open_result(chosen["contact"])  # refused before anything moves
     known = scans.open_calibration(calibration, rig)
@@ -209,7 +209,14 @@ class _Live:
         result = self._operation.result()
         report_missing_maps(self._settings.name, result.process, _REMEDIES)
         report_contact(self._settings.name, result.process)
-        save_and_report(result, output, self._given["device"], as_json=False, must_answer=False)
+        save_and_report(
+            result,
+            output,
+            self._given["device"],
+            as_json=False,
+            must_answer=False,
+            overwrite=self._given["overwrite"],
+        )
         report_levels(self._settings.name, result.process)
 
 

@@ -24,12 +24,17 @@ _UNTOLD = "none: "  # begins the reason for a missing map in a process
 
 
 def save_and_report(
-    result: Result, path: Path, device: str | None, as_json: bool, must_answer: bool = True
+    result: Result,
+    path: Path,
+    device: str | None,
+    as_json: bool,
+    must_answer: bool = True,
+    overwrite: bool = False,
 ) -> None:
     """Write a result and print its summary; see `report_saved`."""
     from mirrorskin import io
 
-    io.save_result(result, path)
+    io.save_result(result, path, overwrite=overwrite)
     report_saved(result, path, device, as_json, must_answer)
 
 

@@ -19,6 +19,7 @@ def command(
     context: click.Context,
     recording: Annotated[Path, Argument(metavar="REC.h5", help=f"Frames: {FORMATS}.")],
     output: Annotated[Path | None, options.result_option("REC-result.h5")] = None,
+    overwrite: options.Overwrite = False,
     live: options.LiveFrames = False,
     calibration: options.Calibration = None,
     memory: options.Memory = "256MB",
@@ -40,7 +41,7 @@ def command(
     with io.open_recording(recording, memory_limit=limit, live=live, **stack) as opened:
         refuse_foreign(context, opened.motion, str(recording))
         target = output or recording.with_name(f"{recording.stem}-result.h5")
-        io.check_output(target, recording, calibration, *files, or_zarr=True)
+        io.check_result_output(target, recording, calibration, *files, overwrite=overwrite)
         source = calibrated(opened, calibration)
         if isinstance(source, io.Calibrated):
             if source.whole.lens is not None and "pixel_size" in stack:
@@ -49,7 +50,7 @@ def command(
             del chosen["tilt"]
         with outputs.progress("reconstructing", source.shape[0]) as show:
             result = engine.reconstruct(source, memory_limit=limit, device=device, progress=show, **chosen)
-    io.save_result(result, target)  # if that fails, it is all that is said
+    io.save_result(result, target, overwrite=overwrite)  # if that fails, it is all that is said
     outputs.report_notes(str(recording), result.process)
     outputs.report_missing_maps(str(recording), result.process, _REMEDIES)
     outputs.report_contact(str(recording), result.process)

@@ -17,6 +17,7 @@ def command(
     ],
     recording: Annotated[Path, Argument(metavar="REC.h5", help=f"Frames: {FORMATS}.")],
     output: Annotated[Path | None, options.result_option("REC-CLASS.h5")] = None,
+    overwrite: options.Overwrite = False,
     live: options.LiveFrames = False,
     memory: options.Memory = "256MB",
     device: options.Devices = None,
@@ -44,10 +45,10 @@ def command(
     limit = bytes_of(memory, "--memory")
     with io.open_recording(recording, memory_limit=limit, live=live, **stack) as source:
         target = output or recording.with_name(f"{recording.stem}-{kind.__name__}.h5")
-        io.check_output(target, recording, *files, or_zarr=True)
+        io.check_result_output(target, recording, *files, overwrite=overwrite)
         with progress("running", source.shape[0]) as show:
             result = run_class(kind, source, show, memory_limit=limit, device=device, **chosen)
-    save_and_report(result, target, device, as_json)
+    save_and_report(result, target, device, as_json, overwrite=overwrite)
     report_notes(str(recording), result.process)
 
 

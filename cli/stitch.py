@@ -18,6 +18,7 @@ def command(
     output: Annotated[
         Path, Option("--output", "-o", metavar="RES.h5", help="Result to write: HDF5, or NAME.zarr.")
     ],
+    overwrite: options.Overwrite = False,
     device: options.Device = None,
     as_json: options.Json = False,
     **given: Annotated[Any, STACK.only("pixel_size")],
@@ -26,9 +27,9 @@ def command(
     from mirrorskin import engine, io
     from mirrorskin.cli.output import save_and_report
 
-    io.check_output(output, *results, or_zarr=True)
+    io.check_result_output(output, *results, overwrite=overwrite)
     touches = [io.open_result(path) for path in results]
     whole = engine.pose.stitch(
         touches, given.get("pixel_size"), names=[str(path) for path in results], device=device
     )
-    save_and_report(whole.result, output, device, as_json)
+    save_and_report(whole.result, output, device, as_json, overwrite=overwrite)

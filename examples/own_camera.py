@@ -31,5 +31,5 @@ with engine.live.Stream(press, size, header=known, latency=0.1 if live else math
             print(f"{newest.frames} frames, {np.isfinite(newest.height).sum()} pixels have a height")
     result = stream.result()
 
-io.save_result(result, "own.h5")
+io.save_result(result, "own.h5", overwrite=True)
 print(f"{number} frames: from {np.nanmin(result.height):.2f} to {np.nanmax(result.height):.2f} mm")

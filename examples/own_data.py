@@ -33,7 +33,7 @@ with io.open_recording(
 print(summarise(result))
 print(f"RMS error {np.sqrt(np.nanmean((result.height - height) ** 2)):.3f} mm")
 
-io.save_result(result, "heights.h5")  # NeXus: silx, h5web and NeXpy plot it unasked
+io.save_result(result, "heights.h5", overwrite=True)  # NeXus: silx, h5web and NeXpy plot it unasked
 figures = figures_of(result, name="a cone, from somebody's file")
 for what in ("height", "section"):
     figures[what].savefig(f"{what}.png", dpi=110)

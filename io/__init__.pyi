@@ -1,4 +1,4 @@
-from .atomic import check_output
+from .atomic import check_output, check_result_output
 from .calibration.file import open_calibration, save_calibration, update_calibration
 from .calibration.source import Calibrated
 from .calibration.types import (
@@ -68,6 +68,7 @@ __all__ = [
     "WallResponse",
     "check",
     "check_output",
+    "check_result_output",
     "describe",
     "export_result",
     "open_calibration",

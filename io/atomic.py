@@ -47,9 +47,7 @@ _WITH_GROUPS.set_create_intermediate_group(True)
 _WITH_GROUPS.set_char_encoding(h5py.h5t.CSET_UTF8)
 
 
-def check_output(
-    path: Path, *keep: Path | None, or_zarr: bool = False, replaces: Replaces = "derived"
-) -> None:
+def check_output(path: Path, *keep: Path | None, replaces: Replaces = "derived") -> None:
     """Refuse an output that could not be written, before any work is done.
 
     Parameters
@@ -58,16 +56,14 @@ def check_output(
         File to write.
     *keep : Path or None
         Inputs, files or folders of files, that must not be overwritten.
-    or_zarr : bool
-        Whether the output is a result: HDF5, or a Zarr store, which must not exist.
-    replaces : {"nothing", "derived", "calibration", "anything"}
+    replaces : {"nothing", "unused", "derived", "calibration", "anything"}
         Which existing file may be replaced; see `mirrorskin.io.existing.Replaces`.
 
     Raises
     ------
     InputError
         Its folder does not exist or cannot be written to, it is a folder, it is the input, a file that is
-        being written, or a file that may not be replaced; a result has the suffix of another format.
+        being written, or a file that may not be replaced.
 
     Examples
     --------
@@ -75,13 +71,6 @@ def check_output(
     """
     check_writable_system()
     with as_input_error(f"{path} cannot be written", "choose another place with -o"):
-        if or_zarr and is_zarr(path) and path.suffix.lower() == ZARR_SUFFIX:
-            from mirrorskin.io.zarr_export import check_store
-
-            check_store(path)
-            return
-        if or_zarr:
-            _check_format(path)
         if is_zarr(path):
             raise InputError(f"{path}: this is written as HDF5: name a local file, .h5, with -o")
         if path.is_dir():
@@ -97,6 +86,42 @@ def check_output(
             _check_existing(path, replaces)
         with tempfile.TemporaryFile(dir=path.parent):
             pass
+
+
+def check_result_output(path: Path, *keep: Path | None, overwrite: bool = False) -> None:
+    """Refuse a result, HDF5 or Zarr, that could not be written, before any work is done.
+
+    Parameters
+    ----------
+    path : Path
+        File to write, or Zarr store, which must not exist.
+    *keep : Path or None
+        Inputs; see `check_output`.
+    overwrite : bool
+        Whether an existing file that can be computed again may be replaced.
+
+    Raises
+    ------
+    InputError
+        See `check_output`; or the suffix is that of another format.
+
+    Examples
+    --------
+    >>> check_result_output(Path("result.h5"), Path("press.h5"))  # doctest: +SKIP
+    """
+    if is_zarr(path) and path.suffix.lower() == ZARR_SUFFIX:
+        from mirrorskin.io.zarr_export import check_store
+
+        with as_input_error(f"{path} cannot be written", "choose another place with -o"):
+            check_store(path)
+        return
+    _check_format(path)
+    check_output(path, *keep, replaces=replaced_by_result(overwrite))
+
+
+def replaced_by_result(overwrite: bool) -> Replaces:
+    """Return which existing files a new result may replace."""
+    return "derived" if overwrite else "unused"
 
 
 def _check_format(path: Path) -> None:
@@ -202,7 +227,7 @@ def link_new(part: Path, target: Path) -> None:
 def _rename(part: Path, path: Path, replaces: Replaces) -> None:
     """Rename a file; check again whether an existing file may be replaced, since it may be new."""
     target = Path(os.path.realpath(path))
-    if replaces == "nothing":
+    if replaces in ("nothing", "unused"):
         try:
             link_new(part, target)
         except FileExistsError:

@@ -9,13 +9,14 @@ from typing import Literal
 from mirrorskin.io.hdf5 import Hdf5File
 from mirrorskin.io.types import InputError
 
-Replaces = Literal["nothing", "derived", "calibration", "anything"]
+Replaces = Literal["nothing", "unused", "derived", "calibration", "anything"]
 """The existing files that a new file may replace.
 
-"nothing": none, the name must be free. "derived": files that can be computed again, such as a result, a
-picture or a table; not a recording, a calibration, an HDF5 or MCAP file of another program, a video, arrays,
-an archive that ``export`` did not write, or settings. "calibration": these, and calibrations. "anything":
-every file, because the user requested it.
+"nothing": none, the name must be free. "unused": the same for a result, which replaces "derived" with
+--overwrite. "derived": files that can be computed again, such as a result, a picture or a table; not a
+recording, a calibration, an HDF5 or MCAP file of another program, a video, arrays, an archive that ``export``
+did not write, or settings. "calibration": these, and calibrations. "anything": every file, because the user
+requested it.
 """
 
 _HDF5, _MCAP = b"\x89HDF\r\n\x1a\n", b"\x89MCAP0\r\n"
@@ -41,7 +42,7 @@ def check_replaced(path: Path, replaces: Replaces) -> None:
     if replaces == "anything":
         return
     kind = protected_kind(path)
-    if replaces == "nothing":
+    if replaces == "nothing" or (replaces == "unused" and not kind):
         known = f" and is {kind}" if kind else ""
         raise InputError(
             f"{path} exists{known}: add --overwrite to replace it, or choose another name with -o"

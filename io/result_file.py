@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.arguments import check_kind, check_path, checked
-from mirrorskin.io.atomic import Item, fixed_text, process_items, write_file
+from mirrorskin.io.arguments import check_flag, check_kind, check_path, checked
+from mirrorskin.io.atomic import Item, fixed_text, process_items, replaced_by_result, write_file
 from mirrorskin.io.calibration.file import CARRIED, calibration_items, carried_by
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape, read_process
 from mirrorskin.io.maps import (
@@ -44,8 +44,8 @@ _AXES = dict.fromkeys("xy", Map(unit="mm", dtype="float64"))
 _LAYOUT = 2  # of the files written here; in layout 1 maps were not declared, and some had other names
 
 
-@checked(result=check_kind(Result), path=check_path)
-def save_result(result: Result, path: str | Path) -> None:
+@checked(result=check_kind(Result), path=check_path, overwrite=check_flag)
+def save_result(result: Result, path: str | Path, *, overwrite: bool = False) -> None:
     """Write a result; the file appears complete or not at all.
 
     Parameters
@@ -53,11 +53,14 @@ def save_result(result: Result, path: str | Path) -> None:
     result : Result
     path : str or Path
         HDF5, or ``NAME.zarr``, also at an address such as ``s3://bucket/NAME.zarr``.
+    overwrite : bool, optional
+        Replace an existing result, or another file that can be computed again. A Zarr store is never
+        replaced.
 
     Raises
     ------
     InputError
-        The file cannot be written.
+        The file exists, or cannot be written.
 
     Examples
     --------
@@ -67,7 +70,7 @@ def save_result(result: Result, path: str | Path) -> None:
     """
     target = path_of(path)
     if not is_zarr(target):
-        write_file(target, _items(result))
+        write_file(target, _items(result), replaced_by_result(overwrite))
         return
     from mirrorskin.io.zarr_export import save_zarr
 

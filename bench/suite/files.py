@@ -134,7 +134,7 @@ def to_result(
     """Open a recording, reconstruct it, and save the result."""
     with io.open_recording(source, **(opening or {})) as recording:
         result = reconstruct(recording, device=device, **options)
-    io.save_result(result, target)
+    io.save_result(result, target, overwrite=True)
     return result
 
 

@@ -104,7 +104,7 @@ def _compute(
     if plan.strict and said:
         raise InputError(f"{source.name}: {said}")
     process: dict[str, ProcessValue] = {**result.process, "batch_parameters": digest}
-    io.save_result(result.assign(process=process), target)
+    io.save_result(result.assign(process=process), target, overwrite=True)
     return replace(
         outcome,
         state="done",

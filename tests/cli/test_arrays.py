@@ -35,7 +35,7 @@ def folder(tmp_path, stack):
 
 
 def heights(*words):
-    done("reconstruct", *words, "-o", "out.h5")
+    done("reconstruct", *words, "-o", "out.h5", "--overwrite")
     return io.open_result("out.h5").height
 
 
@@ -187,7 +187,7 @@ def test_a_recording_has_its_own_travel(folder):
 
 
 def test_levels_that_nobody_gave_are_named():
-    words = ("reconstruct", "ball.npy", *STEPS, *SIZE, "-o", "out.h5")
+    words = ("reconstruct", "ball.npy", *STEPS, *SIZE, "-o", "out.h5", "--overwrite")
     said = run(*words).said
     assert "ball.npy: no dark and bright given: estimated as " in said
     assert said.count("\n") == 1

@@ -144,7 +144,8 @@ def test_devices_lists_what_there_is():
     ],
 )
 def test_what_is_given_is_used(folder, words, name, value):
-    told = json.loads(mirrorskin("reconstruct", "sphere.h5", "-o", "g.h5", *words, "--json", cwd=folder))
+    words = ["-o", "g.h5", "--overwrite", *words, "--json"]
+    told = json.loads(mirrorskin("reconstruct", "sphere.h5", *words, cwd=folder))
     if value is None:
         assert told["summary"]["highest"] < -5
     else:

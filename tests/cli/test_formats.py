@@ -59,7 +59,7 @@ def path(request, tmp_path, monkeypatch, frames):
 
 
 def heights(path, *words):
-    done("reconstruct", path, *STEPS, *SIZE, *LEVELS, *words, "-o", "out.h5")
+    done("reconstruct", path, *STEPS, *SIZE, *LEVELS, *words, "-o", "out.h5", "--overwrite")
     return io.open_result("out.h5").height
 
 
@@ -92,7 +92,7 @@ def test_a_batch_takes_it(path):
 def test_a_correlation_is_that_of_the_array(path):
     found = []
     for name in (path, "ball.npy"):
-        done("correlate", name, "--phase-step", "30deg", "-o", "out.h5")
+        done("correlate", name, "--phase-step", "30deg", "-o", "out.h5", "--overwrite")
         found.append(io.open_result("out.h5").mean)
     np.testing.assert_array_equal(*found)
 

@@ -57,7 +57,7 @@ def folder(kept, tmp_path):
 
 def fuse(*words, names=("press.h5", "turn.h5")):
     """Return the result, and how the command ended."""
-    ended = done("fuse", *names, "-o", "out.h5", *words)
+    ended = done("fuse", *names, "-o", "out.h5", "--overwrite", *words)
     return io.open_result("out.h5"), ended
 
 

@@ -28,7 +28,9 @@ def folder(tmp_path_factory):
 
 
 def scored(folder, recording, *words):
-    told = json.loads(mirrorskin("reconstruct", recording, "-o", "r.h5", *words, "--json", cwd=folder))
+    told = json.loads(
+        mirrorskin("reconstruct", recording, "-o", "r.h5", "--overwrite", *words, "--json", cwd=folder)
+    )
     score = json.loads(mirrorskin("score", "r.h5", "--truth", recording, "--json", cwd=folder))
     return told["process"], score["height"]
 

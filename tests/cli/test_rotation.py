@@ -45,7 +45,7 @@ def turn(name="turn.h5", phase=SETUP.phase, **changes):
 
 def reconstruct(*words, name="turn.h5"):
     """Return the result, and what was said."""
-    ended = done("reconstruct", name, "-o", "out.h5", *words)
+    ended = done("reconstruct", name, "-o", "out.h5", "--overwrite", *words)
     return io.open_result("out.h5"), ended
 
 

@@ -176,7 +176,10 @@ def test_declared_options_arrive_in_their_unit_and_in_the_process():
     assert (process["travel_offset"], process["level"]) == (pytest.approx(0.1), 100.0)
     assert (process["tilt"], process["weights"]) == (pytest.approx(np.radians(2.5)), "[0.25, 0.5, 1.0]")
     assert process["twice"] is True
-    assert json.loads(run(*DEEP, "--tilt", "estimate", "--json").out)["process"]["tilt"] == "estimate"
+    assert (
+        json.loads(run(*DEEP, "--tilt", "estimate", "--json", "--overwrite").out)["process"]["tilt"]
+        == "estimate"
+    )
 
 
 @pytest.mark.parametrize("words", ["--help", "press.h5 --help"])
@@ -229,7 +232,7 @@ def test_built_in_operations_and_methods_run_as_in_python(name, recordings):
     ]
     words += [str(value) for value in options.values() if not isinstance(value, bool)]
     path = recordings / f"{motion}.h5"
-    done("run", f"{module}:{kind}", path, *words, "-o", "out.h5")
+    done("run", f"{module}:{kind}", path, *words, "-o", "out.h5", "--overwrite")
     operation = load_operation(f"{module}:{kind}")(**options)
     with io.open_recording(path) as source:
         expected = (

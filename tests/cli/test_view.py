@@ -65,7 +65,7 @@ def test_a_folder_gets_a_picture_of_each_map(result):
 
 def test_of_turns_one_is_chosen_and_a_picture_s_ending_may_be_in_capitals(result):
     azimuth = np.zeros((2, 5, 6), np.float32)
-    io.save_result(io.Result(azimuth=azimuth), result)
+    io.save_result(io.Result(azimuth=azimuth), result, overwrite=True)
     assert "--turn 0 to 1" in str(view(result).exception)
     path = result.with_name("TURN.PNG")
     done = view(result, "--turn", 1, "-o", path)

@@ -28,7 +28,7 @@ def given(result, kind, folder):
         maps |= {"x": result.x, "y": result.y}
         return maps if kind == "mapping" else {name: values.tolist() for name, values in maps.items()}
     if kind == "file":
-        io.save_result(result, folder / "worn.h5")
+        io.save_result(result, folder / "worn.h5", overwrite=True)
         return folder / "worn.h5"
     dataset = result.to_xarray()
     if kind == "upwards":  # as datasets of geography have it: y rises with the row, and x comes first

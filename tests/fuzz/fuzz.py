@@ -281,16 +281,26 @@ def _of_hdf5(path: Path, sound: Path, out: Path) -> list[Line]:
         ("measure", path, "--json", "--form", "sphere"),
         ("score", path, "--truth", press),
         ("score", result, "--truth", path),
-        ("stitch", path, result, "-o", out / "a.h5"),
-        ("fuse", path, turn, "-o", out / "a.h5"),
-        ("fuse", press, path, "-o", out / "a.h5"),
-        ("correlate", path, "--phase-step", "45deg", "-o", out / "a.h5"),
-        ("reconstruct", path, "-o", out / "a.h5"),
-        ("reconstruct", path, "--motion", "vertical", "--travel-step", "0.1mm", "-o", out / "a.h5"),
+        ("stitch", path, result, "-o", out / "a.h5", "--overwrite"),
+        ("fuse", path, turn, "-o", out / "a.h5", "--overwrite"),
+        ("fuse", press, path, "-o", out / "a.h5", "--overwrite"),
+        ("correlate", path, "--phase-step", "45deg", "-o", out / "a.h5", "--overwrite"),
+        ("reconstruct", path, "-o", out / "a.h5", "--overwrite"),
+        (
+            "reconstruct",
+            path,
+            "--motion",
+            "vertical",
+            "--travel-step",
+            "0.1mm",
+            "-o",
+            out / "a.h5",
+            "--overwrite",
+        ),
         ("reconstruct", path, "-o", out / "a.zarr"),
-        ("reconstruct", path, "-o", out / "a.h5", "--json", "--method", "change-point"),
-        ("reconstruct", press, "--calibration", path, "-o", out / "a.h5"),
-        ("reconstruct", turn, "--heights", path, "-o", out / "a.h5"),
+        ("reconstruct", path, "-o", out / "a.h5", "--overwrite", "--json", "--method", "change-point"),
+        ("reconstruct", press, "--calibration", path, "-o", out / "a.h5", "--overwrite"),
+        ("reconstruct", turn, "--heights", path, "-o", out / "a.h5", "--overwrite"),
         ("calibrate", "show", path),
         ("calibrate", "show", path, "-o", out / "maps"),
         ("batch", path, "-o", out / "results"),
@@ -308,8 +318,8 @@ def _of_frames(path: Path, sound: Path, out: Path) -> list[Line]:
         ("import", path, *press),
         ("import", path, *press, "--travel", sound / "travel.csv"),
         ("import", path, "--motion", "axial", "--phase-step", "30deg", "-o", out / "a.h5"),
-        ("reconstruct", path, "--travel-step", "0.1mm", "-o", out / "a.h5"),
-        ("correlate", path, "--phase-step", "45deg", "-o", out / "a.h5"),
+        ("reconstruct", path, "--travel-step", "0.1mm", "-o", out / "a.h5", "--overwrite"),
+        ("correlate", path, "--phase-step", "45deg", "-o", out / "a.h5", "--overwrite"),
     ]
 
 
@@ -335,8 +345,8 @@ def _of_tables(path: Path, sound: Path, out: Path) -> list[Line]:
     """Return the commands that read positions and readings."""
     press, out = sound / "vertical-raw.h5", out / "a.h5"
     return [
-        ("reconstruct", sound / "frames.npy", "--travel", path, "-o", out),
-        ("correlate", press, "--phases", path, "-o", out),
+        ("reconstruct", sound / "frames.npy", "--travel", path, "-o", out, "--overwrite"),
+        ("correlate", press, "--phases", path, "-o", out, "--overwrite"),
         ("calibrate", "force", press, "--readings", path, "-o", out),
     ]
 
@@ -356,7 +366,7 @@ def _of_words(path: Path, sound: Path, out: Path) -> list[Line]:
         for line in lines
         for words in [line.partition(" ")]
         for command in (
-            ("reconstruct", press, "-o", out / "a.h5", words[0], words[2]),
+            ("reconstruct", press, "-o", out / "a.h5", "--overwrite", words[0], words[2]),
             ("reconstruct", frames, *steps, words[0], words[2]),
             ("view", sound / "vertical-result.h5", "-o", out / "a.png", "--section", words[2]),
         )

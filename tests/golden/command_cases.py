@@ -102,7 +102,7 @@ def recording(name: str) -> Answer:
 
 def result(*words: object) -> Answer:
     """Run a command that writes a result, and return that."""
-    command(*words, "-o", "some-result.h5")
+    command(*words, "-o", "some-result.h5", "--overwrite")
     return result_maps(io.open_result("some-result.h5"))
 
 
@@ -205,8 +205,8 @@ def reconstruct_recorded_turns() -> Answer:
 @case(**RESULT)
 def reconstruct_and_say_so() -> Answer:
     return {
-        "press": told("reconstruct", "press.h5", "-o", "some-result.h5")["summary"],
-        "turn": told("reconstruct", "turn.h5", "-o", "some-result.h5")["summary"],
+        "press": told("reconstruct", "press.h5", "-o", "some-result.h5", "--overwrite")["summary"],
+        "turn": told("reconstruct", "turn.h5", "-o", "some-result.h5", "--overwrite")["summary"],
     }
 
 

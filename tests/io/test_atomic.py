@@ -118,12 +118,12 @@ def test_what_a_link_leads_to_is_replaced_and_the_link_stays(tmp_path):
 def test_a_result_with_the_suffix_of_another_format_is_refused(tmp_path, name, then):
     message = f"{tmp_path / name}: a result is HDF5 (.h5) or Zarr (.zarr): write it so{then}"
     with pytest.raises(io.InputError, match=f"^{re.escape(message)}$"):
-        io.check_output(tmp_path / name, or_zarr=True)
+        io.check_result_output(tmp_path / name)
 
 
 @pytest.mark.parametrize("name", ["w.h5", "w.hdf5", "w.nxs", "w", "run.7"])
 def test_a_result_may_have_a_suffix_of_no_other_format(tmp_path, name):
-    io.check_output(tmp_path / name, or_zarr=True)
+    io.check_result_output(tmp_path / name)
 
 
 def test_a_file_that_is_no_result_may_have_any_suffix(tmp_path):

@@ -110,10 +110,36 @@ def test_settings_are_not_replaced(tmp_path):
     assert path.read_text() == "a = 1"
 
 
-def test_results_and_what_is_exported_are_replaced(tmp_path):
+def test_a_result_replaces_no_file_unless_that_is_asked_for(tmp_path):
+    path = tmp_path / "a.h5"
+    save(path)
+    before = path.read_bytes()
+    with pytest.raises(
+        io.InputError, match=r"a\.h5 exists: add --overwrite to replace it, or choose another"
+    ):
+        save(path)
+    assert path.read_bytes() == before
+    io.save_result(io.Result(zenith=MAP), path, overwrite=True)
+    assert list(io.open_result(path).maps()) == ["zenith"]
+
+
+def test_a_result_that_came_meanwhile_is_not_replaced(tmp_path):
+    path = tmp_path / "a.h5"
+    with pytest.raises(io.InputError, match=r"a\.h5 exists: add --overwrite"), new_file(path, "unused"):
+        save(path)
+    assert list(io.open_result(path).maps()) == ["height"]
+
+
+def test_no_result_replaces_a_recording_even_if_told_to_overwrite(tmp_path):
+    path = record(sphere(), tmp_path / "a.h5")
+    with pytest.raises(io.InputError, match="is a recording, which this command never replaces"):
+        io.save_result(io.Result(height=MAP), path, overwrite=True)
+
+
+def test_results_that_may_be_replaced_and_what_is_exported_are_replaced(tmp_path):
     for path in (tmp_path / "a.h5", tmp_path / "a.txt"):
         save(path)
-        save(path)
+        io.save_result(io.Result(height=MAP), path, overwrite=True)
         write_new(path, [b"text"])
         write_new(path, [b"more"])
         assert path.read_bytes() == b"more"
@@ -155,6 +181,20 @@ def test_no_command_writes_over_a_recording(desk, words):
     assert ended.code == 2, ended
     assert ended.said.count("\n") == 1
     assert (desk / "precious.h5").read_bytes() == before
+
+
+@pytest.mark.parametrize("words", COMMANDS[:4], ids=lambda words: words[0])
+def test_no_command_writes_over_a_result_unless_that_is_asked_for(desk, words):
+    (desk / "old.h5").write_bytes((desk / "res.h5").read_bytes())
+    ended = run(*words, "-o", "old.h5")
+    assert ended.code == 2
+    said = "old.h5 exists: add --overwrite to replace it, or choose another name with -o"
+    assert ended.said == f"mirrorskin: {said}\n"
+
+
+def test_a_result_is_replaced_with_overwrite(desk):
+    assert run("reconstruct", "press.h5", "-o", "res.h5", "--hold", "3", "--overwrite").code == 0
+    assert io.open_result("res.h5").process["hold"] == 3
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".csv", ".ply", ".stl", ".npz", ".mcap"])

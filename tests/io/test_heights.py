@@ -75,7 +75,7 @@ def source_region(tmp_path, told, name="source_region", shape=(5, 7)):
     rows, columns = shape
     values = np.arange(rows * columns, dtype=np.float32).reshape(shape)
     process = {} if told is None else {name: told}
-    io.save_result(io.Result(height=values, process=process), tmp_path / "h.h5")
+    io.save_result(io.Result(height=values, process=process), tmp_path / "h.h5", overwrite=True)
     path, _ = simulation(tmp_path / "r.h5")
     with io.open_recording(path, region=io.Region(ROWS, COLUMNS)) as source:
         return io.open_heights(tmp_path / "h.h5", source), values

@@ -188,7 +188,7 @@ folder = Path(sys.argv[1])
 source = [MadeUp(random_stack("uint8", (60, 40, 50)), io.Header("vertical")) for _ in COMPRESSIONS]
 big = io.Result(height=np.random.default_rng(0).normal(size=(200, 200)).astype("f4"))
 work = [lambda s=s, c=c: record(s, folder / "old.h5", c) for s, c in zip(source, COMPRESSIONS)]
-for write in [*work, lambda: io.save_result(big, folder / "old.h5")]:
+for write in [*work, lambda: io.save_result(big, folder / "old.h5", overwrite=True)]:
     try:
         write()
     except io.InputError as error:

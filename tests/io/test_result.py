@@ -171,10 +171,10 @@ def test_a_failure_leaves_the_older_result(path, monkeypatch):
     before = path.read_bytes()
     bad = a_press(process={"program": object()})
     with pytest.raises(TypeError):
-        io.save_result(bad, path)
+        io.save_result(bad, path, overwrite=True)
     monkeypatch.setattr("pathlib.Path.replace", lambda *names: (_ for _ in ()).throw(OSError(28, "full")))
     with pytest.raises(io.InputError, match=r"result\.h5 could not be written: No space left on device"):
-        io.save_result(a_press(), path)
+        io.save_result(a_press(), path, overwrite=True)
     assert path.read_bytes() == before
     assert list(path.parent.iterdir()) == [path]
 

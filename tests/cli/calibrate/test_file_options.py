@@ -64,7 +64,7 @@ def turn(name="turn.h5", phase=SETUP.phase):
 
 
 def reconstruct(name, *words):
-    done("reconstruct", name, "-o", "out.h5", *words)
+    done("reconstruct", name, "-o", "out.h5", "--overwrite", *words)
     return io.open_result("out.h5")
 
 

@@ -108,7 +108,7 @@ def test_the_command_takes_them_repeated_or_with_commas(press, found, tmp_path, 
     repeated = [word for share in SHARES for word in ("--thresholds", share)]
     commas = ["--thresholds", ",".join(map(str, SHARES))]
     for words in (repeated, commas):
-        words = [*words, "--inclinations", angles, "--no-fill", "-o", "a.h5"]
+        words = [*words, "--inclinations", angles, "--no-fill", "-o", "a.h5", "--overwrite"]
         ended = run("reconstruct", "press.h5", *words)
         assert ended.code == 0, ended.said
         np.testing.assert_array_equal(io.open_result("a.h5").slope_max, found.slope_max)

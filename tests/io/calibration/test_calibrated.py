@@ -247,7 +247,8 @@ def test_a_result_carries_a_copy_also_where_its_form_was_written_before(tmp_path
     for number, calibration in enumerate((a_calibration(), a_calibration(name="east", dtype="uint16"), None)):
         path = tmp_path / f"result-{number}.h5"
         for _ in range(2):
-            io.save_result(io.Result(height=height, process={"hold": 2}, calibration=calibration), path)
+            result = io.Result(height=height, process={"hold": 2}, calibration=calibration)
+            io.save_result(result, path, overwrite=True)
         found = io.open_result(path)
         assert found.process == {"hold": 2}
         assert list(found.maps()) == ["height"]
