@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import click
 
 from mirrorskin.cli import options
+from mirrorskin.cli.defaults import with_pixel_size
 from mirrorskin.cli.groups import Argument, Option
 from mirrorskin.cli.stack import FORMATS, RECORDING, stack_options
 
@@ -43,7 +44,7 @@ def command(
         io.open_recording(recording, memory_limit=bytes_of(memory, "--memory"), **stack) as source,
         progress("checking", source.shape[0]) as show,
     ):
-        found = io.check(source, field_limits=sides, travel_limits=travels, progress=show)
+        found = io.check(with_pixel_size(source), field_limits=sides, travel_limits=travels, progress=show)
     if as_json:
         print_json(found)
     else:

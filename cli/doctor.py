@@ -10,8 +10,8 @@ import sys
 from importlib import metadata
 
 from mirrorskin.cli import options
+from mirrorskin.cli.defaults import config_file, defaults
 from mirrorskin.cli.output import print_fields, print_json
-from mirrorskin.io.system import usable_cores
 
 _VARIABLES = re.compile(r"(OCL|POCL|PYOPENCL|XDG_CACHE|MIRRORSKIN)\w*$")
 _DEVELOPMENT = ("bench", "browser", "dev", "docs", "ptxas")  # extras that users do not need
@@ -21,6 +21,8 @@ _PACKAGES = "numpy", "scipy", "h5py", "hdf5plugin", "opencv-contrib-python-headl
 
 def command(as_json: options.Json = False) -> None:
     """Show the device, versions, extras and caches of this installation, for reports of faults."""
+    from mirrorskin.io.system import usable_cores
+
     facts = {
         "mirrorskin": metadata.version("mirrorskin"),
         "Python": f"{platform.python_version()}, {sys.executable}",
@@ -30,6 +32,9 @@ def command(as_json: options.Json = False) -> None:
         "linker": shutil.which("ld")
         or "none; the embedded device needs one: pip install 'mirrorskin[linker]'",
         "kernel cache": _kernel_cache(),
+        "defaults": ", ".join(
+            [str(config_file() or "none"), *(f"{key} {value}" for key, value in defaults().items())]
+        ),
         **{f"package {name}": _version(name) or "missing" for name in _PACKAGES},
         **{f"extra {name}": found for name, found in _extras().items()},
         **{name: value for name, value in sorted(os.environ.items()) if _VARIABLES.match(name)},

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from mirrorskin.cli import options
 from mirrorskin.cli.declared import declared
+from mirrorskin.cli.defaults import calibration_of, with_pixel_size
 from mirrorskin.cli.groups import Argument, Option
 from mirrorskin.cli.stack import FORMATS, STACK, stack_options
 
@@ -49,6 +50,7 @@ def command(
         _open(axial, "axial", known, limit) as turned,
     ):
         io.check_result_output(target, vertical, axial, calibration, *files, overwrite=overwrite)
+        calibration = calibration_of(pressed, calibration)
         shared = None if calibration is None else io.open_calibration(calibration)
         with progress("fusing", frames_to_read(pressed, turned, register)) as show:
             result = fuse_recordings(
@@ -81,4 +83,4 @@ def _open(path: Path, place: Motion, known: StackOptions, limit: int) -> Recordi
         with open_file(path) as file:
             ours = file.marked(MARK)
     mine: Any = {**known, "dataset": None, "channel": None} if ours else {**known, "motion": place}
-    return io.open_recording(path, memory_limit=limit, **mine)
+    return with_pixel_size(io.open_recording(path, memory_limit=limit, **mine))

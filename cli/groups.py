@@ -155,7 +155,17 @@ def make_command(
 
 
 class Command(click.Command):
-    """A command whose help lists arguments as well."""
+    """A command whose help lists arguments as well, and whose defaults are the user's."""
+
+    def make_context(
+        self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
+    ) -> click.Context:
+        """Return the context of the command, with the user's defaults of its options."""
+        if not extra.get("resilient_parsing"):  # a shell completes it
+            from mirrorskin.cli.defaults import option_defaults
+
+            extra["default_map"] = option_defaults()
+        return super().make_context(info_name, args, parent, **extra)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List arguments and options."""

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import click
 
 from mirrorskin.cli import options
+from mirrorskin.cli.defaults import with_pixel_size
 from mirrorskin.cli.groups import Argument, Option, refuse_foreign
 from mirrorskin.cli.stack import FORMATS, IMPORTED, stack_options
 
@@ -34,7 +35,7 @@ def command(
     io.check_output(output, frames, *files, replaces="anything" if overwrite else "nothing")
     known = stack_options(given)
     known["motion"] = motion.value
-    source = io.open_recording(frames, **known)
+    source = with_pixel_size(io.open_recording(frames, **known))
     with (
         io.Recorder(source, output, compression.value, overwrite=overwrite) as recorder,
         progress("importing", source.shape[0]) as show,

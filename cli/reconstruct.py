@@ -9,6 +9,7 @@ import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.declared import declared
+from mirrorskin.cli.defaults import calibration_of, with_pixel_size
 from mirrorskin.cli.groups import Argument, refuse_foreign
 from mirrorskin.cli.stack import FORMATS, RECORDING, stack_options
 
@@ -42,7 +43,8 @@ def command(
         refuse_foreign(context, opened.motion, str(recording))
         target = output or recording.with_name(f"{recording.stem}-result.h5")
         io.check_result_output(target, recording, calibration, *files, overwrite=overwrite)
-        source = calibrated(opened, calibration)
+        calibration = calibration_of(opened, calibration)
+        source = calibrated(with_pixel_size(opened), calibration)
         if isinstance(source, io.Calibrated):
             if source.whole.lens is not None and "pixel_size" in stack:
                 raise io.InputError(f"{source.whole.name} gives the pixel size. Remove --pixel-size")

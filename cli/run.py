@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from mirrorskin.cli import options
 from mirrorskin.cli.declared import ClassCommand
+from mirrorskin.cli.defaults import with_pixel_size
 from mirrorskin.cli.groups import Argument, make_command
 from mirrorskin.cli.stack import FORMATS, RECORDING, stack_options
 
@@ -46,8 +47,9 @@ def command(
     with io.open_recording(recording, memory_limit=limit, live=live, **stack) as source:
         target = output or recording.with_name(f"{recording.stem}-{kind.__name__}.h5")
         io.check_result_output(target, recording, *files, overwrite=overwrite)
-        with progress("running", source.shape[0]) as show:
-            result = run_class(kind, source, show, memory_limit=limit, device=device, **chosen)
+        frames = with_pixel_size(source)
+        with progress("running", frames.shape[0]) as show:
+            result = run_class(kind, frames, show, memory_limit=limit, device=device, **chosen)
     save_and_report(result, target, device, as_json, overwrite=overwrite)
     report_notes(str(recording), result.process)
 

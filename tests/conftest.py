@@ -18,6 +18,8 @@ from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # A test opens no window, which nobody would close.
 os.environ["MPLBACKEND"] = "agg"
+# Nor does the developer's own configuration matter.
+os.environ["MIRRORSKIN_CONFIG"] = ""
 FOUND = list_devices()
 if not FOUND:
     raise RuntimeError("no OpenCL device found: the tests need one; 'make test' brings PoCL")
