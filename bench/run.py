@@ -98,12 +98,19 @@ def compare_runs(before: Path, after: Path) -> None:
 @main.command("report")
 @click.argument("runs", type=_FILE, nargs=-1, required=True, metavar="RUN.json...")
 @click.option("--output", "-o", type=_FILE, required=True, metavar="PAGE.md", help="Page to write.")
-def make_report(runs: tuple[Path, ...], output: Path) -> None:
-    """Make a page of runs, such as docs/benchmarks.md. Needs no device."""
+@click.option("--chart", type=_FILE, metavar="FILE.svg", help="Chart to write.", show_default="PAGE.svg")
+def make_report(runs: tuple[Path, ...], output: Path, chart: Path | None) -> None:
+    """Make a page of runs, such as docs/benchmarks.md, and its chart. Needs no device."""
     if output.suffix != ".md":
         raise InputError(f"{output}: the name must end in .md")
+    chart = chart or output.with_suffix(".svg")
     check_output(output, *runs)
-    write_new(output, [report.as_page({path: open_run(path) for path in runs}).encode()])
+    check_output(chart, *runs)
+    opened = {path: open_run(path) for path in runs}
+    drawn = report.as_chart(opened)
+    if drawn is not None:
+        write_new(chart, [drawn])
+    write_new(output, [report.as_page(opened, os.path.relpath(chart, output.parent)).encode()])
 
 
 def choose(patterns: Iterable[str]) -> list[str]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from mirrorskin.cli.bench.records import Case, Row, Run, as_ms, as_percent
 from mirrorskin.cli.bench.timing import FIRST, OURS
+from suite import glance
 
 HEAD = ("work", "ms", "quartiles", "kernels", "copies", "GB/s", "frames/s", "of limit", "kernels")
 TARGET_HEAD = ("target", "bound", "measured", "met")
@@ -29,7 +30,7 @@ pip install '.[bench]'                            # peers: Numba, PyTorch, pyamg
 python bench/run.py run --list                    # the cases
 python bench/run.py run 'call-*' -o mine.json     # some of them; all tables are written to mine.md
 python bench/run.py compare before.json mine.json # differences larger than the variation between rounds
-python bench/run.py report mine.json -o page.md   # a page like this one
+python bench/run.py report mine.json -o page.md   # a page like this one, and its chart
 ```"""
 _METHOD = (
     "The works of a case run alternately in one process: the engine, the limits of memory (read, copy, "
@@ -39,7 +40,11 @@ _METHOD = (
     "rounds for reading or copying alone. Compare times of one run; `compare` takes the quartiles into "
     "account when it compares two runs."
 )
-_TARGETS = "Targets, and the measured values."
+_GLANCE = (
+    "Times in milliseconds, from NumPy arrays to maps unless stated otherwise. The limit is the time to read "
+    "the same bytes from memory. Peers return the same maps."
+)
+_TARGETS = "Every target of the project, whether it is met or not."
 _CALLS = (
     "Times in milliseconds of calls as users make them, from NumPy arrays to maps, and of commands, from "
     "process start to end. limit: reading the same bytes from memory. call: a call after earlier ones. "
@@ -92,19 +97,35 @@ def as_markdown(run: Run) -> str:
     return "\n\n".join([*parts, "## Machine", f"{run.title}.", f"{versions}."]) + "\n"
 
 
-def as_page(runs: Mapping[Path, Run]) -> str:
-    """Return the page of some runs."""
+def as_page(runs: Mapping[Path, Run], chart: str) -> str:
+    """Return the page of some runs; ``chart`` is the address of its chart, see `as_chart`."""
     machines = _gather(runs.values())
-    parts = ["# Benchmarks", _ABOUT, "## How to measure", _COMMANDS, _METHOD]
+    parts = ["# Benchmarks", _ABOUT]
+    if glance.entries(_first(machines)):
+        parts.append(f"![Times of mirrorskin, other libraries, and the limit of memory]({chart})")
     for title, about, describe in (
-        ("Targets", _TARGETS, _targets),
+        ("At a glance", _GLANCE, _glance),
         ("Calls", _CALLS, _calls),
         ("Works and peers", _PEERS, _peers),
         ("Accuracy", _ACCURACY, _accuracy),
+        ("Targets", _TARGETS, _targets),
     ):
         parts += _topic(title, about, machines, describe)
-    parts += ["## Machine and runs", _runs(runs)]
+    parts += ["## How to measure", _COMMANDS, _METHOD, "## Machine and runs", _runs(runs)]
     return "\n\n".join(parts) + "\n"
+
+
+def as_chart(runs: Mapping[Path, Run]) -> bytes | None:
+    """Return the chart of a page of some runs, SVG; None if they contain nothing that it shows.
+
+    It shows the machine of the first run.
+    """
+    shown = glance.entries(_first(_gather(runs.values())))
+    return glance.draw(shown) if shown else None
+
+
+def _first(machines: Mapping[str, Machine]) -> Machine:
+    return next(iter(machines.values()), {})
 
 
 def _gather(runs: Iterable[Run]) -> dict[str, Machine]:
@@ -142,6 +163,11 @@ def _topic(
         if mine := describe(machine):
             parts += [*([f"**{name}**"] if len(machines) > 1 else []), *mine]
     return [f"## {title}", about, *parts] if parts else []
+
+
+def _glance(machine: Machine) -> list[str]:
+    shown = glance.entries(machine)
+    return [as_table(glance.HEAD, [glance.as_cells(entry) for entry in shown])] if shown else []
 
 
 def _targets(machine: Machine) -> list[str]:

@@ -3,7 +3,8 @@
 from pathlib import Path
 
 from bench_runs import case, row, run, target
-from suite.report import as_markdown, as_page, as_rows, as_targets
+from suite import glance
+from suite.report import as_chart, as_markdown, as_page, as_rows, as_targets
 
 from mirrorskin.cli.bench.records import Case, Row, Target, Timing, describe_run, open_run
 from mirrorskin.kernels.device import open_device
@@ -16,12 +17,15 @@ FIRST = row("mirrorskin, first call", 0.25, kernel=0.2)
 
 
 def page_of(*runs):
-    return as_page({Path(f"run{n}.json"): one for n, one in enumerate(runs)})
+    return as_page({Path(f"run{n}.json"): one for n, one in enumerate(runs)}, "chart.svg")
 
 
 def test_the_page_in_the_docs_is_that_of_the_committed_runs():
-    page = as_page({path: open_run(path) for path in COMMITTED})
-    made = "make it with: python bench/run.py report bench/results/*.json -o docs/benchmarks.md"
+    page = as_page({path: open_run(path) for path in COMMITTED}, "images/benchmarks.svg")
+    made = (
+        "make it with: python bench/run.py report bench/results/*.json -o docs/benchmarks.md"
+        " --chart docs/images/benchmarks.svg"
+    )
     assert (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8") == page, made
 
 
@@ -83,3 +87,15 @@ def test_a_page_without_targets_has_no_such_part():
     found = page_of(run(case("press", LIMIT, OURS)))
     assert "## Works" in found
     assert not any(f"## {title}" in found for title in ("Targets", "Accuracy", "Calls"))
+
+
+def test_the_chart_in_the_docs_shows_the_committed_runs():
+    chart = (ROOT / "docs" / "images" / "benchmarks.svg").read_text(encoding="utf-8")
+    shown = glance.entries({case.name: case for path in COMMITTED for case in open_run(path).cases})
+    assert len(shown) == 10
+    assert all(entry.title in chart for entry in shown)
+
+
+def test_a_page_without_the_works_of_the_chart_has_none():
+    assert as_chart({Path("run.json"): run(case("other", LIMIT, OURS, FIRST))}) is None
+    assert "![" not in page_of(run(case("other", LIMIT, OURS, FIRST)))
