@@ -1,4 +1,4 @@
-"""A ROS 2 node that presses, and publishes what the camera sees, the heights so far and the surface.
+"""A ROS 2 node that presses, and publishes the camera's pictures, the heights so far and the surface.
 
 python3 press_node.py rig.toml 1.5    # mm; with ROS 2 sourced, and mirrorskin in the same Python
 """
@@ -23,20 +23,28 @@ class Publisher(Node):
 
     def __init__(self):
         super().__init__("mirrorskin")
+        self.pixel_size = None  # mm along x and y
         self.camera = self.create_publisher(Image, "camera/image", 10)
         self.height = self.create_publisher(Image, "height", 10)
         self.surface = self.create_publisher(PointCloud2, "surface", 1)
 
     def show(self, update, status):
-        """Publish what is known now; the loop calls it in a thread of its own."""
+        """Publish an update; the loop calls it in a thread of its own."""
         self.camera.publish(self.picture(update.picture))
         if update.height is not None:
             self.height.publish(self.picture(update.height * np.float32(1e-3)))
+            self.surface.publish(self.cloud(update.height, np.full_like(update.height, np.nan)))
 
     def finish(self, result):
         """Publish the surface, with the standard error of each height."""
-        x, y = np.meshgrid(result.x, result.y)
-        points = np.stack([x, y, result.height, result.height_sigma], axis=-1)[np.isfinite(result.height)]
+        self.surface.publish(self.cloud(result.height, result.height_sigma))
+
+    def cloud(self, height, sigma):
+        """Return the points of heights in mm, (H, W), with their standard errors, which may be NaN."""
+        rows, columns = np.indices(height.shape)
+        x = (columns - (height.shape[1] - 1) / 2) * self.pixel_size[0]
+        y = ((height.shape[0] - 1) / 2 - rows) * self.pixel_size[1]
+        points = np.stack([x, y, height, sigma], axis=-1)[np.isfinite(height)]
         data = (1e-3 * points).astype("<f4")
         cloud = self.stamped(PointCloud2())
         cloud.height, cloud.width = 1, len(data)
@@ -47,7 +55,7 @@ class Publisher(Node):
         cloud.point_step, cloud.row_step = 16, data.nbytes
         cloud.is_bigendian, cloud.is_dense = False, True
         cloud.data = data.tobytes()
-        self.surface.publish(cloud)
+        return cloud
 
     def picture(self, values):
         """Return an image of values, (H, W)."""
@@ -72,6 +80,7 @@ def main(rig_file, depth):
     try:
         with hw.open_rig(hw.load_rig(rig_file)) as rig:
             with hw.SweepScan(rig, hw.VerticalPlan(0.0, depth, speed=SPEED)) as scan:
+                node.pixel_size = scan.header.pixel_size
                 operation = LiveOperation(scan, engine.Press())
                 operation.warm()
                 Loop(scan, operation, on_update=node.show).run()
