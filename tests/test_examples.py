@@ -114,9 +114,38 @@ def streamed(printed):
     assert (frames, lowest, highest) == (31, pytest.approx(-1.9, abs=0.1), pytest.approx(-0.04, abs=0.02))
 
 
+def unwrapped(printed):
+    ((chi2,),) = numbers(printed, r"\(error / standard error\)² (\S+)")
+    assert chi2 == pytest.approx(1, abs=0.1)
+    ((error,),) = numbers(printed, r"RMS error (\S+) nm")
+    assert error < 15
+
+
+def focused(printed):
+    ((share, error),) = numbers(printed, r"(\d+) % of the pixels, RMS error (\S+) µm")
+    assert share > 95
+    assert error < 3
+
+
+def lit(printed):
+    ((angle,),) = numbers(printed, r"median error (\S+) degrees")
+    assert angle < 0.5
+    ((error,),) = numbers(printed, r"RMS error (\S+) µm")
+    assert error < 1
+
+
+def grown(printed):
+    ((error,),) = numbers(printed, r"RMS error (\S+) µm")
+    assert error < 8
+
+
 QUICK = {
     "coin": measured,
+    "focus": focused,
+    "fringes": unwrapped,
     "fused": fused,
+    "lamps": lit,
+    "live_heights": grown,
     "own_camera": streamed,
     "own_data": measured,
     "sphere": measured,
