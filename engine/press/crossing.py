@@ -98,17 +98,8 @@ class PressOperation(Operation):
         )
 
     def with_travel_errors(self, result: Result) -> Result:
-        """Return a result whose heights also have the errors of the travel.
-
-        The variance of a height between two frames, at the share w, is (w^2 + (1 - w)^2) travel_sigma^2:
-        on average 2/3 travel_sigma^2.
-        """
-        if not self.travel_sigma:
-            return result
-        error = np.float32(math.sqrt(2 / 3) * self.travel_sigma)
-        names = [name for name in ("height_sigma", "hysteresis_sigma") if name in result]
-        more = {name: error * (math.sqrt(2) if name != "height_sigma" else 1) for name in names}
-        return result.assign({name: np.hypot(result[name], np.float32(more[name])) for name in names})
+        """Return a result whose heights also have the errors of the travel."""
+        return with_travel_error(result, self.travel_sigma) if self.travel_sigma else result
 
     def reconsider(self, samples: FrameSamples) -> bool:
         """Return whether the first two frames misled about the noise; all frames tell it then."""
@@ -136,6 +127,18 @@ class PressOperation(Operation):
     def declarations(self) -> Mapping[str, Map]:
         """Declarations of the maps; the legend of the status depends on the event."""
         return {**self.maps, "status": STATUS[self.event]}
+
+
+def with_travel_error(result: Result, sigma: float) -> Result:
+    """Return a result whose heights also have errors of the travel of each frame, mm.
+
+    The variance of a height between two frames, at the share w, is (w^2 + (1 - w)^2) sigma^2: on average
+    2/3 sigma^2.
+    """
+    error = np.float32(math.sqrt(2 / 3) * sigma)
+    names = [name for name in ("height_sigma", "hysteresis_sigma") if name in result]
+    more = {name: error * (math.sqrt(2) if name != "height_sigma" else 1) for name in names}
+    return result.assign({name: np.hypot(result[name], np.float32(more[name])) for name in names})
 
 
 class CrossingOperation(PressOperation):

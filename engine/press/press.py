@@ -19,6 +19,7 @@ from mirrorskin.engine.press.estimated_levels import estimate_levels
 from mirrorskin.engine.press.levels import Levels
 from mirrorskin.engine.press.no_answer import with_reason
 from mirrorskin.engine.press.onset import Onset
+from mirrorskin.engine.press.position_errors import PositionErrors
 from mirrorskin.engine.press.rolling_shutter import RollingShutter
 from mirrorskin.engine.press.strokes import Strokes
 from mirrorskin.engine.provenance import estimated_level, level_origin
@@ -274,6 +275,7 @@ class Press(Method):
         shutter = [] if live else [self.make(RollingShutter)]  # live, times come with the frames
         return [
             self.make(NoAnswer, threshold=lowest),
+            self.make(PositionErrors),
             *shutter,
             self.make(LensBlur),
             self.make(Elastomer, threshold=lowest),

@@ -1,0 +1,264 @@
+"""Errors of the frames' positions, which the smoothness of a surface reveals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.engine.method import Context, Step
+from mirrorskin.engine.press.crossing import PressOperation, with_travel_error
+from mirrorskin.engine.press.strokes import Strokes
+from mirrorskin.io import Result
+from mirrorskin.io.findings import Finding, with_findings
+from mirrorskin.kernels.array_types import Doubles
+from mirrorskin.kernels.least_squares import mad_sigma
+
+_BEND = np.array([-1.0, 3.0, -3.0, 1.0])  # third difference of four pixels in a row
+_RISE = np.array([-1.0, -1.0, 1.0, 1.0]) / 4  # mean difference of neighbours
+_LEAST_RISE = 0.2  # steps from pixel to pixel of a slope that shows positions
+_LONGEST = 3  # pixels: greatest distance of the pixels in a row
+_MOST = 2000  # rows of four pixels along each axis
+_CLOSEST = 0.3  # steps between frames that are told apart
+_FEWEST, _MOST_FRAMES = 7, 160  # frames that show positions
+_SEEN = 40  # times that a frame is next to a pixel
+_PRIOR = 0.3  # steps: standard deviation of a position, so that none is undetermined
+_SMOOTH = 4  # frames per degree of the polynomial that the surface itself may have
+_ROUNDS = 3
+_LEAST_BEND = 0.05  # least standard deviation of a bend, relative to the rise
+_OVERLAP = 6  # rows of four pixels that share a pixel, along both axes
+_BINS, _SPREAD = 8, 3.0  # parts of an interval, and how many of them heights must fill
+_LEAST_JITTER, _CLEARER = 0.06, 3.0  # steps, and standard errors, of a jitter that is one
+_SURE_FRAMES = 7  # frames from which a jitter is estimated
+_JUMP, _CLEAR_JUMP = (0.6, 1.5), 5.0  # steps, and standard errors, of one lost frame
+_ALONE = 0.7  # greatest jump elsewhere, relative to it
+
+
+class PositionErrors(Step):
+    """Compare the travel of the frames with the surface, and report what does not fit.
+
+    If a frame was exposed at another travel than stated, then all heights near it are shifted, wherever in
+    the picture they are. A surface has no reason to bend at just these heights, so that the error of
+    each frame is found: the errors e make the bends of rows of four pixels least, relative to their rise, so
+    that no scale is preferred. What varies slowly with height may be the surface itself and is ignored.
+
+    Random errors are added to the standard deviation of heights; one missing step is a lost frame.
+    """
+
+    def apply(self, result: Result, context: Context) -> Result:
+        """Return a result with larger standard deviations, or a warning, where positions do not fit."""
+        operation = context.operation
+        if not isinstance(operation, PressOperation) or isinstance(operation, Strokes):
+            return result
+        travel = context.pushed("travel")
+        errors = _find_errors(result.height, travel)
+        if errors is None:
+            return result
+        jump = errors.lost_frame()
+        if jump is not None:
+            first = int(result.process.get("first_frame", 0))
+            later = first + int(np.argmin(np.abs(travel - errors.travel[jump + 1])))
+            text = (
+                f"the surface bends everywhere at the height of frame {later}, as if the body had moved by"
+                " two steps before it: was a frame lost? Give the travel of each frame"
+            )
+            return with_findings(result, Finding("travel jump", text))
+        jitter = errors.jitter()
+        stated = operation.travel_sigma or 0.0
+        if jitter <= stated:
+            return result
+        text = f"positions jitter by about {1000 * jitter:.2g} µm, which is in the standard deviations"
+        added = math.sqrt(jitter**2 - stated**2)
+        return with_findings(with_travel_error(result, added), Finding("jitter", text, False))
+
+
+@dataclass(frozen=True)
+class _Errors:
+    """Estimated errors of frames at some travel, (n,), mm, and where they are meaningful.
+
+    ``clear`` tells of the intervals between the frames, (n - 1,), whether heights spread over them: many
+    heights at one distance from the frames, as those of a plate, tell nothing. ``jumps`` are the errors of
+    all later frames if they are the same, with their standard errors; ``reach`` is the distance of the pixels
+    in a row.
+    """
+
+    travel: Doubles
+    step: float
+    error: Doubles
+    covariance: Doubles
+    clear: NDArray[np.bool_]
+    jumps: Doubles
+    jump_errors: Doubles
+    reach: int
+
+    def jitter(self) -> float:
+        """Return the standard deviation of random errors, mm; 0 if there are none."""
+        if self.reach == _LONGEST:
+            return 0.0
+        clear = self.clear[:-2] & self.clear[1:-1] & self.clear[2:]
+        clear[[0, -1]] = False
+        if np.count_nonzero(clear) < _SURE_FRAMES:
+            return 0.0
+        differences = np.diff(np.eye(len(self.error)), 3, axis=0)[clear] / math.sqrt(20)
+        jitter = mad_sigma(differences @ self.error)
+        variance = np.einsum("ij,jk,ik->i", differences, self.covariance, differences)
+        error = math.sqrt(float(np.median(variance)))
+        if jitter < max(_LEAST_JITTER * self.step, _CLEARER * error):
+            return 0.0
+        return math.sqrt(jitter**2 - error**2)
+
+    def lost_frame(self) -> int | None:
+        """Return the number of the frame after which one is missing, if one clearly is."""
+        unclear = np.convolve(~self.clear, np.ones(5), "same") > 0
+        unclear[[0, 1, -2, -1]] = True
+        jumps = np.where(unclear, np.nan, self.jumps) / self.step
+        if np.isnan(jumps).all():
+            return None
+        largest = int(np.nanargmax(jumps))
+        jump, error = jumps[largest], self.jump_errors[largest] / self.step
+        jumps[max(0, largest - 2) : largest + 3] = 0
+        alone = np.nanmax(np.abs(jumps)) < _ALONE * jump
+        return largest if _JUMP[0] < jump < _JUMP[1] and jump > _CLEAR_JUMP * error and alone else None
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Rows of four pixels: their bend relative to their rise, and how errors of frames change it.
+
+    bend = bends[i] + sum of change[i, j] * error[frame[i, j]] over the 8 frames next to the pixels.
+    """
+
+    bends: Doubles
+    frame: NDArray[np.intp]
+    change: Doubles
+
+    def between(self, first: int, stop: int) -> _Rows:
+        """Return the rows that lie between two frames, which are then numbered from the first."""
+        inside = ((self.frame >= first) & (self.frame < stop)).all(axis=1)
+        return _Rows(self.bends[inside], self.frame[inside] - first, self.change[inside])
+
+
+def _find_errors(height: NDArray[Any], pushed: Doubles) -> _Errors | None:
+    """Return the errors of the frames' positions; None if the heights do not show them."""
+    travel = np.unique(pushed)
+    if len(travel) < _FEWEST:
+        return None
+    step = float(np.median(np.diff(travel)))
+    travel = _apart(travel, _CLOSEST * step)
+    if len(travel) < _FEWEST:
+        return None
+    lines = [_thinned(part) for part in (-height, -height.T)]
+    heights = np.concatenate([part.ravel() for part in lines])
+    clear = _spread(heights[np.isfinite(heights)], travel)
+    if np.count_nonzero(clear) < _FEWEST - 2:
+        return None
+    rise = np.concatenate([np.abs(np.diff(part, axis=1)).ravel() for part in lines])
+    rise = rise[rise > _LEAST_RISE / 2 * step]
+    if rise.size < _SEEN:
+        return None
+    reach = int(np.clip(round(step / float(np.median(rise))), 1, _LONGEST))
+    rows = _rows_of(lines, travel, step, reach)
+    seen = np.flatnonzero(np.bincount(rows.frame.ravel(), minlength=len(travel)) >= _SEEN)
+    if len(seen) < _FEWEST:
+        return None
+    first, stop = int(seen[0]), int(seen[-1]) + 1
+    if stop - first > _MOST_FRAMES:
+        middle = int(np.median(rows.frame))
+        first = min(max(first, middle - _MOST_FRAMES // 2), stop - _MOST_FRAMES)
+        stop = first + _MOST_FRAMES
+    clear = clear[first : stop - 1]
+    return _fit(rows.between(first, stop), travel[first:stop], step, clear, reach)
+
+
+def _apart(travel: Doubles, least: float) -> Doubles:
+    """Return travel, in ascending order, without what is closer to the one before than a distance."""
+    if np.diff(travel).min() >= least:
+        return travel
+    kept = [0]
+    for number in range(1, len(travel)):
+        if travel[number] - travel[kept[-1]] >= least:
+            kept.append(number)
+    return travel[kept]
+
+
+def _thinned(lines: NDArray[Any]) -> Doubles:
+    """Return evenly spaced lines with enough pixels."""
+    each = max(1, -(-lines.size // _MOST))
+    return lines[each // 2 :: each].astype(np.float64)
+
+
+def _rows_of(lines: list[Doubles], travel: Doubles, step: float, reach: int) -> _Rows:
+    """Return the rows of four pixels on a slope, along lines, that are ``reach`` pixels apart."""
+    parts = []
+    for line in lines:
+        count = line.shape[1] - 3 * reach
+        if count > 0:
+            parts.append(np.stack([line[:, n * reach : n * reach + count].ravel() for n in range(4)]))
+    if not parts:
+        return _Rows(np.empty(0), np.empty((0, 8), np.intp), np.empty((0, 8)))
+    pixels = np.concatenate(parts, axis=1)
+    each = np.diff(pixels, axis=0)
+    rises = (each > 0).all(axis=0) | (each < 0).all(axis=0)
+    rises &= np.abs(pixels[3] - pixels[0] + pixels[2] - pixels[1]) > 4 * _LEAST_RISE * step
+    pixels = pixels[:, rises]
+    rise = np.sum(_RISE[:, np.newaxis] * pixels, axis=0)
+    bends = np.sum(_BEND[:, np.newaxis] * pixels, axis=0) / rise
+    frame = np.clip(np.searchsorted(travel, pixels, side="right") - 1, 0, len(travel) - 2)
+    share = (pixels - travel[frame]) / (travel[frame + 1] - travel[frame])
+    change = (_BEND[:, np.newaxis] - bends * _RISE[:, np.newaxis]) / rise
+    return _Rows(
+        bends,
+        np.concatenate([frame, frame + 1]).T,
+        np.concatenate([change * (1 - share), change * share]).T,
+    )
+
+
+def _spread(heights: Doubles, travel: Doubles) -> NDArray[np.bool_]:
+    """Return of each interval between frames whether the heights in it differ enough."""
+    interval = np.clip(np.searchsorted(travel, heights, side="right") - 1, 0, len(travel) - 2)
+    share = (heights - travel[interval]) / (travel[interval + 1] - travel[interval])
+    part = np.clip((share * _BINS).astype(np.intp), 0, _BINS - 1)
+    count = np.bincount(interval * _BINS + part, minlength=(len(travel) - 1) * _BINS)
+    count = count.reshape(-1, _BINS).astype(np.float64)
+    total = count.sum(axis=1)
+    return np.asarray((total > 0) & (total**2 >= _SPREAD * np.sum(count**2, axis=1)))
+
+
+def _fit(rows: _Rows, travel: Doubles, step: float, clear: NDArray[np.bool_], reach: int) -> _Errors:
+    """Fit the errors of all frames, and those of a single jump between any two of them."""
+    count = len(travel)
+    pairs = (rows.frame[:, :, np.newaxis] * count + rows.frame[:, np.newaxis, :]).ravel()
+    products = rows.change[:, :, np.newaxis] * rows.change[:, np.newaxis, :]
+
+    def normal(weight: Doubles) -> Doubles:
+        """Return the sum of weighted products of changes, (n, n)."""
+        weighted = (weight[:, np.newaxis, np.newaxis] * products).ravel()
+        return np.bincount(pairs, weighted, minlength=count**2).reshape(count, count).astype(np.float64)
+
+    degree = max(2, count // _SMOOTH)
+    smooth, _ = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, count), degree))
+    bend = max(mad_sigma(rows.bends), _LEAST_BEND)
+    error, left = np.zeros(count), rows.bends
+    for _ in range(_ROUNDS):
+        weight = 1 / np.sqrt(1 + (left / (2 * bend)) ** 2)
+        squares = normal(weight)
+        gradient = -np.bincount(
+            rows.frame.ravel(), ((weight * rows.bends)[:, np.newaxis] * rows.change).ravel(), minlength=count
+        )
+        whole = squares + np.eye(count) * (bend / (_PRIOR * step)) ** 2
+        whole += 10 * np.trace(whole) * np.sum(smooth[:, np.newaxis] * smooth[np.newaxis], axis=2)
+        inverse = np.linalg.inv(whole)
+        error = np.sum(inverse * gradient, axis=1)
+        left = rows.bends + np.sum(rows.change * error[rows.frame], axis=1)
+    covariance = _OVERLAP * inverse @ normal((weight * left) ** 2) @ inverse
+
+    after = np.tri(count, count - 1, -1)  # a jump between two frames shifts all that follow
+    inner = np.linalg.pinv(smooth.T @ squares @ smooth)
+    mixed = smooth.T @ squares @ after
+    weights = np.sum(after * (squares @ after), axis=0) - np.sum(mixed * (inner @ mixed), axis=0)
+    weights = np.maximum(weights, 1e-9 * np.trace(squares))
+    jumps = (after.T @ gradient - mixed.T @ inner @ (smooth.T @ gradient)) / weights
+    return _Errors(travel, step, error, covariance, clear, jumps, bend * np.sqrt(_OVERLAP / weights), reach)
