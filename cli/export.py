@@ -9,6 +9,7 @@ import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.groups import Argument, Option
+from mirrorskin.io.export_formats import contents, suffixes_with
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from mirrorskin.io import Result
 
 Point = tuple[float, float]
+
+_APEX = "apex"
 
 
 def command(
@@ -26,16 +29,26 @@ def command(
             "--output",
             "-o",
             metavar="FILE",
-            help="File to write, more than once if you like: a mesh .ply or .stl, points .xyz, heights in"
-            " 16 bits .png or .tif, a cross-section .csv, arrays .npz, ROS 2 messages .mcap, the same as Zarr"
-            " .zarr, also at an address such as s3://bucket/NAME.zarr.",
+            help=f"File to write, more than once if you like: {contents()}, also at an address such as"
+            " s3://bucket/NAME.zarr.",
         ),
     ],
     turn: options.Turn = None,
-    section: options.Section = None,
+    section: Annotated[
+        str | None,
+        Option(
+            metavar=f"X1,Y1:X2,Y2|{_APEX}",
+            help="A .csv of a cross-section between two points, from the picture's centre:"
+            " -2mm,0mm:2mm,0mm, or across the apex.",
+            show_default="a .csv of all heights",
+        ),
+    ] = None,
     points: Annotated[bool, Option("--points", help="A .ply of points, without triangles.")] = False,
+    float32: Annotated[
+        bool, Option("--float32", help="A .tif of float32 in mm, NaN for holes, instead of 16 bits.")
+    ] = False,
 ) -> None:
-    """Write a result as meshes, points, pictures, tables or arrays."""
+    """Write a result as meshes, points, surface files, pictures, tables or arrays."""
     from mirrorskin import io
     from mirrorskin.cli.output import printable, progress
     from mirrorskin.cli.quantity import segment
@@ -44,10 +57,11 @@ def command(
     from mirrorskin.io.recording import is_recording
 
     suffixes = {path.suffix.lower() for path in output}
-    for given, suffix, option in ((section, ".csv", "--section"), (points, ".ply", "--points")):
-        if given and suffix not in suffixes:
-            raise io.InputError(f"{option} is for a {suffix} file: name one with -o, or leave {option} out")
-    ends = None if section is None else segment(section, "--section")
+    for name, given in (("section", section), ("points", points), ("float32", float32)):
+        taken = suffixes_with(name)
+        if given and not suffixes & {*taken}:
+            raise io.InputError(f"--{name} is for a {taken[0]} file: name one with -o, or leave --{name} out")
+    ends = None if section in (None, _APEX) else segment(section, "--section")
     stores, output = _part(output, result, turn)
     if all(path.suffix.lower() == MCAP_SUFFIX for path in output) and is_recording(result):
         with io.open_recording(result) as recording:
@@ -57,9 +71,9 @@ def command(
         found = io.select_turn(io.open_result(result), turn)
         for path in output:
             check_export(found, path)
-        columns = _section(found, ends) if ".csv" in suffixes else None
+        columns = None if section is None else _section(found, ends)
         for path in output:
-            holds = io.export_result(found, path, section=columns, points=points)
+            holds = io.export_result(found, path, section=columns, points=points, float32=float32)
             click.echo(printable(f"{path}: {holds}"))
     for path in stores:
         with progress("exporting", None) as show:

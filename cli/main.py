@@ -51,7 +51,7 @@ PURPOSES = {
     "view": "Show the maps of a result, a section and a histogram of heights.",
     "measure": "Measure a height map: heights, areas, volumes, plane or sphere, roughness, steps.",
     "report": "Write a page with pictures, numbers and the surface.",
-    "export": "Write a result as meshes, points, pictures, tables or arrays.",
+    "export": "Write a result as meshes, points, surface files, pictures, tables or arrays.",
     "score": "Compare a result with the ground truth of a simulation.",
     "info": "Show what a file contains.",
     "check": "Check whether frames and their positions are plausible.",

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from mirrorskin.io import Result
     from mirrorskin.view.result.figures import Ends
 
-_PICTURE = ".png"
+_PICTURE = ".png"  # in a folder
 
 
 def command(
@@ -37,8 +37,9 @@ def command(
         Option(
             "--output",
             "-o",
-            metavar="PICTURE.png|DIR",
-            help="Write one picture of all, or a picture of each into a folder, and open no window.",
+            metavar="PICTURE|DIR",
+            help="Write one picture of all, .png, .pdf or .svg, or a picture of each into a folder, without a"
+            " window.",
             show_default="a window; where there is no screen, RES-view.png",
         ),
     ] = None,
@@ -86,11 +87,13 @@ def _show_in_space(path: Path, turn: int | None, where: str, name: str) -> None:
 def _check(output: Path, result: Path) -> None:
     """Refuse a place that cannot be written to, before anything is drawn."""
     from mirrorskin import io
+    from mirrorskin.view.canvas import FIGURE_SUFFIXES
 
-    if output.suffix.lower() == _PICTURE:
+    if output.suffix.lower() in FIGURE_SUFFIXES:
         io.check_output(output, result)
     elif output.suffix and not output.is_dir():
-        raise io.InputError(f"-o {output}: name a picture that ends in {_PICTURE}, or a folder")
+        suffixes = " or ".join(FIGURE_SUFFIXES)
+        raise io.InputError(f"-o {output}: name a picture that ends in {suffixes}, or a folder")
     else:
         nearest = next(one for one in (output, *output.absolute().parents) if one.exists())
         if not nearest.is_dir():
@@ -102,7 +105,7 @@ def _show(
 ) -> None:
     """Draw maps into a window, a picture or a folder."""
     from mirrorskin import io
-    from mirrorskin.view.canvas import has_screen, show_figure, write_figure
+    from mirrorskin.view.canvas import FIGURE_SUFFIXES, has_screen, show_figure, write_figure
     from mirrorskin.view.result import figures_of, overview
 
     if output is None and has_screen():
@@ -112,7 +115,7 @@ def _show(
     if output is None:
         output = path.with_name(f"{path.stem}-view{_PICTURE}")
         io.check_output(output)
-    if output.suffix.lower() == _PICTURE:
+    if output.suffix.lower() in FIGURE_SUFFIXES:
         figures = {output: overview(shown, name=name, section=ends, maps=maps)}
     else:
         each = figures_of(shown, name=name, section=ends, maps=maps)

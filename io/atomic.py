@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.existing import Replaces, check_replaced
+from mirrorskin.io.export_formats import FORMATS
 from mirrorskin.io.os_errors import as_input_error, legible
 from mirrorskin.io.system import check_writable_system, lock
 from mirrorskin.io.types import Closing, InputError, ProcessValue
@@ -35,7 +36,8 @@ VERSIONS = ("v110", "v110")
 _NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)  # a file system without hard links
 
 _OTHER_FORMATS = {  # suffixes that a result cannot have, with the command that makes one from it
-    **dict.fromkeys(("csv", "tif", "tiff", "png", "ply", "stl", "npz", "mcap", "xyz"), "export"),
+    **{suffix.removeprefix("."): "export" for suffix in FORMATS if suffix != ZARR_SUFFIX},
+    **dict.fromkeys(("pdf", "svg"), "view"),
     "html": "report",
     **dict.fromkeys(("jpg", "jpeg", "npy", "avi", "mp4", "json", "toml"), ""),
 }

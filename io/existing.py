@@ -14,13 +14,18 @@ Replaces = Literal["nothing", "unused", "derived", "calibration", "anything"]
 
 "nothing": none, the name must be free. "unused": the same for a result, which replaces "derived" with
 --overwrite. "derived": files that can be computed again, such as a result, a picture or a table; not a
-recording, a calibration, an HDF5 or MCAP file of another program, a video, arrays, an archive that ``export``
-did not write, or settings. "calibration": these, and calibrations. "anything": every file, because the user
-requested it.
+recording, a calibration, an HDF5 or MCAP file of another program, a video, arrays, an archive or a surface
+(SUR, GSF) that ``export`` did not write, or settings. "calibration": these, and calibrations. "anything":
+every file, because the user requested it.
 """
 
 _HDF5, _MCAP = b"\x89HDF\r\n\x1a\n", b"\x89MCAP0\r\n"
 _NPY, _ZIP, _HEAD = b"\x93NUMPY", b"PK\3\4", 16
+_SURFACES = b"DIGITAL SURF", b"DSCOMPRESSED", b"Gwyddion Simple"
+_OURS, _NOTES = (
+    b"exported by mirrorskin",
+    4096,
+)  # in the notes of a surface that was exported, and their bytes
 _VIDEOS = (
     (0, b"RIFF"),
     (4, b"ftyp"),
@@ -66,6 +71,9 @@ def _is_exported(path: Path) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
             names = set(archive.namelist())
+            if "main.xml" in names:  # X3P
+                with archive.open("main.xml") as description:
+                    return _OURS in description.read(_NOTES)
     except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile):
         return False
     return {"units.npy", "legends.npy", "process.npy"} <= names
@@ -81,6 +89,8 @@ def protected_kind(path: Path) -> str:
             return "" if is_surface(path) else _KINDS["recording"]
         if any(head[place:].startswith(mark) for place, mark in _VIDEOS):
             return "a video"
+        if head.startswith(_SURFACES):
+            return "" if _OURS in file.read(_NOTES) else "a surface of another program"
         if head.startswith(_NPY):
             return "an array"
         if head.startswith(_ZIP):

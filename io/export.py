@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from importlib.util import find_spec
 from io import BytesIO, StringIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,15 +18,13 @@ from numpy.typing import NDArray
 from mirrorskin.io import pictures
 from mirrorskin.io.arguments import check_flag, check_kind, check_path, checked
 from mirrorskin.io.atomic import write_new
-from mirrorskin.io.foreign import MCAP_SUFFIX
+from mirrorskin.io.export_formats import FORMATS
 from mirrorskin.io.mesh import Mesh, face_vectors, normals_around, surface_mesh
 from mirrorskin.io.result import Result
-from mirrorskin.io.result_file import save_result
 from mirrorskin.io.text import one_line
 from mirrorskin.io.types import Floats, InputError
-from mirrorskin.io.url import ZARR_SUFFIX, path_of
+from mirrorskin.io.url import path_of
 
-_SECTION, _ARRAYS = ".csv", ".npz"
 _SOFTWARE, _DATE, _SOURCE = "software", "date", "source"
 _FROM_PROCESS = {_SOURCE: "source", _DATE: "date", "turn": "turn"}
 _NORMAL = "nx", "ny", "nz"
@@ -39,13 +39,14 @@ _METRE = 1e-3  # m per mm
 _NO_DATA = 42113  # GDAL's tag for the value of holes
 
 
-@checked(result=check_kind(Result), path=check_path, points=check_flag)
+@checked(result=check_kind(Result), path=check_path, points=check_flag, float32=check_flag)
 def export_result(
     result: Result,
     path: str | Path,
     *,
     section: Mapping[str, NDArray[Any]] | None = None,
     points: bool = False,
+    float32: bool = False,
 ) -> str:
     """Write a result for other programs; the file appears complete or not at all.
 
@@ -54,14 +55,19 @@ def export_result(
     result : Result
         Maps of one turn; see ``select_turn``.
     path : str or Path
-        The suffix selects the format: ``.ply`` and ``.stl``, a surface of triangles; ``.xyz``, points as
-        text; ``.png``, ``.tif`` and ``.tiff``, heights as counts of 16 bits with their scale, 0 for
-        undefined; ``.npz``, all maps as plain arrays; ``.csv``, a cross-section; ``.mcap``, ROS 2 messages,
-        as written by ``save_messages``; ``.zarr``, everything in a result file, as written by ``save_zarr``.
+        The suffix selects the format: ``.ply``, ``.stl`` and ``.obj``, a surface of triangles; ``.xyz``,
+        points as text; ``.x3p`` (ISO 25178-72), ``.sur`` (Digital Surf) and ``.gsf`` (Gwyddion), heights for
+        programs of metrology; ``.png``, ``.tif`` and ``.tiff``, heights as counts of 16 bits with their
+        scale, 0 for undefined; ``.csv``, heights as a matrix in mm, or a cross-section; ``.npz``, all maps as
+        plain arrays; ``.mcap``, ROS 2 messages, as written by ``save_messages``; ``.zarr``, everything in a
+        result file, as written by ``save_zarr``.
     section : mapping of ndarray, (n,), optional
-        Columns of the cross-section; lengths in mm, and ``filled`` is 1 where a height was not measured.
+        Columns of a cross-section, for a ``.csv``; lengths in mm, and ``filled`` is 1 where a height was not
+        measured.
     points : bool, optional
         Write a PLY of all points, without triangles.
+    float32 : bool, optional
+        Write a TIFF of float32 in mm, NaN where undefined.
 
     Returns
     -------
@@ -82,51 +88,40 @@ def export_result(
     """
     path = path_of(path)
     check_export(result, path)
-    suffix = path.suffix.lower()
-    if suffix == _SECTION:
-        if section is None:
-            raise InputError(
-                f"{path}: a table takes a cross-section, and none is given: export something else"
-            )
-        units = {name: "mm" for name in section if name != "filled"}
-        save_table(path, section, units, _notes_of(result))
-        holds = f"{len(section['height'])} points of a cross-section"
-    elif suffix == MCAP_SUFFIX:
-        from mirrorskin.io.mcap import save_messages
-
-        holds = save_messages(result, path)
-    elif suffix == ZARR_SUFFIX:
-        save_result(result, path)
-        holds = "Zarr"
+    form = FORMATS[path.suffix.lower()]
+    given = {"section": section, "points": points, "float32": float32}
+    options = {name: value for name, value in given.items() if value and name in form.options}
+    module, _, function = form.encoder.partition(":")
+    encode = getattr(import_module(f"mirrorskin.io.{module}"), function)
+    if form.writes_itself:
+        holds: str = encode(result, path) or "everything"
     else:
         try:
-            with_points = {"points": True} if points and suffix == ".ply" else {}
-            parts, holds = _FORMATS[suffix](result, **with_points)
+            parts, holds = encode(result, **options)
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
         write_new(path, parts)
-    relative = (
-        suffix not in (_ARRAYS, ZARR_SUFFIX)
-        and result.offset_unknown is not None
-        and result.offset_unknown.any()
-    )
+    unknown = result.offset_unknown
+    relative = form.needs_heights and unknown is not None and unknown.any()
     return f"{holds}, heights {_height_datum(result)}" if relative else holds
 
 
 def check_export(result: Result, path: str | Path) -> None:
     """Refuse what cannot be exported, before any work is done."""
-    suffix, known = Path(path).suffix.lower(), (*_FORMATS, _SECTION, MCAP_SUFFIX, ZARR_SUFFIX)
-    if suffix not in known:
+    suffix = Path(path).suffix.lower()
+    if suffix not in FORMATS:
         wrong = f"{suffix} is not a supported format" if suffix else "its name has no suffix"
-        raise InputError(f"{path}: {wrong}: name a file that ends with one of {' '.join(known)}")
-    if suffix in (_ARRAYS, ZARR_SUFFIX):
-        return
-    check_heights(result, path)
+        raise InputError(f"{path}: {wrong}: name a file that ends with one of {' '.join(FORMATS)}")
+    form = FORMATS[suffix]
+    if form.package and find_spec(form.package) is None:
+        raise InputError(f"{path} needs the package {form.package}: pip install 'mirrorskin[{form.extra}]'")
+    if form.needs_heights:
+        check_heights(result, path)
 
 
 def check_heights(result: Result, path: str | Path) -> None:
     """Refuse a result without heights in millimetres."""
-    remedy = f"or export its maps as {_ARRAYS}"
+    remedy = "or export its maps as .npz"
     if result.height is None:
         raise InputError(f"{path}: the result has no heights: reconstruct it again with them, {remedy}")
     if not np.isfinite(result.height).any():
@@ -167,13 +162,24 @@ def save_table(
     >>> columns = {"x": np.arange(3.0), "height": np.zeros(3)}
     >>> save_table("section.csv", columns, {"x": "mm", "height": "mm"}, {})  # doctest: +SKIP
     """
-    text = StringIO(newline="")
-    for name, note in notes.items():
-        text.write(f"# {name}: {one_line(note)}\n")
+    write_new(Path(path), [_table(columns, units, notes)])
+
+
+def _table(columns: Mapping[str, NDArray[Any]], units: Mapping[str, str], notes: Mapping[str, str]) -> bytes:
+    """Return the text of a table, see `save_table`."""
+    text = _commented(notes)
     table = csv.writer(text, lineterminator="\n")
     table.writerow([f"{name} [{units[name]}]" if units.get(name) else name for name in columns])
     table.writerows(zip(*(_cells(values) for values in columns.values()), strict=True))
-    write_new(Path(path), [text.getvalue().encode()])
+    return text.getvalue().encode()
+
+
+def _commented(notes: Mapping[str, str]) -> StringIO:
+    """Return notes as lines that begin with ``#``, to which a table can be added."""
+    text = StringIO(newline="")
+    for name, note in notes.items():
+        text.write(f"# {name}: {one_line(note)}\n")
+    return text
 
 
 def _cells(values: NDArray[Any]) -> Iterator[str]:
@@ -182,19 +188,19 @@ def _cells(values: NDArray[Any]) -> Iterator[str]:
         yield "" if math.isnan(value) else f"{value:.9g}"
 
 
-class _Encoded(NamedTuple):
+class Encoded(NamedTuple):
     """The parts of a file, and a description of its contents."""
 
     parts: list[bytes]
     holds: str
 
 
-def _encode_ply(result: Result, points: bool = False) -> _Encoded:
+def encode_ply(result: Result, points: bool = False) -> Encoded:
     """Encode a surface of triangles, or points alone, as binary PLY."""
-    notes = {"unit": "mm"} | _notes_of(result)
+    notes = {"unit": "mm"} | notes_of(result)
     if points:
         columns = points_of(result)
-        return _Encoded(_ply(columns, None, notes), f"{len(columns['x'])} points")
+        return Encoded(_ply(columns, None, notes), f"{len(columns['x'])} points")
     mesh = _surface(result)
     columns = points_of(result, mesh.pixels)
     if result.normals is not None:
@@ -204,12 +210,12 @@ def _encode_ply(result: Result, points: bool = False) -> _Encoded:
             columns[name] = columns[name].copy()
             columns[name][missing] = values
         notes["normals"] = "of the result where it has them, elsewhere of the triangles around"
-    return _Encoded(_ply(columns, mesh.faces, notes), _size(mesh))
+    return Encoded(_ply(columns, mesh.faces, notes), _size(mesh))
 
 
-def _encode_stl(result: Result) -> _Encoded:
+def encode_stl(result: Result) -> Encoded:
     """Encode a surface as binary STL, with its unit in the header, as STL has no field for it."""
-    mesh, notes = _surface(result), _notes_of(result)
+    mesh, notes = _surface(result), notes_of(result)
     title = ", ".join(["unit mm", *(notes[name] for name in (_SOFTWARE, _DATE, _SOURCE) if name in notes)])
     normals = face_vectors(mesh)
     triangles = np.zeros(
@@ -219,42 +225,78 @@ def _encode_stl(result: Result) -> _Encoded:
     triangles["corners"] = mesh.vertices[mesh.faces]
     head = _ascii(title).encode()[:_STL_HEAD].ljust(_STL_HEAD, b" ")
     count = np.uint32(len(triangles)).astype("<u4").tobytes()
-    return _Encoded([head, count, triangles.tobytes()], _size(mesh))
+    return Encoded([head, count, triangles.tobytes()], _size(mesh))
 
 
-def _encode_xyz(result: Result) -> _Encoded:
+def encode_obj(result: Result) -> Encoded:
+    """Encode a surface as Wavefront OBJ: text, in mm, which a comment states."""
+    mesh = _surface(result)
+    head = "".join(
+        f"# {name}: {_ascii(note)}\n" for name, note in ({"unit": "mm"} | notes_of(result)).items()
+    )
+    file = BytesIO(head.encode())
+    file.seek(0, 2)
+    np.savetxt(file, mesh.vertices, "v %.9g %.9g %.9g")
+    np.savetxt(file, mesh.faces + 1, "f %d %d %d")
+    return Encoded([file.getvalue()], _size(mesh))
+
+
+def encode_csv(result: Result, section: Mapping[str, NDArray[Any]] | None = None) -> Encoded:
+    """Encode the heights as a matrix in mm, NaN where undefined; or the columns of a cross-section."""
+    if section is not None:
+        units = {name: "mm" for name in section if name != "filled"}
+        text = _table(section, units, notes_of(result))
+        return Encoded([text], f"{len(section['height'])} points of a cross-section")
+    height, x, y = grid_of(result)
+    width, step = pixel_size_of(x, y)
+    notes = {
+        "content": "heights in mm, a row of the picture per line, from the top",
+        "pixel size": f"{width!r} x {step!r} mm (x, y)",
+        "first value": f"x = {float(x[0])!r} mm, y = {float(y[0])!r} mm; y decreases from line to line",
+    }
+    text_file = _commented(notes | notes_of(result))
+    np.savetxt(text_file, height, "%.9g", delimiter=",")
+    rows, columns = height.shape
+    return Encoded([text_file.getvalue().encode()], f"{rows} x {columns} heights in mm")
+
+
+def encode_xyz(result: Result) -> Encoded:
     """Encode points as text, one per line, after comments; the last comment names the columns."""
     columns = points_of(result)
     names = [f"{name}[{_POINT_UNITS[name]}]" if name in _POINT_UNITS else name for name in columns]
-    head = [*(f"{name}: {note}" for name, note in _notes_of(result).items()), " ".join(names)]
+    head = [*(f"{name}: {note}" for name, note in notes_of(result).items()), " ".join(names)]
     formats = ["%d" if values.dtype.kind == "u" else "%.9g" for values in columns.values()]
     file = BytesIO()
     rows = np.stack([values.astype(np.float64) for values in columns.values()], axis=1)
     np.savetxt(file, rows, formats, header="\n".join(head), encoding="utf-8")
-    return _Encoded([file.getvalue()], f"{len(rows)} points")
+    return Encoded([file.getvalue()], f"{len(rows)} points")
 
 
-def _encode_png(result: Result) -> _Encoded:
+def encode_png(result: Result) -> Encoded:
     """Encode heights as a grey picture of 16 bits.
 
     Its resolution is in pixels per metre. Texts contain the scale of heights, in words and under
     the keys that Gwyddion documents for pictures of 16 bits.
     """
-    counts, notes = _counts(result), _notes_of(result)
+    counts, notes = _counts(result), notes_of(result)
     width, height = counts.pixel_size
     size = width * _METRE, height * _METRE
-    return _Encoded(pictures.encode_png(counts.values, size, _texts(counts, notes)), str(counts))
+    return Encoded(pictures.encode_png(counts.values, size, _texts(counts, notes)), str(counts))
 
 
-def _encode_tiff(result: Result) -> _Encoded:
-    """Encode heights as a grey picture of 16 bits.
+def encode_tiff(result: Result, float32: bool = False) -> Encoded:
+    """Encode heights as a grey picture of 16 bits, or of float32 in mm.
 
     Its resolution is in pixels per centimetre, GDAL's tag marks holes, and the scale of heights is in a
     description that ImageJ reads to display millimetres.
     """
     import tifffile
 
-    counts, notes = _counts(result), _notes_of(result)
+    if float32:
+        from mirrorskin.io.topography import encode_float_tiff
+
+        return encode_float_tiff(result)
+    counts, notes = _counts(result), notes_of(result)
     width, height = counts.pixel_size
     file = BytesIO()
     tifffile.imwrite(
@@ -268,10 +310,10 @@ def _encode_tiff(result: Result) -> _Encoded:
         metadata=None,
         extratags=[(_NO_DATA, "s", 0, "0", True)],
     )
-    return _Encoded([file.getvalue()], str(counts))
+    return Encoded([file.getvalue()], str(counts))
 
 
-def _encode_npz(result: Result) -> _Encoded:
+def encode_npz(result: Result) -> Encoded:
     """Encode the maps, the positions of the pixels, and JSON texts of units, legends and process.
 
     It can be loaded without ``allow_pickle``.
@@ -287,10 +329,10 @@ def _encode_npz(result: Result) -> _Encoded:
     arrays |= {name: json.dumps(text) for name, text in texts.items()}
     file = BytesIO()
     np.savez(file, **arrays)
-    return _Encoded([file.getvalue()], ", ".join(result.maps()))
+    return Encoded([file.getvalue()], ", ".join(result.maps()))
 
 
-def _notes_of(result: Result) -> dict[str, str]:
+def notes_of(result: Result) -> dict[str, str]:
     """Return notes on the source and the zero of heights, and the number of filled ones."""
     process = result.process
     maker = " ".join(str(process[name]) for name in ("program", "version") if name in process)
@@ -318,7 +360,8 @@ def _ascii(text: str) -> str:
     return text.encode("ascii", "backslashreplace").decode()
 
 
-def _grid(result: Result) -> tuple[NDArray[np.float32], Floats, Floats]:
+def grid_of(result: Result) -> tuple[NDArray[np.float32], Floats, Floats]:
+    """Return the heights, (H, W), and the positions of columns and rows, mm."""
     assert result.height is not None
     assert result.x is not None
     assert result.y is not None
@@ -327,7 +370,7 @@ def _grid(result: Result) -> tuple[NDArray[np.float32], Floats, Floats]:
 
 def points_of(result: Result, pixels: NDArray[np.int64] | None = None) -> dict[str, NDArray[Any]]:
     """Return the columns of points, (n,), by name: of the given pixels, or of all with a height."""
-    height, x, y = _grid(result)
+    height, x, y = grid_of(result)
     chosen = np.flatnonzero(np.isfinite(height)) if pixels is None else pixels
     row, column = np.unravel_index(chosen, height.shape)
     columns: dict[str, NDArray[Any]] = {
@@ -345,7 +388,7 @@ def points_of(result: Result, pixels: NDArray[np.int64] | None = None) -> dict[s
 
 
 def _surface(result: Result) -> Mesh:
-    mesh = surface_mesh(*_grid(result), component=result.component)
+    mesh = surface_mesh(*grid_of(result), component=result.component)
     if not mesh.faces.size:
         raise InputError("no three adjacent pixels have heights, so there is no surface: export points, .xyz")
     return mesh
@@ -392,18 +435,22 @@ class _Counts(NamedTuple):
 
 def _counts(result: Result) -> _Counts:
     """Scale the heights of a result to 16 bits."""
-    height, x, y = _grid(result)
+    height, x, y = grid_of(result)
     known = np.isfinite(height)
     heights = np.where(known, height, np.nan).astype(np.float64)
     lowest, highest = float(np.nanmin(heights)), float(np.nanmax(heights))
     step = (highest - lowest) / (_MOST - 1) or _FLAT
     values = np.rint((np.where(known, heights, lowest) - lowest) / step) + 1
-    # For a single row or column, pixels are assumed to be square.
+    counts = np.where(known, values, 0).astype(np.uint16)
+    return _Counts(counts, lowest - step, step, pixel_size_of(x, y), (float(x[0]), float(y[0])))
+
+
+def pixel_size_of(x: Floats, y: Floats) -> tuple[float, float]:
+    """Return the width and height of pixels, mm; those of a single row or column are assumed to be square."""
     sizes = [abs(float(axis[-1] - axis[0])) / (len(axis) - 1) for axis in (x, y) if len(axis) > 1]
     if not sizes:
         raise InputError("the pixel size of a result of one pixel is unknown: export it as .xyz or .npz")
-    counts = np.where(known, values, 0).astype(np.uint16)
-    return _Counts(counts, lowest - step, step, (sizes[0], sizes[-1]), (float(x[0]), float(y[0])))
+    return sizes[0], sizes[-1]
 
 
 def _texts(counts: _Counts, notes: Mapping[str, str]) -> Iterator[tuple[str, str]]:
@@ -451,14 +498,3 @@ def _description(counts: _Counts, notes: Mapping[str, str]) -> str:
     # A backslash would begin an escape sequence.
     lines |= {name: note.replace("\\", r"\\") for name, note in notes.items()}
     return "".join(f"{name}={note}\n" for name, note in lines.items())
-
-
-_FORMATS: dict[str, Callable[..., _Encoded]] = {
-    ".ply": _encode_ply,
-    ".stl": _encode_stl,
-    ".xyz": _encode_xyz,
-    ".png": _encode_png,
-    ".tif": _encode_tiff,
-    ".tiff": _encode_tiff,
-    ".npz": _encode_npz,
-}

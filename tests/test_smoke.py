@@ -12,11 +12,12 @@ import pytest
 from commands import run
 
 from mirrorskin import io
+from mirrorskin.io.export_formats import FORMATS
 
 pytestmark = pytest.mark.slow
 
 SMALL = "--size", "96x80", "--pixel-size", "0.12mm"
-EXPORTS = "ply", "stl", "xyz", "png", "tif", "csv", "npz", "mcap", "zarr"
+EXPORTS = tuple(suffix.removeprefix(".") for suffix in FORMATS)
 
 
 @pytest.fixture(scope="module")

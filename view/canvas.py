@@ -38,6 +38,9 @@ BESIDE: Mapping[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5),
 _ROUND = 1, 2, 5, 10
 _DPI = 110  # pixels per inch in files
 
+FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
+"""Suffixes of files that figures are written to: pixels, or lines and texts."""
+
 
 def check_drawing() -> None:
     """Raise InputError if figures cannot be drawn, before any work is done."""
@@ -56,14 +59,32 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def save_figure(figure: Figure, title: str, path: Path) -> None:
-    """Write a figure with its title as a PNG, or raise InputError."""
+    """Write a figure with its title, or raise InputError; see `write_figure`."""
     figure.suptitle(title, x=0.02, ha="left", weight="bold")
     write_figure(figure, path)
 
 
 def write_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as a PNG, which appears complete or not at all, or raise InputError."""
-    write_new(path, [encode_figure(figure, _DPI)])
+    """Write a figure as PNG, PDF or SVG, which appears complete or not at all, or raise InputError."""
+    suffix = path.suffix.lower()
+    drawn = (
+        encode_figure(figure, _DPI) if suffix == ".png" else _encode_lines(figure, suffix.removeprefix("."))
+    )
+    write_new(path, [drawn])
+
+
+def _encode_lines(figure: Figure, form: str) -> bytes:
+    """Return a figure as PDF or SVG, the same for the same figure; texts can be selected and searched."""
+    import matplotlib
+
+    _print_texts_as_they_are(figure)
+    date = {"pdf": "CreationDate", "svg": "Date"}[form]
+    target = BytesIO()
+    settings: Any = {"svg.fonttype": "none", "svg.hashsalt": "mirrorskin", "pdf.fonttype": 42}
+    with matplotlib.rc_context(settings), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")
+        figure.savefig(target, format=form, dpi=_DPI, metadata={date: None})
+    return target.getvalue()
 
 
 def encode_figure(figure: Figure, dpi: float) -> bytes:

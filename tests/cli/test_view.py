@@ -53,6 +53,23 @@ def test_with_a_screen_all_is_in_one_window_and_nothing_is_written(result, monke
     assert made(result) == []
 
 
+@pytest.mark.parametrize(("suffix", "head"), [("pdf", b"%PDF"), ("SVG", b"<?xml")])
+def test_a_picture_of_lines_is_the_same_each_time(result, suffix, head):
+    path = result.with_name(f"a.{suffix}")
+    drawn = []
+    for _ in range(2):
+        assert view(result, "-o", path).exit_code == 0
+        drawn.append(path.read_bytes())
+    assert drawn[0].startswith(head)
+    assert drawn[0] == drawn[1]
+
+
+def test_a_picture_of_lines_has_texts_that_can_be_searched(result):
+    path = result.with_name("a.svg")
+    assert view(result, "-o", path).exit_code == 0
+    assert ">height</text>" in path.read_text(encoding="utf-8").lower()
+
+
 def test_a_folder_gets_a_picture_of_each_map(result):
     folder = result.parent / "new" / "pictures"
     done = view(
@@ -78,8 +95,8 @@ def test_of_turns_one_is_chosen_and_a_picture_s_ending_may_be_in_capitals(result
     ("words", "told"),
     [
         (["--map", "normal"], "ball.h5 has no normal to draw: it has height, section"),
-        (["-o", "{}"], "name a picture that ends in .png, or a folder"),
-        (["-o", "a.jpg"], "name a picture that ends in .png, or a folder"),
+        (["-o", "{}"], "name a picture that ends in .png or .pdf or .svg, or a folder"),
+        (["-o", "a.jpg"], "name a picture that ends in .png or .pdf or .svg, or a folder"),
         (["-o", "nowhere/a.png"], "no folder"),
         (["-o", "{}/folder"], "ball.h5 is not a folder. Use another -o"),
         (["-o", "a.png/folder", "--map", "nothing"], "has no nothing to draw"),

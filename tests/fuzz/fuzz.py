@@ -27,6 +27,8 @@ from typing import Any
 import mutations
 import numpy as np
 
+from mirrorskin.io.export_formats import FORMATS
+
 PATIENCE = 30.0
 """Seconds of a processor's time after which a reader hangs, or ten times as many by the clock."""
 
@@ -108,7 +110,7 @@ dots:11x9:1mm
 NAMES = ["\x1b[2J", "$\\frac{$", "\u5de5\u5177", "<b>", "-", "a b"]
 """How names of files may begin."""
 
-EXPORTS = (".ply", ".stl", ".xyz", ".png", ".tif", ".npz", ".csv", ".mcap", ".zarr")
+EXPORTS = tuple(FORMATS)
 
 
 def make_samples(folder: Path) -> list[Path]:

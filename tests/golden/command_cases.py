@@ -254,9 +254,10 @@ def measure_results() -> Answer:
 
 @case((1e-5, 1e-4), picture=(0.0, 0.0), fragile=True)
 def export_results() -> Answer:
-    names = [f"fused.{kind}" for kind in ("ply", "stl", "xyz", "png", "tif", "csv", "npz")]
+    names = [f"fused.{kind}" for kind in ("ply", "stl", "xyz", "png", "tif", "npz")]
     command("export", "fused.h5", *(word for name in names for word in ("-o", f"./{name}")))
     command("export", "fused.h5", "-o", "points.ply", "--points")
+    command("export", "fused.h5", "-o", "fused.csv", "--section", "apex")
     command("export", "fused.h5", "-o", "cut.csv", "--section=-3mm,0mm:3mm,1mm")
     with np.load("fused.npz") as file:
         arrays = {f"npz_{name}": file[name] for name in file.files if file[name].dtype.kind in "fiu"}

@@ -10,6 +10,7 @@ import pytest
 import tifffile
 
 from mirrorskin import io
+from mirrorskin.io.export_formats import FORMATS
 from mirrorskin.io.text import one_line, printable
 
 ODD = {
@@ -19,7 +20,7 @@ ODD = {
     "date": "2026\x7f\udcff",
 }
 SECTION = {"distance": np.arange(3.0), "height": np.array([0.0, np.nan, 1.0])}
-SUFFIXES = (".ply", ".stl", ".xyz", ".png", ".tif", ".tiff", ".csv", ".npz", ".mcap", ".zarr")
+SUFFIXES = tuple(FORMATS)
 
 
 @pytest.fixture
@@ -31,7 +32,7 @@ def odd(slope):
 def texts_of(path):
     """Return what a file says in words."""
     data = path.read_bytes()
-    if path.suffix in (".csv", ".xyz"):
+    if path.suffix in (".csv", ".obj", ".xyz"):
         return data.decode()
     if path.suffix == ".ply":
         return data.partition(b"end_header")[0].decode("ascii")
@@ -54,7 +55,7 @@ def png_texts(data):
         at += 12 + size
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".stl", ".xyz", ".png", ".tif", ".tiff", ".csv"])
+@pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj", ".xyz", ".png", ".tif", ".tiff", ".csv"])
 def test_no_control_code_of_a_result_gets_into_a_text(odd, tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     io.export_result(odd, path, section=SECTION)
