@@ -24,6 +24,8 @@ _FEW = 0.05  # share of pixels below which their common behaviour means nothing
 _MOST_OF = 0.8  # share of pixels that decides
 _CLIPPED = 0.1  # share of responding pixels that may reach the end of the scale
 _FLICKER, _DRIFT = 0.01, 2.0  # share of the light; counts of 8 bits
+_OUTLYING = 0.1  # share of the span by which a sample differs from both that before and that after
+_OUTLIERS, _FLASH = 0.003, 0.2  # share of such samples, and of the pixels of a frame: then it is the lamp
 _NOISY = 0.3  # share of the pixels that differ between frames because of noise
 _AS_ONE = 0.5  # mean direction of the pixels' phases above which all respond alike
 _HARMONICS = 3  # of the phase, that describe the brightness of a pixel
@@ -270,6 +272,12 @@ class Traces:
     def _press(self) -> Iterator[Finding]:
         if not self._goes_down():
             return
+        if (outliers := self._outliers()) > _OUTLIERS:
+            yield Finding(
+                "outliers",
+                f"{_percent(outliers)} of the samples differ from both the one before and the one after, so"
+                " heights near them are wrong: look for defective pixels, or for errors of the transmission",
+            )
         travel = self._series["travel"]
         rises, falls = self._changes(self._counts[:, self._responding], np.sign(travel[-1] - travel[0]))
         if falls > _MOST_OF * (rises + falls) and falls > 0.2:
@@ -290,6 +298,14 @@ class Traces:
                 f"brightness returns to where it began at {_percent(1 - rises - falls)} of the pixels that"
                 " respond, although the travel does not: is this a rotation?",
             )
+
+    def _outliers(self) -> float:
+        """Return the share of samples that stand out of the brightness of their pixel of a press."""
+        steps = np.diff(self._counts, axis=0)
+        limit = max(_CLEAR * self.noise, _OUTLYING * self.span)
+        apart = (np.minimum(steps[:-1], -steps[1:]) > limit) | (np.maximum(steps[:-1], -steps[1:]) < -limit)
+        of_frame = apart.mean(axis=1)
+        return float(np.mean(np.where(of_frame < _FLASH, of_frame, 0)))
 
     @property
     def _pictures(self) -> Samples:

@@ -139,6 +139,19 @@ def jumped(steps, count=24):
     return np.where(np.arange(count) >= 10, PHASE + steps * PHASE[1], PHASE)
 
 
+@pytest.mark.parametrize(("share", "expected"), [(0.01, ["outliers"]), (0.001, [])])
+def test_samples_that_stand_out_of_a_press_are_found(share, expected):
+    generator, frames = np.random.default_rng(2), noisy(pressed())
+    wrong = generator.random(frames.shape) < share
+    frames[wrong] = generator.integers(0, 256, np.count_nonzero(wrong))
+    assert kinds(found(frames)) == expected
+
+
+def test_a_frame_that_is_brighter_than_its_neighbours_has_no_outliers():
+    lamp = np.where(np.arange(30) == 15, 1.2, 1)[:, np.newaxis, np.newaxis]
+    assert kinds(found(noisy(pressed() * lamp))) == ["flicker"]
+
+
 @pytest.mark.parametrize(
     ("steps", "text"),
     [
