@@ -30,9 +30,8 @@ with engine.live.Stream(engine.Press(), (SIZE, SIZE), header=press.header, laten
     result = stream.result()
 
 error = 1e3 * (result.height - press.truth.height)[~result.filled.astype(bool)]
-print(
-    f"{COUNT} frames: heights at {np.isfinite(result.height).sum()} pixels, RMS error {np.nanstd(error):.1f} µm"
-)
+count = np.isfinite(result.height).sum()
+print(f"{COUNT} frames: heights at {count} pixels, RMS error {np.nanstd(error):.1f} µm")
 
 side = SIZE * PIXEL / 2
 figure, axes = plt.subplots(1, 4, figsize=(17, 4.2), layout="constrained")
