@@ -21,6 +21,7 @@ from mirrorskin.cli.groups import MOTIONS, Command, ExistingPath, MotionOption, 
 if TYPE_CHECKING:
     from mirrorskin.engine.options import Option
 
+_FILE = re.compile(r"\.[A-Za-z]\w*$")
 _CLASS = re.compile(r".+:[A-Za-z_]\w*")
 _LOADED = "mirrorskin.cli.declared"  # key of a context's class and its options
 _SHARED = ("tilt",)  # options of a stage that classes have, too, with the same meaning
@@ -67,7 +68,7 @@ class Term:
         """What help shows in place of a value."""
         shown = self.unit if self.kind == "text" else self.unit.upper()
         plain = shown or ("N" if self.kind == "integer" else "NUMBER")
-        several = "[,...]" if self.kind == "numbers" else ""
+        several = {"numbers": "[,...]", "map": "|FILE"}.get(self.kind, "")
         return "|".join([_UNITS.get(self.unit, (plain,))[0] + several, *self.words])
 
     def read(self, text: str, where: str) -> Any:
@@ -87,6 +88,8 @@ class Term:
 
         if text in self.words or self.kind in ("choice", "text", "file", "name"):
             return text
+        if self.kind == "map" and _FILE.search(text):
+            return ExistingPath().convert(text, None, None)
         plain = "integer" if self.kind == "integer" else "number"
         try:
             value = getattr(quantity, _UNITS.get(self.unit, ("", plain))[1])(text, where)
@@ -287,7 +290,7 @@ def term_of(one: Option) -> Term:
             shown = f"{math.degrees(one.default):g}deg"
         elif one.unit in ("mm", "MPa", "N", "s"):
             shown += one.unit
-    kind = "number" if one.kind in ("map", "object") else one.kind
+    kind = "number" if one.kind == "object" else one.kind
     return Term(one.name, kind, one.help, one.unit, shown, one.choices, one.words, one.file)
 
 

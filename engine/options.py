@@ -12,6 +12,7 @@ import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from numbers import Real
+from pathlib import Path
 from typing import Any, ClassVar, Literal, dataclass_transform
 
 import numpy as np
@@ -105,7 +106,7 @@ class Option:
     def described(self) -> str:
         """Return type and unit for a docstring, such as ``float, share, default 0.5``."""
         kinds = {"number": "float", "integer": "int", "flag": "bool", "numbers": "sequence of float"}
-        kinds |= {"map": "float or ndarray (H, W)", "file": "path, Result or array", "object": "object"}
+        kinds |= {"map": "float, ndarray (H, W) or path", "file": "path, Result or array", "object": "object"}
         kind = "{" + ", ".join(f'"{one}"' for one in self.choices) + "}" if self.choices else kinds[self.kind]
         kind = " or ".join([kind, *(f'"{word}"' for word in self.words)])
         unit = f", {self.unit}" if self.unit else ""
@@ -135,6 +136,10 @@ class Option:
         if self.kind == "numbers":
             values = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
             return [self._number(one) for one in values]
+        if self.kind == "map" and isinstance(value, str | Path):
+            from mirrorskin.io.arrays import read_map
+
+            return read_map(Path(value))
         if self.kind == "map" and not isinstance(value, Real):
             return as_array(self.name, value)
         return self._number(value)

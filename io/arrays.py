@@ -285,6 +285,22 @@ def read_array(path: Path) -> NDArray[Any]:
         return _read_values(file, head)
 
 
+def read_map(path: Path) -> NDArray[Any]:
+    """Read a value for each pixel, (H, W): a picture, or an array written by ``numpy.save``.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or is no map.
+    """
+    from mirrorskin.io.pictures import read_picture
+
+    values = read_array(path) if path.suffix.lower() == ".npy" else read_picture(path)
+    if values.ndim != 2:
+        raise InputError(f"{path} has shape {values.shape}: a map (H, W) is needed, one value a pixel")
+    return values
+
+
 def _open_frames(path: Path) -> NDArray[Any] | RawFrames:
     """Open the array of numbers in a ``.npy`` file as frames; they are read when they are used."""
     with open_regular(path) as file:
