@@ -11,19 +11,15 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.maps import Map
 from mirrorskin.io.types import Floats
-from mirrorskin.view.canvas import draw_classes, exceeded, explain_colours, filled_colours, round_length
+from mirrorskin.view.canvas import draw_classes, explain_colours, filled_colours, round_length
 from mirrorskin.view.colours import (
-    CYCLIC,
-    DIVERGING,
-    ERROR,
     MISSING,
     MISSING_RGB,
     SEQUENTIAL,
     Colours,
-    apart,
     normal_colours,
-    span,
 )
+from mirrorskin.view.result.scale import Scale, displayed_values, scale_of, title_of_height
 from mirrorskin.view.result.sheet import SMALL, TEXT, Sheet, draw_map, entitle, lay_out, percent
 
 if TYPE_CHECKING:
@@ -43,25 +39,18 @@ def draw_height(axes: Axes, sheet: Sheet, cut: Section | None = None) -> None:
 
     height = sheet.result.height
     assert height is not None
-    low, high = ends = apart(*span(height))
-    scale = sheet.of_height.figure_scale
+    scale = scale_of(sheet, sheet.result.name_of("height") or "height")
+    ends = scale.low / sheet.of_height.figure_scale, scale.high / sheet.of_height.figure_scale
     draw_map(axes, sheet, height_picture(height, sheet.filled, ends), interpolation="antialiased")
-    colours = ScalarMappable(Normalize(scale * low, scale * high), SEQUENTIAL)
-    explain_colours(axes, colours, _label(quantity(sheet), sheet.of_height), exceeded(height, *ends))
+    colours = ScalarMappable(Normalize(scale.low, scale.high), scale.colours)
+    explain_colours(axes, colours, scale.label, scale.beyond)
     if sheet.true_to_scale and sheet.unit == "mm" and height.size > 1:
         _draw_scale(axes, sheet)
     if cut is not None:
         _draw_line(axes, sheet, cut)
     lay_out(axes, sheet)
-    entitle(axes, f"{quantity(sheet)[:1].upper()}{quantity(sheet)[1:]}", "; ".join(_notes(sheet)))
-
-
-def quantity(sheet: Sheet) -> str:
-    """Return the title of the heights in lower case: relative ones if the absolute offset is unknown."""
-    name, unknown = sheet.result.name_of("height") or "height", sheet.result.offset_unknown
-    title = sheet.of_height.title_of(name)
-    title = f"{title[:1].lower()}{title[1:]}"
-    return f"relative {title}" if unknown is not None and unknown.size and unknown.all() else title
+    title = title_of_height(sheet)
+    entitle(axes, f"{title[:1].upper()}{title[1:]}", "; ".join(_notes(sheet)))
 
 
 def _notes(sheet: Sheet) -> Iterator[str]:
@@ -181,10 +170,6 @@ def _draw_key(axes: Axes) -> None:
 
 
 _ARROWS = 12  # along a side
-_SHOWN = 1, 99  # percentiles at the ends of the colour scale
-_DECADES = 30.0  # ratio of these above which the scale is logarithmic
-_SIGNED_SHOWN = 99.0  # percentile of the magnitude at the ends of a diverging scale
-_UNDEFINED_NOTE = "blue: no answer"
 _UNKNOWN_CODE = "unknown number"
 _FLAG_COLOURS = "0.85", "black"
 _CODE_COLOURS = (
@@ -198,7 +183,6 @@ def draw_declared(axes: Axes, sheet: Sheet, name: str) -> None:
     """Draw a map according to its declaration: heights, directions, vectors, codes, or numbers."""
     result = sheet.result
     declared = result.declaration(name)
-    values = result[name]
     if name == result.name_of("height"):
         draw_height(axes, sheet)
     elif declared.sampling == "direction":
@@ -206,70 +190,30 @@ def draw_declared(axes: Axes, sheet: Sheet, name: str) -> None:
     elif declared.codes:
         _draw_codes(axes, sheet, name)
     else:
-        last = values[-1] if declared.per_frame and values.ndim > 2 + bool(declared.components) else values
-        known = declared.has_answer(last).reshape(*last.shape[:2], *[1] * (last.ndim - 2))
-        shown = np.where(known, declared.figure_scale * last.astype(np.float64), np.nan)
-        draw = _draw_signed if declared.colours == "signed" else _draw_numbers
-        draw = _draw_angles if declared.sampling == "angle" else draw
-        draw = _draw_vectors if declared.components else draw
-        draw(axes, sheet, shown, name, declared)
+        _draw_numbers(axes, sheet, name, scale_of(sheet, name))
 
 
-def _label(text: str, declared: Map) -> str:
-    return f"{text} ({declared.figure_unit})" if declared.figure_unit else text
-
-
-def _draw_vectors(axes: Axes, sheet: Sheet, values: Floats, name: str, declared: Map) -> None:
-    """Draw the length of vectors, and arrows if they have the components x and y."""
-    length = np.sqrt(np.sum(values**2, axis=-1))
-    known = length[np.isfinite(length)]
-    low, high = apart(float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
-    draw_map(axes, sheet, length, _label("length", declared), cmap=SEQUENTIAL, vmin=low, vmax=high)
-    entitle(axes, declared.title_of(name), _missing_note(length))
-    if declared.components[:2] != ("x", "y"):
-        return
-    rows, columns = (slice(step // 2, None, step) for step in (max(1, n // _ARROWS) for n in length.shape))
-    x, y = np.meshgrid(sheet.x[columns], sheet.y[rows])
-    arrows = values[rows, columns]
-    axes.quiver(x, y, arrows[..., 0], arrows[..., 1], color="white", edgecolor="black", linewidth=0.3)
-
-
-def _draw_numbers(axes: Axes, sheet: Sheet, values: Floats, name: str, declared: Map) -> None:
-    """Draw numbers by colour; positive ones that span decades on a logarithmic scale."""
+def _draw_numbers(axes: Axes, sheet: Sheet, name: str, scale: Scale) -> None:
+    """Draw numbers by colour; of vectors their length, and arrows if they have the components x and y."""
     from matplotlib.colors import LogNorm, Normalize
 
-    known = values[np.isfinite(values)]
-    low, high = (float(v) for v in np.percentile(known, _SHOWN)) if known.size else (0.0, 1.0)
-    decades = declared.colours != "sequential" and low > 0 and high > _DECADES * low
-    scale = (LogNorm if decades else Normalize)(*apart(low, high))
-    colours = ERROR if declared.colours == "error" else SEQUENTIAL
-    text = "standard deviation" if declared.colours == "error" else name.replace("_", " ")
-    beyond = exceeded(known, low, high)
-    draw_map(axes, sheet, values, _label(text, declared), extend=beyond, cmap=colours, norm=scale)
-    notes = [f"median {np.median(known):.3g} {declared.figure_unit}".rstrip()] if known.size else []
-    entitle(axes, declared.title_of(name), "; ".join(filter(None, [*notes, _missing_note(values)])))
+    declared = sheet.result.declaration(name)
+    norm = (LogNorm if scale.logarithmic else Normalize)(scale.low, scale.high)
+    draw_map(axes, sheet, scale.values, scale.label, extend=scale.beyond, cmap=scale.colours, norm=norm)
+    entitle(axes, declared.title_of(name), scale.note)
+    if declared.sampling == "angle":
+        axes.child_axes[0].set_yticks(range(-180, 181, 90))
+    if declared.components[:2] == ("x", "y"):
+        _draw_arrows(axes, sheet, displayed_values(sheet, name))
 
 
-def _draw_signed(axes: Axes, sheet: Sheet, values: Floats, name: str, declared: Map) -> None:
-    """Draw signed numbers with diverging colours."""
-    known = np.abs(values[np.isfinite(values)])
-    side = float(np.percentile(known, _SIGNED_SHOWN)) if known.any() else 1.0
-    ends = exceeded(values, -side, side)
-    label = _label(name.replace("_", " "), declared)
-    draw_map(axes, sheet, values, label, extend=ends, cmap=DIVERGING, vmin=-side, vmax=side)
-    entitle(axes, declared.title_of(name), _missing_note(values))
-
-
-def _draw_angles(axes: Axes, sheet: Sheet, values: Floats, name: str, declared: Map) -> None:
-    """Draw angles, in degrees, with cyclic colours."""
-    angle = np.degrees(np.angle(np.exp(1j * values / declared.figure_scale)))
-    draw_map(axes, sheet, angle, f"{name.replace('_', ' ')} (deg)", cmap=CYCLIC, vmin=-180, vmax=180)
-    axes.child_axes[0].set_yticks(range(-180, 181, 90))
-    entitle(axes, declared.title_of(name), "0: to the right; 90: up")
-
-
-def _missing_note(values: Floats) -> str:
-    return "" if np.isfinite(values).all() else _UNDEFINED_NOTE
+def _draw_arrows(axes: Axes, sheet: Sheet, vectors: Floats) -> None:
+    rows, columns = (
+        slice(step // 2, None, step) for step in (max(1, n // _ARROWS) for n in vectors.shape[:2])
+    )
+    x, y = np.meshgrid(sheet.x[columns], sheet.y[rows])
+    arrows = vectors[rows, columns]
+    axes.quiver(x, y, arrows[..., 0], arrows[..., 1], color="white", edgecolor="black", linewidth=0.3)
 
 
 def _draw_codes(axes: Axes, sheet: Sheet, name: str) -> None:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from mirrorskin.io.types import Floats
 from mirrorskin.view.canvas import BESIDE, round_length
 from mirrorskin.view.colours import FILLED, apart, span
-from mirrorskin.view.result.maps import outlined, quantity
+from mirrorskin.view.result.maps import outlined
+from mirrorskin.view.result.scale import title_of_height
 from mirrorskin.view.result.sheet import BOX, SMALL, TEXT, Sheet, entitle
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def draw_section(axes: Axes, sheet: Sheet, cut: Section) -> None:
             va="top",
         )
     axes.set_xlabel(f"distance from A ({sheet.unit})", fontsize=TEXT)
-    axes.set_ylabel(f"{quantity(sheet)} ({sheet.of_height.figure_unit})", fontsize=TEXT)
+    axes.set_ylabel(f"{title_of_height(sheet)} ({sheet.of_height.figure_unit})", fontsize=TEXT)
     axes.tick_params(labelsize=SMALL)
     axes.grid(alpha=0.3)
     if np.isfinite(cut.height).any():
@@ -153,7 +154,7 @@ def draw_histogram(axes: Axes, sheet: Sheet) -> None:
         if count.any():
             axes.stairs(below + count, scale * bins, baseline=below, fill=True, color=colour, label=name)
         below = below + count
-    axes.set_xlabel(f"{quantity(sheet)} ({sheet.of_height.figure_unit})", fontsize=TEXT)
+    axes.set_xlabel(f"{title_of_height(sheet)} ({sheet.of_height.figure_unit})", fontsize=TEXT)
     axes.set_ylabel("pixels", fontsize=TEXT)
     axes.tick_params(labelsize=SMALL)
     axes.grid(alpha=0.3)
