@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.groups import Argument, Option
 from mirrorskin.io.export_formats import contents, suffixes_with
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from mirrorskin.io import Result
 
 Point = tuple[float, float]
 
@@ -52,6 +47,7 @@ def command(
     from mirrorskin import io
     from mirrorskin.cli.output import printable, progress
     from mirrorskin.cli.quantity import segment
+    from mirrorskin.engine.metrology import section_columns
     from mirrorskin.io.export import check_export
     from mirrorskin.io.foreign import MCAP_SUFFIX
     from mirrorskin.io.recording import is_recording
@@ -71,7 +67,7 @@ def command(
         found = io.select_turn(io.open_result(result), turn)
         for path in output:
             check_export(found, path)
-        columns = None if section is None else _section(found, ends)
+        columns = None if section is None else section_columns(found, ends)
         for path in output:
             holds = io.export_result(found, path, section=columns, points=points, float32=float32)
             click.echo(printable(f"{path}: {holds}"))
@@ -98,18 +94,3 @@ def _part(output: list[Path], result: Path, turn: int | None) -> tuple[list[Path
         else:
             check_output(path, result)
     return stores, [path for path in output if path not in stores]
-
-
-def _section(result: Result, ends: tuple[Point, Point] | None) -> dict[str, NDArray[Any]]:
-    """Cut a result between two points, or across its apex, into the columns of a table."""
-    import numpy as np
-
-    from mirrorskin import io
-    from mirrorskin.engine.metrology import section
-
-    cut = section(result, *(ends or ()))
-    if not np.isfinite(cut.height).any():
-        raise io.InputError("no height is known along the section: choose other points, or leave it out")
-    known = {"sigma": result.height_sigma, "filled": result.filled}
-    names = ("distance", "x", "y", "height", *(name for name, values in known.items() if values is not None))
-    return {name: getattr(cut, name) for name in names}

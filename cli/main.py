@@ -48,6 +48,7 @@ PURPOSES = {
     "fuse": "Fuse a press and a rotation to one surface.",
     "stitch": "Join several touches to one larger surface.",
     "batch": "Reconstruct many recordings.",
+    "app": "Show recordings and results in the browser: click, change options, measure, save.",
     "view": "Show the maps of a result, a section and a histogram of heights.",
     "measure": "Measure a height map: heights, areas, volumes, plane or sphere, roughness, steps.",
     "report": "Write a page with pictures, numbers and the surface.",

@@ -92,6 +92,25 @@ def stack_options(given: dict[str, Any], where: str = "--") -> StackOptions:
     return options | _travel(values, where) | _phase(values)
 
 
+def stack_words(given: Mapping[str, Any]) -> list[str]:
+    """Return the words of a command for the options of a stack that are given, except for region and frames.
+
+    Examples
+    --------
+    >>> stack_words({"travel_step": 0.1, "pixel_size": (0.03, 0.04), "threshold": 0.4})
+    ['--travel-step=0.1mm', '--pixel-size=0.03mm,0.04mm']
+    """
+    words = []
+    for one in STACK.terms:
+        if one.name not in given or one.name in ("region", "frames"):
+            continue
+        value = given[one.name]
+        values = value if isinstance(value, tuple) else (value,)
+        unit = one.unit.partition(",")[0] if one.unit in ("mm", "rad", "mm,mm") else ""
+        words.append(f"{one.flag}={','.join(f'{part}{unit}' for part in values)}")
+    return words
+
+
 def _travel(values: Mapping[str, Any], where: str) -> StackOptions:
     from mirrorskin.io import InputError, Steps
 

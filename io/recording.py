@@ -437,6 +437,12 @@ def is_recording(path: str | Path) -> bool:
         return file.marked(MARK)
 
 
+def is_result(path: str | Path) -> bool:
+    """Return whether an HDF5 or Zarr file is a result written by mirrorskin."""
+    with open_file(path) as file:
+        return file.marked(RESULT_MARK)
+
+
 def _only_stack(file: Hdf5File) -> str:
     if file.marked(RESULT_MARK):
         raise InputError(f"{file.path} is a result: give the recording that it was made from")

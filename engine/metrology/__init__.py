@@ -3,7 +3,7 @@
 from mirrorskin.engine.metrology.forms import Plane, Sphere, fit_plane, fit_sphere
 from mirrorskin.engine.metrology.measures import FormName, Measures, measure
 from mirrorskin.engine.metrology.quantity import Quantity
-from mirrorskin.engine.metrology.sections import Section, Step, section, step_height
+from mirrorskin.engine.metrology.sections import Section, Step, section, section_columns, step_height
 from mirrorskin.engine.metrology.texture import Roughness, roughness
 
 __all__ = [
@@ -20,5 +20,6 @@ __all__ = [
     "measure",
     "roughness",
     "section",
+    "section_columns",
     "step_height",
 ]

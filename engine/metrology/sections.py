@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -115,6 +116,22 @@ def section(
     column, row_of = (along[0] - x[0]) / size[0], (y[0] - along[1]) / size[1]
     values = _between(maps, height, SamplePoints.at(column, row_of, (height.shape[0], height.shape[1])))
     return Section(distance, along[0], along[1], *values, unit)
+
+
+def section_columns(result: Result, ends: tuple[Point, Point] | None = None) -> dict[str, NDArray[Any]]:
+    """Return a section as the columns of a table; see `section` and `mirrorskin.io.export_result`.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        No height is known along the section.
+    """
+    cut = section(result, *(ends or ()))
+    if not np.isfinite(cut.height).any():
+        raise InputError("no height is known along the section: choose other points, or leave it out")
+    known = {"sigma": result.height_sigma, "filled": result.filled}
+    names = ("distance", "x", "y", "height", *(name for name, values in known.items() if values is not None))
+    return {name: getattr(cut, name) for name in names}
 
 
 def apex(height: NDArray[np.floating]) -> tuple[int, int]:

@@ -46,14 +46,12 @@ class Group:
 
 def contents_of(result: Result, name: str, section: Ends | None, turn: int | None) -> dict[str, Any]:
     """Return the variables of the page template."""
-    surface = surface_data(result)
     parameters, provenance = split_process(result.process)
     contents = {
         "title": name if turn is None else f"{name}, turn {turn}",
         "summary": sentence(str(summarise(result))),
         "made": _origin(result.process),
-        "surface": surface,
-        "texts": _surface_texts(result, surface),
+        **surface_of(result),
         "pictures": pictures_of(result, name, section),
         "numbers": numbers_of(result, section),
         "parameters": _groups(parameters),
@@ -65,6 +63,12 @@ def contents_of(result: Result, name: str, section: Ends | None, turn: int | Non
     }
     shown = {key: text for key, text in _HEADINGS.items() if key not in _NOT_ALWAYS or contents[key]}
     return contents | {"headings": shown}
+
+
+def surface_of(result: Result) -> dict[str, Any]:
+    """Return the variables of the surface."""
+    surface = surface_data(result)
+    return {"surface": surface, "texts": _surface_texts(result, surface)}
 
 
 def _surface_texts(result: Result, surface: Mapping[str, Any] | None) -> dict[str, Any]:

@@ -15,8 +15,9 @@ from mirrorskin.io import InputError, Result, select_turn
 from mirrorskin.io.atomic import MAKE_ROOM, new_file
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.view.canvas import check_drawing
-from mirrorskin.view.report.contents import Ends, contents_of
+from mirrorskin.view.report.contents import Ends, contents_of, surface_of
 
+_TEMPLATES = ("alone.html", "page.html", "script.html", "surface.html")
 _SCRIPTS = ("grid.js", "scene.js", "view.js", "surface.js")
 
 
@@ -68,16 +69,24 @@ def write_report(
         file.write(page)
 
 
-def _render(contents: Mapping[str, Any]) -> str:
+def surface_page(result: Result, name: str) -> str:
+    """Return a page with nothing but the surface of a result, to be shown inside of another page."""
+    return _render(surface_of(select_turn(result, None)) | {"title": name}, "alone.html")
+
+
+def _render(contents: Mapping[str, Any], template: str = "page.html") -> str:
     import jinja2
 
     own = resources.files("mirrorskin.view.report")
-    texts = {name: own.joinpath(name).read_text("utf-8") for name in ("page.html", "page.css", *_SCRIPTS)}
+    texts = {name: own.joinpath(name).read_text("utf-8") for name in (*_TEMPLATES, "page.css", *_SCRIPTS)}
     environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, keep_trailing_newline=True
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        keep_trailing_newline=True,
+        loader=jinja2.DictLoader(texts),
     )
     script = "\n".join(texts[name] for name in _SCRIPTS)
-    return environment.from_string(texts["page.html"]).render(
+    return environment.get_template(template).render(
         **contents,
         policy=_policy(script, texts["page.css"]),
         style=_unescaped(texts["page.css"]),

@@ -152,8 +152,8 @@ def draw_normals(axes: Axes, sheet: Sheet, name: str = "normals") -> None:
     entitle(axes, result.declaration(name).title_of(name), "; ".join(notes))
 
 
-def _draw_key(axes: Axes) -> None:
-    """Draw the colours of all normals on a half-ball seen from above."""
+def ball_colours() -> Colours:
+    """Return the colours of all normals on a half-ball seen from above, (n, n, 4), with opacity."""
     across = np.linspace(-1, 1, _KEY, dtype=np.float32)
     right, up = np.meshgrid(across, across[::-1])
     rest = 1 - right**2 - up**2
@@ -161,6 +161,12 @@ def _draw_key(axes: Axes) -> None:
     colours = np.full((_KEY, _KEY, 4), 255, np.uint8)
     colours[..., :3] = normal_colours(ball)
     colours[rest < 0, 3] = 0
+    return colours
+
+
+def _draw_key(axes: Axes) -> None:
+    """Draw the colours of all normals on a half-ball seen from above."""
+    colours = ball_colours()
     key = axes.inset_axes((1.03, 0.75, 0.2, 0.2))
     key.imshow(colours, extent=(-1, 1, -1, 1), interpolation="antialiased")
     key.set_axis_off()
@@ -222,11 +228,11 @@ def _draw_codes(axes: Axes, sheet: Sheet, name: str) -> None:
     codes = sorted(declared.codes)
     places = np.clip(np.searchsorted(codes, values), 0, len(codes) - 1)
     classes = np.where(np.asarray(codes)[places] == values, places, len(codes)).astype(np.uint8)
-    _draw_shares(axes, sheet, classes, _colours_of(declared), (*(declared.codes[one] for one in codes),))
+    _draw_shares(axes, sheet, classes, code_colours(declared), (*(declared.codes[one] for one in codes),))
     entitle(axes, declared.title_of(name))
 
 
-def _colours_of(declared: Map) -> tuple[str, ...]:
+def code_colours(declared: Map) -> tuple[str, ...]:
     """Return the colours of codes in their order, then the colour of numbers missing in the legend."""
     if len(declared.codes) == 2:
         return (*_FLAG_COLOURS, "white")

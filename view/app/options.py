@@ -1,0 +1,167 @@
+"""Options of an operation as widgets, generated from their declarations."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import panel as pn
+
+from mirrorskin.engine.options import Option
+from mirrorskin.io import InputError
+from mirrorskin.view.app.look import TALL, problem, text
+from mirrorskin.view.app.session import Session
+
+_WIDTH = 262
+_ANY = 2**31 - 1  # a limit that stands for none
+_DEGREES = {"rad": "deg"}  # units that people write instead of the declared one
+_STEPS = 100  # of a slider
+
+
+class OptionsPane:
+    """Widgets of the operation and its options; a change computes the result again.
+
+    Attributes
+    ----------
+    operation : Select
+    widgets : dict of str to Widget
+        The field of each option by name.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self.widgets: dict[str, Any] = {}
+        self.operation = pn.widgets.Select(
+            name="Operation",
+            options=session.operations(),
+            value=session.kind_name,
+            width=_WIDTH,
+            description="What is computed from the frames. All steps: as 'mirrorskin reconstruct' does.",
+        )
+        self._first, self._more = pn.Column(margin=0), pn.Column(margin=0)
+        self.problem = text(width=_WIDTH)
+        self.reset = pn.widgets.Button(name="Reset all options", width=_WIDTH, button_type="light")
+        self.operation.param.watch(lambda event: session.choose_operation(event.new), "value")
+        self.reset.on_click(lambda _: session.choose_operation(session.kind_name))
+        session.watch("operation", callback=self._build)
+        session.watch("problem", callback=lambda: self._say(session.problem))
+        self._build()
+        self._say(session.problem)
+        more = pn.Card(self._more, title="More options", collapsed=True, width=_WIDTH + 20, margin=(5, 0))
+        self.view = pn.Column(
+            self.operation,
+            self.problem,
+            self._first,
+            more,
+            self.reset,
+            width=_WIDTH + 40,
+            height=TALL,
+            scroll=True,
+        )
+
+    def _build(self) -> None:
+        """Make the widgets of the operation: those with a value first, then those that may be left out."""
+        self.widgets = {}
+        parts: dict[bool, list[Any]] = {True: [], False: []}
+        for name, one in self._session.options().items():
+            field, shown = widget_of(one, self._session.value(name))
+            field.param.watch(lambda event, name=name: self._changed(name, event.new), "value")
+            self.widgets[name] = field
+            parts[one.default is not None].append(shown)
+        self._first[:], self._more[:] = parts[True], parts[False]
+
+    def _changed(self, name: str, value: Any) -> None:
+        try:
+            self._session.choose(name, read(self._session.kind.options[name], value))
+        except InputError as error:
+            self._say(str(error))
+
+    def _say(self, what: str) -> None:
+        self.problem.object = problem(what)
+
+
+def widget_of(option: Option, value: Any) -> tuple[Any, Any]:
+    """Return the field of an option, and what is shown: with a slider between limits, or its explanation."""
+    label = option.name.replace("_", " ").capitalize()
+    unit = _DEGREES.get(option.unit, option.unit)
+    titled = f"{label} ({unit})" if unit else label
+    about = described(option)
+    widgets, given = pn.widgets, {"width": _WIDTH, "description": about}
+    if option.kind == "flag":
+        box = widgets.Checkbox(name=label, value=value, margin=(8, 0, 8, 10))
+        return box, pn.Row(box, widgets.TooltipIcon(value=about, margin=(6, 5)))
+    if option.kind == "choice":
+        field = widgets.Select(name=label, options=[*option.choices], value=value, **given)
+        return field, field
+    low, high = option.within
+    if option.kind == "integer" and option.default is not None:
+        end = high if high is not None and high < _ANY else None
+        field = widgets.IntInput(name=titled, value=value, start=low, end=end, **given)
+        return field, field
+    if option.kind == "number" and option.default is not None and low is not None and high is not None:
+        step = (high - low) / _STEPS
+        field = widgets.FloatInput(name=titled, value=value, start=low, end=high, step=step, **given)
+        slider = widgets.FloatSlider(
+            name="",
+            start=low,
+            end=high,
+            step=step,
+            value=value,
+            width=_WIDTH,
+            show_value=False,
+            margin=(0, 10),
+        )
+        slider.param.watch(lambda event: field.param.update(value=event.new), "value_throttled")
+        field.param.watch(lambda event: slider.param.update(value=event.new), "value")
+        return field, pn.Column(field, slider, margin=0)
+    field = widgets.TextInput(
+        name=titled, value=written(option, value), placeholder=option.shown_default or "none", **given
+    )
+    return field, field
+
+
+def described(option: Option) -> str:
+    """Return help, limits and default of an option as a sentence."""
+    text = f"{option.help[:1].upper()}{option.help[1:]}."
+    low, high = option.within
+    if option.kind in ("number", "integer", "numbers", "map") and (low, high, option.above) != (None,) * 3:
+        text += f" {option.needed[:1].upper()}{option.needed[1:]}."
+    default = option.shown_default or (option.default if option.kind != "flag" else "")
+    return f"{text} Default: {default}." if default not in ("", None) else text
+
+
+def written(option: Option, value: Any) -> str:
+    """Return a value as the text of a field; empty if there is none."""
+    if value is None:
+        return ""
+    if isinstance(value, list):
+        return ", ".join(written(option, one) for one in value)
+    return str(value) if isinstance(value, str) else f"{value / _factor(option):.10g}"
+
+
+def read(option: Option, value: Any) -> Any:
+    """Return the value that a widget stands for, in the option's unit."""
+    if not isinstance(value, str) or option.kind in ("choice", "flag"):
+        return value
+    text = value.strip()
+    if not text:
+        return option.default
+    if text in option.words or option.kind == "file":
+        return text
+    numbers = [_number(option, part) for part in text.split(",")]
+    if option.kind == "numbers":
+        return numbers
+    if len(numbers) > 1:
+        raise InputError(f"{option.name} {text}: write the number with a decimal point")
+    return int(numbers[0]) if option.kind == "integer" and numbers[0].is_integer() else numbers[0]
+
+
+def _number(option: Option, text: str) -> float:
+    try:
+        return float(text) * _factor(option)
+    except ValueError:
+        raise InputError(f"{option.name} {text}: {option.needed} is needed") from None
+
+
+def _factor(option: Option) -> float:
+    return math.pi / 180 if option.unit == "rad" else 1.0

@@ -1,0 +1,434 @@
+"""A map or a frame as a picture of Bokeh: colours and captions follow from the declarations of maps."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from bokeh.events import PanEnd, PanStart
+from bokeh.models import (
+    BoxAnnotation,
+    ColorBar,
+    ColumnDataSource,
+    CustomJS,
+    CustomJSHover,
+    HoverTool,
+    LinearColorMapper,
+    LogColorMapper,
+    Range1d,
+    ResetTool,
+    WheelZoomTool,
+)
+from bokeh.plotting import figure
+from numpy.typing import NDArray
+
+from mirrorskin.io import Region
+from mirrorskin.io.maps import SIGMA
+from mirrorskin.io.opencv import encode
+from mirrorskin.view.app.look import plain_axes
+from mirrorskin.view.colours import FILLED_RGB, MISSING_RGB, apart, normal_colours, span
+from mirrorskin.view.result.maps import ball_colours, code_colours
+from mirrorskin.view.result.scale import UNDEFINED_NOTE, displayed_values, scale_of
+from mirrorskin.view.result.sheet import Sheet, percent
+
+Edges = tuple[float, float, float, float]
+"""Left, right, bottom and top of a picture."""
+Point = tuple[float, float]
+
+_SHADES = 256
+_OPAQUE = 255
+_WORD = (
+    'const found = words instanceof Map ? words.get(String(value)) : words[value]; return found ?? "unknown"'
+)
+_NUMBER = 'return isNaN(value) ? "unknown" : Number(value).toPrecision(5)'
+
+
+@dataclass(frozen=True)
+class Readings:
+    """What the pointer reads: values at pixels, (H, W), lines of text, and the words of codes."""
+
+    columns: dict[str, NDArray[Any]] = field(default_factory=dict)
+    tooltips: Sequence[tuple[str, str]] = ()
+    words: dict[str, dict[int, str]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A map as Bokeh draws it.
+
+    Attributes
+    ----------
+    values : ndarray, (H, W)
+        Numbers to colour; or of `rgba`, colours, uint32.
+    palette, low, high, logarithmic
+        Colours of the numbers.
+    label : str
+        Title with the unit; empty for codes and colours.
+    title, caption : str
+    legend : sequence of (str, str)
+        Colours and texts of codes, or of marks.
+    key : str
+        HTML that explains colours of directions.
+    readings : Readings
+        What the pointer reads.
+    """
+
+    values: NDArray[Any]
+    title: str
+    caption: str
+    label: str = ""
+    palette: Sequence[str] = ()
+    low: float = 0.0
+    high: float = 1.0
+    logarithmic: bool = False
+    legend: Sequence[tuple[str, str]] = ()
+    key: str = ""
+    readings: Readings = field(default_factory=Readings)
+
+
+def palette_of(name: str) -> list[str]:
+    """Return the colours of a colour map of Matplotlib."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    return [to_hex(colormaps[name](level)) for level in range(_SHADES)]
+
+
+def hex_of(colour: Any) -> str:
+    """Return a colour as Bokeh understands it."""
+    from matplotlib.colors import to_hex
+
+    if isinstance(colour, tuple):
+        red, green, blue = (part / 255 for part in colour)
+        return to_hex((red, green, blue))
+    return to_hex(colour)
+
+
+def show_map(sheet: Sheet, name: str, like: Shown | None = None) -> Shown:
+    """Return how a map is drawn; with the limits of another if one is given.
+
+    Parameters
+    ----------
+    sheet : Sheet
+    name : str
+        Name of a map of the result.
+    like : Shown, optional
+        The drawing with whose colours it is compared.
+    """
+    declared = sheet.result.declaration(name)
+    title, caption = declared.title_of(name), declared.caption
+    caption = f"{caption[:1].upper()}{caption[1:]}." if caption else ""
+    readings = _read_at_pixels(sheet, name)
+    if declared.sampling == "direction":
+        colours = normal_colours(sheet.result[name], sheet.result.edges)
+        edges = sheet.result.edges is not None and bool(sheet.result.edges.any())
+        legend = [("#000000", "edges")] if edges else []
+        return Shown(_packed(colours), title, caption, legend=legend, key=_key(), readings=readings)
+    if declared.codes:
+        classes, palette, legend = _classes(sheet, name)
+        high = len(palette) - 0.5
+        return Shown(
+            classes, title, caption, palette=palette, low=-0.5, high=high, legend=legend, readings=readings
+        )  # fmt: skip
+    scale = scale_of(sheet, name)
+    low, high = (scale.low, scale.high) if like is None or not like.palette else (like.low, like.high)
+    note = "; ".join(one for one in scale.note.split("; ") if one not in ("", UNDEFINED_NOTE))
+    return Shown(
+        scale.values.astype(np.float32),
+        title,
+        f"{caption} {note[:1].upper()}{note[1:]}." if note else caption,
+        f"{scale.label[:1].upper()}{scale.label[1:]}",
+        palette_of(scale.colours),
+        low,
+        high,
+        scale.logarithmic,
+        readings=readings,
+    )
+
+
+def _key() -> str:
+    """Return a picture of a ball with the colours of normals, x to the right and y up."""
+    png = encode(".png", ball_colours()[..., [2, 1, 0, 3]])
+    source = f"data:image/png;base64,{base64.b64encode(png).decode()}"
+    return f'<span class="key"><img alt="" src="{source}">colours on a ball seen from the camera</span>'
+
+
+def _read_at_pixels(sheet: Sheet, name: str) -> Readings:
+    """Return what the pointer reads: position, value with its standard deviation, status, and origin."""
+    result, declared = sheet.result, sheet.result.declaration(name)
+    columns: dict[str, NDArray[Any]] = {}
+    words: dict[str, dict[int, str]] = {}
+    tooltips = [("x, y", f"$x{{0.000}}, $y{{0.000}} {sheet.unit}")]
+    unit = declared.figure_unit
+    if declared.codes:
+        columns["code"] = result[name]
+        tooltips.append((declared.title_of(name), "@code{custom}"))
+        words["@code"] = declared.codes
+    else:
+        values = displayed_values(sheet, name)
+        parts = declared.components or ("",)
+        for number, part in enumerate(parts):
+            key = f"value{number}"
+            columns[key] = (values[..., number] if part else values).astype(np.float32)
+            tooltips.append((part or declared.title_of(name), f"@{key}{{custom}} {unit}".strip()))
+    sigma = f"{name}{SIGMA}"
+    if sigma in result and result[sigma].ndim == 2:
+        error = result.declaration(sigma)
+        columns["sigma"] = displayed_values(sheet, sigma).astype(np.float32)
+        tooltips.append(("Standard deviation", f"@sigma{{custom}} {error.figure_unit}"))
+    status = "status"
+    if status in result and name != status and result.declaration(status).codes:
+        columns["status"] = result[status]
+        tooltips.append(("Status", "@status{custom}"))
+        words["@status"] = result.declaration(status).codes
+    if result.filled is not None and name == result.name_of("height"):
+        columns["filled"] = result.filled
+        tooltips.append(("Origin", "@filled{custom}"))
+        words["@filled"] = result.declaration("filled").codes
+    return Readings(columns, tooltips, words)
+
+
+def _classes(sheet: Sheet, name: str) -> tuple[NDArray[np.uint8], list[str], list[tuple[str, str]]]:
+    """Return the places of the codes of a map in its legend, their colours, and the legend with shares."""
+    declared, values = sheet.result.declaration(name), sheet.result[name]
+    codes, colours = sorted(declared.codes), [hex_of(one) for one in code_colours(declared)]
+    places = np.clip(np.searchsorted(codes, values), 0, len(codes) - 1)
+    classes = np.where(np.asarray(codes)[places] == values, places, len(codes)).astype(np.uint8)
+    counts = np.bincount(classes.ravel(), minlength=len(codes) + 1)
+    names = [*(declared.codes[one] for one in codes), "unknown number"]
+    legend = [
+        (colours[place], f"{names[place]} {percent(int(count), classes.size)}")
+        for place, count in enumerate(counts)
+        if count
+    ]
+    return classes, colours, legend
+
+
+def _packed(colours: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    """Return red, green and blue as Bokeh's pixels."""
+    rgba = np.full((*colours.shape[:2], 4), _OPAQUE, np.uint8)
+    rgba[..., :3] = colours
+    return np.ascontiguousarray(rgba).view(np.uint32)[..., 0]
+
+
+class Picture:
+    """A figure with a picture, whose rows go down as those of the camera.
+
+    Parameters
+    ----------
+    place : (float, float, float, float)
+        Left, right, bottom and top edge.
+    unit : str
+        Unit of the axes.
+    size : (int, int)
+        Largest width and height of the picture, CSS pixels.
+    like : Picture, optional
+        A picture that it is moved and enlarged together with.
+    """
+
+    def __init__(
+        self,
+        place: Edges,
+        unit: str,
+        size: tuple[int, int] = (480, 480),
+        like: Picture | None = None,
+        bar: bool = True,
+    ) -> None:
+        left, right, bottom, top = place
+        self.place = place
+        x = like.figure.x_range if like else Range1d(left, right)
+        y = like.figure.y_range if like else Range1d(bottom, top)
+        wheel = WheelZoomTool()
+        self.figure: Any = figure(
+            x_range=x,
+            y_range=y,
+            tools=[wheel, ResetTool()],
+            toolbar_location="above",
+            match_aspect=True,
+            aspect_scale=1,
+            background_fill_color=hex_of(MISSING_RGB),
+            **_frame(place, size, bar),
+        )
+        plain_axes(self.figure)
+        self.figure.toolbar.active_scroll = wheel
+        self.figure.grid.visible = False
+        self.figure.xaxis.axis_label, self.figure.yaxis.axis_label = f"x ({unit})", f"y ({unit})"
+        self.source = ColumnDataSource(data={"image": [np.zeros((1, 1), np.float32)]})
+        self.marks = ColumnDataSource(data={"image": [np.zeros((1, 1), np.uint32)]})
+        self.mapper = LinearColorMapper(palette=["#000000", "#ffffff"], nan_color=hex_of(MISSING_RGB))
+        self.logarithmic = LogColorMapper(palette=["#000000"], low=1, high=10, nan_color=hex_of(MISSING_RGB))
+        where = {"x": left, "y": bottom, "dw": right - left, "dh": top - bottom, "origin": "top_left"}
+        self._plain = self.figure.image("image", source=self.source, color_mapper=self.mapper, **where)
+        self._log = self.figure.image("image", source=self.source, color_mapper=self.logarithmic, **where)
+        self._rgba = self.figure.image_rgba("image", source=self.source, **where)
+        self._marks = self.figure.image_rgba("image", source=self.marks, **where)
+        self._bars = [
+            ColorBar(color_mapper=mapper, width=14, padding=0, margin=8, major_label_text_font_size="12px")
+            for mapper in (self.mapper, self.logarithmic)
+        ]
+        if bar:
+            for one in self._bars:
+                self.figure.add_layout(one, "right")
+        self.hover = HoverTool(renderers=[self._plain], tooltips=[])
+        self.figure.add_tools(self.hover)
+
+    def show(self, shown: Shown, marks: NDArray[np.uint32] | None = None, about: str = "") -> None:
+        """Draw a map, and marks above it; the title has the unit of the map, and a text about it."""
+        self.figure.title.text = ", ".join(filter(None, [shown.label or shown.title, about]))
+        colours = shown.values.dtype == np.uint32
+        self._rgba.visible = colours
+        self._log.visible = not colours and shown.logarithmic
+        self._plain.visible = not colours and not shown.logarithmic
+        drawn = self._rgba if colours else self._log if shown.logarithmic else self._plain
+        if not colours:
+            mapper = self.logarithmic if shown.logarithmic else self.mapper
+            mapper.update(palette=[*shown.palette], low=shown.low, high=shown.high)
+        for one, renderer in zip(self._bars, (self._plain, self._log), strict=True):
+            one.visible = renderer.visible and not shown.legend
+        self.source.data = {
+            "image": [shown.values],
+            **{name: [v] for name, v in shown.readings.columns.items()},
+        }
+        empty = np.zeros(shown.values.shape, np.uint32)
+        self.marks.data = {"image": [empty if marks is None else marks]}
+        read = shown.readings
+        numbers = [name for name in read.columns if name.startswith(("sigma", "value"))]
+        formats = {f"@{name}": CustomJSHover(code=_NUMBER) for name in numbers}
+        for column, codes in read.words.items():
+            words = {str(code): text for code, text in codes.items()}
+            formats[column] = CustomJSHover(args={"words": words}, code=_WORD)
+        self.hover.update(renderers=[drawn], tooltips=[*read.tooltips], formatters=formats)
+
+
+def _frame(place: Edges, size: tuple[int, int], bar: bool) -> dict[str, Any]:
+    """Return the size of a picture that is drawn to scale, within a width and a height."""
+    left, right, bottom, top = place
+    proportion = (right - left) / (top - bottom)
+    width = min(size[0], round(size[1] * proportion))
+    height = min(size[1], round(width / proportion))
+    return {"frame_width": width, "frame_height": height}
+
+
+def filled_marks(sheet: Sheet) -> NDArray[np.uint32]:
+    """Return marks of heights that were filled, not measured."""
+    filled = sheet.filled
+    rgba = np.zeros((*filled.shape, 4), np.uint8)
+    rgba[filled] = (*FILLED_RGB, 230)
+    return np.ascontiguousarray(rgba).view(np.uint32)[..., 0]
+
+
+def show_frame(frame: NDArray[Any], title: str, automatic: bool) -> Shown:
+    """Return how a frame is drawn: from black to white, between its ends or those of its type."""
+    if automatic:
+        low, high = apart(*span(frame.astype(np.float32)))
+    else:
+        low, high = (0.0, float(np.iinfo(frame.dtype).max)) if frame.dtype.kind == "u" else (0.0, 1.0)
+    columns = {"counts": frame.astype(np.float32)}
+    tooltips = [("x, y", "$x{0.000}, $y{0.000}"), ("Brightness", "@counts{0.0} counts")]
+    return Shown(
+        frame.astype(np.float32), title, "", "Brightness (counts)", palette_of("gray"), low, high,
+        readings=Readings(columns, tooltips),
+    )  # fmt: skip
+
+
+_RUBBER = """
+const at = [cb_obj.x, cb_obj.y]
+if (cb_obj.event_name == "panstart") origin.data = {x: [at[0]], y: [at[1]]}
+const from = [origin.data.x[0], origin.data.y[0]]
+const mode = modes.data.mode[0]
+if (mode == "move") {
+  for (const [range, place] of [[figure.x_range, 0], [figure.y_range, 1]]) {
+    const shift = from[place] - at[place]
+    range.setv({start: range.start + shift, end: range.end + shift})
+  }
+} else if (mode == "section") {
+  line.data = {x: [from[0], at[0]], y: [from[1], at[1]]}
+} else if (mode == "region") {
+  const [left, right] = [Math.min(from[0], at[0]), Math.max(from[0], at[0])]
+  const [bottom, top] = [Math.min(from[1], at[1]), Math.max(from[1], at[1])]
+  box.setv({left, right, bottom, top, visible: true})
+}
+"""
+
+
+class Dragging:
+    """What the pointer draws on a picture: a section, a region, or nothing where it moves the picture.
+
+    Parameters
+    ----------
+    picture : Picture
+    drawn : callable
+        Called with the mode, and x and y of start and end.
+    mode : {"section", "region", "move"}
+    """
+
+    def __init__(
+        self, picture: Picture, drawn: Callable[[str, Point, Point], None], mode: str = "region"
+    ) -> None:
+        self._drawn, self._start = drawn, (0.0, 0.0)
+        self._modes = ColumnDataSource(data={"mode": [mode]})
+        self.line = ColumnDataSource(data={"x": [], "y": []})
+        plot = picture.figure
+        for width, colour in ((4, "white"), (1.5, "black")):
+            plot.line("x", "y", source=self.line, line_width=width, line_color=colour)
+        self.box = BoxAnnotation(
+            fill_alpha=0, line_color="#d55e00", line_width=2.5, line_dash="dashed", visible=False
+        )
+        plot.add_layout(self.box)
+        origin = ColumnDataSource(data={"x": [0.0], "y": [0.0]})
+        rubber = CustomJS(
+            args={"origin": origin, "modes": self._modes, "line": self.line, "box": self.box, "figure": plot},
+            code=_RUBBER,
+        )
+        plot.js_on_event("panstart", rubber)
+        plot.js_on_event("pan", rubber)
+        plot.on_event(PanStart, self._started)
+        plot.on_event(PanEnd, self._ended)
+
+    @property
+    def mode(self) -> str:
+        """What is drawn: "section", "region", or "move"."""
+        return str(self._modes.data["mode"][0])
+
+    @mode.setter
+    def mode(self, mode: str) -> None:
+        self._modes.data = {"mode": [mode]}
+
+    def _started(self, event: Any) -> None:
+        self._start = event.x, event.y
+
+    def _ended(self, event: Any) -> None:
+        if self.mode != "move":
+            self._drawn(self.mode, self._start, (event.x, event.y))
+
+
+def pixel_at(place: Edges, shape: tuple[int, int], x: float, y: float) -> tuple[float, float]:
+    """Return row and column at a place in a picture with these edges, with fractions."""
+    left, right, bottom, top = place
+    return (top - y) / (top - bottom) * shape[0], (x - left) / (right - left) * shape[1]
+
+
+def region_between(place: Edges, shape: tuple[int, int], one: Point, other: Point) -> Region | None:
+    """Return the pixels of a rectangle between two corners; None if it has less than two rows or columns."""
+    corners = np.array([pixel_at(place, shape, *one), pixel_at(place, shape, *other)])
+    (top, left), (bottom, right) = corners.min(axis=0), corners.max(axis=0)
+    rows = max(0, round(top)), min(shape[0], round(bottom))
+    columns = max(0, round(left)), min(shape[1], round(right))
+    if rows[1] - rows[0] < 2 or columns[1] - columns[0] < 2:
+        return None
+    return Region(rows, columns)
+
+
+def edges_of(place: Edges, shape: tuple[int, int], region: Region) -> dict[str, float]:
+    """Return left, right, bottom and top of a region of a picture with these edges."""
+    left, right, bottom, top = place
+    across, down = (right - left) / shape[1], (top - bottom) / shape[0]
+    return {
+        "left": left + region.columns[0] * across,
+        "right": left + region.columns[1] * across,
+        "bottom": top - region.rows[1] * down,
+        "top": top - region.rows[0] * down,
+    }

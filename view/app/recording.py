@@ -1,0 +1,224 @@
+"""The pane of a recording: its frames, the part that is used, and the brightness of one pixel."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import panel as pn
+from bokeh.events import Tap
+from bokeh.models import BoxAnnotation, ColumnDataSource, HoverTool, Label, Range1d, Span
+from bokeh.plotting import figure
+
+from mirrorskin.io import pixel_axes
+from mirrorskin.view.app.look import hint, plain_axes, table, text
+from mirrorskin.view.app.picture import (
+    Dragging,
+    Picture,
+    Point,
+    edges_of,
+    pixel_at,
+    region_between,
+    show_frame,
+)
+from mirrorskin.view.app.session import Session
+from mirrorskin.view.app.trace import Trace, trace_of
+from mirrorskin.view.canvas import extent
+
+_PICTURE = 480, 520  # largest size, CSS pixels
+_GRAPH = 560, 330
+_COLOURS = {"Dark": "#56606b", "Threshold": "#d55e00", "Bright": "#8a6d00"}
+_LINE, _FIT = "#0072b2", "#d55e00"
+_HINT = "Click a pixel to see its brightness. Drag to draw the region that is used."
+
+
+class RecordingPane:
+    """Frames with a slider, and the brightness of the pixel that was clicked."""
+
+    def __init__(self, session: Session) -> None:
+        assert session.whole is not None
+        self._session = session
+        count, rows, columns = session.whole.shape
+        x, y = pixel_axes((rows, columns), session.whole.header.pixel_size or (1.0, 1.0))
+        self._place = extent(x, y)
+        self._shape = rows, columns
+        unit = "mm" if session.whole.header.pixel_size else "px"
+        self.picture = Picture(self._place, unit, _PICTURE)
+        self._cross = ColumnDataSource(data={"x": [], "y": []})
+        for width, colour in ((4, "white"), (2, "black")):
+            self.picture.figure.scatter(
+                "x", "y", source=self._cross, marker="cross", size=16, line_width=width, line_color=colour
+            )
+        self.dragging = Dragging(self.picture, self._drawn)
+        self.picture.figure.on_event(Tap, self._tapped)
+        self.frame = pn.widgets.IntSlider(
+            name="Frame", start=0, end=count - 1, value=count // 2, width=_PICTURE[0] + 60
+        )
+        self.automatic = pn.widgets.Checkbox(name="Scale grey levels to this frame", value=True)
+        self.frames = pn.widgets.IntRangeSlider(
+            name="Frames used",
+            start=0,
+            end=count,
+            step=1,
+            value=(0, count),
+            width=300,
+            disabled=not session.can_cut,
+        )
+        self.whole = pn.widgets.Button(
+            name="Use the whole picture", width=180, disabled=True, button_type="light"
+        )
+        self.graph = _Graph()
+        self.facts = text(width=_GRAPH[0])
+        self.frame.param.watch(lambda _: self._show_frame(), "value")
+        self.automatic.param.watch(lambda _: self._show_frame(), "value")
+        self.frames.param.watch(lambda _: self._choose_frames(), "value_throttled")
+        self.whole.on_click(lambda _: session.choose_part(None, session.frames))
+        session.watch("pixel", "result", "part", callback=self._show_pixel)
+        session.watch("part", callback=self._show_part)
+        self._show_frame()
+        self._show_part()
+        self._show_pixel()
+        self.view = pn.Row(
+            pn.Column(
+                self.frame,
+                pn.pane.Bokeh(self.picture.figure),
+                pn.Row(self.automatic, self.whole),
+                text(hint(_HINT)),
+            ),
+            pn.Column(self.frames, pn.pane.Bokeh(self.graph.figure), self.facts, width=_GRAPH[0] + 40),
+        )
+
+    def _show_frame(self) -> None:
+        assert self._session.whole is not None
+        number = self.frame.value
+        self.picture.show(show_frame(self._session.whole.frame(number), "", self.automatic.value))
+        axis = self._where(number)
+        self.frame.name = f"Frame{axis}"
+
+    def _where(self, number: int) -> str:
+        """Return the position of the body in a frame, in words."""
+        whole = self._session.whole
+        assert whole is not None
+        if whole.motion == "axial" and whole.phase is not None:
+            return f", phase {math.degrees(whole.phase[number]):.1f} deg"
+        if whole.travel is not None:
+            return f", travel {whole.travel[number]:.4g} mm"
+        if whole.displacement is not None:
+            return f", displaced by {np.hypot(*whole.displacement[number]):.4g} mm"
+        if whole.twist is not None:
+            return f", twist {math.degrees(whole.twist[number]):.4g} deg"
+        return ""
+
+    def _tapped(self, event: Any) -> None:
+        row, column = pixel_at(self._place, self._shape, event.x, event.y)
+        self._session.point_at(math.floor(row), math.floor(column))
+
+    def _drawn(self, _: str, start: Point, end: Point) -> None:
+        """Use the rectangle that was drawn."""
+        region = region_between(self._place, self._shape, start, end)
+        if region is not None and self._session.can_cut:
+            self._session.choose_part(region, self._session.frames)
+        else:
+            self._show_part()
+
+    def _choose_frames(self) -> None:
+        first, end = self.frames.value
+        whole = (first, end) == (0, self.frames.end)
+        if end - first >= 1:
+            self._session.choose_part(self._session.region, None if whole else (first, end))
+
+    def _show_part(self) -> None:
+        region = self._session.region
+        self.whole.disabled = region is None
+        box = self.dragging.box
+        box.visible = region is not None
+        if region is not None:
+            box.update(**edges_of(self._place, self._shape, region))
+        if self._session.frames is not None:
+            first, end = self._session.frames
+            self.frames.value = first, self.frames.end if end is None else end
+
+    def _show_pixel(self) -> None:
+        pixel = self._session.pixel
+        if pixel is None:
+            self.facts.object = hint("No pixel is chosen: click one in the picture.")
+            return
+        left, right, bottom, top = self._place
+        (row, column), (rows, columns) = pixel, self._shape
+        x = left + (column + 0.5) * (right - left) / columns
+        y = top - (row + 0.5) * (top - bottom) / rows
+        self._cross.data = {"x": [x], "y": [y]}
+        trace = trace_of(self._session)
+        if trace is None:
+            self.facts.object = hint("This pixel is outside of the region that is used.")
+            return
+        self.graph.show(trace, f"Pixel in row {row}, column {column}")
+        self.facts.object = table(trace.facts)
+
+
+class _Graph:
+    """The brightness of a pixel with levels, and the event or the fit."""
+
+    def __init__(self) -> None:
+        self.figure = figure(
+            width=_GRAPH[0],
+            height=_GRAPH[1],
+            x_range=Range1d(0, 1),
+            y_range=Range1d(0, 255),
+            tools="pan,wheel_zoom,box_zoom,reset",
+            toolbar_location="above",
+        )
+        plain_axes(self.figure)
+        self.source = ColumnDataSource(data={"x": [], "y": []})
+        self.fit = ColumnDataSource(data={"x": [], "y": []})
+        self.figure.line("x", "y", source=self.source, line_color=_LINE, line_alpha=0.5)
+        points = self.figure.scatter("x", "y", source=self.source, size=6, color=_LINE)
+        self.figure.line("x", "y", source=self.fit, line_color=_FIT, line_width=2)
+        self.figure.add_tools(
+            HoverTool(renderers=[points], tooltips=[("Position", "@x"), ("Brightness", "@y counts")])
+        )
+        self.figure.yaxis.axis_label = "brightness (counts)"
+        self.spans, self.labels = {}, {}
+        for name, colour in _COLOURS.items():
+            self.spans[name] = Span(
+                dimension="width", line_color=colour, line_dash="dashed", line_width=1.5, visible=False
+            )
+            self.labels[name] = Label(
+                x=6, x_units="screen", y=0, y_offset=2, text=name.lower(), text_color=colour,
+                text_font_size="12px", visible=False,
+            )  # fmt: skip
+        self.event = Span(dimension="height", line_color="#009e73", line_width=2, visible=False)
+        self.band = BoxAnnotation(fill_color="#009e73", fill_alpha=0.2, line_alpha=0, visible=False)
+        for one in (*self.spans.values(), *self.labels.values(), self.event, self.band):
+            self.figure.add_layout(one)
+
+    def show(self, trace: Trace, title: str) -> None:
+        """Draw the brightness of a pixel."""
+        self.figure.title.text = title
+        self.figure.xaxis.axis_label = f"{trace.axis} ({trace.unit})" if trace.unit else trace.axis
+        self.source.data = {"x": trace.position, "y": trace.brightness}
+        x, y = ([], []) if trace.curve is None else trace.curve
+        self.fit.data = {"x": x, "y": y}
+        for name in _COLOURS:
+            level = trace.levels.get(name)
+            self.spans[name].visible = self.labels[name].visible = level is not None
+            if level is not None:
+                self.spans[name].location = self.labels[name].y = level
+        shown = np.array([*trace.brightness, *trace.levels.values()])
+        room = 0.06 * (float(np.ptp(shown)) or 1.0)
+        self.figure.y_range.update(start=float(shown.min()) - room, end=float(shown.max()) + room)
+        aside = 0.03 * (float(np.ptp(trace.position)) or 1.0)
+        self.figure.x_range.update(
+            start=float(trace.position.min()) - aside, end=float(trace.position.max()) + aside
+        )
+        known = math.isfinite(trace.event)
+        self.event.visible = known
+        self.band.visible = known and math.isfinite(trace.event_sigma)
+        if known:
+            self.event.location = trace.event
+        if self.band.visible:
+            self.band.left, self.band.right = (
+                trace.event - trace.event_sigma,
+                trace.event + trace.event_sigma,
+            )

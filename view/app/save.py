@@ -1,0 +1,131 @@
+"""The pane that saves a result: files for other programs, the command, and the Python script."""
+
+from __future__ import annotations
+
+import tempfile
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import panel as pn
+
+from mirrorskin import io
+from mirrorskin.engine.metrology import section_columns
+from mirrorskin.io import InputError
+from mirrorskin.io.export import check_export, suffixes
+from mirrorskin.io.url import ZARR_SUFFIX
+from mirrorskin.view.app.look import heading, problem, text
+from mirrorskin.view.app.session import Session
+from mirrorskin.view.app.wording import as_command, as_python
+
+_RESULT, _REPORT, _SECTION = ".h5", ".html", ".csv"
+_WHAT = {
+    _RESULT: "result of mirrorskin (.h5): all maps, options and origin",
+    _REPORT: "report (.html): a page with pictures, numbers and the surface",
+    ".ply": "surface (.ply)",
+    ".stl": "surface (.stl)",
+    ".obj": "surface (.obj)",
+    ".xyz": "points as text (.xyz)",
+    ".png": "heights as a picture of 16 bits (.png)",
+    ".tif": "heights as a picture (.tif)",
+    ".npz": "all maps as NumPy arrays (.npz)",
+    _SECTION: "the section as a table (.csv)",
+    ".mcap": "ROS 2 messages (.mcap)",
+}
+"""What people read of a suffix; others are shown as they are."""
+_SAME = (".tiff", ZARR_SUFFIX)  # another name of .tif, and a folder
+
+
+class SavePane:
+    """Buttons that save a result, and texts that compute it again."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        names = [_RESULT, _REPORT, *(one for one in suffixes() if one not in _SAME)]
+        self.format = pn.widgets.Select(
+            name="File", options={_WHAT.get(one, one): one for one in names}, value=_RESULT, width=460
+        )
+        self.download = pn.widgets.FileDownload(
+            callback=self._file,
+            filename="result.h5",
+            button_type="primary",
+            width=220,
+            label="Save result.h5",
+        )
+        self.problem = text(width=900)
+        self.command = _text("command", 90)
+        self.python = _text("python", 190)
+        self.format.param.watch(lambda _: self._name_file(), "value")
+        session.watch("result", "problem", "part", "ends", callback=self._show)
+        self._show()
+        texts = []
+        if session.whole is not None:
+            for title, area in (
+                ("The same result on the command line", self.command),
+                ("The same result in Python", self.python),
+            ):
+                copy = pn.widgets.Button(name="Copy", width=90, button_type="light")
+                copy.js_on_click(args={"source": area}, code="navigator.clipboard.writeText(source.value)")
+                texts += [heading(title), area, copy]
+        self.view = pn.Column(
+            heading("Save a file"),
+            self.format,
+            self.download,
+            self.problem,
+            *texts,
+        )
+
+    def _name_file(self) -> None:
+        stem = Path(self._session.name).stem
+        self.download.filename = f"{stem}-result{self.format.value}"
+        self.download.label = f"Save {self.download.filename}"
+
+    def _show(self) -> None:
+        self._name_file()
+        self.problem.object = ""
+        if self._session.whole is not None:
+            self.command.value = as_command(self._session)
+            self.python.value = as_python(self._session)
+
+    def _file(self) -> BytesIO | None:
+        """Return the file, written by the exporter that the command line uses."""
+        try:
+            return BytesIO(self.write())
+        except InputError as error:
+            self.problem.object = problem(str(error))
+            return None
+
+    def write(self) -> bytes:
+        """Return the bytes of the file."""
+        session, suffix = self._session, self.format.value
+        if session.now is None:
+            raise InputError("there is no result to save: see the message next to the options")
+        result = session.now.result
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, str(self.download.filename))
+            if suffix == _RESULT:
+                io.save_result(result, path)
+                return path.read_bytes()
+            sheet = session.sheet(session.now)
+            assert sheet is not None
+            if suffix == _REPORT:
+                from mirrorskin.view.report import write_report
+
+                write_report(sheet.result, path, name=session.name, section=session.ends)
+                return path.read_bytes()
+            check_export(sheet.result, path)
+            columns = section_columns(sheet.result, session.ends) if suffix == _SECTION else None
+            io.export_result(sheet.result, path, section=columns)
+            return path.read_bytes()
+
+
+def _text(name: str, height: int) -> Any:
+    return pn.widgets.TextAreaInput(
+        name="",
+        height=height,
+        width=900,
+        disabled=False,
+        css_classes=["code", name],
+        resizable=False,
+        max_length=100_000,
+    )

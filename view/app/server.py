@@ -1,0 +1,102 @@
+"""The server of the application: on this machine only, and only for those who have its address.
+
+The address contains a token, which is the first part of every path: whatever is asked for without it does not
+exist. WebSockets are accepted from pages of this server only.
+"""
+
+from __future__ import annotations
+
+import secrets
+import signal
+import socket
+import webbrowser
+from collections.abc import Callable
+from contextlib import closing
+from importlib.util import find_spec
+from typing import Any
+
+from mirrorskin.io import InputError
+
+HERE = "127.0.0.1"
+
+_TOKEN_BYTES = 24
+
+
+def check_app() -> None:
+    """Raise InputError if the application cannot be shown, before any work is done."""
+    missing = [name for name in ("panel", "bokeh", "matplotlib", "jinja2") if find_spec(name) is None]
+    if missing:
+        raise InputError(f"the application needs {' and '.join(missing)}: pip install 'mirrorskin[app]'")
+
+
+class AppServer:
+    """A server of pages at a secret address of this machine.
+
+    Parameters
+    ----------
+    page : callable
+        Returns what Panel shows in a new browser window.
+    port : int
+        0 for any free one.
+
+    Attributes
+    ----------
+    address : str
+        With the token.
+
+    Raises
+    ------
+    InputError
+        The port cannot be used.
+    """
+
+    def __init__(self, page: Callable[[], Any], port: int = 0) -> None:
+        from panel.io.server import get_server
+
+        port = _free_port(port)
+        token = secrets.token_urlsafe(_TOKEN_BYTES)
+        interrupt = signal.getsignal(signal.SIGINT)
+        self._server = get_server(
+            page,
+            port=port,
+            address=HERE,
+            websocket_origin=f"{HERE}:{port}",
+            prefix=token,
+            title="mirrorskin",
+            show=False,
+            start=False,
+            session_token_expiration=86400,
+        )
+        _restore(interrupt)
+        self.address = f"http://{HERE}:{port}/{token}/"
+
+    def run(self, browser: bool) -> None:
+        """Serve until the program is interrupted."""
+        self._server.start()
+        if browser:
+            self._server.io_loop.add_callback(webbrowser.open, self.address)
+        with closing(self):
+            self._server.io_loop.start()
+
+    def close(self) -> None:
+        """Stop serving, and close all pages."""
+        self._server.stop(wait=False)
+
+
+def _restore(handler: Any) -> None:
+    """Set the handler of Ctrl-C again, which Panel replaces."""
+    try:
+        signal.signal(signal.SIGINT, handler)
+    except (TypeError, ValueError):  # not of Python, or not in the main thread
+        return
+
+
+def _free_port(port: int) -> int:
+    """Return a port on which nothing listens: the given one, or any."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HERE, port))
+        except (OSError, OverflowError) as error:
+            raise InputError(f"port {port} cannot be used ({error}): choose another with --port") from error
+        return int(probe.getsockname()[1])

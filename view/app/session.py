@@ -1,0 +1,302 @@
+"""What the application works on: a recording with options and its results, or a stored result."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mirrorskin import engine, io
+from mirrorskin.engine.options import Option
+from mirrorskin.engine.reconstruction import calibrated, method_for
+from mirrorskin.engine.running import load_operation, run_class
+from mirrorskin.io.foreign import kind_of_frames
+from mirrorskin.io.recording import is_result
+from mirrorskin.io.result import map_shape
+from mirrorskin.view.result.sheet import Sheet, sheet_of
+
+Ends = tuple[tuple[float, float], tuple[float, float]]
+"""Ends of a section, x and y, mm."""
+
+_MODULE = "mirrorskin.engine"
+
+
+@dataclass(frozen=True)
+class Opening:
+    """How a recording is opened: what the command line says about it.
+
+    Attributes
+    ----------
+    keywords : mapping
+        Keywords of `mirrorskin.io.open_recording`, except for region and frames.
+    words : sequence of str
+        The same as words of a command.
+    calibration : Path, optional
+    device : str, optional
+    operation : str
+        ``MODULE:CLASS``; by default the method for the motion.
+    region, frames
+        As for `mirrorskin.io.open_recording`.
+    """
+
+    keywords: Mapping[str, Any] = field(default_factory=dict)
+    words: Sequence[str] = ()
+    calibration: Path | None = None
+    device: str | None = None
+    operation: str = ""
+    region: io.Region | None = None
+    frames: tuple[int, int | None] | None = None
+
+
+@dataclass(frozen=True)
+class Computed:
+    """A result, and what it was computed with."""
+
+    result: io.Result
+    label: str
+    seconds: float = 0.0
+    warnings: Sequence[str] = ()
+
+
+class Session:
+    """A recording with an operation, its options and results, or a stored result.
+
+    Callbacks given to `watch` are called after a change.
+
+    Parameters
+    ----------
+    source : path, Recording or Result
+        What is shown.
+    opening : Opening
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        The file cannot be read.
+    """
+
+    def __init__(self, source: str | Path | io.Recording | io.Result, opening: Opening | None = None) -> None:
+        self._watchers: dict[str, list[Callable[[], None]]] = {}
+        self.opening = opening = opening or Opening()
+        self.path: Path | None = Path(source) if isinstance(source, str | Path) else None
+        self.whole: io.Recording | None = None  # all frames of the whole picture
+        self._part: io.Recording | None = None
+        self.region, self.frames = opening.region, opening.frames
+        self.now: Computed | None = None
+        self.before: Computed | None = None
+        self.problem = ""
+        self.pixel: tuple[int, int] | None = None  # row and column in the whole picture
+        self.measured: io.Region | None = None  # pixels of the maps
+        self.ends: Ends | None = None
+        self.turn: int | None = None
+        self.changed: dict[str, Any] = {}  # options that differ from their defaults
+        if isinstance(source, io.Result):
+            self.name = str(source.process.get("source", "result"))
+            self._keep(Computed(source, "stored result"))
+        elif isinstance(source, io.Recording):
+            self.name, self.whole, self._part = source.name, source, source
+        elif not kind_of_frames(Path(source)) and is_result(source):
+            self.name = Path(source).name
+            self._keep(Computed(io.open_result(source), "stored result"))
+        else:
+            self.name = Path(source).name
+            self.whole = io.open_recording(source, **opening.keywords)
+        if self.whole is not None:
+            own = load_operation(opening.operation) if opening.operation else method_for(self.whole.motion)
+            self.kind: type[Any] = own
+            self.compute()
+
+    @property
+    def can_cut(self) -> bool:
+        """Whether a region and frames can be chosen: the recording can be opened again."""
+        return self.whole is not None and self.path is not None
+
+    @property
+    def is_method(self) -> bool:
+        """Whether the operation is the method of the motion, as that of ``mirrorskin reconstruct``."""
+        return self.whole is not None and self.kind is method_for(self.whole.motion)
+
+    @property
+    def kind_name(self) -> str:
+        """``MODULE:CLASS`` of the operation."""
+        return self.opening.operation or _name_of(self.kind)
+
+    def operations(self) -> dict[str, str]:
+        """Return the operations that apply to the motion: names as in `load_operation`, by label."""
+        if self.whole is None:
+            return {}
+        motion, found = self.whole.motion, {}
+        for name in engine.__all__:
+            kind = getattr(engine, name)
+            if not isinstance(kind, type) or not issubclass(kind, engine.Operation | engine.Method):
+                continue
+            where = getattr(kind, "motions", ())
+            needed = [one for one, must in getattr(kind, "positions", {}).items() if must]
+            has = all(getattr(self.whole, one, None) is not None for one in needed)
+            if kind not in (engine.Operation, engine.Method) and has and (not where or motion in where):
+                method = kind is method_for(motion)
+                found[f"{name} (all steps)" if method else name] = f"{_MODULE}:{name}"
+        if self.opening.operation:
+            found[self.opening.operation.rpartition(":")[2]] = self.opening.operation
+        return dict(sorted(found.items(), key=lambda one: not one[0].endswith("(all steps)")))
+
+    def options(self) -> dict[str, Option]:
+        """Return the options that can be chosen, by name."""
+        found = getattr(self, "kind", None)
+        return {} if found is None else {n: o for n, o in found.options.items() if not o.python_only}
+
+    def value(self, name: str) -> Any:
+        """Return the value of an option."""
+        return self.changed.get(name, self.kind.options[name].default)
+
+    def watch(self, *names: str, callback: Callable[[], None]) -> None:
+        """Call back after a change of "result", "pixel", "measured", "ends" or "part"."""
+        for name in names:
+            self._watchers.setdefault(name, []).append(callback)
+
+    def _tell(self, *names: str) -> None:
+        for callback in dict.fromkeys(one for name in names for one in self._watchers.get(name, [])):
+            callback()
+
+    def choose_operation(self, name: str) -> None:
+        """Choose another operation; its options have their defaults."""
+        self.kind, self.changed = load_operation(name), {}
+        self._tell("operation")
+        self.compute()
+
+    def choose(self, name: str, value: Any) -> None:
+        """Set an option, and compute the result again; a value that is refused leaves the problem only."""
+        declared = self.kind.options[name]
+        try:
+            checked = declared.check(value)
+        except io.InputError as error:
+            self.problem = str(error)
+            self._tell("problem")
+            return
+        if _same(checked, self.value(name)):
+            return
+        self.changed.pop(name, None)
+        if not _same(checked, declared.default):
+            self.changed[name] = checked
+        self.compute()
+
+    def choose_part(self, region: io.Region | None, frames: tuple[int, int | None] | None) -> None:
+        """Use a part of the recording, and compute the result again."""
+        if (region, frames) == (self.region, self.frames):
+            return
+        self.region, self.frames = region, frames
+        if self._part is not None:
+            self._part.close()
+            self._part = None
+        self.measured = self.ends = None
+        self._tell("part")
+        self.compute()
+
+    def point_at(self, row: int, column: int) -> None:
+        """Choose a pixel of the whole picture."""
+        assert self.whole is not None
+        rows, columns = self.whole.shape[1:]
+        if 0 <= row < rows and 0 <= column < columns:
+            self.pixel = row, column
+            self._tell("pixel")
+
+    def measure_in(self, region: io.Region | None) -> None:
+        """Choose the region of the maps that is measured; None for all."""
+        self.measured = region
+        self._tell("measured")
+
+    def cut(self, ends: Ends | None) -> None:
+        """Choose the ends of the section; None for the row through the highest point."""
+        self.ends = ends
+        self._tell("ends")
+
+    def choose_turn(self, turn: int) -> None:
+        """Choose the turn whose maps are shown."""
+        self.turn = turn
+        self._tell("result")
+
+    @property
+    def turns(self) -> int:
+        """Number of turns that the maps have; 0 for maps of all turns together."""
+        size = () if self.now is None else map_shape(self.now.result)
+        return size[0] if len(size) == 3 else 0
+
+    def sheet(self, computed: Computed | None) -> Sheet | None:
+        """Return the maps of a result with their coordinates, of the chosen turn."""
+        if computed is None or not computed.result.maps():
+            return None
+        size = map_shape(computed.result)
+        turn = min(self.turn or 0, size[0] - 1) if len(size) == 3 else None
+        return sheet_of(io.select_turn(computed.result, turn))
+
+    def part(self) -> io.Recording:
+        """Return the recording with the chosen frames and region."""
+        if self._part is None:
+            assert self.path is not None
+            self._part = io.open_recording(
+                self.path, **self.opening.keywords, region=self.region, frames=self.frames
+            )
+        return self._part
+
+    def source(self) -> io.Source:
+        """Return the part; for the method of the motion, with its calibration."""
+        return calibrated(self.part(), self.opening.calibration) if self.is_method else self.part()
+
+    def compute(self) -> None:
+        """Compute the result with the current options; the last one is kept next to it."""
+        started = time.perf_counter()
+        self.problem = ""
+        try:
+            source = self.source()
+            source.rewind()
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always", io.MirrorskinWarning)
+                result = run_class(self.kind, source, device=self.opening.device, **self.changed)
+        except Exception as error:
+            if not hasattr(error, "exit_code"):  # not one of the project's own
+                raise
+            self.problem = str(error)
+            self._tell("problem")
+            return
+        told = [str(one.message) for one in caught]
+        self._keep(Computed(result, self.label(), time.perf_counter() - started, told))
+
+    def label(self) -> str:
+        """Return the options that were changed, in words."""
+        parts = [f"{name.replace('_', ' ')} {shown(value)}" for name, value in self.changed.items()]
+        if self.frames is not None:
+            parts.append(f"frames {self.frames[0]}:{'' if self.frames[1] is None else self.frames[1]}")
+        if self.region is not None:
+            parts.append(f"region {self.region.text}")
+        return ", ".join(parts) or "default options"
+
+    def _keep(self, computed: Computed) -> None:
+        self.before, self.now = self.now, computed
+        self._tell("result", "problem")
+
+    def close(self) -> None:
+        """Close the recording."""
+        for one in (self.whole, self._part):
+            if one is not None and self.path is not None:
+                one.close()
+
+
+def shown(value: Any) -> str:
+    """Return the value of an option for a label."""
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return ", ".join(map(shown, value)) if isinstance(value, list) else str(value)
+
+
+def _same(one: Any, other: Any) -> bool:
+    return type(one) is type(other) and bool(one == other)
+
+
+def _name_of(kind: type[Any]) -> str:
+    public = getattr(engine, kind.__name__, None) is kind
+    return f"{_MODULE if public else kind.__module__}:{kind.__name__}"

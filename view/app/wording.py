@@ -1,0 +1,90 @@
+"""A result as a command and as a Python script that compute the same numbers again."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator
+from typing import Any
+
+from mirrorskin import io
+from mirrorskin.engine.options import Option
+from mirrorskin.view.app.session import Session
+
+_WITH_UNIT = ("mm", "rad", "MPa", "N", "s")
+
+
+def as_command(session: Session) -> str:
+    """Return the command that computes the current result."""
+    assert session.whole is not None
+    words = ["mirrorskin", "reconstruct"] if session.is_method else ["mirrorskin", "run", session.kind_name]
+    words += [str(session.path or session.name), *session.opening.words]
+    if session.region is not None:
+        words += ["--region", session.region.text]
+    if session.frames is not None:
+        words += ["--frames", f"{session.frames[0]}:{'' if session.frames[1] is None else session.frames[1]}"]
+    if session.opening.calibration is not None:
+        words += ["--calibration", str(session.opening.calibration)]
+    if session.opening.device is not None:
+        words += ["--device", session.opening.device]
+    for name, value in session.changed.items():
+        words += _flag(session.kind.options[name], value)
+    return shlex.join([*words, "-o", "result.h5"])
+
+
+def _flag(option: Option, value: Any) -> list[str]:
+    """Return an option with its value; numbers have all their digits, and a unit where one is needed."""
+    name = option.name.replace("_", "-")
+    if option.kind == "flag":
+        return [f"--{name}" if value else f"--no-{name}"]
+    values = value if isinstance(value, list) else [value]
+    return [f"--{name}={','.join(_number(option.unit, one) for one in values)}"]
+
+
+def _number(unit: str, value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    if unit == "counts/rad":
+        return f"{value!r}/rad"
+    return f"{value!r}{unit}" if unit in _WITH_UNIT or unit == "mm/N" else repr(value)
+
+
+def as_python(session: Session) -> str:
+    """Return the Python script that computes the current result."""
+    opening = session.opening
+    options = dict(session.changed)
+    if opening.device is not None:
+        options["device"] = opening.device
+    given = [f"{name}={value!r}" for name, value in options.items()]
+    lines = ["from mirrorskin import engine, io"]
+    if session.is_method:
+        where = [] if opening.calibration is None else [repr(str(opening.calibration))]
+        call = f"engine.reconstruct({', '.join(['recording', *where, *given])})"
+    elif session.kind_name.startswith("mirrorskin.engine:"):
+        call = f"engine.run(recording, engine.{session.kind.__name__}({', '.join(given)}))"
+    else:
+        lines = [
+            "from mirrorskin import io",
+            "from mirrorskin.engine.running import load_operation, run_class",
+        ]
+        call = f"run_class({', '.join([f'load_operation({session.kind_name!r})', 'recording', *given])})"
+    lines += [
+        "",
+        f"with io.open_recording({', '.join(_opening(session))}) as recording:",
+        f"    result = {call}",
+    ]
+    return "\n".join([*lines, 'io.save_result(result, "result.h5")', ""])
+
+
+def _opening(session: Session) -> Iterator[str]:
+    """Yield the arguments of `io.open_recording`."""
+    assert session.whole is not None
+    yield repr(str(session.path or session.name))
+    for name, value in session.opening.keywords.items():
+        if hasattr(value, "positions") and not isinstance(value, io.Steps):  # listed in a file
+            yield f"{name}={list(map(float, value.positions(session.whole.shape[0])))}"
+        else:
+            yield f"{name}={'io.' if isinstance(value, io.Steps) else ''}{value!r}"
+    if session.region is not None:
+        yield f"region=io.{session.region!r}"
+    if session.frames is not None:
+        yield f"frames={session.frames!r}"
