@@ -43,7 +43,9 @@ _OPAQUE = 255
 _WORD = (
     'const found = words instanceof Map ? words.get(String(value)) : words[value]; return found ?? "unknown"'
 )
-_NUMBER = 'return isNaN(value) ? "unknown" : Number(value).toPrecision(5)'
+_UNKNOWN = np.float32(3e38)
+"""What stands for NaN, which Bokeh shows as it is."""
+_NUMBER = 'return value > 1e38 ? "unknown" : Number(value).toPrecision(5)'
 
 
 @dataclass(frozen=True)
@@ -172,12 +174,12 @@ def _read_at_pixels(sheet: Sheet, name: str) -> Readings:
         parts = declared.components or ("",)
         for number, part in enumerate(parts):
             key = f"value{number}"
-            columns[key] = (values[..., number] if part else values).astype(np.float32)
+            columns[key] = _to_read(values[..., number] if part else values)
             tooltips.append((part or declared.title_of(name), f"@{key}{{custom}} {unit}".strip()))
     sigma = f"{name}{SIGMA}"
     if sigma in result and result[sigma].ndim == 2:
         error = result.declaration(sigma)
-        columns["sigma"] = displayed_values(sheet, sigma).astype(np.float32)
+        columns["sigma"] = _to_read(displayed_values(sheet, sigma))
         tooltips.append(("Standard deviation", f"@sigma{{custom}} {error.figure_unit}"))
     status = "status"
     if status in result and name != status and result.declaration(status).codes:
@@ -189,6 +191,10 @@ def _read_at_pixels(sheet: Sheet, name: str) -> Readings:
         tooltips.append(("Origin", "@filled{custom}"))
         words["@filled"] = result.declaration("filled").codes
     return Readings(columns, tooltips, words)
+
+
+def _to_read(values: NDArray[Any]) -> NDArray[np.float32]:
+    return np.where(np.isfinite(values), values, _UNKNOWN).astype(np.float32)
 
 
 def _classes(sheet: Sheet, name: str) -> tuple[NDArray[np.uint8], list[str], list[tuple[str, str]]]:

@@ -111,7 +111,7 @@ class ResultPane:
             self._draw("before", before, show_map(before, name, now), self._session.before)
         other = [self._panes["before"]] if fits else []
         if self._session.before is None and self._session.whole is not None:
-            other = [text(hint("Change an option: the result before is then shown here."), margin=(160, 60))]
+            other = [text(hint("After a change of an option, the previous result is shown here."), margin=(160, 60))]
         self._pair[:] = [self._panes["now"], *other]
         self.caption.object = f"<p>{now.caption}</p>{_legend(sheet, now, self.marked.value)}"
 
@@ -201,7 +201,7 @@ def _legend(sheet: Sheet, shown: Shown, marked: bool) -> str:
         if marked and filled:
             rows.append((hex_of(FILLED_RGB), f"filled, not measured {percent(filled, values.size)}"))
     keys = (f'<span class="key"><i style="background:{colour}"></i>{text}</span>' for colour, text in rows)
-    return "".join([*keys, shown.key])
+    return f'<div class="keys">{"".join([*keys, shown.key])}</div>'
 
 
 class _SectionGraph:
