@@ -32,7 +32,7 @@ class OptionsPane:
         self._session = session
         self.widgets: dict[str, Any] = {}
         self.operation = pn.widgets.Select(
-            name="Operation",
+            label="Operation",
             options=session.operations(),
             value=session.kind_name,
             width=_WIDTH,
@@ -40,7 +40,7 @@ class OptionsPane:
         )
         self._first, self._more = pn.Column(margin=0), pn.Column(margin=0)
         self.problem = text(width=_WIDTH)
-        self.reset = pn.widgets.Button(name="Reset all options", width=_WIDTH, button_type="light")
+        self.reset = pn.widgets.Button(label="Reset all options", width=_WIDTH, color="light")
         self.operation.param.watch(lambda event: session.choose_operation(event.new), "value")
         self.reset.on_click(lambda _: session.choose_operation(session.kind_name))
         session.watch("operation", callback=self._build)
@@ -88,21 +88,21 @@ def widget_of(option: Option, value: Any) -> tuple[Any, Any]:
     about = described(option)
     widgets, given = pn.widgets, {"width": _WIDTH, "description": about}
     if option.kind == "flag":
-        box = widgets.Checkbox(name=label, value=value, margin=(8, 0, 8, 10))
+        box = widgets.Checkbox(label=label, value=value, margin=(8, 0, 8, 10))
         return box, pn.Row(box, widgets.TooltipIcon(value=about, margin=(6, 5)))
     if option.kind == "choice":
-        field = widgets.Select(name=label, options=[*option.choices], value=value, **given)
+        field = widgets.Select(label=label, options=[*option.choices], value=value, **given)
         return field, field
     low, high = option.within
     if option.kind == "integer" and option.default is not None:
         end = high if high is not None and high < _ANY else None
-        field = widgets.IntInput(name=titled, value=value, start=low, end=end, **given)
+        field = widgets.IntInput(label=titled, value=value, start=low, end=end, **given)
         return field, field
     if option.kind == "number" and option.default is not None and low is not None and high is not None:
         step = (high - low) / _STEPS
-        field = widgets.FloatInput(name=titled, value=value, start=low, end=high, step=step, **given)
+        field = widgets.FloatInput(label=titled, value=value, start=low, end=high, step=step, **given)
         slider = widgets.FloatSlider(
-            name="",
+            label="",
             start=low,
             end=high,
             step=step,
@@ -115,7 +115,7 @@ def widget_of(option: Option, value: Any) -> tuple[Any, Any]:
         field.param.watch(lambda event: slider.param.update(value=event.new), "value")
         return field, pn.Column(field, slider, margin=0)
     field = widgets.TextInput(
-        name=titled, value=written(option, value), placeholder=option.shown_default or "none", **given
+        label=titled, value=written(option, value), placeholder=option.shown_default or "none", **given
     )
     return field, field
 

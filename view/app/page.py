@@ -28,7 +28,7 @@ class App:
     ----------
     *sources : path, Recording or Result
         What is shown; of several, one at a time.
-    opening : Opening, optional
+    opening : Opening, or one for each source, optional
         How recordings are opened, and the device.
 
     Attributes
@@ -57,10 +57,12 @@ class App:
         if not sources:
             raise io.InputError("the application needs a recording or a result: name a file")
         pn.extension()
-        self._sources, self._opening = sources, opening or Opening()
+        one = opening or Opening()
+        self._sources = sources
+        self._openings = [one] * len(sources) if isinstance(one, Opening) else [*one]
         names = [_name_of(one, number) for number, one in enumerate(sources)]
         self.choice = pn.widgets.Select(
-            options=dict(zip(names, range(len(names)), strict=True)), width=280, name="", value=0
+            options=dict(zip(names, range(len(names)), strict=True)), width=280, label="", value=0
         )
         self.choice.param.watch(lambda _: self._open(), "value")
         self._about = text(sizing_mode="stretch_width", margin=(9, 10))
@@ -80,7 +82,8 @@ class App:
         """Show the chosen file."""
         if self.session is not None:
             self.session.close()
-        session = Session(self._sources[self.choice.value], self._opening)
+        number = self.choice.value
+        session = Session(self._sources[number], self._openings[number])
         self.session = session
         session.watch("result", "problem", callback=self._describe)
         tabs: list[tuple[str, Any]] = []
@@ -139,11 +142,11 @@ def _name_of(source: Shown, number: int) -> str:
     return source.name if isinstance(source, io.Recording) else f"result {number + 1}"
 
 
-def pages(sources: Sequence[Path], opening: Opening) -> Any:
+def pages(sources: Sequence[Path], openings: Sequence[Opening]) -> Any:
     """Return a function that makes the page of one browser window."""
 
     def page() -> Any:
-        app = App(*sources, opening=opening)
+        app = App(*sources, opening=openings)
         pn.state.on_session_destroyed(lambda _: app.close())
         return app.view
 

@@ -27,7 +27,7 @@ from mirrorskin.view.app.trace import Trace, trace_of
 from mirrorskin.view.canvas import extent
 
 _PICTURE = 480, 520  # largest size, CSS pixels
-_GRAPH = 560, 330
+_GRAPH = 515, 330
 _COLOURS = {"Dark": "#56606b", "Threshold": "#d55e00", "Bright": "#8a6d00"}
 _LINE, _FIT = "#0072b2", "#d55e00"
 _HINT = "Click a pixel to see its brightness. Drag to draw the region that is used."
@@ -53,11 +53,11 @@ class RecordingPane:
         self.dragging = Dragging(self.picture, self._drawn)
         self.picture.figure.on_event(Tap, self._tapped)
         self.frame = pn.widgets.IntSlider(
-            name="Frame", start=0, end=count - 1, value=count // 2, width=_PICTURE[0] + 60
+            label="Frame", start=0, end=count - 1, value=count // 2, width=_PICTURE[0] + 60
         )
-        self.automatic = pn.widgets.Checkbox(name="Scale grey levels to this frame", value=True)
+        self.automatic = pn.widgets.Checkbox(label="Scale grey levels to this frame", value=True)
         self.frames = pn.widgets.IntRangeSlider(
-            name="Frames used",
+            label="Frames used",
             start=0,
             end=count,
             step=1,
@@ -65,9 +65,7 @@ class RecordingPane:
             width=300,
             disabled=not session.can_cut,
         )
-        self.whole = pn.widgets.Button(
-            name="Use the whole picture", width=180, disabled=True, button_type="light"
-        )
+        self.whole = pn.widgets.Button(label="Use the whole picture", width=180, disabled=True, color="light")
         self.graph = _Graph()
         self.facts = text(width=_GRAPH[0])
         self.frame.param.watch(lambda _: self._show_frame(), "value")
@@ -86,7 +84,7 @@ class RecordingPane:
                 pn.Row(self.automatic, self.whole),
                 text(hint(_HINT)),
             ),
-            pn.Column(self.frames, pn.pane.Bokeh(self.graph.figure), self.facts, width=_GRAPH[0] + 40),
+            pn.Column(self.frames, pn.pane.Bokeh(self.graph.figure), self.facts, width=_GRAPH[0] + 20),
         )
 
     def _show_frame(self) -> None:
@@ -94,7 +92,7 @@ class RecordingPane:
         number = self.frame.value
         self.picture.show(show_frame(self._session.whole.frame(number), "", self.automatic.value))
         axis = self._where(number)
-        self.frame.name = f"Frame{axis}"
+        self.frame.label = f"Frame{axis}"
 
     def _where(self, number: int) -> str:
         """Return the position of the body in a frame, in words."""
@@ -153,8 +151,8 @@ class RecordingPane:
         if trace is None:
             self.facts.object = hint("This pixel is outside of the region that is used.")
             return
-        self.graph.show(trace, f"Pixel in row {row}, column {column}")
-        self.facts.object = table(trace.facts)
+        self.graph.show(trace, "Brightness of the pixel")
+        self.facts.object = table({"Pixel": f"row {row}, column {column}", **trace.facts})
 
 
 class _Graph:

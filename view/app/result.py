@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -42,18 +43,19 @@ class ResultPane:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self.map = pn.widgets.Select(name="Map", width=230)
-        self.compared = pn.widgets.Checkbox(name="Show the previous result", value=True)
-        self.marked = pn.widgets.Checkbox(name="Mark filled heights", value=True)
-        self.drag = pn.widgets.RadioButtonGroup(options=_DRAG, value="section", button_type="default")
-        self.turn = pn.widgets.IntInput(name="Turn", start=0, width=80, visible=False)
+        self.map = pn.widgets.Select(label="Map", width=230)
+        self.compared = pn.widgets.Checkbox(label="Show the previous result", value=True)
+        self.marked = pn.widgets.Checkbox(label="Mark filled heights", value=True)
+        self.drag = pn.widgets.RadioButtonGroup(options=_DRAG, value="section", color="default")
+        self.turn = pn.widgets.IntInput(label="Turn", start=0, width=80, visible=False)
         self._pictures: dict[str, Picture] = {}
         self._dragging: Dragging | None = None
         self._pair = pn.Row()
         self.caption = text(width=1100)
         self.section = _SectionGraph()
+        self.where = text()
         self.measures = text(width=500)
-        self.restart = pn.widgets.Button(name="Measure the whole map", width=190, button_type="light")
+        self.restart = pn.widgets.Button(label="Measure the whole map", width=190, color="light")
         self._place: tuple[Any, ...] = ()
         self.map.param.watch(lambda _: self._show_maps(), "value")
         self.compared.param.watch(lambda _: self._show_maps(), "value")
@@ -70,8 +72,8 @@ class ResultPane:
             self._pair,
             self.caption,
             pn.Row(
-                pn.Column(pn.pane.Bokeh(self.section.figure)),
-                pn.Column(self.restart, self.measures),
+                pn.Column(self.where, pn.pane.Bokeh(self.section.figure)),
+                pn.Column(self.measures, self.restart),
             ),
         )
 
@@ -95,7 +97,7 @@ class ResultPane:
         self.section.figure.visible = height is not None
         self._show_maps()
         self._show_section()
-        self._show_measures()
+        _later(self._show_measures)
 
     def _show_maps(self) -> None:
         name = self.map.value
@@ -111,7 +113,11 @@ class ResultPane:
             self._draw("before", before, show_map(before, name, now), self._session.before)
         other = [self._panes["before"]] if fits else []
         if self._session.before is None and self._session.whole is not None:
-            other = [text(hint("After a change of an option, the previous result is shown here."), margin=(160, 60))]
+            other = [
+                text(
+                    hint("After a change of an option, the previous result is shown here."), margin=(160, 60)
+                )
+            ]
         self._pair[:] = [self._panes["now"], *other]
         self.caption.object = f"<p>{now.caption}</p>{_legend(sheet, now, self.marked.value)}"
 
@@ -168,6 +174,8 @@ class ResultPane:
         if before is not None and before.result.height is not None and before.place == sheet.place:
             other = section(before.result, (cut.x[0], cut.y[0]), (cut.x[-1], cut.y[-1]))
         self.section.show(sheet, cut, other)
+        ends = [f"({cut.x[end]:.3g}, {cut.y[end]:.3g})" for end in (0, -1)]
+        self.where.object = f"<p>Section from {ends[0]} to {ends[1]} {sheet.unit}</p>"
 
     def _show_measures(self) -> None:
         sheet = self._session.sheet(self._session.now)
@@ -186,7 +194,17 @@ class ResultPane:
             self.measures.object = problem(str(error))
             return
         rows = {name: str(value) for name, value in measures.quantities.items()}
-        self.measures.object = table(rows, _SECTION[1] - 40)
+        where = "the whole map" if region is None else f"the region {region.text}"
+        self.measures.object = f"<h3>Measures of {where}</h3>{table(rows, _SECTION[1] - 60)}"
+
+
+def _later(callback: Callable[[], None]) -> None:
+    """Call back after the browser has been sent what was drawn so far; at once without a browser."""
+    document = pn.state.curdoc
+    if document is not None and document.session_context is not None:
+        document.add_next_tick_callback(callback)
+    else:
+        callback()
 
 
 def _legend(sheet: Sheet, shown: Shown, marked: bool) -> str:

@@ -43,12 +43,12 @@ class SavePane:
         self._session = session
         names = [_RESULT, _REPORT, *(one for one in suffixes() if one not in _SAME)]
         self.format = pn.widgets.Select(
-            name="File", options={_WHAT.get(one, one): one for one in names}, value=_RESULT, width=460
+            label="File", options={_WHAT.get(one, one): one for one in names}, value=_RESULT, width=460
         )
         self.download = pn.widgets.FileDownload(
             callback=self._file,
             filename="result.h5",
-            button_type="primary",
+            color="primary",
             width=220,
             label="Save result.h5",
         )
@@ -64,7 +64,7 @@ class SavePane:
                 ("The same result on the command line", self.command),
                 ("The same result in Python", self.python),
             ):
-                copy = pn.widgets.Button(name="Copy", width=90, button_type="light")
+                copy = pn.widgets.Button(label="Copy", width=90, color="light")
                 copy.js_on_click(args={"source": area}, code="navigator.clipboard.writeText(source.value)")
                 texts += [heading(title), area, copy]
         self.view = pn.Column(
@@ -121,7 +121,7 @@ class SavePane:
 
 def _text(name: str, height: int) -> Any:
     return pn.widgets.TextAreaInput(
-        name="",
+        label="",
         height=height,
         width=900,
         disabled=False,

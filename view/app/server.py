@@ -6,6 +6,7 @@ exist. WebSockets are accepted from pages of this server only.
 
 from __future__ import annotations
 
+import asyncio
 import secrets
 import signal
 import socket
@@ -51,7 +52,9 @@ class AppServer:
     """
 
     def __init__(self, page: Callable[[], Any], port: int = 0) -> None:
+        from panel.io.resources import DIST_DIR
         from panel.io.server import get_server
+        from tornado.web import StaticFileHandler
 
         port = _free_port(port)
         token = secrets.token_urlsafe(_TOKEN_BYTES)
@@ -63,6 +66,8 @@ class AppServer:
             websocket_origin=f"{HERE}:{port}",
             prefix=token,
             title="mirrorskin",
+            ico_path="none",  # Bokeh's is at an address without the token
+            extra_patterns=[(r"/(favicon\.ico)", StaticFileHandler, {"path": str(DIST_DIR / "images")})],
             show=False,
             start=False,
             session_token_expiration=86400,
@@ -72,6 +77,7 @@ class AppServer:
 
     def run(self, browser: bool) -> None:
         """Serve until the program is interrupted."""
+        self._server.io_loop.asyncio_loop.set_exception_handler(_handle)
         self._server.start()
         if browser:
             self._server.io_loop.add_callback(webbrowser.open, self.address)
@@ -81,6 +87,12 @@ class AppServer:
     def close(self) -> None:
         """Stop serving, and close all pages."""
         self._server.stop(wait=False)
+
+
+def _handle(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Report an error, unless it is that a page was closed while it was sent something."""
+    if type(context.get("exception")).__name__ != "WebSocketClosedError":
+        loop.default_exception_handler(context)
 
 
 def _restore(handler: Any) -> None:

@@ -98,7 +98,7 @@ class Session:
             self._keep(Computed(source, "stored result"))
         elif isinstance(source, io.Recording):
             self.name, self.whole, self._part = source.name, source, source
-        elif not kind_of_frames(Path(source)) and is_result(source):
+        elif holds_result(Path(source)):
             self.name = Path(source).name
             self._keep(Computed(io.open_result(source), "stored result"))
         else:
@@ -282,6 +282,11 @@ class Session:
         for one in (self.whole, self._part):
             if one is not None and self.path is not None:
                 one.close()
+
+
+def holds_result(path: Path) -> bool:
+    """Return whether a file is a result, not frames."""
+    return not kind_of_frames(path) and is_result(path)
 
 
 def shown(value: Any) -> str:

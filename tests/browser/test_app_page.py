@@ -1,0 +1,187 @@
+"""The application in a real browser: open the sample, click, change an option, save, compare."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from commands import done
+from playwright.sync_api import expect
+
+from mirrorskin import io
+
+PATIENCE = 60.0  # seconds
+SCREENSHOTS = os.environ.get("MIRRORSKIN_SCREENSHOTS")  # a folder to keep pictures of the pages in
+SIZE = {"width": 1440, "height": 900}
+BESIDE = 0.68, 0.5  # a place in the picture where the ball is touched, shares of its width and height
+
+
+@pytest.fixture(scope="module")
+def press(tmp_path_factory):
+    path = tmp_path_factory.mktemp("app") / "press.h5"
+    done("sample press -o", path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def address(press):
+    """The address of the application, in a process of its own."""
+    command = [sys.executable, "-m", "mirrorskin.cli.main", "app", str(press), "--no-browser"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        yield server.stdout.readline().strip()
+        server.terminate()
+
+
+class Page:
+    """The application in a window of its own; what it asks for and complains of is kept."""
+
+    def __init__(self, browser, address):
+        self.context = browser.new_context(
+            viewport=SIZE, accept_downloads=True, permissions=["clipboard-read", "clipboard-write"]
+        )
+        self.context.set_default_timeout(1000 * PATIENCE)
+        self.page, self.requests, self.complaints = self.context.new_page(), [], []
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("console", self._heard)
+        self.command = self.page.locator("textarea").first
+        self.page.goto(address)
+        self.page.get_by_text("Click a pixel to see its brightness.").wait_for()
+
+    def _heard(self, message):
+        if message.type in ("error", "warning"):
+            self.complaints.append(message.text)
+
+    def show(self, tab):
+        self.page.locator(".bk-tab", has_text=tab).click()
+
+    def click(self, across, down):
+        """Click at a place of the frame."""
+        box = self.page.locator(".bk-Canvas").first.bounding_box()
+        self.page.mouse.click(box["x"] + across * box["width"], box["y"] + down * box["height"])
+
+    def fact(self, name):
+        """Return what the table next to the graph says."""
+        row = self.page.locator("tr", has=self.page.get_by_text(name, exact=True))
+        return row.locator("td").inner_text()
+
+    def set_threshold(self, value):
+        field = self.page.get_by_label("Threshold (share)")
+        field.fill(str(value))
+        field.press("Enter")
+
+    def keep(self, name):
+        if SCREENSHOTS:
+            self.page.screenshot(path=f"{SCREENSHOTS}/{name}.png")
+
+
+@pytest.fixture
+def opened(browser, address):
+    page = Page(browser, address)
+    yield page
+    page.context.close()
+
+
+def by_command(press, folder, *options):
+    """Return the result of the command line."""
+    path = folder / "command.h5"
+    done("reconstruct", press, *options, "-o", path)
+    return io.open_result(path)
+
+
+def test_a_click_shows_the_numbers_of_the_command_line(opened, press, tmp_path):
+    opened.click(*BESIDE)
+    opened.page.get_by_text("Travel at the onset").wait_for()
+    row, column = map(int, re.fullmatch(r"row (\d+), column (\d+)", opened.fact("Pixel")).groups())
+    result = by_command(press, tmp_path)
+    height, sigma = result.height[row, column], result.height_sigma[row, column]
+    opened.keep("app-recording")
+    assert opened.fact("Travel at the onset") == f"{-height:.4f} mm ± {1e3 * sigma:.2f} µm"
+
+
+def test_a_new_threshold_is_saved_as_the_command_line_saves_it(opened, press, tmp_path):
+    opened.set_threshold(0.37)
+    opened.show("Save and copy")
+    expect(opened.command).to_have_value(re.compile("--threshold=0.37"))
+    with opened.page.expect_download() as download:
+        opened.page.get_by_text("Save press-result.h5").click()
+    saved = tmp_path / "saved.h5"
+    download.value.save_as(saved)
+    found, expected = io.open_result(saved), by_command(press, tmp_path, "--threshold", "0.37")
+    assert {*found} == {*expected}
+    for name in expected:
+        np.testing.assert_array_equal(found[name], expected[name])
+
+
+def test_the_command_is_copied(opened):
+    opened.show("Save and copy")
+    expect(opened.command).to_have_value(re.compile("mirrorskin reconstruct"))
+    command = opened.command.input_value()
+    opened.page.get_by_text("Copy", exact=True).first.click()
+    opened.page.wait_for_function("async text => await navigator.clipboard.readText() === text", arg=command)
+
+
+def test_the_previous_result_is_shown_next_to_the_new_one(opened):
+    opened.show("Result")
+    opened.page.get_by_text("After a change of an option").wait_for()
+    opened.set_threshold(0.4)
+    opened.page.get_by_text("After a change of an option").wait_for(state="detached")
+    assert opened.page.locator(".bk-Canvas").count() == 3
+    opened.keep("app-result")
+
+
+def test_a_section_is_drawn_by_dragging(opened):
+    opened.show("Result")
+    opened.page.get_by_text("highest point", exact=True).wait_for()
+    box = opened.page.locator(".bk-Canvas").first.bounding_box()
+    places = [(box["x"] + share * box["width"], box["y"] + 0.4 * box["height"]) for share in (0.3, 0.5, 0.6)]
+    opened.page.mouse.move(*places[0])
+    opened.page.mouse.down()
+    for place in places[1:]:
+        opened.page.mouse.move(*place, steps=4)
+    opened.page.mouse.up()
+    opened.page.get_by_text("from (").wait_for()
+
+
+def test_a_region_is_measured_by_dragging(opened):
+    opened.show("Result")
+    opened.page.get_by_text("Draw a region to measure").click()
+    whole = opened.page.get_by_text("Measures of the whole map")
+    whole.wait_for()
+    box = opened.page.locator(".bk-Canvas").first.bounding_box()
+    opened.page.mouse.move(box["x"] + 0.35 * box["width"], box["y"] + 0.3 * box["height"])
+    opened.page.mouse.down()
+    opened.page.mouse.move(box["x"] + 0.55 * box["width"], box["y"] + 0.6 * box["height"], steps=5)
+    opened.page.mouse.up()
+    opened.page.get_by_text("Measures of the region").wait_for()
+
+
+def test_the_surface_is_drawn(opened):
+    opened.show("Surface")
+    frame = opened.page.frame_locator("iframe[title=Surface]")
+    frame.locator("#surface.drawn").wait_for()
+    opened.keep("app-surface")
+
+
+@pytest.mark.parametrize("tab", ["Recording", "Result", "Surface", "Save and copy"])
+def test_nothing_needs_to_be_scrolled(opened, tab):
+    opened.show(tab)
+    opened.page.wait_for_load_state("networkidle")
+    high, wide = opened.page.evaluate(
+        "() => [document.scrollingElement.scrollHeight, document.scrollingElement.scrollWidth]"
+    )
+    assert high <= SIZE["height"]
+    assert wide <= SIZE["width"]
+
+
+def test_it_asks_no_other_machine_and_complains_of_nothing(opened, address):
+    for tab in ("Result", "Surface", "Save and copy"):
+        opened.show(tab)
+    opened.page.wait_for_load_state("networkidle")
+    own = address.rpartition("/")[0]
+    assert [url for url in opened.requests if not url.startswith((own, "data:", "about:", "blob:"))] == []
+    assert opened.complaints == []

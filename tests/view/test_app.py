@@ -1,0 +1,247 @@
+"""The application's panes, without a browser: what a click, an option or a region changes."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import param
+import pytest
+from shown import ball
+from stacks import record
+
+from mirrorskin import engine, hw, io
+from mirrorskin.hw.twin import Axial, Vertical
+from mirrorskin.io.maps import TABLE
+from mirrorskin.view.app import App, Opening
+from mirrorskin.view.app.options import read, widget_of
+from mirrorskin.view.app.picture import show_map
+from mirrorskin.view.app.session import Session
+from mirrorskin.view.app.trace import trace_of
+from mirrorskin.view.result.sheet import sheet_of
+
+SHAPE = (40, 50)
+PIXEL = 0.2  # mm
+TRAVEL = 0.1 * np.arange(15)
+TOUCHED = 20, 32  # a pixel that turns light, away from the top, which is filled
+
+
+@pytest.fixture(scope="module")
+def press(tmp_path_factory):
+    """A recording of a press on a ball."""
+    path = tmp_path_factory.mktemp("app") / "press.h5"
+    twin = hw.Twin(object="sphere", shape=SHAPE, pixel_size=PIXEL, movement=Vertical(TRAVEL))
+    record(twin, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def turn(tmp_path_factory):
+    """A recording of a rotation on a ball."""
+    path = tmp_path_factory.mktemp("app") / "turn.h5"
+    movement = Axial(np.arange(8) * np.pi / 4, tilt=0.04, press=1.0)
+    record(hw.Twin(object="sphere", shape=SHAPE, pixel_size=PIXEL, movement=movement, pattern="linear"), path)
+    return path
+
+
+@pytest.fixture
+def app(press):
+    made = App(press)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def session(press):
+    made = Session(press)
+    yield made
+    made.close()
+
+
+def test_a_recording_is_reconstructed_as_on_the_command_line(session, press):
+    with io.open_recording(press) as recording:
+        expected = engine.reconstruct(recording)
+    np.testing.assert_array_equal(session.now.result.height, expected.height)
+
+
+def test_every_option_of_the_operation_has_a_widget(app):
+    declared = [name for name, one in engine.Press.options.items() if not one.python_only]
+    assert list(app.options.widgets) == declared
+
+
+def test_an_option_that_changes_computes_the_result_again(app, press):
+    app.options.widgets["threshold"].value = 0.3
+    with io.open_recording(press) as recording:
+        expected = engine.reconstruct(recording, threshold=0.3)
+    np.testing.assert_array_equal(app.session.now.result.height, expected.height)
+
+
+def test_the_previous_result_is_kept_next_to_the_new_one(app):
+    first = app.session.now
+    app.options.widgets["hold"].value = 3
+    assert app.session.before is first
+    assert len(app.result._pair) == 2
+
+
+def test_an_option_that_is_refused_says_why_and_keeps_the_result(app):
+    first = app.session.now
+    app.options.widgets["noise"].value = "-1"
+    assert app.session.now is first
+    assert "a number in counts of at least 0 is needed" in app.options.problem.object
+
+
+def test_a_text_that_is_no_number_is_refused(app):
+    app.options.widgets["noise"].value = "much"
+    assert "noise much" in app.options.problem.object
+
+
+def test_another_operation_has_its_own_options(app):
+    app.options.operation.value = "mirrorskin.engine:ChangePoint"
+    assert "subframe" not in app.options.widgets
+    assert app.session.now.result.process["operation"] == "ChangePoint"
+
+
+def test_angles_are_written_in_degrees():
+    tilt = engine.Rotation.options["tilt"]
+    field, _ = widget_of(tilt, 0.1)
+    assert field.label == "Tilt (deg)"
+    assert read(tilt, field.value) == pytest.approx(0.1, rel=1e-9)
+    assert read(tilt, "estimate") == "estimate"
+    assert read(tilt, "") is None
+
+
+def test_a_click_shows_the_brightness_with_levels_and_the_onset(app):
+    left, right, bottom, top = app.recording.picture.place
+    row, column = TOUCHED
+    x = left + (column + 0.5) * (right - left) / SHAPE[1]
+    y = top - (row + 0.5) * (top - bottom) / SHAPE[0]
+    app.recording._tapped(SimpleNamespace(x=x, y=y))
+    assert app.session.pixel == TOUCHED
+    trace = trace_of(app.session)
+    np.testing.assert_allclose(trace.position, TRAVEL)
+    assert trace.event == -app.session.now.result.height[TOUCHED]
+    assert trace.event_sigma == app.session.now.result.height_sigma[TOUCHED]
+    assert trace.levels["Dark"] < trace.levels["Threshold"] < trace.levels["Bright"]
+    assert "Travel at the onset" in app.recording.facts.object
+    assert app.recording.graph.event.location == trace.event
+
+
+def test_the_threshold_of_a_pixel_follows_the_option(session):
+    session.point_at(*TOUCHED)
+    session.choose("threshold", 0.25)
+    low, level, high = trace_of(session).levels.values()
+    assert level == pytest.approx(low + 0.25 * (high - low))
+
+
+def test_a_filled_pixel_has_no_onset(session):
+    row, column = np.argwhere(session.now.result.filled > 0)[0]
+    session.point_at(int(row), int(column))
+    assert np.isnan(trace_of(session).event)
+
+
+def test_a_rotation_shows_the_cosine_that_fits(turn):
+    session = Session(turn)
+    session.point_at(20, 32)
+    trace = trace_of(session)
+    with io.open_recording(turn) as recording:
+        frames = np.stack([recording.frame(number) for number in range(8)])
+    fit = engine.correlate(frames, np.arange(8) * np.pi / 4)
+    assert trace.facts["Amplitude"] == f"{fit.modulation[20, 32]:.2f} counts"
+    x, y = trace.curve
+    assert y[0] == pytest.approx(fit.mean[20, 32] + fit["cosine"][20, 32], abs=1e-3)
+    assert x[0] == 0
+    session.close()
+
+
+def test_a_region_that_is_drawn_is_used(app, press):
+    left, _, bottom, top = app.recording.picture.place
+    app.recording._drawn("region", (left, top), (0.0, bottom))
+    assert app.session.region == io.Region((0, 40), (0, 25))
+    assert app.session.now.result.height.shape == (40, 25)
+    assert app.recording.dragging.box.visible
+    app.recording.whole.param.trigger("clicks")
+    assert app.session.region is None
+
+
+def test_frames_that_are_chosen_are_used(app, press):
+    slider = app.recording.frames
+    slider.value = (0, 9)
+    with param.edit_constant(slider):  # as the browser does when the pointer lets go
+        slider.value_throttled = (0, 9)
+    with io.open_recording(press, frames=(0, 9)) as recording:
+        expected = engine.reconstruct(recording)
+    np.testing.assert_array_equal(app.session.now.result.height, expected.height)
+
+
+def test_a_pixel_outside_of_the_region_has_no_brightness(session):
+    session.point_at(*TOUCHED)
+    session.choose_part(io.Region((0, 10), (0, 10)), None)
+    assert trace_of(session) is None
+
+
+def test_a_section_is_where_it_was_drawn(app):
+    app.result._drawn("section", (-2.0, 0.5), (2.0, 0.5))
+    x = app.result.section.sources["now"].data["x"]
+    assert x[-1] == pytest.approx(4.0)
+    assert app.result._dragging.line.data["y"].tolist() == [0.5, 0.5]
+
+
+def test_measures_are_those_of_the_region_that_was_drawn(app):
+    app.result._drawn("region", (-4.0, 2.0), (0.0, -2.0))
+    region = app.session.measured
+    assert region == io.Region((10, 30), (5, 25))
+    expected = engine.measure(app.session.now.result, region=region)
+    assert str(expected.quantities["highest point"]) in app.result.measures.object
+    app.result.restart.param.trigger("clicks")
+    assert app.session.measured is None
+
+
+@pytest.mark.parametrize("name", [*ball().maps()])
+def test_every_map_has_colours_a_caption_and_what_the_pointer_reads(name):
+    shown = show_map(sheet_of(ball()), name)
+    assert shown.title == ball().declaration(name).title_of(name)
+    assert shown.readings.columns
+    assert shown.label or shown.legend or shown.key
+    assert TABLE[name].caption[1:] in shown.caption if name in TABLE else True
+
+
+def test_the_pointer_reads_a_height_with_its_standard_deviation_in_the_units_of_figures():
+    result = ball()
+    shown = show_map(sheet_of(result), "height")
+    assert [text for text, _ in shown.readings.tooltips] == [
+        "x, y",
+        "Height",
+        "Standard deviation",
+        "Status",
+        "Origin",
+    ]
+    known = np.isfinite(result.height)
+    np.testing.assert_allclose(shown.readings.columns["value0"][known], result.height[known])
+    known = np.isfinite(result.height_sigma)
+    np.testing.assert_allclose(shown.readings.columns["sigma"][known], 1e3 * result.height_sigma[known], 1e-6)
+
+
+def test_a_result_alone_has_no_recording_to_click(tmp_path):
+    path = tmp_path / "ball.h5"
+    io.save_result(ball(), path)
+    app = App(path)
+    assert app.recording is None
+    assert app.options is None
+    assert "Height" in app.result.map.options
+
+
+def test_an_open_recording_and_a_result_can_be_shown_in_a_notebook(press):
+    with io.open_recording(press) as recording:
+        app = App(recording, ball())
+        assert app.session.now.result.height.shape == SHAPE
+        app.choice.value = 1
+        assert app.session.now.result.height.shape == (24, 32)
+
+
+def test_a_recording_is_opened_as_the_command_line_says(press):
+    session = Session(press, Opening(keywords={"pixel_size": (0.4, 0.4)}))
+    assert session.now.result.x[1] - session.now.result.x[0] == pytest.approx(0.4)
+    session.close()
+
+
+def test_nothing_to_show_is_refused():
+    with pytest.raises(io.InputError, match="name a file"):
+        App()

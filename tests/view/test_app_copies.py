@@ -1,0 +1,174 @@
+"""What the application saves and copies: files by the exporters, and texts that compute the same numbers."""
+
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from commands import done
+from shown import ball
+from stacks import record
+
+from mirrorskin import hw, io
+from mirrorskin.cli.main import app as mirrorskin
+from mirrorskin.cli.stack import stack_words
+from mirrorskin.hw.twin import Axial, Vertical
+from mirrorskin.io.export import suffixes
+from mirrorskin.view.app.save import SavePane
+from mirrorskin.view.app.session import Opening, Session
+from mirrorskin.view.app.wording import as_command, as_python
+
+SHAPE, PIXEL = (30, 36), 0.26
+REGION = io.Region((2, 28), (4, 34))
+
+
+@pytest.fixture
+def press(tmp_path, monkeypatch):
+    """A recording of a press, in a folder whose name has a space and a quote."""
+    folder = tmp_path / "it's a press"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    twin = hw.Twin(object="sphere", shape=SHAPE, pixel_size=PIXEL, movement=Vertical(0.1 * np.arange(12)))
+    return record(twin, folder / "press.h5")
+
+
+@pytest.fixture
+def turn(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    movement = Axial(np.arange(8) * np.pi / 4, tilt=0.04, press=1.0)
+    twin = hw.Twin(object="sphere", shape=SHAPE, pixel_size=PIXEL, movement=movement, pattern="linear")
+    return record(twin, tmp_path / "turn.h5")
+
+
+def same(one, other):
+    """Whether all maps of two results are equal."""
+    assert {*one} == {*other}
+    for name in one:
+        np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+
+
+def by_command(text):
+    words = shlex.split(text)
+    assert words[0] == "mirrorskin"
+    ended = CliRunner().invoke(mirrorskin, words[1:])
+    assert ended.exit_code == 0, ended.output
+    return io.open_result("result.h5")
+
+
+def by_python(text):
+    exec(compile(text, "copied", "exec"), {})
+    return io.open_result("result.h5")
+
+
+CHANGES = [
+    {},
+    {"threshold": 1 / 3},
+    {"threshold": 0.4, "fill": False, "subframe": False, "hold": 1},
+    {"noise": 2.5, "dark": 15.25, "travel_sigma": 0.001},
+    {"thresholds": [0.3, 0.6], "inclinations": [0.1, 0.2]},
+    {"event": "onset", "blur": 0.0, "line_time": 1e-5},
+    {"method": "change-point"},
+]
+
+
+@pytest.mark.parametrize("way", [(as_command, by_command), (as_python, by_python)], ids=["command", "Python"])
+@pytest.mark.parametrize("changes", CHANGES, ids=str)
+def test_a_press_is_computed_again_with_the_same_numbers(press, changes, way):
+    session = Session(press)
+    for name, value in changes.items():
+        session.choose(name, value)
+    assert session.problem == ""
+    write, run = way
+    same(session.now.result, run(write(session)))
+
+
+@pytest.mark.parametrize("way", [(as_command, by_command), (as_python, by_python)], ids=["command", "Python"])
+def test_a_part_of_a_press_is_computed_again(press, way):
+    session = Session(press)
+    session.choose_part(REGION, (1, None))
+    write, run = way
+    same(session.now.result, run(write(session)))
+
+
+@pytest.mark.parametrize("way", [(as_command, by_command), (as_python, by_python)], ids=["command", "Python"])
+def test_what_the_command_line_said_of_a_stack_is_repeated(press, way):
+    given = {"travel_step": 0.2, "travel_start": 0.1, "pixel_size": (0.1, 0.2)}
+    keywords = {"travel": io.Steps(0.2, 0.1), "pixel_size": (0.1, 0.2)}
+    session = Session(press, Opening(keywords, stack_words(given), device="0"))
+    write, run = way
+    same(session.now.result, run(write(session)))
+
+
+@pytest.mark.parametrize("way", [(as_command, by_command), (as_python, by_python)], ids=["command", "Python"])
+@pytest.mark.parametrize("changes", [{"tilt": 0.0371}, {"tilt": "estimate"}, {"zenith_gain": 77.7}], ids=str)
+def test_a_rotation_is_computed_again_with_the_same_numbers(turn, changes, way):
+    session = Session(turn)
+    for name, value in changes.items():
+        session.choose(name, value)
+    assert session.problem == ""
+    write, run = way
+    same(session.now.result, run(write(session)))
+
+
+@pytest.mark.parametrize("way", [(as_command, by_command), (as_python, by_python)], ids=["command", "Python"])
+def test_another_operation_is_computed_again(press, way):
+    session = Session(press)
+    session.choose_operation("mirrorskin.engine:Onset")
+    session.choose("threshold", 0.35)
+    write, run = way
+    same(session.now.result, run(write(session)))
+
+
+OWN = """
+import numpy as np
+from mirrorskin import engine, io
+
+class Brightest(engine.Operation):
+    least: float = engine.option(default=0.0, unit="counts", help="counts below which a pixel is 0")
+    brightest = io.Map("largest brightness", "counts")
+    def start(self, shape, dtype):
+        self.most = np.zeros(shape)
+    def push(self, frames):
+        np.maximum(self.most, frames.max(axis=0), out=self.most)
+    def result(self):
+        return {"brightest": np.where(self.most < self.least, 0, self.most)}
+"""
+
+
+@pytest.mark.parametrize("way", [(as_command, by_command), (as_python, by_python)], ids=["command", "Python"])
+def test_an_operation_of_ones_own_is_computed_again(press, way):
+    Path("own.py").write_text(OWN)
+    session = Session(press, Opening(operation="own.py:Brightest"))
+    session.choose("least", 100.5)
+    write, run = way
+    same(session.now.result, run(write(session)))
+
+
+def test_a_result_is_saved_as_the_command_line_saves_it(press):
+    session = Session(press)
+    pane = SavePane(session)
+    assert pane.download.filename == "press-result.h5"
+    Path("saved.h5").write_bytes(pane.write())
+    done("reconstruct press.h5 -o command.h5")
+    same(io.open_result("saved.h5"), io.open_result("command.h5"))
+
+
+@pytest.mark.parametrize("suffix", [one for one in suffixes() if one not in (".tiff", ".zarr")])
+def test_every_format_is_exported_as_by_the_command(tmp_path, monkeypatch, suffix):
+    monkeypatch.chdir(tmp_path)
+    io.save_result(ball(), "ball.h5")
+    pane = SavePane(Session(Path("ball.h5")))
+    pane.format.value = suffix
+    written = pane.write()
+    done("export ball.h5 -o", f"ball-result{suffix}")
+    assert len(written) == Path(f"ball-result{suffix}").stat().st_size
+
+
+def test_a_file_that_cannot_be_written_says_why(press):
+    session = Session(press, Opening(operation="mirrorskin.engine:Onset"))
+    session.now = type(session.now)(session.now.result.assign(height=None), "no heights")
+    pane = SavePane(session)
+    pane.format.value = ".ply"
+    assert pane._file() is None
+    assert "no heights" in pane.problem.object
