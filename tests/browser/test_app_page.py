@@ -10,7 +10,6 @@ import sys
 import numpy as np
 import pytest
 from commands import done
-from playwright.sync_api import expect
 
 from mirrorskin import io
 
@@ -74,6 +73,12 @@ class Page:
         field.fill(str(value))
         field.press("Enter")
 
+    def expect_command(self, text):
+        """Wait until the command contains a text."""
+        from playwright.sync_api import expect
+
+        expect(self.command).to_have_value(re.compile(re.escape(text)), timeout=1000 * PATIENCE)
+
     def keep(self, name):
         if SCREENSHOTS:
             self.page.screenshot(path=f"{SCREENSHOTS}/{name}.png")
@@ -106,7 +111,7 @@ def test_a_click_shows_the_numbers_of_the_command_line(opened, press, tmp_path):
 def test_a_new_threshold_is_saved_as_the_command_line_saves_it(opened, press, tmp_path):
     opened.set_threshold(0.37)
     opened.show("Save and copy")
-    expect(opened.command).to_have_value(re.compile("--threshold=0.37"))
+    opened.expect_command("--threshold=0.37")
     with opened.page.expect_download() as download:
         opened.page.get_by_text("Save press-result.h5").click()
     saved = tmp_path / "saved.h5"
@@ -119,7 +124,7 @@ def test_a_new_threshold_is_saved_as_the_command_line_saves_it(opened, press, tm
 
 def test_the_command_is_copied(opened):
     opened.show("Save and copy")
-    expect(opened.command).to_have_value(re.compile("mirrorskin reconstruct"))
+    opened.expect_command("mirrorskin reconstruct")
     command = opened.command.input_value()
     opened.page.get_by_text("Copy", exact=True).first.click()
     opened.page.wait_for_function("async text => await navigator.clipboard.readText() === text", arg=command)

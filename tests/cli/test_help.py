@@ -12,11 +12,13 @@ from commands import done, loaded, refused, run
 from mirrorskin.cli.main import PURPOSES, app, main
 
 HEAVY = (
+    "bokeh",
     "cv2",
     "h5py",
     "jinja2",
     "matplotlib",
     "numpy",
+    "panel",
     "pint",
     "pyopencl",
     "rerun",
@@ -50,6 +52,7 @@ def test_no_command_needs_anything_heavy_before_it_runs():
         ["fuse", "no.h5", "no.h5"],
         ["import", "no.avi", "--motion", "vertical", "-o", "a.h5"],
         ["capture", "vertical", "--rig", "no.toml", "-o", "a.h5"],
+        ["app", "no.h5"],
         ["measure", "no.h5"],
         ["simulate", "vertical", "--object", "no.stl", "-o", "a.h5"],
     ],

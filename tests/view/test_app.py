@@ -219,6 +219,17 @@ def test_the_pointer_reads_a_height_with_its_standard_deviation_in_the_units_of_
     np.testing.assert_allclose(shown.readings.columns["sigma"][known], 1e3 * result.height_sigma[known], 1e-6)
 
 
+def test_text_of_a_file_is_never_markup():
+    codes = {0: "none", 1: "<img src=x onerror=alert(1)>"}
+    declared = {"rust": io.Map("<b>rust</b>", codes=codes)}
+    maps = {**ball(), "rust": np.ones((24, 32), np.uint8)}
+    result = io.Result(maps, declarations=declared, x=ball().x, y=ball().y)
+    app = App(result)
+    app.result.map.value = "rust"
+    assert "<img" not in app.result.caption.object
+    assert "<b>" not in app.result.caption.object
+
+
 def test_a_result_alone_has_no_recording_to_click(tmp_path):
     path = tmp_path / "ball.h5"
     io.save_result(ball(), path)

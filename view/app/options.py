@@ -38,16 +38,16 @@ class OptionsPane:
             width=_WIDTH,
             description="What is computed from the frames. All steps: as 'mirrorskin reconstruct' does.",
         )
-        self._first, self._more = pn.Column(margin=0), pn.Column(margin=0)
+        self._first, self._more = pn.Column(margin=0), pn.Column(margin=(0, -10))
         self.problem = text(width=_WIDTH)
-        self.reset = pn.widgets.Button(label="Reset all options", width=_WIDTH, color="light")
+        self.reset = pn.widgets.Button(label="Reset all options", width=_WIDTH)
         self.operation.param.watch(lambda event: session.choose_operation(event.new), "value")
         self.reset.on_click(lambda _: session.choose_operation(session.kind_name))
         session.watch("operation", callback=self._build)
         session.watch("problem", callback=lambda: self._say(session.problem))
         self._build()
         self._say(session.problem)
-        more = pn.Card(self._more, title="More options", collapsed=True, width=_WIDTH + 20, margin=(5, 0))
+        more = pn.Card(self._more, title="More options", collapsed=True, width=_WIDTH, margin=(8, 10))
         self.view = pn.Column(
             self.operation,
             self.problem,

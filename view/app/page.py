@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -51,9 +52,7 @@ class App:
     (40, 40)
     """
 
-    def __init__(
-        self, *sources: str | Path | io.Recording | io.Result, opening: Opening | None = None
-    ) -> None:
+    def __init__(self, *sources: Shown, opening: Opening | Sequence[Opening] | None = None) -> None:
         if not sources:
             raise io.InputError("the application needs a recording or a result: name a file")
         pn.extension()
@@ -107,8 +106,6 @@ class App:
 
     def _describe(self) -> None:
         """Say in the head what is shown."""
-        from html import escape
-
         session = self.session
         assert session is not None
         parts = [session.name] if len(self._sources) == 1 else []

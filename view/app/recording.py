@@ -57,7 +57,7 @@ class RecordingPane:
         )
         self.automatic = pn.widgets.Checkbox(label="Scale grey levels to this frame", value=True)
         self.frames = pn.widgets.IntRangeSlider(
-            label="Frames used",
+            label="Frames used, from the first to the one after the last",
             start=0,
             end=count,
             step=1,
@@ -65,7 +65,7 @@ class RecordingPane:
             width=300,
             disabled=not session.can_cut,
         )
-        self.whole = pn.widgets.Button(label="Use the whole picture", width=180, disabled=True, color="light")
+        self.whole = pn.widgets.Button(label="Use the whole picture", width=180, disabled=True)
         self.graph = _Graph()
         self.facts = text(width=_GRAPH[0])
         self.frame.param.watch(lambda _: self._show_frame(), "value")
@@ -99,13 +99,13 @@ class RecordingPane:
         whole = self._session.whole
         assert whole is not None
         if whole.motion == "axial" and whole.phase is not None:
-            return f", phase {math.degrees(whole.phase[number]):.1f} deg"
+            return f" at a phase of {math.degrees(whole.phase[number]):.1f} deg"
         if whole.travel is not None:
-            return f", travel {whole.travel[number]:.4g} mm"
+            return f" at a travel of {whole.travel[number]:.4g} mm"
         if whole.displacement is not None:
-            return f", displaced by {np.hypot(*whole.displacement[number]):.4g} mm"
+            return f" displaced by {np.hypot(*whole.displacement[number]):.4g} mm"
         if whole.twist is not None:
-            return f", twist {math.degrees(whole.twist[number]):.4g} deg"
+            return f" at a twist of {math.degrees(whole.twist[number]):.4g} deg"
         return ""
 
     def _tapped(self, event: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -55,7 +56,7 @@ class ResultPane:
         self.section = _SectionGraph()
         self.where = text()
         self.measures = text(width=500)
-        self.restart = pn.widgets.Button(label="Measure the whole map", width=190, color="light")
+        self.restart = pn.widgets.Button(label="Measure the whole map", width=190)
         self._place: tuple[Any, ...] = ()
         self.map.param.watch(lambda _: self._show_maps(), "value")
         self.compared.param.watch(lambda _: self._show_maps(), "value")
@@ -119,7 +120,7 @@ class ResultPane:
                 )
             ]
         self._pair[:] = [self._panes["now"], *other]
-        self.caption.object = f"<p>{now.caption}</p>{_legend(sheet, now, self.marked.value)}"
+        self.caption.object = f"<p>{escape(now.caption)}</p>{_legend(sheet, now, self.marked.value)}"
 
     def _prepare(self, sheet: Sheet) -> None:
         """Make pictures of the size of the maps, if their size has changed."""
@@ -218,8 +219,11 @@ def _legend(sheet: Sheet, shown: Shown, marked: bool) -> str:
         filled = sheet.result.height is not None and int(np.count_nonzero(sheet.filled))
         if marked and filled:
             rows.append((hex_of(FILLED_RGB), f"filled, not measured {percent(filled, values.size)}"))
-    keys = (f'<span class="key"><i style="background:{colour}"></i>{text}</span>' for colour, text in rows)
-    return f'<div class="keys">{"".join([*keys, shown.key])}</div>'
+    keys = "".join(
+        f'<span class="key"><i style="background:{colour}"></i>{escape(words)}</span>'
+        for colour, words in rows
+    )
+    return f'<div class="keys">{keys}{shown.key}</div>'
 
 
 class _SectionGraph:

@@ -64,7 +64,7 @@ class SavePane:
                 ("The same result on the command line", self.command),
                 ("The same result in Python", self.python),
             ):
-                copy = pn.widgets.Button(label="Copy", width=90, color="light")
+                copy = pn.widgets.Button(label="Copy", width=90)
                 copy.js_on_click(args={"source": area}, code="navigator.clipboard.writeText(source.value)")
                 texts += [heading(title), area, copy]
         self.view = pn.Column(
@@ -99,7 +99,7 @@ class SavePane:
         """Return the bytes of the file."""
         session, suffix = self._session, self.format.value
         if session.now is None:
-            raise InputError("there is no result to save: see the message next to the options")
+            raise InputError("no result has been computed: see the message next to the options")
         result = session.now.result
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, str(self.download.filename))

@@ -1,7 +1,7 @@
 """The server of the application: on this machine only, and only for those who have its address.
 
-The address contains a token, which is the first part of every path: whatever is asked for without it does not
-exist. WebSockets are accepted from pages of this server only.
+The address contains a token, which is the first part of every path; other paths do not exist. WebSockets are
+accepted from pages of this server only.
 """
 
 from __future__ import annotations
