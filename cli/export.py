@@ -11,8 +11,6 @@ from mirrorskin.cli import options
 from mirrorskin.cli.groups import Argument, Option
 from mirrorskin.io.export_formats import contents, suffixes_with
 
-Point = tuple[float, float]
-
 _APEX = "apex"
 
 

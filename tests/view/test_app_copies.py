@@ -14,8 +14,7 @@ from mirrorskin import hw, io
 from mirrorskin.cli.main import app as mirrorskin
 from mirrorskin.cli.stack import stack_words
 from mirrorskin.hw.twin import Axial, Vertical
-from mirrorskin.io.export import suffixes
-from mirrorskin.view.app.save import SavePane
+from mirrorskin.view.app.save import SavePane, files
 from mirrorskin.view.app.session import Opening, Session
 from mirrorskin.view.app.wording import as_command, as_python
 
@@ -67,6 +66,7 @@ CHANGES = [
     {"threshold": 0.4, "fill": False, "subframe": False, "hold": 1},
     {"noise": 2.5, "dark": 15.25, "travel_sigma": 0.001},
     {"thresholds": [0.3, 0.6], "inclinations": [0.1, 0.2]},
+    {"dark": "dark.npy"},
     {"event": "onset", "blur": 0.0, "line_time": 1e-5},
     {"method": "change-point"},
 ]
@@ -75,6 +75,7 @@ CHANGES = [
 @pytest.mark.parametrize("way", [(as_command, by_command), (as_python, by_python)], ids=["command", "Python"])
 @pytest.mark.parametrize("changes", CHANGES, ids=str)
 def test_a_press_is_computed_again_with_the_same_numbers(press, changes, way):
+    np.save("dark.npy", np.full(SHAPE, 17.25))
     session = Session(press)
     for name, value in changes.items():
         session.choose(name, value)
@@ -154,21 +155,25 @@ def test_a_result_is_saved_as_the_command_line_saves_it(press):
     same(io.open_result("saved.h5"), io.open_result("command.h5"))
 
 
-@pytest.mark.parametrize("suffix", [one for one in suffixes() if one not in (".tiff", ".zarr")])
-def test_every_format_is_exported_as_by_the_command(tmp_path, monkeypatch, suffix):
+@pytest.mark.parametrize("kind", [*files().values()], ids=str)
+def test_every_format_is_exported_as_by_the_command(tmp_path, monkeypatch, kind):
     monkeypatch.chdir(tmp_path)
     io.save_result(ball(), "ball.h5")
     pane = SavePane(Session(Path("ball.h5")))
-    pane.format.value = suffix
+    pane.format.value = kind
     written = pane.write()
-    done("export ball.h5 -o", f"ball-result{suffix}")
-    assert len(written) == Path(f"ball-result{suffix}").stat().st_size
+    suffix, section = kind
+    if suffix == ".h5":
+        return
+    command = "report" if suffix == ".html" else "export"
+    done(command, "ball.h5", *(["--section", "apex"] if section else []), "-o", f"command{suffix}")
+    assert abs(len(written) - Path(f"command{suffix}").stat().st_size) <= 100  # names and dates
 
 
 def test_a_file_that_cannot_be_written_says_why(press):
     session = Session(press, Opening(operation="mirrorskin.engine:Onset"))
     session.now = type(session.now)(session.now.result.assign(height=None), "no heights")
     pane = SavePane(session)
-    pane.format.value = ".ply"
+    pane.format.value = (".ply", False)
     assert pane._file() is None
     assert "no heights" in pane.problem.object

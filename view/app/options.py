@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import panel as pn
@@ -16,6 +17,7 @@ _WIDTH = 262
 _ANY = 2**31 - 1  # a limit that stands for none
 _DEGREES = {"rad": "deg"}  # units that people write instead of the declared one
 _STEPS = 100  # of a slider
+_FILE = re.compile(r"\.[A-Za-z]\w*$")  # the end of the name of a file
 
 
 class OptionsPane:
@@ -146,7 +148,7 @@ def read(option: Option, value: Any) -> Any:
     text = value.strip()
     if not text:
         return option.default
-    if text in option.words or option.kind == "file":
+    if text in option.words or option.kind == "file" or (option.kind == "map" and _FILE.search(text)):
         return text
     numbers = [_number(option, part) for part in text.split(",")]
     if option.kind == "numbers":

@@ -12,28 +12,25 @@ import panel as pn
 from mirrorskin import io
 from mirrorskin.engine.metrology import section_columns
 from mirrorskin.io import InputError
-from mirrorskin.io.export import check_export, suffixes
-from mirrorskin.io.url import ZARR_SUFFIX
+from mirrorskin.io.export import check_export
+from mirrorskin.io.export_formats import FORMATS
 from mirrorskin.view.app.look import heading, problem, text
 from mirrorskin.view.app.session import Session
 from mirrorskin.view.app.wording import as_command, as_python
 
-_RESULT, _REPORT, _SECTION = ".h5", ".html", ".csv"
-_WHAT = {
-    _RESULT: "result of mirrorskin (.h5): all maps, options and origin",
-    _REPORT: "report (.html): a page with pictures, numbers and the surface",
-    ".ply": "surface (.ply)",
-    ".stl": "surface (.stl)",
-    ".obj": "surface (.obj)",
-    ".xyz": "points as text (.xyz)",
-    ".png": "heights as a picture of 16 bits (.png)",
-    ".tif": "heights as a picture (.tif)",
-    ".npz": "all maps as NumPy arrays (.npz)",
-    _SECTION: "the section as a table (.csv)",
-    ".mcap": "ROS 2 messages (.mcap)",
+_RESULT, _REPORT = ".h5", ".html"
+_OWN = {
+    "result of mirrorskin: all maps, options and origin (.h5)": (_RESULT, False),
+    "report: a page with pictures, numbers and the surface (.html)": (_REPORT, False),
+    "the section as a table (.csv)": (".csv", True),
 }
-"""What people read of a suffix; others are shown as they are."""
-_SAME = (".tiff", ZARR_SUFFIX)  # another name of .tif, and a folder
+_SAME = (".tiff", ".zarr")  # another name of .tif, and a folder, which a browser does not save
+
+
+def files() -> dict[str, tuple[str, bool]]:
+    """Return the suffix of each kind of file by its description, and whether it contains the section only."""
+    others = {f"{form.kind} ({suffix})": (suffix, False) for suffix, form in FORMATS.items()}
+    return {**_OWN, **{text: kind for text, kind in others.items() if kind[0] not in _SAME}}
 
 
 class SavePane:
@@ -41,10 +38,7 @@ class SavePane:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        names = [_RESULT, _REPORT, *(one for one in suffixes() if one not in _SAME)]
-        self.format = pn.widgets.Select(
-            label="File", options={_WHAT.get(one, one): one for one in names}, value=_RESULT, width=460
-        )
+        self.format = pn.widgets.Select(label="File", options=files(), value=(_RESULT, False), width=460)
         self.download = pn.widgets.FileDownload(
             callback=self._file,
             filename="result.h5",
@@ -77,7 +71,7 @@ class SavePane:
 
     def _name_file(self) -> None:
         stem = Path(self._session.name).stem
-        self.download.filename = f"{stem}-result{self.format.value}"
+        self.download.filename = f"{stem}-result{self.format.value[0]}"
         self.download.label = f"Save {self.download.filename}"
 
     def _show(self) -> None:
@@ -97,7 +91,7 @@ class SavePane:
 
     def write(self) -> bytes:
         """Return the bytes of the file."""
-        session, suffix = self._session, self.format.value
+        session, (suffix, with_section) = self._session, self.format.value
         if session.now is None:
             raise InputError("no result has been computed: see the message next to the options")
         result = session.now.result
@@ -114,7 +108,7 @@ class SavePane:
                 write_report(sheet.result, path, name=session.name, section=session.ends)
                 return path.read_bytes()
             check_export(sheet.result, path)
-            columns = section_columns(sheet.result, session.ends) if suffix == _SECTION else None
+            columns = section_columns(sheet.result, session.ends) if with_section else None
             io.export_result(sheet.result, path, section=columns)
             return path.read_bytes()
 

@@ -176,11 +176,12 @@ class Session:
             self.problem = str(error)
             self._tell("problem")
             return
-        if _same(checked, self.value(name)):
+        kept = value if isinstance(value, str) else checked  # of a file its name, not what it contains
+        if _same(kept, self.value(name)):
             return
         self.changed.pop(name, None)
-        if not _same(checked, declared.default):
-            self.changed[name] = checked
+        if not _same(kept, declared.default):
+            self.changed[name] = kept
         self.compute()
 
     def choose_part(self, region: io.Region | None, frames: tuple[int, int | None] | None) -> None:

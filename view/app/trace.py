@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.options import Option
 from mirrorskin.io import Block
 from mirrorskin.io.types import UNDISTORTED, Floats
 from mirrorskin.view.app.session import Session
@@ -134,7 +133,7 @@ def levels_at(session: Session, row: int, column: int) -> dict[str, float]:
     process = session.now.result.process if session.now is not None else {}
     for name in ("dark", "bright"):
         option = session.options().get(name)
-        given = session.value(name) if isinstance(option, Option) else None
+        given = None if option is None else option.check(session.value(name))
         level = given if given is not None else getattr(source.header, name)
         if level is None:
             level = _number(str(process.get(name, "")), part.dtype, name)
