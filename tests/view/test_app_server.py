@@ -1,17 +1,17 @@
 """The server of the application: nothing without the token, no foreign page, no other machine."""
 
 import asyncio
+import http.client
 import re
 import socket
 import threading
 import urllib.error
 import urllib.request
+from contextlib import closing
 from urllib.parse import urlsplit
 
 import pytest
-from tornado.httpclient import HTTPClientError, HTTPRequest
 from tornado.ioloop import IOLoop
-from tornado.websocket import websocket_connect
 
 from mirrorskin.io import InputError
 from mirrorskin.view.app.server import AppServer
@@ -79,18 +79,19 @@ def test_it_listens_on_this_machine_only(served):
 
 
 def _connect(served, path, origin):
-    """Return the HTTP status with which a WebSocket is refused; 101 if it is accepted."""
-
-    async def connect():
-        request = HTTPRequest(f"ws://{served.netloc}{path}", headers={"Origin": origin})
-        socket = await websocket_connect(request, subprotocols=["bokeh", _token(served)])
-        socket.close()
-        return 101
-
-    try:
-        return asyncio.run(connect())
-    except HTTPClientError as error:
-        return error.code
+    """Return the HTTP status of the answer to a WebSocket: 101 if it is accepted."""
+    headers = {
+        "Connection": "Upgrade",
+        "Upgrade": "websocket",
+        "Sec-WebSocket-Version": "13",
+        "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+        "Sec-WebSocket-Protocol": f"bokeh, {_token(served)}",
+        "Origin": origin,
+    }
+    with closing(http.client.HTTPConnection(served.netloc, timeout=PATIENCE)) as connection:
+        connection.request("GET", path, headers=headers)
+        with closing(connection.getresponse()) as reply:
+            return reply.status
 
 
 def _token(served):
