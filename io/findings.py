@@ -56,6 +56,17 @@ def in_process(findings: Iterable[Finding], process: Mapping[str, Any]) -> dict[
     return known
 
 
+def warnings_in(process: Mapping[str, Any]) -> list[str]:
+    """Return the warnings of a process, and those of each recording that was fused.
+
+    Examples
+    --------
+    >>> warnings_in({"vertical_warnings": "frame 3: lost", "noise": 1.2})
+    ['frame 3: lost']
+    """
+    return [str(text) for name, text in process.items() if f"_{name}".endswith("_warnings")]
+
+
 def with_findings(result: Result, *findings: Finding) -> Result:
     """Return a result whose process contains findings, too."""
     return result.assign(process={**result.process, **in_process(findings, result.process)})

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io.findings import warnings_in
 from mirrorskin.io.maps import FILLED_SHADES, Map, declaration_of
 from mirrorskin.io.opencv import encode
 from mirrorskin.io.result import Result, Shown, map_shape, may_name_a_map
@@ -27,6 +28,7 @@ _PICTURE = 480  # pixels along the longer side of a picture, at most
 def as_text(result: Shown) -> str:
     """Return the maps of a result with shape, unit and range, one per line."""
     lines = [f"{name:<14}{shape:<16}{values}" for name, shape, values in _rows(result)]
+    lines += [f"warning: {text}" for text in warnings_in(getattr(result, "process", {}))]
     return "\n".join([f"{type(result).__name__}{_origin(result)}", *(f"  {line}" for line in lines)])
 
 
@@ -41,6 +43,9 @@ def as_html(result: Shown) -> str:
     filled = None if shown is None else _filled(result, shown)
     picture = "" if shown is None else _picture(shown, result.maps()[shown], unit, filled)
     title = f"<p><b>{type(result).__name__}</b>{escape(_origin(result))}</p>"
+    title += "".join(
+        f"<p><b>Warning:</b> {escape(text)}</p>" for text in warnings_in(getattr(result, "process", {}))
+    )
     return f"{title}<div style='display:flex;gap:2em'>{picture}<table>{rows}</table></div>"
 
 

@@ -136,3 +136,9 @@ def test_filled_heights_are_orange_in_a_plot(filled):
 def test_the_text_of_a_result_states_what_is_filled_and_measured_leaves_it_out(filled):
     assert repr(filled).splitlines()[1].endswith("-2 to 0 mm, 83% known, 0.33 filled")
     np.testing.assert_array_equal(filled.measured(), [[0.0, np.nan, np.nan], [-1.0, -1.5, np.nan]])
+
+
+def test_warnings_are_shown_with_the_maps(result):
+    doubtful = result.assign(process={"source": "press.h5", "vertical_warnings": "frame 3 < 4: lost"})
+    assert repr(doubtful).splitlines()[-1] == "  warning: frame 3 < 4: lost"
+    assert "<b>Warning:</b> frame 3 &lt; 4: lost" in doubtful._repr_html_()

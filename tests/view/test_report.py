@@ -430,3 +430,10 @@ def test_a_name_that_is_no_text_does_no_harm(tmp_path, quick):
 def test_a_page_that_cannot_be_written_is_one_line(tmp_path, quick):
     with pytest.raises(io.InputError, match="no folder"):
         report.write_report(cap(), tmp_path / "nowhere" / "page.html", name="a.h5")
+
+
+def test_warnings_are_at_the_top_of_the_page(tmp_path, quick):
+    doubtful = cap().assign(process={**PROCESS, "warnings": "frame 3: lost"})
+    page = written(tmp_path, doubtful)
+    assert "Frame 3: lost." in " ".join(page.texts["p"])
+    assert page.texts["strong"] == ["Warning:"]

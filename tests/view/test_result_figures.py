@@ -157,3 +157,9 @@ def test_drawing_does_not_change_the_result(drawn):
     before = ball().maps()
     for name, values in drawn.maps().items():
         np.testing.assert_array_equal(values, before[name])
+
+
+def test_warnings_are_below_the_summary():
+    doubtful = ball().assign(process={"warnings": "frame 3: lost"})
+    texts = [text.get_text() for text in overview(doubtful, name="a.h5").texts]
+    assert texts[-1] == "Warning: frame 3: lost"

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mirrorskin.engine.metrology import Quantity
 from mirrorskin.engine.summary import summarise
 from mirrorskin.io import InputError, Result
+from mirrorskin.io.findings import warnings_in
 from mirrorskin.io.opencv import encode
 from mirrorskin.view.report.surface import surface_data
 from mirrorskin.view.report.words import PIXELS, UNITS, Rows, map_rows, picture_texts, split_process
@@ -51,6 +52,7 @@ def contents_of(result: Result, name: str, section: Ends | None, turn: int | Non
         "title": name if turn is None else f"{name}, turn {turn}",
         "summary": sentence(str(summarise(result))),
         "made": _origin(result.process),
+        "warnings": [sentence(text) for text in warnings_in(result.process)],
         **surface_of(result),
         "pictures": pictures_of(result, name, section),
         "numbers": numbers_of(result, section),

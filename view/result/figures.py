@@ -7,13 +7,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from textwrap import wrap
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.summary import summarise
 from mirrorskin.io import InputError, Result
+from mirrorskin.io.findings import warnings_in
 from mirrorskin.view.canvas import figure_pixels, new_figure
 from mirrorskin.view.result.maps import draw_declared, draw_height
 from mirrorskin.view.result.section import draw_histogram, draw_section
@@ -35,6 +36,7 @@ _WIDTH, _HIGHEST = 3.5, 5.2
 _LEFT, _RIGHT, _BELOW, _ABOVE = 0.95, 1.75, 0.6, 0.55
 _MARGIN, _GAP = 0.15, 0.2
 _NAME = 13  # points
+_DOUBTFUL = "#b3261e"  # colour of warnings
 _LETTER, _LINE = 0.65 / 72, 1.45 / 72  # inches per point of the font size: width of a letter, line spacing
 
 
@@ -143,10 +145,11 @@ def _figure(sheet: Sheet, panels: Sequence[_Panel], name: str) -> Figure:
     maps = any(panel.name not in _GRAPHS for panel in panels)
     high = min(max(_WIDTH / sheet.proportion if maps else 0.0, BOX * _WIDTH), _HIGHEST)
     wide, tall = _LEFT + _WIDTH + _RIGHT, _BELOW + high + _ABOVE
-    words = [
-        _wrapped(text, wide * columns, size)
-        for text, size in ((name, _NAME), (str(summarise(sheet.result)), TEXT))
-    ]
+    warnings = [f"Warning: {text}" for text in warnings_in(sheet.result.process)]
+    lines: list[tuple[str, float, dict[str, Any]]] = [(name, _NAME, {"weight": "bold"})]
+    lines += [(str(summarise(sheet.result)), TEXT, {"color": "0.3"})]
+    lines += [(text, TEXT, {"color": _DOUBTFUL}) for text in warnings]
+    words = [_wrapped(text, wide * columns, size) for text, size, _ in lines]
     head = _MARGIN + sum(height for _, height in words) + _GAP
     size = wide * columns, tall * rows + head
     figure = new_figure(*size)
@@ -156,10 +159,10 @@ def _figure(sheet: Sheet, panels: Sequence[_Panel], name: str) -> Figure:
         corner = column * wide + _LEFT, (rows - 1 - row) * tall + _BELOW
         place = corner[0] / size[0], corner[1] / size[1], _WIDTH / size[0], high / size[1]
         panel.draw(figure.add_axes(place))
-    (title, above), (line, _) = words
     side, top = _MARGIN / size[0], 1 - _MARGIN / size[1]
-    figure.text(side, top, title, fontsize=_NAME, weight="bold", va="top", parse_math=False)
-    figure.text(side, top - above / size[1], line, fontsize=TEXT, color="0.3", va="top", parse_math=False)
+    for (text, height), (_, points, style) in zip(words, lines, strict=True):
+        figure.text(side, top, text, fontsize=points, va="top", parse_math=False, **style)
+        top -= height / size[1]
     return figure
 
 
