@@ -21,7 +21,8 @@ _BEND = np.array([-1.0, 3.0, -3.0, 1.0])  # third difference of four pixels in a
 _RISE = np.array([-1.0, -1.0, 1.0, 1.0]) / 4  # mean difference of neighbours
 _LEAST_RISE = 0.2  # steps from pixel to pixel of a slope that shows positions
 _LONGEST = 3  # pixels: greatest distance of the pixels in a row
-_MOST = 2000  # rows of four pixels along each axis
+_FEW, _MOST = 2000, 4000  # rows of four pixels along each axis, to begin with and in all
+_SUSPICIOUS = 2.5  # standard errors by which a frame differs from its neighbours
 _CLOSEST = 0.3  # steps between frames that are told apart
 _FEWEST, _MOST_FRAMES = 7, 160  # frames that show positions
 _SEEN = 40  # times that a frame is next to a pixel
@@ -31,7 +32,7 @@ _ROUNDS = 3
 _LEAST_BEND = 0.05  # least standard deviation of a bend, relative to the rise
 _OVERLAP = 6  # rows of four pixels that share a pixel, along both axes
 _BINS, _SPREAD = 8, 3.0  # parts of an interval, and how many of them heights must fill
-_LEAST_JITTER, _CLEARER = 0.06, 3.0  # steps, and standard errors, of a jitter that is one
+_LEAST_JITTER, _CLEARER = 0.07, 3.0  # steps, and standard errors, of a jitter that is one
 _SURE_FRAMES = 7  # frames from which a jitter is estimated
 _JUMP, _CLEAR_JUMP = (0.6, 1.5), 5.0  # steps, and standard errors, of one lost frame
 _ALONE = 0.7  # greatest jump elsewhere, relative to it
@@ -135,6 +136,31 @@ class _Rows:
     frame: NDArray[np.intp]
     change: Doubles
 
+    @property
+    def bend(self) -> float:
+        """Standard deviation of a bend."""
+        return max(mad_sigma(self.bends), _LEAST_BEND)
+
+    def seen(self, count: int) -> NDArray[np.intp]:
+        """Return how often each of some frames is next to a pixel."""
+        return np.bincount(self.frame.ravel(), minlength=count)
+
+    def suspicious(self, clear: NDArray[np.bool_]) -> bool:
+        """Return whether the error of a single frame would make bends clearly less.
+
+        Second differences from frame to frame of what each error would change, in standard errors.
+        """
+        weight = 1 / np.sqrt(1 + (self.bends / (2 * self.bend)) ** 2)
+        gradient = ((weight * self.bends)[:, np.newaxis] * self.change).ravel()
+        frame, count = self.frame.ravel(), len(clear) + 1
+        total, square = (np.bincount(frame, part, minlength=count) for part in (gradient, gradient**2))
+        usable = self.seen(count) >= _SEEN
+        usable[[0, -1]] = False
+        usable[1:-1] &= clear[:-1] & clear[1:]
+        scores = np.where(usable, total / np.sqrt(np.maximum(square, np.finfo(float).tiny)), np.nan)
+        changes = np.diff(scores, 2)
+        return bool(np.any(np.abs(changes) > math.sqrt(6) * _SUSPICIOUS))
+
     def between(self, first: int, stop: int) -> _Rows:
         """Return the rows that lie between two frames, which are then numbered from the first."""
         inside = ((self.frame >= first) & (self.frame < stop)).all(axis=1)
@@ -142,7 +168,7 @@ class _Rows:
 
 
 def _find_errors(height: NDArray[Any], pushed: Doubles) -> _Errors | None:
-    """Return the errors of the frames' positions; None if the heights do not show them."""
+    """Return the errors of the frames' positions; None if the heights do not show any."""
     travel = np.unique(pushed)
     if len(travel) < _FEWEST:
         return None
@@ -150,18 +176,21 @@ def _find_errors(height: NDArray[Any], pushed: Doubles) -> _Errors | None:
     travel = _apart(travel, _CLOSEST * step)
     if len(travel) < _FEWEST:
         return None
-    lines = [_thinned(part) for part in (-height, -height.T)]
-    heights = np.concatenate([part.ravel() for part in lines])
-    clear = _spread(heights[np.isfinite(heights)], travel)
-    if np.count_nonzero(clear) < _FEWEST - 2:
-        return None
-    rise = np.concatenate([np.abs(np.diff(part, axis=1)).ravel() for part in lines])
+    pixels, reach = _pixels_of(height, 1, _FEW), 1
+    clear = _spread(pixels[0][np.isfinite(pixels[0])], travel)
+    rise = np.abs(pixels[1] - pixels[0])
     rise = rise[rise > _LEAST_RISE / 2 * step]
-    if rise.size < _SEEN:
+    if np.count_nonzero(clear) < _FEWEST - 2 or rise.size < _SEEN:
         return None
     reach = int(np.clip(round(step / float(np.median(rise))), 1, _LONGEST))
-    rows = _rows_of(lines, travel, step, reach)
-    seen = np.flatnonzero(np.bincount(rows.frame.ravel(), minlength=len(travel)) >= _SEEN)
+    if reach > 1:
+        pixels = _pixels_of(height, reach, _FEW)
+    if not _rows_of(pixels, travel, step).suspicious(clear):
+        return None
+    pixels = _pixels_of(height, reach, _MOST)
+    clear = _spread(pixels[0][np.isfinite(pixels[0])], travel)
+    rows = _rows_of(pixels, travel, step)
+    seen = np.flatnonzero(rows.seen(len(travel)) >= _SEEN)
     if len(seen) < _FEWEST:
         return None
     first, stop = int(seen[0]), int(seen[-1]) + 1
@@ -169,8 +198,7 @@ def _find_errors(height: NDArray[Any], pushed: Doubles) -> _Errors | None:
         middle = int(np.median(rows.frame))
         first = min(max(first, middle - _MOST_FRAMES // 2), stop - _MOST_FRAMES)
         stop = first + _MOST_FRAMES
-    clear = clear[first : stop - 1]
-    return _fit(rows.between(first, stop), travel[first:stop], step, clear, reach)
+    return _fit(rows.between(first, stop), travel[first:stop], step, clear[first : stop - 1], reach)
 
 
 def _apart(travel: Doubles, least: float) -> Doubles:
@@ -184,22 +212,24 @@ def _apart(travel: Doubles, least: float) -> Doubles:
     return travel[kept]
 
 
-def _thinned(lines: NDArray[Any]) -> Doubles:
-    """Return evenly spaced lines with enough pixels."""
-    each = max(1, -(-lines.size // _MOST))
-    return lines[each // 2 :: each].astype(np.float64)
-
-
-def _rows_of(lines: list[Doubles], travel: Doubles, step: float, reach: int) -> _Rows:
-    """Return the rows of four pixels on a slope, along lines, that are ``reach`` pixels apart."""
+def _pixels_of(height: NDArray[Any], reach: int, most: int) -> Doubles:
+    """Return depths of rows of four pixels, ``reach`` apart, from rows and columns all over, (4, n)."""
     parts = []
-    for line in lines:
-        count = line.shape[1] - 3 * reach
+    for lines in (height, height.T):
+        count = lines.shape[1] - 3 * reach
         if count > 0:
-            parts.append(np.stack([line[:, n * reach : n * reach + count].ravel() for n in range(4)]))
+            thinner = max(1, lines.shape[0] * count // most)
+            skip = math.isqrt(thinner)
+            each = -(-thinner // skip)
+            chosen = lines[each // 2 % lines.shape[0] :: each]
+            parts.append([chosen[:, n * reach : n * reach + count : skip].ravel() for n in range(4)])
     if not parts:
-        return _Rows(np.empty(0), np.empty((0, 8), np.intp), np.empty((0, 8)))
-    pixels = np.concatenate(parts, axis=1)
+        return np.empty((4, 0))
+    return -np.concatenate(parts, axis=1).astype(np.float64)
+
+
+def _rows_of(pixels: Doubles, travel: Doubles, step: float) -> _Rows:
+    """Return those of rows of four pixels that are on a slope."""
     each = np.diff(pixels, axis=0)
     rises = (each > 0).all(axis=0) | (each < 0).all(axis=0)
     rises &= np.abs(pixels[3] - pixels[0] + pixels[2] - pixels[1]) > 4 * _LEAST_RISE * step
@@ -240,8 +270,7 @@ def _fit(rows: _Rows, travel: Doubles, step: float, clear: NDArray[np.bool_], re
 
     degree = max(2, count // _SMOOTH)
     smooth, _ = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, count), degree))
-    bend = max(mad_sigma(rows.bends), _LEAST_BEND)
-    error, left = np.zeros(count), rows.bends
+    bend, error, left = rows.bend, np.zeros(count), rows.bends
     for _ in range(_ROUNDS):
         weight = 1 / np.sqrt(1 + (left / (2 * bend)) ** 2)
         squares = normal(weight)
