@@ -35,7 +35,7 @@ from mirrorskin.engine.rotation.steps import (
     CalibrationErrors,
     Edges,
     Integration,
-    PhaseSign,
+    PhaseErrors,
     RegistrationErrors,
 )
 from mirrorskin.engine.streaming import feed
@@ -259,7 +259,7 @@ class Rotation(Method):
         )
 
     def _steps(self) -> list[Step]:
-        return [Edges(), RegistrationErrors(), PhaseSign(), self.make(Integration), CalibrationErrors()]
+        return [Edges(), RegistrationErrors(), PhaseErrors(), self.make(Integration), CalibrationErrors()]
 
     def _process(self) -> dict[str, ProcessValue]:
         origin = "estimate" if self.tilt == "estimate" else "recording" if self.tilt is None else "given"

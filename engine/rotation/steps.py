@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.method import Context, Step
 from mirrorskin.engine.options import option
+from mirrorskin.engine.rotation.curl import AzimuthError, find_azimuth_error
 from mirrorskin.engine.rotation.edges import find_edges
-from mirrorskin.engine.rotation.normals import Normals
+from mirrorskin.engine.rotation.normals import Normals, azimuth_of
 from mirrorskin.engine.rotation.normals_to_height import Slopes, integrate_normals, slopes_of
 from mirrorskin.engine.rotation.registration import Registered
 from mirrorskin.io import Result
@@ -110,45 +112,75 @@ class CalibrationErrors(Step):
         return result.assign(normals_sigma=np.hypot(result.normals_sigma, operation.response.sigma))
 
 
-class PhaseSign(Step):
-    """Warn if the phases seem to run the wrong way round, so that the surface is mirrored.
+class PhaseErrors(Step):
+    """Correct slopes that are rotated, and warn if phases seem to run the wrong way round.
+
+    The curl of the slopes shows by how much they are rotated, as by a wrong phase of the first frame or by a
+    rolling shutter: see `mirrorskin.engine.rotation.curl`. With phases reversed, the surface is mirrored.
+    """
+
+    def apply(self, result: Result, context: Context) -> Result:
+        """Return the result with other normals, or with a warning, if the slopes contradict the phases."""
+        if result.normals is None:
+            return result
+        if _mirrored(result.normals if result.normals.ndim == 3 else result.normals[0]):
+            found = Finding(
+                "mirrored",
+                "the slopes fit together better with the phases reversed: do phases count counter-clockwise"
+                " in the picture?",
+            )
+            return with_findings(result, found)
+        if result.normals.ndim == 4:
+            return result
+        size = context.source.header.pixel_size or (1.0, 1.0)
+        error = find_azimuth_error(result.normals, result.contact, size)
+        if error is None:
+            return result
+        normals = error.remove(result.normals)
+        sine = np.hypot(normals[..., 0], normals[..., 1])
+        sigma = np.hypot(result.normals_sigma, np.float32(error.sigma) * sine)
+        result = result.assign(normals=normals, azimuth=partial(azimuth_of, normals), normals_sigma=sigma)
+        return with_findings(result, _rotated(error))
+
+
+def _rotated(error: AzimuthError) -> Finding:
+    first, last = math.degrees(error.first), math.degrees(error.last)
+    if error.first == error.last:
+        text = f"by {first:+.1f} degrees, which is corrected: calibrate the phases (calibrate tilt)"
+    else:
+        text = (
+            f"by {first:+.1f} degrees in the first row and {last:+.1f} in the last, as by a rolling shutter,"
+            " which is corrected: use a global shutter, or stop the body for each frame"
+        )
+    return Finding("rotated slopes", f"the curl of the slopes shows that azimuths are wrong {text}")
+
+
+def _mirrored(normals: NDArray[np.floating]) -> bool:
+    """Return whether the slopes are those of a surface if one of them has the other sign.
 
     Slopes p and q of a surface satisfy dp/dy = dq/dx; with the phases reversed, q has the other sign. So the
     mean of their product is positive for a surface, and negative for a mirrored one.
     """
-
-    def apply(self, result: Result, context: Context) -> Result:
-        """Return the result with a warning in ``process``, if the slopes contradict the phases."""
-        if result.normals is None:
-            return result
-        normals = result.normals if result.normals.ndim == 3 else result.normals[0]
-        known = int(np.count_nonzero(np.isfinite(normals[..., 2])))
-        reach, thin = max(1, math.isqrt(known) // _PARTS), max(1, math.isqrt(known) // _POINTS)
-        here, across, down = (
-            normals[rows, columns][::thin, ::thin].astype(np.float64)
-            for rows, columns in (
-                (slice(None, -reach), slice(None, -reach)),
-                (slice(None, -reach), slice(reach, None)),
-                (slice(reach, None), slice(None, -reach)),
-            )
+    known = int(np.count_nonzero(np.isfinite(normals[..., 2])))
+    reach, thin = max(1, math.isqrt(known) // _PARTS), max(1, math.isqrt(known) // _POINTS)
+    here, across, down = (
+        normals[rows, columns][::thin, ::thin].astype(np.float64)
+        for rows, columns in (
+            (slice(None, -reach), slice(None, -reach)),
+            (slice(None, -reach), slice(reach, None)),
+            (slice(reach, None), slice(None, -reach)),
         )
-        with np.errstate(divide="ignore", invalid="ignore"):
-            dp_dy = down[..., 0] / down[..., 2] - here[..., 0] / here[..., 2]  # y points up
-            dq_dx = here[..., 1] / here[..., 2] - across[..., 1] / across[..., 2]
-        defined = np.isfinite(dp_dy) & np.isfinite(dq_dx)
-        if np.count_nonzero(defined) < _FEWEST:
-            return result
-        dp_dy, dq_dx = (_clip_outliers(one[defined]) for one in (dp_dy, dq_dx))
-        product = dp_dy * dq_dx
-        sure = -float(np.mean(product)) > _CLEAR * float(np.std(product)) / math.sqrt(len(product))
-        if not sure or -np.sum(product) < _ALIKE * math.sqrt(np.sum(dp_dy**2) * np.sum(dq_dx**2)):
-            return result
-        found = Finding(
-            "mirrored",
-            "the slopes fit together better with the phases reversed: do phases count counter-clockwise in"
-            " the picture?",
-        )
-        return with_findings(result, found)
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        dp_dy = down[..., 0] / down[..., 2] - here[..., 0] / here[..., 2]  # y points up
+        dq_dx = here[..., 1] / here[..., 2] - across[..., 1] / across[..., 2]
+    defined = np.isfinite(dp_dy) & np.isfinite(dq_dx)
+    if np.count_nonzero(defined) < _FEWEST:
+        return False
+    dp_dy, dq_dx = (_clip_outliers(one[defined]) for one in (dp_dy, dq_dx))
+    product = dp_dy * dq_dx
+    clear = -float(np.mean(product)) > _CLEAR * float(np.std(product)) / math.sqrt(len(product))
+    return clear and -np.sum(product) >= _ALIKE * math.sqrt(np.sum(dp_dy**2) * np.sum(dq_dx**2))
 
 
 def _clip_outliers(values: NDArray[np.float64]) -> NDArray[np.float64]:
