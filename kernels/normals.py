@@ -266,8 +266,9 @@ def conclude(normal: Doubles, sums: Sums, samples: Samples, usable: Array, tilt:
     det = sums.m11 * sums.m22 - sums.m12**2
     touching, misfit = touches(sums, det, samples, tilt, limits, model, rest)
     with np.errstate(divide="ignore", invalid="ignore"):
-        sigma = samples.error * misfit * np.sqrt(np.where(det > 0, (sums.m11 + sums.m22) / det, np.inf))
+        sigma = samples.error * np.sqrt(np.where(det > 0, (sums.m11 + sums.m22) / det, np.inf))
     unknown = (usable < _LEAST) | ~(sigma < _NO_ANSWER)
+    sigma = np.minimum(sigma * misfit, _NO_ANSWER)
     return _answer(normal, np.where(unknown, np.nan, sigma), touching, samples)
 
 

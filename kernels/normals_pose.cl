@@ -239,10 +239,10 @@ __kernel void normals_rock(ARGUMENTS, const int presses, OUT slopes, OUT slope_e
         const F variance = (sums.m22 - 2.0f * slope * sums.m12 + slope * slope * sums.m11) * scaled * per_up * per_up;
         const F zenith = atan2(roots(GREATER(across, (F)0.0f)), found.z), none = NAN;
         const I at_rest = presses ? (I)0 : known.wave.mean < limits.rest;
-        F remains;
-        const I touches = lasts(sums, scaled, known.error_of_one, count, at_rest, limits, limits.model, &remains);
-        const F error = known.error_of_one * misfit(remains, known.error_of_one, count, limits.noise) * roots(variance);
+        F remains, error = known.error_of_one * roots(variance);
         const I answered = (kept.usable >= LEAST) & (det > 0.0f) & (error < NO_ANSWER) & (found.z > 0.0f);
+        const I touches = lasts(sums, scaled, known.error_of_one, count, at_rest, limits, limits.model, &remains);
+        error = raise_error(error, remains, known.error_of_one, count, limits.noise);
         keep_slope(p, turns, answered ? slope : none, answered ? error : none, answered ? zenith : none, slopes, slope_errors,
                    zeniths);
         B flags = WIDE(convert_uchar)(answered & touches & 1);

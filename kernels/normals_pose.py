@@ -120,8 +120,9 @@ def normals_rock(
         p, q = part.T
         slope = -p / q
         variance = (sums.m22 - 2 * slope * sums.m12 + slope**2 * sums.m11) / det / q**2
-        sigma = samples.error * misfit * np.sqrt(np.where(det > 0, variance, np.inf))
+        sigma = samples.error * np.sqrt(np.where(det > 0, variance, np.inf))
         answered = (samples.usable >= _LEAST) & (sigma < _NO_ANSWER) & (q > 0)
+        sigma = np.minimum(sigma * misfit, _NO_ANSWER)
         zenith = np.arctan2(np.sqrt(np.maximum(1 - q**2, 0)), q)
     slope, sigma, zenith = (np.where(answered, one, np.nan) for one in (slope, sigma, zenith))
     return Slopes(slope, sigma, zenith, found & answered)
