@@ -180,7 +180,7 @@ def _mirrored(normals: NDArray[np.floating]) -> bool:
     dp_dy, dq_dx = (_clip_outliers(one[defined]) for one in (dp_dy, dq_dx))
     product = dp_dy * dq_dx
     clear = -float(np.mean(product)) > _CLEAR * float(np.std(product)) / math.sqrt(len(product))
-    return clear and -np.sum(product) >= _ALIKE * math.sqrt(np.sum(dp_dy**2) * np.sum(dq_dx**2))
+    return clear and bool(-np.sum(product) >= _ALIKE * math.sqrt(np.sum(dp_dy**2) * np.sum(dq_dx**2)))
 
 
 def _clip_outliers(values: NDArray[np.float64]) -> NDArray[np.float64]:
