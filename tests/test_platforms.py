@@ -30,7 +30,7 @@ for name in ("SIGHUP", "SIGALRM", "setitimer"):
     delattr(signal, name)
 """
 _DEVICE = "from mirrorskin.kernels.device import open_device; open_device()\n"  # of this system, as any other
-_EXTRAS = "import distributed, matplotlib.pyplot\n"
+_EXTRAS = "import distributed, matplotlib.pyplot, panel\n"
 _IMPORT = """
 import importlib, pkgutil
 for name in ("io", "kernels", "engine", "hw", "view", "cli"):
