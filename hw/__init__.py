@@ -1,6 +1,6 @@
-"""What moves and what sees: stage, camera, both as a rig, and the digital twin of it all.
+"""Hardware: stage, camera, the rig of both, and the digital twin.
 
-The public names stand in ``__init__.pyi``; each is imported from its module when it is first used.
+``__init__.pyi`` lists the public names; each is imported from its module on first use.
 """
 
 import lazy_loader

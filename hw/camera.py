@@ -1,4 +1,4 @@
-"""What a camera is to the rest of the program: frames with numbers and times, and how many were lost."""
+"""The interface of a camera: frames with numbers and times, and the number of lost frames."""
 
 from __future__ import annotations
 
@@ -14,38 +14,40 @@ from mirrorskin.hw.errors import HardwareError
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """Some consecutive frames of a camera.
+    """Consecutive frames of a camera.
 
-    The pixels are raw counts in C order. Their memory is lent: nobody writes to it as long as this array or a
-    view of it is referred to, and 64 bytes beyond it may be read (``mirrorskin.io.Block.lent``).
+    The pixels are raw counts in C order. Their memory is shared: it is not written to while this array or a
+    view of it is referenced, and the 64 bytes after it may be read (``mirrorskin.io.Block.lent``).
     """
 
     pixels: NDArray[Any]  # (n, H, W), uint8, uint16 or float32
-    number: NDArray[np.int64]  # (n,), since the camera was opened, from 0 in steps of 1; lost ones count
-    time: NDArray[np.float64]  # (n,), arrival, seconds on time.monotonic's scale; never decreasing
-    dropped: int = 0  # frames lost between those taken before (or forgotten by flush) and these
+    # (n,), counted since the camera was opened, from 0 in steps of 1; lost frames are counted
+    number: NDArray[np.int64]
+    time: NDArray[np.float64]  # (n,), time of arrival, seconds of time.monotonic; never decreasing
+    dropped: int = 0  # frames lost between the previous ones taken (or flushed) and these
 
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """What a camera did since it was opened."""
+    """Statistics of a camera since it was opened."""
 
-    frames: int = 0  # that arrived
-    dropped: int = 0  # overwritten before anyone took them, or missing already when they arrived
-    late: int = 0  # that came more than 1.5 periods after the one before
-    rate: float = math.nan  # frames a second that arrived of late, as measured; NaN before the second
-    reconnects: int = 0  # times that the camera was lost and came back
+    frames: int = 0  # number of frames that arrived
+    dropped: int = 0  # frames overwritten before they were taken, or missing on arrival
+    late: int = 0  # frames that arrived more than 1.5 periods after the previous one
+    rate: float = math.nan  # measured number of recent frames per second; NaN before the second frame
+    reconnects: int = 0  # number of times the camera was lost and came back
 
 
 class Camera(Protocol):
-    """A camera that runs: its frames arrive by themselves and wait to be taken.
+    """A running camera: frames arrive continuously and are buffered until they are taken.
 
-    It runs from its making until ``close``. All of it may be used from any thread, but one thread takes.
+    It runs from construction until ``close``. All methods are thread-safe, but only one thread may take
+    frames.
     """
 
     @property
     def name(self) -> str:
-        """What to call it in messages."""
+        """Name in messages."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -57,25 +59,25 @@ class Camera(Protocol):
 
     @property
     def counts(self) -> Counts:
-        """What it did so far."""
+        """Statistics so far."""
 
     @property
     def latest(self) -> float:
-        """When the newest frame arrived, seconds on ``time.monotonic``'s scale; -inf before the first."""
+        """Arrival of the newest frame, seconds of ``time.monotonic``; -inf before the first."""
 
     @property
     def error(self) -> HardwareError | None:
-        """Why no more frames will come; None while they may."""
+        """Reason why no more frames will arrive; None while the camera works."""
 
     def take(self, most: int, timeout: float) -> Frames:
-        """Take the oldest frames that wait, or wait for one.
+        """Take the oldest waiting frames, or wait for one.
 
-        At least one is returned and at most `most`, without a gap between them. HardwareError if none came
-        within `timeout` seconds, or none will come any more.
+        At least one and at most `most` frames are returned, without a gap between them. HardwareError if none
+        arrives within `timeout` seconds, or none will arrive any more.
         """
 
     def flush(self) -> None:
-        """Forget the frames that wait; they do not count as dropped."""
+        """Discard the waiting frames; they do not count as dropped."""
 
     def close(self) -> None:
-        """Let the camera go, whatever its state; a second time does nothing."""
+        """Close the camera, whatever its state; a second call does nothing."""

@@ -1,4 +1,4 @@
-"""What cameras share that a thread drains: frames are counted and wait in a ring."""
+"""Base class of cameras that a thread reads: frames are counted and wait in a ring buffer."""
 
 from __future__ import annotations
 
@@ -15,31 +15,32 @@ from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.ring import Ring, usual_slots
 from mirrorskin.io.types import Closing
 
-_WINDOW = 128  # frames that the rate is measured over
-_REVIEW = 16  # frames from one look at the rate to the next, to tell late ones
-_PAUSE = 16  # usual frames; what is longer is a pause
-_LATE = 1.5  # periods
+_WINDOW = 128  # number of frames from which the rate is measured
+_REVIEW = 16  # the median period is recomputed after this many frames
+_PAUSE = 16  # median periods; a longer interval is a pause
+_LATE = 1.5  # periods after which a frame is late
 
 
 class ThreadedCamera(Closing):
-    """A ``mirrorskin.hw.camera.Camera`` but for the thread that brings the frames, and ``close``.
+    """A ``mirrorskin.hw.camera.Camera`` without the thread that reads frames, and without ``close``.
 
-    That thread fills ``_slot()`` and calls ``_put``, again and again, and ``_fail`` when it gives up.
+    A subclass starts a thread that fills ``_slot()`` and calls ``_put`` repeatedly, and ``_fail`` when it
+    gives up.
 
     Parameters
     ----------
     name : str
-        What messages call it.
+        Name in messages.
     shape : (int, int)
         Rows and columns.
     dtype : dtype
         uint8, uint16 or float32.
     rate : float, optional
-        Frames a second, if it is known.
+        Frames per second, if known.
     slots : int, optional
-        Frames that may wait; see ``mirrorskin.hw.ring.usual_slots``.
+        Number of frames that can wait; see ``mirrorskin.hw.ring.usual_slots``.
     clock : Clock
-        What frames' times are on, and readers wait by.
+        Clock of the frames' times and of waiting readers.
     """
 
     shape: tuple[int, int]
@@ -65,47 +66,47 @@ class ThreadedCamera(Closing):
 
     @property
     def counts(self) -> Counts:
-        """What it did so far."""
+        """Statistics so far."""
         return self._counter.counts(self._ring.dropped, self._reconnects)
 
     @property
     def latest(self) -> float:
-        """When the newest frame arrived, monotonic seconds; -inf before the first."""
+        """Arrival of the newest frame, seconds of ``time.monotonic``; -inf before the first."""
         return self._counter.latest
 
     @property
     def error(self) -> HardwareError | None:
-        """Why no more frames will come; None while they may."""
+        """Reason why no more frames will arrive; None while the camera works."""
         return self._ring.error
 
     def take(self, most: int, timeout: float) -> Frames:
-        """Take the oldest frames that wait, or wait for one; see ``Camera.take``."""
+        """Take the oldest waiting frames, or wait for one; see ``Camera.take``."""
         return self._ring.take(most, timeout)
 
     def flush(self) -> None:
-        """Forget the frames that wait; they do not count as dropped."""
+        """Discard the waiting frames; they do not count as dropped."""
         self._ring.flush()
 
     def _slot(self) -> NDArray[Any]:
-        """Return the place for the next frame, (H, W); see ``Ring.slot``."""
+        """Return the buffer for the next frame, (H, W); see ``Ring.slot``."""
         return self._ring.slot()
 
     def _put(self, time: float, lost: int = 0) -> None:
-        """Let readers have what is in the slot, which arrived at a time, after so many lost frames."""
+        """Publish the frame in the slot, with its time of arrival and the number of frames lost before it."""
         self._counter.add(time)
         self._ring.put(time, self._number + lost, lost)
         self._number += lost + 1
 
     def _fail(self, message: str) -> None:
-        """Tell readers that no more frames will come, and why."""
+        """Report to readers that no more frames will arrive, with the reason."""
         self._ring.fail(HardwareError(message))
 
 
 class FrameCounter:
-    """Counts frames as they arrive, and measures how many a second do. Any thread may ask.
+    """Counts frames and measures their rate. All methods are thread-safe.
 
-    The rate is that of the last 128 frames without the pauses between them: intervals that are longer
-    than 16 frames usually take. Neither jitter nor bursts of frames move it much.
+    The rate is computed from the last 128 frames without pauses, which are intervals longer than 16 usual
+    periods. Jitter and bursts of frames hardly affect it.
     """
 
     def __init__(self) -> None:
@@ -118,11 +119,11 @@ class FrameCounter:
 
     @property
     def latest(self) -> float:
-        """When the newest frame arrived; -inf before the first."""
+        """Arrival of the newest frame; -inf before the first."""
         return self._last
 
     def add(self, time: float) -> None:
-        """Count a frame that arrived at a time, seconds."""
+        """Count a frame with its time of arrival, seconds."""
         with self._lock:
             if time - self._last > self._longest:
                 self._late += 1
@@ -132,7 +133,7 @@ class FrameCounter:
                 self._longest = _LATE / self._rate()
 
     def counts(self, dropped: int = 0, reconnects: int = 0) -> Counts:
-        """Return what was counted, with what others counted."""
+        """Return the statistics, with the numbers of drops and reconnects given."""
         with self._lock:
             return Counts(self._frames, dropped, self._late, self._rate(), reconnects)
 
@@ -144,5 +145,5 @@ class FrameCounter:
         step = min(_PAUSE, held // 2)
         intervals = np.diff(times)
         counted = intervals[intervals <= np.median(times[step:] - times[:-step])]
-        # A clock need not tell two frames of a burst apart.
+        # Two frames of a burst may have the same time.
         return float(len(counted) / max(counted.sum(), 1e-9))

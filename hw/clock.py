@@ -1,4 +1,4 @@
-"""The time of hardware: what reads a clock, waits, or starts a thread does so through a `Clock`."""
+"""The clock of hardware: everything that reads the time, waits or starts a thread uses a `Clock`."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """What time it is, and the means to wait.
+    """Provides the time, and objects to wait with.
 
-    A lock that is held while its thread waits must be a condition of the clock. Other locks, for a few
-    statements, may be plain ones.
+    A lock that is held while its thread waits must be a condition of the clock. Locks around a few statements
+    may be plain locks.
     """
 
     def now(self) -> float:
-        """Return the time: seconds that never decrease."""
+        """Return the time, seconds; it never decreases."""
 
     def sleep(self, seconds: float, /) -> None:
-        """Let some seconds pass."""
+        """Wait for some seconds."""
 
     def event(self) -> threading.Event:
-        """Make an event."""
+        """Return a new event."""
 
     def condition(self) -> threading.Condition:
-        """Make a condition, which is also a lock that its thread may take again."""
+        """Return a new condition, which is also a reentrant lock."""
 
     def thread(self, work: Callable[[], object], name: str, daemon: bool = False) -> threading.Thread:
-        """Make a thread, which may wait with this clock's means; it is yet to be started."""
+        """Return a new thread, not started, that may wait on objects of this clock."""
 
 
 class SystemClock:
-    """The clock of the computer, ``time.monotonic``, and plain threads."""
+    """The system's clock, ``time.monotonic``, and plain threads."""
 
     now = staticmethod(time.monotonic)
     sleep = staticmethod(time.sleep)
@@ -40,9 +40,9 @@ class SystemClock:
     condition = staticmethod(threading.Condition)
 
     def thread(self, work: Callable[[], object], name: str, daemon: bool = False) -> threading.Thread:
-        """Make a thread; see `Clock.thread`."""
+        """Return a new thread; see `Clock.thread`."""
         return threading.Thread(target=work, name=name, daemon=daemon)
 
 
 SYSTEM: Clock = SystemClock()
-"""The clock of all hardware that is not given another."""
+"""The default clock of all hardware."""

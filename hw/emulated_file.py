@@ -1,4 +1,4 @@
-"""The first line of an emulated rig's file: it identifies the process without which the file is of no use."""
+"""The first line of an emulated rig's file, which identifies the emulating process."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Self
 from mirrorskin.io.os_errors import open_regular
 
 _HEADING = re.compile(r"# Emulated rig: port (\S+), process (\d+), started at (\d+)\.")
-_LONGEST = 1 << 20  # bytes of a rig file
+_LONGEST = 1 << 20  # maximum size of a rig file, bytes
 _STARTED = 18  # index, after state, of the start time in /proc/PID/stat; see proc(5)
 
 
@@ -44,7 +44,8 @@ class Emulator:
     def read(cls, path: Path) -> Self | None:
         """Return the emulator that wrote a rig file.
 
-        None if the twin did not write it, or if the stage's port has been changed: then it is a user's own.
+        None if the twin did not write the file, or if its port was changed: the file then belongs to the
+        user.
         """
         with open_regular(path) as file:
             text = file.read(_LONGEST).decode("utf-8-sig", errors="replace")
@@ -63,7 +64,7 @@ class Emulator:
 
     @property
     def running(self) -> bool:
-        """Whether the process still runs."""
+        """Whether the process is still running."""
         return _start_of(self.process) == self.started
 
 

@@ -1,7 +1,7 @@
-"""What goes wrong while hardware runs."""
+"""Errors of running hardware."""
 
 
 class HardwareError(Exception):
-    """A stage or a camera failed; the message is one line that says which, how, and what to do."""
+    """A stage or a camera failed; the message is one line with the device, the fault and the remedy."""
 
     exit_code = 1

@@ -1,4 +1,4 @@
-"""Cameras that speak GigE Vision or USB3 Vision, through the library Aravis."""
+"""GigE Vision and USB3 Vision cameras, through the library Aravis."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from mirrorskin.hw.reopened import READ_TIMEOUT, ReopenedCamera, warn_of_other
 from mirrorskin.hw.rig_file import GENICAM, CameraSettings
 from mirrorskin.io import InputError
 
-_BUFFERS = 16  # frames that Aravis may fill before they are read
-_LOOK = 0.2  # seconds that one waits for a frame before it looks whether to end
+_BUFFERS = 16  # buffers that Aravis may fill before they are read
+_LOOK = 0.2  # interval at which the thread checks whether to end, seconds
 _FORMATS = {"uint8": ("Mono8",), "uint16": ("Mono16", "Mono14", "Mono12", "Mono10")}  # the first is preferred
-_INPUT = "Line0"  # that triggers it, unless another is given
-_WRAP = 65535  # the greatest frame number of GigE Vision 1; then comes 1
-_SPAN = 5.0  # seconds that the least delay is looked for in; 50 ppm of drift are 0.25 ms meanwhile
+_INPUT = "Line0"  # default input of the trigger
+_WRAP = 65535  # largest frame number of GigE Vision 1, followed by 1
+_SPAN = 5.0  # seconds over which the minimum delay is computed; a drift of 50 ppm amounts to 0.25 ms
 _REMEDY = (
     "Debian: apt install gir1.2-aravis-0.8 libgirepository1.0-dev libcairo2-dev pkg-config gcc, "
     "then pip install 'mirrorskin[genicam]'"
@@ -28,29 +28,29 @@ _REMEDY = (
 
 
 class GenicamCamera(ReopenedCamera):
-    """A camera by GigE Vision or USB3 Vision, as a ``mirrorskin.hw.camera.Camera``.
+    """A GigE Vision or USB3 Vision camera, as a ``mirrorskin.hw.camera.Camera``.
 
-    It is given the size, format, rate, exposure and gain that the settings ask for; what it did not take is
-    logged as a warning. Its own counter tells how many frames are lost. Times are its own, put on the clock
-    of ``time.monotonic``; see ``DeviceClock``.
+    Format, size, rate, exposure and gain are set according to the settings; deviations are logged as
+    warnings. Lost frames are counted by the camera's own frame numbers. Times are the camera's own, converted
+    to the clock of ``time.monotonic``; see ``DeviceClock``.
 
-    A camera that is silent for 2 s is opened again; see ``ReopenedCamera``.
+    A camera that is silent for 2 s is reopened; see ``ReopenedCamera``.
 
     Parameters
     ----------
     settings : CameraSettings
-        With ``source="genicam:"`` for the first camera, or with what it is called behind the colon: its
-        serial number, IP or MAC address, or Aravis' name for it.
+        ``source="genicam:"`` selects the first camera; otherwise the serial number, IP or MAC address, or
+        Aravis' name of the camera follows the colon.
     slots : int, optional
-        Frames that may wait; see ``mirrorskin.hw.ring.usual_slots``.
+        Number of frames that can wait; see ``mirrorskin.hw.ring.usual_slots``.
     clock : Clock
-        What it waits by; Aravis itself goes by the computer's.
+        Clock to wait with; Aravis uses the system's.
 
     Raises
     ------
     InputError
-        Aravis is missing, there is no such camera, it is used by others, it cannot be set as asked for, or
-        gives no frame within 7 s.
+        Aravis is missing, the camera does not exist, is in use, does not accept the settings, or delivers no
+        frame within 7 s.
 
     Examples
     --------
@@ -74,17 +74,17 @@ class GenicamCamera(ReopenedCamera):
                 stream.push_buffer(self._aravis.Buffer.new_allocate(size))
             device.start_acquisition()
         self._opened()
-        why = f"{self.name} gives no picture"
+        why = f"{self.name} delivers no picture"
         try:
             self._read(stream)
-            self._was_lost(why)  # a camera that is gone takes seconds to stop
+            self._was_lost(why)  # stopping a lost camera takes seconds
         finally:
             with suppress(self._failure):
                 device.stop_acquisition()
         return why
 
     def _read(self, stream: Any) -> None:
-        """Put frames into the ring until there are none for 2 s."""
+        """Put frames into the ring buffer until none arrives for 2 s."""
         times, last, silent_since = DeviceClock(), None, self.clock.now()
         dtype = self.dtype.newbyteorder("<")
         patience = READ_TIMEOUT if self._settings.trigger is None else math.inf
@@ -112,28 +112,30 @@ class GenicamCamera(ReopenedCamera):
             there[device] = {device, *(name(n) for name in names)}
         found = [device for device, names in there.items() if not wanted or wanted in names]
         if not wanted and not found:
-            raise InputError(f"{self.name}: there is none; see its cable, power and network")
+            raise InputError(f"{self.name}: no camera found; check its cable, power supply and network")
         try:
             opened = aravis.Camera.new(found[0] if found else wanted)
         except self._failure as error:
-            known = f"; there are {', '.join(sorted(there))}" if there else "; none is found here"
+            known = f"; available: {', '.join(sorted(there))}" if there else "; none was found"
             raise InputError(f"{self.name} cannot be opened: {error.message}{known}") from error
         if opened.is_gv_device() and not opened.get_device().is_controller():
-            raise InputError(f"{self.name} is used by another program: close that, and wait some seconds")
+            raise InputError(
+                f"{self.name} is used by another program: close that program, and wait some seconds"
+            )
         return opened
 
     def _configure(self, device: Any) -> None:
-        """Set what is asked for, and log what was not taken."""
+        """Apply the settings, and log deviations."""
         asked, off = self._settings, self._aravis.Auto.OFF
         device.set_range_check_policy(self._aravis.RangeCheckPolicy.ENABLE)
         device.set_acquisition_mode(self._aravis.AcquisitionMode.CONTINUOUS)
         device.clear_triggers()
-        device.set_region(-1, -1, *asked.size)  # where it begins is the camera's own
+        device.set_region(-1, -1, *asked.size)  # the offset of the region remains the camera's own
         *_, width, height = device.get_region()
         if (width, height) != tuple(asked.size):
             raise InputError(
-                f"{self.name} gives {width} x {height} pixels, not {asked.size[0]} x {asked.size[1]}: set"
-                " camera.size in the rig file accordingly"
+                f"{self.name} delivers {width} x {height} pixels, not {asked.size[0]} x "
+                f"{asked.size[1]}: set camera.size in the rig file accordingly"
             )
         there = device.dup_available_pixel_formats_as_strings()
         formats = _FORMATS.get(asked.dtype, ())
@@ -141,8 +143,9 @@ class GenicamCamera(ReopenedCamera):
         if not chosen:
             wanted = asked.fourcc or " or ".join(formats) or "none"
             raise InputError(
-                f"{self.name} has no format for dtype {asked.dtype} (wanted: {wanted}; there are "
-                f"{', '.join(there)}): set camera.dtype and camera.fourcc in the rig file accordingly"
+                f"{self.name} has no format for dtype {asked.dtype} (needed: {wanted}; available: "
+                f"{', '.join(there)}): set camera.dtype and camera.fourcc in the rig file "
+                "accordingly"
             )
         device.set_pixel_format_from_string(chosen[0])
         if asked.exposure is not None:
@@ -158,7 +161,7 @@ class GenicamCamera(ReopenedCamera):
         if asked.rate is not None:
             device.set_frame_rate(asked.rate)
             self._compare("rate", asked.rate, device.get_frame_rate(), " Hz")
-        if asked.trigger is not None:  # last: a rate switches it off
+        if asked.trigger is not None:  # last, because setting a rate switches it off
             device.set_trigger(asked.trigger_input or _INPUT)
 
     def _compare(self, what: str, asked: float, got: float, unit: str = "") -> None:
@@ -170,24 +173,25 @@ class GenicamCamera(ReopenedCamera):
         try:
             yield
         except self._failure as error:
-            message = f"{self.name} cannot be set as the rig file says: {error.message}"
+            message = f"{self.name} cannot be set as in the rig file: {error.message}"
             raise InputError(message) from error
 
 
 class DeviceClock:
-    """Puts a camera's times on the clock of ``time.monotonic``.
+    """Converts a camera's time stamps to the clock of ``time.monotonic``.
 
-    A frame is read at its stamp, plus the difference between the clocks, plus its transfer time. The least
-    (read - stamp) of the last 5 s is added to every stamp: this removes the jitter of the transfer and
-    follows the drift. A stamp that does not increase means that the camera's clock was reset: all is new.
+    A frame is received at its stamp, plus the difference of the clocks, plus its transfer time. The minimum
+    of (received - stamp) over the last 5 s is added to every stamp. This removes the jitter of the transfer
+    and follows the drift. A stamp that does not increase means that the camera's clock was reset; the minimum
+    is then restarted.
     """
 
     def __init__(self) -> None:
-        self._least: deque[tuple[float, float]] = deque()  # when read and difference, which both increase
+        self._least: deque[tuple[float, float]] = deque()  # time of reception and difference, both increasing
         self._stamp = self._last = -math.inf
 
     def arrival(self, stamp: float, now: float) -> float:
-        """Return when a frame arrived that was stamped so and read now; never decreasing, nor after now."""
+        """Return the arrival of a frame from its stamp and its reception; never decreasing."""
         if stamp <= self._stamp:
             self._least.clear()
         self._stamp, difference = stamp, now - stamp
@@ -201,21 +205,23 @@ class DeviceClock:
 
 
 def count_lost(before: int, number: int) -> int:
-    """Return how many frames are missing between two of a camera's numbers."""
+    """Return how many frames are missing between two frame numbers of a camera."""
     if number > before:
         return number - before - 1
-    if number == before or before > _WRAP:  # it does not count, or began anew
+    if number == before or before > _WRAP:  # no frame numbers, or restarted
         return 0
     return number + _WRAP - before - 1
 
 
 def load_aravis() -> tuple[Any, Any]:
-    """Return the library Aravis and the error that it raises; InputError if it is missing."""
+    """Return the Aravis library and its error class; InputError if it is not installed."""
     try:
         import gi
 
         gi.require_version("Aravis", "0.8")
         from gi.repository import Aravis, GLib
     except (ImportError, ValueError) as error:
-        raise InputError(f"cameras by GenICam need Aravis, which is missing ({error}); {_REMEDY}") from error
+        raise InputError(
+            f"GenICam cameras need Aravis, which is not installed ({error}); {_REMEDY}"
+        ) from error
     return Aravis, GLib.Error

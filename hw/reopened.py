@@ -1,4 +1,4 @@
-"""What cameras share that may be lost and come back: a thread opens them, again if need be, and reads."""
+"""Base class of cameras that may be lost and come back: a thread opens, reads and reopens them."""
 
 from __future__ import annotations
 
@@ -14,61 +14,63 @@ from mirrorskin.io import InputError
 
 _log = logging.getLogger("mirrorskin.hw")
 
-OPEN_TIMEOUT = 5.0  # seconds that a source has for its opening
+OPEN_TIMEOUT = 5.0  # seconds to open a source
 READ_TIMEOUT = 2.0  # seconds without a picture after which a source counts as lost
-PATIENCE = 10.0  # seconds from the loss of a camera until it is given up
+PATIENCE = 10.0  # seconds after which a lost camera is given up
 _FIRST_FRAME = OPEN_TIMEOUT + READ_TIMEOUT  # seconds until the first frame
-_CLOSING = READ_TIMEOUT + 1.0  # seconds that the thread has for its end
-_PAUSES = (0.05, 1.0)  # seconds between two tries to have a camera back, at first and at most
+_CLOSING = READ_TIMEOUT + 1.0  # seconds to wait for the end of the thread
+_PAUSES = (0.05, 1.0)  # seconds between attempts to reopen a camera, first and maximum
 
 
 class ReopenedCamera(ThreadedCamera):
-    """A camera that a thread opens and drains, and opens again if it is lost, for at most 10 s.
+    """A camera that a thread opens and reads, and reopens after a loss, for at most 10 s.
 
-    It is logged that it is lost, and that it is back. Numbers then go on after as many as the time away had
-    room for. ``error`` stays None meanwhile; ``latest`` shows at once that nothing comes.
+    Loss and return are logged. Frame numbers then continue as if the missing frames had been counted.
+    Meanwhile ``error`` is None, and ``latest`` shows that no frames arrive.
 
-    A subclass has ``_read_until_lost``, sets what that needs, and then calls ``_start``.
+    A subclass implements ``_read_until_lost``, initialises what that needs, and then calls ``_start``.
 
     Parameters
     ----------
     name : str
-        What messages call it.
+        Name in messages.
     settings : CameraSettings
     slots : int, optional
-        Frames that may wait; see ``mirrorskin.hw.ring.usual_slots``.
+        Number of frames that can wait; see ``mirrorskin.hw.ring.usual_slots``.
     clock : Clock
-        What it waits by.
+        Clock to wait with.
     """
 
-    _returns = True  # whether it is opened again after a loss
+    _returns = True  # whether it is reopened after a loss
 
     def __init__(
         self, name: str, settings: CameraSettings, slots: int | None = None, clock: Clock = SYSTEM
     ) -> None:
         self._settings = settings
         super().__init__(name, settings.shape, settings.dtype, settings.rate, slots, clock)
-        self._lost: float | None = None  # since when
+        self._lost: float | None = None  # time of the loss
         self._pause = _PAUSES[0]
         self._refusal: InputError | None = None
         self._ready, self._stop = clock.event(), clock.event()
-        # A driver may hang: the program's end must not wait for that.
+        # A driver may hang, and must not keep the program from ending.
         self._thread = clock.thread(self._drain, self.name, daemon=True)
 
     def _read_until_lost(self, timeout: float) -> str:
-        """Open the source within so many seconds, and until ``_stop`` fill slots and call ``_arrived``.
+        """Open the source within a timeout; until ``_stop``, fill slots and call ``_arrived``.
 
-        Return why no more frames come. InputError if it cannot be opened, or gives what is not asked for.
+        Return the reason why no more frames arrive. InputError if it cannot be opened, or does not match the
+        settings.
         """
         raise NotImplementedError
 
     def _start(self) -> None:
-        """Begin to drain, and wait for the first frame unless it is triggered; InputError after 7 s."""
+        """Start the thread, and wait for the first frame unless it is triggered; InputError after 7 s."""
         self._thread.start()
         try:
             if not self._ready.wait(_FIRST_FRAME):
                 raise InputError(
-                    f"{self.name} gave no picture within {_FIRST_FRAME:.3g} s: see its cable and power"
+                    f"{self.name} delivered no picture within {_FIRST_FRAME:.3g} s: check its "
+                    "cable and power supply"
                 )
             if self._refusal is not None:
                 raise self._refusal
@@ -77,17 +79,17 @@ class ReopenedCamera(ThreadedCamera):
             raise
 
     def _opened(self) -> None:
-        """Say that the source is open; of one that waits for a trigger that is enough."""
+        """Record that the source is open, which suffices for a triggered camera."""
         if self._settings.trigger is not None:
             self._ready.set()
 
     def _arrived(self, time: float, lost: int = 0) -> None:
-        """Let readers have what is in the slot, which arrived at a time, after so many lost frames."""
+        """Publish the frame in the slot, with its time of arrival and the number of frames lost before it."""
         self._put(time, lost if self._lost is None else self._came_back(time))
         self._ready.set()
 
     def take(self, most: int, timeout: float) -> Frames:
-        """Take the oldest frames that wait, or wait for one; see ``Camera.take``."""
+        """Take the oldest waiting frames, or wait for one; see ``Camera.take``."""
         try:
             return super().take(most, timeout)
         except HardwareError as error:
@@ -95,21 +97,21 @@ class ReopenedCamera(ThreadedCamera):
             if lost is None or self.error is not None:
                 raise
             away = self.clock.now() - lost
-            raise HardwareError(f"{self.name} was lost {away:.1f} s ago and is not back yet") from error
+            raise HardwareError(f"{self.name} was lost {away:.1f} s ago and has not come back yet") from error
 
     def close(self) -> None:
-        """Let the camera go; a driver that does not answer is left to itself after 3 s."""
+        """Close the camera; a driver that does not answer within 3 s is abandoned."""
         self._stop.set()
         self._fail(f"{self.name} is closed")
         self._thread.join(_CLOSING)
         if self._thread.is_alive():
-            _log.warning("%s does not let go: unplug it before it is used again", self.name)
+            _log.warning("%s cannot be closed: unplug it before using it again", self.name)
 
     def _drain(self) -> None:
-        """Move frames to the ring until the end: what the thread does."""
+        """Transfer frames to the ring buffer until the end; run by the thread."""
         try:
             self._keep_open()
-        except Exception as error:  # whatever it is, readers must not wait
+        except Exception as error:  # on any exception, readers must not wait forever
             _log.debug("%s failed", self.name, exc_info=error)
             self._fail(f"{self.name} failed: {error}")
             if not self._ready.is_set():
@@ -118,7 +120,7 @@ class ReopenedCamera(ThreadedCamera):
             self._ready.set()
 
     def _keep_open(self) -> None:
-        """Open the source and follow it; again and again if it is lost."""
+        """Open the source and read it, again after each loss."""
         timeout = OPEN_TIMEOUT
         while not self._stop.is_set():
             try:
@@ -135,25 +137,28 @@ class ReopenedCamera(ThreadedCamera):
                 timeout = self._wait_for_return(why)
 
     def _wait_for_return(self, why: str) -> float:
-        """Wait before a lost camera is tried again, or give it up; return the seconds left to try."""
+        """Wait before the next attempt, or give up; return the remaining seconds for attempts."""
         left = self._was_lost(why) + PATIENCE - self.clock.now()
         if left <= 0:
-            self._fail(f"{why}: it was lost, and not back within {PATIENCE:.3g} s; see its cable and power")
+            self._fail(
+                f"{why}: it was lost and did not come back within {PATIENCE:.3g} s; check its cable "
+                "and power supply"
+            )
             self._stop.set()
         self._stop.wait(min(self._pause, max(left, 0.0)))
         self._pause = min(2 * self._pause, _PAUSES[1])
         return min(OPEN_TIMEOUT, max(left, 0.1))
 
     def _was_lost(self, why: str) -> float:
-        """Log that the camera is lost, if that is news, and return since when it is."""
+        """Log a new loss of the camera, and return the time of the loss."""
         if self._lost is None and not self._stop.is_set():
             self._lost = self.clock.now()
-            message = "%s: it was lost after %d frames, and is tried again for %.3g s"
+            message = "%s: lost after frame %d; trying to reopen it for %.3g s"
             _log.warning(message, why, self._number, PATIENCE)
         return self._lost or self.clock.now()
 
     def _came_back(self, time: float) -> int:
-        """Log that the camera is back, and return how many frames it would have given meanwhile."""
+        """Log the return of the camera, and return the number of frames missed meanwhile."""
         away = time - self.latest
         rate = self._counter.counts().rate
         missing = max(1, round(away * rate) - 1) if math.isfinite(rate) else 1
@@ -164,6 +169,6 @@ class ReopenedCamera(ThreadedCamera):
 
 
 def warn_of_other(name: str, what: str, asked: float | str, got: float | str, unit: str = "") -> None:
-    """Log that a camera set something else than was asked for."""
+    """Log that a camera uses another value than requested."""
     said = [f"{value}{unit}" if isinstance(value, str) else f"{value:g}{unit}" for value in (asked, got)]
-    _log.warning("%s: %s %s was asked for, the camera set %s", name, what, *said)
+    _log.warning("%s: %s %s was requested, but the camera set %s", name, what, *said)

@@ -1,6 +1,6 @@
-"""The rig file: TOML that says how a stage and a camera are opened.
+"""The rig file: TOML that describes a stage and a camera.
 
-Each class is a table of the file, and each of its fields a key, in the file's units; properties give mm,
+Each class is a table of the file, and each of its fields a key in the file's units; properties return mm,
 radians and seconds.
 """
 
@@ -28,11 +28,11 @@ _ROUND = 360.0  # degrees
 _CELL = 65535  # rows or columns
 
 GENICAM = "genicam:"
-"""How the source of a camera begins that speaks GigE Vision or USB3 Vision."""
+"""Prefix of the source of GigE Vision and USB3 Vision cameras."""
 
 Text = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]*[^\s\x00-\x1f\x7f][^\x00-\x1f\x7f]*\Z")]
 Line = Literal["coolant", "spindle"]
-"""A line of the controller that can be switched on and off."""
+"""An output of the controller that can be switched on and off."""
 
 Letter = Literal["X", "Y", "Z", "A", "B", "C"]
 _Side = Annotated[float, Meta(gt=0)]
@@ -45,9 +45,9 @@ _Reference = Annotated[
 
 
 class Axis(msgspec.Struct, frozen=True, kw_only=True):
-    """An axis of the machine, and the motion that it makes; see the classes below.
+    """An axis of the machine, and its motion; see the classes below.
 
-    The machine's coordinate is ``zero + direction * value``, with the value in the axis's own unit.
+    The machine coordinate is ``zero + direction * value``, with the value in the axis's own unit.
     """
 
     letter: Annotated[Letter, Meta(description="one of X, Y, Z, A, B, C, in quotes,", examples=["Z"])]
@@ -61,11 +61,13 @@ class Axis(msgspec.Struct, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         low, high = self.limits
         if not low < high:
-            raise ValueError(f"limits are out of order, {low:g} not below {high:g}: write [least, greatest]")
+            raise ValueError(
+                f"limits are in the wrong order, {low:g} is not below {high:g}: write [least, greatest]"
+            )
 
     @property
     def scale(self) -> float:
-        """The machine's units in one mm or rad."""
+        """Machine units per mm or rad."""
         return math.degrees(1.0) if self.unit == "deg" else 1.0
 
     @property
@@ -84,12 +86,12 @@ class Axis(msgspec.Struct, frozen=True, kw_only=True):
         return self._converted(self.speed)
 
     def coordinate(self, value: float) -> float:
-        """Return the machine's coordinate at a value, mm or rad."""
+        """Return the machine coordinate of a value, mm or rad."""
         return self.zero + self.direction * value * self.scale
 
     def value(self, coordinate: float) -> float:
-        """Return the value, mm or rad, at a coordinate of the machine."""
-        return self.direction * (coordinate - self.zero) / self.scale + 0.0  # no minus zero
+        """Return the value, mm or rad, at a machine coordinate."""
+        return self.direction * (coordinate - self.zero) / self.scale + 0.0  # avoids -0
 
     def _converted(self, value: float) -> float:
         return math.radians(value) if self.unit == "deg" else value
@@ -108,7 +110,7 @@ class TravelAxis(Axis, frozen=True, kw_only=True):
 
 
 class CentredAxis(Axis, frozen=True, kw_only=True):
-    """An axis that must be able to go to 0, where the body is before and after all else."""
+    """An axis that must include 0, where the body is before and after a scan."""
 
     _ZERO: ClassVar[str] = "where the body is lowered"
 
@@ -117,13 +119,13 @@ class CentredAxis(Axis, frozen=True, kw_only=True):
         low, high = self.limits
         if not low < 0 < high:
             raise ValueError(
-                f"limits [{low:g}, {high:g}] do not have 0 ({self._ZERO}) within; "
-                "set zero to the machine's coordinate there, and limits on both sides of it"
+                f"limits [{low:g}, {high:g}] do not include 0 ({self._ZERO}); set zero to the "
+                "machine coordinate there, and limits on both sides of it"
             )
 
 
 class ShiftAxis(CentredAxis, frozen=True, kw_only=True):
-    """An axis along the sheet, x or y; 0 is where the body is lowered."""
+    """An axis along the sheet, x or y; the body is lowered at 0."""
 
     zero: Annotated[float, Meta(description="a finite number of mm", examples=[0.0])] = 0.0
     unit: Literal["mm"] = "mm"
@@ -135,7 +137,7 @@ class ShiftAxis(CentredAxis, frozen=True, kw_only=True):
 
 
 class AngleAxis(CentredAxis, frozen=True, kw_only=True):
-    """An axis that turns the body or leans it."""
+    """An axis that rotates the body."""
 
     zero: Annotated[float, Meta(description="a finite number of degrees", examples=[0.0])] = 0.0
     unit: Literal["deg"] = "deg"
@@ -143,7 +145,7 @@ class AngleAxis(CentredAxis, frozen=True, kw_only=True):
 
 
 class TwistAxis(AngleAxis, frozen=True, kw_only=True):
-    """The axis that turns the body about its own axis; 0 is where the body is lowered."""
+    """The axis that turns the body about its own axis; the body is lowered at 0."""
 
     limits: Annotated[
         tuple[
@@ -174,7 +176,7 @@ class TiltAxis(AngleAxis, frozen=True, kw_only=True):
 
 
 class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """How the stage is reached, and what it may do: the table ``[stage]``."""
+    """The connection and the limits of the stage: the table ``[stage]``."""
 
     port: Annotated[Text, Meta(description="a serial port or a URL, in quotes,", examples=["/dev/ttyUSB0"])]
     firmware: Annotated[
@@ -223,8 +225,8 @@ class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
         if (self.pitch is None) != (self.roll is None):
             has, lacks = ("pitch", "roll") if self.roll is None else ("roll", "pitch")
             raise ValueError(
-                f"there is [stage.{has}] and no [stage.{lacks}]: a lean needs both; add the other, or leave "
-                "both out"
+                f"there is [stage.{has}] but no [stage.{lacks}]: a lean needs both; add the "
+                "other, or remove both"
             )
         taken: dict[str, str] = {}
         for name, axis in self.axes.items():
@@ -236,19 +238,19 @@ class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
             taken[axis.letter] = name
         if not self.press > self.travel.low:
             raise ValueError(
-                f"press is {self.press:g}, not above travel.limits' {self.travel.low:g}; "
-                "write the greatest travel that the skin bears, in mm"
+                f"press is {self.press:g}, not above travel.limits' {self.travel.low:g}; write "
+                "the greatest travel that the skin tolerates, in mm"
             )
 
     @property
     def axes(self) -> dict[str, Axis]:
-        """The axes that the stage has, by the motion they make: travel, pitch, roll, x, y, twist."""
+        """The axes of the stage, by motion: travel, pitch, roll, x, y, twist."""
         named = {name: getattr(self, name) for name in ("travel", "pitch", "roll", "x", "y", "twist")}
         return {name: axis for name, axis in named.items() if axis is not None}
 
     @property
     def limits(self) -> Limits:
-        """What the stage may do: its axes, the greatest half-angle all the way round, and its press."""
+        """Limits of the axes, of the half-angle of a precession, and of the press."""
         reaches = [reach for axis in (self.pitch, self.roll) if axis for reach in (-axis.low, axis.high)]
         travel = (self.travel.low, self.travel.high)
         sideways = {
@@ -259,7 +261,7 @@ class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """How the camera is opened, and what its counts mean: the table ``[camera]``."""
+    """The settings of the camera and the meaning of its counts: the table ``[camera]``."""
 
     source: Annotated[
         Annotated[int, Meta(ge=0, lt=1000)] | Text,
@@ -319,18 +321,18 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
                 known = "Mono8 to Mono16" if self.genicam else "two to four letters"
                 raise ValueError(f'fourcc is "{self.fourcc}": this source needs {known}; or leave it out')
         if self.trigger_input is not None and self.trigger is None:
-            raise ValueError("trigger_input is given and trigger is not: add that, or leave both out")
+            raise ValueError("trigger_input is given without trigger: add trigger, or remove trigger_input")
         if self.zenith_gain == 0:
             raise ValueError("zenith_gain is 0: write the counts per degree, e.g. 5.7, or leave it out")
         if self.zenith_gain is None and self.zenith_offset is not None:
             raise ValueError(
-                "zenith_offset is given and zenith_gain is not: the one means nothing without the other; "
-                "add it, or leave both out"
+                "zenith_offset is given without zenith_gain, and has no meaning alone: add "
+                "zenith_gain, or remove zenith_offset"
             )
 
     @property
     def genicam(self) -> bool:
-        """Whether it is a camera by GigE Vision or USB3 Vision."""
+        """Whether it is a GigE Vision or USB3 Vision camera."""
         return str(self.source).startswith(GENICAM)
 
     @property
@@ -340,7 +342,7 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def streamed(self) -> bool:
-        """Whether it is a stream, whose delay is another one at each connection."""
+        """Whether it is a stream, whose delay differs for each connection."""
         return isinstance(self.source, str) and "://" in self.source
 
     @property
@@ -357,7 +359,7 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class RigSettings:
-    """A rig: its file, its name, its stage and its camera."""
+    """A rig: file, name, stage and camera."""
 
     path: Path
     name: str
@@ -416,7 +418,7 @@ def load_rig(path: Path | str) -> RigSettings:
 
 
 def _check_emulator(path: Path) -> None:
-    """Refuse the file of an emulated rig that has ended: its port may belong to another terminal by now."""
+    """Refuse the file of an ended emulated rig, whose port may belong to another terminal now."""
     emulator = Emulator.read(path)
     if emulator is None or emulator.running:
         return
@@ -428,7 +430,7 @@ def _check_emulator(path: Path) -> None:
 
 
 def _own_stage(path: Path, name: str) -> str:
-    """Return the name of a stage's class, as a file's if its module lies beside the rig file."""
+    """Return the name of a stage class, with the path of its module if that is next to the rig file."""
     place, _, kind = name.rpartition(":")
     if not place:
         return name
@@ -437,16 +439,16 @@ def _own_stage(path: Path, name: str) -> str:
 
 
 def _beside(path: Path, name: str) -> str:
-    """Return the path of a file beside the rig file; a name of none there is left as it is."""
+    """Return the path of a file relative to the rig file; other names are returned unchanged."""
     try:
         return str(path.parent / name) if (path.parent / name).exists() else name
-    except OSError:  # it is too long, or the folder may not be looked into
+    except OSError:  # too long, or the folder cannot be read
         return name
 
 
 TEMPLATE = """\
-# A rig for mirrorskin: what moves the sensor's body, and what looks at its skin.
-# Lines that begin with # show what may be set as well.
+# A rig for mirrorskin: the stage that moves the sensor's body, and the camera that watches its skin.
+# Lines that start with # show optional settings.
 
 name = "bench"
 
@@ -454,13 +456,13 @@ name = "bench"
 port = "/dev/ttyUSB0"           # or COM3, socket://192.168.0.7:23, rfc2217://host:port
 # firmware = "grbl"             # or "marlin", or a class of your own as "my_stage.py:MyStage"
 # baud = 115200
-home = true                     # the stage has switches, and must home before it moves
-# timeout = 2.0                 # s that an answer may take
-# report_rate = 20.0            # Hz: how often its position is asked for at rest
-# silence = 0.07                # s without an answer, in motion, after which it is stopped
-press = 2.0                     # mm: greatest travel, whatever the axis could do
-# travel_sigma = 0.002          # mm: how well the travel of a frame is known; it is added to that of heights
-# pivot = [0.0, 0.0, 0.0]       # mm from the centre of the sheet: what the body turns about
+home = true                     # the stage has limit switches, and must be homed before it moves
+# timeout = 2.0                 # s to wait for an answer
+# report_rate = 20.0            # Hz: rate of position queries at rest
+# silence = 0.07                # s without an answer, in motion, after which the stage is stopped
+press = 2.0                     # mm: maximum travel, even if the axis allows more
+# travel_sigma = 0.002          # mm: standard deviation of the travel of a frame
+# pivot = [0.0, 0.0, 0.0]       # mm from the centre of the sheet: pivot of the body's rotation
 
 [stage.travel]                  # mm, positive down, 0 where the skin is just above the object
 letter = "Z"
@@ -469,9 +471,9 @@ zero = -20.0                    # the machine's coordinate at which the travel i
 # unit = "mm"
 limits = [-10.0, 3.0]
 speed = 5.0                     # mm/s
-# steps = 250.0                 # a mm: what the controller's $102 must be, if that is to be checked
+# steps = 250.0                 # per mm: required value of the controller's $102
 
-[stage.pitch]                   # degrees, 0 upright; leave pitch and roll out if the stage only presses
+[stage.pitch]                   # degrees, 0 upright; remove pitch and roll if the stage only presses
 letter = "X"
 direction = 1
 zero = 0.0
@@ -519,21 +521,21 @@ speed = 20.0
 [camera]
 source = 0                      # a camera's number, or in quotes a file, a URL, or genicam:SERIAL
 size = [640, 480]               # columns, rows
-# name = "left"                 # what recordings and calibrations call it; without it, the source
+# name = "left"                 # name in recordings and calibrations; by default the source
 # dtype = "uint8"
 # fourcc = "GREY"
 # exposure = 0.004              # s
 # gain = 1.0
 # rate = 60.0                   # Hz
-# trigger = "coolant"           # or "spindle": the controller's line that triggers it, or a lamp, in steps
-# trigger_input = "Line0"       # the input of a genicam: camera that the line is wired to
+# trigger = "coolant"           # or "spindle": the controller's output that triggers camera or lamp, in steps
+# trigger_input = "Line0"       # the input of a genicam: camera to which this output is connected
 # stall = 0.1                   # s without a frame, in motion, after which the stage is stopped
-# delay = 0.03                  # s from the middle of the exposure to the arrival; a stream's is measured
-# line_time = 15e-6             # s from row to row of a rolling shutter; negative if the last is the first
+# delay = 0.03                  # s from the middle of the exposure to the arrival; measured for a stream
+# line_time = 15e-6             # s from row to row of a rolling shutter; negative if the last is first
 pixel_size = 0.03               # mm at the sheet
-# dark = 12                     # counts without light, or a picture's file
-# bright = "bright.tif"         # counts in full light, or a picture's file
+# dark = 12                     # counts without light, or a picture file
+# bright = "bright.tif"         # counts in full light, or a picture file
 # zenith_gain = 5.7             # counts per degree of zenith
 # zenith_offset = 10            # counts at zenith 0
 """
-"""A rig file to begin with, which has every key."""
+"""A template of a rig file with every key."""

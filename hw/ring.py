@@ -1,4 +1,4 @@
-"""A ring of frames from a camera's thread to a reader: no copies, and no waiting for a late reader."""
+"""A ring buffer of frames from a camera's thread to a reader, without copies, whose writer never waits."""
 
 from __future__ import annotations
 
@@ -14,29 +14,28 @@ from mirrorskin.hw.camera import Frames
 from mirrorskin.hw.clock import SYSTEM, Clock
 from mirrorskin.hw.errors import HardwareError
 
-MEMORY = 64_000_000  # bytes that a ring takes, where nothing else is said
+MEMORY = 64_000_000  # default size of a ring, bytes
 _SECONDS = 0.5
 _LEAST, _MOST = 4, 1024  # frames
-_BEYOND = 64  # bytes behind the frames, so that a kernel may load its last word whole
+_BEYOND = 64  # readable bytes after the frames, so that a kernel may load its last word as a whole
 
 
 def usual_slots(shape: tuple[int, int], dtype: DTypeLike, rate: float | None = None) -> int:
-    """Return how many frames a ring should hold: 64 MB, but 4 to 1024 frames; more where 0.5 s takes more."""
+    """Return the number of frames in a ring: 64 MB or 0.5 s, whichever is more, from 4 to 1024."""
     room = MEMORY // max(1, math.prod(shape) * np.dtype(dtype).itemsize)
     return max(_LEAST, min(room, _MOST), math.ceil(_SECONDS * (rate or 0.0)))
 
 
 class Ring:
-    """Frames side by side in memory that a device can work on in place.
+    """A contiguous ring buffer of frames that a device can use in place.
 
-    One thread writes: it fills ``slot()`` and calls ``put``, again and again, and never waits. One other
-    takes. When all places are full, the oldest frame that waits is lost, and counted. A place that was
-    taken is not written to as long as anything refers to the array that ``take`` gave, or to a view of it.
-    At most half of the places are lent so; a reader that keeps more than these is given copies, so it can
-    never stop the camera.
+    One thread writes: it repeatedly fills ``slot()`` and calls ``put``, and never waits. Another thread
+    takes. When all slots are full, the oldest waiting frame is lost and counted. A slot is not overwritten
+    while the array that ``take`` returned, or a view of it, is referenced. At most half of the slots are
+    shared in this way; a reader that keeps more gets copies, so it can never block the camera.
 
-    The memory begins on a page, and 64 bytes beyond each frame may be read. Frames that were put one after
-    the other lie one after the other, up to the last place. `slots` frames, of `shape` (H, W), may wait.
+    The memory is page-aligned, and the 64 bytes after each frame may be read. Consecutive frames are
+    contiguous, up to the last slot. `slots` frames of `shape` (H, W) can wait.
     """
 
     def __init__(
@@ -50,19 +49,19 @@ class Ring:
         if slots < 1:
             raise ValueError(f"a ring has at least 1 slot, not {slots}")
         self.name = name
-        self.dropped: int = 0  # frames lost so far, here or before they came here
+        self.dropped: int = 0  # frames lost so far, here or before they arrived here
         self.error: HardwareError | None = None
-        # Besides: one is being written to; and while one is lent and one copied, one can wait.
+        # One more for writing; and while one is shared and one copied, one can wait.
         places = max(slots + 2, 4)
         self._slots = slots
         self._most_lent = max(1, slots // 2)
         self._places = _pages((places, *shape), np.dtype(dtype))
         self._time = np.zeros(places)
         self._number = np.zeros(places, np.int64)
-        self._lost = [0] * places  # before each frame
+        self._lost = [0] * places  # number of lost frames before each frame
         self._free = [True] * places
         self._waiting: deque[int] = deque()
-        self._missed = 0  # frames lost since the last that was taken
+        self._missed = 0  # frames lost since the last one taken
         self._lent = 0
         self._returned: deque[range] = deque()
         self._writing = 0
@@ -71,12 +70,12 @@ class Ring:
         self._came = clock.condition()
 
     def slot(self) -> NDArray[Any]:
-        """Return the place for the next frame, (H, W); it stays the same until ``put``."""
+        """Return the buffer for the next frame, (H, W); it is the same until ``put``."""
         place: NDArray[Any] = self._places[self._writing]
         return place
 
     def put(self, time: float, number: int, lost: int = 0) -> None:
-        """Let readers have what is in the slot, which arrived at a time, after so many lost frames."""
+        """Publish the frame in the slot, with its time of arrival and the number of frames lost before it."""
         with self._came:
             here = self._writing
             self._time[here], self._number[here], self._lost[here] = time, number, lost
@@ -89,17 +88,16 @@ class Ring:
             self._came.notify()
 
     def fail(self, error: HardwareError) -> None:
-        """Tell readers, also one that waits, that no more frames will come; those that wait can be taken."""
+        """Report to readers that no more frames will arrive; waiting frames can still be taken."""
         with self._came:
             if self.error is None:
                 self.error = error
             self._came.notify_all()
 
     def take(self, most: int, timeout: float) -> Frames:
-        """Take the oldest frames that wait, or wait for one; see ``mirrorskin.hw.camera.Camera.take``.
+        """Take the oldest waiting frames, or wait for one; see ``mirrorskin.hw.camera.Camera.take``.
 
-        Fewer are given than wait where frames were lost between them, at the last place, and where more
-        would be half of the ring.
+        The result ends before lost frames, at the last slot, and at half of the ring.
         """
         with self._came:
             self._wait(timeout)
@@ -118,7 +116,7 @@ class Ring:
         return Frames(pixels, number, time, missed)
 
     def flush(self) -> None:
-        """Forget the frames that wait; they do not count as dropped."""
+        """Discard the waiting frames; they do not count as dropped."""
         with self._came:
             for place in self._waiting:
                 self._free[place] = True
@@ -126,7 +124,7 @@ class Ring:
             self._missed = 0
 
     def _run(self, most: int) -> range:
-        """Take places that wait, side by side and without a loss between them, from the queue."""
+        """Remove contiguous waiting slots without a loss between them from the queue."""
         first = self._waiting.popleft()
         stop = first + 1
         while self._waiting and stop - first < most and self._waiting[0] == stop and not self._lost[stop]:
@@ -138,16 +136,18 @@ class Ring:
         deadline = self._clock.now() + timeout
         while not self._waiting:
             if self.error is not None:
-                raise self.error.with_traceback(None)  # it would keep what earlier takers held
+                # a traceback would keep arrays of earlier callers alive
+                raise self.error.with_traceback(None)
             left = deadline - self._clock.now()
             if left <= 0:
                 raise HardwareError(
-                    f"{self.name} gave no frame for {timeout:.3g} s: see whether it runs, and its cable"
+                    f"{self.name} delivered no frame for {timeout:.3g} s: check whether it runs, "
+                    "and its cable"
                 )
             self._came.wait(left)
 
     def _reclaim(self) -> None:
-        """Take back the places that nobody refers to any more."""
+        """Recover the slots that are no longer referenced."""
         while self._returned:
             run = self._returned.popleft()
             self._lent -= len(run)
@@ -160,7 +160,7 @@ class Ring:
         self.dropped += 1
 
     def _next(self, here: int) -> int:
-        """Choose the first free place behind this one, round the ring; there always is one."""
+        """Return the first free slot after this one, cyclically; there always is one."""
         count = len(self._free)
         place = next(p % count for p in range(here + 1, here + 1 + count) if self._free[p % count])
         self._free[place] = False
@@ -168,7 +168,7 @@ class Ring:
 
 
 class _Loan:
-    """What the arrays that were given refer to: when it goes, nobody sees its places any more."""
+    """Owner of returned arrays: its deletion shows that their slots are no longer referenced."""
 
     def __init__(self, memory: NDArray[Any], returned: deque[range], run: range) -> None:
         interface = memory.__array_interface__
@@ -176,12 +176,12 @@ class _Loan:
         self._memory, self._returned, self._run = memory, returned, run
 
     def __del__(self) -> None:
-        # This needs no lock: it may happen in the midst of anything, in any thread.
+        # No lock is needed: it may run at any time, in any thread.
         self._returned.append(self._run)
 
 
 def _pages(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Make room for frames that begins on a page, with bytes beyond that may be read."""
+    """Return page-aligned memory for frames, with readable bytes after it."""
     nbytes = math.prod(shape) * dtype.itemsize
     memory = mmap.mmap(-1, nbytes + _BEYOND, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     return np.frombuffer(memory, np.uint8, nbytes).view(dtype).reshape(shape)

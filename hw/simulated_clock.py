@@ -1,4 +1,4 @@
-"""A clock that jumps from event to event: hours of waiting take no time, and always go the same way."""
+"""A simulated clock, which jumps from event to event: waiting takes no time and is deterministic."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
-_POLLS = 1_000_000  # looks at the time without a wait, after which nobody will ever wait
+_POLLS = 1_000_000  # readings of the time without a wait after which no wait is expected
 
 
 class DeadlockError(RuntimeError):
-    """All threads of a simulated clock wait for each other, and no time ends that."""
+    """All threads of a simulated clock wait for each other, without a deadline."""
 
 
 def _always() -> bool:
@@ -29,28 +29,28 @@ def _never() -> bool:
 
 @dataclass(eq=False, slots=True)
 class _Task:
-    """A thread that takes part: while it waits, what for and until when."""
+    """A participating thread: while it waits, its condition and deadline."""
 
     name: str
-    gate: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))  # opened for its turn
+    gate: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))  # released for its turn
     ready: Callable[[], bool] = _always
     deadline: float = math.inf
     what: str = "its turn"
-    error: BaseException | None = None  # raised in it when its turn comes
+    error: BaseException | None = None  # raised in the thread at its turn
 
 
 class SimulatedClock:
     """A `mirrorskin.hw.clock.Clock` whose time passes only while all of its threads wait.
 
-    The thread that makes the clock takes part, and those that ``thread`` makes. One of them runs at a time,
-    until it waits; then the one runs that has waited longest of those whose waiting is over. If there is
-    none, the time jumps to the earliest at which one's is. What happens depends on nothing but the program.
-    What takes no simulated time, such as computing, takes none however long it lasts.
+    The thread that creates the clock participates, and so do those that ``thread`` creates. One of them runs
+    at a time, until it waits. Then the thread runs whose wait is over and that has waited longest. If there
+    is none, the time jumps to the earliest deadline. The order of events depends only on the program.
+    Computations take no simulated time.
 
     Parameters
     ----------
     now : float
-        The time at first, seconds.
+        Initial time, seconds.
 
     Examples
     --------
@@ -66,7 +66,7 @@ class SimulatedClock:
         self._polls = 0
         self._main = _Task(threading.current_thread().name)
         self._tasks = {threading.get_ident(): self._main}
-        self._waiting: list[_Task] = []  # in the order in which they began to
+        self._waiting: list[_Task] = []  # in the order in which they started to wait
 
     @property
     def threads(self) -> list[str]:
@@ -78,27 +78,27 @@ class SimulatedClock:
         self._polls += 1
         if self._polls > _POLLS:
             self._polls = 0
-            raise DeadlockError(f"{threading.current_thread().name} looks at the clock and never waits")
+            raise DeadlockError(f"{threading.current_thread().name} reads the clock but never waits")
         return self._now
 
     def sleep(self, seconds: float, /) -> None:
-        """Let some seconds pass."""
+        """Wait for some seconds."""
         self._wait(_never, max(0.0, seconds), "the time")
 
     def event(self) -> SimulatedEvent:
-        """Make an event."""
+        """Return a new event."""
         return SimulatedEvent(self)
 
     def condition(self) -> SimulatedCondition:
-        """Make a condition, which is also a lock."""
+        """Return a new condition, which is also a lock."""
         return SimulatedCondition(self)
 
     def thread(self, work: Callable[[], object], name: str, daemon: bool = False) -> SimulatedThread:
-        """Make a thread; it never keeps the program from ending."""
+        """Return a new thread; it never keeps the program from ending."""
         return SimulatedThread(self, work, name)
 
     def later(self, seconds: float, action: Callable[[], object], name: str = "later") -> SimulatedThread:
-        """Do something in a thread of its own once some seconds have passed."""
+        """Call a function in its own thread after some seconds."""
 
         def work() -> None:
             self.sleep(seconds)
@@ -109,17 +109,17 @@ class SimulatedClock:
         return thread
 
     def interrupt(self) -> None:
-        """Raise KeyboardInterrupt in the thread that made the clock, where it waits, as Ctrl-C does."""
+        """Raise KeyboardInterrupt where the thread that created the clock waits, as Ctrl-C does."""
         if self._tasks.get(threading.get_ident()) is self._main:
             raise KeyboardInterrupt
         self._main.error = KeyboardInterrupt()
 
     def _wait(self, ready: Callable[[], bool], timeout: float | None, what: str) -> None:
-        """Let others run until something is so, or the time is up."""
+        """Let other threads run until a condition is true, or the time is up."""
         task = self._tasks.get(threading.get_ident())
         if task is None:
             name = threading.current_thread().name
-            raise RuntimeError(f"{name} cannot wait on a simulated clock that did not make it")
+            raise RuntimeError(f"{name} cannot wait on a simulated clock that did not create it")
         task.ready, task.what, task.deadline = ready, what, math.inf
         if timeout is not None and timeout < math.inf:
             # Rounding must not keep the time from passing.
@@ -130,7 +130,7 @@ class SimulatedClock:
             chosen.gate.release()
             try:
                 task.gate.acquire()
-            except BaseException:  # Ctrl-C; another thread runs
+            except BaseException:  # Ctrl-C; another thread runs now
                 task.ready = _always
                 task.gate.acquire()
                 raise
@@ -139,7 +139,7 @@ class SimulatedClock:
             raise error
 
     def _choose(self) -> _Task:
-        """Choose who runs next, and let the time pass until then."""
+        """Select the next thread, and advance the time to its deadline."""
         self._polls = 0
         chosen = next((task for task in self._waiting if task.error is not None or task.ready()), None)
         if chosen is None:
@@ -147,20 +147,20 @@ class SimulatedClock:
             if chosen.deadline == math.inf:
                 who = "; ".join(f"{task.name} for {task.what}" for task in self._waiting)
                 chosen = self._main if self._main in self._waiting else self._waiting[-1]
-                chosen.error = DeadlockError(f"all threads wait, and none for a time: {who}")
+                chosen.error = DeadlockError(f"all threads wait without a deadline: {who}")
             else:
                 self._now = max(self._now, chosen.deadline)
         self._waiting.remove(chosen)
         return chosen
 
     def _begin(self, task: _Task, ident: int | None) -> None:
-        """Let a thread that was started take part; it waits for its turn."""
+        """Let a started thread participate; it waits for its turn."""
         assert ident is not None
         self._tasks[ident] = task
         self._waiting.append(task)
 
     def _end(self) -> None:
-        """Let the thread that runs take part no more."""
+        """End the participation of the current thread."""
         del self._tasks[threading.get_ident()]
         if self._waiting:
             self._choose().gate.release()
@@ -174,14 +174,14 @@ class SimulatedEvent(threading.Event):
         self._clock, self._what = clock, what
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until it is set, for some seconds at most; return whether it is."""
+        """Wait until it is set, at most for the timeout; return whether it is."""
         if not self.is_set():
             self._clock._wait(self.is_set, timeout, self._what)
         return self.is_set()
 
 
 class SimulatedCondition(threading.Condition):
-    """A condition of a simulated clock; notifications wake in the order of waiting."""
+    """A condition of a simulated clock; notifications wake threads in the order of waiting."""
 
     def __init__(self, clock: SimulatedClock) -> None:
         super().__init__()
@@ -202,9 +202,9 @@ class SimulatedCondition(threading.Condition):
             self._owner = None
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait for a notification without the lock, for some seconds at most; return whether one came."""
+        """Release the lock and wait for a notification, at most for the timeout; return whether one came."""
         if self._owner != threading.get_ident():
-            raise RuntimeError("who waits for a condition must have its lock")
+            raise RuntimeError("a thread must hold the lock of a condition to wait for it")
         woken, depth = SimulatedEvent(self._clock, "a notification"), self._depth
         self._sleepers.append(woken)
         self._owner, self._depth = None, 0
@@ -216,19 +216,19 @@ class SimulatedCondition(threading.Condition):
             self._take(depth)
 
     def wait_for(self, predicate: Callable[[], T], timeout: float | None = None) -> T:
-        """Wait until something is so, for some seconds at most; return what it is then."""
+        """Wait until a predicate is true, at most for the timeout; return its value."""
         end = math.inf if timeout is None else self._clock.now() + timeout
         while not (found := predicate()) and (left := end - self._clock.now()) > 0:
             self.wait(left)
         return found
 
     def notify(self, n: int = 1) -> None:
-        """Wake some of those that wait."""
+        """Wake some of the waiting threads."""
         for woken in [self._sleepers.popleft() for _ in range(min(n, len(self._sleepers)))]:
             woken.set()
 
     def notify_all(self) -> None:
-        """Wake all that wait."""
+        """Wake all waiting threads."""
         self.notify(len(self._sleepers))
 
     def _take(self, depth: int) -> None:
@@ -240,7 +240,7 @@ class SimulatedCondition(threading.Condition):
 
 
 class SimulatedThread(threading.Thread):
-    """A thread of a simulated clock, which runs when it is its turn, and keeps no program from ending."""
+    """A daemon thread of a simulated clock."""
 
     def __init__(self, clock: SimulatedClock, work: Callable[[], object], name: str) -> None:
         super().__init__(name=name, daemon=True)
@@ -248,12 +248,12 @@ class SimulatedThread(threading.Thread):
         self._over = SimulatedEvent(clock, f"the end of {name}")
 
     def start(self) -> None:
-        """Begin to work, when the others wait."""
+        """Start the thread; it runs when the others wait."""
         super().start()
         self._clock._begin(self._task, self.ident)
 
     def run(self) -> None:
-        """Work, in turns with the others."""
+        """Run the work, alternating with the other threads."""
         self._task.gate.acquire()
         try:
             self._work()
@@ -262,10 +262,10 @@ class SimulatedThread(threading.Thread):
             self._clock._end()
 
     def join(self, timeout: float | None = None) -> None:
-        """Wait until it has ended, for some seconds at most."""
+        """Wait until it has ended, at most for the timeout."""
         if self._over.wait(timeout):
             super().join()
 
     def is_alive(self) -> bool:
-        """Return whether it has begun and not ended."""
+        """Return whether it was started and has not ended."""
         return super().is_alive() and not self._over.is_set()

@@ -1,4 +1,4 @@
-"""Where a stage can place the body, how far it may go, and what it reports."""
+"""Positions, limits and reports of a stage, and its interface."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from typing import Protocol
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.io import InputError
 
-_ROUNDING = 1e-9  # by which a place may lie beyond a limit, mm and rad
+_ROUNDING = 1e-9  # tolerance of a limit, mm and rad
 _UPRIGHT = 1e-4  # rad
-# Motions that need the body upright: their units in messages, and how many there are in one mm or rad.
+# Motions that need an upright body: their units in messages, and the factor from mm or rad.
 _SIDEWAYS = (("x", "mm", 1.0), ("y", "mm", 1.0), ("twist", "degrees", math.degrees(1.0)))
 
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """Where the body stands.
+    """A position of the body.
 
-    It leans by the half-angle ``hypot(pitch, roll)`` at the phase ``atan2(roll, pitch)``: it is turned about
-    the pivot by Rz(phase) Ry(half-angle) Rz(-phase). A precession is a circle in the plane of pitch and roll.
-    Before that it was moved along x and y, and turned about its own axis by the twist.
+    The body leans by the half-angle ``hypot(pitch, roll)`` at the phase ``atan2(roll, pitch)``: it is rotated
+    about the pivot by Rz(phase) Ry(half-angle) Rz(-phase). A precession is a circle in the plane of pitch and
+    roll. Displacement along x and y and the twist about its own axis are applied first.
 
     Attributes
     ----------
     travel : float
-        How far the body is lowered, mm, positive down.
+        Distance that the body has been lowered, mm, positive down.
     pitch, roll : float
         Radians: half-angle times the cosine and the sine of the phase.
     x, y : float
-        How far the body was moved sideways, mm.
+        Displacement of the body, mm.
     twist : float
-        Radians that it was turned about its axis, counter-clockwise as its camera sees it.
+        Rotation about its own axis, radians, counter-clockwise as seen by the camera.
 
     Examples
     --------
@@ -55,33 +55,33 @@ class Position:
 
     @property
     def phase(self) -> float:
-        """Phase of the lean, radians, from -pi to pi, counter-clockwise; 0 of an upright body."""
+        """Phase of the lean, radians, from -pi to pi, counter-clockwise; 0 for an upright body."""
         return math.atan2(self.roll, self.pitch)
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What a stage said of itself."""
+    """A report of a stage."""
 
-    time: float  # seconds of time.monotonic at which it was so
+    time: float  # seconds of time.monotonic at which it was valid
     position: Position
     state: str  # idle, run, hold, jog, alarm, home, door, check or sleep
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """How far the body may go; held on our side, before anything is sent.
+    """The limits of the body, checked before anything is sent.
 
     Attributes
     ----------
     travel : (float, float)
-        Least and greatest travel that the axis reaches, mm.
+        Range of the axis, mm.
     tilt : float
-        Greatest half-angle of the lean, radians; 0 of a stage that cannot lean.
+        Maximum half-angle of the lean, radians; 0 for a stage that cannot lean.
     press : float
-        Greatest travel that the sensor's skin bears, mm.
+        Maximum travel that the skin tolerates, mm.
     x, y, twist : (float, float)
-        Least and greatest of each, mm and radians; only 0 of a stage without that axis.
+        Range of each, mm and radians; only 0 for a stage without that axis.
     """
 
     travel: tuple[float, float]
@@ -92,34 +92,36 @@ class Limits:
     twist: tuple[float, float] = (0.0, 0.0)
 
     def check(self, position: Position, name: str) -> None:
-        """Refuse a place beyond the limits: an InputError names the limit, and the stage by `name`."""
+        """Refuse a position beyond the limits: an InputError names the limit and the stage (`name`)."""
         travel, tilt, (low, high) = position.travel, position.tilt, self.travel
         if not math.isfinite(travel):
             raise InputError(
-                f"{name}: a travel of {travel} mm is no place; give a finite number of millimetres"
+                f"{name}: a travel of {travel} mm is not a position; give a finite number of millimetres"
             )
         if not low - _ROUNDING <= travel <= high + _ROUNDING:
             raise InputError(
-                f"{name}: a travel of {travel:.9g} mm is beyond the axis, which goes from {low:.9g} to "
-                f"{high:.9g} mm; stay within, or correct the rig file's limits, or $130 to $135"
+                f"{name}: a travel of {travel:.9g} mm is beyond the axis, whose range is "
+                f"{low:.9g} to {high:.9g} mm; stay within it, or correct the limits in the rig "
+                "file, or $130 to $135"
             )
         if travel > self.press + _ROUNDING:
             raise InputError(
-                f"{name}: a travel of {travel:.9g} mm presses deeper than the {self.press:.9g} mm that "
-                "the rig file allows; press less, or raise its press"
+                f"{name}: a travel of {travel:.9g} mm exceeds the maximum of {self.press:.9g} mm "
+                "in the rig file; press less, or increase press there"
             )
         if not math.isfinite(tilt):
-            raise InputError(f"{name}: a tilt of {tilt} is no angle; give a finite one")
+            raise InputError(f"{name}: a tilt of {tilt} is not an angle; give a finite one")
         if tilt > self.tilt + _ROUNDING:
             raise InputError(
-                f"{name}: a tilt of {math.degrees(tilt):.9g} degrees is beyond the greatest, "
-                f"{math.degrees(self.tilt):.9g}; tilt less, or correct the rig file's pitch and roll"
+                f"{name}: a tilt of {math.degrees(tilt):.9g} degrees exceeds the maximum of "
+                f"{math.degrees(self.tilt):.9g}; tilt less, or correct pitch and roll in the rig "
+                "file"
             )
         for motion, unit, scale in _SIDEWAYS:
             self._check_sideways(getattr(position, motion) * scale, motion, unit, scale, name)
 
     def excess(self, position: Position) -> float:
-        """Return how far a place lies beyond the limits: mm or degrees, whichever are more; 0 within."""
+        """Return by how much a position exceeds the limits, mm or degrees, whichever is more; 0 within."""
         low, high = self.travel
         lean = math.degrees(position.tilt - self.tilt)
         beyond = [low - position.travel, position.travel - min(high, self.press), lean]
@@ -129,7 +131,7 @@ class Limits:
         return max(0.0, *beyond)
 
     def nearest(self, position: Position) -> Position:
-        """Return the upright place within the limits that is nearest to another."""
+        """Return the nearest upright position within the limits."""
         low, high = self.travel
         bounds = {"travel": (low, min(high, self.press)), "x": self.x, "y": self.y, "twist": self.twist}
         return Position(
@@ -140,7 +142,7 @@ class Limits:
         )
 
     def way_up(self, position: Position) -> list[Position]:
-        """Return where to go from a place: upright, straight up to the least travel, and to the middle."""
+        """Return the path of a retreat: upright, straight up to the least travel, and to the centre."""
         upright, high = self.nearest(position), self.travel[0]
         ways = [upright] if position.tilt > _UPRIGHT else []
         return list(dict.fromkeys([*ways, replace(upright, travel=high), Position(high)]))
@@ -152,64 +154,64 @@ class Limits:
             return
         if low == high:
             raise InputError(
-                f"{name}: it has no axis of {motion}, which was to go to {value:.9g} {unit}; "
+                f"{name}: it has no axis of {motion}, which should move to {value:.9g} {unit}; "
                 f"add [stage.{motion}] to the rig file"
             )
         raise InputError(
-            f"{name}: {value:.9g} {unit} of {motion} are beyond the axis, which goes from {low:.9g} to "
-            f"{high:.9g} {unit}; stay within, or correct the rig file's limits"
+            f"{name}: {value:.9g} {unit} of {motion} is beyond the axis, whose range is {low:.9g} "
+            f"to {high:.9g} {unit}; stay within it, or correct the limits in the rig file"
         )
 
 
 class Stage(Protocol):
-    """A stage that is open, and moves the body.
+    """An open stage that moves the body.
 
-    All of it may be used from any thread. What cannot be done is an `InputError`, raised before anything
-    moves; what goes wrong afterwards is a `HardwareError`. A stage that failed or was stopped says so in
-    ``error`` and to every call.
+    All methods are thread-safe. Impossible requests are an `InputError`, raised before anything moves; later
+    faults are a `HardwareError`. After a fault or a stop, ``error`` contains the reason and every call raises
+    it.
     """
 
     @property
     def name(self) -> str:
-        """What to call it in messages."""
+        """Name in messages."""
 
     @property
     def limits(self) -> Limits:
-        """How far the body may go."""
+        """Limits of the body."""
 
     @property
     def error(self) -> HardwareError | None:
-        """What is wrong with it; None while all is well."""
+        """The fault of the stage; None if there is none."""
 
     def report(self) -> Report:
-        """Return what it said last; it is asked all the time."""
+        """Return the newest report; reports are queried continuously."""
 
     def history(self, since: float = -math.inf) -> list[Report]:
         """Return the reports later than a time, oldest first; those of the last minutes are kept."""
 
     def home(self) -> None:
-        """Find the switches of its axes; asked for only where the rig file says that it has some."""
+        """Home the axes; called only if the rig file states that there are switches."""
 
     def check_way(self, start: Position, place: Position, speed: float | None) -> None:
-        """Refuse a sweep that it cannot do at a speed, mm/s or rad/s."""
+        """Refuse a sweep that is impossible at a speed, mm/s or rad/s."""
 
     def check_turns(self, tilt: float, turns: float, rate: float) -> None:
-        """Refuse a precession of a half-angle, radians, at a rate, turns a second."""
+        """Refuse a precession of a half-angle, radians, at a rate, turns per second."""
 
     def move(self, place: Position, speed: float | None = None) -> None:
-        """Begin to go to a place in a straight line, as fast as it goes unless a speed is given."""
+        """Start a straight move to a position, at a speed or the maximum speed."""
 
     def follow(self, places: Sequence[Position], speed: float | None = None) -> None:
-        """Begin to go to some places, one after the other; see ``move``."""
+        """Start a sequence of straight moves; see ``move``."""
 
     def precess(self, tilt: float, turns: float, rate: float, start: float = 0.0) -> None:
-        """Begin to go round at a half-angle from a phase, where the body stands; see `GrblStage.precess`."""
+        """Start a precession from the current phase at a half-angle; see `GrblStage.precess`."""
 
     def wait(self, timeout: float | None = None) -> Report:
-        """Wait until all is done, and return a report of rest; what interrupts the wait stops the body."""
+        """Wait until all is done, and return a report of rest; an interruption of the wait stops the body."""
 
     def stop(self) -> None:
-        """Stop the body at once, as often as anyone likes; raises nothing."""
+        """Stop the body at once; may be called repeatedly, and raises nothing."""
 
     def close(self) -> None:
-        """Stop the body if it moves, and let the hardware go."""
+        """Stop the body if it moves, and close the hardware."""

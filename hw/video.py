@@ -1,4 +1,4 @@
-"""A camera, video file or network stream, drained by a thread that never waits for a reader."""
+"""A camera, video file or network stream, read by a thread that never waits for a reader."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from mirrorskin.io.opencv import quiet_opencv
 
 _log = logging.getLogger("mirrorskin.hw")
 
-# OpenCV takes these from the environment only: no messages of FFmpeg's, and whole seconds for a camera.
+# OpenCV reads these from the environment only: silence FFmpeg, and a timeout for cameras in whole seconds.
 _ENVIRONMENT = {"OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT": f"{READ_TIMEOUT:.0f}"}
-_RAW = {"GREY", "Y16", "Y10", "Y12", "YUYV"}  # formats that OpenCV hands on as they are, if asked to
-_GREY8, _GREY16 = b"Y800", b"Y1\0\x10"  # what FFmpeg calls the grey ones
-# Tags of RGB with 48 or 64 bits a pixel, which end in that number or begin with it.
+_RAW = {"GREY", "Y16", "Y10", "Y12", "YUYV"}  # formats that OpenCV returns unchanged on request
+_GREY8, _GREY16 = b"Y800", b"Y1\0\x10"  # FFmpeg's tags of grey formats
+# Tags of RGB with 48 or 64 bits per pixel, which end or start with that number.
 _DEEP_COLOURS = {b"RGB0", b"BGR0", b"0RGB", b"0BGR", b"RBA@", b"BRA@", b"@RBA", b"@BRA"}
 _JPEG, _JPEG_END = "MJPG", b"\xff\xd9"
-_FROZEN, _CHANGES = 5, 16  # pictures in a row without a changed pixel, after so many that had some
+_FROZEN, _CHANGES = 5, 16  # unchanged pictures in a row that count as frozen, after this many changed ones
 _MANUAL = 1.0  # V4L2's "manual exposure"
-_EXPOSURE_UNIT = 1e-4  # seconds, V4L2's
-_STALEST = 0.5  # seconds: a camera's own time that is older is not a time of this clock
+_EXPOSURE_UNIT = 1e-4  # V4L2's unit of exposure, seconds
+_STALEST = 0.5  # seconds; an older time stamp of a camera is not of this clock
 _LONGEST_BACKLOG = 0.5  # seconds
-_WAITED = 0.9  # of the time after which OpenCV says that there is no picture
-_USUAL_RATE = 25.0  # frames a second, of what does not say
+_WAITED = 0.9  # share of OpenCV's timeout after which a failure counts as a timeout
+_USUAL_RATE = 25.0  # default frame rate
 _DEVICES = Path("/dev")
 _CONVERSIONS = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}
 
@@ -43,29 +43,30 @@ _CONVERSIONS = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}
 class VideoCamera(ReopenedCamera):
     """A camera that OpenCV can open, as a ``mirrorskin.hw.camera.Camera``.
 
-    A camera of this machine (V4L2) is given the format, size, rate, exposure and gain that the settings
-    ask for; what it did not take is logged as a warning. Frames are grey: as the camera sends them where
-    it sends grey (8 or 16 bits) or YUYV, else the luma of the colours. Their times are the driver's where
-    these are on the clock of ``time.monotonic``, else that of the arrival here.
+    Format, size, rate, exposure and gain of a local camera (V4L2) are set according to the settings;
+    deviations are logged as warnings. Frames are grey: unchanged if the source is grey (8 or 16 bits) or
+    YUYV, otherwise the luma of the colours. Their times are the driver's if these are on the clock of
+    ``time.monotonic``, otherwise those of arrival.
 
-    A file plays once at its own rate, and ends with an error that says so. Of a stream, the pictures that
-    waited while it was opened are left out. A picture of another size counts as a loss, and so do five in a
-    row without a changed pixel if no two were alike before.
+    A file plays once at its own rate, and then ends with an error. Pictures of a stream that waited while it
+    was opened are discarded. A picture of another size counts as a loss, and so do five in a row without a
+    changed pixel if no two were equal before.
 
-    A camera or stream that is lost is opened again, for at most 10 s; see ``ReopenedCamera``.
+    A lost camera or stream is reopened, for at most 10 s; see ``ReopenedCamera``.
 
     Parameters
     ----------
     settings : CameraSettings
     slots : int, optional
-        Frames that may wait; see ``mirrorskin.hw.ring.usual_slots``.
+        Number of frames that can wait; see ``mirrorskin.hw.ring.usual_slots``.
     clock : Clock
-        What it waits by; OpenCV itself goes by the computer's.
+        Clock to wait with; OpenCV uses the system's.
 
     Raises
     ------
     InputError
-        It is not there, cannot be opened, gives no frame within 7 s, or frames of another size or type.
+        It does not exist, cannot be opened, or delivers no frame within 7 s or frames of another size or
+        type.
 
     Examples
     --------
@@ -77,10 +78,10 @@ class VideoCamera(ReopenedCamera):
     def __init__(self, settings: CameraSettings, slots: int | None = None, clock: Clock = SYSTEM) -> None:
         self._source = find_source(settings.source)
         if settings.trigger is not None and self._source.kind != "device":
-            raise InputError(f"{self._source.name} cannot be triggered: leave camera.trigger out")
+            raise InputError(f"{self._source.name} cannot be triggered: remove camera.trigger")
         if settings.trigger_input is not None:
             raise InputError(
-                f"{self._source.name}: its input is set by its own tools; leave trigger_input out"
+                f"{self._source.name}: its trigger input must be set with its own tools; remove trigger_input"
             )
         self._returns = self._source.kind != "file"
         self._repeats = _Repeats()
@@ -107,7 +108,7 @@ class VideoCamera(ReopenedCamera):
                 slot = self._slot()
                 capture.retrieve(slot)
                 if self._repeats.frozen(slot):
-                    return f"{self.name} gives the same picture again and again"
+                    return f"{self.name} repeats the same picture"
                 if pace is not None:
                     self._stop.wait(pace.due(capture.position) - self.clock.now())
                     time = self.clock.now()
@@ -116,21 +117,19 @@ class VideoCamera(ReopenedCamera):
             capture.release()
         if self._source.kind == "file":
             return f"{self.name} has ended after {self._number} frames"
-        return f"{self.name} gives no picture"
+        return f"{self.name} delivers no picture"
 
 
 class _Repeats:
-    """Tells a stream that stands still from a scene that does: noise makes all pictures differ."""
+    """Detects a frozen stream; in a still scene, noise makes all pictures differ."""
 
     def __init__(self) -> None:
         self._last: NDArray[Any] | None = None
-        self._changes = self._alike = (
-            0  # pictures that differ from the one before; those in a row that do not
-        )
-        self._noisy = True  # no two were alike so far, but for those of this row
+        self._changes = self._alike = 0  # number of changed pictures, and of unchanged ones in a row
+        self._noisy = True  # whether no two pictures were equal before this row
 
     def frozen(self, picture: NDArray[Any]) -> bool:
-        """Take the next picture, whose memory stays as it is until the one after it was taken."""
+        """Return whether the stream is frozen; a picture must stay unmodified during the next call."""
         if not self._noisy:
             return False
         if self._last is not None and all(map(np.array_equal, picture, self._last)):  # row by row
@@ -144,7 +143,7 @@ class _Repeats:
 
 
 class _Pace:
-    """When the pictures of a file that begins to play now are due."""
+    """The playing times of the pictures of a file."""
 
     def __init__(self, clock: Clock, period: float) -> None:
         self._clock, self._period = clock, period
@@ -155,14 +154,14 @@ class _Pace:
         """Return when a picture is due, monotonic seconds, from its position in the file."""
         if self._start is None:
             self._start = self._clock.now() - position
-        elif not position > self._position:  # some files do not say
+        elif not position > self._position:  # some files have no positions
             position = self._position + self._period
         self._position = position
         return self._start + position
 
 
 class Capture:
-    """One connection to a camera, a stream or a file: opened as asked, and read until it is lost."""
+    """One connection to a camera, a stream or a file, opened with the settings, until it is lost."""
 
     def __init__(
         self,
@@ -188,12 +187,12 @@ class Capture:
             raise
 
     def grab(self) -> float | None:
-        """Wait for the next picture, and return when it arrived, monotonic seconds; None: there is none."""
+        """Wait for the next picture, and return its arrival, monotonic seconds; None if there is none."""
         if not self._video.grab():
             return None
         now = self._clock.now()
         if self._trusts:
-            # V4L2 says when the driver had it, on this clock if the driver is a good one.
+            # V4L2 reports the time of the driver, which good drivers take from this clock.
             stamp = float(self._video.get(cv2.CAP_PROP_POS_MSEC)) / 1000
             self._trusts = now - _STALEST <= stamp <= now and stamp > self._last
             now = stamp if self._trusts else now
@@ -209,32 +208,32 @@ class Capture:
         except cv2.error as error:
             raise InputError(f"{self._source.name}: a picture cannot be decoded: {error.err}") from error
         if not done or picture is None:
-            raise InputError(f"{self._source.name}: a picture cannot be decoded: see camera.fourcc")
+            raise InputError(f"{self._source.name}: a picture cannot be decoded: check camera.fourcc")
         if picture is not out:
             self._picture = picture
             to_grey(picture, out, self._source.name)
 
     @property
     def position(self) -> float:
-        """Seconds from a file's beginning to the picture that was grabbed, as the file says."""
+        """Position of the grabbed picture in a file, seconds, as the file states."""
         return float(self._video.get(cv2.CAP_PROP_POS_MSEC)) / 1000
 
     @property
     def period(self) -> float:
-        """Seconds from picture to picture, as the source declares."""
+        """Declared period of the source, seconds."""
         return 1 / self._declared
 
     def release(self) -> None:
-        """Let the source go."""
+        """Close the source."""
         self._video.release()
 
     def _skip_backlog(self) -> None:
-        """Forget the pictures that waited while the stream was opened: when they were taken is not known."""
+        """Discard the pictures that waited while the stream was opened, because their times are unknown."""
         period = 1 / (self._settings.rate or self._declared)
         begun = before = self._clock.now()
         waited = 0
         while (time := self.grab()) is not None and time - begun < _LONGEST_BACKLOG:
-            # One alone can be a decoder's start.
+            # A single one may be the start of a decoder.
             waited = waited + 1 if time - before > period / 2 else 0
             if waited == 2:
                 return
@@ -248,30 +247,30 @@ def _open(source: VideoSource, timeout: float) -> Any:
     if source.kind == "device":
         backend = cv2.CAP_V4L2
     elif source.kind == "stream":
-        # Of several threads each holds a picture back.
+        # Each of several threads would delay by a picture.
         parameters = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, round(1000 * timeout)]
         parameters += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, round(1000 * READ_TIMEOUT), cv2.CAP_PROP_N_THREADS, 1]
     video = cv2.VideoCapture(source.target, backend, parameters)
     if not video.isOpened():
         video.release()
         why = {
-            "device": "another program may be using it, or it is no camera",
-            "stream": f"nothing answers there within {timeout:.3g} s that is a video",
-            "file": "it is damaged, or no video",
+            "device": "another program may be using it, or it is not a camera",
+            "stream": f"no video was received within {timeout:.3g} s",
+            "file": "it is damaged, or not a video",
         }
         raise InputError(f"{source.name} cannot be opened: {why[source.kind]}")
     return video
 
 
 def _configure(video: Any, source: VideoSource, settings: CameraSettings) -> bool:
-    """Set what is asked for, log what was not taken, and return whether pictures come as they are stored."""
+    """Apply the settings, log deviations, and return whether pictures are returned as stored."""
     if source.kind == "device":
         _set_up(video, source, settings)
         raw = _letters(video.get(cv2.CAP_PROP_FOURCC)).strip() in _RAW
     else:
         asked = [name for name in ("fourcc", "exposure", "gain") if getattr(settings, name) is not None]
         if asked:
-            _log.warning("%s: %s can only be set where it is sent from", source.name, " and ".join(asked))
+            _log.warning("%s: %s can only be set at the sender", source.name, " and ".join(asked))
         raw = _is_grey(video, source)
     _check_size(video, source, settings)
     if raw:
@@ -280,13 +279,13 @@ def _configure(video: Any, source: VideoSource, settings: CameraSettings) -> boo
 
 
 def _as_jpeg(video: Any) -> bool:
-    """Have the pictures of a stream of JPEGs as they were sent: OpenCV would scale those of another size."""
+    """Return the JPEGs of a stream as sent, because OpenCV would scale those of another size."""
     return _letters(video.get(cv2.CAP_PROP_FOURCC)) == _JPEG and video.set(cv2.CAP_PROP_FORMAT, -1)
 
 
 def _decode(data: NDArray[np.uint8]) -> NDArray[Any] | None:
-    """Return the luma of a JPEG, (H, W), uint8; None of one that is cut short."""
-    if _JPEG_END not in data[..., -64:].tobytes():  # some cameras pad
+    """Return the luma of a JPEG, (H, W), uint8; None if it is truncated."""
+    if _JPEG_END not in data[..., -64:].tobytes():  # some cameras append padding
         return None
     return cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
 
@@ -322,20 +321,20 @@ def _check_size(video: Any, source: VideoSource, settings: CameraSettings) -> No
     got = [int(video.get(code)) for code in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
     if got != [columns, rows]:
         raise InputError(
-            f"{source.name} gives pictures of {got[0]} x {got[1]}, and {columns} x {rows} is asked for: "
-            "set camera.size in the rig file to a size that the camera has"
+            f"{source.name} delivers pictures of {got[0]} x {got[1]}, but {columns} x {rows} was "
+            "requested: set camera.size in the rig file to a size that the camera has"
         )
 
 
 def _is_grey(video: Any, source: VideoSource) -> bool:
-    """Whether FFmpeg decodes to grey of 8 or 16 bits, which needs no conversion."""
+    """Return whether FFmpeg decodes to grey of 8 or 16 bits, which needs no conversion."""
     tag = _tag(video.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT))
-    # FFmpeg's tags of deeper formats end in the number of bits, or begin with it if they are big-endian.
+    # FFmpeg's tags of deeper formats end with the number of bits, or start with it if they are big-endian.
     bits = 16 if tag in _DEEP_COLOURS else next((bits for bits in (tag[3], tag[0]) if 8 < bits <= 16), 8)
     if bits > 8 and tag != _GREY16:
         raise InputError(
-            f"{source.name} has {bits} bits a sample, but only 8 would be read: send grey of 8 bits, or of 16"
-            " bits in little-endian order"
+            f"{source.name} has {bits} bits per sample, but OpenCV would read only 8: send grey "
+            "with 8 bits, or with 16 bits in little-endian order"
         )
     return tag in (_GREY8, _GREY16)
 
@@ -350,15 +349,15 @@ def _tag(code: float) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class VideoSource:
-    """What a rig file's ``camera.source`` means: a camera of this machine, a stream, or a file."""
+    """The meaning of ``camera.source`` in a rig file: a local camera, a stream, or a file."""
 
     kind: Literal["device", "stream", "file"]
-    target: str  # a device's path, a URL, or a file's path
-    name: str  # what messages call it, without a password
+    target: str  # path of a device or a file, or a URL
+    name: str  # name in messages, without a password
 
 
 def find_source(source: int | str) -> VideoSource:
-    """Find a camera by its number or its path under /dev, a URL, or the path of a video file."""
+    """Return the source for a camera's number, a path under /dev, a URL, or the path of a video file."""
     text = str(source)
     if re.fullmatch(r"\d+", text):
         text = str(_DEVICES / f"video{text}")
@@ -377,23 +376,23 @@ def _check_device(path: Path) -> None:
         there = sorted(str(found) for found in _DEVICES.glob("video*"))
         raise InputError(
             f"camera {path}: there is no such device; "
-            + (f"there are {', '.join(there)}" if there else "no camera is connected that Linux knows")
+            + (f"available: {', '.join(there)}" if there else "Linux reports no camera")
         )
     if not os.access(path, os.R_OK | os.W_OK):
-        raise InputError(f"camera {path} may not be used: add yourself to the group 'video'")
+        raise InputError(f"no permission to use camera {path}: add yourself to the group 'video'")
 
 
 def to_grey(picture: NDArray[Any], out: NDArray[Any], name: str) -> None:
-    """Write a picture's grey to a frame.
+    """Write the grey values of a picture to a frame.
 
-    A grey picture is copied. Of two channels (YUYV) the first is taken, the luma as the camera sent it. BGR
-    becomes the luma of ITU-R BT.601, which is exactly the one value where all three are equal, as a grey
-    camera's are.
+    A grey picture is copied. Of two channels (YUYV) the first, the luma, is used. BGR is converted to the
+    luma of ITU-R BT.601, which is exactly the common value if all three are equal.
     """
     if picture.shape[:2] != out.shape or picture.dtype != out.dtype:
         raise InputError(
-            f"{name} gives pictures of {_describe(picture)}, and {_describe(out)} is asked for: "
-            "set camera.size, camera.dtype or camera.fourcc in the rig file so that they agree"
+            f"{name} delivers pictures of {_describe(picture)}, but {_describe(out)} was "
+            "requested: set camera.size, camera.dtype or camera.fourcc in the rig file so that "
+            "they agree"
         )
     channels = 1 if picture.ndim == 2 else picture.shape[2]
     if channels in _CONVERSIONS:

@@ -1,4 +1,4 @@
-"""The twin as a camera that watches a stage: frames arrive in real time and show the body where it is."""
+"""The twin as a camera that watches a stage: frames arrive in real time and show the body's position."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from mirrorskin.hw.twin import Twin
 from mirrorskin.hw.twin.movement import Pose, Twist, pose_at_lean, pose_at_press
 from mirrorskin.io.types import InputError
 
-_LOOK = 0.002  # seconds from one look at the trigger to the next
+_LOOK = 0.002  # interval at which the trigger is polled, seconds
 
 
 def pose_at(place: Position, pivot: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Pose:
-    """Return where the object is, seen from the body at a place: first it moves sideways and twists."""
+    """Return the pose of the object in the frame of a body at a position."""
     lean = pose_at_lean(place.travel, place.tilt, place.phase, pivot)
     if not (place.x or place.y or place.twist):
         return lean
@@ -34,7 +34,7 @@ def pose_at(place: Position, pivot: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 class _Frame(NamedTuple):
-    """A frame on its way: what it shows, when it arrives, how many were lost before it."""
+    """A frame in transfer: its image, its time of arrival, and the number of frames lost before it."""
 
     pixels: NDArray[Any]
     arrival: float
@@ -42,20 +42,20 @@ class _Frame(NamedTuple):
 
 
 class TwinCamera(ThreadedCamera):
-    """A `mirrorskin.hw.camera.Camera` that sees what the twin sees, wherever the body is at that time.
+    """A `mirrorskin.hw.camera.Camera` that shows the twin at the current position of the body.
 
     Frame n is exposed about the time t = start + n / rate and arrives at t + delay + N(0, jitter), but not
-    before its exposure ends, nor before the frame ahead of it. Its time is that arrival, on the emulated
-    camera's clock: what a busy machine is late with adds nothing to it. A frame that cannot be worked out
-    until a period after its arrival is lost and counted, as in a camera that cannot keep up.
+    before its exposure ends, nor before the preceding frame. Its time is this arrival on the emulated
+    camera's clock, so delays of a busy computer do not affect it. A frame that is not rendered within a
+    period after its arrival is lost and counted, as in a camera that cannot keep up.
 
-    With a `trigger`, which tells when a line went on, off, on, ..., a frame is exposed from each time that it
-    goes on, and none else.
+    With a `trigger`, which returns the times at which a line was switched on, off, on, ..., one frame is
+    exposed each time that the line is switched on.
 
-    `where` gives the body's `Position` at a past time of the `clock`; the twin's movement only bounds
-    how far it may go. `delay` and `jitter` are seconds; the body turns about `pivot`, mm from the centre of
-    the undeformed sheet. ``lateness`` gives by how many seconds the frame of a number is later than that; inf
-    of one that is lost.
+    `where` returns the body's `Position` at a past time of the `clock`; the twin's movement only bounds the
+    positions. `delay` and `jitter` are seconds. The body rotates about `pivot`, mm from the centre of the
+    undeformed sheet. ``lateness`` returns an additional delay of a frame number in seconds; inf loses the
+    frame.
     """
 
     def __init__(
@@ -73,7 +73,9 @@ class TwinCamera(ThreadedCamera):
         rate = twin.frame_rate
         for name, value in (("delay", delay), ("jitter", jitter)):
             if not 0 <= value < math.inf:
-                raise InputError(f"{name} {value} of the emulated camera cannot be: give seconds, 0 or more")
+                raise InputError(
+                    f"{name} {value} of the emulated camera is not possible: give seconds, 0 or more"
+                )
         super().__init__(twin.name, twin.shape[1:], twin.dtype, rate, clock=clock)
         self._twin, self._where, self._pivot = twin, where, pivot
         self._trigger = trigger
@@ -91,16 +93,16 @@ class TwinCamera(ThreadedCamera):
             thread.start()
 
     def stall(self) -> None:
-        """Let no more frames arrive, and say nothing."""
+        """Deliver no more frames, without an error."""
         self._stalled.set()
 
     def lose(self) -> None:
-        """Be gone for good: no more frames arrive, and readers are told."""
+        """Fail permanently: no more frames arrive, and readers get an error."""
         self._stalled.set()
-        self._fail(f"{self.name} was lost: see whether it has power, and its cable")
+        self._fail(f"{self.name} was lost: check its power supply and its cable")
 
     def close(self) -> None:
-        """Stop; frames under way do not arrive. A second time does nothing."""
+        """Stop; frames in transfer do not arrive. A second call does nothing."""
         self._ended.set()
         with self._change:
             self._change.notify_all()
@@ -111,11 +113,11 @@ class TwinCamera(ThreadedCamera):
     def _report_failure(self, work: Callable[[], None]) -> None:
         try:
             work()
-        except Exception as error:  # readers are told, and the other thread ends when it is closed
+        except Exception as error:  # readers get the error; the other thread ends when the camera is closed
             self._fail(f"{self.name} failed: {error}")
 
     def _expose(self) -> None:
-        """Render each frame when its exposure is over, or pass it over if it would come too late."""
+        """Render each frame when its exposure is over, or skip it if it would be too late."""
         # A device's first launch takes longer than later ones.
         self._twin.look(lambda late: pose_at_press(0.0), 0, np.empty(self.shape, self.dtype))
         period, lost, last = 1 / self._rate, 0, -math.inf
@@ -138,7 +140,7 @@ class TwinCamera(ThreadedCamera):
                 last, lost = arrival, 0
 
     def _exposures(self, period: float) -> Iterator[float]:
-        """Yield the middle of each exposure, some of them before their time."""
+        """Yield the middle of each exposure, possibly ahead of time."""
         if self._trigger is None:
             start = self.clock.now()
             yield from (start + number * period for number in itertools.count())
@@ -159,7 +161,7 @@ class TwinCamera(ThreadedCamera):
         return pixels
 
     def _deliver(self) -> None:
-        """Let each frame arrive when it is due."""
+        """Deliver each frame when it is due."""
         missed = 0
         while True:
             with self._change:
@@ -178,5 +180,5 @@ class TwinCamera(ThreadedCamera):
             missed = 0
 
     def _wait_until(self, due: float) -> bool:
-        """Wait for a time, and return whether the camera was closed meanwhile."""
+        """Wait until a time, and return whether the camera was closed meanwhile."""
         return self._ended.wait(max(0.0, due - self.clock.now()))

@@ -1,13 +1,12 @@
-"""A GRBL 1.1 controller: what it does on lines, realtime bytes and alarms, by a clock that is handed to it.
+"""An emulated GRBL 1.1 controller: its reaction to lines, realtime bytes and alarms, as a function of time.
 
-It obeys and answers as the firmware does: lines wait in a receive buffer of 128 bytes, beyond which bytes
-are lost; moves wait in a planner of 15, and the answer to a line comes once its move has found room there;
-realtime bytes are obeyed at once. Machine coordinates are 0 at the homing switches and negative elsewhere.
+It behaves like the firmware: lines wait in a receive buffer of 128 bytes, beyond which bytes are lost; moves
+wait in a planner of 15, and a line is answered when its move is in the planner; realtime bytes are executed
+at once. Machine coordinates are 0 at the homing switches and negative elsewhere.
 
-It has what the stage's driver uses: moves (``gcode.py``), coolant and spindle as lines that are on or off,
-``$$``, ``$I``, ``$X``, ``$H``, hold, resume and reset. Soft limits are looked at for a whole arc before it
-begins; homing moves one axis at a time and slows down before the switch; a line takes a millisecond to be
-read, whatever it says.
+It supports what the driver uses: moves (``gcode.py``), the outputs coolant and spindle, ``$$``, ``$I``,
+``$X``, ``$H``, hold, resume and reset. Soft limits are checked for a whole arc before it starts; homing moves
+one axis at a time and slows down before the switch; reading any line takes a millisecond.
 """
 
 from __future__ import annotations
@@ -22,8 +21,8 @@ from mirrorskin.hw.emulator.motion import BLOCKS, Line, Move, Path, Place, Plann
 
 BANNER = "Grbl 1.1h ['$' for help]"
 BUILD = "[VER:1.1h.20190830:]"
-RX_BUFFER = 128  # bytes that the receive buffer holds
-LINE_TIME = 1e-3  # seconds that a line takes to be read
+RX_BUFFER = 128  # size of the receive buffer, bytes
+LINE_TIME = 1e-3  # time to read a line, seconds
 HARD_LIMIT, SOFT_LIMIT, ABORTED, HOMING_ABORTED, NO_SWITCH = 1, 2, 3, 6, 9
 
 _RESET, _QUERY, _HOLD, _RESUME = 0x18, ord("?"), ord("!"), ord("~")
@@ -33,26 +32,26 @@ _SWITCHES: Mapping[str, tuple[str, bool]] = {
     "M3S999999": ("spindle", True),
     "M5": ("spindle", False),
 }
-_LINE_MAX = 79  # characters of a line, without spaces
-_WCO_EVERY = 10  # reports, of which one has the work offset
-_SEEK_TRAVELS = 1.5  # travels within which a homing switch must be found
-_FIRST_AXIS = 2  # the firmware homes Z before the others
+_LINE_MAX = 79  # maximum length of a line without spaces
+_WCO_EVERY = 10  # one report in this many contains the work offset
+_SEEK_TRAVELS = 1.5  # homing fails after this many lengths of the axis
+_FIRST_AXIS = 2  # the firmware homes Z first
 
-# Settings of a small, quick stage: report in inches, soft limits, homing (on, slow and quick rate a minute,
-# debounce in ms, pull-off); and of each axis: steps a unit, rate a minute, acceleration, travel.
+# Settings of a small, fast stage: report in inches, soft limits, homing (on, slow and fast rate per minute,
+# debounce in ms, pull-off); and for each axis: steps per unit, rate per minute, acceleration, travel.
 _SETTINGS: Mapping[int, float] = {10: 1, 13: 0, 20: 0, 22: 0, 24: 25.0, 25: 500.0, 26: 250, 27: 1.0}
 _PER_AXIS: Mapping[int, float] = {100: 1000.0, 110: 1800.0, 120: 500.0, 130: 200.0}
 
-# What the main loop waits for: a time, or that something holds.
+# The main loop waits for a time, or for a condition.
 _Wait = float | Callable[[], bool]
 _Steps = Generator[_Wait, None, None]
 
 
 class Controller:
-    """A GRBL 1.1 controller; times must not run backwards from call to call.
+    """A GRBL 1.1 controller; times must not decrease from call to call.
 
-    `settings` are the ``$`` settings that differ from the defaults, and `place` is where the axes truly are:
-    the controller counts from there until it has homed. Its `planner` is in true coordinates.
+    `settings` are the ``$`` settings that differ from the defaults. `place` is the true position of the axes;
+    until it has homed, the controller counts from there. Its `planner` uses true coordinates.
     """
 
     def __init__(
@@ -64,7 +63,7 @@ class Controller:
         self._axes = len(axes)
         self._now = now
         self.planner: Planner = Planner(place, memory)
-        self._offset = place  # true coordinates less the controller's own
+        self._offset = place  # true coordinates minus the controller's coordinates
         self._program = Interpreter(axes, self._own_place())
         self._received: deque[int] = deque()
         self._out = bytearray()
@@ -72,11 +71,11 @@ class Controller:
         self._locked = bool(self._settings[22])
         self.switched: dict[str, list[float]] = {
             line: [] for line, _ in _SWITCHES.values()
-        }  # on, off, on, ...
+        }  # times at which it was switched on, off, on, ...
         self._boot()
 
     def _boot(self) -> None:
-        """Begin anew, as after a reset; an alarm stays."""
+        """Restart as after a reset; an alarm remains."""
         self._switch_off()
         self._received.clear()
         self._program.reset(self._own_place())
@@ -93,7 +92,7 @@ class Controller:
 
     @property
     def state(self) -> str:
-        """The state as a report has it."""
+        """State as in a report."""
         for name, holds in (
             ("Home", self._homing),
             ("Alarm", self._locked),
@@ -106,27 +105,27 @@ class Controller:
         return "Idle"
 
     def take(self) -> bytes:
-        """Return what has been printed since the last call."""
+        """Return the output since the last call."""
         out = bytes(self._out)
         self._out.clear()
         return out
 
     def next_event(self) -> float:
-        """Return when something may happen next by itself, inf for never."""
+        """Return the time of the next event, inf if there is none."""
         if self._powered_off:
             return math.inf
         due = math.inf if self._suspended or callable(self._wait) else self._wait
         return min(self.planner.next_event(), due)
 
     def advance(self, now: float) -> None:
-        """Do all that becomes due until a time."""
+        """Process all events up to a time."""
         while (due := self.next_event()) <= now:
             self._now = max(self._now, due)
             self._react()
         self._now = max(self._now, now)
 
     def receive(self, data: bytes) -> None:
-        """Take bytes that arrive now, all at once; of several questions for a report one is answered."""
+        """Receive bytes now; several queries at once get one report."""
         if self._powered_off:
             return
         for byte in data:
@@ -139,7 +138,7 @@ class Controller:
             self._report()
 
     def alarm(self, code: int) -> None:
-        """Raise an alarm: 1 and 2 wait for a reset, others bring one along."""
+        """Raise an alarm: 1 and 2 wait for a reset, others include one."""
         if self._powered_off:
             return
         if code in (HARD_LIMIT, SOFT_LIMIT):
@@ -148,7 +147,7 @@ class Controller:
             self._abort(code)
 
     def die(self) -> None:
-        """Stop dead for good."""
+        """Stop permanently, without deceleration."""
         self.planner.halt(self._now)
         self._switch_off()
         self._powered_off = True
@@ -156,11 +155,11 @@ class Controller:
 
     @property
     def _suspended(self) -> bool:
-        """Whether lines are not read: held, or after an alarm that asks for a reset."""
+        """Whether lines are not read: on hold, or after an alarm that requires a reset."""
         return self._powered_off or self._needs_reset or self.planner.held(self._now)
 
     def _own_place(self) -> Place:
-        """Return where the axes are, as the controller believes."""
+        """Return the position of the axes in the controller's coordinates."""
         return tuple(a - b for a, b in zip(self.planner.place(self._now), self._offset, strict=True))
 
     def _say(self, line: str) -> None:
@@ -169,7 +168,7 @@ class Controller:
     def _per_axis(self, base: int) -> tuple[float, ...]:
         return tuple(self._settings[base + axis] for axis in range(self._axes))
 
-    # Realtime bytes, and what comes of them
+    # Realtime bytes and their effects
 
     def _on_realtime(self, byte: int) -> None:
         if byte == _RESET:
@@ -187,19 +186,19 @@ class Controller:
             self.planner.resume(self._now)
 
     def _react(self) -> None:
-        """Do what the time, or new bytes, ask for."""
+        """Process what is due now."""
         self.planner.advance(self._now)
         if self._limit_reached and self.planner.held(self._now):
             self._lock_until_reset(SOFT_LIMIT)
         self._run_steps()
 
     def _abort(self, code: int | None) -> None:
-        """Stop dead and begin anew, with an alarm or without."""
+        """Stop without deceleration and restart, with or without an alarm."""
         self.planner.halt(self._now)
         if code is not None:
             self._say(f"ALARM:{code}")
             self._locked = True
-        if self._executing:  # a line that is cut short counts as done
+        if self._executing:  # an interrupted line counts as done
             self._say("ok")
         self._boot()
 
@@ -212,11 +211,11 @@ class Controller:
         self._say("[MSG:Reset to continue]")
 
     def _report(self) -> None:
-        """Report, if that has been asked for; not while homing."""
+        """Send a report if one was queried; not while homing."""
         if not self._report_due or self._homing:
             return
         self._report_due = False
-        # Adding 0 makes plain zeros of negative ones.
+        # Adding 0 converts -0 to 0.
         place = ",".join(f"{round(value, 3) + 0.0:.3f}" for value in self._own_place())
         fields = [self.state, f"MPos:{place}", f"FS:{self.planner.speed(self._now) * 60:.0f},0"]
         if self._reports % _WCO_EVERY == 0:
@@ -227,13 +226,13 @@ class Controller:
     # The main loop: one line after the other, waiting where the firmware waits
 
     def _run_steps(self) -> None:
-        """Go on as far as nothing has to be waited for."""
+        """Continue until something must be waited for."""
         while not self._suspended:
             steps, wait = self._steps, self._wait
             if not (wait() if callable(wait) else self._now >= wait):
                 return
             wait = next(steps)
-            if steps is self._steps:  # otherwise that was a reset
+            if steps is self._steps:  # otherwise there was a reset
                 self._wait = wait
 
     def _loop(self) -> _Steps:
@@ -278,7 +277,7 @@ class Controller:
             self._switch(line, False)
 
     def _drive(self, path: Path, feed: float) -> _Steps:
-        """Wait for room in the planner, and put a move there; not beyond the soft limits, if they are on."""
+        """Wait until the planner has room, and add a move; refuse it beyond active soft limits."""
         low = tuple(-travel for travel in self._per_axis(130))
         if self._settings[20] and not stays_inside(path, low, (0.0,) * self._axes):
             self._limit_reached = True
@@ -292,7 +291,7 @@ class Controller:
         self.planner.add(Move(path, *path.limits(feed, rates, self._per_axis(120))), self._now)
 
     def _command(self, text: str) -> _Steps:
-        """Obey what stands behind a ``$``."""
+        """Execute a command that follows a ``$``."""
         if text == "X":
             if self._locked:
                 self._locked = False
@@ -308,7 +307,7 @@ class Controller:
         elif text == "H":
             yield from self._home()
         else:
-            raise GrblError(2)  # of what could be a setting, it misses the number
+            raise GrblError(2)  # like a setting without a number
 
     def _home(self) -> _Steps:
         """Home one axis after the other: to the switch, off it, slowly to it again, and off it."""
@@ -334,7 +333,7 @@ class Controller:
             self.planner.hold(self._now)
 
     def _seek(self, axis: int, goal: float, speed: float) -> _Steps:
-        """Drive one axis, and wait for the switch to settle."""
+        """Move one axis, and wait for the switch to settle."""
         start = self.planner.place(self._now)
         end = (*start[:axis], goal, *start[axis + 1 :])
         if start != end:

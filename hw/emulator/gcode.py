@@ -1,6 +1,6 @@
-"""G-code as the stage's driver speaks it: straight moves and arcs, absolute and relative, in millimetres.
+"""The G-code that the driver uses: straight moves and arcs, absolute and relative, in millimetres.
 
-Of GRBL 1.1, for which these are the codes of errors; all else is refused with ``error:20``.
+Error codes are those of GRBL 1.1; anything else is refused with ``error:20``.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _GROUPS = {
 _GROUP_OF = {code: group for group, codes in _GROUPS.items() for code in codes}
 _PLANES = {"G17": (0, 1), "G18": (2, 0), "G19": (1, 2)}
 _TURN_EPSILON = 5e-7  # radians below which an arc is a whole turn
-_MIN_MOVE = 1e-9  # axis units below which there is nothing to drive
+_MIN_MOVE = 1e-9  # axis units; shorter moves are ignored
 
 Drive = tuple[Path, float]
-"""A path, and the feed along it in units a second, infinite for as fast as the axes go."""
+"""A path, and the feed along it in units per second; infinite for the maximum speed."""
 
 
 class GrblError(Exception):
@@ -36,20 +36,20 @@ class GrblError(Exception):
 
 
 class Interpreter:
-    """The modes, and the place that the program has come to; work and machine coordinates are the same."""
+    """The modal state and the position of the program; work and machine coordinates are the same."""
 
     def __init__(self, axes: str, place: Place) -> None:
         self.axes = axes
         self.reset(place)
 
     def reset(self, place: Place) -> None:
-        """Begin anew at a place, as after a reset."""
+        """Restart at a position, as after a reset."""
         self.place: Place = place
         self._modes = {"motion": "G0", "plane": "G17", "distance": "G90"}
-        self._feed = 0.0  # a minute
+        self._feed = 0.0  # units per minute
 
     def run(self, line: str) -> Drive | None:
-        """Take a line without spaces, and return what it drives; a `GrblError` changes nothing."""
+        """Execute a line without spaces, and return its motion; after a `GrblError` nothing has changed."""
         codes, values = self._words(line)
         modes = self._modes | {group: code for group, code in codes.items() if group in self._modes}
         feed = values.get("F", self._feed)
@@ -62,7 +62,7 @@ class Interpreter:
         return drive
 
     def _words(self, line: str) -> tuple[dict[str, str], dict[str, float]]:
-        """Return the commands by their group, and the other numbers by their letter."""
+        """Return the commands by group, and the other numbers by letter."""
         codes: dict[str, str] = {}
         values: dict[str, float] = {}
         at = 0
@@ -103,7 +103,7 @@ class Interpreter:
             named = {axis for axis, letter in enumerate(self.axes) if letter in values}
             if not named:
                 raise GrblError(26)
-            if not named <= set(plane):  # the firmware would go along a helix
+            if not named <= set(plane):  # the firmware would move along a helix
                 raise GrblError(20)
             return self._arc(plane, values, end, motion == "G2"), feed / 60
         if math.dist(self.place, end) < _MIN_MOVE:
@@ -111,7 +111,7 @@ class Interpreter:
         return Line(self.place, end), math.inf if motion == "G0" else feed / 60
 
     def _arc(self, plane: tuple[int, int], values: dict[str, float], end: Place, clockwise: bool) -> Arc:
-        """Return the arc about the centre that I, J and K give, as seen from its begin."""
+        """Return the arc about the centre given by I, J and K relative to its start."""
         offsets = [values.get("IJK"[axis]) for axis in plane]
         if offsets == [None, None]:
             raise GrblError(35)

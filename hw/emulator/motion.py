@@ -1,13 +1,13 @@
-"""Where a controller's axes are, and when: lines and arcs, driven at trapezoids of speed, kept as a history.
+"""The motion of emulated axes: lines and arcs with trapezoidal speed, and their history.
 
-What is simpler than in the firmware:
+Simplifications compared with the firmware:
 
-- Time is continuous: there are no steps, and the motion is exact at any time.
-- A move begins when it is added; the firmware first looks whether more lines wait.
-- Where two moves meet at an angle the axes stop; the firmware cuts the corner a little.
-- An arc is one move, whose speed is limited so that the acceleration towards the centre stays within the
-  axes' limits; the firmware makes short lines of it, whose corners allow some more.
-- What halts at once loses no steps.
+- Time is continuous: there are no steps, and the position is exact at any time.
+- A move starts when it is added; the firmware first waits for more lines.
+- The axes stop where two moves meet at an angle; the firmware rounds the corner slightly.
+- An arc is one move, whose speed is limited such that the centripetal acceleration stays within the axes'
+  limits; the firmware divides it into short lines, whose corners allow slightly more.
+- Stopping without deceleration loses no steps.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from operator import attrgetter
 
 Place = tuple[float, ...]
 
-BLOCKS = 15  # moves that the firmware's planner has room for
-_ARC_STEP = math.radians(1.0)  # how closely an arc is looked at where it might leave a box
-_SAME = 1e-9  # axis units below which a place counts as on the box's face
-_STRAIGHT = 1e-6  # 1 - cos(angle) below which a corner counts as none
-_TINY = 1e-12  # distances and times that are none
-_FORGET = 1024  # spans that are dropped at a time
+BLOCKS = 15  # moves that the firmware's planner can hold
+_ARC_STEP = math.radians(1.0)  # resolution at which an arc is tested for leaving a box
+_SAME = 1e-9  # axis units; closer positions count as on the face of the box
+_STRAIGHT = 1e-6  # 1 - cos(angle); below it two moves count as collinear
+_TINY = 1e-12  # shorter distances and times count as 0
+_FORGET = 1024  # number of spans that are dropped at a time
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,15 +34,15 @@ class Line:
 
     start: Place
     end: Place
-    samples = 1  # in how many parts each part is as good as straight
+    samples = 1  # number of parts into which a path is divided so that each is nearly straight
 
     @property
     def length(self) -> float:
-        """The distance over all axes."""
+        """Distance over all axes."""
         return math.dist(self.start, self.end)
 
     def point(self, distance: float) -> Place:
-        """Return the place after a distance; beyond the ends, the end."""
+        """Return the position after a distance, clipped to the ends."""
         part = min(max(distance / self.length, 0.0), 1.0)
         if part == 1:
             return self.end
@@ -56,7 +56,7 @@ class Line:
     def limits(
         self, feed: float, rates: Sequence[float], accelerations: Sequence[float]
     ) -> tuple[float, float]:
-        """Return the greatest speed, up to a feed, and acceleration that no axis' limit forbids."""
+        """Return the maximum speed, up to a feed, and acceleration within the limits of all axes."""
         unit = self.tangent(0.0)
         return min(feed, _largest_multiple(rates, unit)), _largest_multiple(accelerations, unit)
 
@@ -65,8 +65,8 @@ class Line:
 class Arc:
     """A circular arc in the plane of two axes; a positive sweep, radians, turns from the first to the second.
 
-    Where the ends' distances from the centre differ (by the rounding of the numbers in the program), the
-    radius changes evenly from the one to the other.
+    If rounding in the program makes the distances of the two ends from the centre differ, the radius changes
+    linearly between them.
     """
 
     start: Place
@@ -77,16 +77,16 @@ class Arc:
 
     @property
     def length(self) -> float:
-        """The distance along it."""
+        """Length of the arc."""
         return abs(self._radius * self.sweep)
 
     @property
     def samples(self) -> int:
-        """One a degree."""
+        """One per degree."""
         return max(1, math.ceil(abs(self.sweep) / _ARC_STEP))
 
     def point(self, distance: float) -> Place:
-        """Return the place after a distance, on the circle."""
+        """Return the position after a distance on the arc."""
         part = min(max(distance / self.length, 0.0), 1.0)
         if part in (0, 1):
             return self.end if part else self.start
@@ -98,7 +98,7 @@ class Arc:
         return tuple(place)
 
     def tangent(self, distance: float) -> Place:
-        """Return the direction there; the radius counts as constant."""
+        """Return the direction there, assuming a constant radius."""
         angle, sense = self._angle(distance / self.length), math.copysign(1.0, self.sweep)
         unit = [0.0] * len(self.start)
         unit[self.plane[0]] = -sense * math.sin(angle)
@@ -108,10 +108,10 @@ class Arc:
     def limits(
         self, feed: float, rates: Sequence[float], accelerations: Sequence[float]
     ) -> tuple[float, float]:
-        """Return the limits that hold all along.
+        """Return the limits that are valid along the whole arc.
 
-        The acceleration towards the centre at the greatest speed may take 1/sqrt(2) of what the plane's
-        weaker axis can do; the rest, as the sides of a right triangle, is left for the one along the arc.
+        The centripetal acceleration at the maximum speed may use 1/sqrt(2) of the acceleration of the weaker
+        axis; the rest, added in quadrature, remains for the acceleration along the arc.
         """
         weaker = min(accelerations[axis] for axis in self.plane)
         turning = math.sqrt(weaker / math.sqrt(2.0) * self._radius)
@@ -136,16 +136,16 @@ Path = Line | Arc
 
 
 def _largest_multiple(limits: Sequence[float], direction: Sequence[float]) -> float:
-    """Return the greatest multiple of a direction that no axis' limit forbids, inf for none."""
+    """Return the largest multiple of a direction within the limits of all axes, inf if unlimited."""
     return min(
         (limit / abs(part) for limit, part in zip(limits, direction, strict=True) if part), default=math.inf
     )
 
 
 def stays_inside(path: Path, low: Place, high: Place) -> bool:
-    """Return whether a path ends in a box and does not leave it; one that begins outside may come back.
+    """Return whether a path ends in a box and does not leave it; one that starts outside may enter.
 
-    Of an arc, what is out for less than a degree may be missed.
+    Of an arc, excursions of less than a degree may be missed.
     """
     was_inside = False
     for number in range(path.samples + 1):
@@ -158,7 +158,7 @@ def stays_inside(path: Path, low: Place, high: Place) -> bool:
 
 
 def shifted(path: Path, by: Place) -> Path:
-    """Return a path moved by a vector."""
+    """Return a path translated by a vector."""
     start, end = (tuple(a + b for a, b in zip(p, by, strict=True)) for p in (path.start, path.end))
     if isinstance(path, Line):
         return Line(start, end)
@@ -168,7 +168,7 @@ def shifted(path: Path, by: Place) -> Path:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Move:
-    """A path, and the greatest speed and acceleration along it, units/s and units/s^2."""
+    """A path with the maximum speed and acceleration along it, units/s and units/s^2."""
 
     path: Path
     speed: float
@@ -177,7 +177,7 @@ class Move:
 
 @dataclass(frozen=True, slots=True)
 class _Span:
-    """A time of constant acceleration on one move."""
+    """An interval of constant acceleration on one move."""
 
     start: float
     end: float
@@ -199,11 +199,11 @@ _start = attrgetter("start")
 
 
 class Planner:
-    """A queue of moves, and where it has led and will lead.
+    """A queue of moves, with their past and planned motion.
 
-    Times are seconds of any steady clock, and must not run backwards from call to call, except where a place
-    or a speed is asked for. ``advance`` must be called at every time that ``next_event`` names. The history
-    of the last ``memory`` seconds is kept.
+    Times are seconds of any steady clock. They must not decrease from call to call, except for queries of a
+    position or a speed. ``advance`` must be called at each time that ``next_event`` returns. The history of
+    the last ``memory`` seconds is kept.
     """
 
     def __init__(self, place: Place, memory: float = 600.0) -> None:
@@ -211,32 +211,32 @@ class Planner:
         self._memory = memory
         self._spans: list[_Span] = []
         self._moves: list[Move] = []
-        self._corners: list[float] = []  # the greatest speed at the begin of each queued move
-        self._ends: list[float] = []  # when the queued moves end, as far as is planned
-        self._stop: float | None = None  # when a hold comes, or came, to rest
+        self._corners: list[float] = []  # maximum speed at the start of each queued move
+        self._ends: list[float] = []  # times at which the queued moves end, as planned
+        self._stop: float | None = None  # time at which a hold is at rest
         self._now = -math.inf
 
     @property
     def free(self) -> int:
-        """How many moves there is room for."""
+        """Number of moves that can be added."""
         return BLOCKS - len(self._moves)
 
     @property
     def busy(self) -> bool:
-        """Whether moves are queued or under way."""
+        """Whether moves are queued or in progress."""
         return bool(self._moves)
 
     @property
     def holding(self) -> bool:
-        """Whether a hold is under way or has come to rest."""
+        """Whether a hold is in progress or at rest."""
         return self._stop is not None
 
     def held(self, now: float) -> bool:
-        """Return whether a hold has come to rest."""
+        """Return whether a hold is at rest."""
         return self._stop is not None and now >= self._stop
 
     def next_event(self) -> float:
-        """Return when a move ends or a hold comes to rest next, inf for never."""
+        """Return the time at which a move ends or a hold is at rest next, inf if there is none."""
         stop = [] if self._stop is None else [self._stop]
         return min((time for time in self._ends[:1] + stop if time > self._now), default=math.inf)
 
@@ -247,7 +247,7 @@ class Planner:
             del self._ends[0], self._moves[0], self._corners[0]
 
     def place(self, at: float) -> Place:
-        """Return where the axes are at a time: past, or as planned."""
+        """Return the position of the axes at a time, past or planned."""
         span = self._span(at)
         return self._first if span is None else span.move.path.point(span.distance_at(at))
 
@@ -262,7 +262,7 @@ class Planner:
         return span is not None and span.start <= at < span.end
 
     def add(self, move: Move, now: float) -> None:
-        """Queue a move that begins where the one before ends; there must be room."""
+        """Queue a move that starts at the end of the previous one; there must be room."""
         self.advance(now)
         self._corners.append(_corner_speed(self._moves[-1], move) if self._moves else 0.0)
         self._moves.append(move)
@@ -271,7 +271,7 @@ class Planner:
             self.advance(now)
 
     def hold(self, now: float) -> None:
-        """Slow down along the path, until the axes rest."""
+        """Decelerate along the path until the axes are at rest."""
         if self.holding:
             return
         self.advance(now)
@@ -291,13 +291,13 @@ class Planner:
         self._stop = time
 
     def resume(self, now: float) -> None:
-        """Go on after a hold."""
+        """Continue after a hold."""
         self._stop = None
         self._plan(now)
         self.advance(now)
 
     def halt(self, now: float) -> None:
-        """Stop dead and forget what is queued; the place is kept."""
+        """Stop without deceleration and clear the queue, keeping the position."""
         self._cut(now)
         self._moves.clear()
         self._corners.clear()
@@ -308,7 +308,7 @@ class Planner:
         return self._spans[max(index, 0)] if self._spans else None
 
     def _cut(self, now: float) -> tuple[float, float]:
-        """Forget what was planned beyond now; return the distance gone on the first move, and the speed."""
+        """Discard the plan after now; return the distance travelled on the first move, and the speed."""
         del self._spans[bisect_right(self._spans, now, key=_start) :]
         self._ends.clear()
         old = bisect_left(self._spans, now - self._memory, key=_start) - 1
@@ -324,7 +324,7 @@ class Planner:
         return last.distance_at(now), last.speed_at(now) if under_way else 0.0
 
     def _plan(self, now: float) -> None:
-        """Plan the speed of all that is queued: as fast as the limits and a stop at the end allow."""
+        """Plan the speed of all queued moves: as fast as the limits and a stop at the end allow."""
         distance, speed = self._cut(now)
         squares = [corner * corner for corner in self._corners] + [0.0]
         for index in range(len(self._moves) - 1, 0, -1):
@@ -340,10 +340,10 @@ class Planner:
             distance, speed = 0.0, math.sqrt(leaves)
 
     def _ramp(self, time: float, move: Move, distance: float, enters: float, leaves: float) -> float:
-        """Append a trapezoid: faster, even, slower; return when it ends."""
+        """Append a trapezoid of acceleration, constant speed and deceleration; return the time of its end."""
         left = move.path.length - distance
         peak = math.sqrt(move.acceleration * left + (enters * enters + leaves * leaves) / 2)
-        # Rounding may leave less than it takes to slow down: then it is done a trifle harder.
+        # Rounding may leave slightly less than the braking distance: deceleration is then slightly higher.
         peak = max(min(peak, move.speed), enters, leaves)
         faster = (peak * peak - enters * enters) / (2 * move.acceleration)
         slower = min((peak * peak - leaves * leaves) / (2 * move.acceleration), left - faster)
@@ -367,7 +367,7 @@ class Planner:
 
 
 def _corner_speed(before: Move, after: Move) -> float:
-    """Return the greatest speed between two moves: none, unless one goes straight on from the other."""
+    """Return the maximum speed at the junction of two moves: 0, unless they are collinear."""
     arrives, departs = before.path.tangent(before.path.length), after.path.tangent(0.0)
     straight = 1 - sum(a * b for a, b in zip(arrives, departs, strict=True)) < _STRAIGHT
     return min(before.speed, after.speed) if straight else 0.0

@@ -1,4 +1,4 @@
-"""An emulated GRBL 1.1 controller with its stage, right in time, and a serial port in front of it."""
+"""An emulated GRBL 1.1 controller with its stage in real time, behind a serial port."""
 
 from __future__ import annotations
 
@@ -20,18 +20,17 @@ from mirrorskin.hw.grbl.report_times import SLICE
 from mirrorskin.io.types import Closing
 
 _CHUNK = 4096  # bytes read or written at once
-_BACKLOG = 65536  # bytes of replies that nobody reads, before more are lost
-_LOOK = 0.05  # seconds after which the threads of a port look whether it was closed
+_BACKLOG = 65536  # maximum of unread reply bytes, beyond which replies are lost
+_LOOK = 0.05  # interval at which the threads of a port check whether it was closed, seconds
 
 
 class GrblMachine:
-    """A controller by a clock: bytes go in, replies come out, and the axes move meanwhile.
+    """A controller with a clock: bytes go in, replies come out, and the axes move meanwhile.
 
-    Nothing runs in the background: whenever something is asked for, all that has become due is done first,
-    each at its own time. Every method may be called from any thread. `settings` are the ``$`` settings that
-    differ from the defaults; `start` is where the axes truly are, in the coordinates that homing brings about
-    (0 where it says nothing), which the controller takes for 0; `memory` is how many seconds ``position``
-    goes back.
+    Nothing runs in the background: each call first processes all events that are due, at their own times. All
+    methods are thread-safe. `settings` are the ``$`` settings that differ from the defaults. `start` is the
+    true position of the axes in the coordinates after homing (0 where not given), which the controller
+    assumes to be 0. `memory` is the length of the history of ``position``, seconds.
     """
 
     def __init__(
@@ -50,22 +49,22 @@ class GrblMachine:
         self._controller = Controller(axes, settings or {}, place, clock.now(), memory)
 
     def receive(self, data: bytes) -> None:
-        """Take bytes from the host, now."""
+        """Receive bytes from the host, now."""
         with self._lock:
             self._current().receive(data)
 
     def take(self) -> bytes:
-        """Return what has been replied since the last call."""
+        """Return the replies since the last call."""
         with self._lock:
             return self._current().take()
 
     def next_event(self) -> float:
-        """Return when something may happen next by itself, on the clock; inf for never."""
+        """Return the time of the next event on the clock; inf if there is none."""
         with self._lock:
             return self._current().next_event()
 
     def position(self, at: float | None = None) -> dict[str, float]:
-        """Return where the axes truly are at a time on the clock, by default now: mm or degrees, as homed."""
+        """Return the true position of the axes at a time, by default now: mm or degrees, as homed."""
         with self._lock:
             planner = self._current().planner
             place = planner.place(self.clock.now() if at is None else at)
@@ -84,23 +83,23 @@ class GrblMachine:
             return planner.speed(self.clock.now() if at is None else at)
 
     def switched(self, line: str) -> list[float]:
-        """Return when coolant or spindle went on, off, on, ... on the clock; it is off at first."""
+        """Return the times at which coolant or spindle was switched on, off, on, ...; it is off initially."""
         with self._lock:
             return [*self._current().switched[line]]
 
     @property
     def state(self) -> str:
-        """The state as a report has it: Idle, Run, Hold:0, Hold:1, Alarm or Home."""
+        """State as in a report: Idle, Run, Hold:0, Hold:1, Alarm or Home."""
         with self._lock:
             return self._current().state
 
     def alarm(self, code: int) -> None:
-        """Raise an alarm: 1 and 2 as limits do, others as what aborts a cycle does (with a reset)."""
+        """Raise an alarm: 1 and 2 as limits do, others with a reset, as errors that abort a cycle do."""
         with self._lock:
             self._current().alarm(code)
 
     def cut_power(self) -> None:
-        """Let the controller die: the axes stop dead, and nothing is answered any more."""
+        """Cut the power: the axes stop without deceleration, and nothing is answered any more."""
         with self._lock:
             self._current().die()
 
@@ -110,13 +109,14 @@ class GrblMachine:
 
 
 class GrblLine(Closing):
-    """A serial port in memory that a controller answers on, by the machine's clock; a context manager.
+    """A serial port in memory in front of a controller, on the machine's clock; a context manager.
 
-    It is a host's end as well: it has what drivers use of ``serial.Serial``, and ``open`` returns it. Any
-    byte and any reply can be made to fail: ``heard`` gets the number of each byte from the host and the byte,
-    ``said`` those of each reply (a line with its end); what they return takes its place. They count from 1.
+    It is also the host's end: it has the methods of ``serial.Serial`` that drivers use, and ``open`` returns
+    it. Faults can be injected into any byte and any reply: ``heard`` is called with the number of each byte
+    from the host and the byte, ``said`` with the number of each reply and the reply (a line with its end).
+    Their return values replace the byte or the reply. Numbers start at 1.
 
-    Every fault may come at any time. The machine outlives the line.
+    Faults may occur at any time. The machine outlives the line.
     """
 
     def __init__(self, machine: GrblMachine) -> None:
@@ -131,21 +131,21 @@ class GrblLine(Closing):
         self._change = self._clock.condition()
 
     def open(self) -> Any:
-        """Return the host's end; what came before is forgotten."""
+        """Return the host's end; earlier bytes are discarded."""
         self._collect()
         self._coming.clear()
         return self
 
     @property
     def in_waiting(self) -> int:
-        """Bytes that can be read."""
+        """Number of bytes that can be read."""
         with self._change:
             self._check()
             self._collect()
             return len(self._coming)
 
     def read(self, size: int = 1) -> bytes:
-        """Wait for bytes, for the timeout at most, and return those that are there."""
+        """Wait for bytes, at most for the timeout, and return the available ones."""
         end = self._clock.now() + (math.inf if self.timeout is None else self.timeout)
         with self._change:
             while not self.in_waiting and (left := end - self._clock.now()) > 0:
@@ -155,7 +155,7 @@ class GrblLine(Closing):
         return data
 
     def write(self, data: bytes) -> int:
-        """Send bytes to the controller, which has them at once."""
+        """Send bytes to the controller, which receives them at once."""
         self._check()
         for byte in data:
             self._count["heard"] += 1
@@ -164,18 +164,18 @@ class GrblLine(Closing):
         return len(data)
 
     def flush(self) -> None:
-        """Do nothing: all that is written is sent at once."""
+        """Do nothing: everything written has been sent."""
 
     def close(self) -> None:
-        """Leave the line; the machine goes on with its commands."""
+        """Close the line; the machine continues with its commands."""
         self._coming.clear()
 
     def silence(self) -> None:
-        """Answer nothing any more; the machine goes on, and still hears."""
+        """Send no more replies; the machine continues and still receives."""
         self._silent = True
 
     def garble(self, count: int, seed: int = 0) -> None:
-        """Send random bytes; replies come after them."""
+        """Send random bytes; replies follow them."""
         self._coming += random.Random(seed).randbytes(count)
         self._wake()
 
@@ -185,7 +185,7 @@ class GrblLine(Closing):
         self._wake()
 
     def unplug(self) -> None:
-        """Pull the cable that feeds the board, too: the line is gone, and the axes stop dead."""
+        """Pull the cable that also powers the board: the line is gone, and the axes stop at once."""
         self.machine.cut_power()
         self._gone = True
         self._wake()
@@ -195,7 +195,7 @@ class GrblLine(Closing):
             raise serial.SerialException("device reports readiness to read but returned no data")
 
     def _collect(self) -> None:
-        """Take what the machine has said."""
+        """Collect the replies of the machine."""
         self._reply += self.machine.take()
         *replies, rest = self._reply.split(b"\n")
         self._reply = rest
@@ -211,17 +211,17 @@ class GrblLine(Closing):
 
 
 class GrblPort(GrblLine):
-    """A pseudo-terminal that a controller answers on, right in time; a context manager.
+    """A pseudo-terminal in front of a controller, in real time; a context manager.
 
-    Open ``url`` as any serial port. Two threads move the bytes between the terminal and the line in memory.
-    The port stays there when a host closes it, and there is no reset when one opens it, as on boards without
-    that line. The machine's clock must be that of the computer.
+    Open ``url`` as any serial port. Two threads transfer the bytes between the terminal and the line in
+    memory. The port remains when a host closes it, and opening it causes no reset, as on boards without that
+    line. The machine must use the system's clock.
     """
 
     def __init__(self, machine: GrblMachine) -> None:
         super().__init__(machine)
         self.timeout = _LOOK
-        import tty  # absent on Windows
+        import tty  # not available on Windows
 
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
@@ -233,11 +233,11 @@ class GrblPort(GrblLine):
             thread.start()
 
     def open(self) -> serial.Serial:
-        """Open the port as its host."""
+        """Open the host's end of the port."""
         return open_port(self.url, 115200, self.url)
 
     def close(self) -> None:
-        """Take the port away; the machine goes on with its commands."""
+        """Remove the port; the machine continues with its commands."""
         if self._closing:
             return
         self._closing = True
@@ -248,14 +248,14 @@ class GrblPort(GrblLine):
         os.close(self._slave)
 
     def unplug(self) -> None:
-        """Pull the cable that feeds the board, too: the port vanishes, and the axes stop dead."""
+        """Pull the cable that also powers the board: the port disappears, and the axes stop at once."""
         super().unplug()
         self.close()
 
     def _hear(self) -> None:
         while not self._closing:
             if select.select([self._master], [], [], _LOOK)[0]:
-                with contextlib.suppress(OSError):  # nothing there after all, or it is unplugged
+                with contextlib.suppress(OSError):  # nothing to read after all, or unplugged
                     self.write(os.read(self._master, _CHUNK))
 
     def _say(self) -> None:

@@ -1,4 +1,4 @@
-"""A whole rig without hardware: the emulated stage moves, and the twin's camera sees it."""
+"""A complete rig without hardware: the emulated stage moves, and the twin's camera watches."""
 
 from __future__ import annotations
 
@@ -43,21 +43,21 @@ from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.types import Floats, InputError
 
 PRESS = 3.0
-"""Greatest travel that the emulated stage allows, mm."""
+"""Maximum travel of the emulated stage, mm."""
 
 TILT = 9.0
-"""Greatest pitch and roll, degrees."""
+"""Maximum pitch and roll, degrees."""
 
 SHIFT, TURN = 2.0, 45.0
-"""Greatest displacement along x and y, mm, and greatest twist, degrees, either way."""
+"""Maximum displacement along x and y, mm, and maximum twist, degrees, in either direction."""
 
-_SILENCE, _STALL = 0.07, 0.1  # seconds that the emulators may be silent in motion
+_SILENCE, _STALL = 0.07, 0.1  # silence of the emulators tolerated in motion, seconds
 _SERVED = 0.5  # the same for emulators in another process, which competes for the processor
-_TIMEOUT = 2.0  # seconds that the emulated controller may take for an answer at rest
-_LIFT = 4.0  # how far above the object the body begins, mm
-_HIGHEST = 4.5  # and how far it can be lifted
-# GRBL's settings of homing, in units a minute, ms and units; and of its axes X, Y, Z, A, B and C, which are
-# pitch, roll, travel, x, y and twist: greatest speeds in mm or degrees a minute, accelerations, lengths.
+_TIMEOUT = 2.0  # maximum time for an answer of the emulated controller at rest, seconds
+_LIFT = 4.0  # initial height of the body above the object, mm
+_HIGHEST = 4.5  # maximum height of the body, mm
+# GRBL's homing settings, in units per minute, ms and units; and for the axes X, Y, Z, A, B and C, which are
+# pitch, roll, travel, x, y and twist: maximum speeds in mm or degrees per minute, accelerations, lengths.
 _AXES = "XYZABC"
 _HOMING = {24: 300.0, 25: 3000.0, 26: 10.0, 27: 0.5}
 _SPEED = 1200.0, 1200.0, 600.0, 300.0, 300.0, 2400.0
@@ -75,35 +75,34 @@ _FILE, _REFERENCE = "rig.toml", "bright.npy"
 
 
 class EmulatedRig:
-    """A GRBL controller behind a terminal, its stage, and the twin on it; it runs within ``with``.
+    """A GRBL controller behind a terminal, its stage, and the twin; it runs inside ``with``.
 
-    The body begins at rest, upright, 4 mm above the object.
-
-    The ``machine``, and inside ``with`` its ``port`` and the ``camera``, can be commanded to fail.
+    Initially the body is at rest, upright, 4 mm above the object. Faults of the ``machine``, and inside
+    ``with`` of its ``port`` and of the ``camera``, can be triggered.
 
     Parameters
     ----------
     object : Object, str or Path
-        What lies under the sensor; see `Twin`.
+        Object under the sensor; see `Twin`.
     camera : Camera, optional
-        What the twin's frames are like; its frame rate is not used.
+        Camera model of the twin; its frame rate is not used.
     rate : float
         Frames a second.
     delay, jitter : float
-        Of the frames' arrival, seconds; see `TwinCamera`.
+        Delay and jitter of the frames' arrival, seconds; see `TwinCamera`.
     seed : int
-        Of noise and jitter.
+        Seed of noise and jitter.
     pivot : (float, float, float)
-        What the body turns about, from the rest sheet's centre, mm.
+        Pivot of the rotation, from the rest sheet's centre, mm.
     trigger : str, optional
-        The controller's line that triggers the camera, coolant or spindle; else it runs freely.
+        The controller's output that triggers the camera, coolant or spindle; without it the camera runs
+        freely.
     home : bool
-        Whether the machine has switches, and must find them before it moves.
+        Whether the machine has switches and must be homed before it moves.
     machine : GrblMachine, optional
-        Another controller with the settings ``MACHINE``, where its axes begin at 0; the rig lacks
-        the axes that it lacks.
+        Another controller with the settings ``MACHINE``, whose axes start at 0; it may lack axes.
     clock : Clock
-        With a `SimulatedClock` nobody waits; the controller then is behind a line in memory, not a terminal.
+        With a `SimulatedClock` waiting takes no time; the controller is then behind a line in memory.
     **scene
         Shape, pixel size, pattern, contact, optics and device: as for `Twin`.
 
@@ -175,27 +174,27 @@ class EmulatedRig:
         self._leaving.close()
 
     def where(self, at: float) -> Position:
-        """Return where the body truly is at a time of the clock."""
+        """Return the true position of the body at a time of the clock."""
         at_machine = self.machine.position(at)
         return Position(**{name: axis.value(at_machine[axis.letter]) for name, axis in self._axes.items()})
 
     def open_stage(self, settings: StageSettings, unlock: bool = False) -> GrblStage:
-        """Open the emulated stage, or another one if its port is another; see ``rig.open_stage``."""
+        """Open the emulated stage, or another one if the port differs; see ``rig.open_stage``."""
         port = self.port.open() if settings.port == self.port.url else None
         return GrblStage(settings, port, unlock=unlock, clock=self.clock)
 
     def open_camera(self, settings: CameraSettings) -> TwinCamera:
-        """Begin anew with the emulated camera, and return it; see ``rig.open_camera``."""
+        """Restart the emulated camera, and return it; see ``rig.open_camera``."""
         self.camera.close()
         self.camera = self._make_camera()
         return self.camera
 
     def twin(self, movement: Movement) -> Twin:
-        """Make the same scene as a twin that is rendered directly; its references are `references`."""
+        """Return the same scene as a twin that is rendered directly, with the references of `references`."""
         return self._make(movement=movement, references="ball")
 
     def references(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Take dark and bright references with a ball, as a lab does, (H, W), float32; see `Twin`."""
+        """Return dark and bright references taken with a ball, (H, W), float32; see `Twin`."""
         header = self.twin(Vertical([0.0])).header
         assert header.dark is not None
         assert header.bright is not None
@@ -203,7 +202,7 @@ class EmulatedRig:
 
     @property
     def settings(self) -> RigSettings:
-        """What a rig file would say."""
+        """The contents of the rig file."""
         stage = StageSettings(
             port=self.port.url,
             home=self._home,
@@ -216,7 +215,7 @@ class EmulatedRig:
         return RigSettings(Path("emulated"), "emulated rig", stage, self._camera_settings())
 
     def serve(self, port: int = 0) -> FrameServer:
-        """Stream the camera's frames to other processes, until what is returned is closed."""
+        """Stream the camera's frames to other processes, until the returned server is closed."""
         return FrameServer(self.camera, self._seen.frame_rate, port)
 
     @staticmethod
@@ -237,7 +236,9 @@ class EmulatedRig:
                 return
             emulator = Emulator.read(path)
             if emulator is None or path.stat().st_uid != os.geteuid():
-                raise InputError(f"{path} is someone else's rig file. Choose another folder with -o")
+                raise InputError(
+                    f"{path} is a rig file that mirrorskin did not write. Choose another folder with -o"
+                )
         if emulator.running and emulator.process != os.getpid():
             raise InputError(
                 f"{path}: an emulated rig is already running in this folder (process {emulator.process})."
@@ -250,7 +251,7 @@ class EmulatedRig:
         Parameters
         ----------
         folder : Path
-            Created if missing. What an emulated rig that was killed left in it is replaced.
+            Created if missing. Files of an emulated rig that was killed are replaced.
         source : str
             URL of the camera's stream; see `serve`.
 
@@ -262,7 +263,7 @@ class EmulatedRig:
         Raises
         ------
         InputError
-            The folder cannot be written to, or contains files of others; see `check_folder`.
+            The folder cannot be written to, or contains other files of these names; see `check_folder`.
         """
         self.check_folder(folder)
         path, picture = folder / _FILE, folder / _REFERENCE
@@ -277,7 +278,8 @@ class EmulatedRig:
             self._leaving.callback(_remove, folder, emulator)
             array = BytesIO()
             np.save(array, self.references()[1])
-            write_new(picture, [array.getvalue()], replaces="anything")  # of an emulated rig, as was checked
+            # it belongs to an emulated rig, as was checked
+            write_new(picture, [array.getvalue()], replaces="anything")
             write_new(path, [f"{emulator.heading}{text}\n".encode()], replaces="anything")
         return path
 
@@ -304,13 +306,13 @@ class EmulatedRig:
 
 
 class _Anywhere(Axial):
-    """Bounds how far the body goes: it leans all the way round, and is moved and turned as far as can be."""
+    """Bounds the positions of the body: all phases of the lean, and the largest displacements and twists."""
 
     def __init__(self, pivot: tuple[float, float, float]) -> None:
         super().__init__(np.arange(8) * np.pi / 4, math.radians(math.hypot(TILT, TILT)), PRESS, pivot)
 
     def pose(self, place: Floats, /) -> Pose:
-        """Lean at a phase, moved that way and twisted."""
+        """Return the pose at a phase, displaced to the limits and twisted."""
         phase, turn = float(place), math.radians(TURN)
         lean = self.tilt * math.cos(phase), self.tilt * math.sin(phase)
         x, y = np.sign(np.round([math.cos(phase), math.sin(phase)], 9)) * SHIFT
@@ -318,7 +320,7 @@ class _Anywhere(Axial):
 
 
 def _remove(folder: Path, emulator: Emulator) -> None:
-    """Remove the files that `EmulatedRig.write` wrote, unless another rig's have replaced them."""
+    """Remove the files that `EmulatedRig.write` wrote, unless those of another rig have replaced them."""
     path = folder / _FILE
     with suppress(OSError):
         if not path.exists() or Emulator.read(path) == emulator:
@@ -327,7 +329,7 @@ def _remove(folder: Path, emulator: Emulator) -> None:
 
 
 def _axes(home: bool, letters: str) -> dict[str, Any]:
-    """Describe the axes: one that has homed counts from its upper end, another from where it began."""
+    """Describe the axes: with homing they count from their upper end, otherwise from the initial position."""
 
     def zero(middle: float) -> float:
         return middle if home else 0.0
@@ -346,7 +348,7 @@ def _axes(home: bool, letters: str) -> dict[str, Any]:
 
 
 def _toml(table: Mapping[str, Any], name: str = "") -> Iterator[str]:
-    """Yield the lines of a table, and of those in it: what JSON writes of a value is TOML as well."""
+    """Yield the lines of a table and of its sub-tables; JSON values are valid TOML."""
     if name:
         yield f"\n[{name}]"
     for key, value in table.items():

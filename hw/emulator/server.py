@@ -1,4 +1,4 @@
-"""A camera's frames for other processes: a stream that ``cv2.VideoCapture`` opens, without any loss."""
+"""A camera's frames for other processes: a lossless stream that ``cv2.VideoCapture`` opens."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from mirrorskin.io.types import Closing, InputError
 
 _COLOURS = {np.dtype(np.uint8): "mono", np.dtype(np.uint16): "mono16"}
 _QUEUE = 4  # frames that wait for a slow viewer
-_LOOK = 0.1  # seconds from one look at whether to end to the next
+_LOOK = 0.1  # interval at which threads check whether to end, seconds
 _FRACTION = 1001  # greatest denominator of the rate in the header
 
 
 class FrameServer(Closing):
-    """Sends a camera's frames to whoever connects, as YUV4MPEG2 of grey pictures over TCP.
+    """Sends a camera's frames to any number of viewers, as grey YUV4MPEG2 over TCP.
 
-    A viewer gets a header and then frames, whole ones only, from the next one on. Of those that wait for a
-    slow viewer the oldest are dropped. When the camera fails the connections end; when it is silent nothing
-    is sent. Only programs of this computer can connect.
+    A viewer gets a header, and then complete frames from the next one on. If it is slow, the oldest waiting
+    frames are dropped. When the camera fails, the connections end; when it is silent, nothing is sent. Only
+    programs on this computer can connect.
 
-    The server takes the camera's frames, and does not close it. The URL to open is ``url``; port 0 takes a
-    free one.
+    The server takes the camera's frames, but does not close the camera. ``url`` is the address to open; port
+    0 selects a free port.
     """
 
     def __init__(self, camera: Camera, rate: float, port: int = 0) -> None:
         if camera.dtype not in _COLOURS:
-            raise InputError(f"{camera.name}: {camera.dtype} cannot be streamed: take uint8 or uint16")
+            raise InputError(f"{camera.name}: {camera.dtype} cannot be streamed: use uint8 or uint16")
         rows, columns = camera.shape
         ratio = Fraction(rate).limit_denominator(_FRACTION)
         self._header = (
@@ -43,12 +43,12 @@ class FrameServer(Closing):
         ).encode()
         self._camera = camera
         self._ended = False
-        self._viewers: dict[socket.socket, deque[bytes]] = {}  # the frames that wait for each
+        self._viewers: dict[socket.socket, deque[bytes]] = {}  # frames that wait for each viewer
         self._change = threading.Condition()
         try:
             self._door = socket.create_server(("127.0.0.1", port))
         except (OSError, OverflowError) as error:
-            raise InputError(f"port {port} cannot be listened on: {error}; take another, or 0") from None
+            raise InputError(f"port {port} cannot be opened: {error}; choose another one, or 0") from None
         self._door.settimeout(_LOOK)
         self.url: str = f"tcp://127.0.0.1:{self._door.getsockname()[1]}"
         self._threads = [threading.Thread(target=work) for work in (self._admit, self._take)]
@@ -56,10 +56,10 @@ class FrameServer(Closing):
             thread.start()
 
     def close(self) -> None:
-        """End all connections and listen no more; a second time does nothing."""
+        """End all connections and stop listening; a second call does nothing."""
         self._ended = True
         self._dismiss()
-        for thread in self._threads:  # those of viewers come after the one that admits them
+        for thread in self._threads:  # threads of viewers are added by the first thread
             thread.join()
         self._door.close()
 
@@ -69,7 +69,7 @@ class FrameServer(Closing):
                 line, _ = self._door.accept()
             except TimeoutError:
                 continue
-            except OSError:  # of too many open files, which may be closed
+            except OSError:  # too many open files, some of which may be closed later
                 time.sleep(_LOOK)
                 continue
             line.settimeout(None)
@@ -81,12 +81,12 @@ class FrameServer(Closing):
         self._dismiss()
 
     def _take(self) -> None:
-        """Offer each frame of the camera to all viewers."""
+        """Pass each frame of the camera to all viewers."""
         while not self._ended:
             try:
                 frames = self._camera.take(1, _LOOK)
             except HardwareError:
-                if self._camera.error is not None:  # otherwise it is only silent
+                if self._camera.error is not None:  # otherwise the camera is only silent
                     self._dismiss()
                     time.sleep(_LOOK)
                 continue
@@ -98,7 +98,7 @@ class FrameServer(Closing):
                 self._change.notify_all()
 
     def _serve(self, line: socket.socket) -> None:
-        with line, suppress(OSError):  # the viewer went
+        with line, suppress(OSError):  # the viewer disconnected
             line.sendall(self._header)
             while True:
                 with self._change:
@@ -111,10 +111,10 @@ class FrameServer(Closing):
             self._viewers.pop(line, None)
 
     def _dismiss(self) -> None:
-        """End all connections, also in the middle of a frame."""
+        """End all connections, even in the middle of a frame."""
         with self._change:
             lines, self._viewers = list(self._viewers), {}
             self._change.notify_all()
         for line in lines:
-            with suppress(OSError):  # the other end was first
+            with suppress(OSError):  # the other end was closed first
                 line.shutdown(socket.SHUT_RDWR)

@@ -1,1 +1,1 @@
-"""A stage behind GRBL: replies, the serial line, moves, and the stage."""
+"""The GRBL driver: replies, the serial line, moves, and the stage."""

@@ -1,4 +1,4 @@
-"""The line to the controller: one thread reads, one asks for reports and keeps watch."""
+"""The serial line to the controller: one thread reads, another one queries reports and monitors."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ from mirrorskin.hw.grbl.report_times import SLICE, Answer, ReportTimes
 from mirrorskin.hw.rig_file import StageSettings
 from mirrorskin.io import InputError
 
-_WRITE = 0.25  # seconds after which a line that takes nothing more is broken
-_NO_PORT = "there is no such port; plug the controller in, or correct the rig file's port"
-_BUSY = "another program uses it; close that first"
+_WRITE = 0.25  # seconds after which a line that accepts no more bytes counts as broken
+_NO_PORT = "there is no such port; connect the controller, or correct the port in the rig file"
+_BUSY = "another program uses it; close that program first"
 _REMEDIES = {
     **dict.fromkeys((errno.ENOENT, errno.ENODEV, errno.ENXIO), _NO_PORT),
     **dict.fromkeys((errno.EBUSY, errno.EAGAIN), _BUSY),
@@ -45,12 +45,12 @@ _REMEDIES = {
 
 
 def open_port(url: str, baud: int, name: str) -> serial.Serial:
-    """Open a serial port, or what a URL of pyserial names, for us alone; reads wait `SLICE` at most."""
+    """Open a serial port or a URL of pyserial exclusively; reads wait at most `SLICE`."""
     try:
         port = serial.serial_for_url(url, baud, timeout=SLICE, do_not_open=True)
         if os.name == "posix":
             port.exclusive = True
-        if not url.lower().startswith("rfc2217:"):  # which knows no such limit
+        if not url.lower().startswith("rfc2217:"):  # it does not support this timeout
             port.write_timeout = _WRITE
         port.open()
     except (OSError, ValueError) as error:
@@ -60,24 +60,24 @@ def open_port(url: str, baud: int, name: str) -> serial.Serial:
 
 
 def close_port(port: serial.Serial) -> None:
-    """Close a port, also one that is gone."""
-    socket = getattr(port, "_socket", None)  # pyserial forgets it where the other side has left
+    """Close a port, even one that no longer exists."""
+    socket = getattr(port, "_socket", None)  # pyserial drops it if the other side has closed
     try:
         port.close()
         if socket is not None:
             socket.close()
-    except Exception:  # pyserial raises many kinds, and there is nothing left to do
+    except Exception:  # pyserial raises many types, and nothing is left to do
         return
 
 
 HOLDING = 0.3
-"""Seconds that a stop waits for rest before it resets, unless the axes take longer to slow down."""
+"""Seconds that a stop waits for rest before it resets, unless the axes need longer to decelerate."""
 
 _RESETTING = 0.3  # seconds that a reset may take to be answered
 
 
 class Stopping:
-    """Where a stop has got to; it needs no lock, so that anyone can begin it at any moment."""
+    """The progress of a stop; it needs no lock, so any thread can start it at any time."""
 
     def __init__(self) -> None:
         self.holding = HOLDING  # seconds that it waits for rest before it resets
@@ -86,27 +86,27 @@ class Stopping:
 
     @property
     def longest(self) -> float:
-        """Seconds that a stop takes at most."""
+        """Maximum duration of a stop, seconds."""
         return self.holding + _RESETTING
 
     @property
     def begun(self) -> bool:
-        """Whether the machine was commanded to hold."""
+        """Whether the hold command was sent."""
         return self._began < math.inf
 
     @property
     def resetting(self) -> bool:
-        """Whether it was commanded to reset."""
+        """Whether the reset command was sent."""
         return self._reset < math.inf
 
     def begin(self, now: float) -> None:
-        """Note that the machine was commanded to hold."""
+        """Record that the hold command was sent."""
         self._began = min(self._began, now)
 
     def reset(self, now: float, rested: float, gone: bool) -> bool:
-        """Return whether to reset now: the machine rests, the line is gone, or the time is up.
+        """Return whether to reset now: the machine is at rest, the line is gone, or the time is up.
 
-        `rested` is when the newest report was asked for, if that was of rest.
+        `rested` is the time at which the newest report was queried, if that report was of rest.
         """
         if self.resetting or not (gone or rested > self._began or now - self._began > self.holding):
             return False
@@ -114,40 +114,40 @@ class Stopping:
         return True
 
     def finish(self, now: float, answered: bool) -> None:
-        """Note whether the reset was answered: then the stop is over, and after a while in any case."""
+        """Record whether the reset was answered. The stop is then complete; otherwise it is after a while."""
         self.over = self.over or answered or now - self._reset > _RESETTING
 
 
 ASK, HOLD, RESET = b"?", b"!", b"\x18"
 
-_TICK = 0.01  # seconds between two looks at the clock
-_TRIPS = 4  # usual round trips at least, that a question may be open in motion
-_OPENING_PERIOD = 0.05  # seconds between questions at most, until `begin`
-_MOVING_PERIOD = 0.025  # the same in motion and during a stop: how soon a silence shows
-_ANSWER_LOST = 0.5  # seconds at rest after which an answer that is out will not come
+_TICK = 0.01  # interval at which the time is checked, seconds
+_TRIPS = 4  # minimum tolerance for an open query in motion, in usual round trips
+_OPENING_PERIOD = 0.05  # maximum interval of queries before `begin`, seconds
+_MOVING_PERIOD = 0.025  # the same in motion and during a stop; it limits how soon a silence is detected
+_ANSWER_LOST = 0.5  # seconds at rest after which a missing answer is considered lost
 _STUCK = 1.0  # seconds after which a read that has not returned counts as hung
-_SLICE = 0.05  # seconds of one wait
-_CHUNK = 1024  # bytes that are heard at a time, before others have their turn
-_INTERRUPTED = ("hold", "door", "sleep", "check")  # states that we did not ask for
+_SLICE = 0.05  # duration of one wait, seconds
+_CHUNK = 1024  # bytes processed at a time, so that other threads get their turn
+_INTERRUPTED = ("hold", "door", "sleep", "check")  # states that this program did not request
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
 class TimedStatus:
-    """A report: what it says, when it was asked for, and when it was so."""
+    """A report, the time of its query, and the time at which it was valid."""
 
     status: Status
     answer: Answer
-    working: bool  # it goes where it was sent: not before `begin`, while it is locked or homes, nor in a stop
+    working: bool  # whether it executes moves: not before `begin`, while locked or homing, or during a stop
 
 
 class Link:
-    """Sends lines and realtime bytes, hears replies, and notices what is wrong.
+    """Sends lines and realtime bytes, receives replies, and detects faults.
 
-    At first it only listens: noise, silence and alarms are no errors until `begin`.
+    Before `begin` it only listens: noise, silence and alarms are not errors.
 
-    Each report is handed to `on_report`, with `lock` held; `lock` is notified whenever something was heard.
+    Each report is passed to `on_report` with `lock` held; `lock` is notified whenever something was received.
     """
 
     def __init__(
@@ -158,17 +158,17 @@ class Link:
         on_report: Callable[[TimedStatus], None],
         clock: Clock,
     ) -> None:
-        self.error: HardwareError | None = None  # what went wrong, first of all
+        self.error: HardwareError | None = None  # the first fault
         self.clock = clock
         self.lock: threading.Condition = clock.condition()
         self.window: Window = Window()
         self.noise: Noise = Noise()
         self.seen: TimedStatus | None = None  # the newest report
-        self.rests: int = 0  # reports of rest in a row, all asked for after the last line was taken
-        self.banner: Banner | None = None  # what it said when it started, since the last reset
+        self.rests: int = 0  # consecutive reports of rest that were queried after the last line was accepted
+        self.banner: Banner | None = None  # start-up message since the last reset
         self.gone: bool = False  # whether the port is lost
-        self.locked = False  # whether an alarm is no error, because the stage is to be homed first
-        self.patience: float | None = None  # seconds that it may be silent while it homes
+        self.locked = False  # whether an alarm is not an error, because the stage will be homed
+        self.patience: float | None = None  # maximum silence while homing, seconds
         self._port = port
         self._name = name
         self._timeout = settings.timeout
@@ -180,10 +180,10 @@ class Link:
         self._replies: list[Reply] = []
         self._refused: Refusal | None = None
         self._active = False
-        self._heard = self.clock.now()  # when it was last listened to
-        self._last_line = -math.inf  # when a line was last sent or answered
+        self._heard = self.clock.now()  # time of the last read
+        self._last_line = -math.inf  # time at which a line was last sent or answered
         self.stopping: Stopping = Stopping()
-        self._deaf = False  # what comes is noise, and was reported as such
+        self._deaf = False  # whether noise was received and reported
         self._closing = False
         self._threads = [
             clock.thread(work, f"{name} {work.__name__.strip('_')}") for work in (self._read, self._poll)
@@ -193,26 +193,26 @@ class Link:
 
     @property
     def round_trip(self) -> float:
-        """Seconds from a question to its answer, of late; NaN before the first."""
+        """Recent time from a query to its answer, seconds; NaN before the first."""
         with self.lock:
             return self._times.usual
 
     @property
     def longest_trip(self) -> float:
-        """The longest of late; NaN before the first."""
+        """Longest recent round trip, seconds; NaN before the first."""
         with self.lock:
             return self._times.longest
 
     @property
     def longest_silence(self) -> float:
-        """Seconds without an answer that a move bears."""
+        """Maximum time without an answer during a move, seconds."""
         with self.lock:
             return max(self._silence, _TRIPS * self._times.usual)
 
-    # What others call
+    # Public methods
 
     def begin(self) -> None:
-        """From now on, take noise, silence, alarms and resets for errors."""
+        """From now on, treat noise, silence, alarms and resets as errors."""
         with self.lock:
             self._active = True
             self.noise = Noise()
@@ -220,7 +220,7 @@ class Link:
     def enqueue(self, *commands: Command) -> int:
         """Send lines, each as soon as the controller has room and its motion is due.
 
-        Return the value of `window.done` once the first is answered.
+        Return the value of `window.done` once the first line is answered.
         """
         with self.lock:
             self._check()
@@ -230,18 +230,18 @@ class Link:
         return numbers[0]
 
     def ask(self, line: str, timeout: float) -> list[Reply]:
-        """Send a line, wait until it is answered, and return what was said in between."""
+        """Send a line, wait for its answer, and return the replies in between."""
         with self.lock:
             self._replies = []
             number = self.enqueue(Command(line))
         self.until(lambda: self.window.done >= number or None, timeout, f"take {line}")
         with self.lock:
             if self._refused is not None:
-                raise HardwareError(f"{self._name}: it refuses {line}: {self._refused}")
+                raise HardwareError(f"{self._name}: the controller refuses {line}: {self._refused}")
             return self._replies
 
     def until(self, ready: Callable[[], T | None], timeout: float, what: str) -> T:
-        """Wait until `ready` gives something; HardwareError if something goes wrong, or it takes too long."""
+        """Wait until `ready` returns something; HardwareError on a fault or a timeout."""
         end = self.clock.now() + timeout
         with self.lock:
             while True:
@@ -255,7 +255,7 @@ class Link:
                 self.lock.wait(min(left, _SLICE))
 
     def restart(self, timeout: float) -> None:
-        """Hold the machine, reset it, and forget what it said before."""
+        """Put the machine on hold, reset it, and discard earlier replies."""
         self.send(HOLD)
         self.clock.sleep(self.stopping.holding)
         self.banner = None
@@ -264,24 +264,24 @@ class Link:
         self.seen = None
 
     def halt(self, why: str) -> None:
-        """Stop the machine at once, from any thread, without waiting for any; the reset follows."""
-        if not self.stopping.resetting:  # a hold after the reset would stay
+        """Stop the machine at once, from any thread and without waiting; the reset follows."""
+        if not self.stopping.resetting:  # a hold after the reset would remain
             self.send(HOLD)
         if self.error is None:
             self.error = HardwareError(f"{self._name}: {why}")
         self.stopping.begin(self.clock.now())
-        if self.patience is not None:  # homing heeds nothing but a reset
+        if self.patience is not None:  # homing reacts only to a reset
             self.send(RESET)
 
     def send(self, byte: bytes) -> None:
-        """Send a realtime byte past all lines; whether it gets there shows in the reports."""
+        """Send a realtime byte ahead of all lines; the reports show whether it arrived."""
         try:
             self._port.write(byte)
-        except Exception:  # pyserial raises many kinds on a port that is gone; the reader reports it
+        except Exception:  # pyserial raises many types if the port is gone; the reader reports it
             return
 
     def close(self) -> None:
-        """Stop the machine if it moves, end the threads, and let the port go, in a second or two at most."""
+        """Stop the machine if it moves, end the threads, and close the port, within a second or two."""
         if self._closing:
             return
         if self._active and self._moving():
@@ -290,7 +290,7 @@ class Link:
         try:
             while self.stopping.begun and not self.stopping.over and self.clock.now() < end:
                 self.clock.sleep(_TICK)
-        finally:  # also after another Ctrl-C
+        finally:  # even after another Ctrl-C
             self._closing = True
             for thread in self._threads:
                 thread.join(1.0)
@@ -298,7 +298,7 @@ class Link:
                 self.error = HardwareError(f"{self._name}: the stage is closed; open it again")
             close_port(self._port)
 
-    # What the threads do
+    # Methods of the threads
 
     def _read(self) -> None:
         while not self._closing:
@@ -309,7 +309,7 @@ class Link:
                 self._unplugged(error)
                 return
             if self._deaf:
-                self.clock.sleep(_TICK)  # a flood must not take the others' time
+                self.clock.sleep(_TICK)  # do not starve other threads during a flood of bytes
             else:
                 self._hear(data, began, self.clock.now())
 
@@ -317,7 +317,10 @@ class Link:
         if self._closing:
             return
         self.gone = True
-        self.halt(f"the line is lost ({error}); the stage may move on: switch it off, and look at the plug")
+        self.halt(
+            f"the connection is lost ({error}); the stage may still be moving: switch it off, and "
+            "check the connector"
+        )
         with self.lock:
             self.lock.notify_all()
 
@@ -333,9 +336,12 @@ class Link:
                     self._handle(reply, began)
                 if noise and self.noise.add(noise, now) and self._active:
                     self._deaf = True
-                    self.halt("what it says is garbled; look at the cable, its shield and the baud rate")
+                    self.halt(
+                        "the controller sends garbled characters; check the cable, its shield and "
+                        "the baud rate"
+                    )
                     break
-            self._check_answers(now)  # here, where no answer can be read and not yet taken
+            self._check_answers(now)  # here, because no answer can be received but not yet processed
             self.lock.notify_all()
 
     def _handle(self, reply: Reply, began: float) -> None:
@@ -352,7 +358,7 @@ class Link:
                     self.halt(f"{reply}")
             case Banner():
                 if self._active and not self.stopping.begun:
-                    self.halt("the controller was reset; it has lost its commands")
+                    self.halt("the controller was reset and has lost its commands")
                 self.banner = reply
             case Setting() | Message():
                 self._replies.append(reply)
@@ -369,21 +375,27 @@ class Link:
         if not self._active:
             return
         if status.state == "alarm" and not self.locked:
-            self.halt("it is in alarm; look at its switches, then reset and home it")
+            self.halt("the controller is in alarm; check the switches, then reset and home it")
         elif status.state in _INTERRUPTED:
-            self.halt(f"it went into the state {status.state} unasked")
+            self.halt(
+                f"the controller changed to the state {status.state} by itself or on request of "
+                "another program"
+            )
 
     def _answered(self, refusal: Refusal | None) -> None:
         line = self.window.answer()
         if line is None:
             if self._active and not self.stopping.begun:
-                self.halt("it answered a line that nobody here sent: let no other program speak to it")
+                self.halt(
+                    "the controller answered a line that this program did not send: let no other "
+                    "program use the port"
+                )
             return
         self._last_line = self.clock.now()
         self.rests = 0
         self._refused = refusal
         if refusal is not None and self._active:
-            self.halt(f"it refuses {line}: {refusal}")
+            self.halt(f"the controller refuses {line}: {refusal}")
         self._pump()
 
     def _pump(self) -> None:
@@ -409,28 +421,31 @@ class Link:
                 if ask:
                     self._times.ask(self.clock.now())
             if ask:
-                if self.stopping.begun and not self.stopping.resetting:  # lest one was lost, or undone
+                if self.stopping.begun and not self.stopping.resetting:  # one may have been lost or undone
                     self.send(HOLD)
                 self.send(ASK)
                 with self.lock:
                     self._times.sent(self.clock.now())
-            if not threading.main_thread().is_alive():  # the program ended and left us
+            if not threading.main_thread().is_alive():  # the program ended without closing the stage
                 if not self.stopping.begun:
                     self.halt("the program ended")
                 self._closing = self.stopping.over
 
     def _check_answers(self, now: float) -> None:
-        """Stop it when it has been silent for too long, or lost an answer."""
+        """Stop the machine if it has been silent for too long, or if an answer was lost."""
         if not self._active or self.stopping.begun:
             return
         if self._times.silence(now) > self._limit() and not self._has_unread():
-            self.halt("it no longer answers; the stage may move on: look at the plug, and switch it off")
+            self.halt(
+                "the controller no longer answers; the stage may still be moving: switch it off, and "
+                "check the connector"
+            )
         idle = self.seen is not None and self.seen.status.state == "idle"
-        # By the time of the question: a busy computer may hand over old reports and answers late.
+        # Use the time of the query: a busy computer may deliver old reports and answers late.
         since = -math.inf if self.seen is None else self.seen.answer.asked - self._last_line
         lost = self.window.unanswered and since > _ANSWER_LOST
         if idle and self.patience is None and lost:
-            self.halt("it rests without having answered all lines; look at the cable")
+            self.halt("the controller is at rest but has not answered all lines; check the cable")
 
     def _limit(self) -> float:
         if self.patience is not None:
@@ -440,24 +455,25 @@ class Link:
     def _moving(self) -> bool:
         if self.window.busy or self.seen is None:
             return self.window.busy
-        taken = self.seen.status.state == "idle" and self.rests == 0  # a line, since the report of rest
+        # a line was accepted since the report of rest
+        taken = self.seen.status.state == "idle" and self.rests == 0
         return taken or not self.seen.status.rests
 
     def _poll_period(self) -> float:
-        """Return the seconds between two questions, as things stand."""
+        """Return the current interval of queries, seconds."""
         if not self._active:
             return min(self._period, _OPENING_PERIOD)
         return min(self._period, _MOVING_PERIOD) if self._moving() or self.stopping.begun else self._period
 
     def _has_unread(self) -> bool:
-        """Return whether there is something to be read that the reader did not get to."""
+        """Return whether received bytes are waiting for the reader."""
         try:
             return self._port.in_waiting > 0
         except Exception:  # as in send
             return False
 
     def _advance_stop(self, now: float) -> None:
-        """Go on with a stop: reset once the machine is held, and wait until that is answered."""
+        """Continue a stop: reset once the machine is at rest, and wait for the answer."""
         rested = self.seen.answer.asked if self.seen is not None and self.seen.status.rests else -math.inf
         if self.stopping.reset(now, rested, self.gone):
             self.window.clear()

@@ -1,4 +1,4 @@
-"""What a GRBL 1.1 or grblHAL controller says, line by line."""
+"""Replies of a GRBL 1.1 or grblHAL controller, line by line."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 LONGEST = 512
-"""Bytes that a reply can have; longer ones are noise."""
+"""Maximum length of a reply, bytes; longer ones are noise."""
 
-_LETTERS = "XYZABCUV"  # the order in which a report gives its coordinates
+_LETTERS = "XYZABCUV"  # order of the coordinates in a report
 _BANNER = re.compile(r"(grblHAL|Grbl) +v?(\d+)\.(\d+)(\w*)", re.IGNORECASE)
 _SETTING = re.compile(r"\$(\d+)=(.*)")
 _CODE = re.compile(r"(error|ALARM):(\d+)")
@@ -21,54 +21,54 @@ _STATES = {"Idle", "Run", "Hold", "Jog", "Alarm", "Home", "Door", "Check", "Slee
 
 _ERRORS = {
     1: "a word without a letter",
-    2: "a number that cannot be read",
+    2: "an unreadable number",
     3: "an unknown $ command",
     5: "homing is switched off ($22)",
-    8: "it takes this only at rest",
-    9: "it is locked after an alarm or a reset: home it",
+    8: "accepted only at rest",
+    9: "locked after an alarm or a reset: home the stage",
     10: "soft limits ($20) need homing ($22)",
     11: "the line is too long",
     15: "the target is beyond the machine's travel ($130 to $135)",
-    20: "it does not know this command",
+    20: "unknown command",
     21: "two commands exclude each other",
     22: "no feed was set",
-    24: "two commands want the axis words",
+    24: "two commands use the same axis words",
     26: "no axis word was given",
-    33: "the arc or the target cannot be",
+    33: "impossible arc or target",
     34: "the arc's radius does not fit its ends",
     35: "the arc has no centre in its plane",
-    # Those of grblHAL alone
-    18: "it was reset",
-    45: "a limit switch is pressed: home it",
-    46: "it must be homed first",
+    # grblHAL only
+    18: "the controller was reset",
+    45: "a limit switch is pressed: home the stage",
+    46: "the stage must be homed first",
     50: "the emergency stop is pressed",
     51: "a motor driver reports a fault",
-    79: "it takes this only after a reset",
+    79: "accepted only after a reset",
 }
 _ALARMS = {
-    1: "a limit switch was hit; home it before anything else",
+    1: "a limit switch was hit; home the stage first",
     2: "the target is beyond the machine's travel ($130 to $135)",
-    3: "it was reset in motion, so that it has lost its place; home it",
+    3: "the controller was reset in motion and has lost its position; home the stage",
     6: "homing was interrupted",
     7: "the door opened while homing",
-    8: "homing found a switch that stays pressed; look at its wiring and at $27",
-    9: "homing did not reach a switch; look at its wiring and at $130 to $135",
+    8: "homing found a switch that stays pressed; check its wiring and $27",
+    9: "homing did not reach a switch; check its wiring and $130 to $135",
     10: "the emergency stop is pressed",
-    11: "it must be homed first",
-    12: "a limit switch is pressed: home it",
-    15: "homing did not reach the second switch of an axis; look at its wiring",
-    16: "its self-test failed; switch it off and on",
-    17: "a motor driver reports a fault; look at the motor and its supply",
-    18: "homing is not set up as it should be; look at $22 and $44 to $49",
-    20: "a board that it is extended by failed; look at its cable",
-    21: "its settings cannot be read; set them anew",
-    22: "its input buffer ran over; look at the cable",
+    11: "the stage must be homed first",
+    12: "a limit switch is pressed: home the stage",
+    15: "homing did not reach the second switch of an axis; check its wiring",
+    16: "the self-test failed; switch the controller off and on",
+    17: "a motor driver reports a fault; check the motor and its power supply",
+    18: "homing is not configured correctly; check $22 and $44 to $49",
+    20: "an extension board failed; check its cable",
+    21: "the settings cannot be read; enter them again",
+    22: "the input buffer overflowed; check the cable",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Banner:
-    """What a controller says when it starts: its name and version, such as (1, 1)."""
+    """Start-up message of a controller: its name and version, such as (1, 1)."""
 
     text: str
     version: tuple[int, int]
@@ -76,12 +76,12 @@ class Banner:
 
 @dataclass(frozen=True, slots=True)
 class Ok:
-    """A line was taken."""
+    """A line was accepted."""
 
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """A line was not taken: ``error:N``."""
+    """A line was refused: ``error:N``."""
 
     code: int
 
@@ -101,18 +101,18 @@ class Alarm:
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """The answer to ``?``: coordinates by letter, in the machine's units, of which a report has some."""
+    """The answer to ``?``: coordinates by letter, in machine units; some may be missing."""
 
     state: str  # lower case: idle, run, hold, jog, alarm, home, door, check, sleep, tool
-    detail: int | None = None  # behind the state: Hold:0 has come to rest, Hold:1 has not
+    detail: int | None = None  # sub-state: Hold:0 is at rest, Hold:1 is not
     machine: Mapping[str, float] | None = None
     work: Mapping[str, float] | None = None
-    offset: Mapping[str, float] | None = None  # how far the machine's are ahead of the work piece's
-    pins: str = ""  # switches that are pressed: axis letters, P probe, D door, H hold, R reset, S start
+    offset: Mapping[str, float] | None = None  # machine coordinates minus work coordinates
+    pins: str = ""  # pressed switches: axis letters, P probe, D door, H hold, R reset, S start
 
     @property
     def rests(self) -> bool:
-        """Whether nothing moves: not in these states, nor while a hold or an open door slows it down."""
+        """Whether nothing moves; a hold or an open door may still be decelerating."""
         if self.state == "hold":
             return self.detail != 1
         if self.state == "door":
@@ -130,7 +130,7 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """Anything in brackets, without them, and the start-up lines."""
+    """Any text in brackets, without them, and the start-up lines."""
 
     text: str
 
@@ -139,7 +139,7 @@ Reply = Banner | Ok | Refusal | Alarm | Status | Setting | Message
 
 
 def parse(line: bytes) -> Reply | None:
-    """Read one reply, without the line's end; None if this is nothing that a controller says."""
+    """Parse one reply without its line end; None if it is not a reply of a controller."""
     try:
         text = line.decode("ascii").strip()
     except UnicodeDecodeError:
@@ -160,14 +160,14 @@ def parse(line: bytes) -> Reply | None:
 
 
 def salvage(line: bytes) -> tuple[Reply | None, int]:
-    """Return the reply, if any, that ends a line which began as something else, and the bytes of noise."""
+    """Return the reply at the end of a line that starts with noise, if any, and the number of noise bytes."""
     match = _LAST.search(line)
     reply = parse(match[0]) if match else None
     return reply, match.start() if match and reply else len(line)
 
 
 def _status(text: str) -> Status | None:
-    """Read ``<Idle|MPos:0.000,0.000,0.000|FS:0,0|WCO:0.000,0.000,0.000>``."""
+    """Parse ``<Idle|MPos:0.000,0.000,0.000|FS:0,0|WCO:0.000,0.000,0.000>``."""
     if not text.endswith(">") or "<" in text[1:]:
         return None
     first, *fields = text[1:-1].split("|")
@@ -200,21 +200,21 @@ def _coordinates(text: str) -> Mapping[str, float] | None:
 
 
 BUFFER = 128
-"""Bytes of lines that a controller keeps while it works, unless it says otherwise."""
+"""Size of the controller's buffer of lines, bytes, unless it reports another one."""
 
 _WINDOW = 1.0  # seconds over which noise is counted
-_BEARABLE = 256  # bytes of it
+_BEARABLE = 256  # bytes of noise that are tolerated in it
 
 
 class Splitter:
-    """Cuts what arrives into lines; each knows when its first byte came."""
+    """Divides received bytes into lines, with the time of the first byte of each."""
 
     def __init__(self) -> None:
         self._rest = bytearray()
         self._began = 0.0
 
     def feed(self, data: bytes, now: float) -> list[tuple[bytes, float]]:
-        """Return the lines that `data` completes, and when each began; overlong ones come in pieces."""
+        """Return the lines that `data` completes, and the times of their first bytes."""
         found: list[tuple[bytes, float]] = []
         *whole, rest = data.replace(b"\r", b"\n").split(b"\n")
         for part in whole:
@@ -231,7 +231,7 @@ class Splitter:
 
 
 class Noise:
-    """Counts the bytes that cannot be understood: a little of it is borne."""
+    """Counts bytes that are not understood; a small number is tolerated."""
 
     def __init__(self) -> None:
         self.total: int = 0
@@ -239,7 +239,7 @@ class Noise:
         self._recent = 0
 
     def add(self, size: int, now: float) -> bool:
-        """Note so many bytes of noise; return whether it is too much within a second."""
+        """Add a number of noise bytes; return whether there are too many within a second."""
         self._heard.append((now, size))
         self.total += size
         self._recent += size
@@ -249,40 +249,40 @@ class Noise:
 
 
 AHEAD = 0.5
-"""Seconds of motion that the controller has in store when the next line is sent.
+"""Seconds of motion that the controller has queued when the next line is sent.
 
-When this program is killed, the stage moves on for this long and for one line more. When this program pauses
+When this program is killed, the stage moves on for this time and for one more line. When this program pauses
 for longer, the stage comes to rest; `Rig` then ends a timed move.
 """
 
 
 class Window:
-    """Lines on their way to the controller: no byte more than its buffer holds, and no motion far ahead.
+    """Lines sent to the controller: never more bytes than its buffer holds, nor motion far ahead.
 
-    Bytes are counted until a line is answered. The motion of a line is assumed to begin when that of the line
-    before it ends, and to last for its duration.
+    Bytes are counted until a line is answered. The motion of a line is assumed to start when that of the
+    previous line ends, and to last for its duration.
     """
 
     def __init__(self, size: int = BUFFER) -> None:
-        self.size = size  # bytes of the controller's buffer
-        self.done: int = 0  # lines answered
-        self._waiting: deque[tuple[bytes, float, float]] = deque()  # with their duration and ramp
+        self.size = size  # size of the controller's buffer, bytes
+        self.done: int = 0  # number of lines answered
+        self._waiting: deque[tuple[bytes, float, float]] = deque()  # with duration and ramp of each
         self._sent: deque[bytes] = deque()
         self._filled = 0
-        self._ends = -math.inf  # when the motion that was sent ends, seconds of time.monotonic
+        self._ends = -math.inf  # end of the motion sent so far, seconds of time.monotonic
 
     @property
     def busy(self) -> bool:
-        """Whether any line waits or is unanswered."""
+        """Whether any line is waiting or unanswered."""
         return bool(self._waiting or self._sent)
 
     @property
     def unanswered(self) -> bool:
-        """Whether a line was sent and not answered yet."""
+        """Whether a sent line is unanswered."""
         return bool(self._sent)
 
     def add(self, line: str, duration: float = 0.0, ramp: float = 0.0) -> int:
-        """Append a line, whose motion takes some seconds, `ramp` of which to reach its speed or to stop.
+        """Append a line whose motion takes `duration` seconds; accelerating or decelerating takes `ramp`.
 
         Return the value of `done` once it is answered.
         """
@@ -293,11 +293,11 @@ class Window:
         return self.done + len(self._sent) + len(self._waiting)
 
     def next(self, now: float) -> bytes | None:
-        """Return the next line, to be sent now, if the buffer has room for it and its motion is due."""
+        """Return the next line to send now, if the buffer has room for it and its motion is due."""
         if not self._waiting:
             return None
         data, duration, ramp = self._waiting[0]
-        # What the controller has in store must be enough to slow down, or it does not reach its speed.
+        # The queued motion must be long enough to decelerate in, or the speed is not reached.
         early = duration > 0 and self._ends - now > AHEAD + ramp / 2
         if early or self._filled + len(data) > self.size:
             return None
@@ -308,7 +308,7 @@ class Window:
         return data
 
     def answer(self) -> str | None:
-        """Note that the oldest line sent was answered, and return it; None if none was sent."""
+        """Record the answer to the oldest line, and return that line; None if none was sent."""
         if not self._sent:
             return None
         data = self._sent.popleft()
@@ -317,7 +317,7 @@ class Window:
         return data.decode("ascii").strip()
 
     def clear(self) -> None:
-        """Forget all lines: the controller was reset."""
+        """Discard all lines: the controller was reset."""
         self._waiting.clear()
         self._sent.clear()
         self._filled = 0

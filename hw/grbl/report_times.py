@@ -1,4 +1,4 @@
-"""When to ask for a report, what time an answer is of, and when there was none for too long."""
+"""When to query a report, the time of a report, and the detection of silence."""
 
 from __future__ import annotations
 
@@ -8,21 +8,22 @@ from collections import deque
 from dataclasses import dataclass
 
 SLICE = 0.02
-"""Longest time that a read waits, seconds: how finely a silence is measured."""
+"""Maximum time of a read, seconds: the resolution at which silence is measured."""
 
-_DELAYED = 2 * SLICE  # of our own sleep: a busy computer may hush others, too
-_PART = 0.5  # of a slice that such a sleep counts as silence
-_SURELY = 0.4  # seconds after which nobody is that busy
-_MEDIAN_OF = 15  # round trips that the usual one is the median of
-_TIMES, _LATE = 3.0, 0.004  # of the usual, and seconds more, that a round trip may take to be trusted
-_AGAIN = 0.04  # seconds, and at least two usual round trips, after which a question is asked again
-_FIRST = 0.2  # the same before any was answered
-_WIDER = 2.0  # times what an answer took that several questions were open for: the same until one is trusted
+_DELAYED = 2 * SLICE  # own delay, seconds, after which a silence may be due to a busy computer
+_PART = 0.5  # share of a slice that counts as silence after such a delay
+_SURELY = 0.4  # seconds after which a silence is real, however busy the computer is
+_MEDIAN_OF = 15  # number of round trips of which the median is the usual one
+_TIMES, _LATE = 3.0, 0.004  # factor and seconds by which a trusted round trip may exceed the usual one
+_AGAIN = 0.04  # seconds, and at least two usual round trips, after which a query is repeated
+_FIRST = 0.2  # the same before the first answer
+# the repeat interval after an ambiguous answer, in times of that answer, until an answer is trusted
+_WIDER = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """When an answer was asked for, when it was so, and whether that can be trusted."""
+    """An answer: the time of its query, the time at which it was valid, and whether these are reliable."""
 
     asked: float
     time: float
@@ -30,54 +31,54 @@ class Answer:
 
 
 class ReportTimes:
-    """Keeps the times of questions and answers.
+    """Records the times of queries and answers.
 
-    A question that stays open is asked again. From then on nobody knows which one an answer is meant for,
-    until a period has passed without any; and it is waited longer before the next is asked again.
+    A query that stays open is repeated. It is then unknown to which query an answer belongs, until an
+    interval without answers has passed; the next repetition also waits longer.
     """
 
     def __init__(self, period: float) -> None:
-        self.period = period  # seconds from one question to the next; may be changed at any time
-        self._quiet = -math.inf  # since when nothing was asked, nor answered that cannot be trusted
+        self.period = period  # interval of queries, seconds; may be changed at any time
+        self._quiet = -math.inf  # start of the interval without queries and ambiguous answers
         self._wider = 0.0
-        self._resume = 0.0  # when no answers to earlier questions are to be expected any more
+        self._resume = 0.0  # time after which no answers to earlier queries are expected
         self._open: list[float] = []
-        self._out = 0.0  # when the first of the open questions was on its way
+        self._out = 0.0  # time at which the first open query was sent
         self._unsure = False
         self._silence = 0.0
         self._trips: deque[float] = deque(maxlen=_MEDIAN_OF)
 
     @property
     def usual(self) -> float:
-        """Seconds of the usual round trip; NaN before the first."""
+        """Usual round trip, seconds; NaN before the first."""
         return statistics.median(self._trips) if self._trips else math.nan
 
     @property
     def longest(self) -> float:
-        """Seconds of the longest of the latest round trips; NaN before the first."""
+        """Longest recent round trip, seconds; NaN before the first."""
         return max(self._trips, default=math.nan)
 
     def listened(self, began: float, now: float) -> None:
-        """Note that somebody listened for `SLICE` seconds at most; an answer is noted afterwards."""
+        """Record a read of at most `SLICE` seconds; call this before its answers are added."""
         if self._open:
             delayed = now - began > _DELAYED
             self._silence += _PART * SLICE if delayed else max(0.0, now - max(began, self._out))
 
     def silence(self, now: float) -> float:
-        """Return for how long a question has been open, as far as somebody listened for an answer."""
+        """Return how long a query has been open while somebody was reading."""
         if self._open and now - self._out > _SURELY:
             return now - self._out
         return self._silence
 
     def due(self, now: float) -> bool:
-        """Return whether to ask now."""
+        """Return whether to send a query now."""
         if not self._open:
             return now - self._quiet >= self.period and now >= self._resume
         wait = max(_AGAIN, 2 * self.usual) if self._trips else _FIRST
         return now - self._open[-1] >= max(wait, self._wider)
 
     def ask(self, now: float) -> None:
-        """Note that the question is about to be sent."""
+        """Record that a query is about to be sent."""
         self._unsure = bool(self._open)
         self._open.append(now)
         self._quiet = now
@@ -85,22 +86,22 @@ class ReportTimes:
             self._out = now
 
     def sent(self, now: float) -> None:
-        """Note that it was sent, which a busy computer may do late: there was no silence before."""
+        """Record that it was sent, which may be late on a busy computer; before that there was no silence."""
         if not self._unsure:
             self._out, self._silence = now, 0.0
 
     def answer(self, now: float) -> Answer:
-        """Note that an answer came: it was so in the middle between question and answer.
+        """Record an answer; it was valid in the middle between query and answer.
 
-        It cannot be trusted if no question was open or several were, which makes it as if asked for never,
-        or if it came late.
+        It is unreliable if no query or several queries were open, or if it was late.
         """
         asked, self._open = self._open, []
         self._silence = 0.0
         if self._unsure or not asked:
             self._quiet = now
             if asked:
-                self._wider = min(_WIDER * (now - asked[0]), _SURELY)  # homing answers nothing for long
+                # homing answers nothing for a long time
+                self._wider = min(_WIDER * (now - asked[0]), _SURELY)
                 self._resume = asked[-1] + self._wider
             return Answer(-math.inf, now, False)
         trip = now - asked[0]

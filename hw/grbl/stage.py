@@ -29,64 +29,63 @@ if TYPE_CHECKING:
 _SWITCHES: dict[tuple[Line, bool], str] = {
     ("coolant", True): "M8",
     ("coolant", False): "M9",
-    ("spindle", True): "M3S999999",  # an output that dims is full on at the greatest speed, $30, and beyond
+    ("spindle", True): "M3S999999",  # dimmable outputs are fully on at the maximum speed ($30) and above
     ("spindle", False): "M5",
 }
-_PREPARE = "G21G90G94"  # millimetres, absolute places, feeds a minute
+_PREPARE = "G21G90G94"  # millimetres, absolute coordinates, feed per minute
 _OLDEST = (1, 1)
-_LACKING = 40  # reports, of which one has the work offset
-_OFFSET_TIMEOUT = 10.0  # seconds in which they come, on a busy computer as well
-_REPORTS_MAX = 1 << 17  # reports: an hour of motion
-_ARRIVED = (
-    0.01  # machine units from the target and the rounding to its steps, at which the body has come to it
-)
-_RESTS = 3  # reports of rest elsewhere, until that is where it stays
-_MARGIN = 0.05  # mm or degrees by which a report may be beyond the limits
-_HOMING = 60.0  # seconds, where the settings do not say how long it takes
-_SLOWING = 1.25  # times the longest ramp, that a hold may take
-_SAME_STEPS = 1e-4  # relative, as $100 to $105 are told
+_LACKING = 40  # number of reports among which one must contain the work offset
+_OFFSET_TIMEOUT = 10.0  # seconds to receive them, even on a busy computer
+_REPORTS_MAX = 1 << 17  # number of reports that are kept: an hour of motion
+_ARRIVED = 0.01  # machine units from the target, in addition to the rounding to steps, that count as arrived
+_RESTS = 3  # reports of rest elsewhere after which the body is not expected to move on
+_MARGIN = 0.05  # mm or degrees by which a report may exceed the limits
+_HOMING = 60.0  # seconds, if the settings do not determine the time of homing
+_SLOWING = 1.25  # maximum duration of a hold, in times of the longest ramp
+_SAME_STEPS = 1e-4  # relative tolerance of $100 to $105
 _LETTERS = "XYZABC"
-_ROTARY = 701  # grblHAL's setting of what a feed is where axes in degrees move as well
+_ROTARY = 701  # setting of grblHAL: how feeds are interpreted if axes in degrees move as well
 _UNLOCK = "release it with 'mirrorskin rig unlock'"
 
 
 @dataclass(frozen=True, slots=True)
 class Controller:
-    """What a controller is."""
+    """Identity and settings of a controller."""
 
-    firmware: str  # its name and version, as it says them
-    axes: str  # their letters, as far as it says them
-    settings: dict[int, float]  # those ``$`` settings that are numbers
+    firmware: str  # name and version
+    axes: str  # letters of the axes, if reported
+    settings: dict[int, float]  # numeric ``$`` settings
 
     def on(self, number: int) -> bool:
-        """Return whether a switch among the settings is on; the first bit of a mask of bits."""
+        """Return whether a setting is on: the first bit of its value."""
         return bool(int(self.settings.get(number, 0)) & 1)
 
 
 class GrblStage(Closing):
-    """A stage that a GRBL controller moves.
+    """A stage with a GRBL controller.
 
-    A place or a precession beyond ``limits`` is an `InputError`, raised before anything is sent. What goes
-    wrong afterwards is a `HardwareError`. Whatever interrupts a call that waits (Ctrl-C too) stops the stage.
-    A stage that was stopped, or that failed, says so in ``error`` and to every call; open it again to go on.
+    A position or a precession beyond ``limits`` is an `InputError`, raised before anything is sent. Later
+    faults are a `HardwareError`. Any interruption of a waiting call, including Ctrl-C, stops the stage. After
+    a stop or a fault, ``error`` contains the reason and every call raises it; open the stage again to
+    continue.
 
     Parameters
     ----------
     settings : StageSettings
-        Where it is plugged in, its axes and limits.
+        Port, axes and limits.
     port : serial.Serial, optional
-        What to speak through instead of opening ``settings.port``; it is closed with the stage.
+        Open port to use instead of ``settings.port``; it is closed with the stage.
     unlock : bool
-        Whether to end an alarm, a hold or an open door that was there before, and to bear a pressed switch:
-        for a person who looked at the machine.
+        Whether to end an existing alarm, hold or open door, and to tolerate a pressed switch, on request of a
+        person who has checked the machine.
     clock : Clock
-        What it waits by.
+        Clock to wait with.
 
     Raises
     ------
     InputError
-        No such port, one in use, one behind which there is no GRBL 1.1, or a machine that another program
-        moves, that is locked though it is not homed, or that stands on a switch.
+        The port does not exist or is in use, the device is not GRBL 1.1, or the machine is moved by another
+        program, is locked without being homed, or is on a limit switch.
 
     Examples
     --------
@@ -110,14 +109,14 @@ class GrblStage(Closing):
         self._settings = settings
         self.axes: Axes = Axes(settings, self.name)
         self._offset: Mapping[str, float] | None = None
-        self._lacking = 0  # reports that did not tell it, so far
+        self._lacking = 0  # number of reports without the work offset so far
         self._reports: deque[Report] = deque(maxlen=_REPORTS_MAX)
         self._latest: Report | None = None
         self._target: Position | None = None
-        self._excess = math.inf  # how far beyond the limits it was at the least, since it works
+        self._excess = math.inf  # smallest excess over the limits since moves are executed
         self._rounding = 0.0  # half a step of the coarsest axis
         self._due = 0.0
-        self._ramp = 0.0  # seconds that a move takes longer because it speeds up and slows down
+        self._ramp = 0.0  # seconds that acceleration and deceleration add to a move
         opened = open_port(settings.port, settings.baud, self.name) if port is None else port
         self._link = Link(opened, self.name, settings, self._on_report, clock)
         try:
@@ -128,7 +127,7 @@ class GrblStage(Closing):
 
     @property
     def error(self) -> HardwareError | None:
-        """What is wrong with the stage; None while all is well. Any thread may ask at any time."""
+        """The fault of the stage, None if there is none. Thread-safe."""
         return self._link.error
 
     @property
@@ -138,27 +137,27 @@ class GrblStage(Closing):
 
     @property
     def parameters(self) -> Mapping[int, float]:
-        """The controller's ``$`` settings, by their numbers."""
+        """The controller's ``$`` settings, by number."""
         return self._controller.settings
 
     @property
     def homes(self) -> bool:
-        """Whether the controller's homing is switched on."""
+        """Whether homing is enabled in the controller."""
         return self._controller.on(22)
 
     @property
     def round_trip(self) -> float:
-        """Seconds from a question for a report to its answer, of late; NaN before the first."""
+        """Recent time from a query to its report, seconds; NaN before the first."""
         return self._link.round_trip
 
     @property
     def longest_trip(self) -> float:
-        """Seconds of the longest of these of late; NaN before the first."""
+        """Longest recent round trip, seconds; NaN before the first."""
         return self._link.longest_trip
 
     @property
     def longest_silence(self) -> float:
-        """Seconds without an answer that a move bears."""
+        """Maximum time without an answer during a move, seconds."""
         return self._link.longest_silence
 
     def check_way(self, start: Position, place: Position, speed: float | None) -> None:
@@ -166,14 +165,15 @@ class GrblStage(Closing):
         self.axes.check_way(start, place, speed)
 
     def check_turns(self, tilt: float, turns: float, rate: float) -> None:
-        """Refuse a precession that is too fast, too slow, or in axes that know no arcs."""
+        """Refuse a precession that is too fast, too slow, or in axes without arcs."""
         self.axes.check_turns(tilt, turns, rate)
 
     def home(self) -> None:
-        """Find the axes' switches; returns when they are found."""
+        """Home the axes; returns when homing is complete."""
         if not self.homes:
             raise InputError(
-                f"{self.name}: homing is switched off; set $22=1, or home = false in the rig file"
+                f"{self.name}: homing is disabled in the controller; set $22=1, or home = false "
+                "in the rig file"
             )
         timeout = self._homing_time()
         with self._guarded():
@@ -188,20 +188,19 @@ class GrblStage(Closing):
             self._target = self.wait().position
 
     def move(self, place: Position, speed: float | None = None) -> None:
-        """Begin to go to `place` in a straight line; returns when the controller has taken the command.
+        """Start a straight move to `place`; returns when the controller has accepted the command.
 
         Parameters
         ----------
         place : Position
-            Where to go.
+            Target.
         speed : float, optional
-            Millimetres a second; radians a second if only the lean changes. If not given, as fast as the
-            axes go.
+            mm/s, or rad/s if only the lean changes; by default the maximum speed of the axes.
         """
         self.follow([place], speed)
 
     def follow(self, places: Sequence[Position], speed: float | None = None) -> None:
-        """Begin to go to some places, one after the other, each in a straight line; see ``move``."""
+        """Start a sequence of straight moves; see ``move``."""
         for place in places:
             self.limits.check(place, self.name)
         ways = itertools.pairwise([self._destination(), *places])
@@ -212,40 +211,40 @@ class GrblStage(Closing):
             self._target = places[-1]
 
     def precess(self, tilt: float, turns: float, rate: float, start: float = 0.0) -> None:
-        """Begin to go round at half-angle `tilt`, from phase `start`, where the body must stand.
+        """Start a precession at half-angle `tilt` from phase `start`, where the body must be.
 
         Parameters
         ----------
         tilt : float
             Half-angle, radians.
         turns : float
-            How often to go round; counter-clockwise if positive.
+            Number of turns; counter-clockwise if positive.
         rate : float
-            Turns a second, positive.
+            Turns per second, positive.
         start : float
-            Phase to begin at, radians.
+            Phase at the start, radians.
         """
         before = self._destination()
         self.limits.check(Position(before.travel, tilt), self.name)
-        assert self._offset is not None  # it is open only when this is known
+        assert self._offset is not None  # an open stage has received it
         commands = self.axes.arcs(tilt, turns, rate, start, self._offset)
         begin, end = (_leaning(before.travel, tilt, phase) for phase in (start, start + math.tau * turns))
         if self.axes.distance(before, begin) > _ARRIVED:
             raise InputError(
-                f"{self.name}: a precession begins where the body leans by {math.degrees(tilt):.4g} degrees "
-                f"at the phase {math.degrees(start):.4g} degrees; move there first"
+                f"{self.name}: a precession starts at a lean of {math.degrees(tilt):.4g} degrees "
+                f"and a phase of {math.degrees(start):.4g} degrees; move there first"
             )
         self._send(commands, end)
 
     def switch(self, line: Line, on: bool) -> None:
-        """Switch a line of the controller, at rest; a stop, which resets the controller, switches it off."""
+        """Switch an output of the controller, at rest; a stop switches it off."""
         with self._guarded():
             self._link.ask(_SWITCHES[line, on], self._settings.timeout)
 
     def wait(self, timeout: float | None = None) -> Report:
-        """Wait until the body rests and every command is done, and return the report of it.
+        """Wait until the body is at rest and every command is done, and return that report.
 
-        The timeout, seconds, is by default what the commands should take, and a margin.
+        The timeout, seconds, is by default the expected duration of the commands, plus a margin.
         """
         self._destination()
         if timeout is None:
@@ -254,14 +253,14 @@ class GrblStage(Closing):
             return self._link.until(self._arrived, timeout, "come to rest")
 
     def report(self) -> Report:
-        """Return what the stage said last; it is asked all the time."""
+        """Return the newest report; reports are queried continuously."""
         if self._link.error is not None:
             raise self._link.error.with_traceback(None)
-        assert self._latest is not None  # it is open only after a report
+        assert self._latest is not None  # an open stage has received a report
         return self._latest
 
     def history(self, since: float = -math.inf) -> list[Report]:
-        """Return the reports later than `since`, oldest first; the newest of an hour or so are kept."""
+        """Return the reports later than `since`, oldest first; about an hour of them is kept."""
         found = []
         with self._link.lock:
             for report in reversed(self._reports):
@@ -271,11 +270,11 @@ class GrblStage(Closing):
         return found[::-1]
 
     def stop(self) -> None:
-        """Stop the body at once. Any thread may call it, as often as it likes; raises nothing."""
-        self._link.halt("the stage was stopped; open it again to go on")
+        """Stop the body at once. Thread-safe; may be called repeatedly, and raises nothing."""
+        self._link.halt("the stage was stopped; open it again to continue")
 
     def close(self) -> None:
-        """Stop the body if it moves, and let the port go."""
+        """Stop the body if it moves, and close the port."""
         self._link.close()
 
     def _open(self, unlock: bool) -> Controller:
@@ -283,7 +282,7 @@ class GrblStage(Closing):
         try:
             controller = _greet(link, self.name, timeout, unlock)
             self._check(controller)
-            if not self._settings.home:  # there are no switches to home against
+            if not self._settings.home:  # there are no switches for homing
                 self._release(unlock)
             link.locked = self._in_state("alarm")
             self._await_offset()
@@ -296,21 +295,21 @@ class GrblStage(Closing):
         return controller
 
     def _release(self, unlock: bool) -> None:
-        """End an alarm if that was asked for; refuse it, and a switch that is pressed, otherwise."""
+        """End an alarm if requested; otherwise refuse it, as well as a pressed switch."""
         link, timeout = self._link, self._settings.timeout
         pins = link.seen.status.pins if link.seen is not None else ""
         pressed = sorted(set(pins) & set(self.axes.letters.values()))
         if pressed and not unlock:
             raise InputError(
-                f"{self.name}: a limit switch of {' and '.join(pressed)} is pressed: see where the machine "
-                f"stands, and {_UNLOCK}"
+                f"{self.name}: a limit switch of {' and '.join(pressed)} is pressed: check the "
+                f"position of the machine, and {_UNLOCK}"
             )
         if not self._in_state("alarm"):
             return
         if not unlock:
             raise InputError(
-                f"{self.name}: it is locked, since power came on or after an alarm, and may have lost its "
-                f"place: see where it stands, and {_UNLOCK}, or set home = true if it has switches"
+                f"{self.name}: it is locked after power-on or an alarm, and may have lost its "
+                f"position: check it, and {_UNLOCK}, or set home = true if it has switches"
             )
         link.ask("$X", timeout)
         link.until(lambda: self._in_state("idle") or None, timeout, "unlock")
@@ -319,17 +318,17 @@ class GrblStage(Closing):
         return self._link.seen is not None and self._link.seen.status.state == state
 
     def _await_offset(self) -> None:
-        """Wait until a report has the offset at which the work coordinates begin."""
+        """Wait until a report contains the origin of the work coordinates."""
         self._link.until(
             lambda: self._offset is not None or self._lacking > _LACKING or None,
             max(self._settings.timeout, _OFFSET_TIMEOUT),
             "report its work offset",
         )
         if self._offset is None:
-            raise InputError(f"{self.name}: its reports lack the work offset (WCO); switch it on in $10")
+            raise InputError(f"{self.name}: its reports lack the work offset (WCO); enable it in $10")
 
     def _check(self, controller: Controller) -> None:
-        """Refuse a controller that lacks an axis; go no faster, slower or farther than it does."""
+        """Refuse a controller that lacks an axis; adopt its limits of speed and travel."""
         status = self._link.seen.status if self._link.seen else None
         known = controller.axes or (status and (status.machine or status.work))
         for motion, letter in self.axes.letters.items():
@@ -342,8 +341,9 @@ class GrblStage(Closing):
             expected = getattr(self._settings, motion).steps
             if steps > 0 and expected is not None and abs(steps / expected - 1) > _SAME_STEPS:
                 raise InputError(
-                    f"{self.name}: ${100 + _LETTERS.index(letter)} is {steps:g} steps where the rig file has "
-                    f"{expected:g}: it goes {steps / expected:.3g} times as far; correct one of them"
+                    f"{self.name}: ${100 + _LETTERS.index(letter)} is {steps:g} steps, but "
+                    f"{expected:g} in the rig file: moves would be {steps / expected:.3g} times "
+                    "as long; correct one of them"
                 )
             if steps > 0:
                 self._rounding = max(self._rounding, 0.5 / steps)
@@ -359,7 +359,7 @@ class GrblStage(Closing):
             self.limits = _within_soft_limits(self._settings, controller, self.name).limits
 
     def _on_report(self, seen: TimedStatus) -> None:
-        """Take a report; the link's lock is held."""
+        """Process a report; the link's lock is held."""
         if seen.status.offset is not None:
             self._take_offset(seen.status.offset, seen.working)
         elif self._offset is None:
@@ -373,9 +373,9 @@ class GrblStage(Closing):
             self._reports.append(self._latest)
 
     def _take_offset(self, offset: Mapping[str, float], working: bool) -> None:
-        """Take where the work coordinates begin; while it works, these stay where they were."""
+        """Store the origin of the work coordinates, which must not change while moves are executed."""
         if working and offset != self._offset:
-            self._link.halt("its work offset was changed; leave G54 and G92 alone, and look at the cable")
+            self._link.halt("the work offset was changed; do not use G54 and G92, and check the cable")
         else:
             self._offset = offset
 
@@ -385,21 +385,21 @@ class GrblStage(Closing):
             machine = {letter: value + self._offset[letter] for letter, value in status.work.items()}
         try:
             return None if machine is None else self.axes.place(machine)
-        except KeyError:  # fewer axes than asked for; refused when the stage is opened
+        except KeyError:  # the controller has fewer axes; opening the stage refuses this
             return None
 
     def _check_limits(self, place: Position, working: bool) -> None:
-        """Stop it beyond its limits; one that begins there may come back, and go no farther."""
+        """Stop the stage beyond its limits; if it started there, it may only return."""
         excess = self.limits.excess(place)
         self._excess = min(self._excess, excess) if working else excess
         if excess > self._excess + _MARGIN:
             self._link.halt(
-                f"it says that it is {excess:.3g} mm or degrees beyond its limits, where nobody sent it; "
-                "look at its cable and its switches, and home it"
+                f"the controller reports a position {excess:.3g} mm or degrees beyond the limits, "
+                "to which it was not sent; check the cable and the switches, and home the stage"
             )
 
     def _destination(self) -> Position:
-        """Return where the body is once all that was asked is done."""
+        """Return the position of the body after all commands."""
         if self._link.error is not None:
             raise self._link.error.with_traceback(None)
         if self._link.locked:
@@ -407,7 +407,7 @@ class GrblStage(Closing):
         return self.report().position if self._target is None else self._target
 
     def _send(self, commands: list[Command], target: Position, ramps: int = 1) -> None:
-        """Send lines that end at a target, and wait until the controller took the first that moves."""
+        """Send lines that end at a target, and wait until the controller has accepted the first move."""
         duration = sum(command.duration for command in commands) + ramps * self._ramp
         with self._guarded():
             with self._link.lock:
@@ -432,11 +432,11 @@ class GrblStage(Closing):
         if off <= _ARRIVED + self._rounding:
             return latest
         if link.rests >= _RESTS:
-            link.halt(f"it rests {off:.3g} mm or degrees from where it was sent; look at its cable")
+            link.halt(f"the stage rests {off:.3g} mm or degrees from its target; check the cable")
         return None
 
     def _homing_time(self) -> float:
-        """Return the longest that homing takes: each axis there and back, and once more."""
+        """Return the maximum duration of homing: each axis there and back, and once more."""
         settings = self._controller.settings
         seek = settings.get(25, 0.0)
         lengths = sum(settings.get(130 + number, 0.0) for number in range(len(_LETTERS)))
@@ -444,7 +444,7 @@ class GrblStage(Closing):
 
     @contextmanager
     def _guarded(self) -> Iterator[None]:
-        """Stop the body on whatever goes wrong inside, Ctrl-C too."""
+        """Stop the body on any exception inside, including Ctrl-C."""
         try:
             yield
         except BaseException:
@@ -453,32 +453,33 @@ class GrblStage(Closing):
 
 
 def _within_soft_limits(settings: StageSettings, controller: Controller, name: str) -> StageSettings:
-    """Return the settings with the limits of what the controller's soft limits leave of the axes."""
+    """Return the settings with limits reduced to the controller's soft limits."""
     axes = {}
     for motion, axis in settings.axes.items():
         length = controller.settings.get(130 + _LETTERS.index(axis.letter), math.inf)
         ends = sorted(axis.zero + axis.direction * value for value in axis.limits)
-        if ends[0] >= 0 and ends[1] <= length:  # homed at the other end, as some are built
+        if ends[0] >= 0 and ends[1] <= length:  # homed at the other end, as on some machines
             continue
         inside = sorted(axis.direction * (min(max(end, -length), 0.0) - axis.zero) for end in ends)
         try:
             axes[motion] = msgspec.structs.replace(axis, limits=(inside[0], inside[1]))
         except ValueError as error:
             raise InputError(
-                f"{name}: stage.{motion}.limits are {ends[0]:g} to {ends[1]:g} in the machine's coordinates, "
-                f"and its soft limits ($20) allow {-length:g} to 0: correct them, or zero"
+                f"{name}: stage.{motion}.limits are {ends[0]:g} to {ends[1]:g} in machine "
+                f"coordinates, but its soft limits ($20) allow {-length:g} to 0: correct the "
+                "limits, or zero"
             ) from error
     return msgspec.structs.replace(settings, **axes)
 
 
 def _greet(link: Link, name: str, timeout: float, unlock: bool) -> Controller:
-    """Find out that GRBL 1.1 answers and rests, and read its settings."""
+    """Check that GRBL 1.1 answers and is at rest, and read its settings."""
     seen = _first(link, name, timeout, unlock)
-    if seen.status.state not in ("idle", "alarm"):  # left so by whoever spoke to it before
+    if seen.status.state not in ("idle", "alarm"):  # left in this state by a previous user
         if not unlock:
             raise InputError(
-                f"{name}: it is in the state {seen.status.state}, by another program or by hand: let that "
-                f"end, or {_UNLOCK}, which stops it"
+                f"{name}: it is in the state {seen.status.state}, caused by another program or by "
+                f"hand: wait until it ends, or {_UNLOCK}, which stops it"
             )
         link.restart(timeout)
         _first(link, name, timeout, unlock)
@@ -486,12 +487,12 @@ def _greet(link: Link, name: str, timeout: float, unlock: bool) -> Controller:
     if controller.on(13):
         raise InputError(f"{name}: it reports in inches; set $13=0")
     if controller.on(_ROTARY):
-        raise InputError(f"{name}: it takes feeds for those of its linear axes alone; set ${_ROTARY}=0")
+        raise InputError(f"{name}: it applies feeds to linear axes only; set ${_ROTARY}=0")
     return controller
 
 
 def _first(link: Link, name: str, timeout: float, unlock: bool) -> TimedStatus:
-    """Wait for the first report; a controller that is locked hard answers only after a reset."""
+    """Wait for the first report; some locked controllers answer only after a reset."""
     try:
         try:
             return link.until(lambda: link.seen, timeout / 2, "answer")
@@ -502,14 +503,14 @@ def _first(link: Link, name: str, timeout: float, unlock: bool) -> TimedStatus:
             return link.until(lambda: link.seen, timeout / 2, "answer")
     except HardwareError as error:
         if link.gone:
-            raise InputError(f"{name}: the line closed at once; is anything behind this port?") from error
+            raise InputError(
+                f"{name}: the connection was closed at once; is anything connected to this port?"
+            ) from error
         if link.banner is not None:
-            raise InputError(f"{name}: {link.banner.text!r} does not report as GRBL 1.1 does") from error
+            raise InputError(f"{name}: {link.banner.text!r} does not send reports like GRBL 1.1") from error
         heard = link.noise.total > 0
-        what = (
-            "what answers is not GRBL 1.1 or grblHAL" if heard else f"nothing answers within {timeout:.3g} s"
-        )
-        raise InputError(f"{name}: {what}; look at the port, the baud rate and the power") from error
+        what = "the device is not GRBL 1.1 or grblHAL" if heard else f"no answer within {timeout:.3g} s"
+        raise InputError(f"{name}: {what}; check the port, the baud rate and the power supply") from error
 
 
 def _identity(link: Link, name: str, timeout: float) -> Controller:
@@ -518,10 +519,10 @@ def _identity(link: Link, name: str, timeout: float) -> Controller:
     match = re.match(r"(\d+)\.(\d+)", version)
     number = (int(match[1]), int(match[2])) if match else link.banner.version if link.banner else (0, 0)
     if number < _OLDEST:
-        raise InputError(f"{name}: it says that it is version {version or '?'}; GRBL 1.1 or later is needed")
+        raise InputError(f"{name}: it reports version {version or '?'}; GRBL 1.1 or later is needed")
     size = re.match(r"OPT:[^,]*,\d+,(\d+)", answers.get("OPT", ""))
     if size:
-        link.window.size = min(BUFFER, int(size[1]))  # a question waits behind all lines that are on the way
+        link.window.size = min(BUFFER, int(size[1]))  # a query waits behind all lines that were sent
     settings = {}
     for said in link.ask("$$", timeout):
         if isinstance(said, Setting) and re.fullmatch(r"-?\d+(\.\d*)?", said.value):

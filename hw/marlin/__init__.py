@@ -1,1 +1,1 @@
-"""Stages behind printers' controllers: Marlin."""
+"""The driver for Marlin, the firmware of 3D printers."""

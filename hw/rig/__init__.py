@@ -1,1 +1,1 @@
-"""Stage and camera together: the rig file, scans, and where the body was in each frame."""
+"""Stage and camera together: rig files, scans, and the position of the body in each frame."""

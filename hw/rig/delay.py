@@ -1,4 +1,4 @@
-"""How late a camera's frames come: measured by a move there and back, which must look the same both ways."""
+"""Measurement of a camera's delay: a move back and forth must look the same in both directions."""
 
 from __future__ import annotations
 
@@ -20,40 +20,40 @@ from mirrorskin.hw.rig_file import Axis
 from mirrorskin.hw.stage import Position
 from mirrorskin.io.types import Floats, InputError
 
-# The move
-_SECONDS = 1.5  # one way, or more
-_FRAMES, _MOST_FRAMES = 60, 150  # one way, at least and at most
-_PRESSED = 0.5  # share of a press that comes before the move
-_LONGEST_DELAY = 0.6  # seconds that late frames are waited for
+# Parameters of the move
+_SECONDS = 1.5  # minimum duration in one direction
+_FRAMES, _MOST_FRAMES = 60, 150  # minimum and maximum number of frames in one direction
+_PRESSED = 0.5  # share of a press before the move starts
+_LONGEST_DELAY = 0.6  # maximum time to wait for late frames, seconds
 _BLOCK = 8  # frames
-_WANDER = 0.5  # seconds whose frames are late alike
-_EVEN_RATIO = 1.3  # ratio of residuals of one line to lines near each frame, of a camera that keeps time
-_SPEED_MARGIN = 0.9  # of an axis's greatest speed; as much above its least
+_WANDER = 0.5  # seconds during which frames have a common delay
+_EVEN_RATIO = 1.3  # ratio of the residuals of one line and of local lines, for a camera with a constant rate
+_SPEED_MARGIN = 0.9  # of an axis's maximum speed; its inverse applies to the minimum speed
 
-# The estimate
-_REMEDY = "go in steps, or, if this is no stream, write it into the rig file as 'delay' of the camera"
-_BLOCKS = 16  # along either side of the picture
-_COMPONENTS = 6  # of the picture's change that count
+# Parameters of the estimate
+_REMEDY = "use steps, or, unless the camera is a stream, set 'delay' of the camera in the rig file"
+_BLOCKS = 16  # along each side of the picture
+_COMPONENTS = 6  # number of principal components of the picture's change
 _RANGE = (-0.05, 0.6)  # seconds
 _TRIALS = 66
 _KNOTS = (5, 40)
 _FRAMES_A_KNOT = 5
 _STIFFNESS = 1e-6
-_EXPLAINED = 0.5  # share of the picture's change that goes by the place
+_EXPLAINED = 0.5  # minimum share of the picture's change that the position explains
 _ERROR_MAX = 0.01  # seconds
 
 
 @dataclass(frozen=True, slots=True)
 class Delay:
-    """How long after the middle of its exposure a frame arrives."""
+    """Time from the middle of an exposure to the arrival of the frame."""
 
     seconds: float
-    error: float  # standard deviation that is expected of it, seconds
+    error: float  # standard error, seconds
 
 
 @dataclass(frozen=True, slots=True)
 class _Stroke:
-    """From one place to another, and how far along it a place is."""
+    """A move between two positions, and the distance travelled along it."""
 
     begin: Position
     end: Position
@@ -64,12 +64,12 @@ class _Stroke:
 
 
 def measure_delay(rig: Rig, plan: Plan) -> Delay:
-    """Move there and back in contact, and find out how late the camera's frames come.
+    """Move back and forth in contact, and return the camera's delay.
 
-    A press goes over the deeper half of its way, and so does that of a slide or a twist, whose friction would
-    make the ways there and back look different; a rotation leans from phase 0 to the opposite one. Each way
-    takes 1.5 s or 60 frames, whichever is longer, as far as the stage goes so slowly. The delay is that
-    against the stage's reports: what these are late by themselves is part of it, as it should be.
+    A press moves over the deeper half of its travel. So do slides and twists, where friction would make the
+    two directions look different. A rotation leans from phase 0 to the opposite phase. Each direction takes
+    1.5 s or 60 frames, whichever is longer, if the stage can move that slowly. The delay is relative to the
+    stage's reports and includes their latency, as it should.
     """
     way = _stroke(rig, plan)
     rests = rig.go(way.begin).time
@@ -77,7 +77,7 @@ def measure_delay(rig: Rig, plan: Plan) -> Delay:
     speed = min(max(way.length / seconds, way.slowest), way.fastest)
     seconds = way.length / speed
     every = max(1, math.floor(seconds * rig.rate / _MOST_FRAMES))
-    _FrameLog(rig, every).until(rests + _LONGEST_DELAY)  # earlier frames may show the way to there
+    _FrameLog(rig, every).until(rests + _LONGEST_DELAY)  # earlier frames may show the approach
     log = _FrameLog(rig, every)
     there = log.follow(rig.begin(lambda: rig.stage.move(way.end, speed), timed=True))
     back = log.follow(rig.begin(lambda: rig.stage.move(way.begin, speed), timed=True))
@@ -111,14 +111,14 @@ def _stroke(rig: Rig, plan: Plan) -> _Stroke:
     start, stop = (plan.start, plan.stop) if isinstance(plan, VerticalPlan) else (0.0, plan.first.travel)
     length = (1 - _PRESSED) * (stop - start)
     if length <= 0:
-        raise InputError(f"the camera's delay cannot be measured by a press of {stop:g} mm: {_REMEDY}")
+        raise InputError(f"the camera's delay cannot be measured with a press of {stop:g} mm: {_REMEDY}")
     first, end = stop - length, Position(stop)
     return _Stroke(Position(first), end, length, lambda place: place.travel - first, *_speeds(stage.travel))
 
 
 def _speeds(axis: Axis | None) -> tuple[float, float]:
-    """Return how fast and how slowly an axis may go, mm/s or rad/s."""
-    if axis is None:  # cannot be: what does not lean does not go round
+    """Return the maximum and the minimum speed of an axis, mm/s or rad/s."""
+    if axis is None:  # not possible: a rotation needs an axis of lean
         return math.inf, 0.0
     return _SPEED_MARGIN * axis.top_speed, SLOWEST / 60 / axis.scale / _SPEED_MARGIN
 
@@ -131,7 +131,7 @@ def _track(
 
 
 class _FrameLog:
-    """Frames of the move, of which only block means are kept."""
+    """Frames of the move, reduced to block means."""
 
     def __init__(self, rig: Rig, every: int) -> None:
         self._rig, self._every = rig, every
@@ -140,18 +140,18 @@ class _FrameLog:
         self.pictures: list[Floats] = []
 
     def arrivals(self) -> tuple[NDArray[np.int64], Floats]:
-        """Return the frames' numbers, (n,), and when they arrived, (n,), seconds."""
+        """Return the frames' numbers, (n,), and times of arrival, (n,), seconds."""
         return np.concatenate(self._numbers), np.concatenate(self._times)
 
     def follow(self, move: Move) -> Move:
-        """Watch until a move is over."""
+        """Collect frames until a move is over."""
         while not move.over:
             self._take()
         self._rig.end(move)
         return move
 
     def until(self, time: float) -> None:
-        """Watch until frames arrive later than a time."""
+        """Collect frames until a time."""
         while self._take() < time:
             pass
 
@@ -164,16 +164,16 @@ class _FrameLog:
         return float(frames.time[-1])
 
 
-# The estimate from frames and places
+# The estimate from frames and positions
 
 
 def frame_times(number: NDArray[np.int64], arrival: Floats) -> tuple[Floats, float]:
-    """Return the times that frames are taken to have arrived at, (n,), seconds, and how far these may be off.
+    """Return smoothed arrival times of frames, (n,), seconds, and their standard error.
 
-    Numbers and arrivals are (n,). If the camera keeps time, the times are those of a straight line through
-    all arrivals. They may be off by what the mean of half a second of arrivals is off that line, in root
-    mean square: chance hardly counts in it, but a line or a buffer that is later now and then does, since it
-    may be so in a scan as well.
+    Numbers and arrivals are (n,). If the camera has a constant rate, the times are a straight line through
+    all arrivals. Their standard error is the RMS deviation of means over half a second from that line. Random
+    jitter hardly contributes to it; a varying latency of the connection or of a buffer does, since it may
+    occur in a scan as well.
     """
     line = even_times(number, arrival, len(arrival))
     late = arrival - line
@@ -194,12 +194,12 @@ def block_means(frames: NDArray[Any], blocks: int = _BLOCKS) -> Floats:
 def estimate_delay(
     arrival: ArrayLike, pictures: ArrayLike, place: Callable[[Floats], Floats], name: str = "the camera"
 ) -> Delay:
-    """Find the delay at which the picture is one function of the place, on the way there and back.
+    """Estimate the delay at which the picture is one function of the position in both directions.
 
-    `arrival`, (n,), seconds, and `pictures`, (n, k), block means, are of the frames; `place` gives the
-    position, (n,), at given times. The function is a linear spline of some twenty knots, fitted together
-    with a linear drift to the principal components of the picture's change; the delay minimises the sum of
-    squares. Its standard error follows from the residual of each frame as an error in time.
+    `arrival`, (n,), seconds, and `pictures`, (n, k), block means, describe the frames; `place` returns the
+    position, (n,), at given times. The function is a linear spline with some twenty knots, fitted together
+    with a linear drift to the principal components of the picture's change. The delay minimises the sum of
+    squares. Its standard error is computed from the residual of each frame, converted to a time.
     """
     from scipy.optimize import minimize_scalar
 
@@ -215,16 +215,16 @@ def estimate_delay(
     best = int(np.argmin(costs))
     if not total > 0 or best in (0, _TRIALS - 1) or costs[best] > (1 - _EXPLAINED) * total:
         raise HardwareError(
-            f"{name}: its delay cannot be found, as the picture hardly changes with the place: press"
-            f" deeper, or {_REMEDY}"
+            f"{name}: the delay cannot be measured, because the picture hardly changes with the "
+            f"position: press deeper, or {_REMEDY}"
         )
     around = tuple(trials[[best - 1, best + 1]])
     found = minimize_scalar(cost, bounds=around, method="bounded", options={"xatol": 1e-5})
     error = _error(float(found.x), time, change, place)
     if not error < _ERROR_MAX:
         raise HardwareError(
-            f"{name}: its delay is {found.x:.3f} s, give or take {error:.3f} s, which is too little to go by:"
-            f" press deeper, or {_REMEDY}"
+            f"{name}: the delay is {found.x:.3f} ± {error:.3f} s, which is too uncertain: press "
+            f"deeper, or {_REMEDY}"
         )
     return Delay(float(found.x), error)
 
@@ -237,7 +237,7 @@ def _principal_components(pictures: Floats) -> Floats:
 
 
 def _fit(place: Floats, time: Floats, change: Floats) -> tuple[Floats, Floats, int]:
-    """Fit a linear spline of the place, and a drift with the time, to each component.
+    """Fit a linear spline of the position, and a drift with time, to each component.
 
     Return the residual and the spline's slope at each frame, (n, c), and the number of parameters.
     """
@@ -250,7 +250,7 @@ def _fit(place: Floats, time: Floats, change: Floats) -> tuple[Floats, Floats, i
 
     since = (time - time.mean())[:, None]
     of_change, of_since = spline.fit(change), spline.fit(since)
-    bent = since - spline.at(of_since)  # the part of the drift orthogonal to all splines
+    bent = since - spline.at(of_since)  # part of the drift that is orthogonal to all splines
     drift = np.sum(bent * change, axis=0) / max(float(np.sum(bent * since)), 1e-300)
     line = of_change - of_since * drift
     slope = (line[knot + 1] - line[knot]) / width
@@ -258,13 +258,13 @@ def _fit(place: Floats, time: Floats, change: Floats) -> tuple[Floats, Floats, i
 
 
 class _LinearSpline:
-    """Least squares of linear splines; each frame, (n,), has the knot before it and its share to the next."""
+    """Least squares of linear splines; each frame has the index of its knot and its share of the next."""
 
     def __init__(self, knot: NDArray[np.intp], share: Floats, count: int) -> None:
         self._knot, self._near, self._next, self._count = knot, 1 - share, share, count
         diagonal = np.bincount(knot, self._near**2, count) + np.bincount(knot + 1, self._next**2, count)
         above = np.bincount(knot + 1, self._near * self._next, count)
-        # A little stiffness determines knots that no frame is near.
+        # A weak regularisation determines knots without frames.
         self._bands = np.stack([above - _STIFFNESS, diagonal + (2 + _STIFFNESS) * _STIFFNESS])
 
     def fit(self, values: Floats) -> Floats:
@@ -285,12 +285,12 @@ class _LinearSpline:
 
 
 def _error(delay: float, time: Floats, change: Floats, place: Callable[[Floats], Floats]) -> float:
-    """Return the standard error of a delay: a frame counts by how its picture depends on time."""
+    """Return the standard error of a delay; a frame is weighted by the rate of change of its picture."""
     step = 1e-3
     residual, slope, parameters = _fit(place(time - delay), time, change)
     speed = (place(time - delay + step) - place(time - delay - step)) / (2 * step)
     per_second = slope * speed[:, None]
     weight = np.sum(per_second**2, axis=1)
-    late = np.sum(per_second * residual, axis=1)  # the frame's error in time, times its weight
+    late = np.sum(per_second * residual, axis=1)  # error of the frame in time, times its weight
     free = max(1, len(time) - parameters) / len(time)
     return math.sqrt(float(np.sum(late**2)) / free) / max(float(weight.sum()), 1e-300)

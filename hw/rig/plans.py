@@ -1,4 +1,4 @@
-"""What a scan is to do: where the body goes, in steps or without a halt, and whether it may."""
+"""Plans of scans: the trajectory of the body, in steps or continuous, and checks of its feasibility."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mirrorskin.hw.stage import Position, Stage
 from mirrorskin.io import InputError
 from mirrorskin.io.types import Floats, Motion
 
-_RAMP = 0.1  # seconds in which a stage is taken to reach its speed, as long as nothing else is known
+_RAMP = 0.1  # assumed acceleration time of a stage, seconds, before it is known
 _STEPS_MAX = 10**6
 _TURNS_MAX = 10_000
 _STROKES_MAX = 10_000
@@ -23,19 +23,19 @@ _ROUNDING = 1e-9  # of a step
 
 @dataclass(frozen=True, slots=True)
 class Trapezoid:
-    """A way that begins and ends at rest: the speed rises evenly, stays, and falls as it rose.
+    """A trajectory from rest to rest with a trapezoidal speed profile.
 
-    It may consist of several equal legs, each of which begins and ends at rest.
+    It may consist of several equal legs, each from rest to rest.
     """
 
-    length: float  # of all legs, mm or radians, above 0
-    speed: float  # in the middle of a leg, mm/s or rad/s; not reached on a short one
+    length: float  # total of all legs, mm or radians, above 0
+    speed: float  # speed in the middle of a leg, mm/s or rad/s; not reached on a short leg
     acceleration: float
     legs: int = 1
 
     @classmethod
     def planned(cls, length: float, speed: float, legs: int = 1) -> Trapezoid:
-        """Guess the acceleration, of which a plan says nothing."""
+        """Return a trajectory with an assumed acceleration."""
         return cls(length, speed, speed / _RAMP, legs)
 
     @property
@@ -45,12 +45,12 @@ class Trapezoid:
 
     @property
     def ramp(self) -> float:
-        """Seconds that speeding up takes."""
+        """Duration of the acceleration, seconds."""
         return min(self.speed, math.sqrt(self.leg * self.acceleration)) / self.acceleration
 
     @property
     def duration(self) -> float:
-        """Seconds for the whole way."""
+        """Total duration, seconds."""
         return self.legs * self._leg_duration
 
     @property
@@ -58,7 +58,7 @@ class Trapezoid:
         return self.leg / (self.acceleration * self.ramp) + self.ramp
 
     def place(self, time: ArrayLike) -> Floats:
-        """Return where it is so many seconds after the beginning; before that and at the end, it rests."""
+        """Return the distance travelled after a time, seconds; constant before start and after end."""
         t = np.clip(np.asarray(time, np.float64), 0, self.duration)
         number = np.clip(t // self._leg_duration, 0, self.legs - 1)
         t = t - number * self._leg_duration
@@ -69,7 +69,7 @@ class Trapezoid:
         return number * self.leg + np.where(t < self.ramp, early, np.where(left < self.ramp, late, cruise))
 
     def time(self, place: ArrayLike) -> Floats:
-        """Return when it is at a place, seconds after the beginning; the inverse of ``place``."""
+        """Return the time at which a distance is reached, seconds; the inverse of ``place``."""
         s = np.clip(np.asarray(place, np.float64), 0, self.length)
         number = np.clip(s // self.leg, 0, self.legs - 1)
         s = s - number * self.leg
@@ -83,91 +83,93 @@ class Trapezoid:
 
 
 class Plan:
-    """What a scan does; see `VerticalPlan`, `AxialPlan`, `HorizontalPlan`, `TwistPlan` and `RockPlan`.
+    """A scan; see `VerticalPlan`, `AxialPlan`, `HorizontalPlan`, `TwistPlan` and `RockPlan`.
 
-    Places are told by how far the body has come along its way: mm, or radians.
+    A position is described by the distance that the body has travelled along its trajectory (way): mm or
+    radians.
     """
 
     __slots__ = ()
     motion: ClassVar[Motion]
-    series: ClassVar[str]  # what a recording says of each frame: travel, phase, displacement, twist or tilt
+    # name of each frame's position in a recording: travel, phase, displacement, twist or tilt
+    series: ClassVar[str]
 
     @property
     def step(self) -> float | None:
-        """From place to place, mm or radians, where the body halts for each frame."""
+        """Distance between two positions of a scan in steps, mm or radians; otherwise None."""
         raise NotImplementedError
 
     @property
     def speed(self) -> float | None:
-        """Of the way without a halt, mm/s or rad/s."""
+        """Speed of a continuous scan, mm/s or rad/s; otherwise None."""
         raise NotImplementedError
 
     @property
     def length(self) -> float:
-        """How long the way is, mm or radians."""
+        """Length of the trajectory, mm or radians."""
         raise NotImplementedError
 
     def place(self, way: float) -> Position:
-        """Return where the body stands so far along its way."""
+        """Return the position of the body after a distance."""
         raise NotImplementedError
 
     def recorded(self, ways: Floats) -> Floats:
-        """Return what a recording says of some places, (n,) or (n, 2), mm or radians."""
+        """Return the recorded value after some distances, (n,) or (n, 2), mm or radians."""
         raise NotImplementedError
 
     def way(self, position: Position, expected: float) -> float:
-        """Return how far along a place is; of those that look alike, the one next to what is expected."""
+        """Return the distance of a position; of several, the one closest to the expected distance."""
         raise NotImplementedError
 
     @property
     def in_steps(self) -> bool:
-        """Whether the body halts for each frame."""
+        """Whether the scan is in steps."""
         return self.step is not None
 
     @property
     def ways(self) -> Floats:
-        """How far along it is at each step, (n,)."""
+        """Distance at each step, (n,)."""
         assert self.step is not None
         return np.asarray(self.step * np.arange(_whole(self.length / self.step) + 1), np.float64)
 
     @property
     def path(self) -> Trapezoid:
-        """The way without a halt."""
+        """Trajectory of a continuous scan."""
         assert self.speed is not None
         return Trapezoid.planned(self.length, self.speed)
 
     @property
     def ends(self) -> list[Position]:
-        """Where the body goes straight to, one after the other, where it does not halt."""
+        """End points of the straight moves of a continuous scan."""
         return [self.place(self.length)]
 
     def begin(self, stage: Stage) -> None:
-        """Tell a stage that stands at the first place to go the way without a halt."""
+        """Start the continuous motion of a stage that is at the first position."""
         stage.follow(self.ends, self.speed)
 
     @property
     def period(self) -> float:
-        """How far it is to the next place that looks alike."""
+        """Distance after which the trajectory repeats."""
         return math.inf
 
     @property
     def constants(self) -> dict[str, float]:
-        """What a recording says of all frames alike, by the name of the series."""
+        """Recorded values that are the same for all frames, by the name of the series."""
         return {}
 
     @property
     def first(self) -> Position:
-        """Where the scan begins."""
+        """First position."""
         return self.place(0.0)
 
     @property
     def values(self) -> Floats:
-        """What a recording says of each step, (n,) or (n, 2)."""
+        """Recorded value of each step, (n,) or (n, 2)."""
         return self.recorded(self.ways)
 
     @property
     def places(self) -> list[Position]:
-        """Where the body stands at each step."""
+        """Position of the body at each step."""
         return [self.place(float(way)) for way in self.ways]
 
     def _check(self, unit: str) -> None:
@@ -178,21 +180,21 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class VerticalPlan(Plan):
-    """Lower the body from one travel to another, and then up and down between them, if it is to oscillate.
+    """Lower the body from one travel to another; with several strokes, oscillate between them.
 
-    Values that cannot be are an `InputError`.
+    Impossible values are an `InputError`.
 
     Attributes
     ----------
     start, stop : float
-        First travel, and that of the first stroke's end, mm; the second lies deeper.
+        First travel, and travel at the end of the first stroke, mm; the second is deeper.
     step : float or None
-        From place to place, mm, where it goes in steps; the last place of a stroke is the last that is not
+        Distance between positions, mm, in a scan in steps; a stroke ends at the last position that is not
         beyond `stop`.
     speed : float or None
-        Where it goes without a halt, mm/s. Either `step` or `speed` is given.
+        Speed of a continuous scan, mm/s. Either `step` or `speed` is given.
     strokes : int
-        How often it goes down or up, at most 10 000 times; the first stroke goes down.
+        Number of strokes down or up, at most 10 000; the first stroke goes down.
 
     Examples
     --------
@@ -218,32 +220,32 @@ class VerticalPlan(Plan):
                 f"a press from {self.start:g} to {self.stop:g} mm does not go down: give a deeper stop"
             )
         if not 1 <= self.strokes <= _STROKES_MAX:
-            raise InputError(f"{self.strokes} strokes cannot be: 1 to {_STROKES_MAX} are possible")
+            raise InputError(f"{self.strokes} strokes are not possible: give 1 to {_STROKES_MAX}")
         self._check("mm")
 
     @property
     def length(self) -> float:
-        """How far it goes in all strokes, mm."""
+        """Total length of all strokes, mm."""
         return self.strokes * self._depth
 
     @property
     def path(self) -> Trapezoid:
-        """The way without a halt: a leg for each stroke."""
+        """Trajectory of a continuous scan: a leg for each stroke."""
         assert self.speed is not None
         return Trapezoid.planned(self.length, self.speed, self.strokes)
 
     @property
     def period(self) -> float:
-        """Down and up."""
+        """Length of a stroke down and one up, mm."""
         return math.inf if self.strokes == 1 else 2 * self._depth
 
     @property
     def ends(self) -> list[Position]:
-        """Where the body turns, and where it ends."""
+        """Turning points and end."""
         return [Position(self.start if number % 2 else self.stop) for number in range(self.strokes)]
 
     def place(self, way: float) -> Position:
-        """Return where the body stands so far on its way."""
+        """Return the position of the body after a distance."""
         return Position(travel=float(self.recorded(np.asarray(way))))
 
     def recorded(self, ways: Floats) -> Floats:
@@ -253,7 +255,7 @@ class VerticalPlan(Plan):
         return np.asarray(self.start + np.where(number % 2, self._depth - along, along))
 
     def way(self, position: Position, expected: float) -> float:
-        """Return how far on its way it has come, mm: in the stroke that is next to what is expected."""
+        """Return the distance travelled, mm, in the stroke closest to the expected distance."""
         depth = min(max(position.travel - self.start, 0.0), self._depth)
         number = np.arange(self.strokes)
         ways = np.where(number % 2, (number + 1) * self._depth - depth, number * self._depth + depth)
@@ -261,29 +263,29 @@ class VerticalPlan(Plan):
 
     @property
     def _depth(self) -> float:
-        """How far a stroke goes, mm."""
+        """Length of a stroke, mm."""
         depth = self.stop - self.start
         return depth if self.step is None else self.step * _whole(depth / self.step)
 
 
 @dataclass(frozen=True, slots=True)
 class HorizontalPlan(Plan):
-    """Press, wait, and slide: along a straight line from where it was pressed.
+    """Press, wait, and slide along a straight line.
 
-    Values that cannot be are an `InputError`.
+    Impossible values are an `InputError`.
 
     Attributes
     ----------
     press : float
         Travel at which the body slides, mm.
     distance : float
-        How far it slides, mm, above 0.
+        Length of the slide, mm, above 0.
     direction : float
         Radians from x, counter-clockwise: y is at pi/2.
     step : float or None
-        From place to place, mm, where it goes in steps.
+        Distance between positions, mm, in a scan in steps.
     speed : float or None
-        Where it goes without a halt, mm/s. Either `step` or `speed` is given.
+        Speed of a continuous scan, mm/s. Either `step` or `speed` is given.
     wait : float
         Seconds at rest, pressed, before it slides.
 
@@ -311,11 +313,11 @@ class HorizontalPlan(Plan):
 
     @property
     def length(self) -> float:
-        """How far it slides, mm."""
+        """Length of the slide, mm."""
         return self.distance
 
     def place(self, way: float) -> Position:
-        """Return where the body stands so far along."""
+        """Return the position of the body after a distance."""
         x, y = way * self._along
         return Position(self.press, x=float(x), y=float(y))
 
@@ -324,29 +326,29 @@ class HorizontalPlan(Plan):
         return ways[:, np.newaxis] * self._along
 
     def way(self, position: Position, expected: float) -> float:
-        """Return how far it has slid, mm."""
+        """Return the distance of the slide so far, mm."""
         return min(max(float(np.dot((position.x, position.y), self._along)), 0.0), self.length)
 
     @property
     def _along(self) -> Floats:
-        """Unit vector of the direction, whose rounding at right angles moves no other axis."""
+        """Unit vector of the direction; right angles are exact, so that no other axis moves."""
         return np.round([math.cos(self.direction), math.sin(self.direction)], 15) + 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class TwistPlan(Plan):
-    """Press, wait, and turn the body about its own axis; values that cannot be are an `InputError`.
+    """Press, wait, and turn the body about its own axis; impossible values are an `InputError`.
 
     Attributes
     ----------
     press : float
         Travel at which the body turns, mm.
     angle : float
-        How far it turns, radians, counter-clockwise if positive; not 0.
+        Angle, radians, counter-clockwise if positive; not 0.
     step : float or None
-        From place to place, radians, above 0, where it goes in steps.
+        Angle between positions, radians, above 0, in a scan in steps.
     speed : float or None
-        Where it goes without a halt, rad/s. Either `step` or `speed` is given.
+        Speed of a continuous scan, rad/s. Either `step` or `speed` is given.
     wait : float
         Seconds at rest, pressed, before it turns.
 
@@ -367,17 +369,17 @@ class TwistPlan(Plan):
     def __post_init__(self) -> None:
         _check_number(self.press, "press", "mm")
         if not (math.isfinite(self.angle) and self.angle):
-            raise InputError(f"angle {self.angle:g} radians cannot be: give one that is not 0")
+            raise InputError(f"angle {self.angle:g} radians is not possible: give one that is not 0")
         _check_wait(self.wait)
         self._check("radians")
 
     @property
     def length(self) -> float:
-        """How far it turns, radians, either way."""
+        """Absolute value of the angle, radians."""
         return abs(self.angle)
 
     def place(self, way: float) -> Position:
-        """Return where the body stands so far along."""
+        """Return the position of the body after an angle."""
         return Position(self.press, twist=math.copysign(way, self.angle))
 
     def recorded(self, ways: Floats) -> Floats:
@@ -385,28 +387,28 @@ class TwistPlan(Plan):
         return np.copysign(ways, self.angle)
 
     def way(self, position: Position, expected: float) -> float:
-        """Return how far it has turned, radians."""
+        """Return the angle so far, radians."""
         return min(max(math.copysign(1.0, self.angle) * position.twist, 0.0), self.length)
 
 
 @dataclass(frozen=True, slots=True)
 class AxialPlan(Plan):
-    """Press, lean, and go round: the body's axis precesses, from phase 0 on, counter-clockwise.
+    """Press, lean, and precess: the body's axis rotates from phase 0 on, counter-clockwise.
 
-    Values that cannot be are an `InputError`.
+    Impossible values are an `InputError`.
 
     Attributes
     ----------
     press : float
-        Travel at which the body goes round, mm.
+        Travel during the rotation, mm.
     tilt : float
         Half-angle of the cone, radians, above 0.
     turns : float
-        How often it goes round, above 0, at most 10 000 times.
+        Number of turns, above 0, at most 10 000.
     phase_step : float or None
-        From place to place, radians, where it goes in steps; the end of the turns is no place of its own.
+        Angle between positions, radians, in a scan in steps; the end of the turns is not a position.
     rate : float or None
-        Where it goes without a halt, turns a second. Either `phase_step` or `rate` is given.
+        Rate of a continuous scan, turns per second. Either `phase_step` or `rate` is given.
 
     Examples
     --------
@@ -427,7 +429,7 @@ class AxialPlan(Plan):
         _check_above_zero(self.tilt, "tilt", "radians")
         _check_above_zero(self.turns, "turns", "")
         if self.turns > _TURNS_MAX:
-            raise InputError(f"{self.turns:g} turns are too many: go round {_TURNS_MAX} times at most")
+            raise InputError(f"{self.turns:g} turns are too many: the maximum is {_TURNS_MAX}")
         _check_one_of(("phase step", self.phase_step, "radians"), ("rate", self.rate, "turns/s"))
         if self.phase_step is not None:
             _check_steps(self.length / self.phase_step, 3)
@@ -444,7 +446,7 @@ class AxialPlan(Plan):
 
     @property
     def length(self) -> float:
-        """Of all turns, radians."""
+        """Phase of all turns, radians."""
         return math.tau * self.turns
 
     @property
@@ -456,23 +458,23 @@ class AxialPlan(Plan):
     def ways(self) -> Floats:
         """Phase of each step, (n,), radians."""
         assert self.phase_step is not None
-        # The end of whole turns is their beginning; a step that ends short of it is taken.
+        # The end of whole turns is their start; a step that ends before it is included.
         count = math.ceil(self.length / self.phase_step - _ROUNDING)
         return np.asarray(self.phase_step * np.arange(count), np.float64)
 
     @property
     def ends(self) -> list[Position]:
-        """None: it goes round."""
+        """Empty: the motion is a precession."""
         return []
 
     def begin(self, stage: Stage) -> None:
-        """Tell a stage that leans at phase 0 to go round."""
+        """Start the precession of a stage that leans at phase 0."""
         stage.precess(self.tilt, self.turns, self.rate or 0.0)
 
     def frames_a_turn(self, frame_rate: float, each: int = 1) -> float:
-        """Return how many frames a turn has, or what there is of the only one.
+        """Return the number of frames in a turn, or in the only, incomplete one.
 
-        Without a halt the camera's frame rate, Hz, must be known; in steps, each place has `each` frames.
+        A continuous scan requires the camera's frame rate, Hz; in steps, each position has `each` frames.
         """
         if self.phase_step is not None:
             turn = math.tau / self.phase_step * each
@@ -480,12 +482,12 @@ class AxialPlan(Plan):
             turn = frame_rate / (self.rate or math.inf)
             if not math.isfinite(turn) or turn <= 0:
                 raise InputError(
-                    "how many frames a turn has is not known: give the camera's rate in the rig file"
+                    "the number of frames per turn is unknown: give the camera's rate in the rig file"
                 )
         return turn * min(1.0, self.turns)
 
     def place(self, way: float) -> Position:
-        """Return where the body stands at a phase, radians."""
+        """Return the position of the body at a phase, radians."""
         return Position(self.press, self.tilt * math.cos(way), self.tilt * math.sin(way))
 
     def recorded(self, ways: Floats) -> Floats:
@@ -499,22 +501,22 @@ class AxialPlan(Plan):
 
 @dataclass(frozen=True, slots=True)
 class RockPlan(Plan):
-    """Press, lean, and rock about one axis: from a tilt on one side to the same on the other.
+    """Press, lean, and rock about one axis: from a tilt on one side to the same tilt on the other.
 
-    Values that cannot be are an `InputError`.
+    Impossible values are an `InputError`.
 
     Attributes
     ----------
     press : float
         Travel at which the body rocks, mm.
     tilt : float
-        Greatest half-angle, radians, above 0; it begins at its negative.
+        Maximum half-angle, radians, above 0; the scan starts at its negative.
     phase : float
-        Where the body leans to at positive tilts, radians, as the phase of a precession.
+        Phase of the lean at positive tilts, radians, as in a precession.
     step : float or None
-        From place to place, radians, where it goes in steps.
+        Angle between positions, radians, in a scan in steps.
     speed : float or None
-        Where it goes without a halt, rad/s. Either `step` or `speed` is given.
+        Speed of a continuous scan, rad/s. Either `step` or `speed` is given.
 
     Examples
     --------
@@ -538,7 +540,7 @@ class RockPlan(Plan):
 
     @property
     def length(self) -> float:
-        """From one side to the other, radians."""
+        """Angle from one side to the other, radians."""
         return 2 * self.tilt
 
     @property
@@ -547,7 +549,7 @@ class RockPlan(Plan):
         return {"phase": self.phase}
 
     def place(self, way: float) -> Position:
-        """Return where the body stands so far on its way."""
+        """Return the position of the body after an angle."""
         tilt = way - self.tilt
         return Position(self.press, tilt * math.cos(self.phase), tilt * math.sin(self.phase))
 
@@ -556,19 +558,19 @@ class RockPlan(Plan):
         return ways - self.tilt
 
     def way(self, position: Position, expected: float) -> float:
-        """Return how far on its way it has come, radians."""
+        """Return the angle so far, radians."""
         tilt = position.pitch * math.cos(self.phase) + position.roll * math.sin(self.phase)
         return min(max(tilt + self.tilt, 0.0), self.length)
 
 
 def _whole(steps: float) -> int:
-    """Return how many whole steps there are; a last one that rounding shortened counts."""
+    """Return the number of whole steps, including a last one that rounding shortened."""
     return math.floor(steps + _ROUNDING * max(1.0, steps))
 
 
 def _check_number(value: float, name: str, unit: str) -> None:
     if not math.isfinite(value):
-        raise InputError(f"{name} {value} {unit} cannot be: give a finite number")
+        raise InputError(f"{name} {value} {unit} is not possible: give a finite number")
 
 
 def _check_above_zero(value: float, name: str, unit: str) -> None:
@@ -578,14 +580,14 @@ def _check_above_zero(value: float, name: str, unit: str) -> None:
 
 def _check_wait(seconds: float) -> None:
     if not 0 <= seconds < math.inf:
-        raise InputError(f"a wait of {seconds:g} s cannot be: give 0 or more")
+        raise InputError(f"a wait of {seconds:g} s is not possible: give 0 or more")
 
 
 def _check_one_of(*both: tuple[str, float | None, str]) -> None:
     given = [(name, value, unit) for name, value, unit in both if value is not None]
     if len(given) != 1:
         (step, _, _), (speed, _, _) = both
-        raise InputError(f"give either a {step}, to go in steps, or a {speed}, to go without a halt")
+        raise InputError(f"give either a {step}, for a scan in steps, or a {speed}, for a continuous one")
     name, value, unit = given[0]
     _check_above_zero(value, name, unit)
 
@@ -593,29 +595,31 @@ def _check_one_of(*both: tuple[str, float | None, str]) -> None:
 def _check_steps(count: float, least: int) -> None:
     if not least - _ROUNDING <= count <= _STEPS_MAX:
         raise InputError(
-            f"{count:.3g} steps cannot be: {least} to {_STEPS_MAX} are possible; change the step or the way"
+            f"{count:.3g} steps are not possible: {least} to {_STEPS_MAX} are; change the step or "
+            "the distance"
         )
 
 
 def check_plan(plan: Plan, settings: StageSettings, name: str, stage: Stage | None = None) -> None:
-    """Refuse a plan that a stage cannot do: beyond its limits, too fast or slow, no axes for arcs.
+    """Refuse a plan that a stage cannot execute: limits, speeds, or axes without arcs.
 
-    The body is lowered where x, y and twist are 0, and lifted straight up from where the scan ended: what
-    holds at both ends of the scan holds there, too. A stage that is open knows its controller's bounds.
+    The body is lowered at x, y and twist 0, and lifted straight up from the end of the scan, so the approach
+    and the retreat are within the limits if both ends of the scan are. An open stage also knows the limits of
+    its controller.
     """
     from mirrorskin.hw.grbl.moves import Axes
 
     limits = settings.limits if stage is None else stage.limits
     for place in (plan.first, *plan.ends):
         limits.check(place, name)
-    if plan.in_steps:  # moves between steps go as fast as the axes do
+    if plan.in_steps:  # moves between steps use the maximum speed
         return
-    if stage is None and settings.firmware == "marlin":  # lest it is homed for nothing
-        raise InputError(f"{name}: Marlin does not tell where it is while it moves; go in steps")
-    if stage is None and settings.firmware != "grbl":  # it tells once it is open
+    if stage is None and settings.firmware == "marlin":  # before it is homed unnecessarily
+        raise InputError(f"{name}: Marlin does not report its position while it moves; use steps")
+    if stage is None and settings.firmware != "grbl":  # checked when the stage is open
         return
     able = Axes(settings, name) if stage is None else stage
-    if isinstance(plan, AxialPlan):  # one turn is as possible as many
+    if isinstance(plan, AxialPlan):  # one turn suffices for the check
         able.check_turns(plan.tilt, min(plan.turns, 1.0), plan.rate or 0.0)
     else:
         able.check_way(plan.first, plan.ends[0], plan.speed)

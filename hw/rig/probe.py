@@ -13,31 +13,31 @@ from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.scan import StepScan
 from mirrorskin.io.types import Floats
 
-_FRAMES, _PLACES = 4, 4  # at a place, and places before, that a place is compared with
-_SIGMAS = 8.0  # of a block's mean, by which it changes on contact
-_LEAST = 1e-4  # of the greatest block mean, that a standard deviation is taken for at least
+_FRAMES, _PLACES = 4, 4  # frames at a position, and number of preceding positions to compare with
+_SIGMAS = 8.0  # change of a block's mean on contact, in standard deviations
+_LEAST = 1e-4  # minimum standard deviation, as a share of the greatest block mean
 
 
 def find_contact(rig: Rig, start: float, step: float) -> float:
     """Lower the body until the picture changes, lift it, and return the travel at first contact, mm.
 
-    Contact lies at most half a step from there. It is told where the mean of one of 16 x 16 blocks differs
-    from that of the four places before by more than eight standard deviations, so that slow drift does not
-    matter. The first four places must be without contact.
+    The result is accurate to half a step. Contact is detected where the mean of one of 16 x 16 blocks differs
+    from its mean at the four preceding positions by more than eight standard deviations, so slow drift has no
+    effect. The first four positions must be without contact.
 
     Parameters
     ----------
     rig : Rig
         The body goes no deeper than its limits allow.
     start : float
-        Travel of the first place, mm.
+        First travel, mm.
     step : float
-        From place to place, mm.
+        Distance between positions, mm.
 
     Raises
     ------
     HardwareError
-        There was no contact, or it came before the fifth place.
+        There was no contact, or it occurred before the fifth position.
 
     Examples
     --------
@@ -59,13 +59,13 @@ def find_contact(rig: Rig, start: float, step: float) -> float:
                 return float(block.travel[0]) - step / 2
             before = [*before[1 - _PLACES :], here]
     raise HardwareError(
-        f"{rig.name}: the picture showed no contact between travels of {start:g} and {deepest:g} mm: "
-        "see where the object is, and the light, and begin higher"
+        f"{rig.name}: the picture showed no contact between travels of {start:g} and {deepest:g} "
+        "mm: check the position of the object and the light, and start higher"
     )
 
 
 def _differ(before: Floats, here: Floats) -> bool:
-    """Whether any of the block means, (n, k), of one place differ from those of others."""
+    """Return whether any of the block means, (n, k), differ from those of other positions."""
     noise = max(float(np.median(before.std(axis=0, ddof=1))), _LEAST * float(np.abs(before).max()))
     sigma = noise * math.sqrt(1 / len(before) + 1 / len(here))
     return bool(np.abs(here.mean(axis=0) - before.mean(axis=0)).max() > _SIGMAS * sigma)

@@ -1,4 +1,4 @@
-"""The dark and the bright reference that a rig file gives: numbers, or pictures in files beside it."""
+"""The dark and the bright reference in a rig file: numbers, or picture files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mirrorskin.hw.rig_file import CameraSettings
 
 SUFFIXES = (".npy", *PICTURE_SUFFIXES)
-"""How the names of reference files end."""
+"""Suffixes of reference files."""
 
 _LARGEST = float(np.finfo(np.float32).max)
 
@@ -25,7 +25,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 def read_reference(
     camera: CameraSettings, name: Literal["dark", "bright"], rig_file: str | Path
 ) -> NDArray[np.float32] | None:
-    """Read a reference, (H, W), NaN where a pixel has none; None if the rig file gives none."""
+    """Return a reference, (H, W), NaN at pixels without one; None if the rig file has none."""
     given = camera.dark if name == "dark" else camera.bright
     if given is None:
         return None
@@ -37,33 +37,33 @@ def read_reference(
         counts = np.full(camera.shape, given, np.float64)
     known = counts[~np.isnan(counts)]
     if not known.size:
-        raise InputError(f"{where}: {given} holds nothing but NaN; take the reference again")
+        raise InputError(f"{where}: {given} contains only NaN; take the reference again")
     least, most = (0, np.iinfo(dtype).max) if dtype.kind == "u" else (-_LARGEST, _LARGEST)
     low, high = known.min(), known.max()
     if not least <= low <= high <= most:
-        found = f"{given} holds {low:.6g} to {high:.6g}" if isinstance(given, str) else f"it is {low:.6g}"
+        found = f"{given} contains {low:.6g} to {high:.6g}" if isinstance(given, str) else f"it is {low:.6g}"
         raise InputError(
-            f"{where}: {found}, and counts of {dtype.name} go from {least:g} to {most:g}; "
-            "take the reference with this camera"
+            f"{where}: {found}, but counts of {dtype.name} are {least:g} to {most:g}; take the "
+            "reference with this camera"
         )
     return counts.astype(np.float32)
 
 
 def check_references(camera: CameraSettings, rig_file: str | Path) -> None:
-    """Refuse references that the camera cannot have, or a bright one below the dark one at most pixels."""
+    """Refuse impossible references, and a bright one below the dark one at most pixels."""
     dark, bright = (read_reference(camera, name, rig_file) for name in ("dark", "bright"))
     if dark is None or bright is None:
         return
     span = bright - dark
     if 2 * np.count_nonzero(span > 0) < np.count_nonzero(~np.isnan(span)):
         raise InputError(
-            f"{rig_file}: camera.bright is not above camera.dark at most of the pixels; are they exchanged?"
+            f"{rig_file}: camera.bright is not above camera.dark at most of the pixels; are they swapped?"
         )
 
 
 def _read(path: Path, where: str) -> NDArray[Any]:
     try:
-        check_regular(path, "name an array or a picture beside the rig file, or leave it out")
+        check_regular(path, "name an array or a picture relative to the rig file, or leave it out")
         return read_array(path) if path.suffix.lower() == ".npy" else read_picture(path)
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
@@ -72,13 +72,13 @@ def _read(path: Path, where: str) -> NDArray[Any]:
 def _check_fits(counts: NDArray[Any], path: str, camera: CameraSettings, where: str) -> None:
     if counts.dtype != camera.dtype and counts.dtype.kind != "f":
         raise InputError(
-            f"{where}: {path} is of {counts.dtype.name}, and the camera of {camera.dtype}; "
-            "take the reference with this camera, or correct camera.dtype"
+            f"{where}: {path} contains {counts.dtype.name}, but the camera delivers "
+            f"{camera.dtype}; take the reference with this camera, or correct camera.dtype"
         )
     if counts.shape != camera.shape:
         found = " x ".join(map(str, reversed(counts.shape))) or "a single number"
         rows, columns = camera.shape
         raise InputError(
-            f"{where}: {path} is {found}, and the camera's pictures {columns} x {rows} (columns x rows); "
-            "take the reference with this camera, or correct camera.size"
+            f"{where}: {path} is {found}, but the camera's pictures are {columns} x {rows} "
+            "(columns x rows); take the reference with this camera, or correct camera.size"
         )

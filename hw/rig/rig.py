@@ -1,4 +1,4 @@
-"""A stage and a camera as one: whatever goes wrong with either, the stage stops."""
+"""A stage and a camera as one unit: a fault of either stops the stage."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from mirrorskin.io import InputError
 from mirrorskin.io.own_class import load_class
 from mirrorskin.io.types import Closing
 
-_TICK = 0.02  # seconds from one look of the guard to the next
-_PAUSE = 0.5  # seconds that the guard may be late: frames that come meanwhile have no time
-_STALL_PERIODS = 3  # without a frame, that a move bears at least
-_UNTIMED = 3  # times as long a silence is borne where it does not matter when frames came
-_SLICE = 0.05  # seconds that the reader waits before it looks whether all is well
-_PATIENCE = 5.0  # seconds that a camera may take for its first frame
+_TICK = 0.02  # interval of the guard's checks, seconds
+_PAUSE = 0.5  # delay of the guard after which the times of frames are unknown, seconds
+_STALL_PERIODS = 3  # minimum tolerance without a frame during a move, in periods
+_UNTIMED = 3  # factor of the tolerance if the times of frames do not matter
+_SLICE = 0.05  # interval at which a waiting reader checks for faults, seconds
+_PATIENCE = 5.0  # seconds until the first frame
 _JOIN = 5.0
 
 
 class Move:
-    """A move of the stage that is under way, begun at a time; a thread waits for its end.
+    """A move of the stage in progress; a thread waits for its end.
 
-    Of one that is `timed`, frames' arrivals tell where the body was.
+    In a `timed` move the positions of frames follow from their arrival times.
     """
 
     timed: bool
@@ -41,30 +41,30 @@ class Move:
 
     def __init__(self, stage: Stage, clock: Clock, began: float, timed: bool, reconnects: int) -> None:
         self._stage, self._clock, self.timed, self.reconnects = stage, clock, timed, reconnects
-        self.began, self.ended = began, math.inf  # when it was known to rest, seconds of time.monotonic
-        self.error: Exception | None = None  # why it did not come to its end
-        self.rest: Report | None = None  # where it came to rest
+        self.began, self.ended = began, math.inf  # time at which rest was reported, seconds of time.monotonic
+        self.error: Exception | None = None  # reason why it did not finish
+        self.rest: Report | None = None  # report of rest at the end
         self._over = clock.event()
         self._thread = clock.thread(self._wait, f"{stage.name}: waits")
         self._thread.start()
 
     @property
     def over(self) -> bool:
-        """Whether it has ended, well or not."""
+        """Whether it has ended, successfully or not."""
         return self._over.is_set()
 
     def join(self, timeout: float) -> bool:
-        """Wait for its end, at most so many seconds, and return whether it came."""
+        """Wait for its end, at most for a timeout, and return whether it has ended."""
         return self._over.wait(timeout)
 
     def close(self) -> None:
-        """Wait for the thread, of a stage that was stopped or rests."""
+        """Wait for the thread, after the stage was stopped or came to rest."""
         self._thread.join(_JOIN)
 
     def _wait(self) -> None:
         try:
             self.rest = self._stage.wait()
-        except Exception as error:  # handed to whoever reads; see Rig.check
+        except Exception as error:  # passed to the reader; see Rig.check
             self._stage.stop()
             self.error = error
         self.ended = self._clock.now()
@@ -72,15 +72,14 @@ class Move:
 
 
 class Rig(Closing):
-    """Stage and camera, guarded. A context manager: leaving it, for whatever reason, stops the stage first.
+    """A guarded stage and camera. A context manager: leaving it for any reason first stops the stage.
 
-    While a move is under way a thread looks fifty times a second whether frames still arrive and whether
-    stage and camera are well. If not, it stops the stage, also while everyone else is busy, and whoever asks
-    the rig for anything gets the reason. Frames are missed after ``camera.stall`` or three periods, whichever
-    is longer, and three times that in steps and on the way to the start, where arrival times do not
-    matter; a computer that is too busy to look that often gives the camera more time. If it does not look
-    for 0.5 s in a timed move, when frames came is not known, and the move ends. Only moves that the rig
-    begins are guarded.
+    During a move a thread checks fifty times per second whether frames arrive and whether stage and camera
+    report faults. On a fault it stops the stage, even if all other threads are busy, and all later calls of
+    the rig raise the reason. The timeout for frames is ``camera.stall`` or three periods, whichever is
+    longer, and three times that in steps and during the approach, where arrival times do not matter. If the
+    computer is too busy for these checks, the timeout is extended. If the guard does not run for 0.5 s in a
+    timed move, the times of frames are unknown, and the move ends. Only moves started by the rig are guarded.
 
     Examples
     --------
@@ -97,34 +96,34 @@ class Rig(Closing):
         self.name: str = settings.name
         self._move: Move | None = None
         self._fault: HardwareError | None = None
-        self.trigger: Trigger | None = None  # what takes frames one by one, if the rig file says so
+        self.trigger: Trigger | None = None  # takes frames one by one, if the rig file has a trigger
         if settings.camera.trigger is not None:
             self.trigger = Trigger(stage, camera, settings.camera, self.check, clock)
-        self._looked = -math.inf  # when the guard last did
+        self._looked = -math.inf  # time of the guard's last check
         self._closing = clock.event()
         self._guard = clock.thread(self._watch, f"{self.name}: guard")
         self._guard.start()
 
     @property
     def rate(self) -> float:
-        """Frames a second: as measured, or as the rig file says."""
+        """Frames per second: measured, or from the rig file."""
         measured = self.camera.counts.rate
         said = self.settings.camera.rate
         return measured if math.isfinite(measured) and measured > 0 else said or math.nan
 
     @property
     def period(self) -> float:
-        """Seconds from frame to frame; 0 as long as nobody knows."""
+        """Frame period, seconds; 0 if unknown."""
         rate = self.rate
         return 1 / rate if math.isfinite(rate) else 0.0
 
     @property
     def moving(self) -> bool:
-        """Whether a move is under way."""
+        """Whether a move is in progress."""
         return self._move is not None and not self._move.over
 
     def check(self) -> None:
-        """Raise what went wrong with stage or camera, if anything did; the stage was stopped then."""
+        """Raise the fault of stage or camera, if any; the stage has then been stopped."""
         move = self._move
         if self._fault is None and move is not None and move.error is not None:
             if not isinstance(move.error, HardwareError):
@@ -134,24 +133,24 @@ class Rig(Closing):
             raise self._fault
 
     def begin(self, move: Callable[[], None], timed: bool = False) -> Move:
-        """Tell the stage to move by calling `move`, and return while it does; see `Move`."""
+        """Call `move`, which starts a motion of the stage, and return it in progress; see `Move`."""
         self.check()
         if self.trigger is None and self.camera.latest == -math.inf:
-            self.take(1)  # a camera that is still starting is not missed later
+            self.take(1)  # a camera that is still starting must not count as lost
         began, reconnects = self.clock.now(), self.camera.counts.reconnects
         move()
         self._move = Move(self.stage, self.clock, began, timed, reconnects)
         return self._move
 
     def end(self, move: Move) -> Report:
-        """Wait until a move is over, and return where the body rests; HardwareError if the rig failed."""
+        """Wait until a move is over, and return the report of rest; HardwareError if the rig failed."""
         while not move.join(_SLICE):
             self.check()
         while move.timed and self._looked < move.ended and self._guard.is_alive():
             self.clock.sleep(_TICK)
         self.check()
         if move.rest is None:
-            raise HardwareError(f"{self.stage.name} did not say where it came to rest: look at its cable")
+            raise HardwareError(f"{self.stage.name} did not report its final position: check its cable")
         return move.rest
 
     def go(self, place: Position, speed: float | None = None) -> Report:
@@ -159,9 +158,9 @@ class Rig(Closing):
         return self.end(self.begin(lambda: self.stage.move(place, speed)))
 
     def take(self, most: int) -> Frames:
-        """Take the frames that wait, or wait for one, as ``Camera.take``; HardwareError if the rig failed.
+        """Take waiting frames, or wait for one, as ``Camera.take``; HardwareError if the rig failed.
 
-        Of a rig with a trigger, one frame is triggered.
+        With a trigger, one frame is triggered.
         """
         if self.trigger is not None:
             return self.trigger.expose()
@@ -176,7 +175,7 @@ class Rig(Closing):
                     raise
 
     def close(self) -> None:
-        """Stop the stage if it moves, and let go of everything."""
+        """Stop the stage if it moves, and close everything."""
         self._leave(self.moving)
 
     def __exit__(
@@ -185,7 +184,7 @@ class Rig(Closing):
         self._leave(kind is not None or self.moving)
 
     def _leave(self, stop: bool) -> None:
-        with ExitStack() as leaving:  # the last is done first, and all of it whatever fails
+        with ExitStack() as leaving:  # in reverse order, and completely even if something fails
             leaving.callback(self.camera.close)
             leaving.callback(self.stage.close)
             leaving.callback(self._end_threads)
@@ -199,10 +198,10 @@ class Rig(Closing):
             self._move.close()
 
     def _watch(self) -> None:
-        """Guard: stop the stage when something is wrong while it moves."""
+        """Guard: stop the stage on a fault during a move."""
         looked, seen, silence, last = self._move, -math.inf, 0.0, self.clock.now()
         while not self._closing.wait(_TICK):
-            # A guard that woke late means a busy machine, on which the camera's thread may be late as well.
+            # If the guard is late, the computer is busy, and the camera's thread may be late as well.
             passed, last = self.clock.now() - last, self.clock.now()
             move, latest = self._move, self.camera.latest
             paused = passed > _PAUSE and move is not None and move.timed and move.ended > last - passed
@@ -215,48 +214,49 @@ class Rig(Closing):
                 silence += _TICK if passed < 2 * _TICK else _TICK / 2
             fault = _paused(passed) if paused else self._fault_after(move, silence)
             if fault is not None:
-                self._fault = self._fault or fault  # first, or the stop would pass for the cause
+                # before the stop, which would otherwise be reported as the cause
+                self._fault = self._fault or fault
                 self.stage.stop()
                 return
             self._looked = last
 
     def _fault_after(self, move: Move, silence: float) -> HardwareError | None:
-        """Return what is wrong with a move after so many seconds without a frame."""
+        """Return the fault of a move after some seconds without a frame."""
         wrong = self.stage.error or self.camera.error
         if wrong is not None:
             return wrong
         if move.timed and self.camera.counts.reconnects > move.reconnects:
             return HardwareError(
-                f"{self.camera.name} was lost while the stage moved, which was stopped; it is back, and its"
-                " frames may be later than before: begin anew"
+                f"{self.camera.name} was lost while the stage moved, so it was stopped; the "
+                "camera is back, but the delay of its frames may have changed: start again"
             )
         bound = longest_wait(self.settings.camera, self.period) * (1 if move.timed else _UNTIMED)
         if self.trigger is not None or silence < bound:
             return None
         return HardwareError(
-            f"{self.camera.name} gave no frame for {silence:.2f} s while the stage moved, which was stopped:"
-            " look at its cable and its load"
+            f"{self.camera.name} delivered no frame for {silence:.2f} s while the stage moved, so "
+            "it was stopped: check its cable and the load of the computer"
         )
 
 
 def longest_wait(settings: CameraSettings, period: float) -> float:
-    """Return the seconds without a frame that a move bears, of a camera with a frame each period."""
+    """Return the maximum time without a frame during a move, seconds, from the frame period."""
     return max(settings.stall, _STALL_PERIODS * period)
 
 
 def _paused(seconds: float) -> HardwareError:
     return HardwareError(
-        f"this program stood still for {seconds:.2f} s while the stage moved, which was stopped: when frames"
-        " came is not known; let nothing pause it, and run less beside it"
+        f"this program was paused for {seconds:.2f} s while the stage moved, so it was stopped: "
+        "the times of the frames are unknown; avoid pauses, and end other programs"
     )
 
 
 def open_stage(settings: StageSettings, unlock: bool = False, clock: Clock = SYSTEM) -> Stage:
-    """Open the stage that a rig file describes, of whatever firmware.
+    """Open the stage that a rig file describes.
 
-    With `unlock`, a GRBL controller's alarm, hold or open door is ended; InputError for others, which have
-    none, and if there is no such class or stage, or it is not what the file says. A stage of
-    the user's own class has a clock of its own.
+    With `unlock`, a GRBL controller's alarm, hold or open door is ended. InputError for other controllers,
+    which have none; if the class or the stage does not exist; or if the stage does not match the file. A
+    stage class of the user has its own clock.
     """
     firmware = settings.firmware
     if firmware == "grbl":
@@ -264,7 +264,9 @@ def open_stage(settings: StageSettings, unlock: bool = False, clock: Clock = SYS
 
         return GrblStage(settings, unlock=unlock, clock=clock)
     if unlock:
-        raise InputError(f"stage {settings.port}: only GRBL is unlocked; switch this one off and on")
+        raise InputError(
+            f"stage {settings.port}: only GRBL can be unlocked; switch this controller off and on"
+        )
     if firmware == "marlin":
         from mirrorskin.hw.marlin.stage import MarlinStage
 
@@ -273,31 +275,31 @@ def open_stage(settings: StageSettings, unlock: bool = False, clock: Clock = SYS
 
 
 def _open_own(settings: StageSettings) -> Stage:
-    """Open a stage of the user's own class."""
+    """Open a stage with a class of the user."""
     name = settings.firmware
     made = load_class(name)
     try:
         inspect.signature(made).bind(settings)
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"{name}(settings) cannot be made: {error}; a stage's class takes one argument, the StageSettings"
+            f"{name}(settings) failed: {error}; a stage class takes one argument, the StageSettings"
         ) from error
     try:
         stage = made(settings)
-    except OSError as error:  # a SerialException is one
-        raise InputError(f"{name}: cannot be opened: {error}; look at stage.port") from error
+    except OSError as error:  # includes SerialException
+        raise InputError(f"{name}: cannot be opened: {error}; check stage.port") from error
     lacking = [one for one in vars(Stage) if one[0] != "_" and not hasattr(stage, one)]
     if lacking:
         if hasattr(stage, "close"):
             stage.close()
         raise InputError(
-            f"{name} has no {', no '.join(lacking)}: mirrorskin.hw.stage.Stage lists what a stage has"
+            f"{name} has no {', no '.join(lacking)}: mirrorskin.hw.stage.Stage lists the methods of a stage"
         )
     return cast("Stage", stage)
 
 
 def open_camera(settings: CameraSettings, clock: Clock = SYSTEM) -> Camera:
-    """Open the camera that a rig file describes; InputError if it is not there, or not what the file says."""
+    """Open the camera that a rig file describes; InputError if it is missing or does not match."""
     if settings.genicam:
         from mirrorskin.hw.genicam import GenicamCamera
 
@@ -317,11 +319,11 @@ def open_rig(
 ) -> Rig:
     """Open the stage and the camera that a rig file describes, and wait for the first frame.
 
-    With a trigger in the rig file there is none yet: `steps` promises that only a ``StepScan`` follows.
+    With a trigger there is no first frame; `steps` states that only a ``StepScan`` will follow.
 
-    A stage that the file says to have switches is homed, since a controller does not tell whether it was,
-    or was only unlocked. InputError if one of them is missing, busy, or not what the file says; HardwareError
-    if no frame came.
+    A stage with switches is homed, because a controller does not report whether it was homed or only
+    unlocked. InputError if a device is missing, in use, or does not match the file; HardwareError if no frame
+    arrives.
     """
     if settings.camera.trigger is not None and not steps:
         raise untriggered(settings)
@@ -340,8 +342,8 @@ def open_rig(
 
 
 def untriggered(settings: RigSettings) -> InputError:
-    """Return the refusal of what needs frames all the time."""
+    """Return the error of operations that need continuous frames."""
     return InputError(
-        f"{settings.path}: camera.trigger takes frames of a capture in steps, and of nothing else: give"
-        " --step or --phase-step, or leave it out"
+        f"{settings.path}: camera.trigger works only for captures in steps: give --step or "
+        "--phase-step, or remove it from the rig file"
     )

@@ -1,4 +1,4 @@
-"""What all scans of a rig have in common: they check, lift, take references, and leave no stage moving."""
+"""Base class of scans: checks, approach, references and retreat."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from mirrorskin.io.types import Block, Closing, Floats, Header, InputError
 
 _DARK_FRAMES = 16
 
-_UNKNOWN_DELAY = 0.2  # seconds that frames are taken to be late at most, where it is not known
+_UNKNOWN_DELAY = 0.2  # assumed maximum delay of frames, seconds, if it is unknown
 
 
 class Scan(Closing):
-    """A `mirrorskin.io.types.LiveSource`: the stage moves as planned, the camera watches.
+    """A `mirrorskin.io.types.LiveSource`: the stage moves according to a plan while the camera records.
 
-    When the header is asked for, or the scan is entered, it lifts the body clear, takes the references and
-    goes to where the scan begins. Left without an error, it lifts the body again; left in the middle of a
-    move, or by an error, it stops the stage. Whoever opened the rig closes it.
+    Reading the header or entering the scan lifts the body, takes the references, and moves to the start of
+    the scan. Leaving it without an error lifts the body again; leaving it during a move or by an error stops
+    the stage. The rig must be closed by its owner.
     """
 
     rig: Rig
@@ -45,7 +45,7 @@ class Scan(Closing):
         self.rig, self.plan = rig, plan
         self.name, self.motion = rig.name, plan.motion
         self.dtype: np.dtype[Any] = rig.camera.dtype
-        self.count = self.dropped = 0  # frames given so far, and lost between them
+        self.count = self.dropped = 0  # frames returned so far, and lost between them
         self._origin: float | None = None
         self._complete = False
         self._live: list[Floats] = []
@@ -53,27 +53,27 @@ class Scan(Closing):
 
     @property
     def expected(self) -> int:
-        """Frames that the scan is expected to give."""
+        """Expected number of frames."""
         raise NotImplementedError
 
     @property
     def rate(self) -> float:
-        """Frames a second that the camera gave."""
+        """Measured frames per second of the camera."""
         return self.rig.camera.counts.rate
 
     @property
     def remark(self) -> str:
-        """What else there is to say of the scan, to be put behind a list; often nothing."""
+        """Additional information for a summary line; often empty."""
         return ""
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Frames expected, rows and columns."""
+        """Expected frames, rows and columns."""
         return (self.expected, *self.rig.camera.shape)
 
     @functools.cached_property
     def header(self) -> Header:
-        """What holds for all frames; it is made ready for the scan when it is asked for."""
+        """Metadata of all frames; the first access prepares the scan."""
         header = self._known()
         settings = self.rig.settings
         dark = read_reference(settings.camera, "dark", settings.path)
@@ -86,7 +86,7 @@ class Scan(Closing):
         return replace(header, dark=dark, bright=bright)
 
     def now(self) -> float:
-        """Return the seconds since the first frame was asked for, the scale of ``Block.time``."""
+        """Return the seconds since the first frame was requested, the scale of ``Block.time``."""
         return 0.0 if self._origin is None else self.rig.clock.now() - self._origin
 
     def positions(self) -> Mapping[str, Floats]:
@@ -94,11 +94,11 @@ class Scan(Closing):
         return {self.plan.series: np.concatenate([self.plan.recorded(np.empty(0)), *self._live])}
 
     def rewind(self) -> None:
-        """Refuse: time does not run back."""
+        """Raise: a live source cannot be rewound."""
         raise RuntimeError("a live source cannot be rewound")
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
-        """Return the next frames, at most ``len(out)``, as lent memory; None when the plan is done."""
+        """Return the next frames, at most ``len(out)``, as shared memory; None at the end of the plan."""
         if self._complete:
             return None
         if self._origin is None:
@@ -114,12 +114,12 @@ class Scan(Closing):
         return block
 
     def lift(self) -> Report:
-        """Bring the body upright, lift it straight up to the end of its travel, and go to the middle."""
+        """Set the body upright, lift it straight up to the end of its travel, and move it to the centre."""
         stage = self.rig.stage
         return self._visit(*stage.limits.way_up(stage.report().position))
 
     def close(self) -> None:
-        """Lift the body; stop the stage, if it is under way."""
+        """Lift the body; stop the stage if it is moving."""
         if self.rig.moving:
             self.rig.stage.stop()
         elif "header" in self.__dict__:  # otherwise it has not moved yet
@@ -138,11 +138,11 @@ class Scan(Closing):
             self.rig.stage.stop()
 
     def _visit(self, *places: Position) -> Report:
-        """Go to some places, to each once, and return where the body rests at last."""
+        """Move to some positions in sequence, and return the final report of rest."""
         return [self.rig.go(place) for place in dict.fromkeys(places)][-1]
 
     def _next(self, most: int, origin: float) -> Block | None:
-        """Return the next frames, of which the first may have to be waited for."""
+        """Return the next frames, after waiting for the first if necessary."""
         raise NotImplementedError
 
     def _block(
@@ -154,7 +154,7 @@ class Scan(Closing):
         return Block(frames, self.count, arrival - origin, dropped=dropped, lent=lent, **known)
 
     def _prepare(self) -> None:
-        """Go to where the scan begins, and wait there; the body leans only when it is pressed."""
+        """Move to the start of the scan, and wait there; the body leans only when it is pressed."""
         first = self.plan.first
         rests = self._visit(Position(first.travel), first).time
         if isinstance(self.plan, HorizontalPlan | TwistPlan):
@@ -166,7 +166,7 @@ class Scan(Closing):
         self.rig.clock.sleep(max(0.0, due - self.rig.clock.now()))
 
     def _known(self) -> Header:
-        """Return what is known before anything moves."""
+        """Return the metadata that are available before anything moves."""
         stage, camera = self.rig.settings.stage, self.rig.settings.camera
         header = Header(
             self.motion,
@@ -192,15 +192,15 @@ def _scalar(value: float | None) -> Floats | None:
     return None if value is None else np.asarray(value, np.float64)
 
 
-_OFF_TARGET = (0.02, 2e-3)  # how far from where it was sent the body may rest, mm and rad
+_OFF_TARGET = (0.02, 2e-3)  # tolerance of the position at rest, mm and rad
 
 
 class StepScan(Scan):
-    """Stands still for each of its frames; see ``Scan``.
+    """A scan that is at rest for each frame; see ``Scan``.
 
-    Frames count whose exposure began after the body had settled: they arrive later by the camera's delay,
-    0.2 s where the rig file does not say and at least that of a stream, and half an exposure. With a trigger
-    in the rig file each frame is exposed when that goes on, once the body has settled.
+    A frame is used if its exposure started after the body had settled. It arrives later by the camera's delay
+    (0.2 s unless in the rig file, for a stream at least 0.2 s) and half an exposure. With a trigger in the
+    rig file, each frame is triggered once the body has settled.
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ class StepScan(Scan):
     settle : float
         Seconds from rest to the first exposure.
     frames : int
-        At each place, 1 or more.
+        Frames at each position, 1 or more.
 
     Examples
     --------
@@ -225,9 +225,9 @@ class StepScan(Scan):
 
     def __init__(self, rig: Rig, plan: Plan, settle: float = 0.1, frames: int = 1) -> None:
         if not 0 <= settle < np.inf:
-            raise InputError(f"a settling time of {settle} s cannot be: give 0 or more")
+            raise InputError(f"a settling time of {settle} s is not possible: give 0 or more")
         if frames < 1:
-            raise InputError(f"{frames} frames a step cannot be: give 1 or more")
+            raise InputError(f"{frames} frames per step are not possible: give 1 or more")
         super().__init__(rig, plan)
         self.settle, self.frames = settle, frames
         self._values, self._places = plan.values, plan.places
@@ -237,7 +237,7 @@ class StepScan(Scan):
 
     @property
     def expected(self) -> int:
-        """Frames that the scan will give."""
+        """Number of frames."""
         return len(self._values) * self.frames
 
     def _next(self, most: int, origin: float) -> Block | None:
@@ -253,7 +253,7 @@ class StepScan(Scan):
         return self._block(frames, arrival, place, dropped, origin)
 
     def _go_on(self) -> None:
-        """Move to the next place, and find from when on frames show the body settled there."""
+        """Move to the next position, and compute the time after which frames show the settled body."""
         self._step += 1
         place = self._places[self._step]
         rest = self.rig.go(place)
@@ -272,7 +272,7 @@ class StepScan(Scan):
         self.rig.camera.flush()
 
     def _take(self, most: int) -> tuple[NDArray[Any], Floats, int]:
-        """Take frames that are new enough; what was lost before the first of a place does not matter."""
+        """Take frames that are new enough; losses before the first frame of a position are ignored."""
         while True:
             taken = self.rig.take(most)
             new = int(np.searchsorted(taken.time, self._since, side="right"))
@@ -282,20 +282,20 @@ class StepScan(Scan):
 
 
 def _check_there(rest: Report, place: Position, name: str) -> None:
-    """Refuse a stage that rests elsewhere than it was sent."""
+    """Refuse a stage that does not rest at its target."""
     off, turned = (
         max(abs(getattr(rest.position, motion) - getattr(place, motion)) for motion in motions)
         for motions in (("travel", "x", "y"), ("pitch", "roll", "twist"))
     )
     if off > _OFF_TARGET[0] or turned > _OFF_TARGET[1]:
         raise HardwareError(
-            f"{name} rests {off:.3f} mm and {math.degrees(turned):.3f} degrees from where it was sent:"
-            " look at its steps per mm and for what holds it"
+            f"{name} rests {off:.3f} mm and {math.degrees(turned):.3f} degrees from its target: "
+            "check its steps per mm, and whether something blocks it"
         )
 
 
 def take_dark(rig: Rig, since: float, count: int = _DARK_FRAMES) -> NDArray[np.float32]:
-    """Return the mean of some frames that arrived after a time, (H, W): the sheet must touch nothing."""
+    """Return the mean of some frames that arrived after a time, (H, W); there must be no contact."""
     total = np.zeros(rig.camera.shape)
     left = count
     if rig.trigger is not None:

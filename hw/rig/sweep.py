@@ -1,4 +1,4 @@
-"""A scan without a halt: the body moves on while frames come, and where it was follows from reports."""
+"""A continuous scan: positions of frames are computed from the stage's reports."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from mirrorskin.hw.rig.scan import Scan
 from mirrorskin.hw.rig.track import LiveTrack, Progress, Track, even_times
 from mirrorskin.io.types import Block, Floats
 
-_SLOWER = 1.01  # than planned a turn may be, and still not have too many frames
-_MARGIN = 0.3  # seconds of frames besides those of the move
+_SLOWER = 1.01  # factor by which a turn may be slower than planned without having too many frames
+_MARGIN = 0.3  # seconds of frames before and after the move
 
 
 class SweepScan(Scan):
-    """Records while the body moves on; see ``Scan``.
+    """Records in continuous motion; see ``Scan``.
 
-    The live position of a frame is that of the planned way, locked to the latest reports, at the frame's
-    arrival less the camera's delay. Afterwards ``positions`` has it better: from all reports, and from
-    the even times at which a camera exposes. A delay that the rig file does not give, and that of a stream,
-    is measured first, by a short move there and back.
+    The live position of a frame is the planned trajectory, synchronised to the latest reports, at the frame's
+    arrival minus the camera's delay. Afterwards ``positions`` returns more accurate ones, computed from all
+    reports and from the constant frame rate of a camera. A delay that the rig file does not give, and that of
+    a stream, is measured first by a short move back and forth.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class SweepScan(Scan):
     plan : Plan
         With a speed or a rate.
     turn_frames : int, optional
-        Frames that a turn has at most: only every second, third, ... frame is given, as it takes.
+        Maximum number of frames per turn: if necessary, only every second, third, ... frame is returned.
 
     Examples
     --------
@@ -60,14 +60,14 @@ class SweepScan(Scan):
 
     @property
     def expected(self) -> int:
-        """Frames that the scan is expected to give."""
+        """Expected number of frames."""
         rate = self.rig.rate
         all_frames = (self._path.duration + _MARGIN) * rate
         return math.ceil(all_frames / self.every) if math.isfinite(rate) else 1
 
     @property
     def every(self) -> int:
-        """How many of the camera's frames one is given of."""
+        """One of this many frames of the camera is returned."""
         plan, rate = self.plan, self.rig.rate
         if self._turn_frames is None or not isinstance(plan, AxialPlan) or not math.isfinite(rate):
             return 1
@@ -76,28 +76,28 @@ class SweepScan(Scan):
 
     @property
     def rate(self) -> float:
-        """Frames a second that the camera gave, from the first to the last of the scan."""
+        """Measured frames per second of the camera during the scan."""
         number, time = (np.concatenate(one) for one in zip(*self._frames, strict=True))
         return float(np.ptp(number) / np.ptp(time)) if len(time) > 1 else super().rate
 
     @property
     def remark(self) -> str:
-        """How late the camera was."""
+        """The camera's delay."""
         late = f"; frames {1e3 * self.delay.seconds:.1f} ms after their exposure"
-        measured = f" (+- {1e3 * self.delay.error:.1f} ms, measured)" if self.delay.error else ""
+        measured = f" (± {1e3 * self.delay.error:.1f} ms, measured)" if self.delay.error else ""
         thinned = f"; 1 of {self._every} frames kept" if self._every > 1 else ""
         return late + measured + thinned
 
     @functools.cached_property
     def delay(self) -> Delay:
-        """How late the camera's frames come: as the rig file says, or measured when it is asked for."""
+        """The camera's delay, from the rig file or measured on first access."""
         camera = self.rig.settings.camera
         if camera.delay is None or camera.streamed:
             return measure_delay(self.rig, self.plan)
         return Delay(camera.delay, 0.0)
 
     def positions(self) -> Mapping[str, Floats]:
-        """Return where the body was in the frames, from all reports once it has come to the end."""
+        """Return the positions of all frames, computed from all reports once the motion has ended."""
         if not self._complete:
             return super().positions()
         number, arrival = (np.concatenate(one) for one in zip(*self._frames, strict=True))
@@ -116,7 +116,7 @@ class SweepScan(Scan):
             if not isinstance(self.plan, AxialPlan):
                 return self._give(taken, rest, np.zeros(rest.stop - rest.start), origin)
         move = self._move
-        assert move is not None  # _begin has begun it
+        assert move is not None  # set by _begin
         while True:
             taken = self.rig.take(most)
             self._add_reports()
@@ -131,15 +131,15 @@ class SweepScan(Scan):
                 return None
 
     def _give(self, taken: Frames, part: slice, way: Floats, origin: float) -> Block:
-        """Make a block of a part of the frames, and remember when they came."""
+        """Return a block with a part of the frames, and record their times."""
         time = taken.time[part]
         self._frames.append((taken.number[part], time))
         return self._block(taken.pixels[part], time, self.plan.recorded(way), taken.dropped, origin)
 
     def _begin(self, most: int) -> tuple[Frames, slice]:
-        """Wait until frames show the body at rest, and begin to move; return these frames."""
+        """Wait until frames show the body at rest, and start the motion; return these frames."""
         plan, stage = self.plan, self.rig.stage
-        self._every = self.every  # of the rate as it is now
+        self._every = self.every  # at the current rate
         self.rig.camera.flush()
         rests = stage.report().time + self.delay.seconds
         while (taken := self.rig.take(most)).time[-1] <= rests:
@@ -150,17 +150,17 @@ class SweepScan(Scan):
         return taken, slice(int(np.searchsorted(taken.time, rests, side="right")), len(taken.time))
 
     def _add_reports(self) -> None:
-        """Take in the reports that came since."""
+        """Add the reports received since the last call."""
         for report in self.rig.stage.history(self._reports[-1][0]):
             way = self._progress(report)
             self._reports.append((report.time, way))
             self._live_track.add(report.time, way)
 
     def _part(self, move: Move, exposed: Floats, way: Floats) -> slice:
-        """Return which of some frames belong to the scan.
+        """Return which frames belong to the scan.
 
-        A straight way has frames at rest on either side. A rotation has none: they would count one phase too
-        often.
+        A straight scan includes frames at rest before and after the motion. A rotation does not: one phase
+        would be weighted too much.
         """
         end = int(np.searchsorted(exposed, move.ended, side="right"))
         if not isinstance(self.plan, AxialPlan):
@@ -169,7 +169,7 @@ class SweepScan(Scan):
         return slice(min(end, int(np.searchsorted(exposed, move.began))), end)
 
     def _thinned(self, taken: Frames, part: slice) -> slice:
-        """Leave out of a part of some frames what is not to be given."""
+        """Return the part without the frames to be skipped."""
         if part.start >= part.stop:
             return part
         skipped = -int(taken.number[part.start]) % self._every

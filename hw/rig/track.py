@@ -1,4 +1,4 @@
-"""Where the body was: from a stage's reports, which are few, late and uneven, to any time."""
+"""The position of the body at any time, from reports, which are few, late and uneven."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from mirrorskin.io.types import Floats
 from mirrorskin.kernels import least_squares
 from mirrorskin.kernels.least_squares import mad_sigma
 
-_RECENT = 8  # of the latest reports, that show how far the way has come
-_SLOPES = (0.2, 2.0)  # of a planned second, that may pass in one
-_AT_REST = 1e-3  # of the way's length, that the body may seem to have moved
-_RAMPS = (0.004, 2.0)  # seconds in which a stage reaches its speed
-_REPORTS_MIN = 4  # reports under way, to find more than when the move began
-_SYSTEMATIC = 1.5  # by which the plan's deviations exceed chance
-_SMOOTH = 5  # reports on either side
-_LOST_FRAME_GAP = 0.6  # periods more than one, between two frames, among which one may have been lost
-_NEAR = 9  # frames on either side of a gap
+_RECENT = 8  # number of latest reports that determine the current position
+_SLOPES = (0.2, 2.0)  # range of the ratio of planned to elapsed time
+_AT_REST = 1e-3  # tolerance for rest, as a share of the trajectory's length
+_RAMPS = (0.004, 2.0)  # range of the acceleration time of a stage, seconds
+_REPORTS_MIN = 4  # minimum number of reports in motion to estimate more than the start time
+_SYSTEMATIC = 1.5  # excess of the deviations over chance, as a ratio, above which they are systematic
+_SMOOTH = 5  # reports on each side
+_LOST_FRAME_GAP = 0.6  # periods in excess of one that may indicate a lost frame
+_NEAR = 9  # frames on each side of a gap
 
 
 class Progress:
-    """Returns how far along the way of a plan without halts each report is: mm, or radians without jumps."""
+    """Converts reports of a continuous plan to travelled distance: mm, or radians without jumps."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
         self._last: tuple[float, float] | None = None
 
     def __call__(self, report: Report) -> float:
-        """Return the way so far; reports come in the order of their times."""
+        """Return the distance; reports must be in the order of their times."""
         expected = 0.0
-        if self._last is not None:  # as planned, but half as far: the body may have rested meanwhile
+        if self._last is not None:  # as planned, but half as far: the body may have been at rest meanwhile
             before, way = self._last
             speed = self._plan.path.speed
             expected = way + min(speed * (report.time - before) / 2, self._plan.period / 2)
@@ -45,10 +45,10 @@ class Progress:
 
 
 class LiveTrack:
-    """Where the body is, as far as it is known while it moves: the planned way, locked to the latest reports.
+    """The live position: the planned trajectory, synchronised to the latest reports.
 
-    The reports of the last moments show by a straight line which of the plan's seconds it is at, and how
-    fast these pass; the plan gives the place. It never runs back. The move was commanded at `began`.
+    A straight line through the recent reports gives the current time on the plan and its rate; the plan gives
+    the position. It never moves backwards. The move was commanded at `began`.
     """
 
     def __init__(self, path: Trapezoid, began: float) -> None:
@@ -59,7 +59,7 @@ class LiveTrack:
         self._done = math.inf
 
     def add(self, time: float, way: float) -> None:
-        """Take a report: how far the body had come at a time, seconds."""
+        """Add a report: the distance travelled at a time, seconds."""
         rest = _AT_REST * self._path.length
         if way <= rest:
             self._line = max(time, self._line[0]), 0.0, 1.0
@@ -70,7 +70,7 @@ class LiveTrack:
             self._line = self._fit_line()
 
     def at(self, times: ArrayLike) -> Floats:
-        """Return the way so far at some times that increase, of the shape of `times`."""
+        """Return the distance at increasing times, in the shape of `times`."""
         t = np.asarray(times, np.float64)
         origin, start, slope = self._line
         way = self._path.place(start + slope * (t - origin))
@@ -80,7 +80,7 @@ class LiveTrack:
         return way
 
     def _fit_line(self) -> tuple[float, float, float]:
-        """Return a time, the plan's second at it, and how many of these pass in one."""
+        """Return a time, the corresponding time on the plan, and the ratio of their rates."""
         time, planned = np.array(self._reports).T
         slope = 1.0
         if len(time) >= 3:
@@ -90,13 +90,13 @@ class LiveTrack:
 
 
 class Track:
-    """Where the body was, once the move is over: fitted to all of the reports.
+    """The final position, fitted to all reports after the move.
 
-    A stage speeds up, keeps its speed and slows down; when, how fast and how quickly comes from all reports
-    together, so that the uneven times of single ones hardly count. Where the reports show that it went
-    otherwise, what they agree on is added. `times`, (n,), seconds, and `ways`, (n,), mm or radians so far,
-    are of the reports; `path` is the planned way. ``began`` and ``path`` are as fitted; ``spread`` is the
-    standard deviation of the reports about the result, mm or radians.
+    Start time, speed and acceleration of a trapezoidal profile are fitted to all reports together, so the
+    jitter of single reports has little influence. Deviations that neighbouring reports agree on are added.
+    `times`, (n,), seconds, and `ways`, (n,), mm or radians, are the reports; `path` is the planned
+    trajectory. ``began`` and ``path`` are the fitted values; ``spread`` is the standard deviation of the
+    reports about the result, mm or radians.
     """
 
     began: float
@@ -113,11 +113,11 @@ class Track:
 
     @property
     def ended(self) -> float:
-        """When the body came to rest, seconds."""
+        """Time at which the body came to rest, seconds."""
         return self.began + self.path.duration
 
     def at(self, times: ArrayLike) -> Floats:
-        """Return how far the body had come at some times that increase; it never runs back."""
+        """Return the distance at increasing times; it never decreases."""
         t = np.asarray(times, np.float64)
         way = self.path.place(t - self.began)
         if self._extra.any():
@@ -126,7 +126,7 @@ class Track:
 
 
 def _fit(time: Floats, way: Floats, path: Trapezoid) -> tuple[float, Trapezoid]:
-    """Find the beginning, the speed and the acceleration that suit all reports best."""
+    """Fit start time, speed and acceleration to all reports."""
     rest = _AT_REST * path.length
     moving = (way > rest) & (way < path.length - rest)
     if not moving.any():
@@ -154,7 +154,7 @@ def _fit(time: Floats, way: Floats, path: Trapezoid) -> tuple[float, Trapezoid]:
 
 
 def _smooth_residual(residual: Floats) -> Floats:
-    """Return what neighbouring reports agree on of what is residual; nothing where it looks like chance."""
+    """Return the smoothed residual where neighbouring reports agree; 0 where it is random."""
     chance = mad_sigma(np.diff(residual)) / math.sqrt(2)
     if len(residual) <= 2 * _SMOOTH or mad_sigma(residual) <= _SYSTEMATIC * chance:
         return np.zeros_like(residual)
@@ -164,14 +164,14 @@ def _smooth_residual(residual: Floats) -> Floats:
 
 
 def even_times(number: ArrayLike, arrival: ArrayLike, window: int = 25) -> Floats:
-    """Take the unevenness out of the times at which a camera's frames arrived.
+    """Return the arrival times of a camera's frames without jitter.
 
-    A camera exposes evenly, whatever happens to its frames on their way. Each time is taken from a straight
-    line through those of the frames around, by their numbers. Frames that were lost but not counted are seen
-    by the whole periods by which all later ones are late.
+    A camera exposes at a constant rate, independent of the transfer of its frames. Each time is taken from a
+    straight line through the times of the surrounding frames, by frame number. Uncounted lost frames are
+    detected because all later frames are late by whole periods.
 
-    Numbers are of the frames, lost ones counted as far as anyone noticed; `window` frames on either side
-    count. The times returned, (n,), seconds, never decrease.
+    Numbers include the lost frames that were detected; `window` frames on each side are used. The result,
+    (n,), seconds, never decreases.
     """
     t = np.asarray(arrival, np.float64)
     if len(t) < 3:
@@ -184,7 +184,7 @@ def even_times(number: ArrayLike, arrival: ArrayLike, window: int = 25) -> Float
         total = np.concatenate([[0.0], np.cumsum(values)])
         return np.asarray((total[end] - total[first]) / (end - first))
 
-    # Counted from the middle, and as deviations from an even clock, so that nothing cancels.
+    # Relative to the middle and to a constant rate, which avoids cancellation.
     n = n - n.mean()
     pace = (t[-1] - t[0]) / (n[-1] - n[0])
     late = t - t[0] - pace * n
@@ -194,8 +194,8 @@ def even_times(number: ArrayLike, arrival: ArrayLike, window: int = 25) -> Float
 
 
 def _with_lost_frames(number: Floats, arrival: Floats) -> Floats:
-    """Count frames that nobody noticed were lost: from a gap on, all frames are whole periods late."""
-    step = min(_NEAR, len(number) // 2)  # jitter hardly counts over some frames
+    """Return numbers that include undetected lost frames: later frames are late by whole periods."""
+    step = min(_NEAR, len(number) // 2)  # averaging over some frames suppresses jitter
     period = float(np.median((arrival[step:] - arrival[:-step]) / (number[step:] - number[:-step])))
     late = arrival - period * (number - number[0])
     counted = number.copy()

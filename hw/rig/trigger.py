@@ -1,4 +1,4 @@
-"""Frames one by one: a line of the stage's controller is switched on for each, for camera or lamp."""
+"""Triggered frames: an output of the controller is switched on for each frame."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from mirrorskin.hw.rig_file import CameraSettings
 from mirrorskin.hw.stage import Stage
 from mirrorskin.io import InputError
 
-_PATIENCE = 2.0  # seconds that a frame may take, besides exposure and delay
+_PATIENCE = 2.0  # seconds that a frame may take, in addition to exposure and delay
 _SLICE = 0.05
 
 
 class Trigger:
-    """Takes exactly one frame each time that a line of the controller is switched on.
+    """Takes exactly one frame each time that an output of the controller is switched on.
 
-    The line is on until the frame has arrived, and off afterwards whatever happens, as long as the controller
-    obeys: a stop of the stage resets the controller, which switches the line off, too.
+    The output is on until the frame has arrived, and is then switched off in any case, as long as the
+    controller obeys; a stop of the stage resets the controller, which also switches it off.
 
     Parameters
     ----------
     stage : Stage
-        At rest; with a method ``switch``, as `GrblStage` has.
+        A stage at rest with a method ``switch``, like `GrblStage`.
     camera : Camera
-        In its triggered mode.
+        A camera in its triggered mode.
     settings : CameraSettings
-        With the line to switch as ``trigger``.
+        Settings with the output as ``trigger``.
     check : callable
-        Raises what went wrong with the rig, if anything did.
+        Raises the fault of the rig, if there is one.
     clock : Clock
     """
 
@@ -40,16 +40,18 @@ class Trigger:
     ) -> None:
         switch = getattr(stage, "switch", None)
         if switch is None:
-            raise InputError(f"{stage.name}: camera.trigger needs a GRBL controller; leave it out")
+            raise InputError(
+                f"{stage.name}: camera.trigger needs a GRBL controller; remove it from the rig file"
+            )
         self._switch, self._line = switch, settings.trigger
         self._camera, self._check, self._clock = camera, check, clock
         self._patience = _PATIENCE + (settings.exposure or 0.0) + (settings.delay or 0.0)
-        self._before: int | None = None  # frames that had come before the first trigger
+        self._before: int | None = None  # frames that arrived before the first trigger
         self._given = 0
-        self.longest: float = 0.0  # seconds from a trigger to its frame, at most
+        self.longest: float = 0.0  # longest time from a trigger to its frame, seconds
 
     def expose(self) -> Frames:
-        """Trigger the camera once, and return the frame; HardwareError if none or another one came."""
+        """Trigger the camera once, and return the frame; HardwareError if there is not exactly one."""
         self.check()
         if self._before is None:
             self._camera.flush()
@@ -59,14 +61,14 @@ class Trigger:
             self._switch(self._line, True)
             frames = self._take()
         finally:
-            with suppress(HardwareError):  # of a stage that was stopped, which switches the line off
+            with suppress(HardwareError):  # raised by a stopped stage, whose output is off anyway
                 self._switch(self._line, False)
         self._given += 1
         self.longest = max(self.longest, self._clock.now() - began)
         return frames
 
     def check(self, wait: bool = False) -> None:
-        """HardwareError if there were more frames than triggers; `wait` for one that is on its way."""
+        """Raise HardwareError if there were more frames than triggers; `wait` for one in transfer."""
         if wait:
             self._clock.sleep(self.longest)
         self._check()
@@ -75,8 +77,9 @@ class Trigger:
         more = self._camera.counts.frames - self._before - self._given
         if more > 0:
             raise HardwareError(
-                f"{self._camera.name} gave {more} frames more than it was triggered for: see that it is in"
-                " its triggered mode, that one edge of the line triggers it, and that this does not bounce"
+                f"{self._camera.name} delivered frames without a trigger ({more}): "
+                "check that it is in its triggered mode, that it triggers on one edge, and that "
+                "the signal does not bounce"
             )
 
     def _take(self) -> Frames:
@@ -90,6 +93,7 @@ class Trigger:
                     raise
                 if self._clock.now() > until:
                     raise HardwareError(
-                        f"{self._camera.name} gave no frame within {self._patience:.3g} s of its trigger: see"
-                        f" the controller's line '{self._line}', its wiring, and the camera's triggered mode"
+                        f"{self._camera.name} delivered no frame within {self._patience:.3g} s of "
+                        f"its trigger: check the controller's output '{self._line}', its wiring, "
+                        "and the camera's triggered mode"
                     ) from None

@@ -1,4 +1,4 @@
-"""What the sensor's body is made of, and what stands round it."""
+"""The sensor's body and the wall around it."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ _SCATTER_MAX = math.radians(20.0)
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """A cylinder of transparent silicone with a mirror sheet at its end, and a lit wall round it (paper 2.2).
+    """A cylinder of transparent silicone with a mirror sheet at its end, inside a lit wall (paper 2.2).
 
-    The wall is a Lambert sheet under a patterned one, lit by two circular lamps behind; it reaches from the
+    The wall is a Lambert sheet behind a patterned one, lit from behind by two ring lamps; it extends from the
     sheet's rest plane to the body's top.
 
     Attributes
@@ -24,22 +24,22 @@ class Body:
     index : float
         Refractive index of the silicone.
     sheet : float
-        Thickness of what lies between the mirror and the object, mm.
+        Thickness of the material between mirror and object, mm.
     modulus : float
-        Young's modulus, N/mm^2; the silicone does not change its volume (Poisson ratio 0.5).
+        Young's modulus, N/mm^2; the silicone is incompressible (Poisson ratio 0.5).
     friction : float
         Coulomb's coefficient between sheet and object.
     scatter : float
-        Largest angle by which the sheet's flakes turn a reflected ray, radians.
+        Largest deviation of a reflected ray by the sheet's flakes, radians.
     air_gap : float
         Between body and wall, mm; 0 is optical contact.
     asymmetry, asymmetry_azimuth : float
-        By how much the lamps light one side more than the other, as a share of the mean, and which, radians.
+        Relative difference of the lamps between the two sides, and azimuth of the brighter side, radians.
 
     Raises
     ------
     InputError
-        A value cannot be.
+        A value is invalid.
     """
 
     diameter: float = 35.0
@@ -61,7 +61,7 @@ class Body:
             "sheet": (0 <= self.sheet < math.inf, "mm, 0 or more"),
             "modulus": (0 < self.modulus < math.inf, "N/mm^2, more than 0"),
             "friction": (0 <= self.friction < math.inf, "a coefficient, 0 or more"),
-            "scatter": (0 <= self.scatter <= _SCATTER_MAX, "radians, 0 to those of 20 degrees"),
+            "scatter": (0 <= self.scatter <= _SCATTER_MAX, "radians, at most 20 degrees"),
             "air_gap": (0 <= self.air_gap < math.inf, "mm, 0 or more"),
             "asymmetry": (0 <= self.asymmetry <= 1, "a share, 0 to 1"),
             "asymmetry_azimuth": (math.isfinite(self.asymmetry_azimuth), "radians"),
@@ -75,8 +75,8 @@ class Body:
 
 
 def check_values(owner: object, what: str, rules: dict[str, tuple[bool, str]]) -> None:
-    """Raise InputError for the first attribute that cannot be; rules tell whether it can, and what can."""
+    """Raise InputError for the first invalid attribute; rules contain whether it is valid, and what is."""
     for name, (holds, remedy) in rules.items():
         if not holds:
             value = getattr(owner, name)
-            raise InputError(f"{name.replace('_', ' ')} {value} of the {what} cannot be: give {remedy}")
+            raise InputError(f"{name.replace('_', ' ')} {value} of the {what} is not possible: give {remedy}")

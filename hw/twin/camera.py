@@ -15,18 +15,18 @@ from mirrorskin.kernels.device import C_TYPES, Device, open_device
 
 _UINT8: np.dtype[Any] = np.dtype(np.uint8)
 _DARK, _BRIGHT = 16.0, 224.0  # counts of 8 bits
-_BITS = {"uint8": (8,), "uint16": (12, 10, 16), "float32": ()}  # the usual one first
-_LEAST_GAIN = 0.05  # of the nominal one; a pixel that sees nothing would be a defect, not a deviation
+_BITS = {"uint8": (8,), "uint16": (12, 10, 16), "float32": ()}  # the default first
+_LEAST_GAIN = 0.05  # relative to the nominal gain; a pixel with less would be a defect
 _NOISE_MAX = 2.0**16
 _ELECTRONS_MIN = 1e-3
 _SPREAD_MAX = 100.0
 _WORD = 2**64
-_MAPS = 0x6D617073  # sets the stream of the pixels' deviations apart from others of the same seed
+_MAPS = 0x6D617073  # separates the random stream of the pixels' deviations from others of the same seed
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """What a camera makes of light; its noise depends on the seed, the frame's number and the pixel alone.
+    """The model of a camera; its noise depends only on the seed, the frame's number and the pixel.
 
     Attributes
     ----------
@@ -43,11 +43,11 @@ class Camera:
         Electrons of one count of light, of this camera's own bits, 0.001 or more: a signal of S counts has
         shot noise of the variance S / electrons. Infinite for none.
     gain_deviation : float
-        Standard deviation of the pixels' gains, as a share; below 1. Gains below 0.05 are made 0.05.
+        Relative standard deviation of the pixels' gains; below 1. Gains are at least 0.05.
     offset_deviation : float
         Standard deviation of the pixels' counts without light.
     frame_rate : float
-        Frames in a second.
+        Frames per second.
     exposure : float
         Seconds during which a frame gathers light, at most a frame's; 0: the body stands still meanwhile.
         The mean of 5 poses stands for the light of a body that moves; of a vertical press in `conform` and
@@ -60,7 +60,7 @@ class Camera:
     Raises
     ------
     InputError
-        A value cannot be.
+        A value is invalid.
     """
 
     dtype: np.dtype[Any] = _UINT8
@@ -90,7 +90,7 @@ class Camera:
         rules = {
             "noise": (0 <= self.noise <= _NOISE_MAX, "its standard deviation in counts, 0 to 65536"),
             "seed": (whole and 0 <= self.seed < _WORD, "a whole number, 0 or more, of 64 bits"),
-            "electrons": (self.electrons >= _ELECTRONS_MIN, "those of a count of light, 0.001 or more"),
+            "electrons": (self.electrons >= _ELECTRONS_MIN, "electrons per count of light, 0.001 or more"),
             "gain_deviation": (
                 0 <= self.gain_deviation < 1,
                 "a share of the gain, 0 or more and less than 1",
@@ -142,7 +142,7 @@ class Sensor:
         self.full: NDArray[Any] = self.offset + span
         self.offset.flags.writeable = self.full.flags.writeable = False
         self._shape, self._pixels = shape, shape[0] * shape[1]
-        self._quarter = -(-self._pixels // 4)  # the generator makes four numbers at a time
+        self._quarter = -(-self._pixels // 4)  # the generator produces four numbers at a time
         room = (4 * self._quarter,)
         self._light = self.device.array("light", room, np.float32)
         self._offset = self.device.array("offset", room, np.float32)
@@ -152,9 +152,9 @@ class Sensor:
             array.write(values.ravel())
 
     def expose(self, light: NDArray[np.float32], frame: int, out: NDArray[Any]) -> None:
-        """Write one frame, by the mean light over its exposure.
+        """Write one frame for the mean light over its exposure.
 
-        The frame's number, a whole number of 64 bits, decides the noise; negative ones can stand for frames
+        The frame's number, a 64-bit integer, determines the noise; negative numbers can be used for frames
         outside the stack.
         """
         self._light.write(self._spread(np.broadcast_to(light, self._shape)).ravel())
@@ -183,7 +183,7 @@ class Sensor:
         out[...] = self._counts.read()[: self._pixels].reshape(self._shape)
 
     def _spread(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Blur light by the lens; beyond the picture's edge it goes on as it ends."""
+        """Blur light by the lens; values at the picture's edge continue beyond it."""
         if self.camera.point_spread == 0:
             return light
         import cv2
@@ -196,7 +196,7 @@ class Sensor:
 
 
 def frame_dtype(dtype: DTypeLike) -> np.dtype[Any]:
-    """Return the dtype of frames that a user named; InputError if frames cannot be of that type."""
+    """Return the dtype of frames that a user specified; InputError if it is not supported."""
     try:
         kind = np.dtype(dtype)
     except TypeError:
@@ -207,7 +207,7 @@ def frame_dtype(dtype: DTypeLike) -> np.dtype[Any]:
 
 
 def _levels(camera: Camera, shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Draw each pixel's counts without light, and how many more it has in full light."""
+    """Draw each pixel's counts without light, and their increase in full light."""
     generator = np.random.default_rng((camera.seed, _MAPS))
     gain = 1 + camera.gain_deviation * generator.standard_normal(shape)
     offset = camera.dark + camera.offset_deviation * generator.standard_normal(shape)

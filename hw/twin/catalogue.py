@@ -1,4 +1,4 @@
-"""The objects that the twin knows by name, and what becomes of a file."""
+"""The named objects of the twin, and objects from files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _MADE_ALREADY: dict[str, Object] = {
 def make_object(
     name: str | Path, shape: tuple[int, int], pixel_size: tuple[float, float], *, scale: float = DEFAULT_SCALE
 ) -> Object:
-    """Make an object by its name or file, as it lies in a field of view.
+    """Return an object by its name or file, placed in a field of view.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def make_object(
     pixel_size : (float, float)
         Millimetres along x and y; those of a height map too.
     scale : float
-        Millimetres a count of a 16-bit height map.
+        mm per count of a 16-bit height map.
 
     Returns
     -------
@@ -69,7 +69,7 @@ def make_object(
 
 
 def check_fits(thing: Object, body_radius: float) -> None:
-    """Raise InputError where a sensor with a body of this radius, mm, is too small to lie on an object."""
+    """Raise InputError if a body of this radius, mm, is too small for an object."""
     if thing.radius > body_radius:
         raise InputError(
             f"{thing.name} is larger than the sensor: it needs a circle of {2 * thing.radius:.4g} mm,"

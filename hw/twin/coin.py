@@ -1,4 +1,4 @@
-"""A coin in the manner of the 5 yen: hole, gear, ear of rice, water, and its value in writing."""
+"""A coin similar to 5 yen: hole, gear, ear of rice, water, and its value in writing."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _GEAR_REACH = math.hypot(_GEAR_TIP, _TOOTH)
 _EAR_RADIUS, _STEM_START, _EAR_START = 6.9, math.radians(-110.0), math.radians(-35.0)
 _GRAIN_PITCH, _GRAIN_PAIRS, _GRAIN_TILT = math.radians(11.0), 9, math.radians(28.0)
 _GRAIN_LENGTH, _GRAIN_WIDTH, _GRAIN_OFFSET = 0.95, 0.45, 0.75  # halves of length and width
-_EAR_REACH, _EAR_BOTTOM = 1.35, -2.5  # no grain is further from the stem, no part lower
+_EAR_REACH, _EAR_BOTTOM = 1.35, -2.5  # maximum distance of grains from the stem, and lowest y
 _WATER_PITCH, _WATER_LINES, _WATER_TOP = 0.95, 7, -2.9
 _WATER_INNER, _WATER_OUTER = 4.4, 9.0
 _KANJI_HALF = 1.9
@@ -52,12 +52,12 @@ _WRITING = ((_GO, -4.5, -5.275), (_EN, 4.5, -5.275))
 
 @dataclass(frozen=True, slots=True)
 class Coin:
-    """A coin 22 mm across with a hole of 5 mm, lying on a table 1.5 mm below its rim.
+    """A coin of 22 mm diameter with a hole of 5 mm, on a table 1.5 mm below its rim.
 
-    It is drawn for this sensor: no wall is upright. The relief (0.25 mm; rim and broad motifs up to z = 0,
-    lines to -0.04 mm) rises from the field in ramps of 35 degrees; the two flanks, outside 22 mm and inside
-    5 mm, fall to the table in ramps of 40 degrees, as a sheet would drape over them: a ramp steeper than 45
-    degrees would stay dark. Ramps are at least 0.12 mm wide, but where one ends in a corner.
+    It is designed for this sensor: no wall is vertical. The relief (0.25 mm; rim and broad motifs up to z =
+    0, lines to -0.04 mm) rises from the field in ramps of 35 degrees. The two flanks, outside 22 mm and
+    inside 5 mm, fall to the table in ramps of 40 degrees, as a sheet would drape over them; a ramp steeper
+    than 45 degrees would stay dark. Ramps are at least 0.12 mm wide, except where one ends in a corner.
     """
 
     name: ClassVar[str] = "coin"
@@ -76,7 +76,7 @@ class Coin:
         return np.maximum(coin, -THICKNESS)
 
     def slope(self, x: Floats, y: Floats, /) -> tuple[Floats, Floats]:
-        """Return dz/dx and dz/dy: 0 where level, else by central differences of the height over 0.2 um."""
+        """Return dz/dx and dz/dy: 0 where level, otherwise central differences of the height over 0.2 µm."""
         x, y = np.broadcast_arrays(x, y)
         z = self.height(x, y)
         ramp = (z != 0) & (z != -RELIEF) & (z != -THICKNESS)
@@ -85,14 +85,14 @@ class Coin:
         return slope[0], slope[1]
 
 
-# Each motif is its *inset*: the distance in mm from its outline, positive inside. Unions are maxima,
-# intersections minima, and the slope of an inset is 1, so that every ramp made of it has one steepness.
+# Each motif is its *inset*: the distance in mm from its outline, positive inside. Unions are maxima and
+# intersections minima. The slope of an inset is 1, so all ramps made of it have the same inclination.
 
 
 def _inset(x: Floats, y: Floats, r: Floats) -> Floats:
     x, y, r = np.broadcast_arrays(x, y, r)
     inset = np.asarray(np.maximum(r - _RIM_FOOT, _GEAR_RING - r))
-    # A motif is drawn only where it can rise above the field; within the ring the teeth are at its top.
+    # Motifs are limited to where they rise above the field; inside the ring the teeth have full height.
     motifs = [
         (_teeth, (r > _GEAR_RING - _RAMP) & (r < _GEAR_REACH)),
         (_ear, (np.abs(r - _EAR_RADIUS) < _EAR_REACH) & (y > _EAR_BOTTOM)),
@@ -120,7 +120,7 @@ def _ear(x: Floats, y: Floats) -> Floats:
     ends = _EAR_RADIUS * np.minimum(angle - _STEM_START, tip - angle)
     inset = np.minimum(_LINE - np.abs(outwards), ends)
     nearest = np.round((angle - _EAR_START) / _GRAIN_PITCH)
-    # Grains overlap their neighbours' share of the stem.
+    # Grains overlap the part of their neighbours at the stem.
     for number in (nearest - 1, nearest, nearest + 1):
         pair = np.clip(number, 0, _GRAIN_PAIRS - 1)
         from_pair = angle - _EAR_START - pair * _GRAIN_PITCH

@@ -21,18 +21,17 @@ Window = tuple[slice, slice]
 
 
 class HalfSpace:
-    """An incompressible half-space whose surface is loaded evenly within each pixel of a grid.
+    """An incompressible half-space with a uniform load within each pixel of a grid.
 
-    Displacements are sums of those of single loaded pixels, which Love (1929) gave in closed form, from
-    Boussinesq's and Cerruti's solutions for a point (Johnson, Contact Mechanics, 1985, sections 3.2, 3.3 and
-    3.6). At Poisson ratio 0.5 pressure moves the surface along its normal only, traction along the surface
-    only. The sums are convolutions, done by FFT on a grid padded with zeros, so nothing outside the grid
-    presses and nothing comes round from the other side. Displacements are those seen from far inside the
-    body, where nothing moves.
+    Displacements are sums over loaded pixels in the closed form of Love (1929), from Boussinesq's and
+    Cerruti's solutions for a point (Johnson, Contact Mechanics, 1985, sections 3.2, 3.3 and 3.6). At Poisson
+    ratio 0.5 pressure displaces the surface only along its normal, and traction only along the surface. The
+    sums are convolutions by FFT on a zero-padded grid, so there are neither loads outside the grid nor
+    periodic images. Displacements are relative to points far inside the body.
 
-    Lengths are mm, and Young's modulus E N/mm^2; ``depth`` is that of the mirror below the surface. Loads are
-    maps of the whole grid, or of its part ``loaded``. Displacements are computed in the loads' precision, of
-    which float32 takes a quarter of the time of float64.
+    Lengths are mm, and Young's modulus E N/mm^2; ``depth`` is the depth of the mirror below the surface.
+    Loads are maps of the whole grid, or of its part ``loaded``. Displacements are computed in the precision
+    of the loads; float32 takes a quarter of the time of float64.
     """
 
     def __init__(
@@ -50,7 +49,7 @@ class HalfSpace:
         self.modulus = modulus
         self.depth = depth
         self._loaded = loaded or (slice(0, shape[0]), slice(0, shape[1]))
-        # So large that no load comes round to where displacements are asked for.
+        # Large enough that no periodic image of a load affects the displacements.
         rows, columns = (
             2 * max(size - part.start, part.stop) - 1 for size, part in zip(shape, self._loaded, strict=True)
         )
@@ -58,7 +57,7 @@ class HalfSpace:
 
     @property
     def pixel_area(self) -> float:
-        """Of one pixel, mm^2."""
+        """Area of a pixel, mm^2."""
         return self.pixel_size[0] * self.pixel_size[1]
 
     @property
@@ -67,27 +66,28 @@ class HalfSpace:
         return 3 / (4 * math.pi * self.modulus)
 
     def window(self, rows: int, columns: int, loaded: Window | None = None) -> HalfSpace:
-        """Return the same half-space below a grid of other size."""
+        """Return the same half-space with a grid of another size."""
         return HalfSpace((rows, columns), self.pixel_size, self.modulus, self.depth, loaded)
 
     def surface(self, pressure: NDArray[Any]) -> Floats:
-        """Return how deep pressure, N/mm^2, pushes the surface in at the pixels' centres, (H, W), mm."""
+        """Return the indentation of the surface by a pressure, N/mm^2, at the pixels' centres, (H, W), mm."""
         return self._normal(pressure, 0.0)
 
     def mirror(self, pressure: Floats) -> Floats:
-        """Return how deep pressure pushes in the layer that lies `depth` below the surface.
+        """Return the indentation of the layer at `depth` below the surface under a pressure.
 
-        Below a point force P the displacement is P / (4 pi G) (1 / s + z^2 / s^3), s the distance and z the
-        depth (Johnson 1985, eq. 3.19); integrated over a pixel it is Love's formula for the surface with z in
-        its distances. The spectrum of this is the surface's times (1 + q z) exp(-q z), q the wavenumber.
+        Below a point force P the displacement is P / (4 pi G) (1 / s + z^2 / s^3), with s the distance and z
+        the depth (Johnson 1985, eq. 3.19). Integrated over a pixel it is Love's formula for the surface with
+        z included in the distances. Its spectrum is the surface's times (1 + q z) exp(-q z), with q the
+        wavenumber.
         """
         return self._normal(pressure, self.depth)
 
     def tangential(self, traction: NDArray[Any]) -> Floats:
-        """Return how traction, N/mm^2 along x and y, shifts the surface along itself, (2, H, W), mm.
+        """Return the displacement along the surface under a traction, N/mm^2 along x and y, (2, H, W), mm.
 
-        A point force Q along x shifts by Q / (4 pi G) times 1 / r + x^2 / r^3 along x and x y / r^3 along y
-        (Cerruti; Johnson 1985, eq. 3.75 at Poisson ratio 0.5).
+        A point force Q along x displaces by Q / (4 pi G) times 1 / r + x^2 / r^3 along x and x y / r^3 along
+        y (Cerruti; Johnson 1985, eq. 3.75 at Poisson ratio 0.5).
         """
         xx, xy, yy = _tangential_spectra(self._padded, self.pixel_size, traction.dtype)
         along_x, along_y = self._spectrum(traction[0]), self._spectrum(traction[1])
@@ -101,7 +101,7 @@ class HalfSpace:
     def _spectrum(self, values: NDArray[Any]) -> NDArray[Any]:
         from scipy import fft
 
-        # The axes one by one: rows of zeros need no transform.
+        # One axis at a time, because rows of zeros need no transform.
         (rows, columns), (across, along) = self._padded, self._loaded
         placed = np.zeros((len(values), columns), values.dtype)
         placed[:, along] = values
@@ -120,12 +120,12 @@ class HalfSpace:
 
 
 def rectangle(mask: NDArray[np.bool_]) -> Window:
-    """Return the rows and columns of the smallest rectangle round what is True; something must be."""
+    """Return the rows and columns of the smallest rectangle around all True pixels; there must be one."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
-# Surface, mirror and the rectangle in contact, which grows; a spectrum is as large as two maps.
+# For surface, mirror and the growing rectangle in contact; a spectrum has the size of two maps.
 @lru_cache(maxsize=6)
 def _normal_spectrum(
     padded: tuple[int, int], pixel_size: tuple[float, float], depth: float, dtype: np.dtype[Any]
@@ -148,9 +148,9 @@ def _tangential_spectra(
 
 
 def _corners(padded: tuple[int, int], pixel_size: tuple[float, float]) -> tuple[Floats, Floats]:
-    """Return x (1, columns + 1) and y (rows + 1, 1) of the corners of pixels, as seen from pixel 0, mm.
+    """Return x (1, columns + 1) and y (rows + 1, 1) of the pixels' corners relative to pixel 0, mm.
 
-    Pixel k of n lies k to the right and below, or n - k to the left and above, whichever is nearer.
+    Pixel k of n is k to the right and below, or n - k to the left and above, whichever is nearer.
     """
     y, x = (np.arange(n + 1, dtype=np.float64) - 0.5 - n // 2 for n in padded)
     return x[np.newaxis, :] * pixel_size[0], -y[:, np.newaxis] * pixel_size[1]
@@ -159,13 +159,13 @@ def _corners(padded: tuple[int, int], pixel_size: tuple[float, float]) -> tuple[
 def _x_log(x: Floats, y: Floats, z: float) -> Floats:
     """Return x ln(y + s), s the distance of (x, y, z); its derivative by x and y is (y^2 + z^2) / s^3.
 
-    Of the logarithm only the part that depends on y is kept: the rest goes in the second difference.
+    Only the part of the logarithm that depends on y is kept; the rest cancels in the second difference.
     """
     return x * np.arcsinh(y / np.sqrt(x**2 + z**2))
 
 
 def _transform(corners: Floats) -> Floats:
-    """Return the real transform of what a pixel gets from an integral's value at its four corners."""
+    """Return the real transform of the integral over a pixel, from the values at its four corners."""
     from scipy import fft
 
     pixels = -np.diff(np.diff(corners, axis=0), axis=1)
@@ -173,15 +173,15 @@ def _transform(corners: Floats) -> Floats:
 
 
 TOLERANCE = 3e-7
-"""Largest error of the gap, as a share of how far the object reaches above the rest plane."""
+"""Maximum error of the gap, as a share of the object's height above the rest plane."""
 
 ITERATIONS = 1000
-"""After this many a press has failed; smooth objects take 10 to 30, rough ones about 100."""
+"""Maximum number of iterations; smooth objects take 10 to 30, rough ones about 100."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contact:
-    """How an object and the silicone have come to rest: they touch where the pressure, N/mm^2, is above 0."""
+    """The equilibrium of an object and the silicone: they touch where the pressure, N/mm^2, is above 0."""
 
     space: HalfSpace
     pressure: Floats
@@ -189,12 +189,12 @@ class Contact:
 
     @property
     def force(self) -> float:
-        """Newtons: the pressure's sum over the area."""
+        """Force, N: the integral of the pressure."""
         return self.space.pixel_area * float(self.pressure.sum())
 
     @property
     def displacement(self) -> Floats:
-        """Of the surface, mm up from the body's rest plane, (H, W), float64; computed at each call."""
+        """Displacement of the surface, mm up from the rest plane, (H, W), float64; computed at each call."""
         return self.space.surface(self.pressure)
 
 
@@ -203,14 +203,14 @@ def press(
 ) -> Contact:
     """Press a rigid object into the half-space, without friction.
 
-    Pressure p and displacement u are those for which, at each pixel, p >= 0, the gap u + compliance force -
-    obstacle is 0 or more, and one of the two is 0: the least elastic energy less work. They are found by
-    conjugate gradients on the pixels that press or overlap (Polonsky and Keer, Wear 231, 1999, 206-219), here
-    at a given depth instead of a given force, and preconditioned by the inverse of an endless half-space.
+    Pressure p and displacement u satisfy, at each pixel, p >= 0, gap u + compliance force - obstacle >= 0,
+    and one of the two is 0. This minimises the elastic energy minus the work. It is solved by conjugate
+    gradients on the pixels under pressure or overlapping (Polonsky and Keer, Wear 231, 1999, 206-219), here
+    at a given depth instead of a given force, preconditioned by the inverse of an infinite half-space.
 
-    Where the object is below the rest plane it cannot touch, as pressure anywhere pushes all of it in. The
-    rest is iterated on, in the smallest rectangle round it, until the gap is right to `TOLERANCE` times the
-    obstacle's greatest height.
+    Where the object is below the rest plane it cannot touch, because any pressure indents the whole surface.
+    The iteration covers the smallest rectangle around the rest, until the gap is accurate to `TOLERANCE`
+    times the obstacle's greatest height.
 
     Parameters
     ----------
@@ -238,7 +238,7 @@ def press(
 def _minimise(
     space: HalfSpace, obstacle: Floats, reach: NDArray[np.bool_], compliance: float, start: Floats
 ) -> tuple[Floats, int]:
-    """Return the pressure at rest on the rectangle that the object can touch, and the steps that it took."""
+    """Return the pressure in equilibrium on the rectangle that the object can touch, and the iterations."""
     space = space.window(*reach.shape)
     tolerance = TOLERANCE * float(obstacle[reach].max())
     lift, precondition = compliance * space.pixel_area, _inverse(space)
@@ -264,15 +264,16 @@ def _minimise(
         steps, start = steps + found.steps, found.x
         if not found.converged:
             raise RuntimeError(
-                f"the contact did not come to rest in {ITERATIONS} iterations: the gap is wrong by"
-                f" {float(np.abs(found.residual).max()):.2g} mm, the tolerance {tolerance:.2g} mm"
+                f"the contact did not converge in {ITERATIONS} iterations: the error of the gap "
+                f"is {float(np.abs(found.residual).max()):.2g} mm, the tolerance {tolerance:.2g} "
+                "mm"
             )
-        if not found.steps:  # it has also converged without the rounding of single precision
+        if not found.steps:  # converged in double precision as well
             return found.x, steps
 
 
 def _inverse(space: HalfSpace) -> Callable[[Floats], Floats]:
-    """Return a rough inverse of the half-space's response, by its spectrum: 2 E q / 3 at wavenumber q."""
+    """Return an approximate inverse of the half-space's response: 2 E q / 3 at wavenumber q."""
     padded, _, _, q = wavenumbers(space)
     stiffness = (2 * space.modulus / 3 * q).astype(np.float32)
     return lambda values: filter_roughly(values, padded, lambda spectrum: stiffness * spectrum)
@@ -281,9 +282,9 @@ def _inverse(space: HalfSpace) -> Callable[[Floats], Floats]:
 def filter_roughly(
     values: Floats, padded: tuple[int, int], multiply: Callable[[Spectrum], Spectrum]
 ) -> Floats:
-    """Change the spectra of maps, (..., H, W), on a grid that comes round on itself.
+    """Filter the spectra of maps, (..., H, W), on a periodic grid.
 
-    Single precision will do: this only steers a search.
+    Single precision suffices, because this is only a preconditioner.
     """
     from scipy import fft
 
@@ -293,7 +294,7 @@ def filter_roughly(
 
 
 def wavenumbers(space: HalfSpace) -> tuple[tuple[int, int], Floats, Floats, Floats]:
-    """Return the size of a grid that comes round on itself, and its transform's q_x, q_y and q, 1/mm."""
+    """Return the size of a periodic grid, and its transform's q_x, q_y and q, 1/mm."""
     from scipy import fft
 
     rows, columns = (fft.next_fast_len(n, real=True) for n in space.shape)
@@ -302,6 +303,6 @@ def wavenumbers(space: HalfSpace) -> tuple[tuple[int, int], Floats, Floats, Floa
         -2 * np.pi * fft.fftfreq(rows, space.pixel_size[1]),
     )
     q = np.hypot(q_x, q_y)
-    # An even load is as soft as half a wave over the grid.
+    # A uniform load has the compliance of half a wave over the grid.
     q[0, 0] = np.pi / max(rows * space.pixel_size[1], columns * space.pixel_size[0])
     return (rows, columns), q_x, q_y, q

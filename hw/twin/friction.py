@@ -1,4 +1,4 @@
-"""Where the sheet sticks to the object and where it slips, while the body moves along it."""
+"""Stick and slip between sheet and object while the body moves along it."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from mirrorskin.io.types import Floats
 from mirrorskin.kernels.conjugate_gradients import Face, conjugate_gradients
 
 TOLERANCE = 3e-4
-"""Largest error of the surface's shift in a step, as a share of how far the object moves in it."""
+"""Maximum error of the surface's displacement in a step, as a share of the object's displacement."""
 
 ITERATIONS = 1000
-"""After this many a step has failed; most take 5 to 40."""
+"""Maximum number of iterations; most steps take 5 to 40."""
 
-# Of the way so far; a step that is no more than this is none.
+# Relative to the total displacement; smaller steps are ignored.
 _NO_STEP = 1e-9
 
-# Tractions so close to the limit are at it.
+# Tractions this close to the limit are at it.
 _AT_LIMIT = 1 - 1e-9
 
 
 class Friction:
-    """Coulomb friction between the body and an object that moves along it, pressed as before.
+    """Coulomb friction between the body and an object that moves along it at constant pressure.
 
-    Traction does not raise the surface of an incompressible body, nor does pressure shift it: the contact and
-    its pressure p stay what they are (Johnson, Contact Mechanics, 1985, section 7.2). In a step the object
-    goes on by dU and the surface by du = C dq, C being Cerruti's response to the traction q. Where |q| < mu p
-    it sticks, du = dU; where |q| = mu p it may slip, and then q points along the slip dU - du. Among all |q|
-    <= mu p this q is the one of least dq C dq / 2 - dq dU (Kalker's principle for one step). It is found by
-    conjugate gradients that are cut off at the limit, as Polonsky and Keer (1999) do it with pressure, from
-    the traction of a step that goes on as the one before.
+    Traction does not raise the surface of an incompressible body, and pressure does not displace it along
+    itself: the contact and its pressure p are unchanged (Johnson, Contact Mechanics, 1985, section 7.2). In a
+    step the object moves by dU and the surface by du = C dq, with C Cerruti's response to the traction q.
+    Where |q| < mu p it sticks, du = dU; where |q| = mu p it may slip, and q is parallel to the slip dU - du.
+    Among all |q| <= mu p this q minimises dq C dq / 2 - dq dU (Kalker's principle for one step). It is found
+    by conjugate gradients that are projected onto the limit, as Polonsky and Keer (1999) do for pressure,
+    starting from the extrapolated traction of the preceding step.
 
-    ``traction``, (2, H, W), is that of the object on the body, N/mm^2, along x and y; it is 0 outside of the
+    ``traction``, (2, H, W), is exerted by the object on the body, N/mm^2, along x and y; it is 0 outside the
     ``window`` of the grid.
     """
 
@@ -53,20 +53,21 @@ class Friction:
             self._before = self._shift = np.zeros((2, *self._touches.shape))
             self._step = self._growth = np.zeros_like(self._before)
             self._inverse = _inverse(self._space)
-            # How far a pixel shifts itself.
+            # Displacement of a pixel under its own load.
             self._own = float(space.window(1, 1).tangential(np.ones((2, 1, 1))).mean())
 
     @property
     def force(self) -> Floats:
-        """Newtons along x and y that the object exerts on the body, (2,)."""
+        """Force of the object on the body along x and y, (2,), N."""
         force: Floats = self.traction.sum(axis=(1, 2)) * self._pixel_area
         return force
 
     def move(self, displacement: Floats) -> NDArray[np.bool_]:
-        """Move the object straight on to another place; return where it slips over the sheet in this step.
+        """Move the object along a straight line; return where it slips over the sheet in this step.
 
-        ``displacement``, (2, H, W), is that of the object against the body since the press, mm along x and y:
-        the same everywhere if it is pushed, a rotation if it is twisted. Slip is what exceeds the tolerance.
+        ``displacement``, (2, H, W), is the total displacement of the object relative to the body since the
+        press, mm along x and y: uniform for a slide, a rotation for a twist. Slip is displacement beyond the
+        tolerance.
         """
         slips = np.zeros_like(self._contact)
         if not self._contact.any():
@@ -74,7 +75,7 @@ class Friction:
         here = np.where(self._touches, displacement[:, *self.window], 0.0)
         step = here - self._before
         far = float(_length(step).max())
-        # Steps of rounding are put together until they are worth a step.
+        # Steps of the size of rounding errors are accumulated.
         if far > _NO_STEP * max(float(_length(place).max()) for place in (here, self._shift)):
             tolerance = TOLERANCE * far
             held = self.traction[:, *self.window]
@@ -89,20 +90,20 @@ class Friction:
         return slips
 
     def _likeness(self, step: Floats) -> float:
-        """Return how much of the last step is in this one; 0 if it goes back."""
+        """Return the share of the last step that is contained in this one; 0 if it reverses."""
         before = float(np.sum(self._step**2))
         return max(0.0, float(np.sum(step * self._step)) / before) if before > 0 else 0.0
 
     def _shifted(self, change: Floats) -> Floats:
-        """Return how much more a change of the traction shifts the surface, (2, H, W), mm."""
+        """Return the displacement of the surface by a change of the traction, (2, H, W), mm."""
         return self._space.tangential(change.astype(np.float32))
 
     def _follow(
         self, traction: Floats, shift: Floats, target: Floats, tolerance: float
     ) -> tuple[Floats, Floats, _Limited]:
-        """Return the traction that shifts the surface to the target where the limit allows, and its shift.
+        """Return the traction that moves the surface to the target within the limit, and its displacement.
 
-        The search starts from a traction, and from the shift that it causes.
+        The search starts from a traction and the displacement that it causes.
         """
 
         def within(traction: Floats) -> Floats:
@@ -121,8 +122,9 @@ class Friction:
         )
         if not found.converged:
             raise RuntimeError(
-                f"stick and slip did not converge in {ITERATIONS} iterations: the shift is wrong by"
-                f" {float(_length(found.residual).max()):.2g} mm, the tolerance {tolerance:.2g} mm"
+                f"stick and slip did not converge in {ITERATIONS} iterations: the error of the "
+                f"displacement is {float(_length(found.residual).max()):.2g} mm, the tolerance "
+                f"{tolerance:.2g} mm"
             )
         return found.x, found.product, self._limited(found.x, target - found.product)
 
@@ -132,8 +134,8 @@ class Friction:
     def _face(self, limited: _Limited) -> Face:
         """Return the directions in which the traction can change.
 
-        What may stick moves together. Where it slips far, only tiny turns of the traction are called for:
-        Jacobi's preconditioner.
+        Pixels that may stick move together. Where the slip is large, only small rotations of the traction are
+        needed: Jacobi's preconditioner.
         """
 
         def precondition(residual: Floats) -> Floats:
@@ -149,11 +151,10 @@ class Friction:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Limited:
-    """The pixels whose traction is at its limit and pushed beyond it: it can only turn.
+    """The pixels whose traction is at its limit and pushed beyond it: it can only rotate.
 
-    ``along`` is the traction's direction there, ``slip`` by how much the surface lags behind in that
-    direction, mm, and ``curvature`` that of the energy where the limit's circle bends away from a straight
-    turn: slip / limit, mm^3/N.
+    ``along`` is the direction of the traction there, ``slip`` the lag of the surface in that direction, mm,
+    and ``curvature`` the curvature of the energy along the limit's circle: slip / limit, mm^3/N.
     """
 
     where: NDArray[np.bool_]
@@ -162,15 +163,15 @@ class _Limited:
     curvature: Floats
 
     def turn(self, vectors: Floats) -> Floats:
-        """Return vectors without their part along the traction where that cannot grow."""
+        """Return vectors without their component along the traction where it is at its limit."""
         turned: Floats = vectors - np.sum(vectors * self.along, axis=0) * self.along
         return turned
 
 
 def _inverse(space: HalfSpace) -> Callable[[Floats], Floats]:
-    """Return a rough inverse of Cerruti's response, by its spectrum.
+    """Return an approximate inverse of Cerruti's response, by its spectrum.
 
-    At wavenumber q a traction is softened by 1 / (2 G q) along q, and twice as much across.
+    The response at wavenumber q is 1 / (2 G q) along q, and twice that across.
     """
     padded, q_x, q_y, q = wavenumbers(space)
     along_x, along_y, stiff = q_x / q, q_y / q, q / (4 * np.pi * space.softness)
@@ -186,7 +187,7 @@ def _inverse(space: HalfSpace) -> Callable[[Floats], Floats]:
 
 def _limited(traction: Floats, lag: Floats, limit: Floats) -> _Limited:
     size = _length(traction)
-    # Without friction there is no traction, and slip goes where the object goes.
+    # Without friction there is no traction, and the slip equals the motion of the object.
     along = np.where(limit > 0, traction, lag)
     along = along / np.maximum(_length(along), np.finfo(float).tiny)
     slip = np.sum(lag * along, axis=0)
@@ -197,12 +198,12 @@ def _limited(traction: Floats, lag: Floats, limit: Floats) -> _Limited:
 
 
 def _shrink(traction: Floats, limit: Floats) -> Floats:
-    """Return the factors that bring tractions back to their limit, 1 for those within."""
+    """Return factors that scale tractions back to their limit, 1 for those within."""
     size = _length(traction)
     factors: Floats = np.divide(limit, size, out=np.ones_like(size), where=size > limit)
     return factors
 
 
 def _length(vectors: Floats) -> Floats:
-    length: Floats = np.sqrt(vectors[0] ** 2 + vectors[1] ** 2)  # three times as quick as np.hypot
+    length: Floats = np.sqrt(vectors[0] ** 2 + vectors[1] ** 2)  # three times as fast as np.hypot
     return length

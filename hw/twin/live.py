@@ -1,4 +1,4 @@
-"""The twin as a camera that does not wait: frames come when they are due."""
+"""The twin as a real-time camera: frames arrive when they are due."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ _QUEUE = 8  # frames that wait for a late reader, as in a camera's driver
 
 
 class Live(Closing):
-    """A source that gives the twin's frames, from the first of them on, at a set rate from the first read on.
+    """A source of the twin's frames at a fixed rate, starting with the first read.
 
-    A read waits for the next frame, and takes those with it that have come since the read before. A reader
-    that is late by more than 8 frames loses the oldest of them; the block says how many.
+    A read waits for the next frame, and also returns the frames that have become due since the previous read.
+    A reader that is late by more than 8 frames loses the oldest of them; the block contains their number.
 
     Parameters
     ----------
     twin : Twin
         It is rewound.
     rate : float, optional
-        Frames a second; the twin's camera's own otherwise.
+        Frames per second; by default that of the twin's camera.
     clock : Clock
-        What it waits by.
+        Clock to wait with.
 
     Attributes
     ----------
     name, header, shape, dtype, motion, rewindable
-        As for every source; what was seen cannot be seen again.
+        As for every source; it cannot be rewound.
 
     Raises
     ------
@@ -53,7 +53,7 @@ class Live(Closing):
     def __init__(self, twin: Twin, rate: float | None = None, clock: Clock = SYSTEM) -> None:
         rate = twin.frame_rate if rate is None else rate
         if not (math.isfinite(rate) and rate > 0):
-            raise InputError(f"{twin.name}: {rate} frames a second cannot be: give more than 0")
+            raise InputError(f"{twin.name}: {rate} frames per second is not possible: give more than 0")
         self.name, self.header, self.motion = twin.name, twin.header, twin.motion
         self.shape, self.dtype = twin.shape, twin.dtype
         self._twin = twin
@@ -64,7 +64,7 @@ class Live(Closing):
         self._given = 0
 
     def rewind(self) -> None:
-        """Refuse: time does not run back."""
+        """Raise: a live source cannot be rewound."""
         raise RuntimeError("a live source cannot be rewound")
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
@@ -85,7 +85,7 @@ class Live(Closing):
         return replace(block, dropped=dropped, time=frame / self._rate)
 
     def _wait(self) -> int:
-        """Wait until the next frame is due, and return how many are by then."""
+        """Wait until the next frame is due, and return the number of frames due."""
         if self._start is None:
             self._start = self._clock.now()
         early = self._start + self._given / self._rate - self._clock.now()

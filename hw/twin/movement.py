@@ -1,4 +1,4 @@
-"""The movements of section 2.1 of the paper: where the object is, seen from the sensor's body."""
+"""The movements of section 2.1 of the paper: the pose of the object relative to the sensor's body."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ class Pose:
 
 
 class Movement:
-    """What the body does, frame by frame: base of `Vertical`, `Axial`, `Horizontal` and `Twist`.
+    """The motion of the body in each frame: base of `Vertical`, `Axial`, `Horizontal` and `Twist`.
 
-    Positions are numbered by frames; one between two frames is passed between their exposures. Here the body
-    stays upright and its positions do not jump.
+    Positions are indexed by frame; fractional indices are positions between the exposures of two frames. In
+    this class the body stays upright and its positions have no jumps.
 
     Attributes
     ----------
     motion : {"vertical", "axial", "horizontal", "twist"}
     positions : ndarray, (T, ...), float64
-        Where the body is in each frame: what a recording says of it.
+        Position of the body in each frame, as in a recording.
     path : ndarray, (T, ...), float64
-        The same without jumps, for what lies between two frames.
+        The same without jumps, for positions between two frames.
     deepest : float
         Greatest travel, mm.
     presses : bool
@@ -50,7 +50,7 @@ class Movement:
     steepest : float
         Greatest tilt to either side, radians.
     pivot : (float, float, float)
-        About which the body tilts, from the rest sheet's centre, mm, in the body's frame.
+        Pivot of the tilt, from the rest sheet's centre, mm, in the body's frame.
     """
 
     path: Floats
@@ -68,32 +68,31 @@ class Movement:
             frame = int(np.argmax(bad))
             raise InputError(f"{name} is not finite at frame {frame}: every frame needs a position")
         if not math.isfinite(deepest):
-            raise InputError(f"press {deepest} mm cannot be: give how far the body is lowered")
+            raise InputError(f"press {deepest} mm is not possible: give the travel of the body")
         self.positions = self.path = positions
         self.deepest: float = float(deepest)
 
     def rise(self, radius: float, /) -> float:
-        """Bound how far an object of a radius about the origin can rise above the rest plane, mm.
+        """Return an upper bound of the height of an object of a radius above the rest plane, mm.
 
-        To the press comes what tilting about the pivot and the object's own width can raise.
+        It is the press plus the rise by tilting about the pivot and by the object's own width.
         """
         x, y, z = self.pivot
         lowered = z + (self.deepest - z) * math.cos(self.steepest)
         return lowered + (radius + math.hypot(x, y)) * math.sin(self.steepest)
 
     def reduced(self, path: Floats, /) -> Floats:
-        """Make places on the path equal where they are the same."""
+        """Map equivalent positions on the path to equal values."""
         return path
 
     def pose(self, place: Floats, /) -> Pose:
-        """Return where the object is when the body is at a place, one item of the path."""
+        """Return the pose of the object at a position of the body, one item of the path."""
         raise NotImplementedError
 
     def pose_at(self, frame: int, late: float = 0.0) -> Pose:
-        """Return where the object is so many frames after a frame's middle, or before if negative.
+        """Return the pose of the object a number of frames after a frame's middle, or before if negative.
 
-        The velocity is constant between two frames, and that of the nearest interval before the first and
-        after the last.
+        The velocity is constant between two frames; beyond the ends it is that of the nearest interval.
         """
         first = frame - 1 if late < 0 else frame
         first = max(0, min(first, len(self.path) - 2))
@@ -101,25 +100,25 @@ class Movement:
         return self.pose(self.reduced(self.path[frame] + late * step))
 
     def header(self) -> Header:
-        """Return what holds for the whole movement."""
+        """Return the metadata of the whole movement."""
         return Header(self.motion, press=self.deepest)
 
     def mark(self, block: Block, /) -> Block:
-        """Add to a block where the body was in its frames."""
+        """Add the positions of the body to a block."""
         here = slice(block.index, block.index + len(block.frames))
         positions: dict[str, Any] = {self._recorded_as: self.positions[here]}
         return replace(block, **positions)
 
 
 def pose_at_press(travel: float) -> Pose:
-    """Lower the body, upright: the object rises in its frame."""
+    """Return the pose of the object when the body is lowered, upright: it rises in the body's frame."""
     return Pose(np.eye(3), np.array([0.0, 0.0, travel]))
 
 
 def pose_at_lean(
     travel: float, tilt: float, phase: float, pivot: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> Pose:
-    """Lower the body, upright, by a travel; then tilt it about its pivot at a phase, see `Axial`.
+    """Return the pose when the body is lowered and then tilted about its pivot at a phase, see `Axial`.
 
     Without a tilt the body stays upright, whatever the phase.
     """
@@ -138,7 +137,7 @@ class Vertical(Movement):
     travel : array_like, (T,)
         Millimetres that the stage has been lowered in each frame.
     compliance : float
-        By how much the stage gives way, mm/N; needs elastic contact, which knows the force.
+        Compliance of the stage, mm/N; needs elastic contact, which computes the force.
 
     Raises
     ------
@@ -154,20 +153,20 @@ class Vertical(Movement):
         positions = check_strokes(travel, _count(travel), "travel")
         super().__init__(positions, "travel", positions.max(initial=-math.inf))
         if not (math.isfinite(compliance) and compliance >= 0):
-            raise InputError(f"compliance {compliance} mm/N cannot be: give 0 or more")
+            raise InputError(f"compliance {compliance} mm/N is not possible: give 0 or more")
         self.compliance = compliance
 
     def pose(self, place: Floats, /) -> Pose:
-        """Lower the body to a travel, mm."""
+        """Return the pose at a travel, mm."""
         return pose_at_press(float(place))
 
     def header(self) -> Header:
-        """Return the motion: there is no one press."""
+        """Return the motion; there is no constant press."""
         return Header(self.motion)
 
 
 def oscillating_travel(start: float, stop: float, strokes: int, frames: int) -> Floats:
-    """Return the travel of strokes down and up that follow a cosine, (frames,), mm.
+    """Return a travel that oscillates as a cosine, (frames,), mm.
 
     Examples
     --------
@@ -179,13 +178,13 @@ def oscillating_travel(start: float, stop: float, strokes: int, frames: int) -> 
 
 
 class Axial(Movement):
-    """Precession: the body's axis goes round on a cone of half-angle ``tilt``.
+    """Precession: the body's axis rotates on a cone of half-angle ``tilt``.
 
     At phase alpha the axis leans towards alpha + pi, and a vector x of the world is, in the body's frame ::
 
         x' = Rz(alpha) Ry(tilt) Rz(-alpha) x
 
-    which is eq. 10 of the paper. The body turns about ``pivot``, so that the object moves in the picture.
+    which is eq. 10 of the paper. The body rotates about ``pivot``, so the object moves in the picture.
 
     Parameters
     ----------
@@ -201,7 +200,7 @@ class Axial(Movement):
     Raises
     ------
     InputError
-        A value cannot be.
+        A value is invalid.
     """
 
     motion: Motion = "axial"
@@ -214,7 +213,7 @@ class Axial(Movement):
         self.path: Floats = np.unwrap(self.positions)
         if not (math.isfinite(tilt) and 0 < tilt <= TILT_MAX):
             raise InputError(
-                f"tilt {math.degrees(tilt):g} degrees cannot be: give more than 0 and at most"
+                f"tilt {math.degrees(tilt):g} degrees is not possible: give more than 0 and at most"
                 f" {math.degrees(TILT_MAX):g} degrees"
             )
         self.tilt: float = tilt
@@ -222,11 +221,11 @@ class Axial(Movement):
         self.pivot: tuple[float, float, float] = _check_pivot(pivot)
 
     def reduced(self, path: Floats, /) -> Floats:
-        """Drop whole turns, and what of the phase rounding may differ by."""
+        """Remove whole turns, and rounding errors of the phase."""
         return _within_turn(path)
 
     def pose(self, place: Floats, /) -> Pose:
-        """Tilt the body about its pivot at a phase, radians."""
+        """Return the pose at a phase, radians: the body is tilted about its pivot."""
         return pose_at_lean(self.deepest, self.tilt, float(place), self.pivot)
 
     def header(self) -> Header:
@@ -235,7 +234,7 @@ class Axial(Movement):
 
 
 class Leaning(Movement):
-    """Lean at any phase by any tilt, and press as deep as one likes, frame by frame; see `Axial`.
+    """A lean of any phase and tilt and a travel for each frame; see `Axial`.
 
     A body that rocks has one phase, and a tilt that is negative on the other side.
 
@@ -251,7 +250,7 @@ class Leaning(Movement):
     Raises
     ------
     InputError
-        A value cannot be.
+        A value is invalid.
     """
 
     motion: Motion = "axial"
@@ -267,23 +266,25 @@ class Leaning(Movement):
         try:
             lean, depth = (np.broadcast_to(np.asarray(v, np.float64), alpha.shape) for v in (tilt, travel))
         except ValueError:
-            raise InputError(f"tilt and travel: one number, or {len(alpha)} as of the phase") from None
+            raise InputError(
+                f"tilt and travel must be one number, or {len(alpha)} numbers like the phase"
+            ) from None
         super().__init__(np.column_stack([alpha, lean, depth]), "pose", depth.max(initial=-math.inf))
         self.path: Floats = np.column_stack([np.unwrap(alpha), lean, depth])
         self.steepest: float = float(np.max(np.abs(lean)))
         if not self.steepest <= TILT_MAX:
-            raise InputError(f"tilt cannot be: give {math.degrees(TILT_MAX):g} degrees at most")
+            raise InputError(f"tilt is too large: the maximum is {math.degrees(TILT_MAX):g} degrees")
         self.presses: bool = bool(np.ptp(depth) > 0)
         self.pivot: tuple[float, float, float] = _check_pivot(pivot)
 
     def reduced(self, path: Floats, /) -> Floats:
-        """Drop whole turns."""
+        """Remove whole turns."""
         reduced = path.copy()
         reduced[..., 0] = _within_turn(path[..., 0])
         return reduced
 
     def pose(self, place: Floats, /) -> Pose:
-        """Lower the body by the third number, mm, and tilt it by the second at the first, radians."""
+        """Return the pose for a phase and a tilt, radians, and a travel, mm."""
         phase, tilt, travel = map(float, place)
         return pose_at_lean(travel, tilt, phase, self.pivot)
 
@@ -292,7 +293,7 @@ class Leaning(Movement):
         return Header(self.motion, press=None if self.presses else self.deepest, pivot=self.pivot)
 
     def mark(self, block: Block, /) -> Block:
-        """Add phases and tilts, and travels that differ."""
+        """Add phases and tilts, and travels if they vary."""
         phase, tilt, travel = self.positions[block.index : block.index + len(block.frames)].T
         return replace(block, phase=phase, tilt=tilt, travel=travel if self.presses else None)
 
@@ -310,7 +311,7 @@ class Horizontal(Movement):
     Raises
     ------
     InputError
-        A value cannot be.
+        A value is invalid.
     """
 
     motion: Motion = "horizontal"
@@ -319,11 +320,13 @@ class Horizontal(Movement):
     def __init__(self, displacement: ArrayLike, press: float) -> None:
         positions = np.asarray(displacement, np.float64)
         if positions.ndim != 2 or positions.shape[1] != 2:
-            raise InputError(f"displacement of shape {positions.shape} cannot be: give x and y a frame")
+            raise InputError(
+                f"displacement of shape {positions.shape} is not possible: give x and y for each frame"
+            )
         super().__init__(positions, "displacement", press)
 
     def pose(self, place: Floats, /) -> Pose:
-        """Move the body by x and y, mm: the object goes the other way in the picture."""
+        """Return the pose for x and y of the body, mm: the object moves in the opposite direction."""
         return Pose(np.eye(3), np.array([-place[0], -place[1], self.deepest]))
 
 
@@ -340,7 +343,7 @@ class Twist(Movement):
     Raises
     ------
     InputError
-        A value cannot be.
+        A value is invalid.
     """
 
     motion: Motion = "twist"
@@ -349,23 +352,25 @@ class Twist(Movement):
     def __init__(self, twist: ArrayLike, press: float) -> None:
         positions = np.asarray(twist, np.float64)
         if positions.ndim != 1:
-            raise InputError(f"twist of shape {positions.shape} cannot be: give one angle a frame")
+            raise InputError(
+                f"twist of shape {positions.shape} is not possible: give one angle for each frame"
+            )
         super().__init__(positions, "twist", press)
 
     def pose(self, place: Floats, /) -> Pose:
-        """Turn the body by an angle: the object goes the other way in the picture."""
+        """Return the pose for an angle of the body: the object turns in the opposite direction."""
         return Pose(_about_z(-float(place)), np.array([0.0, 0.0, self.deepest]))
 
 
 def _check_pivot(pivot: tuple[float, float, float]) -> tuple[float, float, float]:
     if np.shape(pivot) != (3,) or not np.isfinite(pivot).all():
-        raise InputError(f"pivot {pivot} cannot be: give x, y and z in mm")
+        raise InputError(f"pivot {pivot} is not possible: give x, y and z in mm")
     x, y, z = map(float, pivot)
     return x, y, z
 
 
 def _within_turn(phase: Floats) -> Floats:
-    """Drop whole turns, and what of a phase rounding may differ by."""
+    """Remove whole turns, and rounding errors of a phase."""
     return np.asarray(2 * np.pi * (np.round(phase / (2 * np.pi) % 1, 12) % 1))
 
 

@@ -1,4 +1,4 @@
-"""Objects out of files: height maps, and triangle meshes seen from above."""
+"""Objects from files: height maps, and triangle meshes seen from above."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 HEIGHT_MAP_SUFFIXES = (".npy", ".png", ".tif", ".tiff")
 DEFAULT_SCALE = 0.001
 
-_DTYPES = ("uint8", "uint16", "float32", "float64")  # of TIFFs; those of height maps are checked later
+_DTYPES = ("uint8", "uint16", "float32", "float64")  # types of TIFFs; those of height maps are checked later
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeightMap:
-    """A surface given by its heights on a grid whose centre lies under the picture's.
+    """A surface given by its heights on a grid centred on the picture's centre.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class HeightMap:
     pixel_size : (float, float)
         Millimetres between its samples along x and y.
     name : str
-        What to call it.
+        Name in messages.
     """
 
     heights: Floats
@@ -46,7 +46,7 @@ class HeightMap:
 
     @property
     def radius(self) -> float:
-        """Distance of the furthest sample above the lowest level, which is the table, mm."""
+        """Distance of the farthest sample above the lowest level (the table), mm."""
         raised = self.heights > np.nanmin(self.heights)
         rows, columns = np.nonzero(raised if raised.any() else np.isfinite(self.heights))
         x, y = pixel_axes(self.heights.shape, self.pixel_size)
@@ -55,10 +55,10 @@ class HeightMap:
     def height(self, x: Floats, y: Floats, /) -> Floats:
         """Return z in mm, bilinear between the samples; NaN outside the map and next to its NaN samples."""
         rows, columns = self.heights.shape
-        # Rounded, so that a sample's own place gives that sample and none of a neighbour that may be NaN.
+        # Rounded, so that a position on a sample uses only that sample and no neighbour that may be NaN.
         left, share_x = _cell(np.round(x / self.pixel_size[0] + (columns - 1) / 2, 9), columns)
         top, share_y = _cell(np.round((rows - 1) / 2 - y / self.pixel_size[1], 9), rows)
-        # One index into all samples is quicker than two. A neighbour without a share may be NaN: not met.
+        # One flat index is faster than two. A neighbour with weight 0 may be NaN and is excluded.
         samples, corner = self.heights.ravel(), top * columns + left
         to_right, down = (share_x > 0).astype(np.intp), columns * (share_y > 0)
         upper, lower = (
@@ -69,12 +69,12 @@ class HeightMap:
         return height
 
     def slope(self, x: Floats, y: Floats, /) -> tuple[Floats, Floats]:
-        """Return dz/dx and dz/dy by differences to the next samples, one-sided at the object's edge."""
+        """Return dz/dx and dz/dy by differences of neighbouring samples, one-sided at the object's edge."""
         return difference_slope(self.height, x, y, self.pixel_size)
 
 
 def _cell(place: Floats, samples: int) -> tuple[NDArray[np.intp], Floats]:
-    """Return the sample before a place on the grid, and how far on the place is; NaN off the grid."""
+    """Return the sample before a position on the grid, and the fraction beyond it; NaN off the grid."""
     inside = (place >= 0) & (place <= samples - 1)
     before = np.where(inside, place, 0).astype(np.intp)
     return before, np.where(inside, place - before, np.nan)
@@ -83,7 +83,7 @@ def _cell(place: Floats, samples: int) -> tuple[NDArray[np.intp], Floats]:
 def load_height_map(
     path: str | Path, pixel_size: tuple[float, float], *, scale: float = DEFAULT_SCALE
 ) -> HeightMap:
-    """Read a height map and place it so that its highest point is at z = 0.
+    """Return a height map from a file, placed so that its highest point is at z = 0.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def load_height_map(
     pixel_size : (float, float)
         Millimetres between its samples along x and y.
     scale : float
-        Millimetres a count, for 16-bit values.
+        mm per count, for 16-bit values.
 
     Returns
     -------
@@ -108,16 +108,18 @@ def load_height_map(
     """
     path = Path(path)
     if not (np.isfinite(scale) and scale > 0):
-        raise InputError(f"{path}: scale {scale} mm a count cannot be: give a positive number")
+        raise InputError(f"{path}: a scale of {scale} mm per count is not possible: give a positive number")
     values = _read_array(path)
     if values.ndim != 2 or values.size == 0:
-        raise InputError(f"{path}: a height map has rows and columns only, this has shape {values.shape}")
+        raise InputError(
+            f"{path}: a height map has rows and columns only, but this file has shape {values.shape}"
+        )
     if values.dtype == np.uint16:
         heights = values * float(scale)
     elif values.dtype in (np.float32, np.float64):
         heights = values.astype(np.float64)
     else:
-        raise InputError(f"{path}: holds {values.dtype}: save heights as 16-bit counts or as floats in mm")
+        raise InputError(f"{path}: contains {values.dtype}: save heights as 16-bit counts or as floats in mm")
     if np.isinf(heights).any() or np.isnan(heights).all():
         raise InputError(f"{path}: heights must be finite, or NaN where there is no object")
     return HeightMap(heights - np.nanmax(heights), pixel_size, path.name)
@@ -130,15 +132,15 @@ def _read_array(path: Path) -> NDArray[Any]:
 MESH_SUFFIXES = (".stl", ".ply", ".obj")
 
 _SAMPLES_MAX = 20_000_000
-_FARTHEST = 1e9  # mm from the origin: differences of coordinates stay finite, and heights have digits left
+_FARTHEST = 1e9  # maximum distance from the origin, mm; beyond it float64 differences lose precision
 
 
 def load_mesh(path: str | Path, shape: tuple[int, int], pixel_size: tuple[float, float]) -> HeightMap:
-    """Read a mesh and take its heights as seen from above, from +z.
+    """Return the heights of a mesh as seen from above, from +z.
 
-    The middle of its bounding box lies under the picture's centre and its highest point at z = 0. Several
-    bodies in a file make one object. The heights are exact at the field's pixel centres, and beyond the
-    field on the same grid; overhangs and the lower side are hidden.
+    The middle of its bounding box is at the picture's centre, and its highest point at z = 0. Several bodies
+    in a file make one object. The heights are exact at the field's pixel centres, and beyond the field on the
+    same grid; overhangs and the lower side are hidden.
 
     Parameters
     ----------
@@ -163,10 +165,10 @@ def load_mesh(path: str | Path, shape: tuple[int, int], pixel_size: tuple[float,
     path = Path(path)
     triangles = _read_triangles(path)
     _check_surface(path, triangles)
-    # Upright triangles have no area seen from above; their neighbours' edges are theirs.
+    # Vertical triangles have no area seen from above; their edges belong to their neighbours.
     triangles = triangles[_areas_from_above(triangles) > 0]
     if len(triangles) == 0:
-        raise InputError(f"{path}: shows no area seen from above: turn it so that its z axis points upwards")
+        raise InputError(f"{path}: has no area seen from above: rotate it so that its z axis points upwards")
     corners = triangles.reshape(-1, 3)
     low, high = corners.min(axis=0), corners.max(axis=0)
     triangles = triangles - [*(low[:2] + high[:2]) / 2, high[2]]
@@ -174,12 +176,14 @@ def load_mesh(path: str | Path, shape: tuple[int, int], pixel_size: tuple[float,
         _samples(high[1] - low[1], pixel_size[1], shape[0]),
         _samples(high[0] - low[0], pixel_size[0], shape[1]),
     )
-    size = f"{path}: is {high[0] - low[0]:.4g} x {high[1] - low[1]:.4g} mm"
+    size = f"{path}: its size is {high[0] - low[0]:.4g} x {high[1] - low[1]:.4g} mm"
     if grid[0] * grid[1] > _SAMPLES_MAX:
-        raise InputError(f"{size}, too large for pixels this small: a mesh is in millimetres, scale it")
+        raise InputError(
+            f"{size}, which is too large for pixels this small: meshes are in millimetres, scale it"
+        )
     heights = top_surface(triangles, grid, pixel_size)
     if not np.isfinite(heights).any():
-        raise InputError(f"{size}, no pixel meets it: a mesh is in millimetres, scale it")
+        raise InputError(f"{size}, which contains no pixel: meshes are in millimetres, scale it")
     return HeightMap(heights, pixel_size, path.name)
 
 
@@ -187,10 +191,10 @@ def _read_triangles(path: Path) -> Floats:
     mesh = _read_mesh(path)
     faces, vertices = np.asarray(mesh.faces), np.asarray(mesh.vertices, np.float64)
     if len(faces) == 0 or len(vertices) == 0:
-        raise InputError(f"{path}: holds no triangles, and points alone are no surface: export it as a mesh")
+        raise InputError(f"{path}: contains no triangles, only points: export it as a mesh")
     if faces.shape[1:] != (3,) or vertices.shape[1:] != (3,):
         raise InputError(
-            f"{path}: needs three coordinates a corner and three corners a triangle: export it again"
+            f"{path}: needs three coordinates per corner and three corners per triangle: export it again"
         )
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"{path}: has triangles without corners: export the mesh again")
@@ -203,9 +207,9 @@ def _read_triangles(path: Path) -> Floats:
 
 
 def _check_surface(path: Path, triangles: Floats) -> None:
-    """Refuse triangles that do not join, or of which three or another odd number meet at an edge.
+    """Refuse triangles that are not connected, or an odd number of three or more that share an edge.
 
-    Four meet where two bodies share an edge.
+    Four share an edge where two bodies touch.
     """
     _, corner = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
     ends = np.sort(corner.reshape(-1, 3)[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
@@ -214,10 +218,10 @@ def _check_surface(path: Path, triangles: Floats) -> None:
     torn = int(np.count_nonzero((uses > 2) & (uses % 2 == 1)))
     if torn:
         raise InputError(
-            f"{path}: is no surface: at {torn} of its edges three triangles meet; repair the mesh"
+            f"{path}: is not a surface: at {torn} of its edges three triangles meet; repair the mesh"
         )
     if len(triangles) > 1 and not (uses == 2).any():
-        raise InputError(f"{path}: is no surface: its triangles do not join; repair the mesh")
+        raise InputError(f"{path}: is not a surface: its triangles are not connected; repair the mesh")
 
 
 def _read_mesh(path: Path) -> Trimesh:
@@ -226,13 +230,13 @@ def _read_mesh(path: Path) -> Trimesh:
     except ImportError:
         raise InputError(f"{path}: meshes need trimesh: pip install 'mirrorskin[mesh]'") from None
 
-    # From memory: of a file with a name, trimesh opens the files that it names, such as materials.
+    # From memory, because trimesh opens files that a named file refers to, such as materials.
     data = BytesIO(read_regular(path))
     try:
         return trimesh.load_mesh(data, file_type=path.suffix[1:].lower(), process=False)
-    except Exception as error:  # what its parsers raise on a broken file has no common base
+    except Exception as error:  # exceptions of its parsers have no common base
         raise InputError(
-            f"{path}: is no {path.suffix[1:].upper()} mesh that can be read: export it again"
+            f"{path}: is not a readable {path.suffix[1:].upper()} mesh: export it again"
         ) from error
 
 
@@ -243,25 +247,25 @@ def _areas_from_above(triangles: Floats) -> Floats:
 
 
 def _samples(extent: float, pixel_size: float, pixels: int) -> int:
-    """Return how many samples lie within the extent, if they lie where the field's pixel centres do."""
+    """Return the number of samples within the extent, at the positions of the field's pixel centres."""
     half = extent / 2 / pixel_size + 1e-9
     return 2 * int(half) + 1 if pixels % 2 else 2 * int(half + 0.5)
 
 
 _Indices = NDArray[np.intp]
 
-# By so much of a sample a triangle is widened, so that rounding leaves no gap between neighbours.
+# Triangles are widened by this share of a sample, so that rounding leaves no gaps between neighbours.
 _MARGIN = 1e-9
-# Samples (or rows of triangles) that are worked on at a time: bounds the memory.
+# Samples (or rows of triangles) processed at a time, which limits the memory.
 _PART = 300_000
 
 
 def top_surface(triangles: Floats, shape: tuple[int, int], pixel_size: tuple[float, float]) -> Floats:
-    """Return the height of the highest triangle at each sample of a grid about the origin; NaN without any.
+    """Return the height of the highest triangle at each sample of a centred grid; NaN without a triangle.
 
-    Each triangle, of three corners (x, y, z) in mm, is cut along the grid's rows; a cut is a straight line
-    between two edges, on which the height is linear. Where triangles overlap the highest counts (a depth
-    buffer); both their sides can be seen.
+    Each triangle, with three corners (x, y, z) in mm, is cut along the grid's rows; a cut is a straight line
+    between two edges, on which the height is linear. Of overlapping triangles the highest counts (a depth
+    buffer), whatever their orientation.
     """
     rows, columns = shape
     x = triangles[..., 0] / pixel_size[0] + (columns - 1) / 2
@@ -270,7 +274,7 @@ def top_surface(triangles: Floats, shape: tuple[int, int], pixel_size: tuple[flo
     top = np.full(rows * columns, -np.inf)
     low, high = y.min(axis=1), y.max(axis=1)
     first, count = _samples_between(low, high, rows)
-    count[low == high] = 0  # only neighbours have area there
+    count[low == high] = 0  # only neighbouring triangles have area there
     for part in _parts(count):
         triangle, row = _expand(first[part], count[part])
         start, end = _cut(x[part][triangle], y[part][triangle], z[part][triangle], row)
@@ -289,7 +293,7 @@ def _cut(x: Floats, y: Floats, z: Floats, row: _Indices) -> tuple[Floats, Floats
         share = np.where(crosses, np.clip((row - y[:, a]) / rise, 0.0, 1.0), np.nan)
         ends[0, edge] = x[:, a] + share * (x[:, b] - x[:, a])
         ends[1, edge] = z[:, a] + share * (z[:, b] - z[:, a])
-    # At a corner three edges cross, anywhere else two.
+    # At a corner three edges are cut, elsewhere two.
     every = np.arange(len(row))
     left, right = np.nanargmin(ends[0], axis=0), np.nanargmax(ends[0], axis=0)
     return ends[:, left, every], ends[:, right, every]
@@ -307,14 +311,14 @@ def _fill(top: Floats, rows: _Indices, start: Floats, end: Floats) -> None:
 
 
 def _samples_between(start: Floats, end: Floats, samples: int) -> tuple[_Indices, _Indices]:
-    """Return the first sample from start to end, and how many of them there are."""
+    """Return the first sample between start and end, and the number of samples."""
     first = np.clip(np.ceil(start - _MARGIN), 0, samples).astype(np.intp)
     stop = np.clip(np.floor(end + _MARGIN) + 1, 0, samples).astype(np.intp)
     return first, np.maximum(stop - first, 0)
 
 
 def _parts(count: _Indices) -> Iterator[slice]:
-    """Divide counts into runs whose sums stay below a part, if single counts do."""
+    """Yield runs of counts whose sums are below a limit, unless a single count exceeds it."""
     sums = np.cumsum(count)
     start = 0
     while start < len(count):
@@ -325,6 +329,6 @@ def _parts(count: _Indices) -> Iterator[slice]:
 
 
 def _expand(first: _Indices, count: _Indices) -> tuple[_Indices, _Indices]:
-    """Return for all members of all runs, end to end, the number of the run and the member."""
+    """Return for all members of all runs, concatenated, the number of the run and the member."""
     run = np.repeat(np.arange(len(count)), count)
     return run, np.arange(len(run)) + (first - np.cumsum(count) + count)[run]

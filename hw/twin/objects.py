@@ -1,4 +1,4 @@
-"""What the twin can press on: the interface of an object, and objects of simple shape."""
+"""The interface of objects for the twin, and objects of simple shape."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from mirrorskin.io.types import Floats
 
 
 class Object(Protocol):
-    """A solid under the sheet, seen from above: the interface of everything the twin can press on.
+    """A solid under the sheet, seen from above: the interface of all objects for the twin.
 
     ``z = 0`` is the sheet's rest plane, so no height is above it; the highest point touches at travel 0.
-    Coordinates are millimetres from the picture's centre, x to the right and y up the picture.
+    Coordinates are millimetres from the picture's centre, x to the right and y up.
     """
 
     @property
     def name(self) -> str:
-        """What to call it in a recording's title."""
+        """Name in the title of a recording."""
 
     @property
     def radius(self) -> float:
-        """Radius of the circle about the origin that holds the object, not a table that it lies on; mm."""
+        """Radius of the circle about the origin that contains the object without its table, mm."""
 
     def height(self, x: Floats, y: Floats, /) -> Floats:
         """Return the surface's z, mm, float64, shaped as x and y broadcast; NaN where there is no object."""
@@ -36,7 +36,7 @@ class Object(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Shifted:
-    """An object that lies elsewhere under the sheet.
+    """An object displaced from the centre of the sheet.
 
     Attributes
     ----------
@@ -50,12 +50,12 @@ class Shifted:
 
     @property
     def name(self) -> str:
-        """That of the object."""
+        """Name of the object."""
         return self.thing.name
 
     @property
     def radius(self) -> float:
-        """Radius of a circle about the picture's centre that holds the object, mm."""
+        """Radius of a circle about the picture's centre that contains the object, mm."""
         return self.thing.radius + math.hypot(*self.shift)
 
     def height(self, x: Floats, y: Floats, /) -> Floats:
@@ -70,10 +70,10 @@ class Shifted:
 def difference_slope(
     height: Callable[[Floats, Floats], Floats], x: Floats, y: Floats, step: tuple[float, float]
 ) -> tuple[Floats, Floats]:
-    """Differentiate a height function by central differences, one-sided where the object ends.
+    """Return the slope of a height function by central differences, one-sided at the object's edge.
 
-    NaN where the height is, and where both neighbours along that axis are missing; ``step`` is the distance
-    to these.
+    NaN where the height is NaN, and where both neighbours along that axis are missing; ``step`` is the
+    distance to these.
     """
     centre = height(x, y)
     dx, dy = step
@@ -83,12 +83,12 @@ def difference_slope(
 
 
 def zenith_azimuth(dz_dx: Floats, dz_dy: Floats) -> tuple[Floats, Floats]:
-    """Turn slopes into the angles of the normal, which is proportional to (-dz/dx, -dz/dy, 1).
+    """Return zenith and azimuth of the normal, which is proportional to (-dz/dx, -dz/dy, 1).
 
-    The azimuth, in (-pi, pi], is NaN where the surface is level and has none.
+    The azimuth, in (-pi, pi], is NaN where the surface is level.
     """
     zenith = np.arctan(np.hypot(dz_dx, dz_dy))
-    # 0.0 - s, not -s: a negative zero would put the azimuth at -pi.
+    # 0.0 - s instead of -s: a negative zero would give an azimuth of -pi.
     azimuth = np.arctan2(0.0 - dz_dy, 0.0 - dz_dx)
     return zenith, np.where(zenith > 0, azimuth, np.nan)
 
@@ -100,7 +100,7 @@ def _mean_of_known(a: Floats, b: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Sphere:
-    """A ball under the centre of the sheet; the half below its equator is hidden.
+    """A ball under the centre of the sheet; the half below its equator is not visible.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ class Sphere:
 
 @dataclass(frozen=True, slots=True)
 class Cone:
-    """A cone standing under the centre of the sheet, its tip up.
+    """A cone under the centre of the sheet with its tip up.
 
     Attributes
     ----------
@@ -147,7 +147,7 @@ class Cone:
         return -math.tan(self.zenith) * self._distance(x, y)
 
     def slope(self, x: Floats, y: Floats, /) -> tuple[Floats, Floats]:
-        """Return -tan(zenith) times the outward direction; 0, the mean of all sides, at the very tip."""
+        """Return -tan(zenith) times the outward direction; at the tip 0, the mean of all sides."""
         distance = self._distance(x, y)
         steepness = -math.tan(self.zenith) / np.where(distance == 0, 1.0, distance)
         return steepness * x, steepness * y
@@ -159,7 +159,7 @@ class Cone:
 
 @dataclass(frozen=True, slots=True)
 class Cylinder:
-    """A rod lying on its side, its middle under the centre of the sheet; its ends are cut off upright.
+    """A horizontal rod, centred under the sheet, with vertical end faces.
 
     Attributes
     ----------
@@ -208,7 +208,7 @@ PLATE_RADIUS = 15.0
 
 @dataclass(frozen=True, slots=True)
 class Plane:
-    """A tilted plate that ends where it would pass above the sheet's rest plane.
+    """A tilted plate that ends where it would rise above the sheet's rest plane.
 
     Attributes
     ----------
@@ -242,7 +242,7 @@ class Plane:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Two levels with a straight edge between them, which is a ramp that the sensor can see.
+    """Two levels separated by a straight ramp that the sensor can see.
 
     Attributes
     ----------
@@ -267,7 +267,7 @@ class Step:
         return np.clip(ramp, -self.drop, 0.0)
 
     def slope(self, x: Floats, y: Floats, /) -> tuple[Floats, Floats]:
-        """Return -tan(zenith) (cos(azimuth), sin(azimuth)) on the ramp, 0 beside it; NaN off the plate."""
+        """Return -tan(zenith) (cos(azimuth), sin(azimuth)) on the ramp, 0 elsewhere; NaN off the plate."""
         downhill = self._downhill(x, y)
         beside = np.abs(downhill) > self.drop / 2 / math.tan(self.zenith)
         steepness = np.where(np.isnan(downhill), np.nan, np.where(beside, 0.0, -math.tan(self.zenith)))

@@ -1,4 +1,4 @@
-"""The object as the sensor's body meets it: its surface in the body's frame, along the camera's view."""
+"""The surface of an object in the frame of the sensor's body, along the camera's lines of sight."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from mirrorskin.hw.twin.objects import Object
 from mirrorskin.hw.twin.view import View
 from mirrorskin.io.types import Floats
 
-STEEP = 1e6  # a slope that no mirror shows, for the very edge of an object, where it has none
+STEEP = 1e6  # slope at the very edge of an object, where it is undefined; no mirror shows it
 
-_NOWHERE = 1e3  # "far below", in mm, for where there is no object
-_PRECISION = 1e-9  # of a height, mm
-_RAYS = 32768  # followed at a time: what is computed from them stays in the processor's cache
-_SECANTS = 5  # that take a smooth surface from a millimetre to the precision
-_JUMP = 1e-6  # more than G can be, by the precision, on any slope up to STEEP / 1000
+_NOWHERE = 1e3  # "far below", mm, where there is no object
+_PRECISION = 1e-9  # tolerance of a height, mm
+_RAYS = 32768  # rays processed at a time, so that their data fit into the processor's cache
+_SECANTS = 5  # secant steps that reduce an error of a millimetre to the tolerance on a smooth surface
+_JUMP = 1e-6  # larger than G can be at the tolerance on any slope up to STEEP / 1000
 
 
 class Obstacle(NamedTuple):
-    """What of the object stands above the sheet's rest plane, maps of (H, W), float64.
+    """The part of an object above the sheet's rest plane, maps of (H, W), float64.
 
-    ``height`` is NaN where nothing does, and so are the slopes there.
+    ``height`` and the slopes are NaN elsewhere.
     """
 
     height: Floats
@@ -34,14 +34,14 @@ class Obstacle(NamedTuple):
 
 
 class _Vectors(NamedTuple):
-    """A vector of each ray; a component is one number where it is the same for all."""
+    """A vector for each ray; a component that is the same for all is one number."""
 
     x: Any
     y: Any
     z: Any
 
     def of(self, rays: NDArray[np.intp]) -> _Vectors:
-        """Take those of some rays, numbered in C order."""
+        """Return the vectors of some rays, numbered in C order."""
         return _Vectors(*(part if np.ndim(part) == 0 else part.ravel()[rays] for part in self))
 
 
@@ -53,17 +53,17 @@ class _End(NamedTuple):
 
 
 def meet(thing: Object, pose: Pose, view: View) -> Obstacle:
-    """Find the uppermost point of the object on each ray, where that is above the rest plane.
+    """Return the uppermost point of the object on each ray, where it is above the rest plane.
 
-    In the object's frame a ray is a straight line, which a surface ``z = f(x, y)`` meets where ::
+    In the object's frame a ray is a straight line. It meets a surface ``z = f(x, y)`` where ::
 
         G(l) = z(l) - f(x(l), y(l)) = 0
 
-    with l the height in the body's frame. Rays that are upright there need no search. The others are followed
-    down from the object's highest point by steps of at most a pixel to the first change of sign of G, which
-    is then narrowed down to 1e-9 mm: by secants, and where these do not get there by Chandrupatla's method.
-    Where G jumps, the ray meets an upright side of the object, which is as steep as can be. What a ray meets
-    and leaves again within a pixel it misses.
+    with l the height in the body's frame. Rays that are vertical there need no search. The others are
+    followed downwards from the object's highest point in steps of at most a pixel to the first change of sign
+    of G, which is then refined to 1e-9 mm by secants, or, where these do not converge, by Chandrupatla's
+    method. Where G jumps, the ray meets a vertical side of the object. Intersections shorter than a pixel are
+    missed.
     """
     inside, sideways = np.zeros(view.shape, bool), 0.0
     for first in range(0, inside.size, _RAYS):
@@ -81,9 +81,9 @@ def meet(thing: Object, pose: Pose, view: View) -> Obstacle:
 
 
 def _rays(pose: Pose, view: View, pixels: NDArray[np.intp] | slice) -> tuple[_Vectors, _Vectors]:
-    """Return where the rays of some pixels begin and how they lean, in the object's frame."""
+    """Return start and direction of the rays of some pixels in the object's frame."""
     left, down = view.x.ravel()[pixels] - pose.shift[0], view.y.ravel()[pixels] - pose.shift[1]
-    # Row vectors times the rotation are vectors turned back.
+    # Row vectors times the rotation are vectors in the inverse rotation.
     foot = (left * to[0] + down * to[1] - pose.shift[2] * to[2] for to in pose.rotation.T)
     if view.orthographic:
         return _Vectors(*foot), _Vectors(*pose.rotation[2])
@@ -92,10 +92,10 @@ def _rays(pose: Pose, view: View, pixels: NDArray[np.intp] | slice) -> tuple[_Ve
 
 
 def _spread(inside: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
-    """Add to the rays that begin inside the object those near them, and those near the picture's edge.
+    """Add to the rays that start inside the object those near them, and those near the picture's edge.
 
-    No other can meet it: below a point of the surface all is inside the object, and so is the point of the
-    rest plane straight below it, which is no farther off than a ray goes sideways.
+    No other ray can meet it: everything below a point of the surface is inside the object, including the
+    point of the rest plane vertically below it, which is at most as far away as the lateral shift of a ray.
     """
     import cv2
 
@@ -114,7 +114,7 @@ def _meet(
     pixels: NDArray[np.intp],
     maps: Floats,
 ) -> None:
-    """Write height and slopes of some pixels, where there are any, to maps of (3, H x W)."""
+    """Write height and slopes of some pixels, where defined, to maps of (3, H x W)."""
     if steps:
         height, side = _search(thing, foot, lean, steps)
     else:
@@ -130,14 +130,14 @@ def _meet(
 
 
 def _above(thing: Object, x: Floats, y: Floats, z: Floats) -> Floats:
-    """Tell how far a point is above the surface, mm; far, where there is no object."""
+    """Return the height of a point above the surface, mm; a large value where there is no object."""
     distance = z - thing.height(x, y)
     distance[np.isnan(distance)] = _NOWHERE
     return distance
 
 
 def _search(thing: Object, foot: _Vectors, lean: _Vectors, steps: int) -> tuple[Floats, NDArray[np.bool_]]:
-    """Find the uppermost height above 0 at which each ray meets the object, and whether at an upright side.
+    """Return the uppermost height above 0 of the object on each ray, and whether it is a vertical side.
 
     The height is NaN where a ray does not meet it.
     """
@@ -194,13 +194,13 @@ def _narrow(
 
 
 def _slopes(thing: Object, pose: Pose, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return the slopes in the body's frame at points of the object's own."""
+    """Return the slopes in the body's frame at points in the object's frame."""
     along_x, along_y = map(_known, thing.slope(x, y))
     if pose.upright:
         return along_x, along_y
-    # The object's own normal is (-along_x, -along_y, 1).
+    # The normal in the object's frame is (-along_x, -along_y, 1).
     across, up, facing = (to[2] - along_x * to[0] - along_y * to[1] for to in pose.rotation)
-    facing = np.maximum(facing, 1 / STEEP)  # what faces away is as steep as can be
+    facing = np.maximum(facing, 1 / STEEP)  # surfaces that face away get the maximum slope
     return -across / facing, -up / facing
 
 

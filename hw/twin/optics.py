@@ -1,4 +1,4 @@
-"""What the camera sees in the mirror: by zenith alone, or by rays traced to the lit wall."""
+"""The light that the camera sees in the mirror: a function of the zenith, or ray-traced to the wall."""
 
 from __future__ import annotations
 
@@ -19,24 +19,22 @@ _PAPER = Body()
 
 
 class Ideal:
-    """What a camera that looks straight down sees in a mirror at the centre, taken for the whole field.
+    """The view of a camera looking straight down at a mirror in the centre, applied to the whole field.
 
-    A mirror of zenith t shows what lies 2 t off the axis. A ray from the centre of the sheet at rest meets
+    A mirror of zenith t deflects the line of sight by 2 t. A ray from the centre of the sheet at rest meets
     the wall where ::
 
         tan 2t >= radius / height  and  2t <= 90 degrees,   that is  t0 = 11.8 degrees <= t <= t1 = 45 degrees
 
-    What it meets there is the wall's response: 1 inside that window and 0 outside for the uniform pattern;
-    for the linear one a ramp from 0 at its lower zenith to 1 at its upper one, which holds its ends' values
-    beyond. The sheet scatters the ray evenly over +-scatter in the plane of incidence, which are +-scatter
-    / 2 of zenith: the light is the response convolved with that box, by the difference of its
-    antiderivative G ::
+    The response of the wall there is 1 inside that window and 0 outside for the uniform pattern. For the
+    linear one it is a ramp from 0 at its lower zenith to 1 at its upper one, and constant beyond. The sheet
+    scatters the ray uniformly over +-scatter in the plane of incidence, which is +-scatter / 2 of zenith. The
+    light is the response convolved with that box, by the difference of its antiderivative G ::
 
         light(t) = (G(t + w) - G(t - w)) / 2w,     w = scatter / 2
 
-    Left out: how the window changes off the axis, how the sheet's height and an oblique line of sight change
-    it, and what is dark or not beyond the horizon with the linear pattern. All of it is traced by
-    `Wall`.
+    Not included: the change of the window off the axis, the effects of the sheet's height and of an oblique
+    line of sight, and the horizon with the linear pattern. `Wall` traces all of these.
 
     Parameters
     ----------
@@ -55,35 +53,36 @@ class Ideal:
         unfit = {
             "a picture as pattern": not isinstance(pattern, Uniform | Linear),
             "an air gap": body.air_gap != 0,
-            "lamps that light one side more": body.asymmetry != 0,
+            "uneven lamps": body.asymmetry != 0,
         }
         for what, present in unfit.items():
             if present:
                 raise InputError(
-                    f"the ideal optics know of zenith alone, not of {what}: take the optics 'cylinder'"
+                    f"the ideal optics depend on the zenith only and do not support {what}: use "
+                    "the optics 'cylinder'"
                 )
         self._body, self._pattern = body, pattern
 
     def light(self, sheet: Sheet) -> NDArray[np.float32]:
-        """Return the share of full light that each pixel sees, (H, W), float32."""
+        """Return the share of full light at each pixel, (H, W), float32."""
         square = sheet.dz_dx**2 + sheet.dz_dy**2
         light = np.full(square.shape, self.response(np.zeros(1))[0], np.float32)
-        leans = square != 0  # most of a sheet often lies level
+        leans = square != 0  # most of a sheet is often level
         light[leans] = self.response(np.arctan(np.sqrt(square[leans])))
         return light
 
     def response(self, zenith: Floats) -> Floats:
-        """Return the share of full light that a mirror of a zenith, radians, shows; NaN for NaN."""
+        """Return the share of full light of a mirror with a zenith, radians; NaN for NaN."""
         if isinstance(self._pattern, Linear):
             return _ramp_response(zenith, self._pattern, self._body.scatter)
         return uniform_response(zenith, self._body)
 
 
 def uniform_response(zenith: Floats, body: Body = _PAPER) -> Floats:
-    """Return the share of full light that a camera sees from a mirror under a uniformly lit wall.
+    """Return the share of full light that a camera sees in a mirror under a uniformly lit wall.
 
-    Its window of zenith (see `Ideal`) convolved with a box of half-width w = scatter / 2: two ramps, each 2w
-    = 3 degrees wide for the paper's body ::
+    It is the window of zenith (see `Ideal`) convolved with a box of half-width w = scatter / 2: two ramps,
+    each 2w = 3 degrees wide for the paper's body ::
 
         g(t) = (clip(t + w, t0, t1) - clip(t - w, t0, t1)) / 2w
     """
@@ -96,7 +95,7 @@ def uniform_response(zenith: Floats, body: Body = _PAPER) -> Floats:
 def design_range(body: Body) -> tuple[float, float]:
     """Return the zeniths between which the linear pattern's light is exactly linear in zenith, radians.
 
-    Outside of it the scattered rays reach beyond the pattern's ends: 13.3 to 43.5 degrees for the paper's
+    Outside this range, scattered rays reach beyond the pattern's ends: 13.3 to 43.5 degrees for the paper's
     body.
     """
     first, last = zenith_window(body)
@@ -104,7 +103,7 @@ def design_range(body: Body) -> tuple[float, float]:
 
 
 def _ramp_response(zenith: Floats, pattern: Linear, scatter: float) -> Floats:
-    """Convolve a ramp that saturates at both ends with the box of the scatter."""
+    """Convolve a ramp that is constant beyond its ends with the box of the scatter."""
     span = pattern.upper - pattern.lower
     if scatter == 0:
         return np.clip((zenith - pattern.lower) / span, 0, 1)
@@ -122,24 +121,25 @@ def _boxed(antiderivative: Callable[[Floats], Floats], zenith: Floats, half_widt
 
 
 _HALVINGS = 60
-_TINY = 1e-30  # a ray that is totally reflected never gets across
+_TINY = 1e-30  # a totally reflected ray never crosses
 
 
 def visible_zenith(body: Body, x: ArrayLike, y: ArrayLike, azimuth: ArrayLike) -> tuple[Floats, Floats]:
-    """Return the zeniths between which a mirror shows the wall to a camera that looks straight down.
+    """Return the zeniths between which a mirror shows the wall to a camera looking straight down.
 
-    The mirror lies on the rest plane, and nothing scatters. Towards the azimuth the body's side is ::
+    The mirror is in the rest plane, without scatter. In the direction of the azimuth the distance to the
+    body's side is ::
 
         way = c - b,    b = x cos(azimuth) + y sin(azimuth),    c = sqrt(b^2 + radius^2 - x^2 - y^2)
 
-    away, and the ray leans by twice the zenith t: it passes below the rim from ``t = atan2(way, height) / 2``
-    on, and above the horizon up to 45 degrees. With an air gap it must also leave the body: it meets the side
-    at an angle of cosine sin(2t) c / radius, and is totally reflected unless ::
+    and the ray leans by twice the zenith t: it passes below the rim for ``t >= atan2(way, height) / 2``, and
+    above the horizon up to 45 degrees. With an air gap it must also leave the body: it meets the side at an
+    angle of cosine sin(2t) c / radius, and is totally reflected unless ::
 
         sin(2t) > sqrt(1 - 1 / index^2) radius / c
 
-    Just beyond that it leaves steeply and climbs over the rim within the gap, by an angle that is found by
-    halving.
+    Just above that limit it leaves steeply and passes above the rim within the gap; the least zenith at which
+    it does not is found by bisection.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def visible_zenith(body: Body, x: ArrayLike, y: ArrayLike, azimuth: ArrayLike) -
     )
     room = body.radius**2 - x * x - y * y
     along = x * np.cos(azimuth) + y * np.sin(azimuth)
-    # Outside the body there is no room: NaN from here on.
+    # The distance is undefined outside the body: NaN from here on.
     cosine = np.sqrt(along * along + np.where(room > 0, room, np.nan))
     way = room / (cosine + along)
     lower = np.arctan2(way, body.height) / 2
@@ -169,9 +169,10 @@ def visible_zenith(body: Body, x: ArrayLike, y: ArrayLike, azimuth: ArrayLike) -
 
 
 def _leaves(body: Body, way: Floats, cosine: Floats, lower: Floats) -> Floats:
-    """Return the least zenith at which a ray leaves the body below the rim and meets the wall below it, too.
+    """Return the least zenith at which a ray leaves the body below the rim and also meets the wall below it.
 
-    ``cosine`` is that of a level ray to the side's normal. A higher zenith only takes the ray lower.
+    ``cosine`` is that of a horizontal ray and the side's normal. A larger zenith makes the ray meet the wall
+    lower.
     """
     least = math.sqrt(1 - 1 / body.index**2) / cosine
     dark = np.maximum(lower, np.arcsin(np.minimum(least, 1)) / 2)
@@ -184,38 +185,39 @@ def _leaves(body: Body, way: Floats, cosine: Floats, lower: Floats) -> Floats:
 
 
 def _height_at_wall(body: Body, way: Floats, cosine: Floats, zenith: Floats) -> Floats:
-    """Return how high a ray meets the wall across the gap."""
+    """Return the height at which a ray meets the wall across the gap."""
     level, rise = np.sin(2 * zenith), np.cos(2 * zenith)
     out = np.sqrt(np.maximum(1 - body.index**2 * (1 - (level * cosine) ** 2), 0))
-    spread = np.maximum(1 - (body.index * rise) ** 2, 0)  # square of the refracted ray's level part
+    spread = np.maximum(1 - (body.index * rise) ** 2, 0)  # squared horizontal component of the refracted ray
     room = (body.radius + body.air_gap) ** 2 - body.radius**2
     towards = body.radius * out
     across = room / (towards + np.sqrt(towards**2 + spread * room + _TINY))
     return np.asarray(rise * (way / level + body.index * across))
 
 
-_RAYS = 128  # of each pixel
-_FADES = 24  # the light at the wall's edges fades over this part of the scatter
-_GOLDEN = math.pi * (3 - math.sqrt(5))  # angle that never repeats: it spreads points evenly over a sphere
+_RAYS = 128  # rays per pixel
+_FADES = 24  # the light at the wall's edges fades over the scatter divided by this
+# golden angle: points at its multiples are distributed evenly over a sphere
+_GOLDEN = math.pi * (3 - math.sqrt(5))
 
 
 class Wall:
-    """What the camera sees in the mirror: the lit wall, where and only where a ray gets there.
+    """The lit wall in the mirror, by ray tracing.
 
-    At each pixel the line of sight is mirrored at the sheet's normal and scattered by its flakes
-    (`scatter_rays`), and each ray is followed to the wall (`mirrorskin.kernels.wall`). Dark is a ray that
+    At each pixel the line of sight is reflected at the sheet's normal and scattered by its flakes
+    (`scatter_rays`), and each ray is followed to the wall (`mirrorskin.kernels.wall`). A ray is dark if it
 
     - passes over the rim and leaves by the body's top;
-    - goes down below the rest plane: it meets the sheet before the wall, and no second bounce is followed;
+    - goes down below the rest plane: it meets the sheet before the wall, and second reflections are ignored;
     - is totally reflected at the body's side, with an air gap;
     - starts outside the body.
 
-    The sheet does not hide the wall from itself: a ray that would meet another part of the raised sheet
-    passes through it. Between steep walls of a narrow groove that is too bright.
+    The sheet does not occlude the wall: a ray that would meet another part of the raised sheet passes through
+    it, so narrow grooves with steep walls are too bright.
 
     Light agrees with the float64 reference within 2e-5, and within 1e-3 across a gap or less than 0.2 mm from
-    the body's side. Without scatter, a ray that meets an edge within the rounding of float32 may fall on
-    either side.
+    the body's side. Without scatter, a ray that meets an edge within the rounding of float32 may be on either
+    side.
     """
 
     def __init__(self, body: Body, pattern: Pattern, view: View, device: Device) -> None:
@@ -237,10 +239,10 @@ class Wall:
         }
 
     def light(self, sheet: Sheet) -> NDArray[np.float32]:
-        """Return the share of full light that each pixel sees, (H, W), float32.
+        """Return the share of full light at each pixel, (H, W), float32.
 
-        Full is what the pattern's clear places give where the lamps are brightest. The sheet is finite
-        everywhere.
+        Full light is that of the pattern's clear parts where the lamps are brightest. The sheet must be
+        finite everywhere.
         """
         for plane, values in enumerate((sheet.height, sheet.dz_dx, sheet.dz_dy)):
             self._sheet.write(values, row=plane)
@@ -272,20 +274,19 @@ class Wall:
 
 
 def scatter_rays(scatter: float) -> Floats:
-    """Return rays scattered about a mirrored one, as `mirrorskin.kernels.wall.wall_light` takes them.
+    """Return rays scattered about a reflected one, as used by `mirrorskin.kernels.wall.wall_light`.
 
-    A ray is turned off the mirrored one by the vector (u, v), of length at most a = scatter,
-    across it. Its density ::
+    A ray deviates from the reflected one by the vector (u, v) across it, of length at most a = scatter. Its
+    density ::
 
         1 / (2 pi a sqrt(a^2 - u^2 - v^2))
 
-    is that of points spread evenly over a sphere of radius a and seen from afar. Equal slices of a sphere
-    have equal surfaces (Archimedes), so that in every plane through the mirrored ray the low-pass is a box
-    from -a to a, whichever way that plane lies. The rays are the points of a Fibonacci lattice: each in a
-    slice of its own, each turned by the golden angle.
+    is the projection of points distributed evenly over a sphere of radius a. Slices of a sphere of equal
+    thickness have equal areas (Archimedes), so in every plane through the reflected ray the low-pass is a box
+    from -a to a. The rays are a Fibonacci lattice: one per slice, rotated by the golden angle.
 
-    Scatter is in radians. Rays are (S, 3): parts along the mirrored ray, along u and along v; the mirrored
-    ray alone where nothing scatters.
+    Scatter is in radians. Rays are (S, 3): components along the reflected ray, along u and along v; without
+    scatter only the reflected ray.
     """
     if scatter == 0:
         return np.array([[1.0, 0.0, 0.0]])
@@ -298,12 +299,12 @@ def scatter_rays(scatter: float) -> Floats:
 
 
 def fade_angle(scatter: float) -> float:
-    """Return the angle over which a ray fades at the wall's edges, radians: what hides that rays are few."""
+    """Return the angle over which a ray fades at the wall's edges, radians; it hides the number of rays."""
     return 2 * scatter / _FADES
 
 
 def _depends_on(table: NDArray[np.float32]) -> int:
-    """Return 0 where all of a wall is alike, 1 where it changes with height alone, 2 else."""
+    """Return 0 if a wall is uniform, 1 if it varies with height only, otherwise 2."""
     if (table == table[:, :1]).all():
         return int((table != table[0, 0]).any())
     return 2

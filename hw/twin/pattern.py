@@ -1,4 +1,4 @@
-"""What is printed on the patterned sheet round the body: how much light it lets through, and where."""
+"""The print of the patterned sheet around the body: its transmittance by position."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from mirrorskin.io.types import Floats, InputError
 
 PATTERN_NAMES = ("uniform", "linear")
 
-_ROWS = 256  # a straight line between two of them misses the linear pattern by less than 1e-5
+_ROWS = 256  # rows of the table; linear interpolation between them is accurate to 1e-5 for the linear pattern
 
 
 class Pattern(Protocol):
-    """A patterned sheet, as it stands round the body."""
+    """A patterned sheet around the body."""
 
     def table(self, body: Body, /) -> NDArray[np.float32]:
-        """Return what it lets through, (rows + 2, columns + 2), as `mirrorskin.kernels.wall` reads it."""
+        """Return its transmittance, (rows + 2, columns + 2), as `mirrorskin.kernels.wall` reads it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Uniform:
-    """A clear sheet: it lets all light through."""
+    """A clear sheet: transmittance 1."""
 
     def table(self, body: Body, /) -> NDArray[np.float32]:
         """Return ones, (3, 3)."""
@@ -37,22 +37,22 @@ class Uniform:
 
 @dataclass(frozen=True, slots=True)
 class Linear:
-    """A sheet whose transmittance is linear in zenith, as the paper's Figure 9 has it.
+    """A sheet whose transmittance is linear in zenith, as in Figure 9 of the paper.
 
-    A mirror at the centre of the sheet at rest shows a camera that looks straight down the height z of the
-    wall when its zenith is half of what the wall's point lies off the axis. There the sheet lets through ::
+    A mirror at the centre of the sheet at rest shows a camera looking straight down the height z of the wall
+    if its zenith is half of the angle between that point and the axis. There the transmittance is ::
 
         T = (zenith - lower) / (upper - lower), from 0 to 1,     zenith = atan2(radius, z) / 2
 
     Attributes
     ----------
     lower, upper : float
-        Zenith at which it lets nothing through, and all, radians.
+        Zeniths at which the transmittance is 0 and 1, radians.
 
     Raises
     ------
     InputError
-        They are not in order between 0 and 90 degrees.
+        They are not in ascending order between 0 and 90 degrees.
     """
 
     lower: float
@@ -61,18 +61,18 @@ class Linear:
     def __post_init__(self) -> None:
         if not 0 <= self.lower < self.upper <= math.pi / 2:
             raise InputError(
-                f"a pattern linear from a zenith of {self.lower} to {self.upper} rad cannot be:"
-                " give the lower one first, both from 0 to pi/2"
+                f"a pattern linear from a zenith of {self.lower} to {self.upper} rad is not "
+                "possible: give the lower one first, both from 0 to pi/2"
             )
 
     @property
     def gain(self) -> float:
-        """Share of the full light for each radian of zenith."""
+        """Share of full light per radian of zenith."""
         return 1 / (self.upper - self.lower)
 
     @property
     def offset(self) -> float:
-        """Share of the full light at zenith 0 if the line went on so far."""
+        """Share of full light at zenith 0 if the line is extrapolated."""
         return -self.lower * self.gain
 
     def table(self, body: Body, /) -> NDArray[np.float32]:
@@ -80,7 +80,7 @@ class Linear:
         height = body.height * (1 - (np.arange(_ROWS) + 0.5) / _ROWS)
         ends = 2 * self._transmittance(np.array([body.height, 0.0]), body.radius)
         inside = self._transmittance(height, body.radius)
-        # Beyond an edge lies what makes the line to the row before it meet the edge in its very value.
+        # Rows beyond an edge are chosen such that the interpolation is exact at the edge.
         column = np.concatenate([ends[:1] - inside[:1], inside, ends[1:] - inside[-1:]])
         return np.repeat(column.astype(np.float32)[:, np.newaxis], 3, axis=1)
 
@@ -90,7 +90,7 @@ class Linear:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """A sheet with any picture on it, unrolled as one sees it turning on the body's axis.
+    """A sheet with any picture on it, unrolled as seen when turning on the body's axis.
 
     Attributes
     ----------
@@ -117,11 +117,11 @@ class Picture:
 
 
 def make_pattern(name: str | Path, body: Body) -> Pattern:
-    """Make a pattern that a user named.
+    """Return a pattern by its name or file.
 
-    It is "uniform"; "linear", from dark at the zenith that shows the wall's rim to clear at the one that
-    shows the horizon; or the path of a picture, PNG or TIFF, grey or made so. InputError if it is unknown, or
-    its file cannot be used.
+    It is "uniform"; "linear", from dark at the zenith that shows the wall's rim to clear at the zenith that
+    shows the horizon; or the path of a picture, PNG or TIFF, which is converted to grey. InputError if it is
+    unknown, or its file cannot be used.
     """
     if name == "uniform":
         return Uniform()
@@ -150,7 +150,7 @@ def linear_pattern(body: Body) -> Linear:
 def _transmittances(values: NDArray[Any]) -> Floats:
     if values.ndim != 2 or values.size == 0:
         raise InputError(
-            f"a pattern has rows and columns only, this has shape {values.shape}: give one picture"
+            f"a pattern has rows and columns only, but this one has shape {values.shape}: give one picture"
         )
     if values.dtype in (np.uint8, np.uint16):
         return values / float(np.iinfo(values.dtype).max)
@@ -159,5 +159,5 @@ def _transmittances(values: NDArray[Any]) -> Floats:
             f"a pattern cannot be {values.dtype}: give 8- or 16-bit counts, or floats from 0 to 1"
         )
     if not ((values >= 0) & (values <= 1)).all():
-        raise InputError("a pattern lets through from 0 to 1 of the light: scale its values to that")
+        raise InputError("the transmittance of a pattern is 0 to 1: scale its values to that range")
     return values.astype(np.float64)

@@ -1,4 +1,4 @@
-"""The references of a twin: each pixel's own levels, or what a camera finds of them in a lab."""
+"""The references of a twin: each pixel's exact levels, or those that a camera measures in a laboratory."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ ReferenceName = Literal["exact", "ball"]
 _Counts = NDArray[np.float32]
 
 _DARK_FRAMES = 16
-_BRIGHTEST = 3  # which sample of a pixel, by brightness, is its reference: no single glint
-_LEAST = 0.1  # of the others' light, for a pixel that has references
-_STEP = 0.4  # from place to place of the ball, as a share of its radius
-_STEEPEST = math.radians(46.0)  # zenith at the rim of the ball's contact: all that a wall can show
+_BRIGHTEST = 3  # rank of a pixel's sample that is its reference, to exclude single glints
+_LEAST = 0.1  # minimum light of a pixel with references, relative to the others
+_STEP = 0.4  # distance between positions of the ball, as a share of its radius
+_STEEPEST = math.radians(46.0)  # zenith at the rim of the ball's contact, which is all that a wall can show
 
 
 def exact_references(sensor: Sensor, optics: Ideal | Wall | Coat) -> tuple[_Counts, _Counts]:
-    """Return what no lab knows: each pixel's own counts without light and in full light, (H, W), float32.
+    """Return each pixel's exact counts without light and in full light, (H, W), float32.
 
-    They are free of noise, and within what a sample can hold.
+    They have no noise, and are within the range of a sample.
     """
     low = -np.inf if sensor.camera.bits is None else 0.0
     dark, bright = sensor.offset, sensor.full
@@ -40,17 +40,17 @@ def exact_references(sensor: Sensor, optics: Ideal | Wall | Coat) -> tuple[_Coun
 
 
 def ball_references(optics: Ideal | Wall | Coat, sensor: Sensor, view: View) -> tuple[_Counts, _Counts]:
-    """Return each pixel's counts without light and in full light as a lab takes them; NaN where none are.
+    """Return each pixel's counts without light and in full light as measured with a ball; NaN without any.
 
-    A sheet at rest shows no light, so the dark reference is the mean of 16 frames before the touch. It shows
-    no full light either. For the bright reference a lab rolls a ball over the field, here one twice as wide
-    as the field, pressed until it stands at 46 degrees at the rim of its contact: every pixel meets every
-    slope, and its third-brightest sample is the reference. That is some tenths of the noise above the mean of
-    its bright samples, and includes what the pixel's own gain and place and the lamps do; of uneven lamps it
-    it shows only roughly, as it stops at slopes some 15 degrees apart. Pixels that never get a tenth of the
-    light of the others, as those beyond the body, have no references.
+    A sheet at rest shows no light, so the dark reference is the mean of 16 frames before the touch. For the
+    bright reference a ball is rolled over the field, here one twice as wide as the field, pressed until the
+    zenith at the rim of its contact is 46 degrees. Every pixel meets every slope, and its third-brightest
+    sample is the reference. It exceeds the mean of the bright samples by some tenths of the noise. It
+    includes the pixel's own gain and position and the lamps; uneven lamps only approximately, because the
+    slopes are some 15 degrees apart. Pixels that never get a tenth of the light of the others, such as those
+    beyond the body, have no references.
 
-    The optics are those of the clear wall: a lab takes the printed sheet out.
+    The optics are those of the clear wall: the printed sheet is removed in a laboratory.
     """
     reach = max(size * pixel for size, pixel in zip(view.shape, view.pixel_size[::-1], strict=True))
     ball = Conform(Sphere(2 * reach), view)
@@ -60,7 +60,7 @@ def ball_references(optics: Ideal | Wall | Coat, sensor: Sensor, view: View) -> 
     dark = np.zeros(view.shape)
     untouched = optics.light(ball.drape(pose_at_press(-depth)))
     for number in range(_DARK_FRAMES):
-        sensor.expose(untouched, -1 - number, counts)  # a frame's number below 0 is one of no recording
+        sensor.expose(untouched, -1 - number, counts)  # negative frame numbers are not used by recordings
         dark += counts / _DARK_FRAMES
 
     brightest = np.zeros((_BRIGHTEST, *view.shape), np.float32)
@@ -77,7 +77,7 @@ def ball_references(optics: Ideal | Wall | Coat, sensor: Sensor, view: View) -> 
 
 
 def _places(view: View, radius: float) -> list[tuple[float, float]]:
-    """Return where the ball stands: a square grid whose contacts cover the field evenly, mm."""
+    """Return the positions of the ball: a square grid whose contacts cover the field evenly, mm."""
     contact = radius * math.sin(_STEEPEST)
     along = []
     for size, pixel in zip(view.shape[::-1], view.pixel_size, strict=True):

@@ -1,4 +1,4 @@
-"""From where the body is to the light that each pixel gets."""
+"""The light of each pixel at a position of the body."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ from mirrorskin.io.types import Floats
 Light = NDArray[np.float32]
 Shade = Callable[[Light, Floats, Pose, float], Light]
 
-_BLUR_POSES = 5  # poses that stand for the exposure of a moving body
-_BLUR = (np.arange(_BLUR_POSES) + 0.5) / _BLUR_POSES - 0.5  # when, as shares of the exposure
+_BLUR_POSES = 5  # number of poses that represent the exposure of a moving body
+_BLUR = (np.arange(_BLUR_POSES) + 0.5) / _BLUR_POSES - 0.5  # their times, as shares of the exposure
 
 
 class Skin(Protocol):
-    """How the sheet lies in a pose."""
+    """The shape of the sheet in a pose."""
 
     def drape(self, pose: Pose, /) -> Sheet:
-        """Lay the sheet on the object."""
+        """Return the sheet in a pose."""
 
 
 class Optics(Protocol):
-    """What the camera sees in the mirror."""
+    """The light that the camera sees in the mirror."""
 
     def light(self, sheet: Sheet, /) -> Light:
         """Return the share of full light of each pixel, (H, W), float32."""
 
 
 class Scene:
-    """The body wherever it is: sheet and optics are found for each pose.
+    """The light of the body in any pose.
 
-    The light of the latest poses is kept, so that those that come back, as in a rotation, are rendered once.
-    Upright above its own place the body is seen by the `Imprint`, where there is one.
+    The light of the latest poses is cached, so that recurring poses, as in a rotation, are rendered once. An
+    upright body at its own position is rendered by the `Imprint`, if there is one.
 
     Parameters
     ----------
     skin, optics
-        How the sheet lies, and what is seen of it.
+        Models of the sheet's shape and of its light.
     exposure : float
-        How long a frame gathers light, in the unit that tells moments.
+        Exposure, in the unit of the moments.
     room : int
-        Poses whose light is kept; one is.
+        Number of poses whose light is cached, at least 1.
     imprint : Imprint, optional
     shade : callable, optional
         Turns a light into what is seen of it, by the sheet's height, the pose and the moment, where that
@@ -57,7 +57,7 @@ class Scene:
     Attributes
     ----------
     moments : list of float
-        Those of the poses that stand for an exposure, from its middle.
+        Times of the poses that represent an exposure, from its middle.
     """
 
     def __init__(
@@ -79,9 +79,9 @@ class Scene:
         self._kept: dict[bytes, tuple[Light, Floats | None]] = {}
 
     def light(self, pose_at: Callable[[float], Pose], middle: float = 0.0) -> Light:
-        """Return the mean light over an exposure, (H, W), float32; it holds until the next call.
+        """Return the mean light over an exposure, (H, W), float32; it is valid until the next call.
 
-        ``pose_at`` returns the pose so long after the exposure's middle, which is at a moment of its own.
+        ``pose_at`` returns the pose at a time after the exposure's middle.
         """
         if self._imprint is not None:
             poses = [pose_at(late) for late in self._ends]
@@ -91,7 +91,7 @@ class Scene:
         return lights[0] if len(lights) == 1 else np.mean(lights, axis=0, dtype=np.float32)
 
     def render_ahead(self, poses: Iterable[Pose], meanwhile: Callable[[], object]) -> None:
-        """Render poses to come in a thread, as many as are kept, while something else is worked out."""
+        """Render future poses in a thread, as many as are cached, while a function runs."""
         thread = ThreadPoolExecutor(max_workers=1)
         try:
             rendered = [thread.submit(self._render, pose) for pose in itertools.islice(poses, self._room)]
@@ -117,7 +117,7 @@ class Scene:
 
 
 class Witness:
-    """A skin that remembers what touched in all of its poses so far, (H, W), and the force in each, N."""
+    """A skin that records where it has touched in all poses so far, (H, W), and the force in each, N."""
 
     def __init__(self, skin: Skin, shape: tuple[int, int]) -> None:
         self.touched: NDArray[np.bool_] = np.ones(shape, bool)
@@ -125,14 +125,14 @@ class Witness:
         self._forces: dict[bytes, float] = {}
 
     def drape(self, pose: Pose) -> Sheet:
-        """Lay the sheet on the object."""
+        """Return the sheet in a pose."""
         sheet = self._skin.drape(pose)
         self.touched &= sheet.contact
         self._forces[_key(pose)] = sheet.force
         return sheet
 
     def force(self, pose: Pose) -> float:
-        """Return the normal force in a pose, which is gone to if it is new; NaN if it is not worked out."""
+        """Return the normal force in a pose, computed if it is new; NaN without contact mechanics."""
         if _key(pose) not in self._forces:
             self.drape(pose)
         return self._forces[_key(pose)]
@@ -143,11 +143,10 @@ def _key(pose: Pose) -> bytes:
 
 
 class Imprint:
-    """A press without resistance, seen from straight above, under a light that goes by slope alone.
+    """A press without resistance, seen from straight above, whose light depends on the slope only.
 
-    Then a pixel that touches looks the same however deep it is, and no frame needs more than its travel: of
-    the object its ``height``, mm, NaN where there is none, and the light of each pixel in contact and out of
-    it.
+    A pixel in contact then looks the same at any depth, and a frame needs only its travel. The imprint is the
+    object's ``height``, mm, NaN where there is none, and the light of each pixel in contact and out of it.
     """
 
     def __init__(self, height: Floats, touched: Light, untouched: Light) -> None:
@@ -155,14 +154,14 @@ class Imprint:
         self._untouched = untouched
         self._gained = touched - untouched
         self._glows = bool(untouched.any())
-        # Fresh arrays would cost more, by their page faults, than what is written to them.
+        # New arrays would cost more in page faults than writing them.
         self._touches, self._light = np.empty(height.shape, bool), np.empty_like(touched)
 
     def light(self, *passed: float) -> Light:
-        """Return the light at one travel, or the mean over an exposure; it holds until the next call.
+        """Return the light at one travel, or the mean over an exposure; it is valid until the next call.
 
-        ``passed`` is the travel, or those at the exposure's begin, middle and end, with constant velocity in
-        between, mm.
+        ``passed`` is the travel, or the travels at the exposure's start, middle and end, with constant
+        velocity in between, mm.
         """
         time: NDArray[Any] = self._touches
         if len(passed) == 1:
@@ -176,7 +175,7 @@ class Imprint:
         return self._light
 
     def _time(self, begin: float, end: float) -> Light:
-        """Return the share of the time in which a steady travel is at least that of the touch, float32."""
+        """Return the share of the time in which a uniform travel exceeds that of the touch, float32."""
         low, high = min(begin, end), max(begin, end)
         if high == low:
             return (low >= self._reached_at).astype(np.float32)

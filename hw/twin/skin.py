@@ -1,4 +1,4 @@
-"""The mirror sheet: how it lies on an object that it conforms to, or that an elastic body resists."""
+"""The mirror sheet on an object: conforming, or on an elastic body."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Sheet:
     contact : ndarray, (H, W), bool
         Whether sheet and object touch there.
     force : float
-        That presses the object into the body, N; NaN where no contact mechanics is worked out.
+        Normal force, N; NaN without contact mechanics.
     """
 
     height: Floats
@@ -44,14 +44,14 @@ class Sheet:
 
 
 class Conform:
-    """Equation 1 of the paper, F = f H(-vt - f): the object's shape where it stands above the rest plane."""
+    """Equation 1 of the paper, F = f H(-vt - f): the object's shape where it is above the rest plane."""
 
     def __init__(self, thing: Object, view: View) -> None:
         self._thing = thing
         self._view = view
 
     def drape(self, pose: Pose) -> Sheet:
-        """Lay the sheet on the object in a pose."""
+        """Return the sheet on the object in a pose."""
         obstacle = meet(self._thing, pose, self._view)
         contact = np.isfinite(obstacle.height) & self._view.on_body
         height, dz_dx, dz_dy = (np.where(contact, values, 0.0) for values in obstacle)
@@ -59,17 +59,17 @@ class Conform:
 
 
 _POINTS_MAX = 4_000_000
-_COARSE = 97  # places across the body at which it is looked whether the object stands above the rest plane
-_VIEW_ROUNDS = 6  # fixed-point steps along an oblique ray; each gains a factor of slope times lean
+_COARSE = 97  # samples across the body at which the object's height above the rest plane is tested
+_VIEW_ROUNDS = 6  # fixed-point iterations along an oblique ray; each gains a factor of slope times lean
 
 
 class Elastic:
-    """Frictionless contact of the rigid object with the body, taken for an incompressible half-space.
+    """Frictionless contact of the rigid object with the body, approximated as an incompressible half-space.
 
-    The pressure is found on the pixel grid, grown to all that the object can reach in the given poses. The
-    mirror lies a sheet's thickness below the surface. A pose is solved for itself, so that a frame does not
-    depend on what was read before it. Poses to which a body of the ``deepest`` travel slides or twists start
-    from the pressure of that press, which goes with the object.
+    The pressure is computed on the pixel grid, extended by all that the object can reach in the given poses.
+    The mirror is below the surface by the thickness of the sheet. Each pose is solved independently, so a
+    frame does not depend on those read before. Slides and twists of a body at the ``deepest`` travel start
+    from the pressure of that press, moved along with the object.
     """
 
     def __init__(
@@ -89,15 +89,15 @@ class Elastic:
         shape = rows + 2 * grow_y, columns + 2 * grow_x
         if shape[0] * shape[1] > _POINTS_MAX:
             raise InputError(
-                f"elastic contact of the {thing.name} needs {shape[0]} x {shape[1]} points, and"
-                f" {_POINTS_MAX} are the most: take larger pixels or contact 'conform'"
+                f"elastic contact of the {thing.name} needs {shape[0]} x {shape[1]} points, but "
+                f"the maximum is {_POINTS_MAX}: use larger pixels or contact 'conform'"
             )
         self._grid = View(shape, view.pixel_size, body)
         self._field = np.s_[grow_y : grow_y + rows, grow_x : grow_x + columns]
         self.space: HalfSpace = HalfSpace(shape, view.pixel_size, body.modulus, body.sheet)
 
     def solve(self, pose: Pose) -> Contact:
-        """Return pressure and force in a pose, on the grown grid."""
+        """Return pressure and force in a pose, on the extended grid."""
         if pose.shift[2] != self._deepest or pose.rotation[2, 2] != 1:
             return self._press(pose)
         if pose.upright and not pose.shift[:2].any():
@@ -114,7 +114,7 @@ class Elastic:
         return self._press(pose_at_press(self._deepest))
 
     def _moved_along(self, pose: Pose) -> Floats:
-        """Return the pressure of the deepest press where the object has gone by a slide or a twist."""
+        """Return the pressure of the deepest press, moved with the object by a slide or a twist."""
         from scipy.ndimage import map_coordinates
 
         grid, (along_x, along_y) = self._grid, self._grid.pixel_size
@@ -126,7 +126,7 @@ class Elastic:
         return moved
 
     def drape(self, pose: Pose) -> Sheet:
-        """Press the sheet on the object in a pose."""
+        """Return the sheet pressed on the object in a pose."""
         contact = self.solve(pose)
         return replace(self.sheet(contact.pressure), force=contact.force)
 
@@ -151,16 +151,16 @@ class Elastic:
 
     @property
     def places(self) -> Floats:
-        """Where the pixels meet the rest plane, x and y, (2, H, W), mm."""
+        """Points at which the pixels' lines of sight meet the rest plane, x and y, (2, H, W), mm."""
         return np.stack([self._view.x, self._view.y])
 
     @property
     def grid_places(self) -> Floats:
-        """The same of the grown grid."""
+        """The same on the extended grid."""
         return np.stack([self._grid.x, self._grid.y])
 
     def crop(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Cut the field of view out of a map on the grown grid, (..., H, W)."""
+        """Return the field of view of a map on the extended grid, (..., H, W)."""
         return values[(..., *self._field)]
 
     def _seen(self, height: Floats) -> Floats:
@@ -178,12 +178,12 @@ class Elastic:
 
 
 def _slope(height: Floats, axis: int) -> Floats:
-    """Differentiate along an axis, a pixel at a time; flat where there is but one."""
+    """Return the derivative along an axis per pixel; 0 for a single pixel."""
     return np.gradient(height, axis=axis) if height.shape[axis] > 1 else np.zeros_like(height)
 
 
 def _margin(thing: Object, poses: Iterable[Pose], view: View, body: Body) -> tuple[int, int]:
-    """Return the rows and columns by which the field must grow to hold all that the object can touch."""
+    """Return the rows and columns by which the field must be extended to contain all possible contact."""
     cell = 2 * body.radius / _COARSE
     coarse = View((_COARSE, _COARSE), (cell, cell), body)
     reached = np.zeros(coarse.shape, bool)

@@ -1,4 +1,4 @@
-"""What friction does to the skin, frame by frame, while the pressed body moves along the object."""
+"""The effect of friction on the skin, frame by frame, while the pressed body moves along the object."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from mirrorskin.io.types import Floats, InputError
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.skin import drive, material, on_object
 
-_STEPS = 16  # that full sliding takes, at least; and the most between two frames
+_STEPS = 16  # minimum number of steps to full sliding; maximum number between two frames
 _POINTS_MAX = 8_000_000
 
 
 class _Course(NamedTuple):
-    """What `Friction` finds along a movement."""
+    """Results of `Friction` along a movement."""
 
-    window: Window  # of the grid, outside of which there is no traction
+    window: Window  # part of the grid with traction
     loads: NDArray[np.float32]  # (T, 2, h, w), N/mm^2
     forces: Floats  # (T, 2), N
     onset: Floats  # on the grid
 
 
 class Drag(NamedTuple):
-    """How friction drags the skin at one moment: see `mirrorskin.kernels.skin`.
+    """The displacement of the skin by friction at one moment: see `mirrorskin.kernels.skin`.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Drag(NamedTuple):
         margin: tuple[int, int],
         place: Floats,
     ) -> Drag:
-        """Return the drag of the traction in a window of a grid, on the grid grown by a margin."""
+        """Return the drag of the traction in a window of a grid, on the grid extended by a margin."""
         rows, columns = (size + 2 * more for size, more in zip(space.shape, margin, strict=True))
         across, along = (
             slice(part.start + more, part.stop + more) for part, more in zip(window, margin, strict=True)
@@ -66,7 +66,7 @@ class Drag(NamedTuple):
         return cls(shift, place, space.pixel_size)
 
     def material(self, points: Floats) -> Floats:
-        """Return where the skin was at the press that lies at points, (2, ...), mm along x and y."""
+        """Return the positions at the press of the skin that is now at points, (2, ...), mm along x and y."""
         return material(self.shift, self.pixel_size, self.place, points)
 
     def launch(self, name: str, device: Device, shape: tuple[int, ...], **arguments: Any) -> None:
@@ -91,16 +91,16 @@ class Drag(NamedTuple):
 
 
 class SkinHistory:
-    """Stick and slip along a horizontal movement or a twist, and where each point of the skin goes.
+    """Stick and slip along a horizontal movement or a twist, and the displacement of each point of the skin.
 
-    The press's pressure goes with the object. In the object's own frame it stands still, and there `Friction`
-    finds the traction q, and u, how far q shifts the surface. `mirrorskin.kernels.skin` says where this drags
-    the skin.
+    The pressure of the press moves with the object. In the object's frame it is constant, and there
+    `Friction` computes the traction q and the displacement u of the surface by q. `mirrorskin.kernels.skin`
+    computes the resulting displacement of the skin.
 
-    A frame takes as many steps as are needed for 16 to full sliding. A point breaks loose when its traction
-    reaches the limit mu p; near to that, the square of what is missing falls evenly with the travel (exactly
-    so under a ball, by Cattaneo and Mindlin), and the onset is where it comes to 0. Between two frames the
-    traction goes evenly.
+    The number of steps per frame is such that full sliding takes at least 16. A point breaks loose when its
+    traction reaches the limit mu p. Close to that, the square of the difference decreases linearly with the
+    travel (exactly so under a ball, by Cattaneo and Mindlin), and the onset is extrapolated to 0. Between two
+    frames the traction is interpolated linearly.
 
     Parameters
     ----------
@@ -113,12 +113,12 @@ class SkinHistory:
     Attributes
     ----------
     travel : ndarray, (T,), float64
-        The way of the body since the press, along its path: mm, or radians of a twist.
+        Distance travelled by the body since the press: mm, or radians of a twist.
 
     Raises
     ------
     InputError
-        The way is too long for so small pixels.
+        The distance is too long for pixels this small.
     """
 
     def __init__(
@@ -132,13 +132,14 @@ class SkinHistory:
         rows, columns = (size + 2 * more for size, more in zip(skin.space.shape, self._margin, strict=True))
         if rows * columns > _POINTS_MAX:
             raise InputError(
-                f"a way of {self.travel[-1]:g} {'rad' if isinstance(movement, Twist) else 'mm'} over the skin"
-                f" needs {rows} x {columns} points, and {_POINTS_MAX} are the most: take larger pixels"
+                f"a displacement of {self.travel[-1]:g} "
+                f"{'rad' if isinstance(movement, Twist) else 'mm'} over the skin needs {rows} x "
+                f"{columns} points, but the maximum is {_POINTS_MAX}: use larger pixels"
             )
 
     @property
     def force(self) -> Floats:
-        """Newtons that the object exerts on the body along x and y, (T, 2)."""
+        """Force of the object on the body along x and y, (T, 2), N."""
         return self._course.forces
 
     @property
@@ -148,9 +149,9 @@ class SkinHistory:
         return onset
 
     def drag(self, frame: float) -> Drag:
-        """Return how the skin is dragged at a frame.
+        """Return the drag of the skin at a frame.
 
-        The number may have a fraction, and lie half a frame before the first or after the last.
+        The number may be fractional, from half a frame before the first to half a frame after the last.
         """
         before, after, share = self._between(frame)
         window, loads, *_ = self._course
@@ -159,23 +160,23 @@ class SkinHistory:
         return Drag.by(self._skin.space, window, load, self._margin, place)
 
     def displacements(self) -> NDArray[np.float32]:
-        """Return how far the skin has moved along itself in each frame, (T, H, W, 2), mm; on the disk.
+        """Return the displacement of the skin along itself in each frame, (T, H, W, 2), mm; on the disk.
 
-        These are points that lay at the pixels at the press. NaN where the skin's surface would fold.
+        The points are those at the pixels at the press. NaN where the skin's surface would fold.
         """
         shape = self._skin.places.shape
         with TemporaryFile() as file:
             maps = np.memmap(file, np.float32, "w+", shape=(len(self._path), *shape[1:], 2))
         displacement = self._device.array("displacement", shape, np.float32)
         for frame, kept in enumerate(maps):
-            # It starts from that of the frame before.
+            # It starts from the displacement of the preceding frame.
             self.drag(frame).launch("skin_displacement", self._device, shape[1:], displacement=displacement)
             kept[...] = np.moveaxis(displacement.read(), 0, -1)
         return maps
 
     @functools.cached_property
     def _course(self) -> _Course:
-        """All frames in their order."""
+        """Results of all frames in their order."""
         skin = self._skin
         pressure = skin.solve(pose_at_press(self._movement.deepest)).pressure
         friction = Friction(skin.space, pressure, self._coefficient)
@@ -189,22 +190,22 @@ class SkinHistory:
         return _Course(window, loads, forces, slide.onset)
 
     def _between(self, frame: float) -> tuple[int, int, float]:
-        """Return the frames before and after a moment, and its share of the way between."""
+        """Return the frames before and after a moment, and the fraction in between."""
         last = len(self._steps) - 1
         before = min(max(math.floor(frame), 0), max(last - 1, 0))
         return before, min(before + 1, last), frame - before
 
 
 class SkinState:
-    """Stick and slip of a pressed body as it is moved along, of which only the present is known.
+    """Stick and slip of a pressed body as it moves, of which only the current state is kept.
 
-    The same as `SkinHistory` of a movement that goes to the same places, at none of which a press is renewed.
+    Equivalent to `SkinHistory` of a movement through the same positions without another press.
 
     Parameters
     ----------
     skin : Elastic
     travel : float
-        How far the body was pressed, mm.
+        Travel of the press, mm.
     coefficient : float
         Coulomb's, between sheet and object.
     """
@@ -218,7 +219,7 @@ class SkinState:
         self._margin = 0, 0
 
     def go(self, place: Floats) -> None:
-        """Move the body straight on to a place: x and y, (2,), mm, or a twist, (1,), radians."""
+        """Move the body along a straight line to a position: x and y, (2,), mm, or a twist, (1,), radians."""
         before = np.zeros_like(place) if self._place is None else self._place
         if self._place is not None and np.array_equal(before, place):
             return
@@ -231,12 +232,12 @@ class SkinState:
         self._drag = Drag.by(self._skin.space, window, load, self._margin, place)
 
     def drag(self, frame: float) -> Drag:
-        """Return how the skin is dragged now, whatever the frame."""
+        """Return the current drag of the skin, whatever the frame."""
         return self._drag
 
 
 class _Slide:
-    """One body that goes on, in steps that are small against what full sliding takes, and where it slips."""
+    """The motion of one body in steps that are small compared with full sliding, and where it slips."""
 
     def __init__(self, friction: Friction, skin: Elastic, limit: Floats) -> None:
         self.onset = np.full(limit.shape, np.nan)
@@ -244,11 +245,11 @@ class _Slide:
         self._pressed = skin.grid_places[:, limit > 0]
         self._far = float(skin.space.tangential(np.stack([limit, np.zeros_like(limit)]))[0].max())
         self._place: Floats | None = None
-        # The travel, and the square of what the traction lacks of its limit: now, and a step ago.
+        # The travel, and the squared difference of the traction from its limit: now, and one step before.
         self._now, self._before = (0.0, limit**2), (0.0, limit**2)
 
     def go(self, step: Floats) -> None:
-        """Go on from one frame to the next."""
+        """Move from one frame to the next."""
         start = np.zeros_like(step) if self._place is None else self._place
         self._place = start + step
         moved = float(np.hypot(*drive(step, self._pressed)).max(initial=0.0))
@@ -261,7 +262,7 @@ class _Slide:
             self._before, self._now = self._now, (travel, lacking)
 
     def _note(self, new: NDArray[np.bool_], travel: float) -> None:
-        """Note when points broke loose in a step that ends at a travel."""
+        """Record the travel at which points broke loose in a step that ends at a travel."""
         (before, lacked), (now, lacks) = self._before, self._now
         falls = np.maximum(lacked[new] - lacks[new], 0.0)
         middle = np.full_like(falls, (travel - now) / 2)
@@ -270,7 +271,7 @@ class _Slide:
 
 
 def _margin(skin: Elastic, path: Floats) -> tuple[int, int]:
-    """Return by how many rows and columns the grid must grow to hold the places that pixels see."""
+    """Return the rows and columns by which the grid must be extended for the positions that pixels see."""
     corners = skin.places[:, [0, 0, -1, -1], [0, -1, 0, -1]]
     at = np.concatenate([on_object(place, corners) for place in np.unique(path, axis=0)], axis=1)
     far_x, far_y = np.abs(at).max(axis=1)

@@ -1,4 +1,4 @@
-"""What can be seen of the sheet itself: the flakes of its mirror coat, or printed dots."""
+"""The visible texture of the sheet: the flakes of its mirror coat, or printed dots."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from mirrorskin.kernels.skin import FLAKES
 TextureName = Literal["flakes", "dots", "random-dots"]
 TEXTURES: tuple[TextureName, ...] = get_args(TextureName)
 
-_PIXELS_MIN = 2.0  # of a flake or a dot
-_PITCH = 2.0  # from dot to dot, in diameters
+_PIXELS_MIN = 2.0  # minimum size of a flake or a dot
+_PITCH = 2.0  # distance between dots, in diameters
 _RIM = 0.3  # width of a dot's soft rim, in diameters
-_STILL = 1e-7  # mm and radians that are no motion
-_JITTER = (_PITCH - 1 - _RIM) / 2  # by which a dot may lie off its place along x and y, in diameters
+_STILL = 1e-7  # mm and radians; smaller motions are ignored
+_JITTER = (_PITCH - 1 - _RIM) / 2  # maximum displacement of a random dot along x and y, in diameters
 
 
 @dataclass(frozen=True, slots=True)
 class SheetTexture:
-    """How much light the sheet reflects from point to point, fixed in the sheet, without an end.
+    """The reflectance of the sheet by position, fixed in the sheet, without limits.
 
-    A point of the sheet reflects the share r = 1 - contrast t of the light, t being from 0 to 1. Of what it
-    reflects the part ``diffuse`` comes from all of the wall alike, as flakes lie every way, and the rest from
-    where the mirror points to: a pixel that gets the light m from the mirror shows
-    r ((1 - diffuse) m + diffuse), so that the texture is seen in the dark, too.
+    A point of the sheet reflects the share r = 1 - contrast t of the light, with t from 0 to 1. The share
+    ``diffuse`` of the reflected light comes from the whole wall, because flakes have all orientations, and
+    the rest from the direction of the mirror. A pixel that gets the light m from the mirror shows r ((1 -
+    diffuse) m + diffuse), so the texture is also visible in the dark.
 
     Attributes
     ----------
@@ -53,12 +53,12 @@ class SheetTexture:
     diffuse : float
         0 to 1.
     seed : int
-        Of the sheet: the same seed, the same texture.
+        Seed of the texture.
 
     Raises
     ------
     InputError
-        A value cannot be.
+        A value is invalid.
 
     Examples
     --------
@@ -87,7 +87,7 @@ class SheetTexture:
     def reflectance(self, places: Floats, pixel_size: tuple[float, float] = (0.0, 0.0)) -> Floats:
         """Return the share of the light that the sheet reflects around points, by x and y, (2, ...), mm.
 
-        Dots have rims, and are averaged over four points of a pixel of that size, mm; flakes are smooth.
+        Dots have rims, and are averaged over four points of a pixel of `pixel_size`, mm; flakes are smooth.
         """
         if self.kind == "flakes":
             return 1 - self.contrast * self._flakes(places)
@@ -111,12 +111,12 @@ class SheetTexture:
 
     @property
     def coefficients(self) -> NDArray[np.uint8]:
-        """Those of the flakes' spline by x and y, 0 or 1, which repeat."""
+        """Coefficients of the flakes' spline by x and y, 0 or 1, periodic."""
         return np.asarray(_random(self.seed, 1)[0] < 0.5, np.uint8)
 
     @property
     def spacing(self) -> float:
-        """Millimetres from one to the next."""
+        """Distance between coefficients, mm."""
         return self.size / 2
 
     def _dots(self, places: Floats) -> Floats:
@@ -138,8 +138,8 @@ def _random(seed: int, count: int) -> Floats:
 class Coat:
     """Optics of a sheet with a texture, which moves with the skin.
 
-    Without a history the skin moves along its normal alone, as pressure shifts an incompressible body's
-    surface, or as one that conforms.
+    Without a history the skin moves only along its normal, like a conforming skin, or the surface of an
+    incompressible body under pressure.
 
     Attributes
     ----------
@@ -153,26 +153,26 @@ class Coat:
     def __init__(self, texture: SheetTexture, optics: Ideal | Wall, view: View, device: Device) -> None:
         if texture.size < _PIXELS_MIN * max(view.pixel_size):
             raise InputError(
-                f"a texture of {texture.size:g} mm is too fine for pixels of {max(view.pixel_size):g} mm:"
-                f" make it {_PIXELS_MIN:g} pixels or more"
+                f"a texture of {texture.size:g} mm is too fine for pixels of "
+                f"{max(view.pixel_size):g} mm: use {_PIXELS_MIN:g} pixels or more"
             )
         self.texture, self.optics, self._view, self._device = texture, optics, view, device
         self.rest: Floats = texture.reflectance(np.stack([view.x, view.y]), view.pixel_size)
 
     def levels(self, dark: ArrayLike, bright: ArrayLike) -> tuple[Floats, Floats]:
-        """Return what pixels count with no light from the mirror and with all, by the camera's own levels."""
+        """Return the counts of pixels without and with full light, from the camera's levels."""
         dark, bright = np.asarray(dark, np.float64), np.asarray(bright, np.float64)
         span = (bright - dark) * self.rest
         return dark + span * self.texture.diffuse, dark + span
 
     def light(self, sheet: Sheet) -> Light:
-        """Return the share of full light of each pixel, (H, W), float32, of skin that has not moved along."""
+        """Return the share of full light at each pixel, (H, W), float32, without tangential motion."""
         return self.shade(self.optics.light(sheet), sheet.height)
 
     def shade(
         self, light: Light, height: Floats, frame: float = 0.0, history: SkinHistory | SkinState | None = None
     ) -> Light:
-        """Return what pixels show that get a light from the mirror, of a sheet as high as this at a frame."""
+        """Return the light of pixels for the light from the mirror and the sheet's height at a frame."""
         view = self._view
         if view.orthographic and history is None:
             return self.texture.shown(self.rest, light)
@@ -191,7 +191,7 @@ class Coat:
 
 
 class _DraggedFlakes:
-    """The share of flakes that each pixel sees of dragged skin, on a device."""
+    """The share of flakes that each pixel sees on dragged skin, on a device."""
 
     def __init__(self, texture: SheetTexture, view: View, device: Device) -> None:
         self._device, self._shape = device, view.shape
@@ -207,7 +207,7 @@ class _DraggedFlakes:
             self._given[f"part_{axis}"] = device.from_host("part", index - np.floor(index))
 
     def share(self, drag: Drag, off: Floats) -> Light:
-        """Return the share, (H, W), at points that are off their pixels' places at rest, (2, H, W), mm."""
+        """Return the share, (H, W), at points displaced from the pixels' positions at rest, (2, H, W), mm."""
         self._seen.write(off)
         drag.launch(
             "skin_flakes", self._device, self._shape, seen=self._seen, share=self._share, **self._given
@@ -216,10 +216,10 @@ class _DraggedFlakes:
 
 
 class DraggedCoat:
-    """The same of a body that is moved from pose to pose, whose skin friction drags along.
+    """The same for a body that moves from pose to pose and whose skin is dragged by friction.
 
-    While it is pressed as before and upright, it slides or twists from where it was pressed: one of both. A
-    press anew, or a lean, frees the skin.
+    While pressure and lean are constant, it slides or twists from where it was pressed, not both. Another
+    press, or a lean, releases the skin.
     """
 
     def __init__(self, coat: Coat, skin: Elastic, coefficient: float) -> None:
@@ -229,7 +229,7 @@ class DraggedCoat:
         self._twists = False
 
     def shade(self, light: Light, height: Floats, pose: Pose, _: float) -> Light:
-        """Return what pixels show that get a light from the mirror, in the pose after those before."""
+        """Return the light of pixels for the light from the mirror, in the pose after the previous ones."""
         rotation, travel = pose.rotation, float(pose.shift[2])
         x, y, _ = -rotation.T @ pose.shift
         place = np.array([x, y, math.atan2(rotation[0, 1], rotation[0, 0])])

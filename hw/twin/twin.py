@@ -1,4 +1,4 @@
-"""The twin as a source of frames: move the body on an object and watch."""
+"""The twin as a source of frames of a body that moves on an object."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ OpticsName = Literal["ideal", "cylinder"]
 
 _CAMERA = "twin"
 _PIXELS_MAX = 200_000_000
-_MEMORY = 512_000_000  # bytes of light that a movement may keep
-_REACH_POSES = 16  # that tell how far an object reaches
-_ALL = 1e3  # travel that reaches all of any object, mm
+_MEMORY = 512_000_000  # maximum size of cached light, bytes
+_REACH_POSES = 16  # number of poses that determine the reach of an object
+_ALL = 1e3  # travel at which any object is completely below the body, mm
 _IN_WORDS = {
     "conform": "sheet takes the object's shape",
     "elastic": "elastic body",
@@ -46,18 +46,18 @@ _IN_WORDS = {
 
 
 class Twin(Closing):
-    """The sensor, simulated: a `mirrorskin.io.Source` that knows the truth.
+    """The simulated sensor: a `mirrorskin.io.Source` with ground truth.
 
-    In each frame the body is somewhere, the sheet lies on the object (contact), the camera sees the lit wall
-    in the sheet (optics), and turns that light into counts (camera).
+    For each frame the position of the body, the sheet on the object (contact), the lit wall as seen in the
+    sheet (optics), and the counts (camera) are computed.
 
     Parameters
     ----------
     object : Object, str or Path
-        What to press on; a name or a path goes through `make_object`.
+        Object to press on; names and paths are passed to `make_object`.
     object_shift : (float, float)
-        Where the object's centre lies, mm along x and y from the picture's centre; it keeps its height, so
-        that its highest point need not be in the picture.
+        Position of the object's centre, mm along x and y from the picture's centre; its height is unchanged,
+        so its highest point need not be in the picture.
     shape : (int, int)
         Rows and columns of a frame.
     pixel_size : float or (float, float)
@@ -68,19 +68,19 @@ class Twin(Closing):
         Whether the sheet takes the object's shape, as in eq. 1 of the paper, or is the surface of an elastic
         body.
     optics : {"ideal", "cylinder"}
-        Whether brightness goes by the zenith alone, or is traced to the real wall.
+        Whether brightness depends on the zenith only, or is traced to the wall.
     pattern : str or Path
         Of the wall: "uniform", "linear" in the zenith, or a picture, unrolled.
     body : Body
     camera : Camera
     texture : SheetTexture, optional
-        What can be seen of the sheet itself, which moves with the skin; the skin moves along itself in
+        Texture of the sheet, which moves with the skin; the skin moves along itself in
         horizontal movements and twists in elastic contact. References show the texture of the sheet at rest.
     references : {"exact", "ball"}
-        Where the header's dark and bright come from: the camera's exact levels, or frames as a lab takes
+        Origin of the header's dark and bright: the camera's exact levels, or frames as taken in a laboratory
         them; see `ball_references`.
     device : str or Device, optional
-        What renders; see `mirrorskin.kernels.device.open_device`.
+        Device for rendering; see `mirrorskin.kernels.device.open_device`.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class Twin(Closing):
     travel : ndarray, (T,), float64, or None
         Millimetres, of a vertical movement.
     frame_rate : float
-        Frames in a second.
+        Frames per second.
     exposure : float
         Seconds during which a frame gathers light.
 
@@ -137,7 +137,9 @@ class Twin(Closing):
         self._thing = make_object(object, field, pixel) if isinstance(object, str | Path) else object
         if any(object_shift):
             if not np.isfinite(object_shift).all():
-                raise InputError(f"object shift {object_shift} cannot be: give two finite numbers of mm")
+                raise InputError(
+                    f"object shift {object_shift} is not possible: give two finite numbers of mm"
+                )
             self._thing = Shifted(self._thing, object_shift)
 
         self.name: str = f"twin: {self._thing.name}"
@@ -166,7 +168,7 @@ class Twin(Closing):
 
     @functools.cached_property
     def header(self) -> Header:
-        """What holds for all frames; the references are taken at the first access."""
+        """Metadata of all frames; the references are computed at the first access."""
         if self._references == "exact":
             dark, bright = exact_references(self._sensor, self._optics)
         else:
@@ -186,16 +188,16 @@ class Twin(Closing):
 
     @functools.cached_property
     def truth(self) -> Truth:
-        """The object as the upright body stands on it, and what touches, sticks and slips.
+        """The object under the upright body, and where it touches, sticks and slips.
 
-        Under an oblique view, what a pixel sees depends on the depth. Then the maps of a vertical movement
-        are those of the point at which its ray meets the rest plane, and those of another of the point that
-        it sees of the object pressed, NaN where the object does not reach the rest plane. The azimuth is NaN
-        where the surface is level. Contact is that at the greatest travel of a movement that presses, and
-        what lasts through all frames of another. Slip and displacement are known of horizontal movements and
-        twists in elastic contact, the force of all elastic contact.
+        Under an oblique view, the point that a pixel sees depends on the depth. The maps of a vertical
+        movement then refer to the point at which its ray meets the rest plane. Those of other movements refer
+        to the point that it sees of the pressed object, NaN where the object does not reach the rest plane.
+        The azimuth is NaN where the surface is level. Contact is that at the greatest travel of a movement
+        that presses, and contact in all frames of other movements. Slip and displacement are available for
+        horizontal movements and twists in elastic contact, the force for all elastic contact.
 
-        Computed at the first access; after the last frame most of it is known.
+        It is computed at the first access; after the last frame most of it is already available.
         """
         vertical, view, movement = isinstance(self.movement, Vertical), self._view, self.movement
         pressed = pose_at_press(movement.deepest)
@@ -232,7 +234,7 @@ class Twin(Closing):
         )
 
     def sheet(self, frame: int) -> Sheet:
-        """Return how the sheet lies at the middle of a frame's exposure, computed anew."""
+        """Return the sheet at the middle of a frame's exposure; computed at each call."""
         return self._skin.drape(self.movement.pose_at(frame))
 
     def rewind(self) -> None:
@@ -240,7 +242,7 @@ class Twin(Closing):
         self._next = 0
 
     def skip(self, count: int) -> None:
-        """Pass over so many of the next frames, which are not rendered."""
+        """Skip some frames without rendering them."""
         self._next = min(self._next + count, self.shape[0])
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
@@ -285,21 +287,20 @@ class Twin(Closing):
         return self.movement.mark(Block(frames, index=first, time=time))
 
     def look(self, pose_at: Callable[[float], Pose], number: int, out: NDArray[Any]) -> None:
-        """Render one frame with the body wherever it is, as a camera beside a stage sees it.
+        """Render one frame at any position of the body, as for a camera next to a stage.
 
-        The counts are those that `read` gives of a frame of this number with the body at the same places: in
-        elastic contact what friction does to the skin depends on the poses that were looked at before. The
-        movement only bounds how far the body may go: in elastic contact what the object reaches elsewhere is
-        not looked for.
+        The counts equal those of `read` for the same frame number and positions. In elastic contact, friction
+        depends on the poses rendered before. The movement only bounds the positions; in elastic contact,
+        parts of the object reached elsewhere are ignored.
 
         Parameters
         ----------
         pose_at : callable
-            Returns the pose so many seconds after the exposure's middle.
+            Returns the pose at a time after the exposure's middle, seconds.
         number : int
-            Of the frame, which decides the noise.
+            Frame number, which determines the noise.
         out : ndarray, (H, W), the source's dtype
-            Where to write.
+            Output.
         """
         self._sensor.expose(self._anywhere.light(pose_at), number, out)
 
@@ -312,7 +313,7 @@ class Twin(Closing):
 
     @functools.cached_property
     def _imprint(self) -> Imprint | None:
-        """What a press leaves, where no frame needs more than its travel."""
+        """The imprint of a press, if the frames need only their travel."""
         skin, optics, view = self._skin, self._optics, self._view
         if self._names != ("conform", "ideal") or not view.orthographic:
             return None
@@ -324,13 +325,11 @@ class Twin(Closing):
         rise = self.movement.rise(self._body.radius)
         if rise >= self._body.height:
             raise InputError(
-                f"the {self._thing.name} may rise {rise:g} mm into the sensor's body, which is"
-                f" {self._body.height:g} mm high: press less, or turn about a nearer pivot"
+                f"the {self._thing.name} may rise {rise:g} mm into the sensor's body, whose "
+                f"height is {self._body.height:g} mm: press less, or use a nearer pivot"
             )
         if self._compliance > 0 and self._names[0] == "conform":
-            raise InputError(
-                "compliance needs contact 'elastic': a sheet that only conforms presses with no force"
-            )
+            raise InputError("compliance needs contact 'elastic': a conforming sheet has no force")
 
     @property
     def _compliance(self) -> float:
@@ -385,7 +384,7 @@ class Twin(Closing):
 
 
 def _spread(places: Floats) -> Floats:
-    """Return some of the places: the outermost along each coordinate, and others between them."""
+    """Return some of the positions: the extremes along each coordinate, and others between them."""
     places = np.unique(places, axis=0)
     flat = places.reshape(len(places), -1)
     some = np.linspace(0, len(places) - 1, _REACH_POSES).round().astype(np.intp)
@@ -395,15 +394,17 @@ def _spread(places: Floats) -> Floats:
 
 def _check_shape(shape: tuple[int, int]) -> tuple[int, int]:
     if len(shape) != 2 or min(shape) < 1:
-        raise InputError(f"shape {tuple(shape)} cannot be: give rows and columns, 1 or more of each")
+        raise InputError(f"shape {tuple(shape)} is not possible: give rows and columns, 1 or more of each")
     if shape[0] * shape[1] > _PIXELS_MAX:
-        raise InputError(f"shape {tuple(shape)} is too large: {_PIXELS_MAX} pixels are the most")
+        raise InputError(f"shape {tuple(shape)} is too large: the maximum is {_PIXELS_MAX} pixels")
     return int(shape[0]), int(shape[1])
 
 
 def _check_pixel_size(pixel_size: float | tuple[float, float]) -> tuple[float, float]:
     sizes = np.asarray(pixel_size, np.float64)
     if sizes.shape not in ((), (2,)) or not (np.isfinite(sizes) & (sizes > 0)).all():
-        raise InputError(f"pixel size {pixel_size} cannot be: give one positive number of mm, or x and y")
+        raise InputError(
+            f"pixel size {pixel_size} is not possible: give one positive number of mm, or x and y"
+        )
     along_x, along_y = np.broadcast_to(sizes, 2)
     return float(along_x), float(along_y)

@@ -1,4 +1,4 @@
-"""Which way the camera looks inside the body, at each pixel."""
+"""The direction of the camera's lines of sight inside the body, at each pixel."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _ROUNDS = 100
 class View:
     """The camera's lines of sight inside the body.
 
-    The pixel grid lies on the sheet's rest plane: pixel (x, y) sees all points ``(x + z slope_x, y + z
-    slope_y, z)``. An orthographic camera looks straight down everywhere. A pinhole on the body's axis looks
-    through the body's flat top, where each line is refracted: with the pinhole h above the top, the line that
-    meets the rest plane at distance r from the axis has tan(air) = w and tan(inside) = v where ::
+    The pixel grid is in the sheet's rest plane: pixel (x, y) sees all points ``(x + z slope_x, y + z slope_y,
+    z)``. An orthographic camera looks straight down everywhere. A pinhole on the body's axis looks through
+    the body's flat top, where each line is refracted: with the pinhole h above the top, the line that meets
+    the rest plane at distance r from the axis has tan(air) = w and tan(inside) = v where ::
 
         h w + height v = r,     sin(air) = index sin(inside)
 
@@ -46,8 +46,8 @@ class View:
     ) -> None:
         if not distance > body.height:
             raise InputError(
-                f"a camera {distance} mm above the sheet is not above the body:"
-                f" put it more than {body.height} mm above, or at infinity"
+                f"a camera {distance} mm above the sheet is not above the body: use more than "
+                f"{body.height} mm, or infinity"
             )
         self.shape, self.pixel_size = shape, pixel_size
         self.x, self.y = np.meshgrid(*pixel_axes(shape, pixel_size))
@@ -62,10 +62,10 @@ class View:
 
 
 def _tangent_inside(away: Floats, body: Body, above: float) -> Floats:
-    """Return the tangents of the lines inside the body, by how far from the axis they meet the rest plane.
+    """Return the tangents of the lines inside the body by their distance from the axis in the rest plane.
 
     Newton's iteration for the tangent w in air. The distance is a concave function of it, so the iteration
-    climbs to the answer from 0 without ever passing it.
+    converges from 0 monotonically.
     """
     index = body.index
     tangent = np.zeros_like(away)

@@ -93,7 +93,7 @@ def test_what_failed_is_told_in_a_line_and_nothing_is_moved(controller):
     ended = run("rig check rig.toml --move")
     assert ended.code == 1
     assert ended.said.startswith(
-        "mirrorskin: rig.toml: stage, homing ($22): off: the file asks for homing; set stage.home"
+        "mirrorskin: rig.toml: stage, homing ($22): off: the file requires homing; set stage.home"
     )
     assert ended.said.count("\n") == 1
     assert "not tried" in ended.out

@@ -332,29 +332,29 @@ def picture(path):
     cv2.imwrite(path, np.full((4, 4), 99, np.uint8))
 
 
-NOT_A_SURFACE = "points alone are no surface: export it as a mesh"
+NO_TRIANGLES = "contains no triangles, only points: export it as a mesh"
 BAD = {
-    "no tilt": (["axial", "--tilt", "0deg"], "tilt 0 degrees cannot be: give more than 0 and at most 30"),
-    "much tilt": (["axial", "--tilt", "31deg"], "tilt 31 degrees cannot be"),
-    "tilt back": (["axial", "--tilt=-2deg"], "tilt -2 degrees cannot be"),
+    "no tilt": (["axial", "--tilt", "0deg"], "tilt 0 degrees is not possible: give more than 0 and at most 30"),
+    "much tilt": (["axial", "--tilt", "31deg"], "tilt 31 degrees is not possible"),
+    "tilt back": (["axial", "--tilt=-2deg"], "tilt -2 degrees is not possible"),
     "tilt without a unit": (["axial", "--tilt", "2"], "--tilt 2: a unit is needed"),
     "a deep press": (
         ["twist", "--press", "40mm"],
-        "may rise 40 mm into the sensor's body, which is 40 mm high",
+        "may rise 40 mm into the sensor's body, whose height is 40 mm",
     ),
     "a deep travel": (["vertical", "--travel-step", "2mm"], "may rise 58.1 mm into the sensor's body"),
     "compliance of nothing": (["vertical", "--compliance", "1um/N"], "compliance needs contact 'elastic'"),
     "compliance below zero": (
         ["vertical", "--contact", "elastic", "--compliance=-1um/N"],
-        "compliance -0.001 mm/N cannot be",
+        "compliance -0.001 mm/N is not possible",
     ),
     "compliance without a force": (["vertical", "--compliance", "1um"], "write e.g. 0.01mm/N"),
     "an unknown object": (["vertical", "--object", "teapot"], f"take {', '.join(OBJECT_NAMES)}, or the path"),
     "a missing object": (["vertical", "--object", "no.stl"], "no.stl: no such file"),
     "a large object": (["vertical", "--object", "wide.npy"], "is larger than the sensor: it needs a circle"),
-    "points": (["vertical", "--object", "points.obj"], NOT_A_SURFACE),
-    "a wall": (["vertical", "--object", "wall.obj"], "wall.obj: shows no area seen from above"),
-    "no mesh": (["vertical", "--object", "picture.ply"], "is no PLY mesh that can be read"),
+    "points": (["vertical", "--object", "points.obj"], NO_TRIANGLES),
+    "a wall": (["vertical", "--object", "wall.obj"], "wall.obj: has no area seen from above"),
+    "no mesh": (["vertical", "--object", "picture.ply"], "is not a readable PLY mesh"),
     "an unknown pattern": (
         ["vertical", "--pattern", "dots"],
         "pattern 'dots' is unknown: take uniform, linear",
@@ -362,10 +362,10 @@ BAD = {
     "a missing pattern": (["vertical", *WALL, "--pattern", "no.png"], "no.png"),
     "a picture for ideal optics": (
         ["vertical", "--pattern", "picture.png"],
-        "not of a picture as pattern: take the optics 'cylinder'",
+        "not support a picture as pattern: use the optics 'cylinder'",
     ),
-    "a gap for ideal optics": (["vertical", "--air-gap", "1mm"], "not of an air gap: take the optics"),
-    "lamps for ideal optics": (["vertical", "--asymmetry", "0.1"], "not of lamps that light one side more"),
+    "a gap for ideal optics": (["vertical", "--air-gap", "1mm"], "not support an air gap: use the optics"),
+    "lamps for ideal optics": (["vertical", "--asymmetry", "0.1"], "not support uneven lamps"),
     "a gap below zero": (["vertical", *WALL, "--air-gap=-1mm"], "air gap -1.0"),
     "scatter below zero": (["vertical", "--scatter=-1deg"], "scatter"),
     "friction without forces": (
@@ -376,7 +376,7 @@ BAD = {
     "friction below zero": (["twist", "--friction=-0.1"], "friction -0.1"),
     "a fine texture": (
         ["vertical", "--texture", "dots"],
-        "a texture of 0.1 mm is too fine for pixels of 0.4 mm: make it 2 pixels or more",
+        "a texture of 0.1 mm is too fine for pixels of 0.4 mm: use 2 pixels or more",
     ),
     "a texture without a contrast": (
         ["vertical", "--texture", "dots", "--texture-contrast", "0"],
@@ -386,14 +386,14 @@ BAD = {
     "9 bits": (["vertical", "--bits", "9"], "frames of uint8 cannot have 9 bits: take 8"),
     "9 bits of 16": (["vertical", "--dtype", "uint16", "--bits", "9"], "cannot have 9 bits: take 10, 12, 16"),
     "bits of a float": (["vertical", "--dtype", "float32", "--bits", "12"], "leave them out"),
-    "a long exposure": (["vertical", "--exposure", "40ms"], "exposure 0.04 of the camera cannot be"),
+    "a long exposure": (["vertical", "--exposure", "40ms"], "exposure 0.04 of the camera is not possible"),
     "an exposure below zero": (["vertical", "--exposure=-1ms"], "exposure -0.001"),
     "no frame rate": (["vertical", "--frame-rate", "0"], "frame rate 0.0"),
     "half a pivot": (["axial", "--pivot", "1mm,2mm"], "--pivot 1mm,2mm: 3 lengths are needed"),
     "half a displacement": (["horizontal", "--displacement-step", "1mm"], "2 lengths are needed"),
-    "noise below zero": (["vertical", "--noise=-1"], "noise -1.0 of the camera cannot be"),
-    "noise that is no number": (["vertical", "--noise", "nan"], "noise nan of the camera cannot be"),
-    "no electrons": (["vertical", "--electrons", "0"], "electrons 0.0 of the camera cannot be"),
+    "noise below zero": (["vertical", "--noise=-1"], "noise -1.0 of the camera is not possible"),
+    "noise that is no number": (["vertical", "--noise", "nan"], "noise nan of the camera is not possible"),
+    "no electrons": (["vertical", "--electrons", "0"], "electrons 0.0 of the camera is not possible"),
     "a gain of nothing": (["vertical", "--gain-deviation", "1"], "gain deviation 1.0"),
     "offsets below zero": (["vertical", "--offset-deviation=-1"], "offset deviation -1.0"),
     "a point spread below zero": (["vertical", "--point-spread=-1"], "point spread -1.0"),
@@ -402,7 +402,7 @@ BAD = {
         ["vertical", "--camera-distance", "40mm"],
         "a camera 40.0 mm above the sheet is not",
     ),
-    "a camera below": (["vertical", "--camera-distance=-1mm"], "distance -1.0 of the camera cannot be"),
+    "a camera below": (["vertical", "--camera-distance=-1mm"], "distance -1.0 of the camera is not possible"),
     "a travel beyond numbers": (
         ["vertical", "--travel-step", "1e308mm"],
         "travel is 1e+308 at frame 1: every frame needs a finite number, at most 1e+12",

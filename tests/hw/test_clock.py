@@ -217,7 +217,7 @@ def test_a_thread_of_someone_else_cannot_wait(clock):
     stranger = threading.Thread(target=work, name="stranger")
     stranger.start()
     stranger.join()
-    assert said == ["stranger cannot wait on a simulated clock that did not make it"]
+    assert said == ["stranger cannot wait on a simulated clock that did not create it"]
 
 
 def test_looking_at_the_time_without_end_is_an_error(clock):
@@ -225,11 +225,11 @@ def test_looking_at_the_time_without_end_is_an_error(clock):
         while clock.now() < 2000.0:
             pass
 
-    with pytest.raises(DeadlockError, match="MainThread looks at the clock and never waits"):
+    with pytest.raises(DeadlockError, match="MainThread reads the clock but never waits"):
         poll()
     clock.sleep(1.0)
 
 
 def test_a_condition_is_waited_for_with_its_lock(clock):
-    with pytest.raises(RuntimeError, match="must have its lock"):
+    with pytest.raises(RuntimeError, match="must hold the lock"):
         clock.condition().wait(1.0)

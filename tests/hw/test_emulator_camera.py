@@ -196,7 +196,7 @@ def test_a_lost_camera_tells_readers(running) -> None:
 
 @pytest.mark.parametrize("given", [{"delay": -0.1}, {"jitter": math.nan}])
 def test_what_cannot_be_is_refused(given: dict[str, float]) -> None:
-    with pytest.raises(InputError, match=f"^{next(iter(given))} .* cannot be"):
+    with pytest.raises(InputError, match=f"^{next(iter(given))} .* is not possible"):
         TwinCamera(make_twin(MOVEMENTS["press"]), still, **given)
 
 

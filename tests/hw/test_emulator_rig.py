@@ -174,7 +174,7 @@ def test_only_its_own_rig_file_is_replaced(tmp_path: Path) -> None:
         rig.write(tmp_path, "tcp://127.0.0.1:2")
         assert tomllib.loads(path.read_text())["camera"]["source"].endswith(":2")
         path.write_text("# mine\n")
-        with pytest.raises(InputError, match="someone else"):
+        with pytest.raises(InputError, match="did not write"):
             rig.write(tmp_path, "tcp://127.0.0.1:3")
         (tmp_path / "file").write_text("")
         with pytest.raises(InputError, match="cannot be written"):

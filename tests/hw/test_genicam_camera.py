@@ -168,7 +168,7 @@ def test_a_camera_that_is_lost_comes_back_and_its_numbers_go_on(served, monkeypa
         camera = GenicamCamera(settings("genicam:MS3", rate=50.0), slots=300)
         take(camera, 60)
         process.kill()
-        wait_until(lambda: "gives no picture: it was lost after" in caplog.text)
+        wait_until(lambda: "delivers no picture: it was lost after" in caplog.text)
         frames, latest = camera.counts.frames, camera.latest
         camera.flush()
         with pytest.raises(HardwareError, match=r"was lost .* s ago and is not back yet$"):
@@ -184,7 +184,7 @@ def test_a_camera_that_is_lost_comes_back_and_its_numbers_go_on(served, monkeypa
 def test_without_the_library_the_remedy_is_told(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "gi", None)
     with pytest.raises(
-        InputError, match=r"need Aravis, which is missing .*pip install 'mirrorskin\[genicam\]'$"
+        InputError, match=r"need Aravis, which is not installed .*pip install 'mirrorskin\[genicam\]'$"
     ):
         GenicamCamera(settings("genicam:"))
 

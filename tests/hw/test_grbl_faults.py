@@ -79,11 +79,11 @@ def test_an_unplugged_stage_says_so_at_once(moving):
     stage, port = moving
     port.unplug()
     told = failure(stage, 0.0)
-    assert "the line is lost" in told
+    assert "the connection is lost" in told
     assert "switch it off" in told
     stage.stop()
     for ask in (stage.report, stage.wait, lambda: stage.move(Position())):
-        with pytest.raises(HardwareError, match="line is lost"):
+        with pytest.raises(HardwareError, match="connection is lost"):
             ask()
 
 
@@ -107,13 +107,13 @@ def _jump(*place):
         (lambda port: port.alarm(99), "ALARM:99"),
         (_in_alarm, "in alarm"),  # whose line was lost
         (lambda port: port.reset(), "was reset"),
-        (lambda port: port.say("ok"), "it answered a line that nobody here sent"),
-        (lambda port: port.say("error:9"), "it answered a line that nobody here sent"),
-        (lambda port: setattr(port, "state", "Hold:0"), "the state hold unasked"),
-        (lambda port: setattr(port, "state", "Door:1"), "the state door unasked"),
-        (_jump(30, 40, 6.7), "beyond its limits"),
-        (_jump(30, 40, 15.1), "beyond its limits"),
-        (_jump(34, 44, 10), "beyond its limits"),
+        (lambda port: port.say("ok"), "answered a line that this program did not send"),
+        (lambda port: port.say("error:9"), "answered a line that this program did not send"),
+        (lambda port: setattr(port, "state", "Hold:0"), "the state hold by itself"),
+        (lambda port: setattr(port, "state", "Door:1"), "the state door by itself"),
+        (_jump(30, 40, 6.7), "beyond the limits"),
+        (_jump(30, 40, 15.1), "beyond the limits"),
+        (_jump(34, 44, 10), "beyond the limits"),
     ],
 )
 def test_what_happens_in_motion_is_told(moving, fault, told):
@@ -133,7 +133,7 @@ def test_a_stage_that_begins_beyond_its_limits_can_come_back_but_go_no_farther(o
     stage, port = opened(ScriptedGrbl(clock, place=(30.0, 40.0, 17.0)))
     port.on_move = lambda: port.plan.append(([30.0, 40.0, 19.0], 0.5))
     stage.move(Position(-7 + 2.01))
-    assert "beyond its limits" in failure(stage, 1.0)
+    assert "beyond the limits" in failure(stage, 1.0)
 
 
 def test_homing_may_end_beyond_the_limits(opened, clock):
@@ -152,7 +152,7 @@ def test_a_stage_that_rests_elsewhere_than_it_was_sent_says_so(opened):
     port.on_move = lambda: port.plan.__setitem__(-1, ([30.0, 40.0, 8.0], 0.1))
     stage.move(Position(1.0), 10.0)
     told = failure(stage, 0.5)
-    assert "rests 1 mm or degrees from where it was sent" in told
+    assert "rests 1 mm or degrees from its target" in told
     assert str(stage.error) == told
 
 
@@ -185,7 +185,7 @@ def test_a_refused_move_stops_the_stage(opened):
 def test_an_answer_that_was_lost_is_told(opened):
     stage, port = opened()
     port.run = lambda line: port.say("o")
-    with pytest.raises(HardwareError, match="without having answered"):
+    with pytest.raises(HardwareError, match="has not answered"):
         stage.move(Position(1))
 
 

@@ -80,7 +80,7 @@ def test_a_port_in_use_is_refused(terminal):
 
 
 def test_a_port_where_nothing_answers_is_refused(terminal):
-    with pytest.raises(InputError, match=r"nothing answers within 0.25 s"):
+    with pytest.raises(InputError, match=r"no answer within 0.25 s"):
         GrblStage(stage_settings(port=terminal[1], timeout=0.25))
 
 
@@ -99,7 +99,7 @@ def works_until(stage, leave):
     assert stage.wait().position.travel == pytest.approx(1, abs=1e-3)
     stage.move(Position(-4), 0.25)
     leave()
-    with pytest.raises(HardwareError, match="line is lost"):
+    with pytest.raises(HardwareError, match="connection is lost"):
         stage.wait()
     stage.close()
 

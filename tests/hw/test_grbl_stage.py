@@ -95,14 +95,14 @@ def test_what_is_beyond_the_limits_is_refused_before_anything_is_sent(opened, cl
 def test_steps_other_than_the_rig_files_are_refused(opened, clock):
     travel = stage_settings().travel
     opened(ScriptedGrbl(clock, settings={102: 500.0}), travel=structs.replace(travel, steps=500.0))
-    with pytest.raises(InputError, match=r"\$102 is 500 steps .* has 250: it goes 2 times as far"):
+    with pytest.raises(InputError, match=r"\$102 is 500 steps, but 250 .*: moves would be 2 times as long"):
         opened(ScriptedGrbl(clock, settings={102: 500.0}), travel=structs.replace(travel, steps=250.0))
 
 
 def test_a_speed_below_the_firmwares_is_refused_before_anything_is_sent(opened, clock):
     stage, port = opened(ScriptedGrbl(clock, settings={102: 250}))
     sent = list(port.lines)
-    with pytest.raises(InputError, match=r"no fewer than 30\.5.*go 0\.122 or faster"):
+    with pytest.raises(InputError, match=r"minimum is 30\.5.*use 0\.122 or more"):
         stage.move(Position(1.0), 0.02)
     assert port.lines == sent
     stage.move(Position(0.1), 0.2)

@@ -72,7 +72,7 @@ def test_it_goes_no_faster_than_the_controller(stage, line):
 def test_sweeps_and_turns_are_refused(stage, clock, plan):
     camera = FakeCamera(clock, lambda at: Position(), lambda place: np.zeros((4, 4), np.uint8))
     rig = Rig(stage, camera, RIG, clock)
-    with rig, pytest.raises(io.InputError, match=r"does not tell where it is while it \w+; go in steps"):
+    with rig, pytest.raises(io.InputError, match=r"does not report its position while it moves; use steps"):
         SweepScan(rig, plan)
 
 
@@ -111,10 +111,10 @@ def test_a_stop_in_motion_comes_at_once(clock, emergency):
     ("fault", "message"),
     [
         (lambda line: setattr(line, "silent", True), "no longer answers"),
-        (lambda line: line.unplug(), "the line is lost"),
-        (lambda line: line.say("start"), "was reset; it has lost its place"),
-        (lambda line: line.say("ok"), "answered a line that nobody here sent"),
-        (lambda line: line.say(*["\x01\xe9\x7f" * 40] * 5), "what it says is garbled"),
+        (lambda line: line.unplug(), "the connection is lost"),
+        (lambda line: line.say("start"), "was reset and has lost its position"),
+        (lambda line: line.say("ok"), "answered a line that this program did not send"),
+        (lambda line: line.say(*["\x01\xe9\x7f" * 40] * 5), "sends garbled characters"),
         (lambda line: setattr(line, "noise", lambda said: said.replace("M110", "M111")), "checksum mismatch"),
         (lambda line: line.say("Error:Heating failed, system stopped!"), "Heating failed"),
     ],
@@ -148,17 +148,17 @@ def test_homing_is_stopped_by_killing_the_controller(line, clock):
 def test_a_place_that_the_controller_clips_is_noticed(stage, line):
     line.ends = -0.5
     stage.move(Position(-1.0))
-    with pytest.raises(HardwareError, match=r"rests 0\.5 mm or degrees from where it was sent"):
+    with pytest.raises(HardwareError, match=r"rests 0\.5 mm or degrees from its target"):
         stage.wait()
 
 
 @pytest.mark.parametrize(
     ("instead", "message"),
     [
-        ({"M115": "FIRMWARE_NAME:Klipper FIRMWARE_VERSION:v0.12"}, "it is Klipper, not Marlin"),
-        ({"M115": "Grbl 1.1h ['$' for help]"}, "what answers is not Marlin"),
-        ({"M115": ""}, "nothing answers within 12 s"),
-        ({"M27": "SD printing byte 12/34\nok"}, "prints from its card"),
+        ({"M115": "FIRMWARE_NAME:Klipper FIRMWARE_VERSION:v0.12"}, "firmware is Klipper, not Marlin"),
+        ({"M115": "Grbl 1.1h ['$' for help]"}, "the device is not Marlin"),
+        ({"M115": ""}, "no answer within 12 s"),
+        ({"M27": "SD printing byte 12/34\nok"}, "printing from its card"),
         ({"M114": "X:0.00 Y:0.00 E:0.00\nok"}, "has no axis Z"),
         ({"M503": "nothing\nok", "G90": "Error:checksum mismatch"}, "answers G90 with 'Error:checksum"),
     ],
@@ -175,7 +175,7 @@ def test_the_rig_file_chooses_it(line, clock, monkeypatch):
     stage = open_stage(STAGE, clock=clock)
     stage.close()
     assert stage.firmware == "Marlin 2.1.2 (Nov 24 2026)"
-    with pytest.raises(io.InputError, match="only GRBL is unlocked"):
+    with pytest.raises(io.InputError, match="only GRBL can be unlocked"):
         open_stage(STAGE, unlock=True)
 
 
@@ -227,14 +227,16 @@ def test_a_wait_ends_in_time(stage, line):
 def test_who_else_moves_it_is_noticed(stage, line):
     line.put(0.5)
     line.until(lambda: stage.error, SOON)
-    with pytest.raises(HardwareError, match=r"rests 0\.5 mm .* let nobody else move it"):
+    with pytest.raises(HardwareError, match=r"rests 0\.5 mm .* check that nothing else moves it"):
         stage.report()
 
 
 def test_other_steps_than_the_rig_file_s_are_refused(line):
     line.instead = {"M503": "echo:  M92 X80.00 Y80.00 Z200.00\nok"}
     travel = msgspec.structs.replace(STAGE.travel, steps=400.0)
-    with pytest.raises(io.InputError, match=r"M92 Z is 200 steps where the rig file has 400: it goes 0\.5"):
+    with pytest.raises(
+        io.InputError, match=r"M92 Z is 200 steps, but 400 in the rig file: moves would be 0\.5"
+    ):
         MarlinStage(msgspec.structs.replace(STAGE, travel=travel), line, clock=line.clock)
 
 
@@ -299,7 +301,7 @@ def test_a_rig_file_captures_in_steps(capture, tmp_path):
 def test_a_sweep_is_refused_before_it_homes(capture, line):
     ended = capture("--stop 0.4mm --speed 0.2mm/s")
     assert (ended.code, line.log) == (2, [])
-    assert "Marlin does not tell where it is while it moves; go in steps" in ended.said
+    assert "Marlin does not report its position while it moves; use steps" in ended.said
 
 
 @pytest.mark.parametrize("fault", [lambda line: line.unplug(), lambda line: setattr(line, "silent", True)])

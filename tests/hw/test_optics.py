@@ -75,8 +75,8 @@ def test_a_picture_is_shared_out_over_the_wall() -> None:
         (np.zeros((2, 2, 3)), "rows and columns"),
         (np.zeros((0, 4)), "rows and columns"),
         (np.array([[0, 1]]), "int64"),
-        (np.array([[0.5, 1.01]]), "from 0 to 1"),
-        (np.array([[0.5, np.nan]]), "from 0 to 1"),
+        (np.array([[0.5, 1.01]]), "is 0 to 1"),
+        (np.array([[0.5, np.nan]]), "is 0 to 1"),
     ],
 )
 def test_what_is_no_picture_is_refused(values: np.ndarray, problem: str) -> None:
@@ -160,7 +160,7 @@ def test_the_ideal_light_is_exactly_linear_over_the_design_range() -> None:
     ],
 )
 def test_what_is_no_function_of_zenith_is_not_ideal(body: Body, pattern: Pattern, problem: str) -> None:
-    with pytest.raises(InputError, match=f"{problem}.*take the optics 'cylinder'"):
+    with pytest.raises(InputError, match=f"{problem}.*use the optics 'cylinder'"):
         Ideal(body, pattern)
 
 

@@ -113,7 +113,7 @@ def test_what_it_cannot_do_is_refused_before_it_moves(lab):
     with rig_of(stage, line) as rig:
         for plan, said in (
             (VerticalPlan(0.0, 1.0, speed=101.0), "cannot go at 101 mm"),
-            (VerticalPlan(0.0, 2.5, speed=1.0), "presses deeper"),
+            (VerticalPlan(0.0, 2.5, speed=1.0), "exceeds the maximum"),
             (AxialPlan(1.0, 0.02, rate=0.5), "tilt"),
         ):
             with pytest.raises(io.InputError, match=said):
@@ -217,10 +217,10 @@ def test_commands_move_it_from_a_rig_file(folder):
             ("def home(", "def seek("),
             "my_stage.py:LabStage has no home: mirrorskin.hw.stage.Stage",
         ),
-        ("unlock", ("", ""), "only GRBL is unlocked"),
+        ("unlock", ("", ""), "only GRBL can be unlocked"),
         ("lift", (":LabStage", ":NoStage"), "there is no class NoStage"),
         ("lift", ("my_stage:", "no_stage:"), "there is no no_stage in"),
-        ("lift", ("my_stage:LabStage", "collections:namedtuple"), "namedtuple(settings) cannot be made"),
+        ("lift", ("my_stage:LabStage", "collections:namedtuple"), "namedtuple(settings) failed"),
         ("lift", ("my_stage:LabStage", "copy:copy"), "copy:copy has no name, no error"),
         (
             "check",

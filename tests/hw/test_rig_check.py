@@ -128,9 +128,9 @@ def test_a_stage_that_is_as_its_file_says_is_sound():
     assert {one.verdict for one in found.values()} == {"ok"}
     assert found["firmware"].found == "Grbl 1.1h"
     assert found["position"].found == ("travel -15.000 mm, pitch 0.000 deg, roll 0.000 deg (before homing)")
-    assert found["travel: limits against $132"].found == "-10 to 3 mm, of 13 mm of the controller"
-    assert found["pitch: speed against $110"].found == "20 deg/s, of 20 deg/s of the controller"
-    assert found["reports"].found == "20.0 Hz, asked 20 Hz"
+    assert found["travel: limits against $132"].found == "-10 to 3 mm, 13 mm in the controller"
+    assert found["pitch: speed against $110"].found == "20 deg/s, 20 deg/s in the controller"
+    assert found["reports"].found == "20.0 Hz, requested 20 Hz"
     assert found["round trip of a report"].found == "4.0 ms"
     assert stage.did == []
 
@@ -138,8 +138,8 @@ def test_a_stage_that_is_as_its_file_says_is_sound():
 @pytest.mark.parametrize(
     ("number", "value", "what", "said"),
     [
-        (132, 12.9, "travel: limits against $132", "they are 13 mm apart, and the axis is shorter"),
-        (131, 8.9, "roll: limits against $131", "they are 9 deg apart, and the axis is shorter"),
+        (132, 12.9, "travel: limits against $132", "the limits are 13 mm apart, but the axis is shorter"),
+        (131, 8.9, "roll: limits against $131", "the limits are 9 deg apart, but the axis is shorter"),
         (112, 240.0, "travel: speed against $112", "set stage.travel.speed = 4"),
         (110, 600.0, "pitch: speed against $110", "set stage.pitch.speed = 10"),
     ],
@@ -166,7 +166,7 @@ def test_limits_that_the_controller_s_soft_limits_cut_are_warned_of(zero, soft, 
 def test_what_the_controller_does_not_tell_is_no_fault():
     found = look(Stage(parameters={22: 1.0}))
     assert {one.verdict for one in found.values()} == {"ok"}
-    assert found["roll: limits against $131"].found == "-5 to 4 deg, of what the controller does not tell"
+    assert found["roll: limits against $131"].found == "-5 to 4 deg, unknown in the controller"
 
 
 def test_homing_that_the_controller_cannot_do_fails():
@@ -192,7 +192,7 @@ def test_an_alarm_is_a_fault_unless_homing_ends_it():
 
 def test_slow_and_missing_reports_are_told():
     found = look(Stage(every=0.1))["reports"]
-    assert (found.verdict, found.found) == ("warning", "10.0 Hz, asked 20 Hz")
+    assert (found.verdict, found.found) == ("warning", "10.0 Hz, requested 20 Hz")
     assert "set stage.report_rate = 10" in found.remedy
     assert look(Stage(every=100.0))["reports"].verdict == "failed"
     slow = Stage()
@@ -204,7 +204,7 @@ def test_an_answer_that_came_late_asks_for_more_silence():
     late = Stage()
     late.longest_trip = 0.06
     found = look(late)["longest round trip"]
-    assert (found.verdict, found.found) == ("warning", "60.0 ms, of 70 ms that a move bears")
+    assert (found.verdict, found.found) == ("warning", "60.0 ms; the limit in motion is 70 ms")
     assert "set stage.silence = 0.18" in found.remedy
 
 
@@ -276,7 +276,7 @@ def test_a_camera_that_is_as_its_file_says_is_sound():
     found = film(Camera(), rate=102.0)
     assert {one.verdict for one in found.values()} == {"ok"}
     assert found["pictures"].found == "7 x 5 uint8"
-    assert found["rate"].found == "100.00 Hz, asked 102 Hz"
+    assert found["rate"].found == "100.00 Hz, requested 102 Hz"
     assert found["brightness"].found == "0 to 34, median 17; 0.00% saturated, 2.86% black"
     total = int(found["frames"].found.split()[0])
     assert 90 <= total <= 110
@@ -284,7 +284,7 @@ def test_a_camera_that_is_as_its_file_says_is_sound():
 
 def test_a_frame_that_came_late_asks_for_a_longer_stall():
     found = film(Camera(every=0.08))["longest wait for a frame"]
-    assert (found.verdict, found.found) == ("warning", "80.0 ms, of 100 ms that a move bears")
+    assert (found.verdict, found.found) == ("warning", "80.0 ms; the limit in motion is 100 ms")
     assert "set camera.stall = 0.24" in found.remedy
 
 
@@ -370,10 +370,10 @@ def test_a_stage_that_is_lost_while_the_camera_is_looked_at_is_told():
     class Unplugged(Camera):
         def close(self):
             super().close()
-            stage.report = lambda: (_ for _ in ()).throw(HardwareError("stage: the line is lost"))
+            stage.report = lambda: (_ for _ in ()).throw(HardwareError("stage: the connection is lost"))
 
     stage = Stage()
-    with pytest.raises(HardwareError, match="the line is lost"):
+    with pytest.raises(HardwareError, match="the connection is lost"):
         list(opened(stage, Unplugged()))
     assert stage.did == ["close"]
 

@@ -265,13 +265,13 @@ WRONG = [
     ('letter = "C"', 'letter = "A"', '[stage] roll.letter is "A", and so is pitch.letter: each motion'),
     ("zero = 7.5\n", "zero = -inf\n", "stage.pitch.zero is -inf: a finite number of degrees is needed"),
     ('zero = -20\nunit = "mm"', 'unit = "deg"', 'stage.travel.unit is "deg": one of "mm" is needed'),
-    ("limits = [-5, 3]", "limits = [3, 3]", "[stage.travel] limits are out of order, 3 not below 3: write ["),
+    ("limits = [-5, 3]", "limits = [3, 3]", "[stage.travel] limits are in the wrong order, 3 is not below 3"),
     ("limits = [-5, 3]", "limits = [-5, true]", "stage.travel.limits is [-5, True]: a list of the least and"),
-    ("limits = [-6.0, 4.0]", "limits = [0, 4]", "[stage.pitch] limits [0, 4] do not have 0 (upright) within"),
+    ("limits = [-6.0, 4.0]", "limits = [0, 4]", "[stage.pitch] limits [0, 4] do not include 0 (upright)"),
     (
         "limits = [-1.5, 2.5]",
         "limits = [1, 2]",
-        "[stage.x] limits [1, 2] do not have 0 (where the body is",
+        "[stage.x] limits [1, 2] do not include 0 (where the body is",
     ),
     ("limits = [-30.0, 60.0]", "limits = [-400, 4]", "stage.twist.limits is [-400, 4]: a list of the least"),
     ("speed = 0.75", "speed = 0", "stage.x.speed is 0: a speed above 0, in mm a second, is needed"),
@@ -298,7 +298,7 @@ WRONG = [
     (
         'trigger = "spindle"',
         "",
-        "[camera] trigger_input is given and trigger is not: add that, or leave both",
+        "[camera] trigger_input is given without trigger: add trigger",
     ),
     ('fourcc = "Y16"', 'fourcc = "Mono12"', '[camera] fourcc is "Mono12": this source needs'),
     (
@@ -319,11 +319,11 @@ WRONG = [
         'dark = "dark.gif"',
         'camera.dark is "dark.gif": a number of counts, or a file (.npy, .png',
     ),
-    ("dark = 12", "dark = -1", "camera.dark: it is -1, and counts of uint16 go from 0 to 65535"),
+    ("dark = 12", "dark = -1", "camera.dark: it is -1, but counts of uint16 are 0 to 65535"),
     ("dark = 12", "dark = 4001", "camera.bright is not above camera.dark at most of the pixels"),
     ("bright = 4000.5", 'bright = "b.tif"', "camera.bright: b.tif cannot be read: No such file or directory"),
     ("zenith_gain = 5.7", "zenith_gain = 0", "[camera] zenith_gain is 0: write the counts per degree"),
-    ("zenith_gain = 5.7", "", "[camera] zenith_offset is given and zenith_gain is not"),
+    ("zenith_gain = 5.7", "", "[camera] zenith_offset is given without zenith_gain"),
     ("[stage.roll]", "[stage.rol]", "stage.rol is not known: did you mean roll?"),
     ("[camera]", "[kamera]", "kamera is not known: did you mean camera?"),
 ]
@@ -338,8 +338,8 @@ def test_what_cannot_be_is_refused_with_its_key(refusal, line, wrong, said):
 def test_pitch_without_roll_is_refused_and_roll_without_pitch(refusal):
     before, pitch, rest = re.split(r"(?=\[stage\.pitch\])|(?=\[stage\.roll\])", EVERYTHING)
     roll, camera = re.split(r"(?=\[camera\])", rest)
-    assert "there is [stage.pitch] and no [stage.roll]" in refusal(before + pitch + camera)
-    assert "there is [stage.roll] and no [stage.pitch]" in refusal(before + roll + camera)
+    assert "there is [stage.pitch] but no [stage.roll]" in refusal(before + pitch + camera)
+    assert "there is [stage.roll] but no [stage.pitch]" in refusal(before + roll + camera)
 
 
 @pytest.mark.parametrize("table", ["stage", "camera", "stage.travel"])
@@ -403,15 +403,15 @@ def test_a_reference_of_a_camera_of_floats_may_lie_anywhere(rig, tmp_path):
 @pytest.mark.parametrize(
     ("picture", "said"),
     [
-        (PICTURE.T, r"b.npy is 3 x 4, and the camera's pictures 4 x 3 \(columns x rows\)"),
-        (PICTURE[0], "b.npy is 4, and the camera's pictures 4 x 3"),
-        (np.uint8(3), "b.npy is a single number, and the camera's pictures"),
-        (PICTURE.astype(np.uint16), "b.npy is of uint16, and the camera of uint8; take"),
-        (PICTURE > 105, "b.npy is of bool, and the camera of uint8"),
+        (PICTURE.T, r"b.npy is 3 x 4, but the camera's pictures are 4 x 3 \(columns x rows\)"),
+        (PICTURE[0], "b.npy is 4, but the camera's pictures are 4 x 3"),
+        (np.uint8(3), "b.npy is a single number, but the camera's pictures"),
+        (PICTURE.astype(np.uint16), "b.npy contains uint16, but the camera delivers uint8; take"),
+        (PICTURE > 105, "b.npy contains bool, but the camera delivers uint8"),
         (PICTURE.astype(np.complex64), "b.npy is not a NumPy array of numbers .it holds complex64."),
-        (PICTURE * np.nan, "b.npy holds nothing but NaN"),
-        (PICTURE + 200.0, "b.npy holds 300 to 311, and counts of uint8 go from 0 to 255"),
-        (np.where(PICTURE == 105, np.inf, PICTURE), "b.npy holds 100 to inf, and counts of uint8"),
+        (PICTURE * np.nan, "b.npy contains only NaN"),
+        (PICTURE + 200.0, "b.npy contains 300 to 311, but counts of uint8 are 0 to 255"),
+        (np.where(PICTURE == 105, np.inf, PICTURE), "b.npy contains 100 to inf, but counts of uint8"),
     ],
 )
 def test_a_reference_that_the_camera_cannot_give_is_refused(refusal, tmp_path, picture, said):

@@ -39,7 +39,7 @@ def test_a_camera_that_stalls_stops_the_stage_while_everyone_is_busy(rig, timed,
     rig.camera.stall()
     assert stopped(rig)  # nobody asked the rig for anything
     assert stall <= rig.stage.stops[0] - began < stall + 0.05
-    with pytest.raises(HardwareError, match=rf"fake camera gave no frame for {stall}"):
+    with pytest.raises(HardwareError, match=rf"fake camera delivered no frame for {stall}"):
         rig.take(1)
 
 
@@ -55,7 +55,7 @@ def test_a_camera_that_came_back_in_a_timed_move_stops_it(rig):
     rig.begin(lambda: rig.stage.move(Position(2.0), 0.5), timed=True)
     rig.camera.reconnects += 1
     assert stopped(rig)
-    with pytest.raises(HardwareError, match=r"was lost while the stage moved.* begin anew"):
+    with pytest.raises(HardwareError, match=r"was lost while the stage moved.* start again"):
         rig.check()
 
 
@@ -177,6 +177,6 @@ def test_a_program_that_stood_still_ends_a_timed_move(rig, monkeypatch, timed):
         rig.end(move)
         assert rig.stage.stops == []
         return
-    with pytest.raises(HardwareError, match=r"stood still for 0\.60 s while the stage moved"):
+    with pytest.raises(HardwareError, match=r"was paused for 0\.60 s while the stage moved"):
         rig.end(move)
     assert rig.stage.stops

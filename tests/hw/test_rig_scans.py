@@ -310,5 +310,5 @@ def test_a_stage_that_rests_elsewhere_is_not_believed(monkeypatch):
         scan = StepScan(rig, VerticalPlan(0.0, 1.0, step=0.5), settle=0.0)
         _ = scan.header
         monkeypatch.setattr(rig, "go", lambda place, speed=None: astray)
-        with pytest.raises(HardwareError, match="from where it was sent"):
+        with pytest.raises(HardwareError, match="from its target"):
             drain(scan)

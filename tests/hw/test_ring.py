@@ -130,7 +130,7 @@ def test_forgotten_frames_are_not_dropped() -> None:
 def test_no_frame_in_time_is_an_error_that_names_the_camera(clock) -> None:
     ring = Ring(SHAPE, np.uint8, 3, "camera 5", clock)
     begun = clock.now()
-    with pytest.raises(HardwareError, match=r"camera 5 gave no frame for 0.05 s"):
+    with pytest.raises(HardwareError, match=r"camera 5 delivered no frame for 0.05 s"):
         ring.take(1, 0.05)
     assert clock.now() - begun == pytest.approx(0.05)
 

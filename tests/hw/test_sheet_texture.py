@@ -180,7 +180,7 @@ def read_all_left(twin: Twin) -> NDArray[np.float32]:
         ({"contrast": 1.1}, "contrast 1.1 of the texture"),
         ({"diffuse": -0.1}, "diffuse -0.1 of the texture"),
         ({"seed": -1}, "seed -1 of the texture"),
-        ({"size": 0.09}, "a texture of 0.09 mm is too fine for pixels of 0.05 mm: make it 2 pixels or more"),
+        ({"size": 0.09}, "a texture of 0.09 mm is too fine for pixels of 0.05 mm: use 2 pixels or more"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(changes: dict[str, Any], words: str) -> None:

@@ -186,5 +186,5 @@ def test_a_body_that_does_not_press_moves_no_skin() -> None:
 
 
 def test_too_long_a_way_is_refused() -> None:
-    with pytest.raises(InputError, match=r"a way of 50 mm .* points, .*: take larger pixels"):
+    with pytest.raises(InputError, match=r"a displacement of 50 mm .* points, .*: use larger pixels"):
         history(Horizontal([[0.0, 0.0], [50.0, 0.0]], 0.1), 0.5, 0.005)

@@ -35,13 +35,13 @@ def test_what_lies_on_a_limit_is_within(place):
 @pytest.mark.parametrize(
     ("place", "limit"),
     [
-        (Position(-2.001), "from -2 to 10 mm"),
-        (Position(11), "from -2 to 10 mm"),
-        (Position(4.001), "deeper than the 4 mm"),
+        (Position(-2.001), "range is -2 to 10 mm"),
+        (Position(11), "range is -2 to 10 mm"),
+        (Position(4.001), "exceeds the maximum of 4 mm"),
         (Position(math.nan), "finite"),
         (Position(math.inf), "finite"),
-        (Position(0, math.radians(3.01)), "greatest, 3;"),
-        (Position(0, math.radians(2.5), math.radians(2.5)), "greatest, 3;"),
+        (Position(0, math.radians(3.01)), "maximum of 3;"),
+        (Position(0, math.radians(2.5), math.radians(2.5)), "maximum of 3;"),
         (Position(0, math.nan), "finite"),
     ],
 )
@@ -69,10 +69,10 @@ def test_how_far_a_place_is_beyond_the_limits_is_known(place, excess):
 @pytest.mark.parametrize(
     ("place", "limit"),
     [
-        (Position(x=2.01), "2.01 mm of x are beyond the axis, which goes from -1 to 2 mm"),
+        (Position(x=2.01), "2.01 mm of x is beyond the axis, whose range is -1 to 2 mm"),
         (Position(x=math.nan), "beyond the axis"),
-        (Position(twist=math.radians(-10.5)), "-10.5 degrees of twist are beyond"),
-        (Position(y=0.1), r"no axis of y, which was to go to 0.1 mm; add \[stage.y\]"),
+        (Position(twist=math.radians(-10.5)), "-10.5 degrees of twist is beyond"),
+        (Position(y=0.1), r"no axis of y, which should move to 0.1 mm; add \[stage.y\]"),
     ],
 )
 def test_a_move_sideways_beyond_its_limit_is_refused(place, limit):

@@ -88,7 +88,9 @@ def test_a_missing_frame_ends_a_capture_in_one_line_and_the_line_is_off(emulated
     rig.camera.stall()
     ended = run("capture", "vertical", "--rig", file, "-o", tmp_path / "press.h5", *STEPS)
     assert ended.code == 1
-    assert "gave no frame within 2 s of its trigger: see the controller's line 'coolant', its" in ended.said
+    assert (
+        "delivered no frame within 2 s of its trigger: check the controller's output 'coolant', its" in ended.said
+    )
     assert len(rig.machine.switched("coolant")) == 2
 
 
@@ -97,7 +99,7 @@ def test_a_camera_that_runs_freely_is_a_fault(emulated):
     with (
         rigs.open_rig(told, steps=True) as opened,
         StepScan(opened, VerticalPlan(0.0, 1.0, step=0.5), settle=0.0) as scan,
-        pytest.raises(HardwareError, match=r"gave \d+ frames more than it was triggered for: see that it is"),
+        pytest.raises(HardwareError, match=r"delivered frames without a trigger \(\d+\): check that it is"),
     ):
         drain(scan)
 
@@ -115,7 +117,7 @@ def test_a_surplus_frame_after_the_last_trigger_is_a_fault(emulated):
         stage.switch("coolant", True)
         rig.clock.sleep(0.1)
         assert rig.camera.counts.frames == came + 1
-        with pytest.raises(HardwareError, match="gave 1 frames more than it was triggered for"):
+        with pytest.raises(HardwareError, match=r"delivered frames without a trigger \(1\)"):
             scan.read()
 
 
@@ -154,18 +156,18 @@ def test_what_needs_frames_all_the_time_is_refused(emulated, tmp_path):
         run("rig", "probe", file, "--from", "-1mm"),
     ):
         assert ended.code == 2
-        assert "camera.trigger takes frames of a capture in steps, and of nothing else: give" in ended.said
+        assert "camera.trigger works only for captures in steps: give" in ended.said
     with (
         rig.open_stage(told.stage) as stage,
         Rig(stage, rig.camera, told, rig.clock) as opened,
-        pytest.raises(InputError, match=r"camera\.trigger takes frames of a capture in steps"),
+        pytest.raises(InputError, match=r"camera\.trigger works only for captures in steps"),
     ):
         SweepScan(opened, VerticalPlan(0.0, 1.0, speed=1.0))
 
 
 def test_a_stage_that_has_no_line_is_refused():
     with pytest.raises(
-        InputError, match=r"^fake stage: camera.trigger needs a GRBL controller; leave it out$"
+        InputError, match=r"^fake stage: camera.trigger needs a GRBL controller; remove it from the rig file$"
     ):
         fake_rig(lambda place: np.zeros((8, 8), np.uint8), told={"trigger": "coolant"})
 

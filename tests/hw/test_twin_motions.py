@@ -498,12 +498,12 @@ def test_a_seed_gives_one_recording_and_another_seed_another(device: Device, nam
     [
         (
             {"movement": Vertical([1.0, 40.0])},
-            "sphere may rise 40 mm into the sensor's body, which is 40 mm high",
+            "sphere may rise 40 mm into the sensor's body, whose height is 40 mm",
         ),
         ({"pixel_size": 1e3}, "no pixel of 1000 x 1000 mm lies on the sensor.*smaller"),
         ({"movement": Axial([0.0], 0.1, 41.0)}, "rise 42.* mm into .*press less"),
-        ({"movement": Twist([0.0], 3.0), "body": Body(height=3.0)}, "rise 3 mm into .* 3 mm high"),
-        ({"movement": Axial([0.0], 0.1, 1.0, (1e3, 0.0, 0.0))}, "rise 10.* mm .*turn about a nearer pivot"),
+        ({"movement": Twist([0.0], 3.0), "body": Body(height=3.0)}, "rise 3 mm into .* height is 3 mm"),
+        ({"movement": Axial([0.0], 0.1, 1.0, (1e3, 0.0, 0.0))}, "rise 10.* mm .*use a nearer pivot"),
         ({"object": Sphere(36.0)}, "sphere is larger than the sensor.*36 mm.*35 mm"),
         ({"movement": Vertical([1.0], compliance=0.1)}, "compliance needs contact 'elastic'"),
         ({"distance": 30.0}, "not above the body"),

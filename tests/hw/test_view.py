@@ -44,5 +44,5 @@ def test_lines_are_refracted_at_the_top_towards_the_pinhole(distance: float, ind
 
 @pytest.mark.parametrize("distance", [40.0, 39.0, 0.0, -50.0, -np.inf, np.nan])
 def test_a_camera_must_be_above_the_body(distance: float) -> None:
-    with pytest.raises(InputError, match=r"put it more than 40\.0 mm above"):
+    with pytest.raises(InputError, match=r"use more than 40\.0 mm"):
         View(SHAPE, PIXEL, Body(), distance)

@@ -39,7 +39,7 @@ def test_the_environment_may_choose(monkeypatch):
     monkeypatch.setenv("PYOPENCL_CTX", "0:0")
     assert open_device().info == list_devices()[0]
     monkeypatch.setenv("PYOPENCL_CTX", "99")
-    with pytest.raises(UnknownDeviceError, match="PYOPENCL_CTX='99' names no device"):
+    with pytest.raises(UnknownDeviceError, match="PYOPENCL_CTX='99' matches no device"):
         open_device()
 
 

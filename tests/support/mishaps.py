@@ -132,7 +132,7 @@ class Child:
 
 def starved(said: str) -> bool:
     """Return whether a capture ended because this machine was too busy to emulate a rig in time."""
-    return any(words in said for words in ("no longer answers", "gave no frame", "stood still"))
+    return any(words in said for words in ("no longer answers", "delivered no frame", "stood still"))
 
 
 def state_of(path: Path) -> str | None:

@@ -65,7 +65,7 @@ FAULTS: dict[str, tuple[Callable[[EmulatedRig], Any], str]] = {
     "G92 by another program": (_says(b"G92Z1\n"), "offset"),
     "G10 by another program": (_says(b"G10L2P1Z1\n"), ""),
     "move by another program": (_says(b"G91\nG1Z-1F60\nG90\n"), ""),
-    "camera stalls": (lambda emulated: emulated.camera.stall(), "gave no frame"),
+    "camera stalls": (lambda emulated: emulated.camera.stall(), "delivered no frame"),
     "camera lost": (lambda emulated: emulated.camera.lose(), "was lost"),
     "Ctrl-C": (_interrupt, "stopped by the user"),
     "none": (lambda emulated: None, ""),
