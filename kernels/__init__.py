@@ -1,1 +1,1 @@
-"""OpenCL: the devices, and each kernel beside its NumPy reference."""
+"""OpenCL: the devices, and each kernel next to its NumPy reference."""

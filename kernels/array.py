@@ -1,4 +1,4 @@
-"""Memory: arrays that host and device both see, and buffers borrowed from another owner."""
+"""Memory: arrays on host and device, and buffers that belong to another owner."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from mirrorskin.kernels.device import Device
 
 SLACK = 64
-"""Bytes behind an array that a kernel may load with its last word."""
+"""Readable bytes after an array, which a kernel may load with its last word."""
 
 ZERO = 0
-"""What arrays of all types can be filled with."""
+"""Fill values that are valid for all types."""
 
 _NO_ROOM = {
     cl.status_code.MEM_OBJECT_ALLOCATION_FAILURE,
@@ -43,7 +43,7 @@ _Made = TypeVar("_Made")
 
 
 def device_error(device: Device, what: str, error: cl.Error) -> DeviceError:
-    """Return an error that says what a device could not do, why, and what to do."""
+    """Return an error with the operation that a device could not do, the reason, and the remedy."""
     return DeviceError(
         f"{device.info.title} cannot {what}: {error}; if that goes on, choose another ('mirrorskin devices')"
     )
@@ -52,7 +52,7 @@ def device_error(device: Device, what: str, error: cl.Error) -> DeviceError:
 def _wrap_cl_errors(
     work: Callable[Concatenate[Any, _Given], _Made],
 ) -> Callable[Concatenate[Any, _Given], _Made]:
-    """Run a method of an array in one thread at a time, and name device and array where OpenCL fails."""
+    """Run a method of an array in one thread at a time, and add device and array to OpenCL's errors."""
 
     @wraps(work)
     def told(array: Array | BorrowedBuffer, /, *given: _Given.args, **named: _Given.kwargs) -> _Made:
@@ -67,14 +67,15 @@ def _wrap_cl_errors(
 
 
 class Array:
-    """An array that host and device both see: one memory where they share it, a copy each otherwise.
+    """An array on host and device: one memory if they share it, otherwise a copy on each.
 
-    It holds zeros at first, or anything where that does not matter. ``write``, ``fill`` and ``read`` copy
-    values. ``release`` ends the use, and does not copy memory that is shared. ``park`` makes room on the
-    device for other arrays. Kernels wait for what was written, and reading waits for kernels.
+    It is initialised with zeros, or not at all. ``write``, ``fill`` and ``read`` copy values. ``release``
+    ends the use, and does not copy shared memory. ``park`` frees memory on the device for other arrays.
+    Kernels wait for earlier writes, and reads wait for kernels.
 
     ``numpy.asarray(array)`` is a copy on the host, ``array[rows]`` another array on the device, and ``lend``
-    the same memory for pyopencl. Where memory is shared, ``numpy.from_dlpack(array)`` is the array itself.
+    returns the same memory for pyopencl. If memory is shared, ``numpy.from_dlpack(array)`` is the array
+    itself.
 
     Attributes
     ----------
@@ -106,16 +107,14 @@ class Array:
         self._mapped: Mapping | None = None
         self._parked: NDArray[Any] | None = None  # values while there is no memory on the device
         self._is_parked = False
-        self._is_lent = False  # whether others may still use the memory when this array is gone
+        self._is_lent = False  # whether others may still use the memory when this array is deleted
         self._buffer: cl.Buffer | None = None
         self.shape, self.dtype, self._zeroed = shape, dtype, zeroed
-        self._filling: Any = (
-            ZERO if zeroed and not self.is_shared else None
-        )  # a number that it will be filled with
+        self._filling: Any = ZERO if zeroed and not self.is_shared else None  # pending fill value
         self.nbytes: int = math.prod(shape) * dtype.itemsize
         if self.nbytes > device.max_allocation:
             raise DeviceMemoryError(_no_room(device, name, self.nbytes))
-        # A device that shares memory sees it from its first kernel on, with what the host wrote before.
+        # A device that shares memory sees the host's writes from its first kernel on.
         if not self.is_shared:
             self._allocate()
         else:
@@ -126,7 +125,7 @@ class Array:
 
     @cached_property
     def _host(self) -> NDArray[Any]:
-        """The memory that host and device share."""
+        """The memory shared by host and device."""
         return self._memory[: self.nbytes].view(self.dtype).reshape(self.shape)
 
     @cached_property
@@ -150,7 +149,7 @@ class Array:
         return (self[row] for row in range(len(self)))
 
     def __getitem__(self, rows: int | slice) -> Array:
-        """Return some rows, without a step, on the device: all of them as they are, otherwise a copy."""
+        """Return some rows, without a step, on the device: itself for all rows, otherwise a copy."""
         start, shape = self._part(rows)
         return self if shape == self.shape else self.cut(start // self.dtype.itemsize, shape)
 
@@ -181,7 +180,7 @@ class Array:
 
     @_wrap_cl_errors
     def write(self, values: NDArray[Any], row: int = 0) -> None:
-        """Write values in C order from a row on; other rows stay. The values may be changed at once."""
+        """Write values in C order from a row on; the values may be changed at once."""
         row_size = math.prod(self.shape[1:])
         whole = row == 0 and values.size == row_size * self.shape[0]
         if self._is_parked:
@@ -218,9 +217,9 @@ class Array:
 
     @_wrap_cl_errors
     def release(self) -> NDArray[Any]:
-        """Wait for the device and return what it wrote; the array is no longer of use.
+        """Wait for the device and return the values; the array must not be used any more.
 
-        Shared memory is returned as it is, without a copy.
+        Shared memory is returned without a copy.
         """
         if not self.is_shared:
             values = self.read()
@@ -235,9 +234,9 @@ class Array:
 
     @_wrap_cl_errors
     def park(self, keep: bool = True) -> None:
-        """Make room on the device until a kernel uses the array; keep its values on the host or forget them.
+        """Free the memory on the device until a kernel uses the array; the host keeps its values, or none.
 
-        Shared memory stays as it is.
+        Shared memory is unchanged.
         """
         if self.is_shared or self._is_parked:
             return
@@ -248,7 +247,7 @@ class Array:
 
     @_wrap_cl_errors
     def cut(self, start: int, shape: tuple[int, ...]) -> Array:
-        """Return a copy, on the device, of the elements from a number on, in another shape."""
+        """Return a copy, on the device, of the elements from an index on, in another shape."""
         copied = Array(self.device, self.name, shape, self.dtype, zeroed=False)
         if copied.nbytes == 0:
             return copied
@@ -279,7 +278,7 @@ class Array:
 
     @property
     def buffer(self) -> cl.Buffer:
-        """The device's side, for kernels."""
+        """The buffer on the device, for kernels."""
         buffer = self._buffer
         if buffer is not None and self._mapped is None and self._filling is None:
             return buffer
@@ -287,7 +286,7 @@ class Array:
 
     @_wrap_cl_errors
     def _ready(self) -> cl.Buffer:
-        """Return the device's side, with all that was written."""
+        """Return the buffer on the device, after all pending writes."""
         if self._buffer is None:
             self._allocate()
             assert self._buffer is not None
@@ -302,23 +301,23 @@ class Array:
         return self._buffer
 
     def _let_host_write(self, whole: bool) -> None:
-        """Let the host write to shared memory: all of it, or a part beside what the device wrote."""
+        """Map shared memory for writing by the host: all of it, or a part outside the device's writes."""
         if not whole:
             self._map()
         elif self._mapped is None and self._buffer is not None:
             if self.last_use is not None:
                 self.device.profile.wait(self.name, self.last_use)
-            self._buffer = None  # a new one sees what the host wrote, without a turn of the queue
+            self._buffer = None  # a new one sees the host's writes, without using the queue
 
     def _map(self) -> None:
-        """Let the host see what the device wrote to shared memory, if anything."""
+        """Make the device's writes to shared memory visible to the host."""
         if self._mapped is None and self._buffer is not None:
             with self.device.profile.waiting_for(self.name):
                 self._mapped = Mapping(self.device.queue, self._buffer, self.shape, self.dtype)
 
     def _fill_on_device(self) -> None:
         value, self._filling = self._filling, None
-        # Single bytes are slow, and there is room behind the last element.
+        # Single bytes are slow, and there is padding after the last element.
         pattern = (
             np.zeros(1, np.uint32)
             if value == ZERO and not np.signbit(value)
@@ -334,7 +333,7 @@ class Array:
         self.arrived, self.last_use = event, None
 
     def _copy_up(self, values: NDArray[Any], start: int) -> None:
-        """Copy values to the device's side, from a place in bytes on."""
+        """Copy values to the device from an offset in bytes on."""
         if values.size == 0:
             return
         if start == 0 and values.size * self.dtype.itemsize == self.nbytes:
@@ -345,7 +344,7 @@ class Array:
         self.arrived, self.last_use = event, None
 
     def _read(self, rows: int | slice, queue: cl.CommandQueue, after: Sequence[cl.Event]) -> NDArray[Any]:
-        """Return a copy of some rows, once some commands are over."""
+        """Return a copy of some rows after some commands."""
         start, shape = self._part(rows)
         if not self.is_shared:
             if self._parked is not None:
@@ -365,13 +364,13 @@ class Array:
         return copied
 
     def _part(self, rows: int | slice) -> tuple[int, tuple[int, ...]]:
-        """Return the place of some rows, in bytes, and their shape."""
+        """Return the offset of some rows, in bytes, and their shape."""
         chosen = range(self.shape[0])[rows]
         first, count = (chosen, ()) if isinstance(chosen, int) else (chosen.start, (len(chosen),))
         return first * (self.nbytes // self.shape[0]), (*count, *self.shape[1:])
 
     def _give_back(self) -> None:
-        """Give the device's side back; other arrays wait for what still uses it."""
+        """Return the buffer to the pool; other arrays wait for commands that still use it."""
         buffer, self._buffer = self._buffer, None
         if buffer is not None and not (self.is_shared or self._is_lent):
             self.device.pool.give(buffer, self.latest)
@@ -412,10 +411,10 @@ def adopt(device: Device, name: str, values: pyopencl.array.Array) -> Array:
 
 
 def fetch(parts: Sequence[tuple[Array, int | slice]], keep: Sequence[bool] = ()) -> list[NDArray[Any]]:
-    """Return rows of several arrays of a device, for which it is waited for once.
+    """Return rows of several arrays of a device, with a single wait.
 
-    ``keep`` says of each whether the array stays of use; by default, none does. Where memory is shared, rows
-    of the others are no copies.
+    ``keep`` states for each whether the array can still be used; by default, none can. If memory is shared,
+    rows of the others are not copies.
     """
     keep = keep or [False] * len(parts)
     device, reads, after = parts[0][0].device, [], []
@@ -441,21 +440,21 @@ def fetch(parts: Sequence[tuple[Array, int | slice]], keep: Sequence[bool] = ())
 
 
 def _put(target: NDArray[Any], values: NDArray[Any], first: int) -> None:
-    """Write values to elements from a number on."""
+    """Write values to elements from an index on."""
     target.reshape(-1)[first : first + values.size].reshape(values.shape)[...] = values
 
 
 def _empty(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return memory on the host that was used before, if there is some."""
+    """Return previously used memory on the host, if available."""
     nbytes = math.prod(shape) * dtype.itemsize
     return memory.take(nbytes, zeroed=False)[:nbytes].view(dtype).reshape(shape)
 
 
 class BorrowedBuffer:
-    """Another owner's memory, which kernels read in place; it stays alive until they are done.
+    """Memory of another owner that kernels read in place; it stays alive until they are done.
 
-    ``name``, ``host``, ``shape``, ``nbytes``, ``buffer``, ``arrived`` and ``last_use`` are as of an `Array`;
-    nothing is ever copied.
+    ``name``, ``host``, ``shape``, ``nbytes``, ``buffer``, ``arrived`` and ``last_use`` are like those of an
+    `Array`; nothing is copied.
     """
 
     name: str
@@ -470,7 +469,7 @@ class BorrowedBuffer:
         self.shape, self.nbytes = values.shape, values.nbytes
         self.last_use: cl.Event | None = None
         self._lock = threading.RLock()
-        # Kernels only read. But Intel's runtime copies what is read-only and not aligned to 128 bytes.
+        # Kernels only read it. But Intel's runtime copies read-only memory that is not aligned to 128 bytes.
         access = cl.mem_flags.READ_WRITE if values.flags.writeable else cl.mem_flags.READ_ONLY
         flags = access | cl.mem_flags.USE_HOST_PTR
         loaded = as_strided(values.reshape(-1).view(np.uint8), (values.nbytes + SLACK,))
@@ -489,10 +488,10 @@ class BorrowedBuffer:
 
 
 def can_be_borrowed(values: NDArray[Any]) -> bool:
-    """Whether kernels can read values where they lie: in C order, aligned, and followed by what may be read.
+    """Return whether kernels can read values in place: C order, aligned, and followed by readable memory.
 
-    Kernels load their last word whole. The array that the values are a part of may go on behind them, and
-    memory is there in whole pages.
+    Kernels load their last word as a whole. The values may be followed by other elements of their base array,
+    and memory consists of whole pages.
     """
     if not (values.flags.c_contiguous and values.flags.aligned):
         return False
@@ -504,21 +503,21 @@ def can_be_borrowed(values: NDArray[Any]) -> bool:
 
 
 Operand = Array | BorrowedBuffer
-"""What a kernel takes besides numbers."""
+"""Types of a kernel's array arguments."""
 
 
 def _wait_before_end(command: cl.Event, memory_in_use: NDArray[Any]) -> None:
-    """Wait for the last command that uses some memory, before nobody refers to the memory any more."""
+    """Wait for the last command that uses some memory, before the memory is released."""
     try:
         with waiting, suppress(cl.Error):
             command.wait()
-    except SystemExit:  # the interpreter ends, and the kernel goes on
+    except SystemExit:  # the interpreter ends while the kernel continues
         keep_for_ever(memory_in_use)
 
 
 @contextmanager
 def _naming(device: Device, name: str, nbytes: int) -> Iterator[None]:
-    """Name the array for which a device has no memory."""
+    """Add the name of the array to a device's out-of-memory error."""
     try:
         yield
     except cl.Error as error:
@@ -529,6 +528,6 @@ def _naming(device: Device, name: str, nbytes: int) -> Iterator[None]:
 
 def _no_room(device: Device, name: str, nbytes: int) -> str:
     return (
-        f"{device.info.title} has no room for {name} ({nbytes} bytes; "
-        f"one buffer holds at most {device.max_allocation}): take a smaller region, or another device"
+        f"{device.info.title} has no memory for {name} ({nbytes} bytes; one buffer holds at most "
+        f"{device.max_allocation}): use a smaller region, or another device"
     )

@@ -1,9 +1,9 @@
-"""Built programs of PoCL 3.0 as LLVM's bitcode, which it loads in a tenth of the time that a source takes.
+"""Built programs of PoCL 3.0 as LLVM bitcode, which loads in a tenth of the time of a source.
 
-PoCL 3.0 preprocesses a source at each start, in 20 ms, although its cache folder has the built program. To
-ask for the program's binary compiles all of its kernels, in seconds. But the cache folder holds the program
-as bitcode, and bitcode is a binary that PoCL takes. The kernels that it compiles of bitcode are kept by their
-names alone, so names get a suffix that depends on the source, the options, the driver and the processor.
+PoCL 3.0 preprocesses a source at each start, in 20 ms, although its cache folder contains the built program.
+Querying the program's binary compiles all of its kernels, which takes seconds. But the cache folder contains
+the program as bitcode, which PoCL accepts as a binary. It caches kernels compiled from bitcode by name only,
+so names get a suffix computed from the source, the options, the driver and the processor.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ _RECENT = 60.0  # seconds since a program was used, for file systems with coarse
 
 
 def works_with(driver: str) -> bool:
-    """Return whether a PoCL of this version keeps and takes bitcode as described."""
+    """Return whether this version of PoCL stores and accepts bitcode as described."""
     return driver.startswith("3.0")
 
 
 def rename_kernels(source: str, suffix: str) -> list[str]:
-    """Return options of the compiler that append a suffix to the names of a source's kernels."""
+    """Return compiler options that append a suffix to the names of a source's kernels."""
     return [f"-D{name}={name}{suffix}" for name in dict.fromkeys(_KERNEL.findall(source))]
 
 

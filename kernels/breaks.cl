@@ -1,11 +1,11 @@
-// Links that let go where the surface breaks. Specification: breaks.py.
+// Removal of links where the surface is discontinuous. Specification: breaks.py.
 //
-// TILE   pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
-// GROUP  work-items that add up what links cost together, 1 where an item does
+// TILE   pixels of one work-item: 1 on a GPU, many on a CPU
+// GROUP  work-items that reduce the cost of links together, 1 if each item does so alone
 //
-// No pixel of the last column has a link to the right, and none of the last row one down: so the pixel before the
-// first of a row, and the one above the first row, may be any of those. PoCL makes vector code of loops without
-// branches, calls and sums.
+// Pixels of the last column have no link to the right, and those of the last row none down: any such pixel can
+// replace the missing neighbours of the first column and row. PoCL vectorises loops without branches, calls and
+// reductions.
 
 #pragma OPENCL FP_CONTRACT OFF
 #include "common.clh"
@@ -17,7 +17,7 @@
 
 #define SIZE const int rows, const int columns
 
-// An item has a piece of a row: what ACTION does to pixel p with those before, after, above and below.
+// An item processes a piece of a row: ACTION is applied to pixel p with its four neighbours.
 #define PIECE(ACTION)                                                                            \
     const int pieces = (columns + CHUNK - 1) / CHUNK, item = get_global_id(0), row = item / pieces; \
     const int count = rows * columns, up = row > 0 ? -columns : count - columns;                 \

@@ -1,20 +1,21 @@
-"""Links that let go where the surface breaks: what ``breaks.cl`` computes, in NumPy with float64 inside.
+"""Removal of links where the surface is discontinuous: ``breaks.cl`` in NumPy with float64.
 
-A link is trusted by how well its two pixels know its slope. With s the slopes, a the cosines of the normals
-to the line of sight, and t what tells of a tear beside it, the slope of the link has about the variance ::
+The confidence of a link depends on how well its two pixels determine its slope. With s the slopes, a the
+cosines of the normals to the line of sight, and t the evidence of a tear next to it, the variance of the
+slope of the link is about ::
 
     v = n^2 (1 / a_i^4 + 1 / a_j^4) / 2 + (bend (s_i - s_j))^2 + (tear t)^2
 
-n being the normals' noise: slopes of a surface seen from aside are uncertain; where they differ, a bend or a
-cliff lies between; where four links about a corner do not close, one of them leads across a cliff. Heights u
-are sought that make ::
+with n the noise of the normals. Slopes of a surface seen obliquely are uncertain; where they differ, there is
+a bend or a cliff between them; if the sum of four links around a corner is not zero, one of them crosses a
+cliff. The heights u minimise ::
 
     sum of (n^2 / v) w f(r),      f' = 2 r / (1 + k m^2)^2,      r = (u_j - u_i) / p - s
 
-small, w being the link's weight without all this, p the pixel size, k the sharpness, and m what |r| is above
-slack |s_i - s_j|, as a bend may lie anywhere between the pixels: without slack f = r^2 / (1 + k r^2). The
-weights (n^2 / v) w / (1 + k m^2)^2, held while heights change, make least squares that bound the sum from
-above and touch it, since f is concave in r^2: their solution lowers it.
+with w the weight of the link without all this, p the pixel size, k the sharpness, and m the excess of |r|
+over slack |s_i - s_j|, because a bend may be anywhere between the pixels; without slack f = r^2 / (1 + k
+r^2). For fixed weights (n^2 / v) w / (1 + k m^2)^2, this is a least-squares problem that bounds the sum from
+above and touches it, since f is concave in r^2; so its solution decreases the sum.
 """
 
 from __future__ import annotations
@@ -31,14 +32,14 @@ Floats = NDArray[np.float32]
 Flags = NDArray[np.uint8]
 
 RIGHT, DOWN = 1, 2
-"""Flags of a pixel: there is a link to the one on the right, to the one below."""
+"""Flags of a pixel: it has a link to the right, or down."""
 
 
 def breaks_curl(flags: Flags, slope_x: Floats, slope_y: Floats, width: float, height: float) -> Doubles:
-    """Return by how much four links about a corner of pixels fail to close, in slopes.
+    """Return the sum of the four links around a corner of pixels, as a slope.
 
-    It is that of the corner right and below of each pixel; 0 where a link is missing. Slopes are to the right
-    and *down* the picture; width and height are a pixel's, in units of their geometric mean.
+    The corner is right and below of each pixel; 0 if a link is missing. Slopes are to the right and *down*
+    the picture; width and height are those of a pixel, relative to their geometric mean.
     """
     curl = np.zeros(flags.shape)
     across = (slope_x[:, 1:].astype(np.float64) + slope_x[:, :-1]) / 2
@@ -51,7 +52,7 @@ def breaks_curl(flags: Flags, slope_x: Floats, slope_y: Floats, width: float, he
 
 
 def breaks_sum(values: Floats, reach: int, downwards: bool) -> Doubles:
-    """Return sums of as many pixels to either side, along rows or downwards."""
+    """Return sums over as many pixels on either side, along rows or columns."""
     one = values.astype(np.float64) if downwards else values.T.astype(np.float64)
     ring = np.pad(one, ((reach, reach), (0, 0)))
     sums = sum((ring[i : i + len(one)] for i in range(2 * reach + 1)), np.zeros(one.shape))
@@ -59,11 +60,11 @@ def breaks_sum(values: Floats, reach: int, downwards: bool) -> Doubles:
 
 
 def breaks_spread(curl: Floats, sums: Floats, reach: int, noise: float, wide: bool) -> Doubles:
-    """Return how much tells of a tear at each corner, above the noise.
+    """Return the evidence of a tear at each corner, in excess of the noise.
 
-    ``sums`` are those of the curl over a square around, 2 reach + 1 along each side, about zero where a
-    slanted crease makes it alternate. It is the size of that over the side; or the geometric mean of that and
-    the corner's own, which keeps to the place.
+    ``sums`` are sums of the curl over a square of 2 reach + 1 on each side, about zero where it alternates
+    along a slanted crease. The result is their magnitude over the side, or the geometric mean of that and the
+    curl of the corner, which is better localised.
     """
     mean = np.abs(sums.astype(np.float64)) / (2 * reach + 1)
     tears = np.zeros(curl.shape)
@@ -76,7 +77,7 @@ def breaks_trust(right: Floats, down: Floats, slope_x: Floats, slope_y: Floats, 
     """Return weights of the links to the right and down, and their slopes.
 
     ``facing`` are the cosines a, ``right`` and ``down`` the weights w, ``noise`` is n^2, and n^2 / v is at
-    least ``least``. A link's slope is that of the sum of both normals: without error on a sphere.
+    least ``least``. A link's slope is that of the sum of both normals, which is exact on a sphere.
     """
     one = _trust(right, slope_x, facing, tears, noise, bend, tear, least)
     other = _trust(down.T, slope_y.T, facing.T, tears.T, noise, bend, tear, least)
@@ -103,10 +104,10 @@ def _trust(
 def breaks_links(weight_x: Floats, weight_y: Floats, rise_x: Floats, rise_y: Floats, slope_x: Floats,
                  slope_y: Floats, held: Floats, heights: Floats, width: float, height: float, slack: float,
                  sharpness: float, most: float) -> tuple[Doubles, Doubles, Doubles, float]:  # fmt: skip
-    """Return links to the right and down, the right side of their equations, and how many are broken.
+    """Return links to the right and down, the right-hand side of the equations, and the broken links.
 
-    Links whose k m^2 is above ``most`` are cut; ``held`` is the right side of known heights. Those broken
-    count k m^2 / (1 + k m^2) each; the kernel writes a sum for each of its items.
+    Links whose k m^2 exceeds ``most`` are cut; ``held`` is the right-hand side of known heights. A broken
+    link counts as k m^2 / (1 + k m^2); the kernel writes a sum for each of its items.
     """
     u = heights.astype(np.float64)
     x = _links(weight_x, rise_x, slope_x, u, width, slack, sharpness, most)

@@ -1,8 +1,8 @@
-// The change-point of a pixel's brightness, and the height that follows. Specification: changepoint.py.
+// Change-points of a pixel's brightness, and heights. Specification: changepoint.py.
 //
 // FRAME   type of a sample
-// TOP     what a saturated sample holds; samples that can be NaN have none
-// TILE    pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
+// TOP     value of a saturated sample; undefined for floats
+// TILE    pixels of one work-item: 1 on a GPU, many on a CPU
 
 #pragma OPENCL FP_CONTRACT OFF
 #include "common.clh"
@@ -24,7 +24,7 @@
 #define PLATEAU 3
 #define BENT 1.5f
 
-// Hypotheses that the samples miss by so many square sigmas more than the best weigh nothing beside it.
+// Hypotheses whose misfit exceeds the least one by this many squared sigmas have negligible weight.
 #define NEGLIGIBLE 40
 
 #ifdef TOP
@@ -41,7 +41,7 @@ float share_of(const FRAME sample, const float dark, const float gain)
     return (SATURATED(sample) & ((share - light) * gain < 0)) ? light : share;
 }
 
-// Round to even, in a way that vectorises: past 2^23 a float holds whole numbers only. For less than 2^22.
+// Round to even in a way that vectorises: above 2^23 a float is an integer. For values below 2^22.
 int round_even(const float value)
 {
     return as_int(value + 12582912.0f) - as_int(12582912.0f);
@@ -82,7 +82,7 @@ __kernel void changepoint_scan(
         __global const FRAME *restrict frame = frames + (size_t)t * pixels + base;
         __global FRAME *restrict slot = ring + (size_t)(number % SLOTS) * pixels + base;
         for (int p = 0; p < width; ++p) {
-            const FRAME sample = frame[p], kept = slot[p];  // what is loaded in a condition stays scalar
+            const FRAME sample = frame[p], kept = slot[p];  // conditional loads would stay scalar
             const int undecided = sum[p] != DECIDED;
             const float share = share_of(sample, low[p], rate[p]);
             const int units = round_even((share < 0 ? 0 : share > 1 ? 1 : share) * UNIT);
@@ -150,14 +150,14 @@ __kernel void changepoint_split(
     }
 }
 
-// Samples about a change, as running sums over whole steps: nothing is rounded.
+// Samples around a change, as running sums in integer arithmetic: nothing is rounded.
 typedef struct {
-    int low, high;  // which of the slots there are: [low, high)
+    int low, high;  // range of the available slots: [low, high)
     int values[SLOTS + 1], moments[SLOTS + 1], squares[SLOTS + 1];
 } samples_t;
 
-// What a hypothesis says: how much the samples miss it, how likely it is before they are seen, when the level
-// was crossed in frames from the start, and the variance of that.
+// A hypothesis: misfit of the samples, prior probability, time of the crossing in frames from the start, and
+// its variance.
 typedef struct {
     float misfit, prior, crossing, variance;
 } answer_t;
@@ -167,14 +167,14 @@ typedef struct {
     int own;
 } query_t;
 
-// A pixel's own levels, the one between them whose crossing is looked for, and its variance.
+// The levels of a pixel, the level to be crossed, and its variance.
 typedef struct {
     float dark, light, wanted, unsure;
 } levels_t;
 
 #define IMPOSSIBLE ((answer_t){INFINITY, 1, 0, 0})
 
-// One sample under way between two on the levels: how long the ramp lasts is not seen.
+// One sample in transition between samples on the levels: the length of the ramp is not determined.
 answer_t single(const samples_t *samples, const int begin, const levels_t levels, const float noise)
 {
     const float above = (samples->values[begin + 1] - samples->values[begin]) / STEP - levels.dark;
@@ -190,8 +190,8 @@ answer_t single(const samples_t *samples, const int begin, const levels_t levels
     return answer;
 }
 
-// A straight line through the samples under way. It should meet the levels where they begin and end: by what
-// it misses them there, it misses the samples. The crossing lies on it.
+// A straight line through the samples in transition. It should meet the levels at its ends; deviations there
+// are added to the misfit. The crossing is on the line.
 answer_t ramp(
     const samples_t *samples, const int begin, const int length, const levels_t levels, const float noise,
     const float enough)
@@ -256,14 +256,14 @@ answer_t hypothesis(
     return answer;
 }
 
-// Mean and variance of what all hypotheses say, each by its weight, and the least misfit in square sigmas.
-// The sums are kept relative to the likeliest.
+// Mean and variance over all hypotheses by weight, and the least misfit in squared sigmas. The sums are
+// relative to the most likely hypothesis.
 float3 weigh(const samples_t *samples, const query_t query)
 {
     const float scale = 1 / (query.noise * query.noise);
     float best = INFINITY, enough = INFINITY, weight = 0, mean = 0, square = 0;
     for (int length = 0; length <= SLOTS; ++length) {
-        const int least = length < 2;  // these need a sample on either level
+        const int least = length < 2;  // these need a sample on each level
         for (int begin = samples->low + least; begin + length <= samples->high - least; ++begin) {
             const answer_t answer = hypothesis(samples, query, begin, length, enough);
             const float cost = answer.misfit * scale;
@@ -281,8 +281,8 @@ float3 weigh(const samples_t *samples, const query_t query)
     return (float3)(mean, square / weight, best);
 }
 
-// The variance of a crossing between two samples under way by which an edge that a lens blurs may have crossed
-// elsewhere, beyond what noise explains.
+// The variance of a crossing between two samples in transition if the edge is blurred by a lens, in excess of
+// the noise.
 float variance_of_blur(const samples_t *samples, const query_t query, const float crossing)
 {
     const int frame = (int)floor(crossing), slot = frame + REACH;
@@ -291,7 +291,7 @@ float variance_of_blur(const samples_t *samples, const query_t query, const floa
     const float high = (samples->values[slot + 2] - samples->values[slot + 1]) / STEP, level = query.level;
     const float margin = PLATEAU * query.noise;
     if (low < margin || low >= level || high < level || high > 1 - margin) return 0;
-    // The quantile of a share is proportional to v + BENT v^3, with v the share less a half.
+    // The quantile of a share is proportional to v + BENT v^3, with v = share - 1/2.
     const float first = low - 0.5f, second = high - 0.5f, middle = level - 0.5f, rise = high - low;
     const float both = first * first + first * second + second * second, share = (level - low) / rise;
     const float bent = share * (1 + BENT * (middle * middle + middle * first + first * first)) / (1 + BENT * both);
@@ -299,14 +299,14 @@ float variance_of_blur(const samples_t *samples, const query_t query, const floa
     return fmax(off * off - known * known * (share * share + (1 - share) * (1 - share)), 0.0f);
 }
 
-// The same without the misfit, and with a variance that owns up to it and to a blur.
+// The same without the misfit, and with a variance that includes it and the blur.
 float2 estimate(const samples_t *samples, query_t query)
 {
     const float3 found = weigh(samples, query);
     const int freedom = max(samples->high - samples->low - 4, 1);
     const float blur = variance_of_blur(samples, query, found.x);
     if (found.z <= DOUBT * freedom) return (float2)(found.x, found.y + blur);
-    // Samples that no hypothesis fits are noisier than was said, or change in another way.
+    // Samples that no hypothesis fits are noisier than stated, or change in another way.
     query.noise *= sqrt(found.z / freedom);
     const float3 again = weigh(samples, query);
     const float moved = again.x - found.x;
@@ -339,7 +339,7 @@ void gather(
     }
 }
 
-// Whether the samples do not rise at the change, within the noise.
+// Whether the samples do not rise significantly at the change.
 int is_flat(const samples_t *samples, const float noise)
 {
     const int before = REACH - samples->low, after = samples->high - REACH;
@@ -348,8 +348,8 @@ int is_flat(const samples_t *samples, const float noise)
     return light - dark < 6 * noise * sqrt(1.0f / before + 1.0f / after);
 }
 
-// Travel between frames, and beyond the ends as it was there, as the sum of two floats; the frame is given
-// from the start, which keeps its last bits.
+// Travel between frames, extrapolated beyond the ends, as the sum of two floats; the frame is relative to the
+// start, which preserves its last bits.
 float2 travel_at(__global const float2 *restrict travel, const int count, const int start, const float crossing)
 {
     const int frame = clamp(start + (int)floor(crossing), 0, count - 2);

@@ -1,12 +1,12 @@
-"""The change-point of a pixel's brightness: what ``changepoint.cl`` computes, in plain NumPy.
+"""The change-point of a pixel's brightness: ``changepoint.cl`` in plain NumPy.
 
-Brightness goes from a dark to a light level once, suddenly or along a ramp. Where both levels are known,
-`changepoint_scan` finds the change in one pass (Page, Biometrika 41, 1954). Where they are not,
-`changepoint_sum` and `changepoint_split` find it in two (Hinkley, Biometrika 57, 1970). Both keep the samples
-around the change, from which `changepoint_heights` finds when the level was crossed.
+Brightness changes from a dark to a light level once, suddenly or along a ramp. If both levels are known,
+`changepoint_scan` finds the change in one pass (Page, Biometrika 41, 1954). Otherwise `changepoint_sum` and
+`changepoint_split` find it in two (Hinkley, Biometrika 57, 1970). Both keep the samples around the change,
+from which `changepoint_heights` computes the crossing of the level.
 
-The way from light to dark is the same one with a gain below zero: what is said of dark and light here is then
-true of light and dark, and shares are of the way from light to dark.
+A change from light to dark is the same with a negative gain: dark and light are exchanged, and shares are
+relative to the range from light to dark.
 """
 
 from __future__ import annotations
@@ -28,15 +28,16 @@ DECIDED = np.iinfo(np.int32).max
 
 REACH = 12  # frames that are kept before and after the change
 SLOTS = 2 * REACH + 1
-UNIT = 1 << 20  # of the scan: what one fully light frame counts
-STEP = 1 << 12  # of the heights: the way from dark to bright
+UNIT = 1 << 20  # unit of the scan: one fully light frame
+STEP = 1 << 12  # unit of the heights: the range from dark to bright
 
-STRAIGHT = 0.005  # of the way from dark to bright: no transition is a straight ramp to better than that
-SPIKE = 8  # sigmas by which no sample exceeds both of its neighbours
-DOUBT = 2  # times the expected misfit that the best hypothesis may have
-SPREAD = 0.3  # of that way: by so much a pixel's own levels may differ from those given
-PLATEAU = 3  # sigmas by which a sample on a level may miss it
-SINGLE, RAMP = 1 / 3, 1 / 5  # prior odds, against a sudden change, of one frame under way and of a ramp
+STRAIGHT = 0.005  # share of that range to which no transition is a straight ramp
+SPIKE = 8  # a sample that exceeds both neighbours by this many sigmas is a spike
+DOUBT = 2  # tolerated misfit of the best hypothesis, in times of the expected one
+SPREAD = 0.3  # standard deviation of a pixel's own levels about the given ones, as a share of that range
+PLATEAU = 3  # sigmas within which a sample is on a level
+# prior odds of one frame in transition and of a ramp, relative to a sudden change
+SINGLE, RAMP = 1 / 3, 1 / 5
 
 
 def changepoint_scan(frames: Array, first: int, level: int, least: int, quiet: np.float32, dark: Array,
@@ -80,7 +81,7 @@ def changepoint_scan(frames: Array, first: int, level: int, least: int, quiet: n
 
 
 def changepoint_sum(frames: Array, total: Floats) -> None:
-    """Add a block of frames to totals, which the kernel holds as sums of two floats."""
+    """Add a block of frames to totals, which the kernel stores as sums of two floats."""
     for frame in frames:
         total += frame
 
@@ -152,7 +153,7 @@ def changepoint_heights(start: Array, excess: Array, below: Array, since: Array,
         dim = start[found] - below[found]
         hovered = (dim > REACH) & _flat(samples, spread)
         crossing, deviation, misfit = _weigh(samples, spread, level, own)
-        # Samples that no hypothesis fits are noisier than was said, or change in another way.
+        # Samples that no hypothesis fits are noisier than stated, or change in another way.
         blur = _variance_of_blur(samples, spread, level, crossing)
         odd = misfit > DOUBT * samples.freedom
         spread = np.where(odd, spread * np.sqrt(misfit / samples.freedom), spread)
@@ -168,14 +169,14 @@ def changepoint_heights(start: Array, excess: Array, below: Array, since: Array,
 
 
 def excess_of_noise(quiet: np.float32, gain: Array) -> Array:
-    """Return the units of excess that are nothing but noise; the kernel does this in passing."""
+    """Return the units of excess caused by noise; computed in passing by the kernel."""
     share = np.minimum(quiet * gain * gain, np.float32(1000))
     return np.asarray(np.rint(share * np.float32(UNIT)), np.int32)
 
 
 @dataclass(frozen=True)
 class _Samples:
-    """Samples about each change: running sums, (SLOTS + 1, P), and which there are, [low, high)."""
+    """Samples around each change: running sums, (SLOTS + 1, P), and the available range, [low, high)."""
 
     low: Array
     high: Array
@@ -185,11 +186,11 @@ class _Samples:
 
     @property
     def freedom(self) -> Array:
-        """Samples less the numbers that a ramp takes from them."""
+        """Number of samples minus the number of parameters of a ramp."""
         return np.asarray(np.maximum(self.high - self.low - 4, 1), np.intp)
 
     def total(self, start: Array | int, stop: Array | int) -> tuple[Floats, Floats]:
-        """Return the sum of the values, and of their squares, of the slots from start to stop."""
+        """Return the sums of the values and of their squares over the slots from start to stop."""
         every = np.arange(self.low.size)
         values, squares = (part[stop, every] - part[start, every] for part in (self.values, self.squares))
         return values, squares
@@ -197,7 +198,7 @@ class _Samples:
 
 @dataclass(frozen=True)
 class _Levels:
-    """Each pixel's own levels, the one between them whose crossing is looked for, and its variance."""
+    """Each pixel's own levels, the level to be crossed, and its variance."""
 
     dark: Floats
     light: Floats
@@ -206,7 +207,7 @@ class _Levels:
 
 
 def _share(frame: Array, dark: Array, gain: Array) -> Array:
-    """Return the share of the way from dark to bright; a saturated sample is light."""
+    """Return the share of the range from dark to bright; a saturated sample is light."""
     share = (frame.astype(np.float32) - dark) * gain
     if frame.dtype.kind == "f":
         return share
@@ -217,7 +218,7 @@ def _share(frame: Array, dark: Array, gain: Array) -> Array:
 def _gather(
     start: Array, since: Array, ring: Array, dark: Array, gain: Array, count: int
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return the samples about each change, (SLOTS, P), in whole steps, and which of them there are."""
+    """Return the samples around each change, (SLOTS, P), in integer steps, and which are available."""
     number = start + np.arange(-REACH, REACH + 1)[:, np.newaxis]
     there = (number >= since) & (number < count) & (number >= 0)
     share = np.clip(_share(np.take_along_axis(ring, number % SLOTS, 0), dark, gain), -1, 2)
@@ -225,7 +226,7 @@ def _gather(
 
 
 def _without_spikes(values: Floats, there: NDArray[np.bool_], limit: Floats) -> Floats:
-    """Put a sample that stands out from both of its neighbours level with the nearer one."""
+    """Replace a sample that exceeds both of its neighbours by the nearer one."""
     calm = values.copy()
     inner = there[:-2] & there[2:]
     sides = np.stack([values[:-2], values[2:]])
@@ -245,7 +246,7 @@ def _add_up(values: Floats, there: NDArray[np.bool_]) -> _Samples:
 
 
 def _flat(samples: _Samples, noise: Floats) -> NDArray[np.bool_]:
-    """Tell where the samples do not rise at the change, within the noise."""
+    """Return where the samples do not rise significantly at the change."""
     before, after = REACH - samples.low, samples.high - REACH
     dark = samples.total(samples.low, REACH)[0] / before
     light = samples.total(REACH, samples.high)[0] / after
@@ -255,7 +256,7 @@ def _flat(samples: _Samples, noise: Floats) -> NDArray[np.bool_]:
 def _hypotheses(
     samples: _Samples, noise: Floats, level: float, own: bool
 ) -> Iterator[tuple[Floats, Floats, Floats, Floats]]:
-    """Yield of each its misfit, its prior, the crossing in frames from the start, and its variance."""
+    """Yield misfit, prior, crossing in frames from the start, and its variance of each hypothesis."""
     for length in range(SLOTS + 1):
         for begin in range(SLOTS - length + 1):
             yield _hypothesis(samples, noise, level, own, begin, length)
@@ -293,10 +294,11 @@ def _hypothesis(
 def _single(
     samples: _Samples, begin: int, levels: _Levels, noise: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """One sample under way between two on the levels: how long the ramp lasts is not seen.
+    """One sample in transition between samples on the levels: the length of the ramp is not determined.
 
-    It lasts at most 1 / max(share, 1 - share) frames, or a neighbour were under way too; and the longer it
-    is, the likelier it is to be met: on average it is two thirds of that, with a variance of an eighteenth.
+    It lasts at most 1 / max(share, 1 - share) frames, otherwise a neighbour would be in transition, too.
+    Longer ramps are more likely to be sampled: the mean length is two thirds of that, with a variance of an
+    eighteenth.
     """
     above = samples.total(begin, begin + 1)[0] - levels.dark
     rise = np.maximum(levels.light - levels.dark, 0.1)
@@ -311,10 +313,10 @@ def _single(
 def _ramp(
     samples: _Samples, begin: int, length: int, levels: _Levels, noise: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Draw a straight line through the samples under way.
+    """Fit a straight line to the samples in transition.
 
-    It should meet the levels where they begin and end: by what it misses them there, it misses the samples.
-    The crossing lies on it.
+    It should meet the levels at its ends; deviations there are added to the misfit. The crossing is on the
+    line.
     """
     first, last = begin - REACH, begin - REACH + length - 1
     middle, spread = (first + last) / 2, length * (length**2 - 1) / 12
@@ -340,7 +342,7 @@ def _ramp(
 
 
 def _variance_of_blur(samples: _Samples, noise: Floats, level: float, crossing: Floats) -> Floats:
-    """Return by how much an edge that a lens blurs may have crossed elsewhere, beyond what noise explains."""
+    """Return the variance of the crossing of an edge blurred by a lens, in excess of the noise."""
     frame = np.floor(crossing).astype(np.intp)
     slot = np.clip(frame + REACH, samples.low, samples.high - 2)
     low, high = (samples.total(slot + side, slot + side + 1)[0] for side in (0, 1))
@@ -349,20 +351,20 @@ def _variance_of_blur(samples: _Samples, noise: Floats, level: float, crossing: 
     rise = np.where(under_way, high - low, 1)
     first, second, middle, share = low - 0.5, high - 0.5, level - 0.5, (level - low) / rise
     both = first**2 + first * second + second**2
-    # The quantile of a share is proportional to v + BENT v^3, with v the share less a half.
+    # The quantile of a share is proportional to v + BENT v^3, with v = share - 1/2.
     bent = share * (1 + BENT * (middle**2 + middle * first + first**2)) / (1 + BENT * both)
     variance = (frame + bent - crossing) ** 2 - (noise / rise) ** 2 * (share**2 + (1 - share) ** 2)
     return np.where(under_way, np.maximum(variance, 0), 0)
 
 
 def _travel_at(travel: Floats, frame: Floats) -> Floats:
-    """Return the travel between frames, and beyond the ends as it was there."""
+    """Return the travel between frames, extrapolated beyond the ends."""
     before = np.clip(np.floor(frame).astype(np.intp), 0, len(travel) - 2)
     return np.asarray(travel[before] + (frame - before) * (travel[before + 1] - travel[before]))
 
 
 def _weigh(samples: _Samples, noise: Floats, level: float, own: bool) -> tuple[Floats, Floats, Floats]:
-    """Return mean and standard deviation of what all hypotheses say, and the least misfit, square sigmas."""
+    """Return mean and standard deviation over all hypotheses, and the least misfit, squared sigmas."""
     answers = zip(*_hypotheses(samples, noise, level, own), strict=True)
     misfit, prior, crossing, variance = (np.array(part) for part in answers)
     misfit /= noise**2

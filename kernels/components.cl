@@ -1,11 +1,11 @@
 // Heights of the connected components of a surface. Specification: components.py.
 //
-// TILE     pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
-// ONE      1 where there is one component: labels are then not read
-// GROUP    work-items that add up one component of a strip together; 1 where an item adds up all components of its strip.
-//          As many find the offset of one component
+// TILE     pixels of one work-item: 1 on a GPU, many on a CPU
+// ONE      1 if there is one component: labels are then not read
+// GROUP    work-items that sum one component of a strip together, and compute the offset of one component; 1 if an item
+//          sums all components of its strip
 //
-// PoCL makes vector code of loops without branches.
+// PoCL vectorises loops without branches.
 
 #pragma OPENCL FP_CONTRACT OFF
 #include "common.clh"
@@ -27,13 +27,13 @@
 #define IS_OF(p, component) (labels[p] == (component))
 #endif
 
-// Both are there before one is chosen: no branch.
+// Both values are loaded before one is selected, which avoids a branch.
 float chosen(const int which, const float one, const float other)
 {
     return which ? one : other;
 }
 
-// What is averaged: heights, or by how much they are above those that are known.
+// The averaged quantity: heights, or their excess over the known heights.
 #define SHARE(p) (heights ? chosen(flags[p] & KNOWN, height_weights ? height_weights[p] : 1.0f, 0.0f) \
                           : chosen(ANSWERED(p), 1.0f, 0.0f))
 #define VALUE(p, column) (heights ? RISEN(p, column) - heights[p] : RISEN(p, column))
@@ -44,7 +44,7 @@ float chosen(const int which, const float one, const float other)
     total += share;                                                                                    \
 }
 
-// Sums over strips of rows, each into its own row of the sums.
+// Sums over strips of rows, each into its own row of the output.
 __kernel GROUP_SIZE void components_sum(
     const int rows, const int columns, __global const uchar *restrict flags, __global const int *restrict labels,
     MAP reliefs, const int place, const float plane_x, const float plane_y, const float plane_z, MAP heights, MAP height_weights,
@@ -92,7 +92,7 @@ __kernel GROUP_SIZE void components_sum(
             total[0] += share_of[lane];
         }
 #else
-        // Pixels of one component side by side are summed first: a sum in memory is slow, and loses digits.
+        // Adjacent pixels of one component are summed first: sums in memory are slow and lose digits.
         int component = -1;
         float part = 0.0f, shares = 0.0f;
         for (int column = 0; column <= columns; ++column) {
@@ -112,7 +112,7 @@ __kernel GROUP_SIZE void components_sum(
 #endif
 }
 
-// Offsets of the components without a known height, or of all others, that give them a mean: `mean` and its rest.
+// Offsets that give components without a known height, or all others, their mean: `mean` and its remainder.
 __kernel GROUP_SIZE void components_offsets(
     const int strips, const int components, MAP sums, MAP totals, __global const uchar *restrict unknown,
     const int of_unknown, const float mean, const float mean_rest, OUT offsets)

@@ -1,6 +1,6 @@
-"""Heights of a surface's connected components: what ``components.cl`` computes, in NumPy with float64 inside.
+"""Heights of a surface's connected components: ``components.cl`` in NumPy with float64.
 
-A solver gives the relief: heights above a plane, up to an offset of each component.
+A solver returns the relief: heights above a plane, up to an offset of each component.
 """
 
 from __future__ import annotations
@@ -19,12 +19,11 @@ Labels = NDArray[np.int32]
 
 def components_sum(flags: Flags, labels: Labels, relief: Array, plane: Triple, heights: Array | None,
                    height_weights: Array | None, components: int) -> tuple[Doubles, Doubles]:  # fmt: skip
-    """Return of each component a sum of heights, and what to divide it by for their mean; (components,) each.
+    """Return for each component a sum of heights, and its divisor for the mean; (components,) each.
 
-    With known heights it is the mean of what the others are above these, weighted like them. ``labels`` say
-    to which component a pixel belongs, -1 without an answer; ``plane`` is how much it rises from column to
-    column and from row to row, and its height in the top left pixel, mm. Each of the kernel's items sums
-    over a strip of rows.
+    With known heights it is the mean excess of the other heights over these, with their weights. ``labels``
+    are the component numbers of pixels, -1 without a result; ``plane`` is its rise per column and per row,
+    and its height in the top left pixel, mm. Each of the kernel's items sums over a strip of rows.
     """
     risen, share = relief + _level(plane, flags.shape), (labels >= 0).astype(np.float64)
     if heights is not None:
@@ -40,9 +39,9 @@ def components_sum(flags: Flags, labels: Labels, relief: Array, plane: Triple, h
 def components_offsets(
     sums: Array, totals: Array, unknown: Array, of_unknown: int, mean: float, offsets: Array
 ) -> None:
-    """Write offsets that give some components a mean; those of the others stay.
+    """Write the offsets that give some components a mean; those of the others are unchanged.
 
-    These are the components without a known height, if ``of_unknown`` is 1, or all others. ``sums`` and
+    These are the components without a known height if ``of_unknown`` is 1, otherwise all others. ``sums`` and
     ``totals``, (strips, components), are those of `components_sum`; ``unknown`` is 1 for a component without
     a known height.
     """
@@ -54,7 +53,7 @@ def components_offsets(
 def components_add_offsets(
     flags: Flags, labels: Labels, relief: Array, plane: Triple, offsets: Array
 ) -> Doubles:
-    """Return heights: relief, plane, and the offset of the component, mm; NaN without an answer."""
+    """Return heights: relief, plane, and the offset of the component, mm; NaN without a result."""
     height = relief + _level(plane, flags.shape) + np.asarray(offsets, np.float64)[labels]
     return np.where(labels >= 0, height, np.nan)
 

@@ -2,14 +2,15 @@
 //
 // FRAME  type of a sample
 // BITS   its width; samples of 32 bits are no counts
-// TILE   pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
+// TILE   pixels of one work-item: 1 on a GPU, many on a CPU
 
 #pragma OPENCL FP_CONTRACT OFF
 #include "common.clh"
 
-// --- The fit that sums tell ---------------------------------------------------------------------------------------
+// --- The fit from sums
+// --------------------------------------------------------------------------------------------
 
-#if TILE > 1 && defined(cl_khr_fp64)  // a core's float64 is quicker than its pairs of floats
+#if TILE > 1 && defined(cl_khr_fp64)  // float64 of a CPU is faster than pairs of floats
 typedef double Exact;
 #define EXACT(pair) ((double)(pair).high + (pair).rest)
 #define FLOAT(x) ((float)(x))
@@ -24,7 +25,7 @@ typedef Pair Exact;
 #endif
 #define FIT(i) EXACT(((Pair){fit[i], fit[9 + (i)]}))
 
-// Answers for pixel p from the sums of its samples, less a reference, and of the squares.
+// Results of pixel p from the sums of its samples, minus a reference, and of their squares.
 #define ANSWER(p, reference, total, along, across, square) \
     { \
         const Exact a = total, b = along, c = across, x = ROW(0), y = ROW(1), z = ROW(2); \
@@ -35,7 +36,8 @@ typedef Pair Exact;
         residual[p] = root((left < 0 ? 0 : left) * fit[27]); \
     }
 
-// --- Sums of whole counts: nothing is rounded ---------------------------------------------------------------------
+// --- Sums of integer counts: nothing is rounded
+// -------------------------------------------------------------------
 
 #if BITS < 32
 #if BITS == 8
@@ -45,7 +47,7 @@ typedef long Narrow;
 #endif
 #define WINDOW 64  // frames whose sums fit into Narrow
 
-// A pixel's sums of some type, less a reference: a whole number near the mean of its samples.
+// The sums of a pixel in some type, minus a reference: an integer near the mean of its samples.
 #define CENTRE(Sum, total, cosine, sine, square) \
     const int centre = (int)((float)total * (1 / (float)used) + 0.5f); \
     const Sum rest = total - (Sum)centre * used, along = cosine - centre * (Sum)cosines, \
@@ -59,7 +61,7 @@ typedef long Narrow;
 #define ANSWER_COUNTS(Sum, p) \
     ANSWER(p, centre, EXACTLY(Sum, rest), EXACTLY(Sum, along), EXACTLY(Sum, across), EXACTLY(Sum, spread))
 
-// One of the frames that are taken side by side, whose samples are added to a pixel's sums a, b, c and d.
+// One of several frames whose samples are added to a pixel's sums a, b, c and d together.
 #define SIDE(i) \
     __global const FRAME *restrict frame##i = frames + (size_t)place[t + i] * stride + low; \
     const Narrow cosine##i = basis[3 * (t + i) + 1], sine##i = basis[3 * (t + i) + 2];
@@ -156,7 +158,8 @@ __kernel void correlation_convert(
 }
 #endif
 
-// --- Sums of any samples less their references --------------------------------------------------------------------
+// --- Sums of any samples minus their references
+// --------------------------------------------------------------------
 
 enum { TOTAL, COSINE, SINE, SQUARE, SUMS };
 
@@ -172,8 +175,8 @@ typedef struct {
         sums->rest[k][p] = pair.rest; \
     }
 
-// Adds frames; where there are no sums yet, the first sample is the reference of all. Inlined, or else a GPU's lane
-// would keep its sums in memory.
+// Adds frames; before the first one, its sample becomes the reference. Inlined, because a GPU's lane would
+// otherwise keep its sums in memory.
 __attribute__((always_inline)) void add(
     Sums *restrict sums, const int fresh, const int width, __global const FRAME *restrict frames, const int count,
     const int stride, __global const int *restrict place, MAP basis)
@@ -237,7 +240,7 @@ __kernel void correlation_solve_pairs(
         ANSWER(p, reference[p], EXACT(PAIR(total[p])), EXACT(PAIR(cosine[p])), EXACT(PAIR(sine[p])), EXACT(PAIR(square[p])))
 }
 
-// Both at once, for samples of which nothing is kept.
+// Both at once, if the samples are not kept.
 __kernel void correlation_window_pairs(
     __global const FRAME *restrict frames, const int count, const int pixels, const int stride,
     __global const int *restrict place, MAP basis, MAP fit, OUT mean, OUT cosine_part, OUT sine_part, OUT residual)

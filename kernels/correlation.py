@@ -1,26 +1,25 @@
-"""Least squares over the phases of a rotation: what ``correlation.cl`` computes, in plain NumPy.
+"""Least squares over the phases of a rotation: ``correlation.cl`` in plain NumPy.
 
-Samples E_k at the phases alpha_k are fitted by a + b cos alpha_k + c sin alpha_k, so that
-SS = sum_k w_k (E_k - a - b cos alpha_k - c sin alpha_k)^2 is least. With X the matrix of rows
-(1, cos alpha, sin alpha) and W the weights, four sums over the samples tell all there is to know: Z'E, where
-Z is W X but for rounding, and E'W E.
+Samples E_k at the phases alpha_k are fitted by a + b cos alpha_k + c sin alpha_k, which minimises SS = sum_k
+w_k (E_k - a - b cos alpha_k - c sin alpha_k)^2. With X the matrix of rows (1, cos alpha, sin alpha) and W the
+weights, four sums over the samples suffice: Z'E, where Z is W X up to rounding, and E'W E.
 
-Whole counts of frames that all have weight 1 are summed as integers, with the cosines and sines of Z rounded
-to multiples of a unit, so that nothing is lost however long a stack is, and however it is cut into blocks.
-The rounding of Z does no harm: (Z'X)^-1 Z'E is an instrumental-variable estimate (Reiersol, Econometrica 9,
-1941), exact for samples that the model describes, and SS is E'W E - beta' X'W X beta then. Otherwise it
-differs from least squares by the noise times the rounding, less than a part in 100 000 of it.
+Integer counts of frames with weight 1 are summed as integers, with the cosines and sines of Z rounded to
+multiples of a unit. So nothing is lost, however long a stack is and however it is divided. The rounding of Z
+is harmless: (Z'X)^-1 Z'E is an instrumental-variable estimate (Reiersol, Econometrica 9, 1941), exact for
+samples that satisfy the model, and SS is then E'W E - beta' X'W X beta. Otherwise it differs from least
+squares by the noise times the rounding, less than a part in 100 000 of the noise.
 
-Any other samples are summed as pairs of floats, which are as good as float64, after the first one has been
-subtracted; Z is then rounded to float32.
+Other samples are summed as pairs of floats, which are as accurate as float64, after subtracting the first
+sample; Z is then rounded to float32.
 
-``fit`` says what follows from the sums s = Z'(E - r) of a pixel's samples less its reference r. With
-L'L = X'W X, L upper triangular ::
+``fit`` is a table, (28,) float32, that converts the sums s = Z'(E - r) of a pixel's samples minus its
+reference r. With L'L = X'W X, L upper triangular ::
 
     u = L (Z'X)^-1 s        (a - r, b, c) = L^-1 u        SS = sum_k w_k (E_k - r)^2 - u'u
 
-It is a table, (28,) float32: the matrix L (Z'X)^-1, row by row, as two floats each, all the high ones first;
-L^-1; and one over the degrees of freedom, N - 3, or NaN where there are none.
+It contains the matrix L (Z'X)^-1, row by row, as two floats each, all the high ones first; L^-1; and the
+inverse of the degrees of freedom, N - 3, or NaN if there are none.
 """
 
 from __future__ import annotations
@@ -36,14 +35,14 @@ Floats = NDArray[np.float64]
 Answers = tuple[Floats, Floats, Floats, Floats]
 
 WINDOW = 64
-"""Frames that can be summed at once, and that a sliding window can hold."""
+"""Maximum number of frames that can be summed at once, and in a sliding window."""
 
 
 def correlation_window(frames: Array, place: Array, basis: Array, used: int, cosines: int, sines: int,
                        fit: Array) -> Answers:  # fmt: skip
     """Return mean, cosine, sine and residual, counts, of at most `WINDOW` frames of weight 1.
 
-    It is ``correlation_add`` and ``correlation_solve_counts`` at once; the kernel's sums are int32 for uint8.
+    It combines ``correlation_add`` and ``correlation_solve_counts``; the kernel's sums are int32 for uint8.
     """
     total, cosine, sine, square = sums = np.zeros((4, frames.shape[1]), np.int64)
     correlation_add(frames, place, basis, True, *sums)
@@ -52,7 +51,7 @@ def correlation_window(frames: Array, place: Array, basis: Array, used: int, cos
 
 def correlation_add(frames: Array, place: Array, basis: Array, fresh: bool, total: Counts, cosine: Counts,
                     sine: Counts, square: Counts) -> None:  # fmt: skip
-    """Add frames of weight 1 to sums, or begin these anew where ``fresh``.
+    """Add frames of weight 1 to sums, or start new sums if ``fresh``.
 
     Parameters
     ----------
@@ -75,9 +74,9 @@ def correlation_add(frames: Array, place: Array, basis: Array, fresh: bool, tota
 
 def correlation_solve_counts(used: int, cosines: int, sines: int, total: Counts, cosine: Counts,
                              sine: Counts, square: Counts, fit: Array) -> Answers:  # fmt: skip
-    """Return mean, cosine, sine and residual, counts, by integer sums over ``used`` frames.
+    """Return mean, cosine, sine and residual, counts, from integer sums over ``used`` frames.
 
-    ``cosines`` and ``sines`` are the sums of the frames' own, units; for ``fit`` see the module.
+    ``cosines`` and ``sines`` are the sums over the frames, units; for ``fit`` see the module.
     """
     return _solve(_centre(used, cosines, sines, total, cosine, sine, square), fit)
 
@@ -85,9 +84,9 @@ def correlation_solve_counts(used: int, cosines: int, sines: int, total: Counts,
 def correlation_convert(used: int, cosines: int, sines: int, unit: float, total: Counts, cosine: Counts,
                         sine: Counts,
                         square: Counts) -> tuple[Floats, Floats, Floats, Floats, Floats]:  # fmt: skip
-    """Return the reference and the sums with which ``correlation_sum`` goes on; the kernel works in place.
+    """Return the reference and the sums for ``correlation_sum``; the kernel works in place.
 
-    ``unit`` is what cosines and sines were rounded to multiples of.
+    ``unit`` is the unit of the rounded cosines and sines.
     """
     reference, *sums = _centre(used, cosines, sines, total, cosine, sine, square)
     return reference, sums[0], unit * sums[1], unit * sums[2], sums[3]
@@ -95,11 +94,11 @@ def correlation_convert(used: int, cosines: int, sines: int, unit: float, total:
 
 def correlation_sum(frames: Array, place: Array, basis: Array, fresh: bool, reference: Array, total: Floats,
                     cosine: Floats, sine: Floats, square: Floats) -> None:  # fmt: skip
-    """Add some frames of any weights to the sums so far.
+    """Add frames of any weights to the sums so far.
 
-    ``fresh`` says that there are none; then the first sample becomes the reference, which is subtracted from
-    all. ``basis``, (m, 3), holds of each frame its weight, and the weight times cosine and sine of its phase.
-    The kernel holds each sum as that of two floats.
+    If ``fresh``, there are none, and the first sample becomes the reference, which is subtracted from all.
+    ``basis``, (m, 3), contains for each frame its weight, and the weight times cosine and sine of its phase.
+    The kernel stores each sum as a pair of floats.
     """
     if fresh:
         reference[:] = frames[place[0]]
@@ -116,12 +115,12 @@ def correlation_sum(frames: Array, place: Array, basis: Array, fresh: bool, refe
 def correlation_solve_pairs(
     reference: Array, total: Floats, cosine: Floats, sine: Floats, square: Floats, fit: Array
 ) -> Answers:
-    """Return mean, cosine, sine and residual, counts, by the sums of ``correlation_sum``."""
+    """Return mean, cosine, sine and residual, counts, from the sums of ``correlation_sum``."""
     return _solve(np.stack([reference.astype(np.float64), total, cosine, sine, square]), fit)
 
 
 def correlation_window_pairs(frames: Array, place: Array, basis: Array, fit: Array) -> Answers:
-    """Return mean, cosine, sine and residual, counts, of frames of any weights, of which nothing is kept."""
+    """Return mean, cosine, sine and residual, counts, of frames of any weights, without keeping sums."""
     reference, total, cosine, sine, square = sums = np.zeros((5, frames.shape[1]))
     correlation_sum(frames, place, basis, True, *sums)
     return correlation_solve_pairs(reference, total, cosine, sine, square, fit)
@@ -130,7 +129,7 @@ def correlation_window_pairs(frames: Array, place: Array, basis: Array, fit: Arr
 def _centre(
     frames: int, cosines: int, sines: int, total: Counts, cosine: Counts, sine: Counts, square: Counts
 ) -> Floats:
-    """Take a whole number near the mean from all samples: return it and the sums, while exact, (5, P)."""
+    """Subtract an integer near the mean from all samples: return it and the exact sums, (5, P)."""
     reference = np.floor(total / frames + 0.5).astype(np.int64)
     rest = total - reference * frames
     spread = square - reference * (total + rest)
@@ -139,7 +138,7 @@ def _centre(
 
 
 def _solve(sums: Floats, fit: Array) -> Answers:
-    """Return mean, cosine, sine and residual; the sums are (5, P), the reference first."""
+    """Return mean, cosine, sine and residual from sums, (5, P), the reference first."""
     table = fit.astype(np.float64)
     parts = (table[:9] + table[9:18]).reshape(3, 3) @ sums[1:4]
     mean, cosine, sine = table[18:27].reshape(3, 3) @ parts

@@ -1,6 +1,6 @@
-"""The device layer: choose a device, compile for it, hold arrays on it, run kernels.
+"""The device layer: selection of a device, compilation, arrays, launches.
 
-It knows no algorithm. Nothing here touches OpenCL before the first call.
+It contains no algorithms. Nothing here uses OpenCL before the first call.
 """
 
 from __future__ import annotations
@@ -39,26 +39,26 @@ from mirrorskin.kernels.waiting import close_at_exit, waiting
 
 DeviceKind = Literal["gpu", "cpu", "other"]
 Choice: TypeAlias = "str | int | Device | Sequence[str | int | Device] | None"
-"""What names one device or several; see `open_devices`."""
+"""A choice of one or several devices; see `open_devices`."""
 ALL = "all"
 """The choice of all devices of a kind."""
 C_TYPES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
-"""OpenCL's names of the types that a recording's samples have; set ``dtypes`` of an operation to these."""
+"""OpenCL's names of the types of samples; use these for ``dtypes`` of an operation."""
 
 _FOLDER = Path(__file__).parent
 _log = logging.getLogger("mirrorskin.kernels")
 _opening = threading.Lock()
 _numbers = itertools.count()  # of buffers that were arguments of kernels
 _opened: WeakSet[Device] = WeakSet()
-_left_out: set[cl.Device] = set()  # those that failed where others could be taken
-_KINDS = ("gpu", "cpu", "other")  # in the order in which they are taken
+_left_out: set[cl.Device] = set()  # devices that failed and were replaced by others
+_KINDS = ("gpu", "cpu", "other")  # in the order of preference
 _PLACE = re.compile(r"(\w+\.clh?|<kernel>):(\d+):(\d+):\s*(?:fatal )?(?:error:)?\s*(.+)")
 _INSTALL = "install a GPU's OpenCL driver, or on x86-64 Linux 'pip install pocl-binary-distribution'"
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """What is known of a device without opening it.
+    """Properties of a device that are available without opening it.
 
     Attributes
     ----------
@@ -88,17 +88,17 @@ class DeviceInfo:
 
     @property
     def title(self) -> str:
-        """Platform and name, as ``--device`` understands them."""
+        """Platform and name, as accepted by ``--device``."""
         return f"{self.platform}: {self.name}"
 
 
 def list_devices() -> list[DeviceInfo]:
-    """Return what OpenCL offers on this machine, in the order that ``open_device`` numbers it."""
+    """Return OpenCL's devices on this machine, in the order of their numbers in ``open_device``."""
     return [_describe(device) for device in _find()]
 
 
 def open_device(choice: Choice = None) -> Device:
-    """Open a device; the same choice gives the same object, with what it has compiled.
+    """Return an open device; the same choice returns the same object, with its compiled programs.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def are_several(choice: Choice) -> bool:
 
 
 def _checked(choice: Choice) -> str | Device | Sequence[str | int | Device] | None:
-    """Return a choice, a number as text; UnknownDeviceError for what cannot name a device."""
+    """Return a choice, a number as text; UnknownDeviceError for an invalid one."""
     if isinstance(choice, SupportsIndex) and not isinstance(choice, bool):
         return str(operator.index(choice))
     if isinstance(choice, int | bytes) or not isinstance(choice, str | Device | Sequence | None):
@@ -193,13 +193,13 @@ def opened_devices() -> list[Device]:
 
 
 def free_memory() -> None:
-    """Give the memory that is kept from call to call back to the system.
+    """Return the memory that is cached between calls to the system.
 
-    Arrays that the engine works in and the maps that it returns lie in memory that is used again once nobody
-    refers to it: its pages need not be made anew. No more than `mirrorskin.kernels.memory.KEPT`, 512 MB, is
-    kept while nobody uses it, besides the solver of the last call of `mirrorskin.engine.integrate`: some 100
-    bytes a pixel, of pictures up to 8 Mpx. On a device with its own memory, at most an eighth of that is kept
-    as well, and 48 MB of the host's memory for copies.
+    Arrays of the engine and the maps that it returns use memory that is reused once it is no longer
+    referenced, because its pages are already mapped. At most `mirrorskin.kernels.memory.KEPT`, 512 MB, is
+    cached while unused, in addition to the solver of the last call of `mirrorskin.engine.integrate`: some 100
+    bytes per pixel, for pictures up to 8 Mpx. On a device with its own memory, at most an eighth of that is
+    cached as well, and 48 MB of the host's memory for copies.
 
     Examples
     --------
@@ -215,7 +215,7 @@ def free_memory() -> None:
 
 
 class Device:
-    """An open device: its context and queue, its compiled programs, its profile.
+    """An open device: context, queue, compiled programs and profile.
 
     Attributes
     ----------
@@ -275,7 +275,7 @@ class Device:
         return _find().index(self.context.devices[0])
 
     def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike, zeroed: bool = True) -> Array:
-        """Make room for an array on the device.
+        """Return a new array on the device.
 
         Parameters
         ----------
@@ -294,7 +294,7 @@ class Device:
         return Array(self, name, shape, np.dtype(dtype), zeroed)
 
     def from_host(self, name: str, values: ArrayLike, dtype: DTypeLike = np.float32) -> Array:
-        """Make an array that holds values; where there are none, one element that means nothing.
+        """Return a new array with some values; if there are none, it has one meaningless element.
 
         Parameters
         ----------
@@ -316,10 +316,10 @@ class Device:
         return array
 
     def borrow(self, name: str, values: NDArray[Any]) -> BorrowedBuffer | None:
-        """Let kernels read another owner's memory in place; the device must share the host's memory.
+        """Return another owner's memory for use by kernels in place; the device must share the host's memory.
 
-        None where that cannot be: values that are not in C order, or at no multiple of their item size, or
-        behind which 64 bytes cannot be read; or a device that refuses memory such as a file's.
+        None if this is not possible: values that are not in C order or aligned, or that are not followed by
+        64 readable bytes; or a device that refuses memory such as a file's.
 
         Parameters
         ----------
@@ -333,13 +333,13 @@ class Device:
         try:
             return BorrowedBuffer(self, name, values)
         except DeviceError as error:
-            _log.info("%s cannot work on %s in place (%s): they are copied", self.info.title, name, error)
+            _log.info("%s cannot use %s in place (%s): it is copied", self.info.title, name, error)
             return None
 
     def share(self, name: str, values: NDArray[Any] | Array) -> Operand:
-        """Let kernels read values in place, or else a copy; nobody may write to them meanwhile.
+        """Return values for use by kernels in place, or a copy; they must not be written to meanwhile.
 
-        An array of a device is returned as it is.
+        An array of the device is returned unchanged.
         """
         if isinstance(values, Array):
             return values
@@ -359,7 +359,7 @@ class Device:
 
     def _new_buffer(self, nbytes: int) -> cl.Buffer:
         buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, size=nbytes)
-        # Drivers allocate at first use; a migration makes a lack of memory show here.
+        # Drivers allocate on first use; a migration makes a lack of memory show here.
         undefined = cl.mem_migration_flags.CONTENT_UNDEFINED
         with self.enqueuing:
             event = cl.enqueue_migrate_mem_objects(self.copies, [buffer], flags=undefined)
@@ -401,9 +401,9 @@ class Device:
         return kernel
 
     def with_new_queue(self) -> Device:
-        """Return the same device with queues of its own, whose kernels need not wait for those before.
+        """Return the same device with queues of its own, whose kernels need not wait for earlier ones.
 
-        Arrays may be passed from one to the other; what a kernel must wait for is their ``arrived``.
+        Arrays may be passed between them; a kernel waits for their ``arrived``.
         """
         other = copy.copy(self)
         other.queue, other.copies = _queues(self.context)
@@ -411,23 +411,23 @@ class Device:
         return other
 
     def free(self) -> None:
-        """Give memory that is kept for later calls back to the driver."""
+        """Return cached memory to the driver."""
         self.cache.clear()
         try:
             self.transfers.free(self)
             self.pool.free()
         except cl.Error as error:
-            raise device_error(self, "give memory back", error) from error
+            raise device_error(self, "release memory", error) from error
 
     def flush(self) -> None:
-        """Have the device begin what it was given, without waiting for it."""
+        """Submit the enqueued commands to the device, without waiting."""
         try:
             self.queue.flush()
         except cl.Error as error:
-            raise device_error(self, "begin its work", error) from error
+            raise device_error(self, "start its work", error) from error
 
     def finish(self) -> None:
-        """Wait until everything given to the device is done."""
+        """Wait until all enqueued commands are done."""
         try:
             with self.profile.waiting_for("queue"):
                 self.queue.finish()
@@ -438,7 +438,7 @@ class Device:
         try:
             program = self._program(file, options)
             if name not in program.signatures:
-                if f"_cl_{name}" in program.signatures:  # PoCL renames those functions, and so the kernel
+                if f"_cl_{name}" in program.signatures:  # PoCL renames these functions, and thus the kernel
                     raise DeviceError(
                         f"{name} is a function of OpenCL: rename the kernel, such as to my_{name}"
                     )
@@ -446,7 +446,7 @@ class Device:
                 raise DeviceError(f"there is no kernel {name} in the source; it has {there}")
             try:
                 kernel = cl.Kernel(program.built, name + program.suffix)
-            except cl.LogicError:  # what the driver keeps of built programs is damaged: the source has it
+            except cl.LogicError:  # the driver's cache of built programs is damaged: add a line to the source
                 program = self._program(file, options, "__constant int again = 0;\n")
                 kernel = cl.Kernel(program.built, name + program.suffix)
             return Kernel(self, name, kernel, program.signatures[name])
@@ -485,7 +485,7 @@ class Device:
         return program
 
     def _recall_or_compile(self, source: str, options: list[str]) -> _Program:
-        """Take from the disk what was built of this source for this device and driver, or build it."""
+        """Load the program built from this source for this device and driver from the disk, or build it."""
         device = self.context.devices[0]
         driver = device.platform.version, device.name, device.version, device.driver_version
         circumstances = driver, embedded.compiler(), options, source
@@ -495,14 +495,14 @@ class Device:
             try:
                 return _Program(self._load(binary, options), *json.loads(head))
             except cl.Error as error:
-                _log.info("a program is built anew: %s", error)
+                _log.info("building a program again: %s", error)
         program, kept = self._compile_to_keep(source, options, f"_{digest(circumstances)}")
         if kept is not None:
             keep("program", circumstances, b"\n".join([json.dumps(program[1:]).encode(), kept]))
         return program
 
     def _compile_to_keep(self, source: str, options: list[str], suffix: str) -> tuple[_Program, bytes | None]:
-        """Build a program, and return its binary, too, if the driver has one without more work."""
+        """Build a program; also return its binary if the driver has one without further work."""
         device = self.context.devices[0]
         if not _is_pocl(device):
             program = self._compile(source, options)
@@ -516,7 +516,7 @@ class Device:
                     named = {name.removesuffix(suffix): one for name, one in program.signatures.items()}
                     return _Program(built, suffix, named), binary
             except (cl.Error, OSError) as error:
-                _log.info("a program is not kept: %s", error)
+                _log.info("a program is not cached: %s", error)
         return self._compile(source, options), None
 
     def _compile(self, source: str, options: list[str]) -> _Program:
@@ -529,10 +529,10 @@ class Device:
 
 
 class _WithoutBuildLogs:
-    """The context in which pyopencl does not warn of build logs: some compilers always write one.
+    """A context in which pyopencl does not warn of build logs, because some compilers always write one.
 
-    The filters of warnings belong to the process. `warnings.catch_warnings` in two threads at once may leave
-    those of the other one behind; here the first thread sets them, and the last one restores them.
+    Warning filters belong to the process. `warnings.catch_warnings` in two threads at once may leave the
+    filters of one of them behind; here the first thread sets them, and the last one restores them.
     """
 
     def __init__(self) -> None:
@@ -557,7 +557,7 @@ _without_build_logs = _WithoutBuildLogs()
 
 
 class _Program(NamedTuple):
-    """A built program: what the names of kernels end with in it, and their arguments."""
+    """A built program: the suffix of its kernels' names, and their arguments."""
 
     built: cl.Program
     suffix: str
@@ -565,7 +565,7 @@ class _Program(NamedTuple):
 
 
 class Kernel:
-    """A compiled kernel, ready to run over so many items.
+    """A compiled kernel, ready to be launched.
 
     Attributes
     ----------
@@ -583,7 +583,7 @@ class Kernel:
         self._signature = [(name, converter(name, type_name)) for name, type_name in signature]
         self.arguments: tuple[str, ...] = tuple(name for name, _ in signature)
         self._names = frozenset(self.arguments)
-        self._set: list[object] = [...] * len(signature)  # what each argument was set to
+        self._set: list[object] = [...] * len(signature)  # the current value of each argument
         self.group: int = _group_of(kernel, device.context.devices[0], device.layout.group)
 
     def __call__(
@@ -595,7 +595,7 @@ class Kernel:
         first_item: int = 0,
         **arguments: Operand | float | np.generic | None,
     ) -> None:
-        """Put one run on the device's queue.
+        """Enqueue one launch.
 
         Parameters
         ----------
@@ -620,7 +620,7 @@ class Kernel:
         arrays = [arg for arg in args if isinstance(arg, Operand)]
         complete = cl.command_execution_status.COMPLETE
         try:
-            with self._device._launching:  # as a kernel object holds the arguments until it is enqueued
+            with self._device._launching:  # because a kernel object stores the arguments until it is enqueued
                 for place, arg in enumerate(args):
                     self._put(place, arg)
                 copies = [array.arrived for array in arrays if array.arrived is not None]
@@ -636,11 +636,11 @@ class Kernel:
             raise device_error(self._device, f"run {self.name}", error) from error
 
     def _put(self, place: int, value: Any) -> None:
-        """Set an argument, unless it has this value already: that takes longer than a launch."""
+        """Set an argument, unless it has this value already: setting it takes longer than a launch."""
         key: object = value
         if isinstance(value, Operand):
             value = value.buffer
-            # Not id(), which the buffer of a dropped array may have had.
+            # Not id(), which the buffer of a deleted array may have had.
             key = value.__dict__.setdefault("number", next(_numbers))
         elif value is not None:
             key = value.tobytes()  # 0 and -0 are equal
@@ -662,7 +662,7 @@ class Kernel:
             value = arguments[name]
             if convert is None:
                 if not (value is None or isinstance(value, Operand)):
-                    raise TypeError(f"{self.name}: {name} takes an array of the device, not {value!r}")
+                    raise TypeError(f"{self.name}: {name} must be an array of the device, not {value!r}")
             else:
                 try:
                     value = convert(value)
@@ -673,7 +673,7 @@ class Kernel:
 
 
 def _group_of(kernel: cl.Kernel, device: cl.Device, wanted: int) -> int:
-    """Return the work-items of a group: what the kernel demands, else what is wanted and allowed."""
+    """Return the size of a work-group: the kernel's requirement, otherwise the desired and allowed one."""
     ask = cl.kernel_work_group_info
     demanded = int(kernel.get_work_group_info(ask.COMPILE_WORK_GROUP_SIZE, device)[0])
     if demanded:
@@ -694,7 +694,7 @@ def _find() -> list[cl.Device]:
     embedded.prepare()
     try:
         platforms = cl.get_platforms()
-    except cl.LogicError:  # the loader's way to say that there is none
+    except cl.LogicError:  # the loader's way to report that there is none
         return []
     return [device for platform in platforms for device in _devices_of(platform)]
 
@@ -731,7 +731,7 @@ def _is_pocl(device: cl.Device) -> bool:
 
 
 def _choose(choice: str | None) -> list[cl.Device]:
-    """Return the devices that a choice means, one or several of a kind: the first of them that works."""
+    """Return the devices of a choice, one or several of a kind: the first of them that works."""
     devices = _find()
     if not devices:
         reason = embedded.why_no_device()
@@ -743,7 +743,7 @@ def _choose(choice: str | None) -> list[cl.Device]:
     if len(titles) == 1 or (titles and choice.casefold().strip() in _KINDS[:2]):
         return _best_first(matches)
     known = "; ".join(f"{i} = {_describe(d).title}" for i, d in enumerate(devices))
-    problem = "no such device" if not matches else "more than one device answers to that"
+    problem = "no such device" if not matches else "more than one device matches"
     reason = None if matches else embedded.why_no_device()
     raise UnknownDeviceError(
         f"device {choice!r}: {problem}; there is {known}{f' ({reason})' if reason else ''}"
@@ -765,12 +765,12 @@ def _default(devices: list[cl.Device]) -> list[cl.Device]:
             return [cl.create_some_context(interactive=False).devices[0]]
         except (cl.Error, RuntimeError, ValueError, IndexError) as error:
             named = os.environ["PYOPENCL_CTX"]
-            raise UnknownDeviceError(f"PYOPENCL_CTX={named!r} names no device: {error}") from error
+            raise UnknownDeviceError(f"PYOPENCL_CTX={named!r} matches no device: {error}") from error
     return _best_first(devices)
 
 
 def _best_first(devices: list[cl.Device]) -> list[cl.Device]:
-    """Sort devices: GPUs before CPUs, memory of their own before the host's, then by size."""
+    """Sort devices: GPUs before CPUs, own memory before the host's, then by size."""
 
     def rank(device: cl.Device) -> tuple[int, bool, int]:
         info = _describe(device)
@@ -809,7 +809,7 @@ def _is_all(choice: object) -> bool:
 
 
 def _with_includes(name: str, text: str) -> str:
-    """Return kernels with the files that they include: all of it is the key of what was compiled."""
+    """Return kernels with the files that they include, which is the key of the compiled program."""
     lines = [f'#line 1 "{name}"']
     for number, line in enumerate(text.splitlines(), 1):
         included = re.fullmatch(r'#include "(\w+\.clh)"', line)
@@ -823,7 +823,7 @@ def _shared(name: str) -> str:
 
 
 def _explain_build(path: Path, source: str, log: str, info: DeviceInfo) -> str:
-    """Quote the first line that a compiler complains of, in one line."""
+    """Return the first error of a compiler in one line."""
     errors = [line.strip() for line in log.splitlines() if "error" in line.lower()]
     found = next(filter(None, (_PLACE.search(line) for line in errors)), _PLACE.search(log))
     lines = _lines_of(source)

@@ -1,4 +1,4 @@
-"""What was found out about this machine or built for it once, kept in the user's cache folder."""
+"""Results about this machine, and programs built for it, in the user's cache folder."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _DIGEST = hashlib.sha256().digest_size
 
 
 def recall(topic: str, circumstances: object) -> bytes | None:
-    """Return what was kept of a topic under these circumstances, which their ``repr`` distinguishes.
+    """Return the cached value of a topic under these circumstances, which are identified by their ``repr``.
 
-    None where there is nothing, or what is there is not as it was written.
+    None if there is none, or if it is damaged.
     """
     try:
         kept = _record(topic, circumstances).read_bytes()
@@ -28,7 +28,7 @@ def recall(topic: str, circumstances: object) -> bytes | None:
 
 
 def keep(topic: str, circumstances: object, answer: bytes) -> None:
-    """Keep an answer, whole or not at all; without a writable folder it will be found out again."""
+    """Cache a value atomically; without a writable folder it will be computed again."""
     record = _record(topic, circumstances)
     partial = record.with_suffix(f".{os.getpid()}-{threading.get_native_id()}")
     try:
@@ -36,7 +36,7 @@ def keep(topic: str, circumstances: object, answer: bytes) -> None:
         partial.write_bytes(hashlib.sha256(answer).digest() + answer)
         partial.replace(record)
     except OSError as error:
-        _log.info("%s will be found out again next time: %s", topic, error)
+        _log.info("%s will be computed again next time: %s", topic, error)
 
 
 def digest(circumstances: object) -> str:

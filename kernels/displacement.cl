@@ -1,13 +1,13 @@
-// How far a texture has moved: a frame's spline, the frame fetched back, and least squares in windows.
+// Displacement of a texture: spline of a frame, interpolation of the displaced frame, and least squares in windows.
 // Specification: displacement.py.
 //
 // FRAME   type of a sample
-// TILE    pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
+// TILE    pixels of one work-item: 1 on a GPU, many on a CPU
 // WINDOW  pixels of a window's side
-// TOP     what a saturated sample holds; floats have none
+// TOP     value of a saturated sample; undefined for floats
 //
-// A window's sums are kept for each of its columns, and put together at the end: on cores the columns of a chunk
-// lie side by side in vectors, and no sum changes its order.
+// The sums of a window are kept for each of its columns, and added at the end: on a CPU the columns of a chunk are
+// the lanes of a vector, and the order of additions does not change.
 
 #pragma OPENCL FP_CONTRACT OFF
 
@@ -16,8 +16,8 @@
 #define TAPS 8
 #define MARGIN (TAPS + 4)
 #define PARAMETERS 10
-#define AFFINE 6  // of them
-#define MOST 1e5f  // magnitude of an inverse matrix
+#define AFFINE 6  // number of affine parameters
+#define MOST 1e5f  // maximum magnitude of an inverse matrix
 
 __kernel void displacement_pad(const int rows, const int columns, __global const FRAME *restrict frame, OUT padded)
 {
@@ -51,7 +51,7 @@ __kernel void displacement_filter(const int pixels, const int step, MAP source, 
 #define KNOWN(sample) ((sample) - (sample) == 0)
 #endif
 
-// Of a place beyond an end, its mirror image.
+// Positions beyond an end are mirrored.
 #define MIRROR(place, length) \
     ((place) < 0 ? -(place) : (place) < (length) ? (place) : 2 * ((length) - 1) - (place))
 
@@ -116,7 +116,7 @@ __kernel void displacement_planes(
     }
 }
 
-// Weights of the coefficients at -1, 0, 1 and 2, for a place from 0 to 1.
+// Weights of the coefficients at -1, 0, 1 and 2, for a position from 0 to 1.
 #define CUBIC(w, part) { \
     const float rest = 1 - (part); \
     w##0 = rest * rest * rest * (1.0f / 6); \
@@ -125,7 +125,7 @@ __kernel void displacement_planes(
     w##3 = (part) * (part) * (part) * (1.0f / 6); \
 }
 
-// Variance of what they make of samples with noise of variance 1; the constants are CORRELATION.
+// Variance of the interpolated value for noise of variance 1; the constants are CORRELATION.
 #define NOISE_GAIN(w) (CORRELATION0 * (w##0 * w##0 + w##1 * w##1 + w##2 * w##2 + w##3 * w##3) \
     + 2 * CORRELATION1 * (w##0 * w##1 + w##1 * w##2 + w##2 * w##3) \
     + 2 * CORRELATION2 * (w##0 * w##2 + w##1 * w##3) + 2 * CORRELATION3 * (w##0 * w##3))
@@ -137,7 +137,7 @@ __kernel void displacement_planes(
 
 #define LINE(at, w) (w##0 * (at)[0] + w##1 * (at)[1] + w##2 * (at)[2] + w##3 * (at)[3])
 
-// Where a pixel lies among nodes: the one before, and how far it is from there to the next.
+// The node before a pixel, and the fraction of the way to the next one.
 #define SPLIT(pixel, nodes, node, part) \
     float part = ((pixel) - start) / step; \
     part = part > 0 ? part : 0; \
@@ -147,7 +147,7 @@ __kernel void displacement_planes(
     node = node > 0 ? node : 0; \
     part -= node;
 
-// Weights of the nodes at -1, 0, 1 and 2: Keys' cubic, straight between the last two at either end.
+// Weights of the nodes at -1, 0, 1 and 2: Keys' cubic, linear in the last interval at each end.
 #define KEYS(node, part, nodes) \
     const float bend_##node = node > 0 && node < (nodes) - 2 ? (part) * (1 - (part)) / 2 : 0; \
     const float node##0 = -bend_##node * (1 - (part)), node##3 = -bend_##node * (part); \
@@ -226,7 +226,7 @@ __kernel void displacement_pixels(
     }
 }
 
-#define LANES (TILE > 1 ? 8 : 1)  // columns of a window that are worked on side by side
+#define LANES (TILE > 1 ? 8 : 1)  // columns of a window processed together
 
 #define PLACE(i) ((2 * (i) - (WINDOW - 1)) * (1.0f / WINDOW))
 
@@ -295,8 +295,8 @@ __kernel void displacement_solve(
     answer[(AFFINE + 2) * nodes + node] = variances;
 }
 
-// Inverts a matrix of which the lower triangle is given, in place, after its diagonal was made 1 (Cholesky). Returns
-// whether that is possible within rounding.
+// Inverts a matrix, given by its lower triangle, in place, after scaling its diagonal to 1 (Cholesky).
+// Returns whether this is possible within rounding.
 int invert(float normal[PARAMETERS][PARAMETERS])
 {
     float scale[PARAMETERS];
@@ -328,7 +328,7 @@ int invert(float normal[PARAMETERS][PARAMETERS])
             float sum = 0;
             for (int m = k; m < PARAMETERS; ++m) sum += normal[m][k] * normal[m][l];
             squares += (k == l ? 1 : 2) * sum * sum;
-            normal[l][k] = sum;  // above the diagonal; on it, no later sum needs it
+            normal[l][k] = sum;  // above the diagonal; later sums do not need it on the diagonal
         }
     }
     for (int k = 0; k < PARAMETERS; ++k)

@@ -1,15 +1,15 @@
-"""How far a texture has moved: what ``displacement.cl`` computes, in plain NumPy with float64 inside.
+"""Displacement of a texture: ``displacement.cl`` in plain NumPy with float64.
 
-A frame between its samples is the cubic spline through them (Unser, Aldroubi and Eden, IEEE Trans. Signal
-Processing 41, 1993): its coefficients are a filter of the frame, of which 17 samples are taken along each
-axis. What is left out is less than 3e-5 of a sample.
+Between its samples a frame is the cubic spline through them (Unser, Aldroubi and Eden, IEEE Trans. Signal
+Processing 41, 1993). Its coefficients are a filter of the frame, truncated to 17 samples along each axis; the
+truncation error is less than 3e-5 of a sample.
 
-A reference has four planes: its counts, NaN where they are no measurement; their derivatives along columns
-and rows; and their difference from the mean around. They are padded by ``halo`` pixels of zeros (of NaN in
-the first), so that a window may reach beyond the picture.
+A reference has four planes: its counts, NaN where they are not measurements; their derivatives along columns
+and rows; and their difference from the local mean. They are padded by ``halo`` pixels of zeros (of NaN in the
+first), so that a window may extend beyond the picture.
 
-In a window, the frame is taken for the reference, moved by an affine field, times a gain and plus a plane of
-brightness. That has ten parameters: displacement to the right and down at the window's centre, four
+In a window, the frame is modelled as the reference, displaced by an affine field, times a gain and plus a
+plane of brightness. This has ten parameters: displacement to the right and down at the window's centre, four
 derivatives of these, brightness and its two slopes, gain. Their columns are those of `basis`.
 """
 
@@ -24,28 +24,28 @@ Array = NDArray[Any]
 
 POLE = np.sqrt(3.0) - 2
 TAPS = 8
-"""Samples on either side that a coefficient is made of."""
+"""Number of samples on either side that contribute to a coefficient."""
 MARGIN = TAPS + 4
-"""Mirrored samples round a padded frame, of which the outer ones have no coefficient."""
+"""Mirrored samples around a padded frame; the outer ones have no coefficient."""
 PARAMETERS, AFFINE = 10, 6
-"""Of a window, and those of them that tell how it moves."""
+"""Number of parameters of a window, and of those that describe its motion."""
 MOST = 1e5
-"""Magnitude of the inverse of a normal matrix, whose diagonal was 1, up to which it is used."""
+"""Maximum norm of the inverse of a normal matrix whose diagonal is scaled to 1."""
 
 _ROOT = (4 + 2 * np.cos(_ANGLES := np.linspace(0, 2 * np.pi, 256, endpoint=False))) / 6
 CORRELATION = tuple(float(np.mean(np.cos(k * _ANGLES) / _ROOT**2)) for k in range(4))
-"""Covariance of coefficients 0 to 3 samples apart, of frames whose samples have noise of variance 1."""
+"""Covariance of coefficients 0 to 3 samples apart, for samples with noise of variance 1."""
 
 
 def displacement_pad(frame: Array, padded: Array) -> None:
-    """Write a frame, and its mirror image round it, into a map that is larger by a margin on each side."""
+    """Write a frame and its mirror image around it into a map that is larger by a margin on each side."""
     padded[:] = np.pad(frame.astype(np.float64), MARGIN, mode="reflect")
 
 
 def displacement_filter(step: int, source: Array, filtered: Array) -> None:
     """Write the spline's coefficients along one axis: ``step`` is 1 along rows, else the length of a row.
 
-    Values so near the begin or end of the whole map that samples are missing stay as they are.
+    Values so near the start or end of the whole map that samples are missing are unchanged.
     """
     flat, out, reach = source.reshape(-1).astype(np.float64), filtered.reshape(-1), TAPS * step
     middle = flat[reach:-reach].copy()
@@ -58,9 +58,9 @@ def displacement_filter(step: int, source: Array, filtered: Array) -> None:
 
 
 def displacement_across(window: int, frame: Array, sums: Array, counts: Array) -> None:
-    """Write the sum of the known samples of a row around each pixel, and their number, mirrored at the ends.
+    """Write the sum of the valid samples of a row around each pixel, and their number, mirrored at the ends.
 
-    Known are samples that are finite, and those below the greatest value of an integer type.
+    Valid samples are finite, and below the greatest value of an integer type.
     """
     samples, known = _known(frame)
     for values, summed in ((np.where(known, samples, 0.0), sums), (known, counts)):
@@ -109,14 +109,14 @@ def _around(values: Array, window: int, axis: int) -> Array:
 
 
 def cubic(part: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the weights, (4, ...), of the coefficients at -1, 0, 1 and 2 for a place from 0 to 1."""
+    """Return the weights, (4, ...), of the coefficients at -1, 0, 1 and 2 for a position from 0 to 1."""
     rest = 1 - part
     near, far = (2 / 3 - 0.5 * x**2 * (2 - x) for x in (part, rest))
     return np.stack([rest**3 / 6, near, far, part**3 / 6])
 
 
 def noise_gain(weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the variance of an interpolated value, of samples with noise of variance 1, along one axis."""
+    """Return the variance of a value interpolated along one axis, for samples with noise of variance 1."""
     lags = [CORRELATION[k] * np.sum(weights[: 4 - k] * weights[k:], axis=0) for k in range(4)]
     return np.asarray(lags[0] + 2 * (lags[1] + lags[2] + lags[3]))
 
@@ -136,7 +136,7 @@ def interpolate_nodes(field: Array, start: float, step: int, size: tuple[int, in
 
 
 def keys(place: NDArray[np.float64], nodes: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return the four nodes around each place and their weights: Keys' cubic, straight at the ends.
+    """Return the four nodes around each position and their weights: Keys' cubic, linear at the ends.
 
     Keys, IEEE Trans. Acoustics, Speech and Signal Processing 29, 1981.
     """
@@ -148,10 +148,10 @@ def keys(place: NDArray[np.float64], nodes: int) -> tuple[NDArray[np.intp], NDAr
 
 
 def displacement_pixels(step: int, start: float, logarithms: bool, nodes: Array, pixels: Array) -> None:
-    """Write at pixels, (T, H, W, n), the values of nodes, (T, n, rows, columns).
+    """Write the values of nodes, (T, n, rows, columns), interpolated at pixels, (T, H, W, n).
 
-    They are cubic, where nodes are missing linear, and else NaN.
-    ``logarithms``: the nodes' values are logarithms of what is written, which is then above 0.
+    Interpolation is cubic, linear where nodes are missing, and otherwise NaN. With ``logarithms`` the nodes'
+    values are logarithms of the output, which is then positive.
     """
     for values, written in zip(nodes, pixels, strict=True):
         fine = values.astype(np.float64)
@@ -169,7 +169,7 @@ def displacement_pixels(step: int, start: float, logarithms: bool, nodes: Array,
 def displacement_warp(
     step: int, start: float, halo: int, coefficients: Array, planes: Array, field: Array, difference: Array
 ) -> None:
-    """Write by how much the reference differs from a frame that is fetched back.
+    """Write the difference between the reference and a frame interpolated at displaced positions.
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ def displacement_warp(
 def windows(maps: Array, row: int, step: int, first: int, window: int, nodes: int) -> NDArray[np.float64]:
     """Return the windows of a row of nodes, (n, nodes, window^2), of maps (n, H, W).
 
-    ``first`` is where the window of the first node begins, on either axis.
+    ``first`` is the start of the window of the first node, on either axis.
     """
     strip = maps[:, first + row * step : first + row * step + window].astype(np.float64)
     strip = np.lib.stride_tricks.sliding_window_view(strip, window, axis=2)

@@ -1,17 +1,17 @@
-// Where the normal jumps, and where contact ends. Specification: edges.py.
+// Edges: jumps of the normal, and the end of contact. Specification: edges.py.
 //
-// TILE      pixels of one work-item, at most CHUNK of them side by side; 1 where an item is a lane
-// SPACING   pixels from place to place, and along the side of a cell
-// STEPS     distances from the pixel at which there are pairs: 3, or 2 that must agree
-// LEAST     pairs that must be known
-// REACH     pixels across a line over which it must be the highest
-// GUARD     pixels from the lines of the passes before within which there is no other
-// PART      of the mean difference that the jump must be
-// FIRST     1 in the first pass, before which nothing is drawn and all is in doubt
+// TILE      pixels of one work-item, at most CHUNK of them at a time; 1 on a GPU
+// SPACING   distance between evaluated pixels, and side of a cell, pixels
+// STEPS     number of distances of pairs from the pixel: 3, or 2 that must agree
+// LEAST     minimum number of valid pairs
+// REACH     half-width of the non-maximum suppression, pixels
+// GUARD     minimum distance from the lines of earlier passes, pixels
+// PART      minimum share of the mean difference that the jump must be
+// FIRST     1 in the first pass, when there are no lines yet and all pixels are undecided
 // LAST      1 in the last pass
 //
-// Cells are six planes (x, y, z, variance, share known, 1 where no line is drawn), with a margin so that no pair leaves
-// them. PoCL makes vector code of loops over pixels without calls, branches and loops inside.
+// Cells are six planes (x, y, z, variance, share of valid pixels, 1 where no line is drawn), with a margin that contains
+// all pairs. PoCL vectorises loops over pixels without calls, branches and inner loops.
 
 #include "common.clh"
 
@@ -42,7 +42,7 @@ __kernel void edges_clean(
     }
 }
 
-// Runs of TILE cells of a row, one an item; rows are those of the cells with their margin.
+// Runs of TILE cells of a row, one per item; rows include the margin.
 #define EACH_CELL                                                                                  \
     const int stride = columns + 2 * MARGIN, high = rows + 2 * MARGIN, plane = high * stride;      \
     const int runs = (stride + TILE - 1) / TILE, y = (int)get_global_id(0) / runs;                 \
@@ -94,7 +94,7 @@ __kernel void edges_join(const int rows, const int columns, MAP cells, __global 
 }
 
 #ifdef SPACING
-// Runs of CHUNK pixels of a row, one an item.
+// Runs of CHUNK pixels of a row, one per item.
 __kernel void edges_jumps(
     const int rows, const int columns, MAP cells, MAP pairs, const float jump, const float bend,
     const float significance, const float quiet, const float floor_, const float lowest,
@@ -209,7 +209,7 @@ float at(__global const float *strength, const int rows, const int columns, cons
     return row >= 0 && row < rows && column >= 0 && column < columns ? strength[row * columns + column] : 0;
 }
 
-// Whether a line of the passes before lies beside a pixel, or on it.
+// Whether a line of earlier passes is at or next to a pixel.
 int guarded(
     __global const uchar *edges, const int rows, const int columns, const int row, const int column, const float cosine,
     const float sine)
@@ -245,7 +245,7 @@ __kernel void edges_thin(
 }
 #endif
 
-// Whether a pixel in contact has one of four neighbours out of it; the picture's end is no end of contact.
+// Whether a pixel in contact has one of four neighbours out of contact; the picture's border does not count.
 int ends(__global const uchar *clean, const int rows, const int columns, const int row, const int column)
 {
     const int p = row * columns + column;

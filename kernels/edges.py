@@ -1,11 +1,11 @@
-"""Edges of what is touched: what ``edges.cl`` computes, in plain NumPy with float64 inside.
+"""Edges of an object: ``edges.cl`` in plain NumPy with float64.
 
-At a pixel and in eight directions, pairs of places that lie point-symmetric about it are compared. What is
-even about the pixel cancels in their differences; what is left is a straight line over the distance: its
-slope is the surface's bend, its height at distance 0 is the jump (least squares). Three passes look for ever
-smaller jumps in ever more noise: `NEAR` wants two distances to agree and bears with some bend, `FINE` fits
-lines to three distances, `COARSE` to three distances of means of 3 x 3 pixels. A pass decides where jumps are
-clear; the last looks where they are not, and not across the lines that are drawn already.
+At a pixel and in eight directions, pairs of positions that are point-symmetric about it are compared.
+Contributions that are even about the pixel cancel in their differences. The remainder is a straight line over
+the distance: its slope is the curvature of the surface, its value at distance 0 is the jump (least squares).
+Three passes search for smaller jumps in more noise: `NEAR` requires two distances to agree and tolerates some
+curvature, `FINE` fits lines to three distances, `COARSE` to three distances of means of 3 x 3 pixels. A pass
+decides where jumps are clear; the last one searches elsewhere, and not across lines that are drawn already.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from mirrorskin.kernels.array_types import Doubles
 Array = NDArray[Any]
 Mask = NDArray[np.bool_]
 
-WAYS = 8  # directions, over half a turn
-MARGIN = 10  # pixels round the cells, so that no pair leaves them
+WAYS = 8  # number of directions, over half a turn
+MARGIN = 10  # pixels around the cells, which contain all pairs
 CELLS = ("x", "y", "z", "variance", "share", "free")
-"""Planes of the cells: mean normal, mean square sigma, share of pixels known, 1 where no line is drawn."""
+"""Planes of the cells: mean normal, mean square sigma, share of valid pixels, 1 where no line is drawn."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pass:
-    """How one pass compares.
+    """Parameters of a pass.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ PASSES = (NEAR, FINE, COARSE)
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """When a jump is an edge; angles in radians.
+    """Criteria of an edge; angles in radians.
 
     Attributes
     ----------
@@ -90,11 +90,11 @@ class Limits:
 
 
 def pairs(chosen: Pass) -> tuple[Array, Array]:
-    """Return where the pairs of a pass lie.
+    """Return the positions of the pairs of a pass.
 
-    ``places``, (WAYS, 3, steps, 2), are columns to the right and rows down, of three lines side by side; the
-    other place is the negative. ``distances``, (WAYS, 3, steps), are those from the pixel along the
-    direction; 0 for a place that is there already.
+    ``places``, (WAYS, 3, steps, 2), are columns to the right and rows down, for three parallel lines; the
+    other position is the negative. ``distances``, (WAYS, 3, steps), are those from the pixel along the
+    direction; 0 for duplicates.
     """
     angle = np.pi / WAYS * np.arange(WAYS)
     along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, np.newaxis, np.newaxis]
@@ -112,10 +112,11 @@ def pairs(chosen: Pass) -> tuple[Array, Array]:
 
 
 def edges_clean(contact: Array) -> Array:
-    """Turn over the flags, (H, W), that a pixel's neighbours contradict.
+    """Invert the flags, (H, W), that contradict the neighbours of a pixel.
 
-    A pixel out of contact needs three quarters of them in contact to be so, too: of eight, six, which fills
-    lines one pixel wide and no corner. One in contact needs all but one of them out of it.
+    A pixel out of contact is set to contact if three quarters of its neighbours are in contact: six of eight,
+    which fills lines one pixel wide and no corner. One in contact is cleared if all but one of them are out
+    of contact.
     """
     touched = np.pad((contact != 0).astype(np.int64), 1)
     inside = np.pad(np.ones(contact.shape, np.int64), 1)
@@ -127,10 +128,10 @@ def edges_clean(contact: Array) -> Array:
 
 
 def edges_cells(vectors: Array, sigma: Array, contact: Array, clean: Array) -> Doubles:
-    """Return the cells of one pixel each, (6, H + 2 MARGIN, W + 2 MARGIN), nothing known in the margin.
+    """Return the cells of one pixel each, (6, H + 2 MARGIN, W + 2 MARGIN), invalid in the margin.
 
     Vectors are unit normals, NaN where there is none, sigma their standard error, radians. A normal counts
-    only where contact and clean contact say so: what is flagged along a crease saw both of its sides in turn.
+    only if contact and cleaned contact are set: pixels flagged along a crease saw both of its sides in turn.
     """
     known = (clean != 0) & (contact != 0) & np.isfinite(vectors).all(axis=-1) & (sigma >= 0)
     known &= sigma < np.inf
@@ -141,7 +142,7 @@ def edges_cells(vectors: Array, sigma: Array, contact: Array, clean: Array) -> D
 
 
 def edges_join(cells: Doubles, edges: Array) -> Doubles:
-    """Return cells of 3 x 3 pixels about each pixel, from those of one pixel and the lines so far."""
+    """Return cells of 3 x 3 pixels around each pixel, from cells of one pixel and the lines so far."""
     known, drawn = cells[4], np.pad(edges != 0, MARGIN)
     joined = np.zeros_like(cells)
     rows, columns = (slice(1, size - 1) for size in known.shape)
@@ -157,11 +158,11 @@ def edges_join(cells: Doubles, edges: Array) -> Doubles:
 
 
 def edges_jumps(cells: Doubles, chosen: Pass, limits: Limits, doubt: Array) -> tuple[Doubles, Array]:
-    """Look for jumps of the normal, and return their strengths and directions.
+    """Return strengths and directions of the jumps of the normal.
 
-    The strength is the jump in standard errors, in the direction where that is largest; 0 where it is no
-    edge. The direction is counted clockwise from x as seen in the picture. ``doubt``, (H, W), is changed in
-    place: 1 where the passes so far are not quiet enough to decide; pixels without doubt have no jump.
+    The strength is the jump in standard errors, in the direction in which that is largest; 0 where there is
+    no edge. The direction is counted clockwise from x as seen in the picture. ``doubt``, (H, W), is updated
+    in place: 1 where the passes so far are too noisy to decide; decided pixels have no jump.
     """
     strength, way = np.zeros(doubt.shape), np.zeros(doubt.shape, np.uint8)
     jump, error, least = np.zeros(doubt.shape), np.zeros(doubt.shape), np.full(doubt.shape, np.inf)
@@ -185,13 +186,13 @@ def edges_jumps(cells: Doubles, chosen: Pass, limits: Limits, doubt: Array) -> t
 def _fit(
     cells: Doubles, chosen: Pass, places: Array, distances: Array, floor: float
 ) -> tuple[Doubles, Doubles, Mask]:
-    """Fit the jump in one direction: return it, its standard error, and where it is one and no bend."""
+    """Return the jump in one direction, its standard error, and where it is a jump and not a bend."""
     rows, columns = (size - 2 * MARGIN for size in cells.shape[1:])
 
     def at(right: int, down: int) -> Doubles:
         return cells[:, MARGIN + down : MARGIN + down + rows, MARGIN + right : MARGIN + right + columns]
 
-    sums = np.zeros((10, rows, columns))  # of 1, u, u^2, variance, difference, u times difference
+    sums = np.zeros((10, rows, columns))  # sums of 1, u, u^2, variance, difference, u times difference
     for line, away in zip(places, distances, strict=True):
         open_ = np.ones((rows, columns))
         for step, ((right, down), u) in enumerate(zip(line.tolist(), away.tolist(), strict=True)):
@@ -199,7 +200,7 @@ def _fit(
             if step > 0:
                 open_ = open_ * here[5] * there[5]
             weight = here[4] * there[4] * open_ * (u > 0)
-            # Of two distances each is summed by itself.
+            # With two distances each one is summed separately.
             once, moment = (step == 0, step == 1) if chosen.steps == 2 else (1.0, u)
             difference = here[:3] - there[:3]
             parts = [once, moment, moment * u, once * (here[3] + there[3])]
@@ -212,7 +213,7 @@ def _fit(
 
 
 def _agreed(sums: Doubles, chosen: Pass) -> tuple[Doubles, Doubles, Mask, Mask]:
-    """Return the jump that differences at two distances agree on, its share of the variance, and flags."""
+    """Return the jump on which differences at two distances agree, its share of the variance, and flags."""
     usable = (sums[0] >= chosen.least) & (sums[1] >= chosen.least)
     near, far = (np.where(usable, part, 1.0) for part in sums[:2])
     first, second = sums[4:7] / near, sums[7:] / far
@@ -223,7 +224,7 @@ def _agreed(sums: Doubles, chosen: Pass) -> tuple[Doubles, Doubles, Mask, Mask]:
 
 
 def _straight(sums: Doubles, chosen: Pass) -> tuple[Doubles, Doubles, Mask, Mask]:
-    """Return the jump of straight lines, its share of the variance, and where it is known and no bend."""
+    """Return the jump of straight lines, its share of the variance, and where it is valid and not a bend."""
     n, u1, u2 = sums[:3]
     usable = n >= chosen.least
     spread = n * u2 - u1 * u1
@@ -232,16 +233,16 @@ def _straight(sums: Doubles, chosen: Pass) -> tuple[Doubles, Doubles, Mask, Mask
     mean = sums[4:7] / n
     jump = (u2 * sums[4:7] - u1 * sums[7:]) / spread
     square, both = np.sum(jump**2, axis=0), np.sum(jump * mean, axis=0)
-    # Next to an edge the line overshoots, to the other side; where the surface bends the mean is larger.
+    # Next to an edge the line overshoots; where the surface bends the mean is larger.
     real = (2 * both >= square) & (square >= chosen.part**2 * np.sum(mean**2, axis=0))
     return np.sqrt(square), u2 / spread, usable, real
 
 
 def edges_thin(strength: Doubles, way: Array, chosen: Pass, edges: Array) -> Array:
-    """Add lines, where the strength is highest across them, to those drawn so far.
+    """Add lines, where the strength has a maximum across them, to those drawn so far.
 
-    A pixel is not drawn where a line of the passes before lies within ``guard`` of it, in the direction of
-    its jump or up to 45 degrees from that: it would be the same one.
+    A pixel is not drawn if a line of earlier passes is within ``guard`` of it, in the direction of its jump
+    or up to 45 degrees from that: it would be the same line.
     """
     added = np.array(edges)
     for row, column in np.argwhere(strength > 0):
@@ -265,7 +266,7 @@ def _value(values: Array, row: int, column: int) -> float:
 
 
 def _guarded(edges: Array, row: int, column: int, cosine: float, sine: float, guard: int) -> bool:
-    """Tell whether a line lies beside a pixel, or on it."""
+    """Return whether a line is at or next to a pixel."""
     for down in range(-guard, guard + 1):
         for right in range(-guard, guard + 1):
             along = abs(right * cosine + down * sine)
@@ -277,10 +278,10 @@ def _guarded(edges: Array, row: int, column: int, cosine: float, sine: float, gu
 
 
 def edges_bound(clean: Array, edges: Array) -> Array:
-    """Draw the pixels in contact with one of four neighbours out of it; what is next to them makes way."""
+    """Draw the pixels in contact with one of four neighbours out of contact; adjacent lines are removed."""
     touched = np.pad(clean != 0, 1, constant_values=True)
     inner = touched[:-2, 1:-1] & touched[2:, 1:-1] & touched[1:-1, :-2] & touched[1:-1, 2:]
-    # The picture's end is no end of contact: beyond it all counts as touched.
+    # The picture's border does not count: beyond it everything counts as in contact.
     bound = (clean != 0) & ~inner
     around = np.pad(bound, 1)
     rows, columns = clean.shape

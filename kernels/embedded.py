@@ -1,6 +1,6 @@
-"""The embedded OpenCL device: PoCL from its wheel, which needs no GPU, no driver and no root.
+"""The embedded OpenCL device: PoCL from its wheel, which needs no GPU, no driver and no root access.
 
-What keeps it from running is corrected or reported here, before PoCL can end the process.
+Conditions under which PoCL would end the process are corrected or reported here.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from mirrorskin.kernels.processor_name import NAME_FUNCTION, PATCHABLE, ensure_n
 
 _log = logging.getLogger("mirrorskin.kernels")
 
-_SCHEME = 2  # version of the answers on disk
+_SCHEME = 2  # version of the results on disk
 _TIMEOUT = 120  # seconds, for a cold disk
 _RAN = "PoCL ran a kernel"
 _SOURCE = "kernel void probe(global float *x) { const int i = get_global_id(0); x[i] = 2 * x[i] + i; }"
 
 _lock = threading.Lock()
-_processor: str | None = None  # the name it compiles for, once prepared
+_processor: str | None = None  # name of the processor for which it compiles, once prepared
 _patched = False
 
 
 def prepare() -> None:
-    """Prepare what PoCL needs; call it before the first look at OpenCL's platforms.
+    """Prepare PoCL's environment; call it before OpenCL's platforms are listed.
 
     PoCL gets folders for its caches, and its compiler the name of this processor.
 
@@ -64,17 +64,17 @@ def prepare() -> None:
             _processor, _patched = ensure_name(library)
         except OSError as error:
             _processor = "unknown"
-            _log.info("PoCL is used as it is, and may not know this processor: %s", error)
+            _log.info("PoCL is not patched, and may not know this processor: %s", error)
 
 
 def compiler() -> object:
-    """Return what PoCL's programs depend on besides its version, once prepared: processor and settings."""
+    """Return the processor and settings on which PoCL's programs depend, once prepared."""
     settings = [item for item in os.environ.items() if item[0].startswith("POCL_")]
     return _processor, sorted(item for item in settings if item[0] != "POCL_CACHE_DIR")
 
 
 def note(driver: str) -> str:
-    """Return what a user should know of the embedded device, from the driver's version; mostly nothing."""
+    """Return a note for users of the embedded device, from the driver's version; mostly empty."""
     if not (_patched and driver.startswith(PATCHABLE)):
         return ""
     return f"compiles for {_processor}: its function {NAME_FUNCTION} is patched in memory"
@@ -82,10 +82,10 @@ def note(driver: str) -> str:
 
 @functools.cache
 def verify(device: cl.Device) -> None:
-    """Make sure that a PoCL can run a kernel; call it before its first one, which else may end the process.
+    """Check that PoCL can run a kernel; call it before the first one, which could end the process.
 
-    A child process tries, with the system's linker and then with the package ``ziglang``'s. A good answer
-    is kept in the user's cache folder, for this PoCL, processor, linker and Python.
+    A child process tries, with the system's linker and then with that of the package ``ziglang``. Success is
+    cached in the user's cache folder, for this PoCL, processor, linker and Python.
 
     Raises
     ------
@@ -105,10 +105,10 @@ def verify(device: cl.Device) -> None:
 
 
 def why_no_device() -> str | None:
-    """Return in one line why OpenCL shows no device, or not the one wanted; None where that is unknown."""
+    """Return in one line why OpenCL shows no device, or not the requested one; None if unknown."""
     choice = os.environ.get("POCL_DEVICES")
     if choice is not None and not _shows_pocl():
-        return f"POCL_DEVICES is {choice!r}, by which PoCL shows no device; unset it"
+        return f"POCL_DEVICES is {choice!r}, which makes PoCL show no device; unset it"
     vendors = os.environ.get("OCL_ICD_VENDORS")
     place = Path(vendors or "/etc/OpenCL/vendors")
     if vendors and not place.exists():
@@ -126,7 +126,7 @@ def why_no_device() -> str | None:
 
 
 def why_no_kernel(is_pocl: bool) -> str | None:
-    """Return in one line which environment variable may be the reason that a kernel does not compile."""
+    """Return the environment variable that may prevent a kernel from compiling, in one line."""
     problem = _why_no_cache() if is_pocl else None
     names = ("PYOPENCL_BUILD_OPTIONS", *(("POCL_EXTRA_BUILD_FLAGS",) if is_pocl else ()))
     added = [f"{name} adds {os.environ[name]!r}" for name in names if os.environ.get(name)]
@@ -152,7 +152,7 @@ def _check_threads() -> None:
 
 
 def _named_in(list_: Path) -> str:
-    """Return the library that a file of OpenCL's loader names."""
+    """Return the library named in a file of OpenCL's loader."""
     try:
         return list_.read_text(encoding="utf-8", errors="replace").strip()
     except OSError:
@@ -160,7 +160,7 @@ def _named_in(list_: Path) -> str:
 
 
 def find_library() -> Path | None:
-    """Return PoCL's shared library where its wheel is installed, without importing pyopencl."""
+    """Return PoCL's shared library if its wheel is installed, without importing pyopencl."""
     spec = importlib.util.find_spec("pyopencl")
     if spec is None or spec.origin is None:
         return None
@@ -187,7 +187,7 @@ exec {command} "$@"
 
 
 def find_zig() -> Path | None:
-    """Return the program of the package ``ziglang``, or None where it is not installed."""
+    """Return the program of the package ``ziglang``, or None if it is not installed."""
     spec = importlib.util.find_spec("ziglang")
     if spec is None or spec.origin is None:
         return None
@@ -196,7 +196,7 @@ def find_zig() -> Path | None:
 
 
 def write_linker(cache: Path, command: Sequence[str]) -> Path:
-    """Write an ``ld`` that calls a linker, once for each command; return the folder that holds it."""
+    """Write an ``ld`` that calls a linker, once for each command; return its folder."""
     script = _LD.format(command=shlex.join(command))
     folder = cache / f"linker-{hashlib.sha256(script.encode()).hexdigest()[:16]}"
     if not (folder / "ld").is_file():
@@ -205,12 +205,12 @@ def write_linker(cache: Path, command: Sequence[str]) -> Path:
         with os.fdopen(handle, "w", encoding="utf-8") as file:
             file.write(script)
         Path(name).chmod(0o755)
-        Path(name).replace(folder / "ld")  # another process may be writing it too
+        Path(name).replace(folder / "ld")  # another process may be writing it as well
     return folder
 
 
 def provide_linker() -> bool:
-    """Put a linker first on this process's ``PATH``; return whether there is one to put."""
+    """Put a linker first on this process's ``PATH``; return whether there is one."""
     zig = find_zig()
     if zig is None:
         return False
@@ -227,8 +227,8 @@ def provide_linker() -> bool:
 
 
 def _circumstances(device: cl.Device) -> object:
-    """Return what the answer depends on: this PoCL, this processor, this linker and this Python."""
-    # Every object of OpenCL begins with a pointer to the functions of its library.
+    """Return the circumstances of a result: this PoCL, processor, linker and Python."""
+    # Every OpenCL object starts with a pointer to the functions of its library.
     functions = ctypes.cast(device.int_ptr, ctypes.POINTER(ctypes.POINTER(ctypes.c_void_p)))[0]
     files = [look_up(functions[1])[0], shutil.which("ld")]
     states = [(file, Path(file).stat()) for file in files if file is not None]
@@ -238,13 +238,13 @@ def _circumstances(device: cl.Device) -> object:
 
 
 def _probe(platform: cl.Platform) -> str | None:
-    """Run one kernel in a child process; return None, or in one line what went wrong and what to do."""
+    """Run one kernel in a child process; return None, or in one line the error and the remedy."""
     problem = _why_no_cache()
     if problem is not None:
         return problem
     number = str(cl.get_platforms().index(platform))
     command = [sys.executable, "-P", "-m", "mirrorskin.kernels.embedded", number]
-    # A cache of its own: a kernel that was linked before would hide that none can be linked now.
+    # A separate cache: a kernel that was linked before would hide that none can be linked now.
     with tempfile.TemporaryDirectory(dir=kernel_cache()) as cache:
         environment = {**os.environ, "POCL_CACHE_DIR": cache}
         try:
@@ -254,7 +254,7 @@ def _probe(platform: cl.Platform) -> str | None:
         except subprocess.TimeoutExpired:
             return f"PoCL did not finish a small kernel within {_TIMEOUT} s; choose another device"
         except OSError as error:
-            return f"PoCL cannot be tried, since {sys.executable} does not start ({error.strerror})"
+            return f"PoCL cannot be tested, since {sys.executable} does not start ({error.strerror})"
     if child.returncode == 0 and child.stdout.decode().startswith(_RAN):
         return None
     return _explain(child.returncode, child.stderr.decode(errors="replace"))
@@ -278,7 +278,7 @@ def _explain(status: int, complaints: str) -> str:
 
 
 def kernel_cache() -> Path:
-    """Return the folder in which PoCL 3.0 keeps compiled kernels."""
+    """Return the folder in which PoCL 3.0 caches compiled kernels."""
     given = os.environ.get("POCL_CACHE_DIR")
     if given is not None:
         return Path(given)
@@ -288,7 +288,7 @@ def kernel_cache() -> Path:
 
 
 def _why_no_cache() -> str | None:
-    """Try the folders that PoCL and pyopencl must be able to write; return None where both can be."""
+    """Test the folders that PoCL and pyopencl must be able to write; return None if both can be."""
     variable = "POCL_CACHE_DIR" if "POCL_CACHE_DIR" in os.environ else "XDG_CACHE_HOME"
     needed = [("PoCL", kernel_cache(), variable)]
     if "PYOPENCL_NO_CACHE" not in os.environ:
@@ -343,7 +343,7 @@ def _check_address_space() -> None:
 
 
 def _run_probe(number: int) -> None:
-    """Run one kernel on each device of a platform: what the child process does."""
+    """Run one kernel on each device of a platform, in the child process."""
     import resource
 
     resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
@@ -358,7 +358,7 @@ def _run_probe(number: int) -> None:
         cl.enqueue_nd_range_kernel(queue, kernel, x.shape, None)
         cl.enqueue_copy(queue, x, buffer)
         if not np.array_equal(x, 2 + np.arange(64)):
-            raise SystemExit("error: its numbers are wrong")
+            raise SystemExit("error: wrong results")
     print(_RAN)
 
 

@@ -1,17 +1,17 @@
-"""What can go wrong on the way to a device."""
+"""Errors of the device layer."""
 
 
 class DeviceError(Exception):
-    """A device cannot do its work; the message is one line that says why and what to do."""
+    """A device cannot do its work; the message is one line with the reason and the remedy."""
 
     exit_code = 1
 
 
 class UnknownDeviceError(DeviceError):
-    """No device answers to the name that was given."""
+    """No device matches the name."""
 
     exit_code = 2
 
 
 class DeviceMemoryError(DeviceError):
-    """The device has no room for a buffer; smaller pieces may still fit."""
+    """The device has no memory for a buffer; smaller pieces may still fit."""

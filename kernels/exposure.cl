@@ -1,27 +1,27 @@
-// From light to counts: each pixel's levels, shot and read noise, quantisation. Specification: exposure.py.
+// Conversion of light to counts: levels of each pixel, shot and read noise, quantisation. Specification: exposure.py.
 //
-// Noise comes from a counter, not from a state: Philox4x32-10 of the seed, the frame and the pixel. One
-// counter serves four pixels, a quarter of the picture apart, so that neighbouring counters serve neighbours.
-// All is plain arithmetic, and nothing a loop: a call of sqrt or log, or a loop inside, would keep PoCL from
-// doing eight counters at once. The polynomials are fitted for the least relative error.
+// The noise is computed from a counter, without a state: Philox4x32-10 of the seed, the frame and the pixel. One
+// counter is used for four pixels, a quarter of the picture apart, so adjacent counters belong to adjacent pixels.
+// The code is plain arithmetic without loops: a call of sqrt or log, or an inner loop, would prevent PoCL from
+// processing eight counters at once. The polynomials minimise the relative error.
 //
 // FRAME  type of a sample
-// WHOLE  1 where samples are whole numbers: they are rounded, and clipped to 0 ... top
-// SHOT   1 for shot noise besides the read noise
-// TILE   counters of one work-item; 1 where an item is a lane, many where it is a core's loop
+// WHOLE  1 if samples are integers: they are rounded, and clipped to 0 ... top
+// SHOT   1 for shot noise in addition to the read noise
+// TILE   counters of one work-item: 1 on a GPU, many on a CPU
 //
-// Maps hold 4 * quarter pixels; the last few may be none of the picture's.
+// Maps contain 4 * quarter pixels; the last few may be padding.
 
 #pragma OPENCL FP_CONTRACT OFF
 #include "common.clh"
 
 #define LOG_2 0.693147181f
-#define UNIT 0x1p-31f       // of the 31 bits of a uniform number
-#define TURN 0x1p-32f       // of the 32 bits of a place on a quarter turn
-#define NEAREST 0x1.8p23f  // a float of this size has no places behind the point
-#define TINY 1e-30f         // where there is no noise, there is nothing to bend
+#define UNIT 0x1p-31f  // the 31 bits of a uniform number
+#define TURN 0x1p-32f  // the 32 bits of a position on a quarter turn
+#define NEAREST 0x1.8p23f  // a float of this size has no fractional bits
+#define TINY 1e-30f  // without noise there is nothing to transform
 
-// Round i of Philox on the words a to d; its keys grow by Weyl's constants.
+// Round i of Philox on the words a to d; the keys are incremented by Weyl's constants.
 #define ROUND(i) { \
     const ulong left = (ulong)a * 0xD2511F53u, right = (ulong)c * 0xCD9E8D57u; \
     a = (uint)(right >> 32) ^ b ^ ((uint)seed + i * 0x9E3779B9u); \
@@ -41,7 +41,7 @@ float radius(const uint word)
     return root(-2.0f * ((float)exponent * LOG_2 + x * slope));
 }
 
-// A point of the unit circle: 30 bits for its place on a quarter of it, two for which quarter.
+// A point of the unit circle: 30 bits for its position on a quarter, two for the quarter.
 float2 direction(const uint word)
 {
     const float quarter = (float)(int)(word << 2) * TURN, square = quarter * quarter;
@@ -54,7 +54,8 @@ float2 direction(const uint word)
     return (float2)(upright ? sine : signed_cosine, upright ? signed_cosine : sine);
 }
 
-// What noise adds to a signal; with shot noise the normal number is bent to have its third moment.
+// The noise added to a signal; with shot noise the normal number is transformed to the third moment of the
+// shot noise.
 float noise(const float signal, const float normal, const float read, const float grain)
 {
 #if SHOT

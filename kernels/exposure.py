@@ -1,16 +1,16 @@
-"""From light to counts: what ``exposure.cl`` computes, in plain NumPy with float64 inside.
+"""Conversion of light to counts: ``exposure.cl`` in plain NumPy with float64.
 
 Noise is a pure function of the seed, the frame and the pixel. Random words come from Philox4x32-10 (Salmon,
 Moraes, Dror and Shaw: Parallel random numbers: as easy as 1, 2, 3. SC11, 2011, doi 10.1145/2063384.2063405),
-which has no state but a counter and a key, and passes TestU01's BigCrush. Box and Muller's transform makes
-two independent normal numbers of two words; they reach to 6.6 standard deviations. The device's are the same
-but for 1e-6. Its whole counts differ by one where they fall next to a half: 5 in a million of 8 bits, 1 in a
-thousand of 16 bits.
+which has no state except a counter and a key, and passes TestU01's BigCrush. Box and Muller's transform
+converts two words to two independent normal numbers of up to 6.6 standard deviations. Those of the device
+differ by 1e-6. Its integer counts differ by one where they are next to a half: 5 in a million for 8 bits, 1
+in a thousand for 16 bits.
 
-Shot noise is Poisson's: in electrons, its variance is the mean. A normal number z is bent by Cornish and
-Fisher's first term, s z + b (z^2 - 1), so that read and shot noise together have their mean and variance
-exactly. Their third moment is short by 4 b^3, which is 2 % of it at one electron. Where there is less light
-than that, the counts are not distributed as Poisson's.
+Shot noise is Poisson's: in electrons, its variance is the mean. A normal number z is transformed by Cornish
+and Fisher's first term, s z + b (z^2 - 1), such that mean and variance of read and shot noise together are
+exact. Their third moment is too small by 4 b^3, which is 2 % of it at one electron. Below that light the
+counts are not Poisson distributed.
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ def radius(word: Words) -> Doubles:
 
 
 def direction(word: Words) -> tuple[Doubles, Doubles]:
-    """Return the points of the unit circle that words stand for.
+    """Return the points of the unit circle for words.
 
-    The lower 30 bits, taken as a signed number, are the place on the quarter of the circle about the positive
-    x axis. The highest bit mirrors that quarter to the other side, and the next one exchanges x and y.
+    The lower 30 bits, as a signed number, are the position on the quarter of the circle around the positive x
+    axis. The highest bit mirrors that quarter to the other side, and the next one exchanges x and y.
     """
     angle = (word << 2).view(np.int32) * (np.pi / 2 * 2.0**-32)
     across, along = np.where(word >> 31, -1, 1) * np.cos(angle), np.sin(angle)
@@ -62,7 +62,7 @@ def direction(word: Words) -> tuple[Doubles, Doubles]:
 def normals(quarter: int, frame: int, seed: int) -> Doubles:
     """Return the standard normal numbers, (4 * quarter,), of one frame.
 
-    Counter n serves the pixels n, n + quarter, n + 2 quarter and n + 3 quarter. Frame and seed, whole numbers
+    Counter n is used for the pixels n, n + quarter, n + 2 quarter and n + 3 quarter. Frame and seed, integers
     from 0 to 2^64 - 1, are the counter's upper half, and the key.
     """
     counter = np.zeros((4, quarter), np.uint32)
@@ -74,10 +74,10 @@ def normals(quarter: int, frame: int, seed: int) -> Doubles:
 
 
 def noise(signal: Doubles, normal: Doubles, read: float, grain: float) -> Doubles:
-    """Return what noise adds to a signal, counts above dark, by standard normal numbers.
+    """Return the noise added to a signal, counts above dark, for standard normal numbers.
 
     ``read`` is the standard deviation of the read noise, counts; ``grain`` the counts of one electron, 0 for
-    no shot noise. Where the signal is negative, there is no shot noise.
+    no shot noise. A negative signal has no shot noise.
     """
     shot = np.maximum(signal, 0) * grain
     variance = read**2 + shot
@@ -91,8 +91,8 @@ def expose(light: Array, offset: Array, span: Array, frame: int, seed: int, read
            top: float, counts: Array) -> None:  # fmt: skip
     """Write the counts of one frame.
 
-    ``light`` is 0 to 1, ``offset`` the counts without light, and ``span`` how many more there are in full
-    light; (P,), P a multiple of four. Integer types are rounded, half to even, and clipped to 0 ... ``top``.
+    ``light`` is 0 to 1, ``offset`` the counts without light, and ``span`` the increase in full light; (P,), P
+    a multiple of four. Integer types are rounded, half to even, and clipped to 0 ... ``top``.
     """
     signal = span.astype(np.float64) * light
     exact = offset + signal + noise(signal, normals(len(light) // 4, frame, seed), read, grain)

@@ -1,6 +1,6 @@
 // Slopes from normals that are seen along z, and their weights. Specification: facing.py.
 //
-// TILE     pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
+// TILE     pixels of one work-item: 1 on a GPU, many on a CPU
 
 #pragma OPENCL FP_CONTRACT OFF
 #include "common.clh"

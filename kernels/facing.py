@@ -1,4 +1,4 @@
-"""Slopes from normals that are seen along z, and their weights: what ``facing.cl`` computes, in NumPy.
+"""Slopes from normals that are seen along z, and their weights: ``facing.cl`` in NumPy.
 
 `mirrorskin.engine.integration.camera.find_slopes` explains them.
 """

@@ -1,6 +1,6 @@
 // The contrast around each pixel, and its peak over the frames. Specification: focus.py.
 //
-// TILE     pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
+// TILE     pixels of one work-item: 1 on a GPU, many on a CPU
 // FRAME    type of a sample
 
 #pragma OPENCL FP_CONTRACT OFF
@@ -17,7 +17,7 @@ __kernel void focus_scan(
             const int row = p / columns, column = p % columns;
             const int top = max(row - radius, 0), bottom = min(row + radius, rows - 1);
             const int left = max(column - radius, 0), right = min(column + radius, columns - 1);
-            const float middle = frame[p];  // of differences, the squares lose nothing
+            const float middle = frame[p];  // squares of differences from it lose no digits
             float sum = 0, square = 0;
             for (int y = top; y <= bottom; ++y)
                 for (int x = left; x <= right; ++x) {
@@ -52,10 +52,10 @@ __kernel void focus_scan(
 
 #define SIGNAL(k) (peak[(k) * plane + p] - noisy)
 
-// One over the variance of the signal's logarithm for noise of variance 1, of a non-central chi-square.
+// Inverse variance of the signal's logarithm for noise of variance 1, from a non-central chi-square.
 #define WEIGHT(signal) ((signal) > 0 ? (signal) * ((signal) / (2 * noisy + 4 * (signal))) : 0)
 
-// One of the points of the fit; within a loop over k.
+// One of the points of the fit; used in a loop over k.
 #define POINT                                                                     \
     const float signal = SIGNAL(k), weight = WEIGHT(signal), place = at[k];       \
     if (!(weight > 0)) continue;
@@ -75,7 +75,7 @@ __kernel void focus_fit(
         const float freedom = high * wide - 1, noisy = freedom * variance, top = SIGNAL(reach);
         MAP at = places + sharpest * (2 * reach + 1);
 
-        // Polynomials that are orthogonal over the places, and their sums with the logarithms.
+        // Polynomials that are orthogonal over the positions, and their sums with the logarithms.
         float total = 0, mean = 0, norm = 0, skew = 0, bent = 0, level = 0, along = 0, across = 0;
         int points = 0;
         for (int k = 0; k <= 2 * reach; ++k) {

@@ -1,4 +1,4 @@
-"""The contrast around each pixel, and its peak over the frames: what ``focus.cl`` computes, in NumPy."""
+"""The contrast around each pixel, and its peak over the frames: ``focus.cl`` in NumPy."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Array = NDArray[Any]
 
 def focus_scan(frames: Array, first: int, radius: int, reach: int, best: Array, peak: Array,
                recent: Array) -> None:  # fmt: skip
-    """Go through a block of frames; the maps are the state, changed in place.
+    """Process a block of frames; the maps are the state, updated in place.
 
     Parameters
     ----------

@@ -1,12 +1,12 @@
 // Least squares of brightness over the directions of the light, frame by frame. Specification: lambert.py.
 //
-// TILE     pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
+// TILE     pixels of one work-item: 1 on a GPU, many on a CPU
 // FRAME    type of a sample
 
 #pragma OPENCL FP_CONTRACT OFF
 #include "common.clh"
 
-// Turns the pair (a, x) so that x becomes 0; ALONG turns another pair in the same way (Givens).
+// Rotates the pair (a, x) so that x becomes 0; ALONG rotates another pair in the same way (Givens).
 #define TURN(a, x)                                                                          \
     do {                                                                                    \
         const float square = (a) * (a) + (x) * (x), inverse = inverse_root(square);         \
@@ -63,7 +63,7 @@ __kernel void lambert_normals(
     for (int p = low; p < end; ++p) {
         const float r00 = R(0), r01 = R(1), r02 = R(2), r11 = R(4), r12 = R(5), r22 = R(7), freedom = R(10) - 3;
         const float size = sqrt(r00 * r00 + r01 * r01 + r02 * r02 + r11 * r11 + r12 * r12 + r22 * r22);
-        // The triangle's inverse, whose product with its transpose is the covariance for noise 1.
+        // The inverse of the triangle, whose product with its transpose is the covariance for noise 1.
         const float a = 1 / r00, d = 1 / r11, f = 1 / r22, b = -r01 * a * d, e = -r12 * d * f;
         const float c = -(r01 * e + r02 * f) * a;
         float x = a * R(3) + b * R(6) + c * R(8), y = d * R(6) + e * R(8), z = f * R(8);

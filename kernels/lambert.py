@@ -1,8 +1,8 @@
-"""Least squares of brightness over the directions of the light: what ``lambert.cl`` computes, in NumPy.
+"""Least squares of brightness over the directions of the light: ``lambert.cl`` in NumPy.
 
-The samples E_k of a pixel that are neither dark nor saturated, and the lamps' vectors l_k, are the rows
-(l_k, E_k) of a matrix. The triangle R of its QR decomposition (Golub and Van Loan, Matrix Computations,
-section 5.3) holds all that least squares needs, loses nothing by cancellation, and takes in further rows by
+The samples E_k of a pixel that are neither dark nor saturated, and the lamps' vectors l_k, are the rows (l_k,
+E_k) of a matrix. The triangle R of its QR decomposition (Golub and Van Loan, Matrix Computations, section
+5.3) is sufficient for least squares, loses nothing by cancellation, and is updated with further rows by
 rotations.
 """
 
@@ -23,7 +23,7 @@ _PLACES = np.triu_indices(4)
 
 def lambert_add(frames: Array, lights: Array, fresh: bool, darks: Array, shadow: float, bright: float,
                 triangle: Array) -> None:  # fmt: skip
-    """Take in frames, or begin anew where ``fresh``; the triangle is changed in place.
+    """Add frames, or start anew if ``fresh``; the triangle is updated in place.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def lambert_add(frames: Array, lights: Array, fresh: bool, darks: Array, shadow:
 
 def lambert_normals(triangle: Array, normals: Array, normals_spread: Array, albedo: Array,
                     albedo_spread: Array, residual: Array, samples: Array) -> None:  # fmt: skip
-    """Solve the fits that triangles, (11, P), hold.
+    """Solve the fits represented by triangles, (11, P).
 
     Parameters
     ----------

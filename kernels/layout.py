@@ -1,4 +1,4 @@
-"""How a kernel's work is cut: long loops for the cores of a CPU, or small items for the lanes of a GPU."""
+"""The division of a kernel's work: long loops for the cores of a CPU, small items for the lanes of a GPU."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How much one work-item does; all but the group are macros of the kernels.
+    """The size of a work-item; all but the group are macros of the kernels.
 
     Attributes
     ----------

@@ -1,16 +1,16 @@
-// What memory and arithmetic can give: the least that any kernel does. Specification: limits.py.
+// Limits of memory and arithmetic: minimal kernels. Specification: limits.py.
 //
 // LANES   4-byte numbers of a word, which is one load: 4 or 16
 // WORDS   words of one work-item
-// STRIDE  work-items that lie side by side: 1 where an item is a core's loop and reads on without a gap; a
-//         work-group where an item is a lane, so that neighbours read neighbouring words
+// STRIDE  distance between the words of a work-item: 1 on a CPU, where an item reads contiguously; the size of a
+//         work-group on a GPU, where adjacent items read adjacent words
 
 #include "common.clh"
 
 typedef JOIN(uint, LANES) WORD;
 typedef JOIN(float, LANES) NUMBERS;
 
-// An item's words are this one and each STRIDE-th after it.
+// An item's words are this one and every STRIDE-th after it.
 long first_word(void)
 {
     const long item = get_global_id(0);
@@ -22,7 +22,7 @@ __kernel void read_all(__global const WORD *restrict words, const int count, __g
     const long first = first_word();
     if (first >= count) return;
     const long end = min((long)count, first + STRIDE * WORDS);
-    // Independent sums, or each addition would wait for the one before it.
+    // Independent sums, so that additions do not wait for each other.
     WORD a = 0, b = 0, c = 0, d = 0;
     long i = first;
     for (; i + 3 * STRIDE < end; i += 4 * STRIDE) {
@@ -49,7 +49,7 @@ __kernel void triad_all(__global WORD *words, const int count, const uint scale)
     for (long i = first; i < end; i += STRIDE) words[2L * count + i] = words[i] + scale * words[count + i];
 }
 
-// WORDS is 8 here: as many sums that do not wait for each other.
+// WORDS is 8 here: as many independent sums.
 __kernel void multiply_all(
     __global NUMBERS *restrict numbers, const int count, const int steps, const float factor, const float summand)
 {

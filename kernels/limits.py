@@ -1,4 +1,4 @@
-"""What memory and arithmetic can give: what ``limits.cl`` computes, in plain NumPy."""
+"""Limits of memory and arithmetic: ``limits.cl`` in plain NumPy."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Array = NDArray[Any]
 
 
 def read_all(words: Array, each: int, stride: int) -> Array:
-    """Read all words, (n, lanes), once; return a sum modulo 2^32 of each item, so that none can be left out.
+    """Read all words, (n, lanes), once; return a sum modulo 2^32 for each item, so that all are needed.
 
     An item reads ``each`` words, every ``stride``-th of a block of ``stride * each``.
     """
@@ -32,9 +32,9 @@ def triad_all(words: Array, count: int, scale: int) -> None:
 
 
 def multiply_all(numbers: Array, stride: int, steps: int, factor: float, summand: float) -> None:
-    """Multiply and add so many times, in place, as eight independent chains an item.
+    """Multiply and add a number of times, in place, as eight independent chains per item.
 
-    What does not fill an item's eight words, every ``stride``-th one, is left alone.
+    Words that do not fill an item's eight, every ``stride``-th one, are unchanged.
     """
     first = np.arange(len(numbers)) // (8 * stride) * 8 * stride + np.arange(len(numbers)) % stride
     whole = first + 7 * stride < len(numbers)

@@ -1,14 +1,14 @@
 // The pixels' graph from slopes. Specification: links.py.
 //
-// TILE     pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
-// MASK     1 where a mask is given
-// WEIGHTS  of the slopes: 0 the same everywhere, 1 a map, 2 a map for x and one for y, 3 maps of the links' own
-// HEIGHTS  0 none known, 1 known with the same weight everywhere, 2 with a map of weights
-// KEEP     1 where the weights are to be written
+// TILE     pixels of one work-item: 1 on a GPU, many on a CPU
+// MASK     1 if a mask is given
+// WEIGHTS  weights of the slopes: 0 uniform, 1 a map, 2 a map for x and one for y, 3 maps for the links themselves
+// HEIGHTS  known heights: 0 none, 1 with uniform weight, 2 with a map of weights
+// KEEP     1 if the weights are output
 //
-// Arguments that are not given are left out: tests for null pointers made these loops 30 times slower. An item
-// has a piece of a row, or of ROWS of them. PoCL makes vector code of loops without branches and calls; what
-// would read outside the maps is done beside them.
+// Optional arguments are left out: tests for null pointers made these loops 30 times slower. An item processes a
+// piece of a row, or of ROWS rows. PoCL vectorises loops without branches and calls; pixels at the border of the
+// maps are processed separately.
 
 #pragma OPENCL FP_CONTRACT OFF
 #include "common.clh"
@@ -74,7 +74,7 @@
 #define IS_KNOWN(p) (FINITE(heights[p]) & (height_weights[p] > 0.0f))
 #endif
 
-// Begins a loop's item: columns begin to end of the rows top to bottom.
+// Starts a loop of an item: columns begin to end of the rows top to bottom.
 #define PIECE(rows_of_it)                                                                              \
     const int across_all = (columns + CHUNK - 1) / CHUNK, item = get_global_id(0);                     \
     const int top = item / across_all * rows_of_it, bottom = LESSER(rows, top + rows_of_it);           \
@@ -92,7 +92,7 @@ float harmonic(const float a, const float b)
 #define KNOWN_FLAG(p) 0
 #endif
 
-// What a pixel is by itself: with RIGHT and DOWN where its slopes count along these links.
+// State of a pixel alone: RIGHT and DOWN if its slopes count along these links.
 #define CLASSIFY(p, state) {                                                                               \
     const int real = FINITE(dz_dx[p]) & FINITE(dz_dy[p]);                                              \
     const int x = WANTED(p) & X_COUNTS(p), y = WANTED(p) & Y_COUNTS(p);                                \
@@ -126,7 +126,7 @@ __kernel void links_flags(
 
 #define UNLIKE(a, b) ((dz_dx[a] - dz_dx[b]) * (dz_dx[a] - dz_dx[b]) + (dz_dy[a] - dz_dy[b]) * (dz_dy[a] - dz_dy[b]))
 
-// The neighbour to which a pixel on an edge keeps its link: the one off the edge that is most like it; else -1.
+// The neighbour to which a pixel on an edge keeps its link: the most similar one off the edge, otherwise -1.
 int kept(
     const int p, const int row, const int column, const int columns, __global const float *dz_dx,
     __global const float *dz_dy, __global const uchar *edges, __global const uchar *flags)
@@ -171,8 +171,8 @@ __kernel void links_cut(
     }
 }
 
-// Slope of the link from here to next: of four pixels in line where links lead through all of them (bit is 0 where
-// there are not as many), else the mean of two.
+// Slope of the link from here to next: from four pixels in line if links connect all of them (bit is 0
+// otherwise), else the mean of two.
 float link_slope(
     __global const float *slope, __global const uchar *flags, const int before, const int here, const int next,
     const int after, const int bit)
@@ -182,7 +182,8 @@ float link_slope(
     return (flags[before] & flags[here] & flags[next] & bit) ? four : 0.5f * near;
 }
 
-// A link's weight times its required rise. It is computed everywhere and chosen afterwards: no branch, no call.
+// A link's weight times its required rise. It is computed everywhere and selected afterwards, without
+// branches and calls.
 float required(const int linked, const float weight, const float size, const float slope, const float plane)
 {
     const float all = weight * (size * (slope - plane));
@@ -200,7 +201,7 @@ float chosen(const int linked, const float value)
     required(flags[p] & RIGHT, X_WEIGHT(p, (p) + 1), size_x, X_SLOPE(p, before, bit), plane_x)
 #define Y_RISE(p) required(flags[p] & DOWN, Y_WEIGHT(p, (p) + next), -size_y, Y_SLOPE(p), plane_y)
 
-// Where a row's neighbours are, and whether links downwards have pixels in line with them.
+// Offsets of a row's neighbours, and whether links downwards have pixels in line with them.
 #define NEIGHBOURS(row)                                                                                \
     const int before = (row) > 0 ? columns : 0, next = (row) + 1 < rows ? columns : 0;                 \
     const int after = (row) + 2 < rows ? 2 * columns : next, line = (row) > 0 ? DOWN : 0;
@@ -222,7 +223,7 @@ float chosen(const int linked, const float value)
 #define KEPT_MAPS
 #endif
 
-// Of several right sides with the same links, one below the other, that in a place.
+// Of several right-hand sides with the same links, stored one below the other, the current one.
 __kernel void links_join(GRAPH, KEPT_MAPS OUT source, const int place)
 {
     PIECE(ROWS)
@@ -282,7 +283,7 @@ float square(const int linked, const float weight, const float left)
     return linked ? all : 0.0f;
 }
 
-// Sums of an item each, or of a group: squares of what is left over, times their weights.
+// Sums per item or per group: squared residuals times their weights.
 __kernel GROUP_SIZE void links_misfit(GRAPH, MAP reliefs, const int place, OUT sums)
 {
     PIECE(ROWS)

@@ -1,11 +1,11 @@
-"""The pixels' graph from slopes: what ``links.cl`` computes, in plain NumPy with float64 inside.
+"""The pixels' graph from slopes: ``links.cl`` in plain NumPy with float64.
 
-Heights u are sought that minimise, over the links from pixel i to its neighbour j on the right or below, ::
+The heights u minimise, over the links from pixel i to its neighbour j on the right or below, ::
 
     sum of w (u_j - u_i - d)^2  +  sum of a (u_i - k_i)^2
 
-with d = pixel size x slope of the link, k the known heights. Its normal equations are A u = b; b is summed
-per link, so that it is 0 in all on every connected component without a known height.
+with d = pixel size x slope of the link, k the known heights. The normal equations are A u = b; b is summed
+per link, so its sum is 0 on every connected component without a known height.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ Flags = NDArray[np.uint8]
 Triple = tuple[float, float, float]
 
 RIGHT, DOWN = 1, 2
-"""Flags of a pixel: it is linked to the one on the right, to the one below."""
+"""Flags of a pixel: it is linked to the right, or down."""
 SLOPE, KNOWN = 4, 8
-"""Its slopes count; its height is known."""
+"""Its slopes are valid; its height is known."""
 LOST = 16
-"""It was wanted, but its slopes are no numbers."""
+"""It was requested, but its slopes are NaN."""
 
 
 def links_flags(dz_dx: Array, dz_dy: Array, mask: Array | None, weight_x: Array | None,
                 weight_y: Array | None, heights: Array | None,
                 height_weights: Array | None) -> Flags:  # fmt: skip
-    """Return what the pixels are and which are linked, (H, W), a sum of the flags above.
+    """Return flags of the pixels, including their links, (H, W), a sum of the flags above.
 
-    Neighbours are linked where the slopes of both count along the link. Slopes and known heights are not
-    finite where there is none, weights and the mask are 0; all but the slopes may be None: for the same
-    everywhere, or ``weight_y`` for that it is ``weight_x``.
+    Neighbours are linked if the slopes of both count along the link. Missing slopes and known heights are not
+    finite, missing weights and the mask are 0; all but the slopes may be None: for uniform weights, or
+    ``weight_y`` if it equals ``weight_x``.
     """
     wanted = np.ones(dz_dx.shape, bool) if mask is None else mask != 0
     along_x = wanted if weight_x is None else wanted & (weight_x > 0)
@@ -57,9 +57,9 @@ def links_flags(dz_dx: Array, dz_dy: Array, mask: Array | None, weight_x: Array 
 
 
 def links_cut(dz_dx: Array, dz_dy: Array, edges: Array, flags: Flags) -> Flags:
-    """Return the flags without the links that lead across edges.
+    """Return the flags without the links across edges.
 
-    A pixel on an edge keeps one link, to that neighbour off the edge whose slopes are the most similar; among
+    A pixel on an edge keeps one link, to the neighbour off the edge with the most similar slopes; among
     equals to the one on the right, on the left, below, above, in this order.
     """
     cut, marked = flags.copy(), edges != 0
@@ -74,7 +74,7 @@ def links_cut(dz_dx: Array, dz_dy: Array, edges: Array, flags: Flags) -> Flags:
 def _links_of(
     row: int, column: int, shape: tuple[int, ...]
 ) -> dict[tuple[int, int], tuple[tuple[int, int], int]]:
-    """Return the four neighbours in the picture, with the pixel and flag that say whether there is a link."""
+    """Return the four neighbours in the picture, with the pixel and flag of the link."""
     links = {
         (row, column + 1): ((row, column), RIGHT),
         (row, column - 1): ((row, column - 1), RIGHT),
@@ -89,7 +89,7 @@ def _links_of(
 def _most_alike(
     dz_dx: Array, dz_dy: Array, marked: Mask, flags: Flags, row: int, column: int
 ) -> tuple[int, int] | None:
-    """Return the linked neighbour off the edge whose slopes are nearest to a pixel's."""
+    """Return the linked neighbour off the edge with the most similar slopes."""
     best, least = None, np.inf
     for there, (owner, bit) in _links_of(row, column, flags.shape).items():
         far = math.hypot(*(float(s[there]) - float(s[row, column]) for s in (dz_dx, dz_dy)))
@@ -104,8 +104,8 @@ def links_join(dz_dx: Array, dz_dy: Array, flags: Flags, weight_x: Array | None,
                owned: bool = False) -> tuple[Doubles, Doubles, Doubles, Doubles]:  # fmt: skip
     """Return right, down, anchor and source of `mirrorskin.engine.integration.graph.Links`, (H, W) each.
 
-    The slope of a link is (-s[-1] + 13 s[0] + 13 s[1] - s[2]) / 24 of four pixels in line, where links lead
-    through all of them, else the mean of two; its weight is the harmonic mean of two pixels' weights.
+    The slope of a link is (-s[-1] + 13 s[0] + 13 s[1] - s[2]) / 24 of four pixels in line if links connect
+    all of them, otherwise the mean of two; its weight is the harmonic mean of two pixels' weights.
 
     Parameters
     ----------
@@ -137,9 +137,9 @@ def links_misfit(dz_dx: Array, dz_dy: Array, flags: Flags, weight_x: Array | Non
                  heights: Array | None, height_weights: Array | None, weights: Triple,
                  size: tuple[float, float], plane: Triple, relief: Array, *,
                  owned: bool = False) -> float:  # fmt: skip
-    """Return the sum that heights are to make least, of ``relief``, (H, W), the heights above the plane.
+    """Return the sum that the heights minimise, for ``relief``, (H, W), the heights above the plane.
 
-    The other parameters are those of ``links_join``. The kernel returns a sum of each of its items.
+    The other parameters are those of ``links_join``. The kernel returns a sum for each of its items.
     """
     (right, across), (down, along) = _steps(
         dz_dx, dz_dy, flags, weight_x, weight_y, weights, size, plane, owned
@@ -157,7 +157,7 @@ def links_misfit(dz_dx: Array, dz_dy: Array, flags: Flags, weight_x: Array | Non
 def _steps(dz_dx: Array, dz_dy: Array, flags: Flags, weight_x: Array | None, weight_y: Array | None,
            weights: Triple, size: tuple[float, float], plane: Triple,
            owned: bool) -> tuple[tuple[Doubles, Doubles], tuple[Doubles, Doubles]]:  # fmt: skip
-    """Return the weight of each link and the height that it should lead up; to the right, and down."""
+    """Return the weight of each link and its rise; to the right, and down."""
     map_x = np.ones(flags.shape) if weight_x is None else weight_x.astype(np.float64)
     map_y = map_x if weight_y is None else weight_y.astype(np.float64)
     right, down = flags & RIGHT != 0, flags & DOWN != 0
@@ -170,7 +170,7 @@ def _steps(dz_dx: Array, dz_dy: Array, flags: Flags, weight_x: Array | None, wei
 
 
 def link_slopes(slope: Array, linked: Mask) -> Doubles:
-    """Return the slopes of the links to the next column: of four pixels in line, or at the ends of two."""
+    """Return the slopes of the links to the next column: from four pixels in line, at the ends from two."""
     ends = linked | np.roll(linked, 1, axis=1)
     known, found = np.where(ends, slope, 0.0).astype(np.float64), np.zeros(slope.shape)
     found[:, :-1] = (known[:, :-1] + known[:, 1:]) / 2
@@ -190,7 +190,7 @@ def _harmonic(weight: Doubles) -> Doubles:
 
 def _anchors(flags: Flags, heights: Array | None, height_weights: Array | None, weights: Triple,
              size: tuple[float, float], plane: Triple) -> tuple[Doubles, Doubles]:  # fmt: skip
-    """Return the weight of each known height, and how high it is above the plane."""
+    """Return the weight of each known height, and its height above the plane."""
     known = flags & KNOWN != 0
     row, column = np.indices(flags.shape)
     level = plane[2] + plane[0] * size[0] * column - plane[1] * size[1] * row

@@ -34,7 +34,7 @@ class Mapping:
         after: Sequence[cl.Event] = (),
     ) -> None:
         """Map a part of a buffer, which starts at an offset in bytes, once some events are over."""
-        self._maps: list[cl.MemoryMap] = []  # none after the release
+        self._maps: list[cl.MemoryMap] = []  # empty after the release
         view, _ = cl.enqueue_map_buffer(
             queue, buffer, flags, offset, shape, dtype, wait_for=after, is_blocking=True
         )

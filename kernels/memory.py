@@ -1,4 +1,4 @@
-"""Host memory that is kept from call to call, since pages that were used before cost nothing to use again."""
+"""Host memory that is cached between calls, because pages that were used before need not be mapped again."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 KEPT = 2**29
-"""Bytes that are kept at most while nobody uses them."""
+"""Maximum number of unused bytes that are cached."""
 
 PAGE = 4096
-"""Bytes of the smallest pages that there are."""
+"""Size of the smallest pages, bytes."""
 
-_LEAST = 2**16  # bytes, below which memory is not worth keeping
+_LEAST = 2**16  # bytes, below which memory is not cached
 
 _lock = threading.Lock()
-_kept: list[NDArray[np.uint8]] = []  # what was given back the longest ago comes first
-_given_back: deque[NDArray[np.uint8]] = deque()  # and not yet among those kept: a finalizer waits for no lock
+_kept: list[NDArray[np.uint8]] = []  # least recently used first
+# not yet in the cache, because a finalizer must not wait for a lock
+_given_back: deque[NDArray[np.uint8]] = deque()
 
 
 class _Block:
-    """Memory from its first page on, as NumPy takes it; given back when the last array in it dies."""
+    """Page-aligned memory for NumPy; returned to the cache when its last array is deleted."""
 
     def __init__(self, raw: NDArray[np.uint8]) -> None:
         self._raw = raw
@@ -35,9 +36,9 @@ class _Block:
 
 
 def take(nbytes: int, zeroed: bool) -> NDArray[np.uint8]:
-    """Return memory that starts on a page, so that a device sharing it need not copy.
+    """Return page-aligned memory, so that a device sharing it need not copy.
 
-    It holds zeros, or anything. MemoryError: there is none.
+    It contains zeros, or is not initialised. MemoryError if there is none.
     """
     if nbytes < _LEAST:
         small = np.zeros(nbytes + PAGE, np.uint8)
@@ -57,15 +58,15 @@ def take(nbytes: int, zeroed: bool) -> NDArray[np.uint8]:
 
 
 def free() -> None:
-    """Give the memory that nobody uses back to the system."""
+    """Return unused memory to the system."""
     _tidy()
     with _lock:
         _kept.clear()
 
 
 def _tidy() -> None:
-    """Keep what was given back, and let go of what was not used for the longest time."""
-    while _given_back and _lock.acquire(blocking=False):  # who holds the lock comes here next
+    """Cache returned memory, and release the least recently used."""
+    while _given_back and _lock.acquire(blocking=False):  # the holder of the lock comes here next
         try:
             while _given_back:
                 _kept.append(_given_back.popleft())

@@ -1,23 +1,23 @@
 // Heights on a graph of pixels, by multigrid. Specification: multigrid.py.
 //
 // TILE       nodes of one work-item, a multiple of WIDTH, in passes over one level
-// WIDTH      nodes side by side in a vector: 8, or 1 where an item is a lane
-// ROWS       of a tile of nodes that a work-group takes in the passes that do half a cycle, and its COLUMNS
+// WIDTH      nodes in a vector: 8 on a CPU, 1 on a GPU
+// ROWS       rows of a tile of nodes that a work-group processes in half a cycle; COLUMNS, its columns
 // PART       nodes of one part of a sum
-// LINKS      of a node: 4, or 8 on coarse levels whose aggregates are not all blocks of two by two
-// ANCHORED   1 where there are known heights, 0 where there are none
-// GROUP      work-items of the group that does all small levels, 1 where an item is a core's loop
-// STEPS      of Jacobi's method in half a cycle over a level with launches of its own: 3 or 4
-// NEAR_NODES nodes whose heights the group that does all small levels keeps in local memory; 0 if in global memory
-// ROUNDS     in which parts of blocks move to another aggregate; even
-// COARSEST   nodes of the coarsest level at most, which is solved by the inverse of its matrix
-// SUMS       work-items of a group that adds up one part together, 1 where an item does
-// LANES      right sides that are solved for at once, 1, 4, 8 or 16: a node's value is a vector of them; WIDTH is 1 then
+// LINKS      links of a node: 4, or 8 on coarse levels whose aggregates are not all blocks of two by two
+// ANCHORED   1 if there are known heights, otherwise 0
+// GROUP      work-items of the group that processes all small levels, 1 on a CPU
+// STEPS      Jacobi steps in half a cycle on a level with launches of its own: 3 or 4
+// NEAR_NODES nodes whose heights the group of the small levels keeps in local memory; 0 if in global memory
+// ROUNDS     rounds in which parts of blocks move to another aggregate; even
+// COARSEST   maximum number of nodes of the coarsest level, which is solved by the inverse of its matrix
+// SUMS       work-items of a group that reduces one part, 1 if each item does so alone
+// LANES      right-hand sides solved at once, 1, 4, 8 or 16: a node's value is a vector of them; WIDTH is then 1
 //
-// All levels lie one after the other in the same arrays. A level begins at `base` with a row of nodes that are
-// none, then come its rows of `stride` nodes, a multiple of 16, then another row of none: so every node has
-// neighbours in memory, and where there is no link its weight is 0. A node's links lead to the right and down,
-// and where there are 8 along both diagonals downwards: `falling` to the right, `rising` to the left.
+// All levels are stored in the same arrays, one after the other. A level starts at `base` with a row of padding, then
+// its rows of `stride` nodes, a multiple of 16, then another row of padding. So every node has neighbours in memory;
+// the weight of a missing link is 0. A node's links lead to the right and down, and if there are 8 also along both
+// diagonals downwards: `falling` to the right, `rising` to the left.
 
 #include "common.clh"
 
@@ -27,9 +27,9 @@ typedef float value;
 typedef JOIN(float, LANES) value;
 #endif
 #if WIDTH == 8
-typedef float8 reals, values;  // of links, and of what nodes have
+typedef float8 reals, values;  // of links, and of the values of nodes
 typedef int8 ints;
-typedef float8 __attribute__((aligned(4))) loose;  // somewhere in memory
+typedef float8 __attribute__((aligned(4))) loose;  // unaligned
 typedef float4 __attribute__((aligned(4))) half_loose;
 #define AT(p) (*(__global const loose *)(p))
 #define NEAR(p) (*(__local const loose *)(p))
@@ -74,7 +74,7 @@ typedef int ints;
 #define INLINE static inline __attribute__((always_inline))
 #define BETWEEN base, rows, stride, coarse_base, coarse_rows, coarse_stride
 
-// Nodes from `begin` to `end`, which an item takes of a level.
+// The nodes of a level from `begin` to `end` that an item processes.
 #define ITEMS_NODES                                                                                        \
     const int begin = base + stride + (int)get_global_id(0) * TILE;                                        \
     const int end = LESSER(begin + TILE, base + stride * (rows + 1));
@@ -86,8 +86,9 @@ typedef int ints;
 #define WITH_ANCHOR(value)
 #endif
 
-// The links of nodes i, their sum with the anchor, what flows to nodes along them, -A x, and what is around nodes, by
-// weight. READ gives heights at p, in rows of s. Flow is found from differences, so that float32 heights are enough.
+// For nodes i: their links, the sum of the links and the anchor, the flow along the links, -A x, and the
+// weighted sum of the neighbours. READ returns heights at p, in rows of s. The flow is computed from
+// differences, for which float32 heights suffice.
 #define AXES                                                                                               \
     const reals to_right = AT(right + i), to_left = AT(right + i - 1);                                     \
     const reals to_below = AT(down + i), to_above = AT(down + i - stride);
@@ -121,12 +122,12 @@ typedef int ints;
 
 // --- Levels -----------------------------------------------------------------------------------------------------
 //
-// A coarse node stands for an aggregate of fine ones: as a rule for a block of two by two. Where the nodes of a block do
-// not hang together by strong links, as on either side of a cut, those beside its largest part go to the aggregate
-// of that neighbouring block to which their strongest link leads: `to` has 0 of a node that stays, else 1 + 3 (down + 1) +
-// (right + 1). Parts that have no link to another block's largest part stay.
+// A coarse node represents an aggregate of fine ones, usually a block of two by two. If strong links do not connect all
+// nodes of a block, as along a cut, the nodes outside its largest part join the aggregate of the neighbouring block to
+// which their strongest link leads: `to` is 0 for a node that stays, otherwise 1 + 3 (down + 1) + (right + 1). Parts
+// without a link to another block's largest part stay.
 
-// Items take pieces of rows, in turn where one group does all.
+// Items process pieces of rows, in turn if one group does all.
 #define PIECES ((stride / 2 + TILE - 1) / TILE)
 #define EACH_PIECE for (int piece = get_global_id(0); piece < coarse_rows * PIECES; piece += (int)get_global_size(0))
 #define OF_PIECE                                                                                           \
@@ -137,7 +138,7 @@ typedef int ints;
          C += WIDTH, J += WIDTH, I += 2 * WIDTH, K += 2 * WIDTH)
 #define EACH_COARSE_NODE for (int C = from, J = coarse_first + from; C < upto; ++C, ++J)
 
-// The weight of the link that leads from node i so many rows down and columns right.
+// The weight of the link from node i to a node some rows down and columns to the right.
 float link_of(const int i, const int stride, const int down_by, const int right_by, GRAPH_ARGS)
 {
 #if LINKS == 8
@@ -147,7 +148,7 @@ float link_of(const int i, const int stride, const int down_by, const int right_
     return down_by ? right_by ? 0 : down[down_by > 0 ? i : i - stride] : right[right_by > 0 ? i : i - 1];
 }
 
-// A link is strong if it has a share of the geometric mean of its nodes' greatest ones along its axis.
+// A link is strong if it has a share of the geometric mean of its nodes' largest links along its axis.
 #define STRONG(w, g, h) (((w) > 0) & ((w) * (w) >= strength * strength * (g) * (h)))
 #define ALONG_X(PICK, i) GREATER(PICK(right + (i)), PICK(right + (i) - 1))
 #define ALONG_Y(PICK, i) GREATER(PICK(down + (i)), PICK(down + (i) - stride))
@@ -158,7 +159,8 @@ float link_of(const int i, const int stride, const int down_by, const int right_
      | BIT((part & 8) != 0, join_d))
 #define LARGER(part) main = SIZE(part) > SIZE(main) ? part : main;
 
-// Of each block's nodes a, b and below them c, d, by bits: the largest part, and, 4 bits on, those that have links.
+// For each block with nodes a, b and below them c, d, by bits: the largest part, and, shifted by 4 bits, the
+// nodes with links.
 #define PARTS_ARGS                                                                                         \
     LEVEL_ARGS, COARSE_ARGS, const float strength, GRAPH_ARGS, __global uchar *restrict parts,             \
     __global int *restrict touched, const int level, __global int *restrict splits
@@ -203,17 +205,17 @@ INLINE void find_parts(PARTS_ARGS)
 }
 __kernel void multigrid_parts(PARTS_ARGS) { find_parts(BETWEEN, strength, GRAPH, parts, touched, level, splits); }
 
-// Rows and columns from a node's block to the aggregate that it belongs to.
+// Rows and columns from a node's block to its aggregate.
 #define WENT_DOWN(i) (to[i] ? (to[i] - 1) / 3 - 1 : 0)
 #define WENT_RIGHT(i) (to[i] ? (to[i] - 1) % 3 - 1 : 0)
 
-// The nodes of a block whose first is I, from 0 to 3.
+// Number of a node in the block that starts at I, from 0 to 3.
 #define NODE(k) (I + (k) / 2 * stride + (k) % 2)
 
-// To which aggregates parts go that are not their block's largest. In each round, a part without a place takes that next to its
-// block to which its links to nodes with a place lead, unless another of its links would then lead further than to the next
-// aggregate. In the last round, parts of which that has become true stay with their block, and aggregates that are no blocks are
-// marked.
+// Assigns parts that are not the largest of their block to aggregates. In each round, an unassigned part
+// moves to the adjacent aggregate with the strongest links to assigned nodes, unless another of its links
+// would then lead further than to the next aggregate. In the last round, parts for which this has become true
+// stay with their block, and aggregates that are not blocks are marked.
 #define MOVE_ARGS                                                                                          \
     LEVEL_ARGS, COARSE_ARGS, const float strength, GRAPH_ARGS, BYTES parts, const int clear,               \
     const int first_round, const int last_round, BYTES to, __global uchar *restrict places,                \
@@ -228,7 +230,7 @@ INLINE void move_parts(MOVE_ARGS)
             const int I = first + 2 * C;
             for (int rest = (parts[J] >> 4) & ~parts[J]; rest;) {
                 int part = rest & -rest, before = 0;
-                while (part != before) {  // what hangs together with it
+                while (part != before) {  // everything connected to it
                     before = part;
                     for (int k = 0; k < 16; ++k) {
                         const int a = NODE(k / 4), b = NODE(k % 4), y = k % 4 / 2 - k / 8, x = k % 2 - k / 4 % 2;
@@ -242,7 +244,8 @@ INLINE void move_parts(MOVE_ARGS)
                 }
                 rest &= ~part;
                 float sums[9] = {0, 0, 0, 0, 0, 0, 0, 0, 0}, most = 0;
-                int top = -2, bottom = 2, left = -2, right_most = 2, old = 0, target = 0;  // where no link would be too long
+                // the range in which no link would be too long
+                int top = -2, bottom = 2, left = -2, right_most = 2, old = 0, target = 0;
                 for (int k = 0; k < 36; ++k) {
                     const int m = k / 9, y = k % 9 / 3 - 1, x = k % 3 - 1, v = m / 2 + y, u = m % 2 + x;
                     const int inside = v >> 1 == 0 && u >> 1 == 0;
@@ -259,7 +262,8 @@ INLINE void move_parts(MOVE_ARGS)
                     right_most = LESSER(right_most, beside + 1);
                     const int has_place = went || parts[J_there] >> (2 * (v & 1) + (u & 1)) & 1;
                     if (!has_place || inside || below < -1 || below > 1 || beside < -1 || beside > 1) continue;
-                    for (int way = 0; way < 9; ++way) sums[way] += way == 3 * below + beside + 4 ? w : 0;  // in registers
+                    // in registers
+                    for (int way = 0; way < 9; ++way) sums[way] += way == 3 * below + beside + 4 ? w : 0;
                 }
                 for (int way = 0; way < 9; ++way) {
                     const int y = way / 3 - 1, x = way % 3 - 1, is_old = way + 1 == old;
@@ -286,7 +290,8 @@ __kernel void multigrid_move(MOVE_ARGS)
     move_parts(BETWEEN, strength, GRAPH, parts, clear, first_round, last_round, to, places, touched, level, splits, moves);
 }
 
-// Fine nodes i of the aggregate J, whose block is at a row and a column C of the coarse level; from all blocks around.
+// Fine nodes i of the aggregate J, whose block is at row R and column C of the coarse level, from all blocks
+// around it.
 #define BELONGS(i, y, x)                                                                                   \
     (to[i] ? ((y) >> 1) + WENT_DOWN(i) == row && ((x) >> 1) + WENT_RIGHT(i) == C : (y) >> 1 == row && (x) >> 1 == C)
 #define EACH_MEMBER                                                                                        \
@@ -298,8 +303,9 @@ __kernel void multigrid_move(MOVE_ARGS)
      | touched[J] | touched[J + 1] | touched[J + coarse_stride - 1] | touched[J + coarse_stride]           \
      | touched[J + coarse_stride + 1])
 
-// The coarse links and anchors, and a list of the aggregates that are no blocks. A coarse link has half the weight of those that it stands for, since the way between the
-// middles of aggregates is twice as long; links further than to the next aggregate are left out.
+// The coarse links and anchors, and a list of the aggregates that are not blocks. A coarse link has half the
+// summed weight of its fine links, because the centres of aggregates are twice as far apart; links further
+// than to the next aggregate are dropped.
 #define COARSEN_ARGS                                                                                       \
     LEVEL_ARGS, COARSE_ARGS, GRAPH_ARGS, BYTES to, COUNTS touched, const int level, COUNTS moves,          \
     OUT coarse_right, OUT coarse_down, OUT coarse_falling, OUT coarse_rising, OUT coarse_anchor,           \
@@ -361,9 +367,8 @@ __kernel void multigrid_coarsen(COARSEN_ARGS)
     coarsen(BETWEEN, GRAPH, to, touched, level, moves, COARSE_GRAPH, changed, changes);
 }
 
-// A kernel that is called by another is not portable: what both do is in functions.
-//
-// All levels from `from` on, by one group, and one over their diagonals: of blocks alone if `plain` is 1.
+// A kernel called by another kernel is not portable, so the common code is in functions. All levels from
+// `from` on, by one group, and the inverse of their diagonals; for blocks only if `plain` is 1.
 typedef struct {
     int base, rows, stride;
 } Level;
@@ -375,10 +380,10 @@ typedef struct {
 #define OF_COARSE(l) const int coarse_base = levels[l].base, coarse_rows = levels[l].rows, coarse_stride = levels[l].stride;
 #define FENCE barrier(CLK_GLOBAL_MEM_FENCE | CLK_LOCAL_MEM_FENCE);
 
-// The inverse of the coarsest level's matrix, by one group. Elimination only adds, multiplies and divides positive numbers
-// (Grassmann, Taksar and Heyman, Operations Research 33, 1985): the sum of a node's links and anchor is its pivot. The last node
-// of a part without anchors has none left, and is held at 0. With the links u of node k over its pivot d, rows k of the inverse M
-// are u M, and 1 / d + u M u on the diagonal.
+// The inverse of the coarsest level's matrix, by one group. Elimination only adds, multiplies and divides
+// positive numbers (Grassmann, Taksar and Heyman, Operations Research 33, 1985): the sum of a node's links
+// and anchor is its pivot. The last node of a component without anchors has pivot 0, and is held at 0. With u
+// the links of node k over its pivot d, row k of the inverse M is u M, and 1 / d + u M u on the diagonal.
 #define EACH_LATER(j, k) for (int j = (k) + 1 + (int)get_local_id(0); j < nodes; j += (int)get_local_size(0))
 #define NEAR_BARRIER barrier(CLK_LOCAL_MEM_FENCE);
 INLINE void invert_coarsest(
@@ -463,11 +468,12 @@ __kernel GROUP_SIZE void multigrid_build(
 
 // --- Cycles -----------------------------------------------------------------------------------------------------
 
-// Steps of Jacobi's method: Chebyshev's polynomial over the upper half of the spectrum, and one for what sums over blocks leave.
+// Jacobi steps: a Chebyshev polynomial for the upper half of the spectrum, and one step for the remainder of
+// the block sums.
 #define FIRST 1.3896f
 #define SECOND 0.5617f
 #define THIRD 1.0f
-#if STEPS == 4  // where launches count more than arithmetic: for levels gone through once, found by trial
+#if STEPS == 4  // if launches cost more than arithmetic: for levels visited once, found by experiment
 #define LARGE_FIRST 3.2f
 #define LARGE_EXTRA 0.53f
 #define LARGE_SECOND 1.0f
@@ -479,7 +485,7 @@ __kernel GROUP_SIZE void multigrid_build(
 #endif
 #define STEP_BY(omega, READ, p, s) ((1 - (omega)) * READ(p) + (omega) * AT(inverse + i) * (AT(b + i) + AROUND_OF(READ, p, s)))
 
-// What the aggregates of nodes have, and those of fine nodes i, whose blocks are at J: from e in some memory.
+// The values of the aggregates of nodes, for fine nodes i with blocks at J; from e in some memory.
 #if WIDTH == 8
 #define SPREAD(SPACE, J) ((*(SPACE const half_loose *)(e + (J))).s00112233)
 #else
@@ -497,7 +503,7 @@ __kernel GROUP_SIZE void multigrid_build(
     }
 INJECTED(injected, __global)
 
-// The sum of what the members of an aggregate have.
+// The sum of the values of the members of an aggregate.
 #define GATHERED(NAME, SPACE)                                                                              \
     value NAME(const int J, const int base, const int stride, COARSE_ARGS, BYTES to, SPACE const value *had, \
         const int origin)                                                                                  \
@@ -509,8 +515,8 @@ INJECTED(injected, __global)
     }
 GATHERED(gathered, __global)
 
-// A group's tile of a level and SIDE nodes around it, in local memory. Beyond rows there is nothing; what lies beyond columns is
-// of other rows, to which no link leads.
+// A tile of a level with a margin of SIDE nodes, in local memory. Beyond the rows there is nothing; beyond
+// the columns are nodes of other rows, to which no link leads.
 #define AROUND STEPS
 #define SIDE (WIDTH == 8 ? 8 : AROUND)
 #define ACROSS (COLUMNS + 2 * SIDE)
@@ -528,7 +534,7 @@ GATHERED(gathered, __global)
     for (int x = lane * WIDTH - ((more) ? SIDE : 0), i = base + stride * (top + y + 1) + left + x,         \
              p = (y + AROUND) * ACROSS + SIDE + x;                                                         \
          x < wide + ((more) ? SIDE : 0); x += lanes * WIDTH, i += lanes * WIDTH, p += lanes * WIDTH)
-// What follows is done for the nodes of a tile and `more` around it; outside of the level's rows the room is set to 0.
+// Applied to the nodes of a tile with a margin of `more`; memory outside the level's rows is set to 0.
 #define FILL(more, room)                                                                                   \
     EACH_LINE(more) if (top + y < 0 || top + y >= rows) EACH_OF_LINE(more) PUT_NEAR(room + p) = 0;         \
     EACH_LINE(more) if (top + y >= 0 && top + y < rows) EACH_OF_LINE(more)
@@ -547,7 +553,8 @@ GATHERED(gathered, __global)
 #endif
 #define MINE (y >= 0 && y < ROWS && x >= 0 && x < wide)
 
-// One over the diagonal, and which tiles, one for a group, have nodes with links or anchors: all others are left out.
+// The inverse of the diagonal, and the tiles, one per group, that have nodes with links or anchors: all
+// others are skipped.
 __kernel void multigrid_invert(LEVEL_ARGS, GRAPH_ARGS, OUT inverse, const int first_tile, __global uchar *restrict live)
 {
     const int across = (stride + COLUMNS - 1) / COLUMNS, tile = get_group_id(0), top = tile / across * ROWS;
@@ -570,8 +577,8 @@ __kernel void multigrid_invert(LEVEL_ARGS, GRAPH_ARGS, OUT inverse, const int fi
     if (get_local_id(0) == 0) live[first_tile + tile] = any;
 }
 
-// Steps of Jacobi's method, from heights x or from zero, to t; and the sums of the residual over blocks, the coarse right
-// side. The residual itself is written if `keep` is 1.
+// Jacobi steps, from heights x or from zero, to t; and the sums of the residual over blocks, which are the
+// coarse right-hand side. The residual itself is stored if `keep` is 1.
 __kernel void multigrid_descend(
     LEVEL_ARGS, COARSE_ARGS, GRAPH_ARGS, MAP inverse, BYTES live, const int first_tile, VALUES b, const int again, VALUES x_before, OUT_VALUES t, const int keep,
     OUT_VALUES residual, OUT_VALUES coarse_b)
@@ -605,7 +612,7 @@ __kernel void multigrid_descend(
     }
 }
 
-// The coarse right side of aggregates that are no blocks.
+// The coarse right-hand side of aggregates that are not blocks.
 #define SOME GREATER(TILE / 16, 1)
 __kernel void multigrid_gather(LEVEL_ARGS, COARSE_ARGS, BYTES to, COUNTS changed, const int count, VALUES residual, OUT_VALUES coarse_b)
 {
@@ -616,8 +623,8 @@ __kernel void multigrid_gather(LEVEL_ARGS, COARSE_ARGS, BYTES to, COUNTS changed
     }
 }
 
-// What the aggregates have, added to t, and steps of Jacobi's method; the sums over tiles of the heights times
-// the right side.
+// The values of the aggregates, added to t, and Jacobi steps; the sums over tiles of the heights times the
+// right-hand side.
 __kernel void multigrid_ascend(
     LEVEL_ARGS, COARSE_ARGS, GRAPH_ARGS, MAP inverse, BYTES live, const int first_tile, VALUES b, VALUES e, const int moved_nodes, BYTES to, VALUES t,
     OUT_VALUES x_new, OUT_VALUES parts)
@@ -653,9 +660,10 @@ __kernel void multigrid_ascend(
     }
 }
 
-// A cycle over all levels from `from` on, too small for launches of their own, by one group: the answer to b, after what
-// `multigrid_gather` does to it, goes to x. Coarser levels are gone through twice, and the first one if `twice` is 1. The inverse of the last one's matrix is given.
-#if NEAR_NODES > 0  // WIDTH is 1, and pointers to local memory are read as any
+// A cycle over all levels from `from` on that are too small for launches of their own, by one group: the
+// solution for b, after `multigrid_gather`, is stored in x. Coarser levels are visited twice, and the first
+// one if `twice` is 1. The inverse of the last level's matrix is given.
+#if NEAR_NODES > 0  // WIDTH is 1, and pointers to local memory are read like others
 INJECTED(injected_near, __local)
 GATHERED(gathered_near, __local)
 #define INJECTED_AT injected_near
@@ -760,9 +768,9 @@ __kernel GROUP_SIZE void multigrid_tail(
 
 // --- Conjugate gradients ----------------------------------------------------------------------------------------
 //
-// Sums are written in parts, which each group of the next kernel adds up again: no sum goes to the host. Of each cycle, `history` has
-// three numbers of each right side: the product of b and z, the length of the step, and the square of b before it. A length is 0 where
-// one of both products is not positive, or `moving` is 0.
+// Sums are stored in parts, which each group of the next kernel adds up: no sum is copied to the host. For each cycle and each
+// right-hand side, `history` contains the product of b and z, the length of the step, and the square of b before it. A length is
+// 0 if one of the two products is not positive, or `moving` is 0.
 
 #define HISTORY(cycle, number) history[3 * (cycle) + (number)]
 #define RATIO(a, b) ((((a) > 0) & ((b) > 0)) ? (a) / (b) : (value)0)
@@ -783,7 +791,7 @@ __kernel void multigrid_residual(LEVEL_ARGS, GRAPH_ARGS, VALUES b, VALUES x, OUT
     }
 }
 
-// A sum over PART nodes: of an item that goes through them, or of a group, each of whose items takes one of SUMS nodes.
+// A sum over PART nodes: by one item, or by a group, each of whose items processes one of SUMS nodes.
 #if SUMS > 1
 #define SUM_GROUP __attribute__((reqd_work_group_size(SUMS, 1, 1)))
 #define PART_NODES                                                                                         \
@@ -821,8 +829,8 @@ __kernel void multigrid_residual(LEVEL_ARGS, GRAPH_ARGS, VALUES b, VALUES x, OUT
     EACH_OF_PART
 #define WRITE_PART WRITE_SUM(0, sum)
 
-// The next direction, and the product of it with the matrix times it. The last step, along the direction before, is taken here, as it is
-// read anyway, if `step` is 1 from zero, if 2 from x.
+// The next direction, and its product with the matrix times it. The previous step, along the previous
+// direction, is applied here, because that is read anyway: from zero if `step` is 1, from x if 2.
 #define DIRECTION(i) (AT(z + (i)) + factor * AT(before + (i)))
 #define TAKEN(length, along) ((step == 1 ? (values)0 : AT(x + i)) + ALONG(length, AT(along + i)))
 __kernel SUM_GROUP void multigrid_direct(
@@ -840,7 +848,8 @@ __kernel SUM_GROUP void multigrid_direct(
     values sum = 0;
     EACH_LIVE {
         SIDES
-        const values p = bz > 0 ? DIRECTION(i) : (values)0;  // never infinite: it may be read at nodes without links later
+        // never infinite: it may be read at nodes without links later
+        const values p = bz > 0 ? DIRECTION(i) : (values)0;
         STREAM(direction + i, p);
         sum += p * -FLOW(DIRECTION, i, stride);
         if (step) PUT(x + i) = TAKEN(length, before);
@@ -848,7 +857,7 @@ __kernel SUM_GROUP void multigrid_direct(
     WRITE_PART
 }
 
-// The residual after a step along it, and the square of that.
+// The residual after a step along it, and its square.
 __kernel SUM_GROUP void multigrid_advance(
     LEVEL_ARGS, const int cycle, GRAPH_ARGS, MAP inverse, VALUES moving, const int count, VALUES products, OUT_VALUES history,
     VALUES direction, OUT_VALUES b, OUT_VALUES parts)
@@ -867,7 +876,7 @@ __kernel SUM_GROUP void multigrid_advance(
     WRITE_PART
 }
 
-// A step, where no direction follows.
+// A step without a following direction.
 __kernel void multigrid_take(LEVEL_ARGS, const int cycle, const int step, VALUES history, VALUES direction, OUT_VALUES x)
 {
     ITEMS_NODES
@@ -903,7 +912,7 @@ __kernel void multigrid_admit_graph(
     }
 }
 
-// A last step, and the map of the heights.
+// The last step, and the map of the heights.
 __kernel void multigrid_finish(
     LEVEL_ARGS, const int columns, const int cycle, const int step, VALUES history, VALUES direction, OUT level, OUT map)
 {
@@ -915,9 +924,8 @@ __kernel void multigrid_finish(
     }
 }
 
-// A live step has one right side.
-// Of what a cycle makes of b, z, and of the last step, p, the products with the matrix times them, and of b and p: z A z,
-// z A p, p A p and b p.
+// A live step has one right-hand side. For the result z of a cycle and the previous step p: z A z, z A p, p A
+// p and b p.
 #define STEP(i) AT(p + (i))
 #define CORRECTION(i) AT(z + (i))
 __kernel SUM_GROUP void multigrid_curve(LEVEL_ARGS, GRAPH_ARGS, MAP b, MAP z, MAP p, const int count, OUT parts)
@@ -938,9 +946,9 @@ __kernel SUM_GROUP void multigrid_curve(LEVEL_ARGS, GRAPH_ARGS, MAP b, MAP z, MA
     WRITE_SUM(3 * count, bp)
 }
 
-// How far to go along both, to the least in their plane, by the parts of these products and of that of b and z, which one group
-// adds up. No sum goes to the host.
-#define INDEPENDENT 1e-4f  // share of the products' determinant from which on both directions are used
+// The step lengths along both that minimise the energy in their plane, from the parts of these products and
+// of b z, reduced by one group. No sum is copied to the host.
+#define INDEPENDENT 1e-4f  // minimum share of the products' determinant for which both directions are used
 __kernel GROUP_SIZE void multigrid_best(const int products, MAP product, const int count, MAP parts, OUT lengths)
 {
     __local float room[GROUP];
@@ -968,7 +976,7 @@ __kernel void multigrid_follow(LEVEL_ARGS, MAP lengths, MAP z, OUT p, OUT x)
 }
 #endif
 
-// The product of two.
+// The product of two vectors.
 __kernel SUM_GROUP void multigrid_dot(LEVEL_ARGS, VALUES one, VALUES other, OUT_VALUES parts)
 {
     EACH_PART {
@@ -977,7 +985,7 @@ __kernel SUM_GROUP void multigrid_dot(LEVEL_ARGS, VALUES one, VALUES other, OUT_
     WRITE_PART
 }
 
-// What the anchors weigh of heights.
+// The heights times the weights of the anchors.
 __kernel SUM_GROUP void multigrid_weigh(LEVEL_ARGS, MAP anchor, VALUES x, OUT_VALUES parts)
 {
     EACH_PART {
@@ -1004,8 +1012,8 @@ __kernel void multigrid_release(LEVEL_ARGS, const int columns, MAP level, OUT ma
     }
 }
 #else
-// `count` maps from `first` on, one below the other; further lanes have none. Pieces of a row by turns, as maps lie
-// where caches keep few of them at once.
+// `count` maps from `first` on, one below the other; further lanes are empty. Pieces of a row are
+// interleaved, because caches hold few parts of maps at equal distances.
 #define PIECE LESSER(TILE, 64)
 __kernel void multigrid_admit(
     LEVEL_ARGS, const int columns, const int first, const int count, MAP map, OUT level)
@@ -1038,7 +1046,8 @@ __kernel void multigrid_release(
 
 // --- Variances --------------------------------------------------------------------------------------------------
 
-// The number of pixels with a flag of `wanted` in each node of a level: a pixel is followed from aggregate to aggregate.
+// The number of pixels with a flag of `wanted` in each node of a level: each pixel is followed from aggregate
+// to aggregate.
 __kernel void multigrid_masses(
     LEVEL_ARGS, const int columns, __global const Level *restrict levels, const int number, COUNTS changes, BYTES to,
     const int wanted, BYTES map, __global int *restrict level)
@@ -1061,16 +1070,16 @@ __kernel void multigrid_masses(
     }
 }
 
-// The variance on a level of at most LINE nodes a side: the diagonal of the inverse G of its matrix. Of a component without
-// anchors, the mean over its pixels is 0: with the masses m and their sum M, the diagonal is that of G, less 2 G m / M, plus
-// m G m / M^2, where G holds one node at 0.
+// The variance on a level of at most LINE nodes per side: the diagonal of the inverse G of its matrix. For a component without
+// anchors, the mean over its pixels is 0: with the masses m and their sum M, the diagonal is that of G, minus 2 G m / M, plus
+// m G m / M^2, where G fixes one node at 0.
 //
-// Rows are eliminated from the first to the last (block tridiagonal). In a row, the sweep of node k turns weights to later nodes
-// into shares p of what arrives at k that leaves to them, and adds p p / d for nodes that were swept. Nothing is subtracted, as in
-// `invert_coarsest`. Right sides are swept as further rows of m: weights to the next row, anchors, masses, and the sums
-// of squares m^2 / d, which are m G m in the end. The last node of a component without anchors has nothing left: it receives all
-// masses, and returns them (`whole`) with m G m (`squares`). From the last row to the first, G + (G L) G' (L G) is the inverse G of a
-// row with those after it, where G' is that of the next row, and L are the links to it.
+// Rows are eliminated from the first to the last (block tridiagonal). In a row, the sweep of node k converts weights to later
+// nodes into shares p of the flow through k, and adds p p / d for nodes already swept. Nothing is subtracted, as in
+// `invert_coarsest`. Right-hand sides are swept as further rows of m: weights to the next row, anchors, masses, and the sums of
+// squares m^2 / d, which finally are m G m. The last node of a component without anchors has pivot 0: it receives all masses, and
+// returns them (`whole`) with m G m (`squares`). From the last row to the first, G + (G L) G' (L G) is the inverse G of a row
+// and all rows after it, where G' is that of the next row, and L are the links to it.
 #define LINE 64
 #define EACH_ELEMENT(count)                                                                                \
     for (int e = get_local_id(0) * WIDTH, a = e / stride, c = e % stride; e < (count) * stride;            \
@@ -1121,7 +1130,7 @@ __kernel GROUP_SIZE void multigrid_exact(
             const float inverse = INVERSE(pivot);
             NEAR_BARRIER
             if (get_local_id(0) == 0) swept[k] = pivot > 0;
-            const int count = pivot > 0 ? stride + 4 : 0;  // no barrier is left out
+            const int count = pivot > 0 ? stride + 4 : 0;  // no barrier is skipped
             for (int a = get_local_id(0); a < stride && count == 0; a += GROUP) {
                 const float share = a == k ? 1 : m[a * stride + k];
                 whole[first + a] += share * m[(stride + 2) * stride + k];
@@ -1193,7 +1202,7 @@ __kernel GROUP_SIZE void multigrid_exact(
     }
 }
 
-// The links, scaled along both axes so that those along x weigh as much on average as those along y.
+// The links, scaled along both axes such that those along x and y have the same mean weight.
 #define MEAN(a, b) (((a) + (b)) * ((((a) > 0) & ((b) > 0)) ? (reals)0.5f : (reals)1))
 #define EVENED_SIDES AXES EVENED_OF_SIDES
 #define EVENED_OF_SIDES                                                                                    \
@@ -1203,7 +1212,7 @@ __kernel GROUP_SIZE void multigrid_exact(
     const reals go_right = by_x * to_right, go_left = by_x * to_left;                                      \
     const reals go_below = by_y * to_below, go_above = by_y * to_above;
 
-// One over the diagonal of these.
+// The inverse of the diagonal of these.
 __kernel void multigrid_even(LEVEL_ARGS, GRAPH_ARGS, OUT evened)
 {
     ITEMS_NODES
@@ -1214,8 +1223,8 @@ __kernel void multigrid_even(LEVEL_ARGS, GRAPH_ARGS, OUT evened)
     }
 }
 
-// How likely a walk along them, which takes each as often as it weighs, is back where it was after two steps; and what the
-// aggregates have, brought to their nodes.
+// The probability that a random walk along the links, by weight, has returned after two steps; and the values
+// of the aggregates, prolonged to their nodes.
 __kernel void multigrid_returns(
     LEVEL_ARGS, COARSE_ARGS, MAP right, MAP down, MAP evened, VALUES e, const int moved_nodes, BYTES to, OUT returns, OUT_VALUES t)
 {
@@ -1230,7 +1239,7 @@ __kernel void multigrid_returns(
     }
 }
 
-// The variance: what the aggregates have, spread by a step of Jacobi's method, and what they do not.
+// The variance: that of the aggregates, smoothed by a Jacobi step, and the local part.
 #define BESIDE(i) (AT(evened + (i)) * (c3 + c4 * AT(returns + (i))) + here * AT(returns + (i)))
 __kernel void multigrid_spread(
     LEVEL_ARGS, GRAPH_ARGS, MAP inverse, MAP evened, MAP returns, const float c0, const float c1, const float c2, const float c3,
@@ -1249,8 +1258,8 @@ __kernel void multigrid_spread(
     }
 }
 
-// Standard deviations: the roots of variances, of which each has its least share of one over the diagonal; no number
-// where no flag of `wanted` is.
+// Standard deviations: roots of variances, which are at least a share of the inverse diagonal; NaN without a
+// flag of `wanted`.
 __kernel void multigrid_deviation(
     LEVEL_ARGS, const int columns, const float least, const int wanted,
     BYTES flags, MAP inverse, MAP level, OUT map)

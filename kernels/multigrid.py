@@ -1,34 +1,34 @@
-r"""Heights on a graph of pixels: what ``multigrid.cl`` computes, in plain NumPy with float64.
+r"""Heights on a graph of pixels: ``multigrid.cl`` in plain NumPy with float64.
 
 The heights x of a graph minimise sum w (x_j - x_i - d)^2 over its links and sum a (x_i - k)^2 over known
-heights k: A x = b with A = D - W, where W holds the links' weights and D, the diagonal, their sums and the
-anchors a. A cycle solves it nearly, on grids of which each has half the rows and columns of the one before:
+heights k: A x = b with A = D - W, where W contains the links' weights and D, the diagonal, their sums plus
+the anchors a. A cycle solves it approximately, on grids with half the rows and columns of the preceding one:
 
-- Three steps of Jacobi's method, x <- x + omega D^-1 (b - A x), take out what changes from node to node.
-- A coarse node stands for an aggregate of fine ones. With I, which gives each node what its aggregate has,
-  the coarse right side is I^T (b - A x), and the coarse answer e goes back as x + I e. Then the three steps
-  follow in reverse, so that a cycle is symmetric.
-- A coarse link has half the weight of those that it stands for, since the way between the middles of
-  aggregates is twice as long: I^T A I would let heights follow slopes only half as far.
-- As sums and injection are coarser than A asks for, levels from the third on are gone through twice. The
-  first time they answer up to twice too much where parts hang together by few links; the second time mends
-  that, and a cycle is positive definite. It must be done on all of them, or too much becomes more and more.
-  Where launches are dear, only small levels are gone through twice: a cycle that is gone through once, over
-  a positive definite one, is positive definite itself, whatever the coarse answer is too much by.
-- The coarsest level is answered by the inverse of its matrix.
+- Three Jacobi steps, x <- x + omega D^-1 (b - A x), remove what changes from node to node.
+- A coarse node represents an aggregate of fine ones. With the injection I, which gives each node the value of
+  its aggregate, the coarse right-hand side is I^T (b - A x), and the coarse solution e is added as x + I e.
+  Then the three steps follow in reverse order, so that a cycle is symmetric.
+- A coarse link has half the summed weight of its fine links, because the centres of aggregates are twice as
+  far apart: with I^T A I heights would follow slopes only half as far.
+- Sums and injection are coarser than A requires, so levels from the third on are visited twice. The first
+  visit may overestimate up to twofold where parts are connected by few links; the second one corrects that,
+  and a cycle is positive definite. This must be done on all of these levels, or the overestimate accumulates.
+  Where launches are expensive, only small levels are visited twice: a cycle visited once over a positive
+  definite one is positive definite, whatever the overestimate.
+- The coarsest level is solved by the inverse of its matrix.
 
-*Aggregates* are blocks of two by two, as a rule. Over a cut, that would join what A keeps apart, and the
-coarse answer would be wrong on both sides: so where a block's nodes do not hang together by strong links,
-only its largest part stays, and other parts go to aggregates of neighbouring blocks, along their links. A
-coarse node has links to its eight neighbours alone. A part that had others to further ones by moving stays
-where it is: were a link dropped, the coarse operator would be too weak there, its answer more than twice the
-right one, and a level gone through twice not positive definite.
+*Aggregates* are usually blocks of two by two. Across a cut, a block would connect what A separates, and the
+coarse solution would be wrong on both sides. If strong links do not connect a block's nodes, only its largest
+part stays, and other parts move to aggregates of neighbouring blocks, along their links. A coarse node has
+links to its eight neighbours only. A part whose move would create links to others stays where it is: if a
+link were dropped, the coarse operator would be too weak there, its solution more than twice the correct one,
+and a level visited twice not positive definite.
 
-*Variances*: what a node's has, an element of A's inverse, beyond that of its coarse node is, by six numbers
-c, d (c0 + c1 r + c2 d sum w r_j + c5 o) + d sum w d_j (c3 + c4 r_j). Here w are the weights of its links,
-scaled so that those along x and y have the same mean (over those that there are), d one over their sum and
-the anchor, r = d sum w^2 d_j, how likely a walk along these links is back after two steps, and o one less the
-geometric over the arithmetic mean of both axes' mean weights.
+*Variances*: the variance of a node, an element of A's inverse, in excess of that of its coarse node is, with
+six coefficients c, d (c0 + c1 r + c2 d sum w r_j + c5 o) + d sum w d_j (c3 + c4 r_j). Here w are the weights
+of its links, scaled so that those along x and y have the same mean (over existing links), d is the inverse of
+their sum plus the anchor, r = d sum w^2 d_j the probability that a random walk along these links returns
+after two steps, and o one minus the ratio of the geometric to the arithmetic mean of both axes' mean weights.
 """
 
 from __future__ import annotations
@@ -47,17 +47,17 @@ Flags = NDArray[np.bool_]
 Way = tuple[int, int]  # rows down and columns to the right
 
 WAYS = (0, 1), (1, 0), (1, 1), (1, -1)
-"""Of the links that a node has in ``Level.links``; the other four are its neighbours'."""
+"""Directions of a node's links in ``Level.links``; the other four are its neighbours'."""
 STEPS = 1.3896, 0.5617, 1.0
-"""Chebyshev's polynomial over the upper half of the spectrum, and a step for what sums over blocks leave."""
+"""Chebyshev's polynomial over the upper half of the spectrum, and a step for the remainder of block sums."""
 LARGE_STEPS = 3.2, 0.53, 1.0, 0.9
-"""Found by trial for large levels that are gone through once, where launches count more than arithmetic."""
+"""Found by experiment for large levels that are visited once, where launches cost more than arithmetic."""
 COARSEST = 64
-"""Nodes of the coarsest level at most, in rows whose length is a multiple of 16."""
+"""Maximum number of nodes of the coarsest level, in rows whose length is a multiple of 16."""
 ROUNDS = 4
-"""In which parts of blocks find another aggregate."""
+"""Number of rounds in which parts of blocks are assigned to other aggregates."""
 INDEPENDENT = 1e-4
-"""Share of the products' determinant from which on two directions are two."""
+"""Minimum share of the products' determinant for which two directions are used."""
 
 
 @dataclass(frozen=True)
@@ -79,14 +79,14 @@ class Level:
     to: Ints
 
     def sides(self) -> Iterator[tuple[Way, Doubles]]:
-        """Give all ways that links lead, and of each node the weight of its link there."""
+        """Yield all directions of links, and for each node the weight of its link there."""
         for (down, right), weights in zip(WAYS, self.links, strict=True):
             yield (down, right), weights
             yield (-down, -right), shifted(weights, -down, -right)
 
     @property
     def diagonal(self) -> Doubles:
-        """Of A."""
+        """Diagonal of A."""
         whole: Doubles = sum((weights for _, weights in self.sides()), self.anchor)
         return whole
 
@@ -99,13 +99,13 @@ class Level:
 
     @property
     def coarse_shape(self) -> tuple[int, int]:
-        """Of the next level."""
+        """Shape of the next level."""
         rows, columns = self.to.shape
         return -(-rows // 2), -(-columns // 2)
 
 
 def shifted(values: Any, down: int, right: int) -> NDArray[Any]:
-    """Return what each node's neighbour that way has, 0 where there is none."""
+    """Return the value of each node's neighbour in a direction, 0 where there is none."""
     rows, columns = values.shape
     return np.pad(values, 1)[1 + down : 1 + down + rows, 1 + right : 1 + right + columns]
 
@@ -116,7 +116,7 @@ def step_of(to: Any) -> tuple[Any, Any]:
 
 
 def inverse_of(diagonal: Doubles) -> Doubles:
-    """Return one over it, 0 where a node has neither links nor an anchor."""
+    """Return the inverse of the diagonal, 0 for a node without links and anchor."""
     return np.where(diagonal > 0, 1 / np.where(diagonal > 0, diagonal, 1), 0)
 
 
@@ -124,7 +124,7 @@ def inverse_of(diagonal: Doubles) -> Doubles:
 
 
 def parts(level: Level, strength: float) -> tuple[Ints, Flags]:
-    """Return the first node of its block that each hangs together with, and whether its part is the largest.
+    """Return for each node the first node of its part of the block, and whether its part is the largest.
 
     The nodes of a block have numbers from 0 to 3; those without links along the axes have -1.
     """
@@ -146,7 +146,7 @@ def parts(level: Level, strength: float) -> tuple[Ints, Flags]:
 
 
 def moves(level: Level, label: Ints, largest: Flags) -> Ints:
-    """Return ``Level.to``: parts without a place take one in rounds, by the places of the round before."""
+    """Return ``Level.to``: unassigned parts are assigned in rounds, based on the preceding round."""
     groups: dict[tuple[int, ...], list[Way]] = {}
     for y, x in np.argwhere((label >= 0) & ~largest).tolist():
         groups.setdefault((y // 2, x // 2, int(label[y, x])), []).append((y, x))
@@ -163,7 +163,7 @@ def moves(level: Level, label: Ints, largest: Flags) -> Ints:
 def _place(
     nodes: Sequence[Way], sides: Sequence[tuple[Way, Doubles]], largest: Flags, to: Ints, *, last: bool
 ) -> int:
-    """Return to which aggregate a part goes; in the last round only where it wanted to, or it stays."""
+    """Return the aggregate of a part; in the last round only the one chosen before, or it stays."""
     own, old = np.array(nodes[0]) // 2, int(to[nodes[0]])
     sums, lowest, highest = np.zeros((3, 3)), np.full(2, -2), np.full(2, 2)
     for y, x in nodes:
@@ -185,7 +185,7 @@ def _place(
 
 
 def coarsen(level: Level) -> Level:
-    """Return the next level; what links lead further than to the next aggregate is left out."""
+    """Return the next level; links further than to the next aggregate are dropped."""
     links, row, column = np.zeros((4, *level.coarse_shape)), *level.aggregate
     for (v, u), weights in level.sides():
         y, x = np.nonzero(weights)
@@ -197,7 +197,7 @@ def coarsen(level: Level) -> Level:
 
 
 def build(right: Doubles, down: Doubles, anchor: Doubles | None, strength: float | None) -> list[Level]:
-    """Return all levels of a graph, the finest first; without a strength of blocks alone."""
+    """Return all levels of a graph, the finest first; without a strength from blocks only."""
     none = np.zeros(right.shape)
     links = np.stack([right, down, none, none]).astype(np.float64)
     levels = [Level(links, none if anchor is None else anchor.astype(np.float64), none.astype(np.int64))]
@@ -224,7 +224,7 @@ def residual(level: Level, b: Doubles, x: Doubles) -> Doubles:
 
 
 def smooth(level: Level, b: Doubles, x: Doubles, steps: Sequence[float] = STEPS) -> Doubles:
-    """Do steps of Jacobi's method; nodes without links come to 0."""
+    """Return the heights after Jacobi steps; nodes without links become 0."""
     inverse = inverse_of(level.diagonal)
     for omega in steps:
         x = (1 - omega) * x + omega * inverse * (b + around(level, x))
@@ -232,19 +232,19 @@ def smooth(level: Level, b: Doubles, x: Doubles, steps: Sequence[float] = STEPS)
 
 
 def gathered(level: Level, values: Doubles) -> Doubles:
-    """Return I^T of them: sums over aggregates."""
+    """Return I^T of values: sums over aggregates."""
     whole = np.zeros(level.coarse_shape)
     np.add.at(whole, level.aggregate, values)
     return whole
 
 
 def injected(level: Level, values: Doubles) -> Doubles:
-    """Return I of them: what each node's aggregate has."""
+    """Return I of values: each node gets the value of its aggregate."""
     return np.asarray(values[level.aggregate])
 
 
 def inverse_matrix(level: Level) -> Doubles:
-    """Return the inverse of A, with the last node of each part without anchors held at 0."""
+    """Return the inverse of A, with the last node of each component without anchors fixed at 0."""
     index: Any = np.arange(level.to.size).reshape(level.to.shape)
     w, held = np.zeros((index.size, index.size)), level.anchor.ravel().copy()
     for way, weights in level.sides():
@@ -273,9 +273,9 @@ def cycle(
     twice_from: int = 2,
     large: Sequence[float] = STEPS,
 ) -> Doubles:
-    """Answer the right side of a level, from heights x or from zero.
+    """Return the approximate solution for a right-hand side of a level, from heights x or from zero.
 
-    Levels from `twice_from` on are gone through twice; those before do `large` steps.
+    Levels from `twice_from` on are visited twice; those before do `large` steps.
     """
     level = levels[number]
     if number == len(levels) - 1:
@@ -290,9 +290,9 @@ def cycle(
 
 
 def best_step(bz: float, zz: float, zp: float, pp: float, bp: float) -> tuple[float, float]:
-    """Return how far to go along z and p, to the least in their plane, or along z where both are nearly one.
+    """Return the step lengths along z and p that minimise the energy; along z only if they are parallel.
 
-    Arguments are products: of the right side with both, and of both with A times them.
+    Arguments are products: of the right-hand side with both, and of both with A times them.
     """
     if zz * pp > 0 and zz * pp - zp**2 > INDEPENDENT * zz * pp:
         along, again = np.linalg.solve([[zz, zp], [zp, pp]], [bz, bp])
@@ -323,7 +323,7 @@ def exact_variance(level: Level, masses: Doubles) -> Doubles:
 
 
 def evened_sides(level: Level) -> tuple[list[tuple[Way, Doubles]], Doubles]:
-    """Return links along the axes, scaled to the same mean along both, and how uneven these were."""
+    """Return links along the axes, scaled to the same mean along both, and a measure of their unevenness."""
     links = list(level.sides())[:4]  # right, left, below, above
     x, y = (
         (one + two) * np.where((one > 0) & (two > 0), 0.5, 1) for (_, one), (_, two) in (links[:2], links[2:])
@@ -335,14 +335,14 @@ def evened_sides(level: Level) -> tuple[list[tuple[Way, Doubles]], Doubles]:
 
 
 def walk(level: Level) -> tuple[Doubles, Doubles]:
-    """Return one over the diagonal of evened links, and how likely a walk is back after two steps."""
+    """Return the inverse diagonal of scaled links, and the return probability of a walk of two steps."""
     links, _ = evened_sides(level)
     d = inverse_of(sum((w for _, w in links), level.anchor))
     return d, d * sum(w**2 * shifted(d, *way) for way, w in links)
 
 
 def local_part(level: Level, c: Sequence[float]) -> Doubles:
-    """Return what each node's variance has that the coarse one does not."""
+    """Return the local part of each node's variance."""
     (links, uneven), (d, r) = evened_sides(level), walk(level)
     beside = sum(w * shifted(d * (c[3] + c[4] * r), *way) for way, w in links)
     back = sum(w * shifted(r, *way) for way, w in links)
@@ -350,6 +350,6 @@ def local_part(level: Level, c: Sequence[float]) -> Doubles:
 
 
 def spread(level: Level, coarse: Doubles, local: Doubles) -> Doubles:
-    """Return what coarse nodes have, spread by a step of Jacobi's method, and a local part."""
+    """Return the values of coarse nodes, smoothed by a Jacobi step, plus a local part."""
     brought = injected(level, coarse)
     return local + brought + inverse_of(level.diagonal) * residual(level, np.zeros(brought.shape), brought)

@@ -3,13 +3,14 @@
 
 #include "normals.clh"
 
-#define PART (WORDS < 4 ? WORDS : 4)  // vectors that are worked on at once
-#define STEADY 1e-6f  // amplitude, radians, up to which rounding makes the azimuth
+#define PART (WORDS < 4 ? WORDS : 4)  // vectors processed at once
+#define STEADY 1e-6f  // amplitude, radians, below which rounding determines the azimuth
 
-// The expected zenith of a sample, and by how much it grows along the meridian, across it and with the tilt, by its weight.
+// The expected zenith of a sample, and its derivatives along the meridian, across it and with respect to the
+// tilt, weighted.
 typedef struct { F zenith, u1, u2, u3; } Expected;
 
-// What a direction makes expected of all samples; see `expect`.
+// The expected samples for a direction; see `expect`.
 typedef struct { Direction at; F base, lean, high, low, beside_x, beside_y; } Pose;
 
 Pose pose_of(const Direction at, const float cos_tilt, const float sin_tilt)
@@ -27,8 +28,8 @@ Pose pose_of(const Direction at, const float cos_tilt, const float sin_tilt)
     return pose;
 }
 
-// Half the sine of a zenith is root(x - x^2), of x = sin^2(zenith / 2); and x is base + lean cos(azimuth - phase), which
-// loses no digits that matter.
+// Half the sine of a zenith is root(x - x^2) with x = sin^2(zenith / 2); x is base + lean cos(azimuth -
+// phase), which loses no significant digits.
 Expected expect(const Pose pose, const Samples of, const int k)
 {
     const float c = entry(of, COSINE, k), s = entry(of, SINE, k);
@@ -43,8 +44,8 @@ Expected expect(const Pose pose, const Samples of, const int k)
     return found;
 }
 
-// Eq. 10 is linear in the normal once the cosine of the zenith is taken: its wave is the normal. A missing sample is taken
-// for the mean of the others.
+// Eq. 10 is linear in the normal for the cosine of the zenith: its wave is the normal. A missing sample is
+// replaced by the mean of the others.
 INLINE Direction begin_at(const Samples of, const I usable, const float cos_tilt, const float sin_tilt)
 {
     F mean = 0.0f, x = 0.0f, y = 0.0f, z = 0.0f;
@@ -66,8 +67,8 @@ INLINE Direction begin_at(const Samples of, const I usable, const float cos_tilt
     return direction_of(x * cos_tilt, y * cos_tilt, z * sin_tilt);
 }
 
-// The normal equations at a direction, of samples that are all there and all within range; the last ones with the tilt. u1
-// and u2 make a unit vector, as do u3 and u2 by the share of the tilt in the zenith.
+// The normal equations at a direction for samples that are all valid and in range; the last ones with the
+// tilt. (u1, u2) is a unit vector, and so is (u3, u2) scaled by the share of the tilt in the zenith.
 INLINE Sums look(
     const Direction at, const Samples of, const Wave wave, const float weights, const float cos_tilt, const float sin_tilt,
     const int last)
@@ -97,7 +98,7 @@ INLINE Sums look(
     return sums;
 }
 
-// The same of any samples.
+// The same for any samples.
 Sums look_closely(
     const Direction at, const Samples of, const F error_of_one, const float cos_tilt, const float sin_tilt)
 {
@@ -113,7 +114,7 @@ Sums look_closely(
     return sums;
 }
 
-// Step by step for some vectors at once, so that none waits for its own results.
+// Step by step for several vectors at once, so that none waits for its own results.
 __kernel void normals_exact(ARGUMENTS)
 {
     GATHER_ARGUMENTS
@@ -142,7 +143,7 @@ __kernel void normals_exact(ARGUMENTS)
             const F error_of_one = known[i].error_of_one, waves = sums[i].waves;
             const I usable = known[i].usable;
             Direction found = step(nearer[i], sums[i]);
-            // Where too few samples tell anything, there is no answer, however closely one looks.
+            // Too few informative samples give no result, whatever the steps.
             const I irregular = (usable < count) & (usable >= LEAST);
             if (any_of(irregular)) {
                 Direction at = begin[i];
@@ -153,7 +154,7 @@ __kernel void normals_exact(ARGUMENTS)
                 }
                 found = blend(found, at, irregular);
             }
-            // A sheet at rest shows the zenith 0 all the time; one in contact a mean of the tilt or more.
+            // A sheet at rest has zenith 0; one in contact has a mean of at least the tilt.
             const I at_rest = known[i].wave.mean < limits.rest;
             conclude(maps, p, turns, found, sums[i], error_of_one, count, usable, at_rest, limits, limits.model);
             if (!bare) keep_wave(maps, p, turns, of[i], known[i].wave, waves);
@@ -161,8 +162,8 @@ __kernel void normals_exact(ARGUMENTS)
     }
 }
 
-// Last come the variances of the wave's mean and cosine, the covariance of cosine and sine, and the sine's variance, in
-// those of a sample.
+// The last arguments are the variances of the wave's mean and cosine, the covariance of cosine and sine, and
+// the variance of the sine, relative to that of a sample.
 __kernel void normals_paper(
     ARGUMENTS, const float of_mean, const float of_cosine, const float of_both, const float of_sine)
 {

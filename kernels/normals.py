@@ -1,16 +1,17 @@
-"""Surface normals from one turn of axial rotation: what ``normals.cl`` computes, in NumPy with float64.
+"""Surface normals from one turn of axial rotation: ``normals.cl`` in NumPy with float64.
 
-At phase alpha the body's axis is a = (-sin d cos alpha, -sin d sin alpha, cos d), and what a pixel shows is
-its zenith t seen from that axis: cos t = n . a (eq. 10). So a sample is a distance on the sphere, from the
+At phase alpha the body's axis is a = (-sin d cos alpha, -sin d sin alpha, cos d), and a pixel shows its
+zenith t relative to that axis: cos t = n . a (eq. 10). So a sample is a distance on the sphere, from the
 normal n to a known point.
 
 `normals_exact` starts from the linear fit: cos t is mean + cosine cos alpha + sine sin alpha with n =
-(-cosine, -sine, mean tan d) / sin d. Two Gauss-Newton steps on the distances lead to the most likely normal:
-a third moves it by less than a hundredth of its standard error. A distance grows by u . dn when the normal
-moves, where u is the unit vector that points away from a; so sum u u' (gain / noise)^2 is Fisher's
-information, and the trace of its inverse the predicted mean square of the angle to the true normal.
+(-cosine, -sine, mean tan d) / sin d. Two Gauss-Newton steps on the distances lead to the maximum-likelihood
+normal: a third step would move it by less than a hundredth of its standard error. A distance grows by u . dn
+when the normal moves, where u is the unit vector that points away from a; so sum u u' (gain / noise)^2 is the
+Fisher information, and the trace of its inverse the predicted mean square of the angle to the true normal.
 
-`normals_paper` is eq. 14-22: t is taken for theta + d cos(phi - alpha), which holds well above d only.
+`normals_paper` is eq. 14-22: t is approximated by theta + d cos(phi - alpha), which is valid only well above
+d.
 """
 
 from __future__ import annotations
@@ -27,17 +28,17 @@ from mirrorskin.kernels.array_types import Doubles
 Array = NDArray[Any]
 
 MORE = 12
-"""Steps after the first two, for pixels of which a sample is clipped, missing or out of range."""
+"""Steps after the first two, for pixels with a sample that is clipped, missing or out of range."""
 
-_REACH = 0.25  # longest step, radians
-_NO_ANSWER = 1.0  # a standard error, radians, from which on nothing is known
-_LEAST = 3  # samples that must be there and within their range
-_STEADY = 1e-6  # amplitude, radians, up to which rounding makes the azimuth
-_MARGIN = 3.0  # standard deviations that a sample must be from the ends of a range to be within it
-_MODEL = 0.2  # RMS of what the model may leave out in contact, as a share of the tilt
-_DOUBT = 2.0  # by which the variance of the noise may be wrong
+_REACH = 0.25  # maximum step, radians
+_NO_ANSWER = 1.0  # standard error, radians, above which there is no result
+_LEAST = 3  # minimum number of valid samples within their range
+_STEADY = 1e-6  # amplitude, radians, below which rounding determines the azimuth
+_MARGIN = 3.0  # standard deviations from the ends of the range that a sample must have to count as within it
+_MODEL = 0.2  # RMS error of the model in contact, as a share of the tilt
+_DOUBT = 2.0  # factor by which the variance of the noise may be wrong
 _REST = 0.5  # share of the tilt below which a mean zenith is that of a sheet at rest
-_MOST = 2.0  # tilts above which a pixel shows no wave of the body's: a constant one looks level and tilted
+_MOST = 2.0  # maximum amplitude, in tilts: a pixel with constant brightness looks level and tilted
 _STILL = 0.25  # share of the tilt below which a sheet does not follow the object
 
 
@@ -56,7 +57,7 @@ class Variance(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Up to where the residuals of a fit with free tilt are those of a lasting contact.
+    """Limits of the residuals of a fit with free tilt for lasting contact.
 
     Attributes
     ----------
@@ -80,9 +81,9 @@ class Limits(NamedTuple):
 
 
 def contact_limits(freedom: int, tilt: float) -> Limits:
-    """Return the limits for a fit with so many degrees of freedom, (frames - 3).
+    """Return the limits for a fit with a number of degrees of freedom, (frames - 3).
 
-    The noise's share is chi-square's quantile at 99.9 %, which n + 4.37 sqrt(n) + 5.7 meets within 3 %.
+    The noise's share is the 99.9 % quantile of chi-square, approximated by n + 4.37 sqrt(n) + 5.7 within 3 %.
     """
     noise = _DOUBT * (freedom + 4.37 * math.sqrt(freedom) + 5.7)
     return Limits(noise, (freedom + 3) * (_MODEL * tilt) ** 2, _STILL * tilt, _MOST * tilt, _REST * tilt)
@@ -90,7 +91,7 @@ def contact_limits(freedom: int, tilt: float) -> Limits:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The answer of each pixel.
+    """The result of each pixel.
 
     Attributes
     ----------
@@ -115,7 +116,7 @@ class Answer:
 def normals_exact(
     frames: Array, turn: Doubles, scale: Doubles, tilt: float, noise: Variance, limits: Limits
 ) -> Answer:
-    """Find the most likely normals.
+    """Return the maximum-likelihood normals.
 
     Parameters
     ----------
@@ -134,14 +135,15 @@ def normals_exact(
 
 
 def most_likely(samples: Samples, start: Doubles, axes: Doubles, tilting: Doubles) -> tuple[Doubles, Sums]:
-    """Return the most likely normals and the normal equations next to them.
+    """Return the maximum-likelihood normals and the normal equations near them.
 
-    From the normals that are begun with, (n, 3), steps are taken. ``axes`` are the body's in the frames,
-    (N, 3), and ``tilting`` is how they move with the tilt.
+    Steps start from given normals, (n, 3). ``axes`` are the body's axes in the frames, (N, 3), and
+    ``tilting`` their derivatives with respect to the tilt.
     """
     normal, sums = start, None
     for number in range(2 + MORE):
-        # What is clipped, missing or out of range needs all steps, and only that is treated as such.
+        # Pixels with clipped, missing or out-of-range samples need all steps and their likelihood; others do
+        # not.
         moves = samples.irregular if number >= 2 else np.ones_like(samples.irregular)
         if number == 2:
             normal = np.where(samples.irregular[:, np.newaxis], start, normal)
@@ -157,11 +159,11 @@ def most_likely(samples: Samples, start: Doubles, axes: Doubles, tilting: Double
 def normals_paper(
     frames: Array, turn: Doubles, scale: Doubles, noise: Variance, limits: Limits, spread: Doubles
 ) -> Answer:
-    """Find normals by the paper's approximation: the mean is the zenith, the wave's phase the azimuth.
+    """Return normals by the paper's approximation: the mean is the zenith, the wave's phase the azimuth.
 
-    Nothing is known of clipped and missing samples here. ``spread`` holds the variances of mean and cosine,
-    the covariance of cosine and sine, and the variance of the sine, in those of a sample. The standard errors
-    are those by noise; the approximation's own error comes on top.
+    Clipped and missing samples are not handled here. ``spread`` contains the variances of mean and cosine,
+    the covariance of cosine and sine, and the variance of the sine, relative to that of a sample. The
+    standard errors include the noise only; the error of the approximation is additional.
     """
     samples = Samples(frames, turn, scale, noise)
     zenith, c, s = samples.mean, samples.cosine, samples.sine
@@ -184,7 +186,7 @@ def normals_paper(
 
 
 def add_turn(before: Answer, now: Answer, turns: int) -> Answer:
-    """Take a turn into the mean of the ``turns`` - 1 before it, normals weighted by inverse variances."""
+    """Return the combination of a turn with the mean of the ``turns`` - 1 before it, by inverse variances."""
     own, theirs = (np.where(np.isnan(one.sigma), 0.0, 1 / one.sigma**2) for one in (now, before))
     sums = own[:, np.newaxis] * np.nan_to_num(now.vectors) + theirs[:, np.newaxis] * np.nan_to_num(
         before.vectors
@@ -208,7 +210,7 @@ def add_turn(before: Answer, now: Answer, turns: int) -> Answer:
 
 
 class Samples:
-    """Samples as zeniths, and their fit with one wave a turn."""
+    """Samples as zeniths, and their fit with one wave per turn."""
 
     offset: NDArray[Any]
     low: NDArray[Any]
@@ -249,7 +251,7 @@ class Samples:
         self.square: NDArray[Any] = np.sum((turn[2][:, np.newaxis] * (self.zenith - wave)) ** 2, axis=0)
 
     def keep(self, there: NDArray[np.bool_]) -> None:
-        """Take all samples but those that are there, (N, n), for missing."""
+        """Treat all samples as missing except for some, (N, n)."""
         self.missing = self.missing | ~there
         self.usable: NDArray[Any] = (self.whole & there).sum(axis=0)
         self.irregular: NDArray[Any] = self.usable < len(there)
@@ -257,11 +259,11 @@ class Samples:
 
 def conclude(normal: Doubles, sums: Sums, samples: Samples, usable: Array, tilt: float, limits: Limits,
              model: float | Doubles, rest: NDArray[np.bool_]) -> Answer:  # fmt: skip
-    """Say how certain a direction is, and whether it is one of a lasting contact.
+    """Return the standard error of a direction, and whether it is one of a lasting contact.
 
-    The sums are those at the direction, or next to it; ``usable`` counts the samples that are whole and
-    within their range; ``model`` is the sum of squares that the model may leave out, in the unit of the
-    samples, squared; ``rest`` is where the sheet is at rest.
+    The sums are those at the direction, or next to it; ``usable`` is the number of valid samples within their
+    range; ``model`` is the sum of squares of the model's error, in the unit of the samples, squared; ``rest``
+    is where the sheet is at rest.
     """
     det = sums.m11 * sums.m22 - sums.m12**2
     touching, misfit = touches(sums, det, samples, tilt, limits, model, rest)
@@ -276,9 +278,9 @@ def touches(
     sums: Sums, det: Doubles, samples: Samples, tilt: float, limits: Limits, model: float | Doubles,
     rest: NDArray[np.bool_],
 ) -> tuple[NDArray[np.bool_], Doubles]:  # fmt: skip
-    """Return where residuals are those of a lasting contact, and by how much errors are larger than by noise.
+    """Return where residuals are those of a lasting contact, and the factor by which errors exceed the noise.
 
-    ``det`` is that of the answer's equations.
+    ``det`` is the determinant of the equations.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         more_tilt, information, residual = _free_tilt(sums, det)
@@ -310,7 +312,7 @@ class Sums:
     def of(
         cls, u1: Doubles, u2: Doubles, u3: Doubles, share: Doubles, pull: Doubles, squares: Doubles
     ) -> Sums:
-        """Sum over the samples, (N, n): derivatives, shares of information, pulls and squared misfits."""
+        """Return sums over the samples, (N, n): derivatives, information, gradients and squared misfits."""
         return cls(
             m11=(share * u1 * u1).sum(axis=0),
             m12=(share * u1 * u2).sum(axis=0),
@@ -325,7 +327,7 @@ class Sums:
         )
 
     def where(self, chosen: NDArray[np.bool_], other: Sums) -> Sums:
-        """Take the pixels that are chosen from here, the others from there."""
+        """Return the selected pixels from here, the others from there."""
         return Sums(*(np.where(chosen, getattr(self, f.name), getattr(other, f.name)) for f in fields(self)))
 
 
@@ -341,7 +343,7 @@ def _start(samples: Samples, turn: Doubles, tilt: float) -> Doubles:
 
 
 def _look(normal: Doubles, samples: Samples, axes: Doubles, tilting: Doubles, closely: bool) -> Sums:
-    """Form the normal equations at a direction; closely, as clipped or missing samples demand."""
+    """Return the normal equations at a direction; `closely` for clipped or missing samples."""
     chord = np.linalg.norm(normal[np.newaxis] - axes[:, np.newaxis], axis=2)
     zenith = 2 * np.arcsin(np.clip(chord / 2, 1e-6, math.sqrt(0.5)))
     along, across = tangents(normal)
@@ -360,13 +362,13 @@ def _look(normal: Doubles, samples: Samples, axes: Doubles, tilting: Doubles, cl
 def likelihood(
     samples: Samples, seen: Doubles, inside: NDArray[np.bool_]
 ) -> tuple[Doubles, Doubles, Doubles]:
-    """Return of each sample its share of information, its pull on the zenith, and its squared misfit.
+    """Return for each sample its information, its residual, and its squared misfit.
 
-    Expected is ``share``; where that is not inside the range, a sample contributes nothing.
+    The expected sample is ``share``; if that is not inside the range, a sample contributes nothing.
 
-    A clipped sample has the likelihood of being beyond its bound (Tobin 1958): with z the bound's distance
-    in standard deviations and m the ratio of the normal distribution's density to its integral there, its
-    pull is m and its information m (m + z).
+    A clipped sample has the probability of being beyond its bound as its likelihood (Tobin 1958): with z the
+    bound's distance in standard deviations and m the ratio of the normal density to its integral there, its
+    residual is m and its information m (m + z).
     """
     from scipy import special
 
@@ -389,7 +391,7 @@ def likelihood(
 
 
 def _axes(turn: Doubles, tilt: float) -> tuple[Doubles, Doubles]:
-    """Return the body's axis at each phase, (N, 3), and how it moves with the tilt."""
+    """Return the body's axis at each phase, (N, 3), and its derivative with respect to the tilt."""
     ones = np.ones_like(turn[0])
     axes = np.stack([-math.sin(tilt) * turn[0], -math.sin(tilt) * turn[1], math.cos(tilt) * ones], axis=1)
     tilting = np.stack([-math.cos(tilt) * turn[0], -math.cos(tilt) * turn[1], -math.sin(tilt) * ones], axis=1)
@@ -406,7 +408,7 @@ def tangents(normal: Doubles) -> tuple[Doubles, Doubles]:
 
 
 def step(normal: Doubles, sums: Sums) -> Doubles:
-    """Take a Gauss-Newton step."""
+    """Return the direction after a Gauss-Newton step."""
     along, across = tangents(normal)
     with np.errstate(divide="ignore", invalid="ignore"):
         det = sums.m11 * sums.m22 - sums.m12**2
@@ -418,7 +420,7 @@ def step(normal: Doubles, sums: Sums) -> Doubles:
 
 
 def _free_tilt(sums: Sums, det: Doubles) -> tuple[Doubles, Doubles, Doubles]:
-    """Return the step of the tilt were it free, its information, and the sum of squares then left."""
+    """Return the step of a free tilt, its information, and the remaining sum of squares."""
     d1, d2 = (sums.m22 * sums.b1 - sums.m12 * sums.b2) / det, (sums.m11 * sums.b2 - sums.m12 * sums.b1) / det
     w1 = (sums.m22 * sums.m13 - sums.m12 * sums.m23) / det
     w2 = (sums.m11 * sums.m23 - sums.m12 * sums.m13) / det
@@ -428,7 +430,7 @@ def _free_tilt(sums: Sums, det: Doubles) -> tuple[Doubles, Doubles, Doubles]:
 
 
 def _like_noise(square: Doubles, samples: Samples, noise: float, model: float | Doubles) -> NDArray[np.bool_]:
-    """Tell where a sum of squares is that of noise and of what the model leaves out; all, of three frames."""
+    """Return where a sum of squares is explained by noise and model error; everywhere for three frames."""
     if samples.freedom == 0:
         return np.ones(len(square), bool)
     found: NDArray[np.bool_] = square <= noise * samples.error**2 + model

@@ -1,6 +1,6 @@
 // Surface normals from samples at any known poses. Specification: normals_pose.py; macros and arguments: normals.clh.
 //
-// tables   behind a turn's planes: the body's axis in each frame, how that moves with the tilt, and travel
+// tables   after the planes of a turn: the body's axis in each frame, its derivative with respect to the tilt, and travel
 // presses  whether travel differs from frame to frame
 
 #define PLANES (TURN_PLANES + 7)
@@ -8,14 +8,14 @@
 
 enum { AXIS_X = TURN_PLANES, AXIS_Y, AXIS_Z, LEAN_X, LEAN_Y, LEAN_Z, TRAVEL };
 
-#define AT_REST 4.0f    // standard deviations of a sample up to which it may be that of a sheet at rest
-#define STEPS 2         // of all pixels
+#define AT_REST 4.0f  // standard deviations of a sample up to which it may be that of a sheet at rest
+#define STEPS 2  // steps for all pixels
 #define NOTHING -1e30f  // travel before all others
 
-typedef struct { F x, y, z; } Vector;  // a unit vector, or of rocking its part in the upright plane
+typedef struct { F x, y, z; } Vector;  // a unit vector, or for rocking its component in the vertical plane
 typedef struct { F zenith, u1, u2, u3; } Expected;
 
-// What is there of a pixel's samples: those that are deeper than `lost`.
+// The samples of a pixel that are deeper than `lost`.
 typedef struct { F lost; I usable; } Kept;
 
 Vector vector_of(const Direction at) { return (Vector){at.st * at.cp, at.st * at.sp, at.ct}; }
@@ -27,8 +27,8 @@ Vector axis_of(const Samples of, const int k)
 
 F product(const Vector a, const Vector b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 
-// The deepest travel at which a pixel shows the zenith 0 as a sheet at rest, or the least that it can, and how many samples
-// are left, whole and in range.
+// The greatest travel at which a pixel shows the zenith 0 of a sheet at rest, or the least visible zenith,
+// and the number of remaining valid samples in range.
 INLINE Kept keep(const Samples of, const Known known, const float rest_below, const int presses)
 {
     Kept kept = {NOTHING, known.usable};
@@ -50,7 +50,7 @@ INLINE Kept keep(const Samples of, const Known known, const float rest_below, co
     return kept;
 }
 
-// Expected of a sample, by the distance of two unit vectors: twice the half sine.
+// Expected value of a sample, from the distance of two unit vectors: twice the half sine.
 Expected expect(const Direction at, const Samples of, const int k)
 {
     const Vector n = vector_of(at), a = axis_of(of, k), apart = {n.x - a.x, n.y - a.y, n.z - a.z};
@@ -65,7 +65,7 @@ Expected expect(const Direction at, const Samples of, const int k)
     return found;
 }
 
-// The same of the parts in an upright plane, which need not make a unit vector.
+// The same for the components in a vertical plane, which need not be a unit vector.
 Expected expect_part(const Vector part, const Samples of, const int k)
 {
     const Vector a = axis_of(of, k), lean = {entry(of, LEAN_X, k), 0.0f, entry(of, LEAN_Z, k)};
@@ -74,7 +74,7 @@ Expected expect_part(const Vector part, const Samples of, const int k)
     return (Expected){rest * inverse * angle_by_half_sine(x), by_sine * a.x, by_sine * a.z, by_sine * product(lean, part)};
 }
 
-// Adds a sample to the normal equations; closely, as clipped or missing samples demand.
+// Adds a sample to the normal equations; `closely` for clipped or missing samples.
 INLINE void take(Sums *sums, const Samples of, const int k, const Expected seen, const F lost, const F error_of_one,
                  const int closely)
 {
@@ -104,7 +104,7 @@ INLINE Sums look_part(const Vector part, const Samples of, const F lost, const F
     return sums;
 }
 
-// The cosine of the zenith is linear in the normal: least squares over the samples that are there and whole. In a plane, y is 0.
+// The cosine of the zenith is linear in the normal: least squares over the valid samples. In a plane, y is 0.
 INLINE Vector begin_at(const Samples of, const F lost, const int in_plane)
 {
     F xx = 0.0f, xy = 0.0f, xz = 0.0f, yy = 0.0f, yz = 0.0f, zz = 0.0f, bx = 0.0f, by = 0.0f, bz = 0.0f;
@@ -131,7 +131,7 @@ INLINE Vector begin_at(const Samples of, const F lost, const int in_plane)
                     (cxz * bx + cyz * by + czz * bz) * scale};
 }
 
-// Keeps the part of a unit vector no longer than that.
+// Limits the length of a component of a unit vector to 1.
 Vector within(const Vector part)
 {
     const F square = product(part, part), shorter = square > 1.0f ? inverse_roots(square) : (F)1.0f;
@@ -190,7 +190,7 @@ __kernel void normals_pose(ARGUMENTS, const int presses)
     }
 }
 
-// Of several turns the means, weighted by the inverse of the slopes' variances.
+// For several turns the means, weighted by the inverse variances of the slopes.
 INLINE void keep_slope(const int p, const int turns, F slope, F error, F zenith, OUT slopes, OUT errors, OUT zeniths)
 {
     if (turns > 1) {

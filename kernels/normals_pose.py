@@ -1,15 +1,15 @@
-"""Surface normals from samples at any known poses: what ``normals_pose.cl`` computes, in NumPy with float64.
+"""Surface normals from samples at any known poses: ``normals_pose.cl`` in NumPy with float64.
 
-In frame k the body's axis is the unit vector a_k, and a pixel shows its zenith t_k seen from that axis,
-cos t_k = n . a_k. So least squares over the frames give a first normal, and the steps of `normals_exact` lead
-from there to the most likely one.
+In frame k the body's axis is the unit vector a_k, and a pixel shows its zenith t_k relative to that axis, cos
+t_k = n . a_k. Least squares over the frames give an initial normal, and the steps of `normals_exact` lead
+from there to the maximum-likelihood normal.
 
-Where all axes lie in one upright plane, as of a body that rocks about one axis, the normal's part across that
-plane has no influence. `normals_rock` finds the other two, p along the plane and q upwards, in the same way:
-the slope of the surface along the plane is -p / q.
+If all axes are in one vertical plane, as for a body that rocks about one axis, the normal's component across
+that plane has no influence. `normals_rock` estimates the other two, p along the plane and q upwards, in the
+same way: the slope of the surface along the plane is -p / q.
 
-Where travel differs from frame to frame, a pixel may be out of contact in some: it shows the zenith 0 then,
-or the least that it can. What was sampled no deeper than the deepest frame in which it did is left out.
+If travel differs from frame to frame, a pixel may be out of contact in some frames: it then shows the zenith
+0, or the least visible zenith. Samples that are not deeper than the deepest such frame are excluded.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ from mirrorskin.kernels.normals import (
 )
 
 AXIS, LEAN, TRAVEL = slice(6, 9), slice(9, 12), 12
-"""Rows of a table of poses, (13, N), behind those of a turn: the axis, how it moves with the tilt, travel."""
+"""Rows of a table of poses, (13, N), after those of a turn: the axis, its derivative by the tilt, travel."""
 
 _AT_REST = 4.0  # standard deviations of a sample up to which it may be that of a sheet at rest
 
 
 @dataclass(frozen=True, slots=True)
 class Slopes:
-    """What rocking tells of each pixel, (n,); NaN without an answer.
+    """Results of rocking for each pixel, (n,); NaN without a result.
 
     Attributes
     ----------
@@ -72,9 +72,9 @@ def normals_pose(
     limits: Limits,
     presses: bool = False,
 ) -> Answer:
-    """Find the most likely normals; all but the table and the last is as for `normals_exact`.
+    """Return the maximum-likelihood normals; arguments as for `normals_exact`, except table and `presses`.
 
-    The tilt is the root mean square of the frames'; ``presses`` says that travel differs between frames.
+    The tilt is the root mean square over the frames; ``presses`` states that travel differs between frames.
     """
     samples = _samples(frames, table, scale, noise, limits, presses)
     axes = table[AXIS].T
@@ -97,7 +97,7 @@ def normals_rock(
     limits: Limits,
     presses: bool = False,
 ) -> Slopes:
-    """Find the slopes along the plane of rocking; the axes are (along it, 0, up)."""
+    """Return the slopes along the plane of rocking; the axes are (along it, 0, up)."""
     samples = _samples(frames, table, scale, noise, limits, presses)
     axes, leaning = table[AXIS].T[:, ::2], table[LEAN].T[:, ::2]
     level, weight = _levels(samples)
@@ -131,7 +131,7 @@ def normals_rock(
 def _samples(
     frames: Array, table: Doubles, scale: Doubles, noise: Variance, limits: Limits, presses: bool
 ) -> Samples:
-    """Return the samples, of which those out of contact are taken for missing."""
+    """Return the samples, with those out of contact marked as missing."""
     samples = Samples(frames, table[:6], scale, noise)
     if presses:
         with np.errstate(invalid="ignore"):
@@ -145,20 +145,20 @@ def _samples(
 
 
 def _rests(samples: Samples, limits: Limits, presses: bool) -> NDArray[np.bool_]:
-    """Tell where the sheet is at rest all the time; samples that are at rest are left out else."""
+    """Return where the sheet is always at rest; elsewhere samples at rest are excluded."""
     with np.errstate(invalid="ignore"):
         return np.zeros(samples.mean.shape, bool) if presses else samples.mean < limits.rest
 
 
 def _levels(samples: Samples) -> tuple[Doubles, Doubles]:
-    """Return the cosines of the zeniths, and their weights: 0 of missing and of clipped samples."""
+    """Return the cosines of the zeniths, and their weights: 0 for missing and clipped samples."""
     none = samples.missing | samples.under | samples.over
     weight = np.where(none, 0.0, samples.turn[2][:, np.newaxis] ** 2)
     return np.where(none, 0.0, np.cos(samples.zenith)), weight
 
 
 def _look(part: Doubles, samples: Samples, axes: Doubles, leaning: Doubles, closely: bool) -> Sums:
-    """Form the normal equations of both parts, as those of a direction."""
+    """Return the normal equations of both components, like those of a direction."""
     half = np.clip(0.5 - 0.5 * (axes @ part.T), 1e-12, 0.5)
     zenith, root = 2 * np.arcsin(np.sqrt(half)), samples.turn[2][:, np.newaxis]
     by_sine = -root / np.sin(zenith)
@@ -172,12 +172,12 @@ def _look(part: Doubles, samples: Samples, axes: Doubles, leaning: Doubles, clos
 
 
 def _within(part: Doubles) -> Doubles:
-    """Keep parts of a unit vector no longer than that."""
+    """Return components of a unit vector limited to length 1."""
     return np.asarray(part / np.maximum(np.linalg.norm(part, axis=1, keepdims=True), 1))
 
 
 def _step(sums: Sums) -> Doubles:
-    """Return a Gauss-Newton step of both parts."""
+    """Return a Gauss-Newton step of both components."""
     with np.errstate(divide="ignore", invalid="ignore"):
         det = sums.m11 * sums.m22 - sums.m12**2
         d1 = (sums.m22 * sums.b1 - sums.m12 * sums.b2) / det

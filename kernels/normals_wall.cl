@@ -1,29 +1,29 @@
-// Surface normals where a cylindrical wall makes the light: samples are lights, not zeniths. Specification: normals_wall.py,
-// response.py; macros and arguments: normals.clh.
+// Surface normals with a cylindrical wall: samples are lights, not zeniths. Specification: normals_wall.py, response.py;
+// macros and arguments: normals.clh.
 
 #include "normals.clh"
 
 #define STEPS 3  // Gauss-Newton steps of all pixels
-#define SETTLED 1e-12f  // square of a step, radians, after which the next ones are none
+#define SETTLED 1e-12f  // squared step, radians, below which further steps are omitted
 
-// The wall's numbers, before those of its inverse and its curve.
+// The wall's parameters, before those of its inverse and its curve.
 enum {
     RADIUS,
     RIM,
-    SCATTER,  // square of the sine of its half-angle
+    SCATTER,  // squared sine of its half-angle
     BEND,
     BEND_SQUARE,
-    LAMP_X,   // by the radius, as LAMP_Y
+    LAMP_X,  // relative to the radius, like LAMP_Y
     LAMP_Y,
-    NEAREST,  // the q between which the curve holds
+    NEAREST,  // range of q in which the curve is valid
     FURTHEST,
-    DARKEST,  // and the lights
+    DARKEST,  // corresponding lights
     LIGHTEST,
-    SENSE,    // 1 where steeper is brighter, -1 where it is darker
+    SENSE,  // 1 if steeper is brighter, -1 if it is darker
     PIVOT_X,
     PIVOT_Y,
     PIVOT_Z,
-    MIDDLE,   // what q is counted from in the curve, and how often
+    MIDDLE,  // origin and scale of q in the curve
     PER_Q,
     INVERSE
 };
@@ -31,16 +31,16 @@ enum {
 typedef struct {
     MAP is;
     int inverse_length, curve_length;
-    int follows;  // whether a pixel keeps seeing one point of the object
+    int follows;  // whether a pixel follows one point of the object
     float cos_tilt, sin_tilt;
 } Wall;
 
-// The point that a pixel sees in the mean pose, by how much its line of sight moves for each mm of z, and that for each mm
+// The point that a pixel sees in the mean pose, the shift of its line of sight per mm of z, and that per mm
 // from the axis.
 typedef struct { F x, y, z, slope_x, slope_y, bend; } Place;
 
-// The expected light of a sample; by how much it grows along the meridian, across it and with the tilt, by its weight; and
-// whether all its rays meet the wall.
+// The expected light of a sample; its derivatives along the meridian, across it and with respect to the tilt,
+// weighted; and whether all its rays meet the wall.
 typedef struct { F light, u1, u2, u3; I inside; } Expected;
 
 Place place_of(const Wall wall, const F x, const F y, const F z)
@@ -50,8 +50,8 @@ Place place_of(const Wall wall, const F x, const F y, const F z)
     return place;
 }
 
-// The normal and the point turn with the body first: along the phase's direction and up only. The line of sight need not be
-// a unit vector.
+// Normal and point are first rotated with the body: only along the phase's direction and up. The line of
+// sight need not be a unit vector.
 Expected expect(const Direction at, const Place place, const Wall wall, const Samples of, const int k)
 {
     const float c = entry(of, COSINE, k), s = entry(of, SINE, k), root = entry(of, ROOT_WEIGHT, k);
@@ -73,7 +73,7 @@ Expected expect(const Direction at, const Place place, const Wall wall, const Sa
         py = place.y + (pz - place.z) * sy;
     }
 
-    // Where the reflected ray meets the wall, and the light there.
+    // The intersection of the reflected ray with the wall, and the light there.
     const F facing = sx * bx + sy * by + bz, twice = facing + facing;
     const F rx = twice * bx - sx, ry = twice * by - sy, rz = twice * bz - 1.0f, flat = rx * rx + ry * ry;
     const F room = radius * radius - px * px - py * py, along = px * rx + py * ry;
@@ -91,7 +91,7 @@ Expected expect(const Direction at, const Place place, const Wall wall, const Sa
     steep *= wall.is[PER_Q];
     level += steep * (q - held);
 
-    // Its derivatives by the normal that the body sees, and by that of the mean pose.
+    // Its derivatives with respect to the normal in the body's frame, and in the mean pose.
     const float lamp_x = wall.is[LAMP_X], lamp_y = wall.is[LAMP_Y];
     const F lamp = 1.0f + lamp_x * mx + lamp_y * my, by_height = lamp * steep * (radius * per_far * per_both);
     const F further = (level * (lamp_x * rx + lamp_y * ry) + by_height * rz) * per_leave;
@@ -107,7 +107,8 @@ Expected expect(const Direction at, const Place place, const Wall wall, const Sa
     found.u2 = root * (at.cp * wy - at.sp * wx);
     found.u3 = root * (flat_v * bz - vz * out_n);
 
-    // Whether the rays that are turned up and down by the scatter meet the wall, too: by the sines of the angles to its edges.
+    // Whether the rays deflected up and down by the scatter also meet the wall: by the sines of the angles to
+    // its edges.
     const F below = wall.is[RIM] - h, over = wall.is[RIM] - pz, apart = way * way * flat;
     const F turned = wall.is[SCATTER] * (sx * sx + sy * sy + 1.0f);
     found.inside = (q == held) & (below >= 0.0f) & (h >= 0.0f)
@@ -115,8 +116,8 @@ Expected expect(const Direction at, const Place place, const Wall wall, const Sa
     return found;
 }
 
-// The mean light is that of a place on the wall; the wave gives its azimuth, and so how far it is from here. A missing
-// sample is taken for the mean of the others.
+// The mean light corresponds to a height on the wall; the wave gives the azimuth, and thus the distance to
+// the wall. A missing sample is replaced by the mean of the others.
 Direction begin_at(const Samples of, const F mean, const Place place, const Wall wall)
 {
     const float radius = wall.is[RADIUS], nearest = wall.is[NEAREST], furthest = wall.is[FURTHEST];
@@ -144,7 +145,7 @@ Direction begin_at(const Samples of, const F mean, const Place place, const Wall
                         rise * per_ray + per_sight);
 }
 
-// The normal equations at a direction, of samples that are all there and all within range.
+// The normal equations at a direction for samples that are all valid and in range.
 Sums look(const Direction at, const Samples of, const Place place, const Wall wall, const Wave wave)
 {
     Sums sums = {0};
@@ -159,7 +160,7 @@ Sums look(const Direction at, const Samples of, const Place place, const Wall wa
     return sums;
 }
 
-// The same of any samples.
+// The same for any samples.
 Sums look_closely(const Direction at, const Samples of, const Place place, const Wall wall, const F error_of_one)
 {
     Sums sums = {0};
@@ -191,7 +192,7 @@ __kernel void normals_wall(
             found = step(found, sums);
         }
         const F waves = sums.waves;
-        // Where too few samples tell anything, there is no answer, however closely one looks.
+        // Too few informative samples give no result, whatever the steps.
         const I irregular = ((known.usable < count) | (sums.within < count)) & (known.usable >= LEAST);
         if (any_of(irregular)) {
             Direction at = begin;

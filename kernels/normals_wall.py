@@ -1,11 +1,11 @@
-"""Surface normals where a cylindrical wall makes the light: what ``normals_wall.cl`` computes, in NumPy.
+"""Surface normals with a cylindrical wall: ``normals_wall.cl`` in NumPy.
 
-As `mirrorskin.kernels.normals.normals_exact`, but samples are lights (`mirrorskin.kernels.response`), not
-zeniths, and places count. The body sees a normal n at phase alpha as Rz(alpha) Ry(tilt) Rz(-alpha) n, and the
-point p of the object at pivot + Rz(alpha) Ry(tilt) Rz(-alpha) (p - pivot).
+Like `mirrorskin.kernels.normals.normals_exact`, but samples are lights (`mirrorskin.kernels.response`), not
+zeniths, and depend on the position. In the body's frame a normal n at phase alpha is Rz(alpha) Ry(tilt)
+Rz(-alpha) n, and the point p of the object is at pivot + Rz(alpha) Ry(tilt) Rz(-alpha) (p - pivot).
 
-It starts from the place on the wall that shows the mean light to the centre, and from the wave's azimuth,
-which is off by degrees. Gauss-Newton steps lead to the most likely normal from there.
+The initial value is the height on the wall that shows the mean light to the centre, and the wave's azimuth,
+which is wrong by degrees. Gauss-Newton steps lead from there to the maximum-likelihood normal.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from mirrorskin.kernels.response import light_slopes, sight_slopes, wall_light
 Array = NDArray[Any]
 
 STEPS = 3
-"""Gauss-Newton steps of all pixels: one more moves the answer by less than a tenth of its standard error."""
+"""Gauss-Newton steps of all pixels: one more changes the result by less than 0.1 standard errors."""
 
-_LEAST = 3  # samples that must be whole and within their range
+_LEAST = 3  # minimum number of valid samples within their range
 
 
 class Wall(NamedTuple):
-    """What makes the light; see `mirrorskin.io.WallResponse`.
+    """The model of the light; see `mirrorskin.io.WallResponse`.
 
     Attributes
     ----------
@@ -80,11 +80,11 @@ class Wall(NamedTuple):
 def normals_wall(
     frames: Array, turn: Doubles, scale: Doubles, wall: Wall, tilt: float, noise: Variance, limits: Limits
 ) -> Answer:
-    """Find the most likely normals; samples that are expected out of range say nothing of the direction.
+    """Return the maximum-likelihood normals; samples expected out of range carry no information.
 
-    The arguments are those of ``normals_exact``, but for ``scale``, (5, n): counts without light; light per
-    count; x and y from the wall's axis on the rest plane, and z of the object in the mean pose, mm. What the
-    model may leave out is an angle of the meridian here as well.
+    The arguments are those of ``normals_exact``, except for ``scale``, (5, n): counts without light; light
+    per count; x and y from the wall's axis on the rest plane, and z of the object in the mean pose, mm. The
+    model's error is an angle of the meridian here as well.
     """
     ends = np.broadcast_to(np.array(wall.ends)[:, np.newaxis], (2, scale.shape[1]))
     samples = Samples(frames, turn, np.concatenate([scale[:2], ends]), noise)
@@ -110,7 +110,7 @@ def normals_wall(
 
 
 def _start(samples: Samples, scale: Doubles, wall: Wall) -> Doubles:
-    """Return where the mean light and the wave point, (n, 3)."""
+    """Return the directions given by the mean light and the wave, (n, 3)."""
     known = np.maximum((~samples.missing).sum(axis=0), 1)
     zeniths = np.where(samples.missing, 0.0, samples.zenith)
     mean = zeniths.sum(axis=0) / known
@@ -136,7 +136,7 @@ def _start(samples: Samples, scale: Doubles, wall: Wall) -> Doubles:
 def _look(
     normal: Doubles, samples: Samples, turn: Doubles, scale: Doubles, wall: Wall, tilt: float, closely: bool
 ) -> tuple[Sums, NDArray[np.bool_]]:
-    """Form the normal equations at a direction, and say which samples are expected within range."""
+    """Return the normal equations at a direction, and which samples are expected within range."""
     turning, tilting = _rotations(turn, tilt)
     facing = np.einsum("kij,nj->kni", turning, normal)
     place = _places(scale, turning, wall)
@@ -156,7 +156,7 @@ def _look(
 
 
 def _rotations(turn: Doubles, tilt: float) -> tuple[Doubles, Doubles]:
-    """Return how the body at each phase sees a vector, (N, 3, 3), and how that changes with the tilt."""
+    """Return rotations to the body's frame at each phase, (N, 3, 3), and their derivatives by the tilt."""
     cosine, sine = turn[:2]
     zero, one = np.zeros_like(cosine), np.ones_like(cosine)
     out = np.stack([cosine, sine, zero], axis=1)
@@ -168,7 +168,7 @@ def _rotations(turn: Doubles, tilt: float) -> tuple[Doubles, Doubles]:
 
 
 def _places(scale: Doubles, turning: Doubles, wall: Wall) -> Doubles:
-    """Return where each sample's point is seen, as `wall_light` takes it, (5, N, n)."""
+    """Return the positions of each sample's point, as used by `wall_light`, (5, N, n)."""
     x, y, z = scale[2:]
     slope_x, slope_y = sight_slopes(np.stack([x, y]), wall.sight)
     point = np.stack([x + z * slope_x, y + z * slope_y, z])

@@ -1,19 +1,19 @@
-// Onset of the light state: the first crossing of the threshold that holds. Specification: onset.py.
+// Onset of the light state: the first crossing of the threshold that is confirmed. Specification: onset.py.
 //
 // FRAME    type of a sample; BITS, its width
-// TILE     pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
+// TILE     pixels of one work-item: 1 on a GPU, many on a CPU
 //
-// For the end of the light state each sample is complemented, so dark is light and light is dark: `release` is 1 then.
+// For the end of the light state (`release` = 1) samples are complemented, which exchanges dark and light.
 //
-// Maps lie in planes of `stride` pixels, of which the first `pixels` are the picture's:
+// Maps are planes of `stride` pixels, the first `pixels` of which belong to the picture:
 //
-// levels   counts at which a pixel turns light, NaN where it cannot; counts of its dark plateau
-// marks    the smallest sample that is light; that is not surely dark; that is near the level
-// left     frames after which nothing about a pixel can change any more if all are light, or MOST if they are more
-// times    frame at which the run began; the last frame that was surely dark, and the last that was not near the
-//          level, before a run that is not complete, or before now where the last sample is near the level
-// samples  the last sample; those before, at and after the onset of a run that is not complete; that after the last
-//          that was not near the level
+// levels   counts at which a pixel turns light, NaN if it cannot; counts of its dark plateau
+// marks    the smallest light sample; the smallest that is not certainly dark; the smallest near the level
+// left     number of frames after which a pixel is decided if all are light, at most MOST
+// times    frame at which the run started; the last certainly dark frame and the last frame not near the level,
+//          before an incomplete run, or before now if the last sample is near the level
+// samples  the last sample; those before, at and after the onset of an incomplete run; the sample after the last
+//          one that was not near the level
 // answers  height; sigma: as if no frame followed
 // status   0 invalid input, 1 onset, 2 never light, 3 light at start (`release`: 2 dark at start, 3 light to the end)
 // travel   has planes of `room` frames: travel; the step to it; travel since the first frame
@@ -26,7 +26,7 @@
 #define BENT 1.5f  // onset.py
 #define SURE_WAY 34  // standard deviations: a quarter of it is 8.5, which noise does not reach
 
-// As wide as a sample, so that whole vectors of both are worked on.
+// As wide as a sample, so that both have vectors of the same length.
 #if BITS == 8
 typedef uchar Count;
 #elif BITS == 16
@@ -34,10 +34,10 @@ typedef ushort Count;
 #else
 typedef uint Count;
 #endif
-#define CHUNK (TILE < 256 ? TILE : 256)  // pixels that are looked at together where something happens
+#define CHUNK (TILE < 256 ? TILE : 256)  // pixels examined together when something happens
 #define MOST (BITS == 8 ? 255 : 65535)
 #define NONE ((Count)~0u)
-#define SPAN 64  // frames that are counted before anything else is looked at
+#define SPAN 64  // frames that are counted before anything else is examined
 
 #if BITS == 32
 #define SEE(x) as_float(as_uint(x) ^ ((uint)release << 31))
@@ -49,7 +49,8 @@ typedef uint Count;
 #define LEAST(a, b) LESSER(a, b)
 #endif
 
-// --- Which samples are light -----------------------------------------------------------------------------------
+// --- Light samples
+// ----------------------------------------------------------------------------------------------
 
 float next_up(const float x)
 {
@@ -57,7 +58,7 @@ float next_up(const float x)
     return as_float(x == 0 ? 1 : up);
 }
 
-// The smallest float that is not below dark + share (bright - dark), as if in double precision.
+// The smallest float not below dark + share (bright - dark), as if in double precision.
 float level_between(const float dark, const float bright, const float share, const float share_rest)
 {
     const Pair range = sum_of(bright, -dark), product = product_of(share, range.high), sum = sum_of(dark, product.high);
@@ -65,28 +66,29 @@ float level_between(const float dark, const float bright, const float share, con
     return level.rest > 0 ? next_up(level.high) : level.high;
 }
 
-// Turns bright and dark, maps of step 1 or single numbers of step 0, into level and dark, and finds what is light.
+// Converts bright and dark, maps of step 1 or single numbers of step 0, to level and dark, and computes the
+// smallest light sample.
 __kernel void onset_levels(
     const int pixels, const int stride, const int release, const float share, const float share_rest, MAP brights,
     const int bright_step, MAP darks, const int dark_step, OUT levels, __global FRAME *restrict marks)
 {
     const int base = get_global_id(0) * TILE, width = min(TILE, pixels - base);
-    const int different = bright_step | dark_step ? width : 1;  // pixels; the others are like the first
+    const int different = bright_step | dark_step ? width : 1;  // pixels; the others equal the first
     if (width <= 0) return;
-    // Compilers make no vector code of unknown steps, nor (Intel's) of writes to two planes of one array.
+    // Compilers do not vectorise unknown strides, nor (Intel's) stores to two planes of one array.
     float high[TILE], low[TILE];
     for (int p = 0; p < different; ++p) high[p] = brights[bright_step ? base + p : 0];
     for (int p = 0; p < different; ++p) low[p] = darks[dark_step ? base + p : 0];
     for (int p = 0; p < different; ++p) {
         const float bright = high[p], dark = low[p], range = bright - dark;
-        const int usable = (range > 0) & (range - range == 0);  // the last: finite
+        const int usable = (range > 0) & (range - range == 0);  // the last condition: finite
         const float between = level_between(dark, bright, share, share_rest), level = usable ? between : NAN;
 #if BITS == 32
         marks[base + p] = release ? next_up(-level) : level;
         levels[base + p] = release ? -level : level;
         low[p] = release ? -bright : dark;
 #else
-        // Rounded up; a saturated sample is light. What is never dark has no release.
+        // Rounded up; a saturated sample is light. A pixel that is never dark has no release.
         const float top = NONE, bound = level > 0 ? (level < top ? level : top) : usable ? 0 : top;
         const int whole = (int)bound, reached = whole + (whole < bound);
         marks[base + p] = release ? (FRAME)(NONE - reached + 1) : (FRAME)reached;
@@ -102,8 +104,8 @@ __kernel void onset_levels(
     for (int p = different; p < width; ++p) levels[stride + base + p] = dark;
 }
 
-// Finds what is surely dark: samples that miss the level by `tolerance` counts; and what is near the level: all that
-// miss it by less than a quarter of the way from dark.
+// Computes the smallest samples that are not certainly dark (within `tolerance` counts of the level) and that
+// are near the level (within a quarter of the rise from dark).
 __kernel void onset_sure(
     const int pixels, const int stride, const float tolerance, MAP levels, __global FRAME *restrict marks)
 {
@@ -133,10 +135,11 @@ __kernel void onset_sure(
     for (int p = 0; p < width; ++p) marks[2 * stride + base + p] = nears[p];
 }
 
-// --- What the samples around an onset tell ------------------------------------------------------------------------
+// --- Samples around an onset
+// --------------------------------------------------------------------------------------
 
-// The last frame below `bound` from frame `from` of a pixel's `series` backwards; the first of all is taken for dark.
-// The series begins with frame `first`; `last` is the sample before it, and `known` the answer there.
+// The last frame below `bound`, from frame `from` of a pixel's `series` backwards; the very first counts as
+// dark. The series starts with frame `first`; `last` is the sample before it, and `known` the result there.
 int last_below(
     __global const FRAME *series, const int from, const int pixels, const int first, const int release,
     const FRAME bound, const FRAME last, const int known)
@@ -146,8 +149,9 @@ int last_below(
     return first == 0 ? 0 : last < bound ? first - 1 : known;
 }
 
-// Height and variance of a pixel: onset.py explains them. All is computed, then chosen, so that it becomes vector code.
-// `jumped` says that `from` and `step` are not of the onset, but of the step in which the pixel rose to its plateau.
+// Height and variance of a pixel, see onset.py. Everything is computed and then selected, so that it
+// vectorises. `jumped` means that `from` and `step` describe the step in which the pixel rose to its plateau,
+// not the onset.
 float2 answer(
     const float low, const float high, const float after, const float waited, const float doubt, const float from,
     const float step, const float level, const float dark, const float threshold, const float noise,
@@ -163,7 +167,7 @@ float2 answer(
     const float crossed = (most - low) * steepness, rest = 1 - crossed;
     const float share = sudden ? 0.5f : crossed;
     const float slope = step * noise * steepness, width = step + (hovered ? doubt : 0);
-    // With a normal distribution's quantile in place of the share: v + BENT v^3, v the share less a half.
+    // With the quantile of a normal distribution in place of the share: v + BENT v^3, v = share - 1/2.
     const float way = level - dark, per_way = way > 0 ? threshold / way : 0, middle = threshold - 0.5f;
     const float below = (low - dark) * per_way - 0.5f, above = (high - dark) * per_way - 0.5f;
     const float both = below * below + below * above + above * above;
@@ -172,9 +176,11 @@ float2 answer(
     return (float2)(-(from + step * share), (look ? known : 0) + (guess ? guessed : 0));
 }
 
-// --- Frames, one after the other ----------------------------------------------------------------------------------
+// --- Frame by frame
+// ---------------------------------------------------------------------------------------------
 
-// Finds when a pixel was last surely dark, and not near its level, at frame `from` or before, and the sample after that.
+// Finds the last frames, up to `from`, that were certainly dark and that were not near the level, and the
+// sample after the latter.
 #define LOOK_BACK(p, from) \
     { \
         const FRAME last = first > 0 ? SEE(lasts[p]) : 0; \
@@ -184,8 +190,9 @@ float2 answer(
         if (next >= 0 && next <= from - first) risens[p] = SEE(frames[(size_t)next * pixels + (p)]); \
     }
 
-// One of the frames that are taken side by side: where it is dark, the pixel starts again, until it has held. Both are so
-// where neither difference is 0: bytes have no comparison without a sign on many processors, but such a difference.
+// One of several frames processed together: where it is dark, the run of the pixel restarts, unless it is
+// confirmed. Both conditions hold where neither difference is 0: many processors cannot compare unsigned
+// bytes, but have saturated differences.
 #if BITS == 32
 #define TAKE(i) \
     sample = SEE(group[(size_t)(i) * pixels + p]); \
@@ -199,7 +206,7 @@ float2 answer(
     again = LESSER((Count)LACK(light[p], sample), (Count)LACK(end_of_run, clock##i)); \
     end_of_run = again ? next##i : end_of_run;
 #endif
-// Read from an array: compilers widen to 32 bits what is computed.
+// Read from an array: compilers widen computed values to 32 bits.
 #define TIMES(i) const Count clock##i = CLOCK(t + i), next##i = CLOCK(t + i + 1) + most;
 #if TILE > 1
 #define CLOCK(t) clock[t]
@@ -218,8 +225,8 @@ float2 answer(
 #define EIGHT(each) each(0) each(1) each(2) each(3) each(4) each(5) each(6) each(7)
 #define SIXTEEN(each) EIGHT(each) each(8) each(9) each(10) each(11) each(12) each(13) each(14) each(15)
 
-// Takes in frames `first` to `first + count` of a press. Without `subframe` the height is that of the paper's
-// equation 4, at the frame of the onset itself, and there are no `samples`.
+// Processes frames `first` to `first + count` of a press. Without `subframe` the height is that of the
+// paper's equation 4, at the frame of the onset itself, and there are no `samples`.
 __kernel void onset_scan(
     __global const FRAME *restrict frames, const int count, const int pixels, const int stride, const int first,
     const int hold, const int release, const int subframe, const float threshold, __global const FRAME *restrict marks,
@@ -228,10 +235,11 @@ __kernel void onset_scan(
     OUT answers, __global uchar *restrict status)
 {
     const int base = get_global_id(0) * TILE, width = min(TILE, pixels - base), never = 2 + release;
-    // Frames from an onset on, after which nothing about it can change.
+    // Frames after an onset until it is final.
     const int needed = subframe && hold < 3 ? 3 : hold, after = needed - hold;
     const Count whole = LESSER(needed, MOST);
-    const Count most = LESSER(hold, 2 * SPAN);  // frames of a run that are counted: it cannot hold within SPAN beyond that
+    // counted frames of a run: beyond this it cannot be confirmed within SPAN
+    const Count most = LESSER(hold, 2 * SPAN);
 #if TILE > 1
     Count clock[SPAN + 1];
     for (int t = 0; t <= SPAN; ++t) clock[t] = t;
@@ -273,8 +281,8 @@ __kernel void onset_scan(
         for (int p = 0; p < width; ++p) any |= remain[p];
         if (!any) break;
 
-        // When a run has held, counted from `now`, if all frames from its beginning are light; beyond `most` where it begins
-        // after `now`.
+        // When a run is confirmed, counted from `now`, if all frames from its start are light; beyond `most`
+        // if it starts after `now`.
         Count held[TILE], bad[TILE];
         for (int p = 0; p < width; ++p) held[p] = remain[p] > after ? LESSER(remain[p] - after, most) : 0;
         for (int p = 0; p < width; ++p) bad[p] = 0;
@@ -322,8 +330,8 @@ __kernel void onset_scan(
                 continue;
             }
 
-            // The samples around onsets within these frames. Those of other pixels mean nothing: simple loops over all are
-            // faster than a choice.
+            // The samples around onsets within these frames. Those of other pixels are meaningless: simple
+            // loops over all are faster than a selection.
             FRAME dim[CHUNK], bright[CHUNK], later[CHUNK], second[CHUNK];
             int at[CHUNK], old = 0, running = 0, unsure = 0;
             for (int p = low; p < high; ++p) {
@@ -342,7 +350,7 @@ __kernel void onset_scan(
                 dim[i] = start + at[i] > 0 ? SEE(sample) : SEE(last);
                 later[i] = LEAST(one, two);
             }
-            // Runs that began before `now` are known by the samples that were kept, and by the next two.
+            // Runs that started before `now` use the samples that were kept, and the next two.
             for (int p = low; p < high && old; ++p) {
                 if ((before[p - low] == 0) | (times[p] <= 0) | (times[p] >= now)) continue;
                 const FRAME kept = laters[p], one = SEE(span[p]), two = SEE(span[length > 1 ? p + pixels : p]);
@@ -352,7 +360,7 @@ __kernel void onset_scan(
                 later[p - low] = since == 1 ? LEAST(one, two) : since == 2 ? LEAST(kept, one) : kept;
             }
 
-            // Where the sample before is near the level, one has to look further back: mostly by one sample.
+            // If the previous sample is near the level, the search continues backwards, mostly by one sample.
             float waited[CHUNK], doubt[CHUNK];
             int frame[CHUNK], jumped[CHUNK], waits[CHUNK], hard = 0;
             for (int p = low; p < high; ++p) {
@@ -420,7 +428,7 @@ __kernel void onset_scan(
 
     for (int p = 0; p < width; ++p) left[base + p] = remain[p];
     if (!subframe) return;
-    // Where the last sample is near the level, the next block would not see since when.
+    // If the last sample is near the level, the next block could not determine since when.
     __global const FRAME *restrict final = frames + (size_t)(count - 1) * pixels;
     for (int low = 0, high; low < width; low = high) {
         high = min(low + CHUNK, width);

@@ -1,12 +1,12 @@
-"""Onset of the light state: what ``onset.cl`` computes, in plain NumPy with float64 inside.
+"""Onset of the light state: ``onset.cl`` in plain NumPy with float64.
 
-A pixel is light in a frame when its sample is at least its light level. Its onset is the first frame of
-the first run of light frames that lasts for `hold` frames, or until the stack ends. The scan goes through
-a stack block by block and keeps, per pixel, the start of the present or the decided run and the samples
-around it; the heights follow from those. The kernel does both at once: it answers for a pixel as soon as no
-further frame can change its answer.
+A pixel is light in a frame if its sample is at least its light level. Its onset is the first frame of the
+first run of light frames that lasts for `hold` frames, or until the stack ends. The scan processes a stack
+block by block and keeps, per pixel, the start of the current or the confirmed run and the samples around it;
+the heights are computed from those. The kernel does both at once: it computes a pixel as soon as no further
+frame can change its result.
 
-The end of the light state is the onset of the dark one: the same on samples and levels that are complemented.
+The end of the light state is the onset of the dark one: the same with complemented samples and levels.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ Array = NDArray[Any]
 DARK = -1
 INVALID = -2
 BENT = 1.5
-"""Of the normal distribution's quantile of a share v + 1/2: v + BENT v^3, within a tenth from 0.1 to 0.9."""
+"""Coefficient of the normal quantile of a share v + 1/2: v + BENT v^3, within a tenth from 0.1 to 0.9."""
 _SURE_WAY = 34  # standard deviations: a quarter of it is 8.5, which noise does not reach
 
 
 def complement(samples: Array) -> Array:
-    """Exchange dark and light: the distance to the type's largest number, or the negative of a float."""
+    """Return complemented samples: the distance to the type's largest number, or the negative of a float."""
     return -samples if samples.dtype.kind == "f" else ~samples
 
 
 def onset_levels(
     bright: Array, dark: Array, threshold: float, dtype: np.dtype[Any], release: bool = False
 ) -> tuple[Array, Array, Array]:
-    """Turn a share of the way from dark to bright into counts: level, plateau and light.
+    """Return level, plateau and light for a share of the range from dark to bright, counts.
 
     ``level`` is the smallest float32 that reaches the threshold, NaN where bright is not above dark;
-    ``plateau`` the counts without light; ``light`` the smallest sample that is light, as saturated ones
-    always are. For a release all are complemented: the plateau is that with light, and ``light`` the smallest
-    complemented sample that is not.
+    ``plateau`` the counts without light; ``light`` the smallest light sample; saturated samples are always
+    light. For a release all are complemented: the plateau is that with light, and ``light`` the smallest
+    complemented sample that is not light.
     """
     low, high = dark.astype(np.float64), bright.astype(np.float64)
     with np.errstate(invalid="ignore"):
@@ -59,9 +59,9 @@ def onset_levels(
 
 
 def onset_sure(level: Array, light: Array, tolerance: float) -> Array:
-    """Return the smallest samples, (P,), that miss the level by less than the tolerance, counts.
+    """Return the smallest samples, (P,), that are within the tolerance, counts, of the level.
 
-    Below them a sample is surely dark. They are never above `light`, and `light` itself where the level is
+    Samples below them are certainly dark. They are never above `light`, and equal to `light` if the level is
     beyond the range of the type.
     """
     sure = np.nan_to_num(level) - np.float32(tolerance)
@@ -73,9 +73,9 @@ def onset_sure(level: Array, light: Array, tolerance: float) -> Array:
 
 
 def onset_near(level: Array, dark: Array, sure: Array) -> Array:
-    """Return the smallest samples, (P,), that miss the level by less than a quarter of the way from dark.
+    """Return the smallest samples, (P,), within a quarter of the range from dark to the level.
 
-    They are never above `sure`, and `sure` itself where nothing is so far below the level.
+    They are never above `sure`, and equal to `sure` where nothing is that far below the level.
     """
     level = level.astype(np.float32)
     below = np.float32(0.25) * (level - dark)
@@ -89,7 +89,7 @@ def onset_near(level: Array, dark: Array, sure: Array) -> Array:
 def onset_scan(frames: Array, first: int, hold: int, light: Array, sure: Array, near: Array, onset: Array,
                below: Array, foot: Array, risen: Array, last: Array, before: Array, at: Array,
                after: Array) -> None:  # fmt: skip
-    """Go through a block of frames; the maps are the state, changed in place.
+    """Process a block of frames; the maps are the state, updated in place.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def onset_scan(frames: Array, first: int, hold: int, light: Array, sure: Array, 
 
         next_to = onset == number - 1
         after[next_to] = frame[next_to]
-        # A bright spike is no plateau: of two samples the lesser is the safer one.
+        # A bright spike is not a plateau, so the smaller of two samples is used.
         second = (onset == number - 2) & (onset >= 0)
         after[second] = np.fmin(after[second], frame[second])
         last[:] = frame
@@ -134,22 +134,26 @@ def onset_heights(onset: Array, below: Array, foot: Array, risen: Array, before:
                   after: Array, level: Array, dark: Array, threshold: float, travel: NDArray[np.float64],
                   noise: float, dark_tolerance: float, light_tolerance: float,
                   subframe: bool) -> tuple[NDArray[np.float64], NDArray[np.float64], Array]:  # fmt: skip
-    """Turn onsets into heights, standard deviations (mm) and status.
+    """Return heights, standard deviations (mm) and status for onsets.
 
-    The crossing lies between the frame before the onset and the onset. Where both samples sit on the pixel's
-    plateaus, nothing is known but that interval: its middle is the unbiased guess, and its half-width over
-    sqrt(3) the standard deviation. Elsewhere the samples tell where the level was crossed, as well as the
-    noise allows if the change was under way in both of them; a sample on a plateau does not tell when the
-    change began or ended, so with one of them there the interval's share is added. Brightness rises evenly
-    where a slope crosses a pixel, and like the integral of a normal distribution behind a lens that blurs:
-    the difference of the two crossings is added to the standard deviation of a change that was under way in a
-    sample. A pixel may also hover about its level and cross it when noise says so: its step is within the
-    noise, or it was near the level for longer than its step would take. It may have crossed at any time since
-    the last frame in which it was surely dark. But where it had risen to its light plateau in one step, and
-    that plateau is so near the level that noise hid it at first, the change was in that step. A sample off
-    its plateau by less than an eighth of the step may sit on it all the same, lit by its neighbours. Without
-    `subframe` the height is that of the paper's equation 4, at the onset itself, which is wrong by half a
-    step on average and by up to a whole one.
+    The crossing is between the frame before the onset and the onset. If both samples are on the pixel's
+    plateaus, only that interval is known: its middle is the unbiased estimate, and its half-width over
+    sqrt(3) the standard deviation. Otherwise the samples determine the crossing as accurately as the noise
+    allows if both are in transition. A sample on a plateau does not show when the change started or ended, so
+    if one of them is on a plateau, the variance of the interval is added.
+
+    Brightness rises linearly where a slope crosses a pixel, and like the integral of a normal distribution
+    behind a lens that blurs: the difference of the two crossings is added to the standard deviation of a
+    sample in transition.
+
+    A pixel may also hover about its level, where noise determines the crossing: its step is within the noise,
+    or it was near the level for longer than its step would take. The crossing may then be at any time since
+    the last frame in which it was certainly dark. But if it had risen to its light plateau in one step, and
+    noise hid this at first because that plateau is near the level, the change was in that step. A sample off
+    its plateau by less than an eighth of the step may still be on it, with light from its neighbours.
+
+    Without `subframe` the height is that of the paper's equation 4, at the onset itself, whose error is half
+    a step on average and up to a whole one.
 
     Parameters
     ----------
@@ -185,7 +189,7 @@ def onset_heights(onset: Array, below: Array, foot: Array, risen: Array, before:
     per_way = np.divide(threshold, way, out=np.zeros_like(low), where=way > 0)
     first, second = ((part - dark[found]) * per_way - 0.5 for part in (low, high))
     middle, both = threshold - 0.5, first**2 + first * second + second**2
-    # Less the crossing of the quantile z(v) = v + BENT v^3: (z(middle) - z(first)) / (z(second) - z(first)).
+    # Minus the crossing of the quantile z(v) = v + BENT v^3: (z(middle) - z(first)) / (z(second) - z(first)).
     off = crossed * BENT * (middle - second) * (middle + first + second) / (1 + BENT * both)
     known = np.abs(width) * np.hypot(noise * np.hypot(crossed, 1 - crossed) / step, off)
     hovered = (step <= light_tolerance) | ((start - 2 - below[found]) * step > 2.5 * light_tolerance)

@@ -1,4 +1,4 @@
-"""A device's memory that is kept from call to call, since a new buffer costs more than its first kernel."""
+"""A device's memory that is cached between calls, because a new buffer costs more than its first kernel."""
 
 from __future__ import annotations
 
@@ -11,25 +11,26 @@ import pyopencl as cl
 from mirrorskin.kernels.waiting import waiting
 
 SHARE = 8
-"""The memory of a device over the bytes that are kept at most while nobody uses them."""
+"""Ratio of a device's memory to the maximum of unused bytes that are cached."""
 
 _Kept = tuple[cl.Buffer, cl.Event | None]
 
 
 class BufferPool:
-    """Buffers that nobody uses, each with the last command that used it.
+    """Unused buffers, each with the last command that used it.
 
-    A buffer is taken again for the same number of bytes only, so that tools which find accesses beyond the
-    end of a buffer find them.
+    A buffer is reused only for the same number of bytes, so that tools which detect accesses beyond the end
+    of a buffer work.
     """
 
     def __init__(self, limit: int) -> None:
         self._limit, self._lock = limit, threading.Lock()
-        self._kept: list[_Kept] = []  # what was given back the longest ago comes first
-        self._given_back: deque[_Kept] = deque()  # and not yet kept: a finalizer waits for no lock
+        self._kept: list[_Kept] = []  # least recently used first
+        # not yet in the cache, because a finalizer must not wait for a lock
+        self._given_back: deque[_Kept] = deque()
 
     def give(self, buffer: cl.Buffer, last_use: cl.Event | None) -> None:
-        """Keep a buffer that nobody refers to any more, with the last command that uses it."""
+        """Cache an unreferenced buffer, with the last command that uses it."""
         self._given_back.append((buffer, last_use))
 
     def take(self, nbytes: int) -> _Kept | None:
@@ -42,19 +43,19 @@ class BufferPool:
         return None
 
     def free(self) -> None:
-        """Give all buffers that nobody uses back to the driver."""
+        """Return all unused buffers to the driver."""
         with self._lock:
             self._tidy(limit=0)
 
     def _tidy(self, limit: int | None = None) -> None:
-        """Keep what was given back, and release what was not used for the longest time."""
+        """Cache returned buffers, and release the least recently used."""
         while self._given_back:
             self._kept.append(self._given_back.popleft())
         excess = sum(buffer.size for buffer, _ in self._kept) - (self._limit if limit is None else limit)
         while self._kept and excess > 0:
             buffer, last_use = self._kept.pop(0)
             excess -= buffer.size
-            if last_use is not None:  # drivers differ in what they do with buffers that commands still use
+            if last_use is not None:  # drivers differ in how they treat buffers that commands still use
                 with waiting, suppress(cl.Error):
                     last_use.wait()
             buffer.release()

@@ -1,7 +1,7 @@
 // Normal equations of a rigid motion between two maps. Specification: pose.py.
 //
-// TILE     1 where an item is a lane; otherwise it processes a row of LANES pixels at once
-// BESIDE   1 where the Jacobian by the first map's own curvature is wanted too
+// TILE     1 on a GPU; otherwise an item processes a row of LANES pixels at once
+// BESIDE   1 if the Jacobian by the first map's own curvature is also computed
 
 #include "common.clh"
 
@@ -23,7 +23,7 @@
 #define LOAD(map, p) (*(__global const Loose *)((map) + 8 * (p)))
 #define KEEP(values, room) (*(Lanes *)(room) = (values))
 #define KEPT(room) (*(const Lanes *)(room))
-typedef float8 __attribute__((aligned(4))) Loose;  // somewhere in memory
+typedef float8 __attribute__((aligned(4))) Loose;  // unaligned
 typedef F __attribute__((aligned(4))) Lanes;
 typedef I __attribute__((aligned(4))) Places;
 
@@ -66,7 +66,7 @@ float sum_over_lanes(const F x) { return x; }
 #define NUMBERS 0
 #endif
 
-// What does not count has no effect, and is finite.
+// Invalid pixels get weight 0 and finite values.
 Record where(const I known, const Record r)
 {
     const F none = 0.0f;
@@ -76,7 +76,7 @@ Record where(const I known, const Record r)
 
 Vector upright(const F x, const F y) { return (Vector){x, y, roots(GREATER(1.0f - x * x - y * y, (F)1e-6f))}; }
 
-// Covariance of a normal after a rotation; u, v: x and y of it then.
+// Covariance of a normal after a rotation; u, v: its x and y then.
 Symmetric variances(const Vector n, const float *turn, const F u, const F v, const F square, const float least)
 {
     const F flat = n.x * n.x + n.y * n.y, outside = GREATER(flat, (F)least), per_outside = 1.0f / outside;
@@ -109,7 +109,8 @@ Symmetric turn_curvature(const F z_before, const Symmetric h, const F over_z, co
                        scale * (yy + 2.0f * yz * q + zz * q * q)};
 }
 
-// Three rows of the Jacobian, six numbers each; the first two are whitened, and have 0 for a translation along z.
+// Three rows of the Jacobian, six numbers each; the first two are whitened, and are 0 for a translation along
+// z.
 typedef struct { F x[5], y[5], z[6]; } Jacobian;
 #define UPPER(i, k) ((i) * (11 - (i)) / 2 + (k))
 #define PRODUCT(a, i, b, k) \
@@ -134,7 +135,7 @@ void jacobian(const Vector n, const Symmetric h, const F over_z, const Vector ar
     rows->z[5] = sure;
 }
 
-// Of pose after pose, and block after block of the first map's pixels: the sums that pose.py names, SUMS numbers each.
+// For each pose and each block of the first map's pixels: the SUMS sums described in pose.py.
 __kernel void pose_equations(
     const int count, const int rows, const int columns, const int other_rows, const int other_columns, const int step,
     MAP first, MAP second, MAP poses, OUT sums)

@@ -1,9 +1,9 @@
-"""Normal equations of a rigid motion between two maps: what ``pose.cl`` computes, in NumPy with float64.
+"""Normal equations of a rigid motion between two maps: ``pose.cl`` in NumPy with float64.
 
 A map is an array of records, (H, W, 8): the normal's x and y, the mean square angular error of the normal
-(radians^2, `VAGUE` or more where it is not to be compared), height (mm) and its variance (mm^2, `FAR` where
-it is not to be compared), and the second derivatives of the height xx, xy and yy (1/mm). A pixel that cannot
-be used is NaN in its first number.
+(radians^2, `VAGUE` or more if it is not to be compared), height (mm) and its variance (mm^2, `FAR` if it is
+not to be compared), and the second derivatives of the height xx, xy and yy (1/mm). The first number of an
+unusable pixel is NaN.
 """
 
 from __future__ import annotations
@@ -20,18 +20,19 @@ Array = NDArray[Any]
 BLOCK = 8
 """Pixels on each side of a block, whose sums are written together."""
 PARTS = (0, 21, 27, 28, 29, 30, 31, 67)
-"""Where the sums of a block begin: upper triangle of J'WJ; J'Wr; chi^2; what is expected of it; compared
-heights; compared normals; and J'WK, K being the Jacobian by the first map's own normals and curvature, which
-is the only part that a block may lack."""
+"""Offsets in the sums of a block: upper triangle of J'WJ; J'Wr; chi^2; its expectation; compared heights;
+compared normals; and J'WK, with K the Jacobian by the first map's own normals and curvature, which is
+optional.
+"""
 FAR = 1e30
 NEAR = 1e20
-"""Variance from which on a height is not compared: of FAR, the smallest share between pixels is more."""
+"""Variance above which a height is not compared: even the smallest interpolated share of FAR exceeds it."""
 VAGUE = 100.0
-"""Radians^2 from which on a normal is not compared."""
+"""Radians^2 above which a normal is not compared."""
 
 
 class Shape(NamedTuple):
-    """Normals with what their change needs: rows (n,), of the unit vectors and the second derivatives."""
+    """Normals and the quantities for their derivatives: rows (n,), of unit vectors and second derivatives."""
 
     x: Doubles
     y: Doubles
@@ -42,7 +43,7 @@ class Shape(NamedTuple):
 
 
 def pose_equations(step: int, first: Array, second: Array, poses: Array, sums: Array) -> None:
-    """Write sums of each block of the first map's pixels at some poses; every ``step``-th pixel counts.
+    """Write sums over each block of the first map's pixels at some poses; every ``step``-th pixel counts.
 
     Parameters
     ----------
@@ -113,10 +114,10 @@ def _upright(x: Doubles, y: Doubles) -> Doubles:
 
 
 def _interpolate(second: Doubles, place: Doubles, grid: Array) -> tuple[Doubles, Doubles, NDArray[np.bool_]]:
-    """Return the records at places, (8, n), the squared weights' sums, and which places have four pixels.
+    """Return the records at positions, (8, n), the sums of squared weights, and where four pixels exist.
 
-    Between pixels all numbers change linearly. To the height each pixel adds half of what its own normal
-    makes of the distance, so that a paraboloid remains one.
+    All numbers are interpolated linearly. Each pixel adds to the height half of the rise given by its own
+    normal, so that a paraboloid remains one.
     """
     rows, columns = second.shape[:2]
     x0, y0, step_x, step_y = grid
@@ -142,7 +143,7 @@ def _interpolate(second: Doubles, place: Doubles, grid: Array) -> tuple[Doubles,
 def _variances(x: Doubles, y: Doubles, turn: Array, square: Doubles, least: float) -> Doubles:
     """Return the covariance xx, xy, yy of a normal's x and y after a rotation.
 
-    An angular error has the share ``least`` / (2 sin^2 zenith) of its variance along the meridian.
+    The share ``least`` / (2 sin^2 zenith) of the variance of an angular error is along the meridian.
     """
     flat = x * x + y * y
     share = least / 2 / np.maximum(flat, least)

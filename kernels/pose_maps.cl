@@ -1,6 +1,6 @@
 // Records of a map for the fit of a motion, from its heights and normals. Specification: pose_maps.py.
 //
-// TILE     pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
+// TILE     pixels of one work-item: 1 on a GPU, many on a CPU
 
 #include "common.clh"
 
@@ -24,7 +24,7 @@
     const int begin = (int)get_global_id(0) * TILE;     \
     for (int p = begin; p < LESSER(begin + TILE, rows * columns); ++p)
 
-// Slopes along x and y of the plane that fits the known ones of 5 x 5 pixels; NAN if they do not determine one.
+// Slopes along x and y of the plane fitted to the valid heights of 5 x 5 pixels; NAN if it is undetermined.
 INLINE float2 gradient_at(
     MAP values, const int rows, const int columns, const int p, const float step_x, const float step_y)
 {
@@ -139,7 +139,7 @@ __kernel void pose_halve(const int rows, const int columns, const int wide, MAP 
     }
 }
 
-// Of strips of a row, one after the other: SUMMARY numbers.
+// For strips of a row, one after the other: SUMMARY numbers.
 __kernel void pose_summary(
     const int rows, const int columns, const float x0, const float y0, const float step_x, const float step_y,
     MAP records, OUT summary)

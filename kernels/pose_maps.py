@@ -1,4 +1,4 @@
-"""Records of a map for the fit of a motion: what ``pose_maps.cl`` computes, in NumPy with float64.
+"""Records of a map for the fit of a motion: ``pose_maps.cl`` in NumPy with float64.
 
 Records are those of `mirrorskin.kernels.pose`.
 """
@@ -19,16 +19,16 @@ STEEPEST = 0.17
 NOT_COMPARED = 1e6
 """Mean square error of normals that are not compared, radians^2."""
 SUMMARY, STRIP = 6, 16
-"""Numbers of a strip in `pose_summary`, and its pixels."""
-AROUND = 2  # pixels around edges and the border of contact that are not used; reach of a gradient
-_LEAST = 7  # pixels that a gradient is taken from
-_FLAT = 1e-3  # of a singular arrangement of them
+"""Length of the record of a strip in `pose_summary`, and number of its pixels."""
+AROUND = 2  # pixels around edges and the border of contact that are excluded; reach of a gradient
+_LEAST = 7  # minimum number of pixels of a gradient
+_FLAT = 1e-3  # relative determinant of a singular arrangement of them
 
 
 def pose_gradient(step_x: float, step_y: float, values: Array, gradient: Array) -> None:
-    """Write the slopes along x and y, (H, W, 2), of the plane that fits what is known of 5 x 5 pixels best.
+    """Write the slopes along x and y, (H, W, 2), of the plane fitted to the valid heights of 5 x 5 pixels.
 
-    NaN where the pixel itself is unknown, or fewer than seven are known, or these lie along a line.
+    NaN if the pixel itself is invalid, or fewer than seven are valid, or these are collinear.
     """
     rows, columns = values.shape
     wide = np.pad(values.astype(np.float64), AROUND, constant_values=np.nan)

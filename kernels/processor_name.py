@@ -1,10 +1,10 @@
-"""A correction of PoCL 3.0: the name of the processor that it compiles for, patched in memory.
+"""A correction of PoCL 3.0: the name of the processor for which it compiles, patched in memory.
 
-The wheel of PoCL 3.0 holds LLVM 14. A processor younger than that is "generic" to it, a name that its own
-compiler then refuses, and no option overrides it. Here the function that names the processor is made to
-answer with the best older one that has no instruction that this one lacks. Only the very function of that
-wheel, known by its code, is called and patched: in another library the same name may stand for anything. Any
-other PoCL is used as it is.
+The wheel of PoCL 3.0 contains LLVM 14. It calls a newer processor "generic", a name that its own compiler
+refuses, and no option overrides it. Here the function that returns the name is patched to return the best
+older processor without instructions that this one lacks. Only the function of that wheel, identified by its
+code, is called and patched, because in another library the same name may mean anything. Any other PoCL is
+unchanged.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ NAME_FUNCTION = "pocl_get_llvm_cpu_name"
 _NAME_FUNCTION_SIZE = 83  # bytes, in that wheel
 _NAME_FUNCTION_SHA256 = "fd587da3800019b6c70376351f2227b8fea5f15daff803329977ee54951655b6"  # of its code
 
-# PoCL's builds of its own library, by the processor they are for. Each needs what the ones before it need
-# and what stands beside it: the instructions that a compiler uses unasked, in the words of /proc/cpuinfo.
+# PoCL's builds of its own library, by processor. Each needs the instructions of the preceding ones and those
+# listed with it: the instructions that a compiler uses by default, as named in /proc/cpuinfo.
 _LEVELS = (
     ("core2", {"pni", "ssse3", "cx16", "lahf_lm"}),
     ("penryn", {"sse4_1"}),
@@ -99,7 +99,7 @@ class _Symbol(ctypes.Structure):
 
 
 class _Found(ctypes.Structure):
-    """What the dynamic linker knows of an address (Dl_info)."""
+    """Information of the dynamic linker about an address (Dl_info)."""
 
     _fields_ = (
         ("file", ctypes.c_char_p), ("base", ctypes.c_void_p), ("name", ctypes.c_char_p),
@@ -108,7 +108,7 @@ class _Found(ctypes.Structure):
 
 
 def look_up(address: int | None) -> tuple[Path | None, int]:
-    """Return the library that an address is in, and the bytes of its function there, 0 where unknown."""
+    """Return the library that contains an address, and the size of its function there, 0 if unknown."""
     found, symbol = _Found(), ctypes.POINTER(_Symbol)()
     search = getattr(ctypes.CDLL(None), "dladdr1", None)
     if search is None or not search(ctypes.c_void_p(address), ctypes.byref(found), ctypes.byref(symbol), 1):
@@ -130,7 +130,7 @@ def _address(function: Any) -> int:
 
 @functools.cache
 def _c_string(text: str) -> ctypes.Array[ctypes.c_char]:
-    """Return a string that stays in memory: the machine code below points at it."""
+    """Return a string that stays in memory, because the machine code below points to it."""
     return ctypes.create_string_buffer(text.encode())
 
 

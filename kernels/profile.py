@@ -1,4 +1,4 @@
-"""What was done on a device, how long it took and how many bytes it moved."""
+"""Statistics of the work on a device: durations and bytes."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from mirrorskin.kernels.waiting import waiting
 
 Kind = Literal["compile", "upload", "fill", "copy", "kernel", "download", "wait"]
 
-_PENDING_LIMIT = 1024  # events held before they are read, so that an endless run stays bounded
+_PENDING_LIMIT = 1024  # events kept before they are read, which bounds the memory of an endless run
 
 
 @dataclass(slots=True)
 class Record:
-    """All runs of one kernel, program or array: seconds and bytes moved are those of all of them together.
+    """All runs of one kernel, program or array: seconds and bytes are totals.
 
-    Those of kind "wait" are the times that the host waited for the device; all other kinds are work.
+    The kind "wait" is the time that the host waited for the device; all other kinds are work.
     """
 
     kind: Kind
@@ -34,7 +34,7 @@ class Record:
 
     @property
     def bandwidth(self) -> float:
-        """Bytes per second over all runs; 0 where no time was taken."""
+        """Bytes per second over all runs; 0 if no time was measured."""
         return self.bytes / self.seconds if self.seconds > 0 else 0.0
 
 
@@ -52,41 +52,41 @@ class Profile:
             self._add(kind, name, seconds, 0)
 
     def wait(self, name: str, event: cl.Event) -> None:
-        """Wait for a command, and count that."""
+        """Wait for a command, and record the time."""
         with self.waiting_for(name):
             event.wait()
 
     @contextmanager
     def waiting_for(self, name: str) -> Iterator[None]:
-        """Count a wait for the device, which is what is done in this context."""
+        """Record the duration of this context as a wait for the device."""
         start = time.perf_counter()
         with waiting:
             yield
         self.add("wait", name, time.perf_counter() - start)
 
     def watch(self, kind: Kind, name: str, event: cl.Event, nbytes: int) -> None:
-        """Count the run that ``event`` ends, once it is over."""
+        """Record the run of ``event``, once it is over."""
         with self._lock:
             self._pending.append((kind, name, event, nbytes))
             if len(self._pending) >= _PENDING_LIMIT:
-                self._read_pending(_PENDING_LIMIT // 2)  # those are over, mostly
+                self._read_pending(_PENDING_LIMIT // 2)  # mostly completed
 
     def records(self) -> list[Record]:
-        """Wait for what is under way and return all records, longest first."""
+        """Wait for pending runs and return all records, longest first."""
         with self._lock:
             self._read_pending()
             return sorted(self._records.values(), key=lambda record: -record.seconds)
 
     def clear(self) -> None:
-        """Forget everything so far."""
+        """Remove all records."""
         with self._lock:
             self._read_pending()
             self._records.clear()
 
     def _read_pending(self, count: int | None = None) -> None:
-        """Count the oldest of the runs that were watched, by default all."""
+        """Record the oldest pending runs, by default all."""
         pending = self._pending[:count]
-        del self._pending[:count]  # one that failed is not waited for again
+        del self._pending[:count]  # a failed one is not waited for again
         for kind, name, event, nbytes in pending:
             with waiting:
                 event.wait()

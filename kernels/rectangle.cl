@@ -1,23 +1,23 @@
-// Heights of a full rectangle: cosine modes of its rows and then of its columns, each divided by what the links make of it, and
-// back. Specification: rectangle.py.
+// Heights of a full rectangle: cosine transforms of its rows and then of its columns, division by the eigenvalues, and the
+// inverse transforms. Specification: rectangle.py.
 //
-// LANES    complex numbers side by side in a vector: 8 where an item is a core's loop, 1 where it is a lane of a group
-// ROOM     complex vectors that a group has room for, `size` or more; 0 where they lie in `scratch`
-// KNOWN    1 where known heights are given
-// ODD      1 where a step has a radix of 7 or more: these take twice the registers
+// LANES    complex numbers in a vector: 8 on a CPU, 1 on a GPU
+// ROOM     complex vectors in the local memory of a group, `size` or more; 0 if they are in `scratch`
+// KNOWN    1 if known heights are given
+// ODD      1 if a step has a radix of 7 or more: these need twice the registers
 //
-// A group transforms 2 * LANES lines at once, half of them as real parts of complex numbers and half as imaginary parts. With the
-// even points of a line forwards and then the odd ones backwards, its cosine modes are the parts of its Fourier transform, turned
-// (Makhoul 1980).
+// A group transforms 2 * LANES lines at once, half of them as real parts of complex numbers and half as imaginary parts. If the
+// even points of a line are arranged forwards and then the odd ones backwards, its cosine modes are the rotated parts of its
+// Fourier transform (Makhoul 1980).
 //
-// The Fourier transform stays in its place. `plan` has for each step its radix and how far apart the numbers are that it adds,
-// `roots` are those of 1. Afterwards the modes are out of order: `place` says where modes k and length - k are. Backwards, with
-// real and imaginary parts exchanged, the same steps in reverse lead from there to the points. A length that has a large prime
-// factor is less than `size`: its transform is then a convolution of so many points (Bluestein 1970).
+// The Fourier transform is in place. `plan` contains for each step its radix and the distance between the numbers that it adds;
+// `roots` are the roots of 1. The resulting modes are permuted: `place` is the position of modes k and length - k. The inverse
+// uses the same steps in reverse, with real and imaginary parts exchanged. If a length with a large prime factor is less than
+// `size`, its transform is a convolution of `size` points (Bluestein 1970).
 //
-// The spectrum lies in strips of 2 * LANES slots, for modes k, k + 1 ... of rows and then length - k, length - k - 1 ...: of each of
-// `padded` rows a strip has so many numbers, and its columns are what a group transforms at once. Numbers of one size go together:
-// each rounds the other.
+// The spectrum is stored in strips of 2 * LANES slots, for modes k, k + 1 ... of rows and then length - k, length - k - 1 ...
+// A strip contains so many numbers of each of `padded` rows, and a group transforms its columns at once. Numbers of similar
+// magnitude are paired, because each is affected by the rounding of the other.
 
 #include "common.clh"
 
@@ -46,7 +46,7 @@ typedef __global C *Work;
 #define TAKE_WORK Work work = (Work)scratch + (long)get_group_id(0) * size;
 #endif
 #define EACH(i) for (int i = 0; i < LANES; ++i)
-#define ALL(i, count) for (int i = ME; i < (count); i += OTHERS)  // shared among the items of a group
+#define ALL(i, count) for (int i = ME; i < (count); i += OTHERS)  // divided among the items of a group
 #define BLOCKS(i, count) for (int i = ME * LANES; i < (count); i += OTHERS * LANES)
 
 // ---- Fourier transforms
@@ -57,11 +57,11 @@ typedef __global C *Work;
 
 C crossed(const C z) { return (C)(z.hi, z.lo); }
 C conjugate(const C z) { return (C)(z.lo, -z.hi); }
-C turned_back(const C z) { return (C)(z.hi, -z.lo); }  // by a quarter
+C turned_back(const C z) { return (C)(z.hi, -z.lo); }  // by a quarter turn
 C turned(const C z, MAP factor) { return factor[0] * z + factor[1] * (C)(-z.hi, z.lo); }
 
-// A step adds numbers that are `far` apart, from number j of each block on: to modes (not `up`) they are turned afterwards, to
-// points before.
+// A step adds numbers that are `far` apart, from number j of each block on: forwards (not `up`) they are
+// rotated afterwards, backwards before.
 #if LANES == 8
 #define ALL_BLOCKS                                                                                         \
     for (int block = 0; block < size / stretch; ++block)                                                   \
@@ -95,7 +95,7 @@ C turned(const C z, MAP factor) { return factor[0] * z + factor[1] * (C)(-z.hi, 
     const C a = z[0] + z[2], b = z[0] - z[2], c = z[1] + z[3], d = turned_back(z[1] - z[3]);               \
     z[0] = a + c; z[1] = b + d; z[2] = a - c; z[3] = b - d;                                                \
     PUT_ALL(4)
-// Numbers n and radix - n go together: cosines meet their sums, sines their differences.
+// Numbers n and radix - n are combined: cosines multiply their sums, sines their differences.
 #define ADD_ODD(radix, unroll)                                                                             \
     C all = z[0];                                                                                          \
     UNROLL for (int n = 1; n <= radix / 2; ++n) {                                                          \
@@ -116,7 +116,7 @@ C turned(const C z, MAP factor) { return factor[0] * z + factor[1] * (C)(-z.hi, 
         at[(radix - k) * far] = !up && j ? TURNED(radix - k, a - b) : a - b;                               \
     }
 #define ADD_FEW(radix) ADD_ODD(radix, UNROLL)
-#define ADD_MANY(radix) ADD_ODD(radix, )  // in fewer registers
+#define ADD_MANY(radix) ADD_ODD(radix, )  // with fewer registers
 STEP(2, ADD_2)
 STEP(3, ADD_FEW)
 STEP(4, ADD_4)
@@ -143,8 +143,8 @@ void take_steps(Work work, const int size, const int steps, __global const int *
     }
 }
 
-// With the numbers times a chirp, the transform is their convolution with another chirp, times the first: to modes, times the
-// other's transform, and back. All in order.
+// With the numbers times a chirp, the transform is their convolution with another chirp, times the first one:
+// forwards, times the other's transform, and backwards. All in order.
 void transform(Work work, LINES, const int up)
 {
     SYNC
@@ -163,7 +163,7 @@ void transform(Work work, LINES, const int up)
 }
 #define TRANSFORM(up) transform(work, length, size, steps, plan, roots, place, turns, chirp, other, up);
 
-// Twice the cosine modes k and length - k of all lines, and back; both of mode `length`, which is 0.
+// Twice the cosine modes k and length - k of all lines, and the inverse; mode `length` is 0.
 #define GET_MODES(k)                                                                                       \
     const float c = turns[2 * (k)], s = turns[2 * (k) + 1];                                                \
     const C z0 = work[place[2 * (k)]], z1 = work[place[2 * (k) + 1]];                                      \
@@ -176,12 +176,12 @@ void transform(Work work, LINES, const int up)
         work[place[2 * (k)]] = x + y;                                                                      \
         work[place[2 * (k) + 1]] = x - y;                                                                  \
     }
-#define SPOT(n) ((n) & 1 ? length - 1 - (n) / 2 : (n) / 2)  // where point n of a line goes
+#define SPOT(n) ((n) & 1 ? length - 1 - (n) / 2 : (n) / 2)  // position of point n of a line
 
 // ---- Rows: points or modes in lanes
 
 #if LANES == 8
-typedef struct __attribute__((packed)) { F values; } Loose;  // a row begins anywhere
+typedef struct __attribute__((packed)) { F values; } Loose;  // rows start at any address
 #define LOAD(from) (((__global const Loose *)(from))->values)
 #define STORE(to, given) (((__global Loose *)(to))->values = (given))
 #define SINGLES(a, b, c, d)                                                                                \
@@ -205,8 +205,9 @@ typedef struct __attribute__((packed)) { F values; } Loose;  // a row begins any
         else                                                                                               \
             for (int l = 0; l < count; ++l) some[l] = ((const float *)&given)[l];                          \
     }
-// Past the caches, where the compiler knows how: what is written there is not read before all of it is. That, and to ask for
-// the next strip ahead, takes a sixth off the time of 4 Mpx. OpenCL's own `prefetch` does nothing in PoCL.
+// Non-temporal stores, if the compiler supports them: the data are read only after all are written. With the
+// prefetch of the next strip this saves a sixth of the time for 4 Mpx. OpenCL's own `prefetch` does nothing
+// in PoCL.
 #ifdef __has_builtin
 #if __has_builtin(__builtin_nontemporal_store)
 #define STREAM(to, given) __builtin_nontemporal_store(given, (__global F *)(to))
@@ -297,7 +298,8 @@ __kernel void rectangle_heights(
 
 // ---- Columns
 
-// Of each picture below the other. The level of all heights is lost, unless it is no number.
+// For each of several pictures, stored one below the other. The level of all heights is dropped, unless it is
+// NaN.
 __kernel void rectangle_divide(
     const int pictures, const int padded, LINES, MAP along, MAP across, OUT spectrum, __global float *restrict scratch)
 {
@@ -329,8 +331,8 @@ __kernel void rectangle_divide(
 #define SLOPES const int pictures, const int rows, const int columns, MAP dz_dx, MAP dz_dy
 #endif
 
-// An item has a piece of some rows of a picture; they lie one below the other and have the same known heights. Near the border it does another thing than where links lead to all sides from all neighbours:
-// PoCL makes vector code of loops without branches.
+// An item processes a piece of some rows of a picture; pictures are stored one below the other and have the
+// same known heights. The border is processed separately: PoCL vectorises loops without branches.
 #define ROWS 16
 #define COLUMNS (LANES == 8 ? 256 : 1)
 #define ALL_PIXELS(border, inner)                                                                          \
@@ -346,7 +348,8 @@ __kernel void rectangle_divide(
         for (; column < end; ++column) border(first + column)                                              \
     }
 
-// 24 times the slope of the link from pixel p to the next one in line: of four pixels, or at the ends of two.
+// 24 times the slope of the link from pixel p to the next one in line: from four pixels, or at the ends from
+// two.
 #define LINK(slope, p, next)                                                                               \
     (13.0f * (slope[p] + slope[(p) + (next)]) - (slope[(p) - (next)] + slope[(p) + 2 * (next)]))
 
@@ -356,7 +359,8 @@ float link(MAP slope, const int p, const int next, const int n, const int count)
     return n >= 0 && n < count - 1 ? 12.0f * (slope[p] + slope[p + next]) : 0.0f;
 }
 
-// The right side: weights of links times their rise, of those that end in a pixel less those that begin there.
+// The right-hand side: weights of links times their rise, of those that end in a pixel minus those that start
+// there.
 __kernel void rectangle_source(SLOPES, const float x, const float y, OUT source)
 {
 #define PUT_SOURCE(p, by_x, by_y) source[p] = x * (by_x) + y * (by_y) IF_KNOWN(+ weight_z * known_heights[p - before]);
@@ -368,7 +372,7 @@ __kernel void rectangle_source(SLOPES, const float x, const float y, OUT source)
     ALL_PIXELS(SOURCE_BORDER, SOURCE_INNER)
 }
 
-// What is left over of links and known heights: squares, times their weights, summed by item.
+// Squared residuals of links and known heights times their weights, summed by item.
 __kernel void rectangle_misfit(
     SLOPES, const float weight_x, const float weight_y, const float size_x, const float size_y, MAP relief, OUT sums)
 {

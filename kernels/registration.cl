@@ -1,20 +1,20 @@
-// Frames that follow the object: each pixel's sample is fetched from where its point has moved to.
+// Registration of frames: each pixel's sample is interpolated at the position to which its point has moved.
 // Specification: registration.py.
 //
 // FRAME   type of a sample
-// TOP     largest count of an integer type; it is not set for floats
-// LEVELS  1 where each pixel has its own counts for the same light, 0 where all are alike
-// CURVED  1 where shifts go by the squares of column and row, and their product, as well; unset otherwise
-// TILE    pixels of one work-item, all in one row; 1 where an item is a lane, many where it is a core's loop
+// TOP     largest count of an integer type; undefined for floats
+// LEVELS  1 if each pixel has its own counts for the same light, 0 if all are equal
+// CURVED  1 if shifts also contain the squares of column and row, and their product; otherwise undefined
+// TILE    pixels of one work-item, all in one row: 1 on a GPU, many on a CPU
 //
-// A missing sample is a NaN, and so is the border round a padded frame: whatever is made of one is a NaN as
-// well, without a question.
+// A missing sample is a NaN, and so is the border around a padded frame: every result of one is then a NaN
+// without a test.
 
 #include "common.clh"
 
 #define BORDER 2
 
-#define CHUNK (TILE < 64 ? TILE : 64)  // pixels whose places are worked out side by side
+#define CHUNK (TILE < 64 ? TILE : 64)  // pixels whose positions are computed together
 
 #ifdef TOP
 #define USABLE(counts) ((counts) > 0 & (counts) < TOP)
@@ -22,7 +22,7 @@
 #define USABLE(counts) ((counts) - (counts) == 0)  // neither infinite nor NaN
 #endif
 
-// Weights of the samples at -1, 0, 1 and 2, for a place from 0 to 1.
+// Weights of the samples at -1, 0, 1 and 2, for a position from 0 to 1.
 #define BEFORE(part) (((-1.0f / 6 * (part) + 0.5f) * (part) - 1.0f / 3) * (part))
 #define HERE(part) (((0.5f * (part) - 1) * (part) - 0.5f) * (part) + 1)
 #define NEXT(part) (((-0.5f * (part) + 0.5f) * (part) + 1) * (part))
@@ -30,7 +30,7 @@
 
 #define LINE(at, a, b, c, d) ((a) * (at)[0] + (b) * (at)[1] + (c) * (at)[2] + (d) * (at)[3])
 
-// What lies outside of low ... high is held there; so is a NaN, at low, since no comparison holds for it.
+// Values outside low ... high are clipped; NaN becomes low, because no comparison with it is true.
 #define HOLD(value, low, high) { \
     value = value > (low) ? value : (low); \
     value = value < (high) ? value : (high); \
@@ -54,7 +54,8 @@ __kernel void registration_admit(
     }
 }
 
-// Each place has five numbers: where it lies in the padded frame, and the four samples of which it is the mean.
+// Each position has five numbers: its location in the padded frame, and the four samples of which it is the
+// mean.
 __kernel void registration_mend(const int count, __global const int *restrict places, OUT padded)
 {
     const int first = get_global_id(0) * TILE, end = min(first + TILE, count);

@@ -1,6 +1,6 @@
-// Where friction drags the skin. Specification: skin.py.
+// Displacement of the skin by friction. Specification: skin.py.
 //
-// TILE   pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
+// TILE   pixels of one work-item: 1 on a GPU, many on a CPU
 // TWIST  1 for a twist, 0 for a movement along the skin
 
 #pragma OPENCL FP_CONTRACT OFF
@@ -13,12 +13,13 @@
 
 #define FLOOR(x) ((int)(x) - ((x) < (int)(x)))
 
-// Of a map, bilinear.
+// Bilinear interpolation of a map.
 #define BETWEEN(at) ((1 - down) * ((1 - right) * (at)[upper + west] + right * (at)[upper + east]) \
     + down * ((1 - right) * (at)[lower + west] + right * (at)[lower + east]))
 
-// How far the skin has been dragged, mm, that is now at (x, y) from a pixel. A twist's place is the angle's cosine and
-// sine. Places are in pixels from the one of the grid that is nearest: small numbers, with small rounding errors.
+// The displacement, mm, of the skin that is now at (x, y) from a pixel. For a twist, the position is cosine
+// and sine of the angle. Positions are relative to the nearest grid pixel, in pixels: small numbers with
+// small rounding errors.
 float2 dragged(const float x, const float y, const int row, const int column, const int rows, const int columns,
     const int grid_rows, const int grid_columns, const float along_x, const float along_y, const float2 place,
     MAP shift)
@@ -45,7 +46,8 @@ float2 dragged(const float x, const float y, const int row, const int column, co
     const int lower = min(north + 1, grid_rows - 1) * grid_columns;
     const float shift_x = BETWEEN(shift), shift_y = BETWEEN(shift + grid_rows * grid_columns);
 #if TWIST
-    // From where it was to the point seen: seen (1 - (1 - away) exp(-i turn)), away + i turn = shift / at.
+    // From its original position to the point seen: seen (1 - (1 - away) exp(-i turn)), away + i turn = shift
+    // / at.
     const float square = at_x * at_x + at_y * at_y;
     if (square > 0) {
         const float away = (shift_x * at_x + shift_y * at_y) / square;
@@ -93,7 +95,7 @@ __kernel void skin_displacement(
 
 #define WRAPPED(cell) ((cell) & (FLAKES - 1))
 
-// Weights of the coefficients of a cubic B-spline at -1, 0, 1 and 2, for a place from 0 to 1.
+// Weights of the coefficients of a cubic B-spline at -1, 0, 1 and 2, for a position from 0 to 1.
 #define CUBIC(w, part) { \
     const float rest = 1 - (part); \
     w[0] = rest * rest * rest * (1.0f / 6); \

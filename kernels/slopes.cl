@@ -1,21 +1,22 @@
 // Slopes and their weights from normals. Specification: slopes.py.
 //
-// TILE     pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
-// WIDTH    pixels side by side in a vector: 8, or 1 where an item is a lane
+// TILE     pixels of one work-item: 1 on a GPU, many on a CPU
+// WIDTH    pixels in a vector: 8 on a CPU, 1 on a GPU
 //
-// Maps are as long as the picture, but whole vectors of them may be read and written.
+// Maps have the size of the picture, but whole vectors of them may be read and written.
 
 #include "common.clh"
 
-#define STEEPEST 0.17364818f  // cosine of the zenith beyond which a slope would grow without bounds
-#define WIDEST 0.25f          // radians^2: variance of an azimuth beyond which its mean cosine is not made good
-#define AROUND 2              // pixels on each side, from which the meridian's direction is taken
+#define STEEPEST 0.17364818f  // cosine of the zenith at which slopes are limited
+// radians^2: variance of the azimuth up to which the shortening by its mean cosine is corrected
+#define WIDEST 0.25f
+#define AROUND 2  // pixels on each side that determine the meridian's direction
 #define LEAST 1.1754944e-38f
 
 #if WIDTH == 8
 typedef float8 F;
 typedef int8 I;
-typedef float8 __attribute__((aligned(4))) Loose;  // somewhere in memory
+typedef float8 __attribute__((aligned(4))) Loose;  // unaligned
 typedef uchar8 __attribute__((aligned(1))) Bytes;
 #define READ(map, p) (*(__global const Loose *)((map) + (p)))
 #define WRITE(map, p, values) (*(__global Loose *)((map) + (p)) = (values))
@@ -38,17 +39,18 @@ typedef int I;
 #define READ_VECTORS F x = vectors[3 * p], y = vectors[3 * p + 1], z = vectors[3 * p + 2];
 #endif
 
-// The exponential of numbers from 0 to 1/2, to 1e-7.
+// Exponential function from 0 to 1/2, accurate to 1e-7.
 #define EXPONENTIAL(x)                                                                                 \
     (1.0f + (x) * (1.0f + (x) * (0.5f + (x) * (0.16666667f + (x) * (0.041666668f + (x) * (0.0083333338f \
      + (x) * (0.0013888889f + (x) * 0.0001984127f)))))))
 
-// The variance of the azimuth, radians^2 within bounds, and the share of an angular error's that is along the meridian.
+// The variance of the azimuth, radians^2, within bounds, and the share of the angular variance along the
+// meridian.
 #define UNSURE(flat, variance)                                                                         \
     const F outside = GREATER(flat, (F)least), share = 0.5f * least / outside;                         \
     const F wide = (1.0f - share) * (variance) / outside, turned = LESSER(wide, (F)WIDEST);
 
-// Slopes, and the squares of the normal's parts along x and y. Where nothing is known slopes are no numbers, and the
+// Slopes, and the squares of the normal's components along x and y. Without a normal slopes are NaN, and the
 // squares 0.
 __kernel void slopes_find(
     const int pixels, const float least, MAP vectors, MAP sigma, __global const uchar *restrict contact, OUT dz_dx,
@@ -79,7 +81,7 @@ __kernel void slopes_find(
 #define ROWS 16
 #endif
 
-// One of five rows around another: where it begins, less the columns on the left, and 0 where there is none.
+// One of five rows around another: its start, minus the columns on the left, and 0 if there is none.
 #define ROW(k, by)                                                                                     \
     const int is_there_##k = row + by >= 0 && row + by < rows;                                         \
     const int at_##k = (is_there_##k ? row + by : row) * columns + begin - AROUND;                     \
@@ -90,7 +92,7 @@ __kernel void slopes_find(
     ((there_0 * READ(map, at_0 + i) + there_1 * READ(map, at_1 + i))                                   \
      + (there_3 * READ(map, at_3 + i) + there_4 * READ(map, at_4 + i)) + READ(map, at_2 + i))
 
-// Inverse variances of slopes along x and y, within bounds; 0 where nothing is known.
+// Inverse variances of slopes along x and y, within bounds; 0 without a normal.
 __kernel void slopes_weigh(
     const int rows, const int columns, const float least, const float lowest, const float highest, MAP sigma, MAP dz_dx,
     MAP squares_x, MAP squares_y, OUT weight_x, OUT weight_y)
@@ -99,7 +101,7 @@ __kernel void slopes_weigh(
     const int top = item / across_all * ROWS, bottom = LESSER(rows, top + ROWS);
     if (top >= rows) return;
     const int begin = item % across_all * CHUNK, end = LESSER(columns, begin + CHUNK);
-    const int width = end - begin;  // of lines that begin with the pixels on the left, as far as there are any
+    const int width = end - begin;  // of lines that include the available pixels on the left
     const int from = AROUND - LESSER(begin, AROUND), to = width + AROUND + LESSER(columns - end, AROUND);
     float x[CHUNK + 2 * AROUND + WIDTH], y[CHUNK + 2 * AROUND + WIDTH];
     for (int i = 0; i < from; ++i) x[i] = y[i] = 0.0f;
@@ -128,7 +130,7 @@ __kernel void slopes_weigh(
             if (i + WIDTH <= width) {
                 WRITE(weight_x, p, in_x);
                 WRITE(weight_y, p, in_y);
-            } else {  // the next pixels are another item's
+            } else {  // the next pixels belong to another item
                 PUT(x, 0, in_x);
                 PUT(y, 0, in_y);
                 for (int lane = 0; lane < width - i; ++lane) {

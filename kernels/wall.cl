@@ -1,19 +1,20 @@
 // The lit wall as the camera sees it in the mirror sheet. Specification: wall.py.
 //
-// TILE     pixels of one work-item; 1 where an item is a lane, many where it is a core's loop
-// OBLIQUE  1 where each pixel has its own line of sight, 0 where all look straight down
-// GAP      1 with air between body and wall, 0 where they touch
-// TABLE    what the wall's radiance depends on: 0 nothing, 1 the height, 2 the azimuth, too
-// LAMPS    1 where the lamps light one side more than the other
+// TILE     pixels of one work-item: 1 on a GPU, many on a CPU
+// OBLIQUE  1 if each pixel has its own line of sight, 0 if all look straight down
+// GAP      1 with air between body and wall, 0 if they touch
+// TABLE    dependence of the wall's radiance: 0 none, 1 on the height, 2 also on the azimuth
+// LAMPS    1 if the lamps are uneven
 
 #include "common.clh"
 
-#define CHUNK (TILE < 64 ? TILE : 64)  // pixels whose rays are traced side by side: what is known of them stays in the nearest cache
+// pixels whose rays are traced together, so that their data stay in the first cache
+#define CHUNK (TILE < 64 ? TILE : 64)
 
 #define TINY 1e-20f
-#define LEAST 1e-6f  // one over a way that no ray goes, mm
+#define LEAST 1e-6f  // inverse of a distance that no ray travels, mm
 
-// Where an item is a lane, the library's root is the faster one.
+// The library's root is faster on a GPU.
 #if TILE == 1
 #define ROUGH_INVERSE_ROOT(x) rsqrt(x)
 #define INVERSE_ROOT(x) rsqrt(x)
@@ -23,7 +24,7 @@
 #endif
 
 #if TABLE == 2
-// Within 1e-7 of atan2, in a way that vectorises.
+// atan2 within 1e-7, in a form that vectorises.
 float azimuth_of(const float x, const float y)
 {
     const float across = GREATER(x, -x), up = GREATER(y, -y);
@@ -44,7 +45,8 @@ float azimuth_of(const float x, const float y)
 }
 #endif
 
-// How a ray leaves a point inside a cylinder: its cosine to the side times the radius, and one over its way there.
+// A ray from a point inside a cylinder: its cosine to the side times the radius, and the inverse of its
+// length.
 float2 leave(const float x, const float y, const float ray_x, const float ray_y, const float room, const float per_room)
 {
     const float along = x * ray_x + y * ray_y;
@@ -54,21 +56,22 @@ float2 leave(const float x, const float y, const float ray_x, const float ray_y,
 }
 
 #if GAP
-// Cosine of a refracted ray to the normal, by Snell; 0 where the ray is totally reflected.
+// Cosine of a refracted ray to the normal, by Snell's law; 0 for total reflection.
 float refracted(const float in, const float index)
 {
     const float square = 1 - index * index * (1 - in * in), passing = GREATER(square, TINY);
     return square > 0 ? passing * INVERSE_ROOT(passing) : 0;
 }
 
-// What share of light is not reflected, by Fresnel: the mean of both polarisations.
+// Transmitted share of light by Fresnel's equations: the mean of both polarisations.
 float passed(const float in, const float out, const float index)
 {
     const float across = index * in + out, within = in + index * out, both = across * within;
     return 2 * index * in * out * (across * across + within * within) / (both * both);
 }
 
-// How far a ray goes from a cylinder, where its cosine to the normal is `out`, to a wider one: by `outer`, squared.
+// Distance of a ray from a cylinder, at the cosine `out` to the normal, to a wider one: `outer` is the
+// difference of squares.
 float cross_gap(const float out, const float ray_x, const float ray_y, const float radius, const float outer)
 {
     const float towards = radius * out, square = towards * towards + (ray_x * ray_x + ray_y * ray_y) * outer + TINY;
@@ -76,7 +79,8 @@ float cross_gap(const float out, const float ray_x, const float ray_y, const flo
 }
 #endif
 
-// 1 below the rim, `below` above the height where the ray starts, and above the rest plane, `z` below; 0 beyond.
+// 1 below the rim, `below` above the height where the ray starts, and above the rest plane, `z` below;
+// otherwise 0.
 float within_edges(
     const float z, const float below, const float ray_z, const float cosine, const float per_way, const float radius,
     const float sharpness)
@@ -157,7 +161,8 @@ __kernel void wall_light(
 #endif
             const float off = x[i] * x[i] + y[i] * y[i] + TINY, flat = ray_x[i] * ray_x[i] + ray_y[i] * ray_y[i] + TINY;
             const float way = radius - off * INVERSE_ROOT(off), level = flat * INVERSE_ROOT(flat);
-            // Dark without a look at its rays: one that leans as far as any passes over the rim of the nearest wall.
+            // Dark without tracing its rays: even the most inclined one passes over the rim of the nearest
+            // wall.
             const int over = (level + ray_z[i] * slack) * (rim - z[i]) < way * (ray_z[i] - level * slack);
             lit[i] = (way > 0) & !over;
             busy |= lit[i];
@@ -205,7 +210,7 @@ __kernel void wall_light(
                 share = passed(in, out, index);
                 at_x += more * air_x;
                 at_y += more * air_y;
-                span += more * index;  // as far as its rise goes
+                span += more * index;  // as long as it rises
                 per_way = 1 / span;
 #endif
                 share *= within_edges(z[i], rim - z[i], to_z, left.x, per_way, radius, sharpness);
