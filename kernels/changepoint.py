@@ -58,7 +58,7 @@ def changepoint_scan(frames: Array, first: int, level: int, least: int, quiet: n
     quiet : square counts; times the square of the gain, the excess that noise makes up
     dark, gain : (P,), counts without light, and one over the counts from dark to bright; of a release, counts
         with full light, and one over the counts from there to dark
-    start : (P,), first frame after the change; ``INVALID`` after a sample that is no number
+    start : (P,), first frame after the change; ``INVALID`` after a NaN sample
     excess : (P,), units so far; ``DECIDED`` once the change is certain
     below : (P,), last frame in which the sample was nearer to dark than to the level
     ring : (SLOTS, P), samples of the frames around the change, each at its number modulo ``SLOTS``

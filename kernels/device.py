@@ -72,7 +72,7 @@ class DeviceInfo:
     float64 : bool
         Whether it has double precision.
     note : str
-        What a user should know of it; mostly nothing.
+        A note for users; mostly empty.
     """
 
     name: str
@@ -223,20 +223,19 @@ class Device:
     process : int
         The process that opened it, the only one in which it works.
     context, queue, copies
-        The OpenCL objects; frames are brought on a queue of their own, beside the kernels.
+        The OpenCL objects; frames are copied on a queue of their own, concurrently with kernels.
     profile : Profile
-        What was run on it so far.
+        Statistics of the work so far.
     max_allocation : int
         Bytes that one array may take.
     layout : Layout
-        How work is cut for it: for the cores of a CPU, or for the lanes of anything else.
+        How work is divided: for the cores of a CPU, or for the lanes of other devices.
     enqueuing : threading.Lock
-        Held while a command is enqueued, and for nothing else: drivers differ in what several threads may
-        do at once.
+        Held only while a command is enqueued, because drivers differ in their thread safety.
     transfers, pool
-        Staging buffers and buffers that are kept, if it has memory of its own.
+        Staging buffers and cached buffers, if it has its own memory.
     cache : dict of str to object
-        What callers keep on it from one call to the next, taken out while in use.
+        Objects that callers cache between calls, removed while in use.
     """
 
     info: DeviceInfo
@@ -280,11 +279,11 @@ class Device:
         Parameters
         ----------
         name : str
-            What the profile calls it.
+            Name in the profile.
         shape : tuple of int
         dtype : dtype
         zeroed : bool
-            Whether it holds zeros at first, without a copy of them, or anything.
+            Whether it is initialised with zeros, which need not be copied.
 
         Raises
         ------
@@ -299,7 +298,7 @@ class Device:
         Parameters
         ----------
         name : str
-            What the profile calls it.
+            Name in the profile.
         values : array_like
         dtype : dtype
 
@@ -324,9 +323,9 @@ class Device:
         Parameters
         ----------
         name : str
-            What the profile calls it.
+            Name in the profile.
         values : ndarray
-            Nobody may write to it as long as it is borrowed.
+            Must not be written to while it is borrowed.
         """
         if not can_be_borrowed(values):
             return None
@@ -376,7 +375,7 @@ class Device:
         name : str
             The function in it.
         **defines : str or int
-            Macros to set; ``WORDS`` and ``TILE`` are those of the device's layout otherwise.
+            Macros to set; ``WORDS`` and ``TILE`` are set by the device's layout.
 
         Raises
         ------

@@ -177,7 +177,7 @@ def displacement_warp(
     halo : pixels round the reference's planes
     coefficients : of the frame's spline, padded
     planes : (4, H + 2 halo, W + 2 halo), of the reference
-    field : (2, rows, columns) of nodes, pixels to the right and down, by which the frame is fetched back
+    field : (2, rows, columns) of nodes, displacement of the frame to the right and down, pixels
     difference : (2, H + 2 halo, W + 2 halo), the reference minus the frame, plus the derivatives times the
         field, so that it is the derivatives times the displacement; and the variance of that, of samples with
         noise of variance 1; 0 where the reference has no measurement, NaN where the frame ends

@@ -34,17 +34,17 @@ class Pass:
     Attributes
     ----------
     spacing : int
-        Pixels from place to place, and along the side of a cell.
+        Distance between positions, and side of a cell, pixels.
     steps : int
-        Distances from the pixel at which there are pairs; of two, no bend is fitted.
+        Number of distances of pairs from the pixel; with two, no bend is fitted.
     least : float
-        Pairs that must be known, at each distance where there are two, else in all.
+        Minimum number of valid pairs, at each of two distances, otherwise in all.
     reach : int
-        Pixels across a line over which it must be the highest.
+        Half-width of the non-maximum suppression, pixels.
     guard : int
-        Pixels from the lines of the passes before within which there is no other.
+        Minimum distance from the lines of earlier passes, pixels.
     part : float
-        Of the mean difference that the jump must be: what is less is a bend.
+        Minimum share of the mean difference that the jump must be; less is a bend.
     """
 
     spacing: int
@@ -70,13 +70,13 @@ class Limits:
     jump : float
         Angle to look for.
     bend : float
-        What `NEAR` adds, as it takes bends for jumps.
+        Added to `jump` in `NEAR`, which cannot distinguish bends from jumps.
     significance : float
-        Standard errors that a jump must have.
+        Minimum size of a jump in standard errors.
     quiet : float
-        Standard error of a jump with which no coarser pass is needed.
+        Standard error of a jump below which no coarser pass is needed.
     floor : float
-        Standard error of a jump that there always is.
+        Minimum standard error of a jump.
     lowest : float
         Angle below which nothing is an edge.
     """

@@ -90,7 +90,7 @@ def verify(device: cl.Device) -> None:
     Raises
     ------
     DeviceError
-        It can run no kernel here; the message says what to install.
+        It cannot run kernels here; the message names the packages to install.
     """
     circumstances = _circumstances(device)
     known = recall("pocl", circumstances)

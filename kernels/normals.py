@@ -124,7 +124,7 @@ def normals_exact(
         is that of being beyond. A NaN is a missing sample
     turn : (6, N), cosine and sine of each phase, root of its weight, and its shares in mean, cosine and sine
     scale : (4,) or (4, n), counts at zenith 0, radians per count, and the zeniths between which brightness is
-        linear. What is expected out of them says nothing of the direction
+        linear. Samples expected outside of them carry no information on the direction
     tilt : radians
     """
     samples = Samples(frames, turn, scale, noise)

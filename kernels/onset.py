@@ -96,11 +96,10 @@ def onset_scan(frames: Array, first: int, hold: int, light: Array, sure: Array, 
     frames : (n, P), uint8, uint16 or float32
     first : number of the block's first frame in the stack
     hold : light frames in a row that make an onset
-    light, sure, near : (P,), smallest sample that is light, that is not surely dark, that is near the level
-    onset : (P,), frame at which the run began; ``DARK`` without one, ``INVALID`` after a sample that is no
-        number
-    below : (P,), last frame before the run that was surely dark; the first frame is taken for dark. The
-        kernel keeps it only where it is not the last frame before the run
+    light, sure, near : (P,), smallest samples that are light, not certainly dark, near the level
+    onset : (P,), frame at which the run started; ``DARK`` without one, ``INVALID`` after a NaN sample
+    below : (P,), last certainly dark frame before the run; the first frame counts as dark. The kernel keeps
+        it only where it is not the last frame before the run
     foot, risen : (P,), last frame before the run that was not near the level, as ``below``, and the sample
         after it
     last : (P,), the sample before the block

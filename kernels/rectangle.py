@@ -1,20 +1,18 @@
-"""Heights of a full rectangle: what ``rectangle.cl`` computes, in plain NumPy with float64 inside.
+"""Heights of a full rectangle: ``rectangle.cl`` in plain NumPy with float64.
 
-A u = b is solved for the heights u, with A the Laplacian of a graph that links each pixel to its neighbours:
-by a weight along x, by another one along y, and with a screening on its diagonal. Its eigenvectors are
-cosines ::
+A u = b is solved for the heights u, with A the Laplacian of a graph that links each pixel to its neighbours,
+with one weight along x, another one along y, and a screening on its diagonal. Its eigenvectors are cosines ::
 
     modes of b along rows, then down columns  ->  each divided by its eigenvalue  ->  back to points of u
 
-The spectrum, (strips, rows, 2 lanes), has in the slots of a strip some modes k of rows of a length, one after
-the other, then length - k. Mode ``length`` is 0; what slots with k beyond half the length hold means nothing.
-Pictures lie one below the other.
+The spectrum has the shape (strips, rows, 2 lanes). The slots of a strip contain some consecutive modes k of
+rows, then length - k. Mode ``length`` is 0; slots with k beyond half the length are meaningless. Pictures are
+stored one below the other.
 
-Pictures from slopes are links that all have one weight along x and another along y: right sides, and what
-is left over of them.
+Pictures from slopes have links with one weight along x and another along y: right-hand sides and residuals.
 
-The kernels take sizes besides, and go about the Fourier transforms by the tables of
-``mirrorskin.engine.integration.rectangle``.
+The kernels also take sizes, and use the tables of ``mirrorskin.engine.integration.rectangle`` for the Fourier
+transforms.
 """
 
 from __future__ import annotations
@@ -42,8 +40,8 @@ def rectangle_modes(source: Floats, spectrum: Floats) -> None:
 def rectangle_divide(pictures: int, along: Floats, across: Floats, spectrum: Floats) -> None:
     """Divide cosine modes of the columns of each picture by ``along`` + ``across``, in place.
 
-    ``along``, (strips, 2 lanes), is of a slot, ``across``, (rows of a picture + 1), of a mode of columns. The
-    mode that is the same everywhere becomes 0.
+    ``along``, (strips, 2 lanes), is per slot, ``across``, (rows of a picture + 1), per mode of columns. The
+    constant mode becomes 0.
     """
     rows = len(across) - 1
     for picture in range(pictures):
@@ -56,7 +54,7 @@ def rectangle_divide(pictures: int, along: Floats, across: Floats, spectrum: Flo
 
 
 def rectangle_heights(spectrum: Floats, level: float, height: Floats) -> None:
-    """Write ``level`` and the points of rows, times twice their length, given their cosine modes."""
+    """Write ``level`` and the points of rows, times twice their length, from their cosine modes."""
     rows, length = height.shape
     low, high = (
         part.transpose(1, 0, 2).reshape(spectrum.shape[1], -1) for part in np.split(spectrum, 2, axis=2)
@@ -74,10 +72,10 @@ def rectangle_source(
     weight_z: float = 0.0,
     heights: Floats | None = None,
 ) -> None:
-    """Write weights of links times their rise, of those that end in a pixel less those that begin there.
+    """Write weights of links times their rise, of those that end in a pixel minus those that start there.
 
-    ``x`` and ``y`` are the weight of links times the size of a pixel / 24. Known heights add what they are
-    times ``weight_z``.
+    ``x`` and ``y`` are the weight of links times the size of a pixel / 24. Known heights contribute their
+    value times ``weight_z``.
     """
     source[...] = 0.0 if heights is None else weight_z * heights
     for factor, slope, part in ((x, dz_dx, source), (y, dz_dy.T, source.T)):
@@ -92,7 +90,7 @@ def rectangle_misfit(
     weight_z: float = 0.0,
     heights: Floats | None = None,
 ) -> float:
-    """Return what is left over of links and known heights: the sum of squares, times their weights."""
+    """Return the residual of links and known heights: the sum of squares times their weights."""
     left = 0.0 if heights is None else weight_z * float(((relief - heights.astype(np.float64)) ** 2).sum())
     ways = (1, slopes[0], relief.astype(np.float64)), (-1, slopes[1].T, relief.T.astype(np.float64))
     for weight, size, (sign, slope, points) in zip(weights, sizes, ways, strict=True):

@@ -1,16 +1,16 @@
-"""Frames that follow the object: what ``registration.cl`` computes, in plain NumPy with float64 inside.
+"""Registration of frames: ``registration.cl`` in plain NumPy with float64.
 
-A sample between the pixels is that of the cubic through the four nearest samples of a row and of a column
-(Lagrange's formula): 16 of them, with weights that sum to one. Noise that is independent from sample to
-sample is scaled by the root of the weights' sum of squares, 0.64 to 1.
+A sample between pixels is that of the cubic through the four nearest samples of a row and of a column
+(Lagrange's formula): 16 samples, with weights that sum to one. Independent noise of the samples is scaled by
+the root of the weights' sum of squares, 0.64 to 1.
 
-Measured on frames of the twin with pixels of 0.05 mm and a brightness of 265 counts a radian, behind a lens
-that blurs by 0.5 pixels, RMS error in counts of straight lines, Keys' cubic convolution, this, and the
-quintic through six samples: ball 0.08, 0.03, 0.03, 0.02; ridges every 2 mm 0.70, 0.19, 0.19, 0.13; ridges
-every 0.6 mm 4.2, 1.4, 1.3, 0.7; coin 1.8, 0.8, 0.8, 0.6. A sample's noise is 1.5 counts, and on the mean
-scaled by 0.67, 0.80, 0.77 and 0.82. So straight lines bend what they should show by more than the noise; six
-samples gain what noise hides, at twice the work, and lose more round what is missing. At the creases of a
-picture without blur no formula helps.
+RMS errors in counts, for frames of the twin with pixels of 0.05 mm, a gain of 265 counts per radian, and a
+lens that blurs by 0.5 pixels, of linear interpolation, Keys' cubic convolution, this, and the quintic through
+six samples: ball 0.08, 0.03, 0.03, 0.02; ridges every 2 mm 0.70, 0.19, 0.19, 0.13; ridges every 0.6 mm 4.2,
+1.4, 1.3, 0.7; coin 1.8, 0.8, 0.8, 0.6. The noise of a sample is 1.5 counts, and is scaled on average by 0.67,
+0.80, 0.77 and 0.82. So the error of linear interpolation exceeds the noise; the gain of six samples is below
+the noise, at twice the work, and they lose more around missing samples. At the creases of a picture without
+blur no formula helps.
 """
 
 from __future__ import annotations
@@ -23,15 +23,14 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 BORDER = 2
-"""Samples without a number round a padded frame: whoever needs one of them gets none."""
+"""Width of the border of NaN around a padded frame: results that need one of them are NaN."""
 
 
 def registration_admit(frame: Array, offset: Array, gain: Array, padded: Array) -> None:
-    """Write the part of a frame that can be used, on a scale that all pixels share, into a padded map.
+    """Write the usable part of a frame, on a scale common to all pixels, into a padded map.
 
-    ``offset`` and ``gain`` are the counts of each pixel where the shared scale is 0, and for each unit of it;
-    0 and 1, (1, 1), where all pixels are alike. The border is NaN, and so are counts that are clipped or not
-    finite.
+    ``offset`` and ``gain`` are the counts of each pixel at 0 of the common scale, and per unit of it; 0 and
+    1, (1, 1), if all pixels are equal. The border is NaN, and so are counts that are clipped or not finite.
     """
     value = (frame.astype(np.float64) - offset) / gain
     if frame.dtype.kind == "u":
@@ -42,17 +41,17 @@ def registration_admit(frame: Array, offset: Array, gain: Array, padded: Array) 
 
 
 def registration_mend(places: Array, padded: Array) -> None:
-    """Put the mean of four samples in place of each that never has a number.
+    """Replace each sample that is never valid by the mean of four samples.
 
-    ``places``, (n, 5), are those places in the padded frame, row by row, and the four samples, none of which
-    is mended.
+    ``places``, (n, 5), are their positions in the padded frame, row by row, and the positions of the four
+    samples, which are not replaced themselves.
     """
     flat = padded.reshape(-1)
     flat[places[:, 0]] = flat[places[:, 1:]].astype(np.float64).mean(axis=1)
 
 
 def weights(part: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the weights, (4, ...), of the samples at -1, 0, 1 and 2 for a place from 0 to 1."""
+    """Return the weights, (4, ...), of the samples at -1, 0, 1 and 2 for a position from 0 to 1."""
     before, behind, beyond = part + 1, part - 1, part - 2
     return np.stack(
         [
@@ -73,9 +72,9 @@ def registration_resample(
     ----------
     padded, offset, gain : as of ``registration_admit``
     height : (H, W), of the object's points, mm; NaN where unknown
-    shift : (2, 4) or (2, 7), how many pixels to the right, and how many down, the point of a pixel is to be
-        found: a number, and what is added for each column, row and millimetre of height; perhaps also for the
-        column's square, the column times the row, and the row's square
+    shift : (2, 4) or (2, 7), displacement of the point of a pixel to the right and down, pixels: a constant,
+        and coefficients of column, row and height in mm; optionally also of the column's square, the column
+        times the row, and the row's square
     registered : (H, W), counts on the scale of the pixel that they come to, NaN where one of the 16 samples
         is missing
     noise : (2, H, W), sums over the frames: of the squared factors by which the noise of a sample is scaled,
@@ -102,9 +101,9 @@ def registration_resample(
 def _split(
     start: NDArray[np.float64], shift: NDArray[np.float64], length: int
 ) -> tuple[Array, NDArray[np.float64]]:
-    """Return the sample before a place, and how far it is from there to the place, 0 to 1.
+    """Return the sample before a position, and the fraction beyond it, 0 to 1.
 
-    A place that is unknown or far outside becomes one whose samples are not all in the picture.
+    An unknown or distant position is replaced by one with samples outside the picture.
     """
     place = np.clip(np.where(np.isnan(shift), -1, start + shift), -1, length - 1)
     before = np.floor(place).astype(np.intp)

@@ -1,13 +1,13 @@
-"""How bright a mirror inside a lit cylinder looks: the formula of `mirrorskin.io.WallResponse`.
+"""The brightness of a mirror inside a lit cylinder: the formula of `mirrorskin.io.WallResponse`.
 
-A line of sight s is mirrored at the normal n and goes on to the wall of radius R, which it meets at height h;
-P is the place on the mirror and room what is left to the wall there ::
+A line of sight s is reflected at the normal n and meets the wall of radius R at height h; P is the position
+of the mirror and room = R^2 - P^2 ::
 
     r = s - 2 (s . n) n    A = Px rx + Py ry    c = sqrt(A^2 + (rx^2 + ry^2) room)    way = room / (A + c)
     m = (P + way r) / R across the axis    h = z + way rz    q = h / (R + sqrt(h^2 + R^2))
 
 q is the tangent of half the elevation at which the centre sees that height: 0 at the horizon, and the zenith
-of a mirror at the centre that shows it is pi/4 - atan(q). The light is what the wall gives there ::
+of a mirror at the centre that shows it is pi/4 - atan(q). The light is ::
 
     light = (1 + lamp_x mx + lamp_y my) (curve[0] + curve[1] q + curve[2] q^2 ...)
 
@@ -26,25 +26,25 @@ from mirrorskin.kernels.array_types import Doubles
 
 Array = NDArray[Any]
 
-_LEVEL = 1e-24  # added to the squared level part of rays, which is 0 for vertical ones
+_LEVEL = 1e-24  # added to the squared horizontal component of rays, which is 0 for vertical ones
 
 
 class Ray(NamedTuple):
-    """A mirrored line of sight."""
+    """A reflected line of sight."""
 
     direction: Doubles  # (3, ...): a unit vector, away from the mirror
-    at: Doubles  # (2, ...): where it meets the wall, across the axis, as a share of the radius
+    at: Doubles  # (2, ...): its intersection with the wall, across the axis, as a share of the radius
     way: Doubles  # from the mirror to the wall, mm
     cosine: Doubles  # to the wall's normal, times the radius
-    height: Doubles  # at which it meets the wall, mm
+    height: Doubles  # of the intersection, mm
 
 
 def wall_light(place: ArrayLike, normals: ArrayLike, geometry: Sequence[float], lamps: Sequence[float],
                curve: ArrayLike, reach: Sequence[float]) -> tuple[Doubles, NDArray[np.bool_]]:  # fmt: skip
-    """Return how bright mirrors look, (N, n), in shares of full light, and where that is known.
+    """Return the brightness of mirrors, (N, n), in shares of full light, and where it is valid.
 
-    It is known where q is within reach and the two rays meet the wall that the scatter turns up and down
-    most. Out of reach the curve goes on straight.
+    It is valid where q is within reach and the two rays that are deflected up and down most by the scatter
+    meet the wall. Out of reach the curve is extrapolated linearly.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def wall_light(place: ArrayLike, normals: ArrayLike, geometry: Sequence[float], 
         mm; by how much the line of sight moves along x and y for each millimetre of z
     normals : (N, n, 3), unit vectors in the body's frame
     geometry : radius of the body and height of the wall, mm; half-angle of the scatter, radians
-    lamps : by what share of the mean the lamps light the side at x and at y more
+    lamps : relative increase of the wall's brightness towards x and y
     curve : polynomial in q, from the lowest power on
     reach : lowest and highest q at which the curve is known
     """
@@ -65,10 +65,9 @@ def wall_light(place: ArrayLike, normals: ArrayLike, geometry: Sequence[float], 
 
 def light_slopes(place: ArrayLike, normals: ArrayLike, geometry: Sequence[float], lamps: Sequence[float],
                  curve: ArrayLike, reach: Sequence[float] = (-np.inf, np.inf)) -> Doubles:  # fmt: skip
-    """Return how the light of `wall_light` changes with the normals' three parts, (N, n, 3).
+    """Return the derivatives of the light of `wall_light` by the normals' components, (N, n, 3).
 
-    By the formula as it stands, which takes the normals for unit vectors: only the parts across a normal
-    have a meaning.
+    The formula assumes unit vectors: only the components across a normal are meaningful.
     """
     sight, normal, ray = _follow(place, normals, geometry[0])
     q = half_tangent(ray.height, geometry[0])
@@ -76,7 +75,7 @@ def light_slopes(place: ArrayLike, normals: ArrayLike, geometry: Sequence[float]
     by_height = (1 - q**2) ** 2 / (2 * geometry[0] * (1 + q**2))
     by_height *= lamp_light(ray, lamps) * steepness
     by_lamps = light * np.reshape(np.asarray(lamps, np.float64) / geometry[0], (2, *[1] * q.ndim))
-    # A ray that turns by dr meets the wall way (dr - r (R at . dr) / c) further on.
+    # The intersection of a ray that turns by dr moves by way (dr - r (R at . dr) / c).
     along = ((by_lamps * ray.direction[:2]).sum(axis=0) + by_height * ray.direction[2]) / ray.cosine
     by_ray = ray.way * np.stack([*(by_lamps - along * geometry[0] * ray.at), by_height])
     facing, pull = (sight * normal).sum(axis=0), (by_ray * normal).sum(axis=0)
@@ -84,9 +83,9 @@ def light_slopes(place: ArrayLike, normals: ArrayLike, geometry: Sequence[float]
 
 
 def sight_slopes(from_axis: Doubles, sight: Sequence[float]) -> Doubles:
-    """Return how far lines of sight move along x and y for each mm of z, (2, ...).
+    """Return the shift of lines of sight along x and y per mm of z, (2, ...).
 
-    ``from_axis`` are places on the rest plane, mm from the body's axis; ``sight`` is the slope for each mm of
+    ``from_axis`` are positions on the rest plane, mm from the body's axis; ``sight`` is the slope per mm of
     distance, and its growth with the square of the distance.
     """
     return np.asarray(-(sight[0] + sight[1] * (from_axis**2).sum(axis=0)) * from_axis, np.float64)
@@ -98,22 +97,22 @@ def sight_of(slopes: Doubles) -> Doubles:
 
 
 def lamp_light(ray: Ray, lamps: Sequence[float]) -> Doubles:
-    """Return the light of the lamps as a share of their mean, where rays meet the wall."""
+    """Return the light of the lamps as a share of their mean, at the intersections of rays with the wall."""
     return np.asarray(1 + lamps[0] * ray.at[0] + lamps[1] * ray.at[1])
 
 
 def shade_terms(x: ArrayLike, y: ArrayLike) -> Doubles:
-    """Return the functions of which shading is composed, (5, ...); x and y are shares of the radius."""
+    """Return the basis functions of the shading, (5, ...); x and y are shares of the radius."""
     u, v = np.asarray(x, np.float64), np.asarray(y, np.float64)
     return np.stack([u, v, u * u, u * v, v * v])
 
 
 def follow(point: Doubles, sight: Doubles, normal: Doubles, radius: float, closest: float = -np.inf) -> Ray:
-    """Follow lines of sight from points of mirrors to the wall.
+    """Return lines of sight from points of mirrors to the wall.
 
     Points, (3, ...), are mm from the body's axis and above the rest plane; ``sight`` and ``normal`` are unit
-    vectors. Outside the wall there is no answer, or that for ``closest``: the least square of the radius less
-    that of a point's distance from the axis.
+    vectors. Outside the wall the result is undefined, or that for ``closest``: the least difference of the
+    squared radius and a point's squared distance from the axis.
     """
     x, y, z = point
     ray = sight - 2 * (sight * normal).sum(axis=0) * normal
@@ -131,16 +130,16 @@ def half_tangent(height: Doubles, radius: float) -> Doubles:
 
 
 def level(q: Doubles, curve: ArrayLike, reach: Sequence[float]) -> tuple[Doubles, Doubles]:
-    """Return the curve's value and slope, which stays out of reach what it is at the end of it."""
+    """Return the curve's value and slope; the slope is constant out of reach."""
     polynomial = np.polynomial.polynomial
-    powers = np.append(np.asarray(curve, np.float64), 0.0)  # of which even a constant has a slope
+    powers = np.append(np.asarray(curve, np.float64), 0.0)  # a constant has a slope, too
     held = np.asarray(np.clip(q, reach[0], reach[1]), np.float64)
     slope = np.asarray(polynomial.polyval(held, polynomial.polyder(powers)), np.float64)
     return polynomial.polyval(held, powers) + slope * (q - held), slope
 
 
 def _follow(place: ArrayLike, normals: ArrayLike, radius: float) -> tuple[Doubles, Doubles, Ray]:
-    """Return sights and normals, (3, N, n), and the rays, of `wall_light`'s arguments."""
+    """Return sights and normals, (3, N, n), and the rays for `wall_light`'s arguments."""
     x, y, z, slope_x, slope_y = np.asarray(place, np.float64)
     normal = np.moveaxis(np.asarray(normals, np.float64), -1, 0)
     sight = sight_of(np.stack([slope_x, slope_y]))
@@ -150,7 +149,7 @@ def _follow(place: ArrayLike, normals: ArrayLike, radius: float) -> tuple[Double
 
 
 def _meets_wall(ray: Ray, z: Doubles, geometry: Sequence[float]) -> NDArray[np.bool_]:
-    """Return whether the two rays that scatter turns up and down most meet the wall."""
+    """Return whether the two rays that are deflected up and down most by the scatter meet the wall."""
     turned = np.tan(geometry[2])
     out = np.hypot(ray.direction[0], ray.direction[1])
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Evenly spaced values of an array on a device: what ``samples.cl`` computes, in NumPy, and its use."""
+"""Evenly spaced values of an array on a device: ``samples.cl`` in NumPy, and its use."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def samples_take(
 
 
 def take_samples(array: Array, first: int, apart: int, step: int, shape: tuple[int, int]) -> NDArray[Any]:
-    """Return what `samples_take` does from an array on a device, and copy nothing else to the host."""
+    """Return the result of `samples_take` for an array on a device; nothing else is copied to the host."""
     samples = array.device.array("samples", shape, array.dtype, zeroed=False)
     kernel = array.device.kernel("samples", "samples_take", VALUE=C_TYPES[array.dtype.name])
     kernel(

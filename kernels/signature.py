@@ -17,7 +17,7 @@ _SCALARS = {
 }  # fmt: skip
 
 OPTION = "-cl-kernel-arg-info"
-"""With this option of the compiler, the driver keeps names and types of arguments."""
+"""Compiler option with which the driver keeps names and types of arguments."""
 
 Convert = Callable[[Any], Any]
 Signature = list[tuple[str, str]]
@@ -37,11 +37,11 @@ def _argument(kernel: cl.Kernel, place: int) -> tuple[str, str]:
         str(kernel.get_arg_info(place, one))
         for one in (cl.kernel_arg_info.NAME, cl.kernel_arg_info.TYPE_NAME)
     )
-    return name.removeprefix("_cl_"), type_name  # PoCL's prefix for the names of functions of OpenCL
+    return name.removeprefix("_cl_"), type_name  # PoCL's prefix for the names of OpenCL functions
 
 
 def converter(argument: str, type_name: str) -> Convert | None:
-    """Return what converts a number to the type of an argument; None for a buffer.
+    """Return a function that converts a number to the type of an argument; None for a buffer.
 
     Raises
     ------

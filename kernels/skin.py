@@ -1,10 +1,10 @@
-"""Where friction drags the skin: what ``skin.cl`` computes, in plain NumPy with float64.
+"""Displacement of the skin by friction: ``skin.cl`` in plain NumPy with float64.
 
-In the frame of the object that it touches, the traction shifts the skin's surface by a map u. While the
-object moves by U against the body, a point of it is ahead of the skin by U - u: there is the skin that was at
-this place plus U - u at the press. A place is (x, y) of a movement along the skin, mm, or (angle,) of a twist
-about the origin, radians. U is then proportional to the angle, and U - u is taken for an arc about the origin
-and a distance along the radius: this is exact where all sticks and where nothing does.
+In the frame of the object that it touches, the traction displaces the skin's surface by a map u. While the
+object moves by U relative to the body, a point of it is ahead of the skin by U - u: the skin there was at
+this position plus U - u at the press. A position is (x, y) for a movement along the skin, mm, or (angle,) for
+a twist about the origin, radians. U is then proportional to the angle, and U - u is treated as an arc about
+the origin and a radial distance; this is exact where all sticks and where nothing does.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from mirrorskin.kernels.array_types import Doubles
 
-ROUNDS = 200  # fixed-point steps to a point of the skin; each gains a factor of the surface's strain
-CLOSE = 1e-4  # of a pixel, within which a point of the skin is found
-FLAKES = 512  # coefficients of flakes along each axis, after which they repeat
+ROUNDS = 200  # fixed-point iterations to a point of the skin; each gains a factor of the surface's strain
+CLOSE = 1e-4  # tolerance of a point of the skin, pixels
+FLAKES = 512  # period of the coefficients of flakes along each axis
 
 
 def skin_displacement(
@@ -30,7 +30,7 @@ def skin_displacement(
     along_y: float,
     twist: int = 0,
 ) -> None:
-    """Find how far points of the skin that were at the pixels at the press have moved.
+    """Write the displacement of the skin that was at the pixels at the press.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def skin_flakes(
     spacing: float,
     twist: int = 0,
 ) -> Doubles:
-    """Return the share of flakes, (H, W), that pixels see of the skin: a cubic B-spline, 0 to 1.
+    """Return the share of flakes, (H, W), that pixels see on the skin: a cubic B-spline, 0 to 1.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def _rest(rows: int, columns: int, along_x: float, along_y: float) -> Doubles:
 def material(
     shift: NDArray[Any], pixel_size: tuple[float, float], place: Doubles, points: Doubles
 ) -> Doubles:
-    """Return where the skin that is now at points was at the press, (2, ...), mm along x and y."""
+    """Return the positions at the press of the skin that is now at points, (2, ...), mm along x and y."""
     from scipy.ndimage import map_coordinates
 
     at = on_object(place, points)
@@ -114,21 +114,21 @@ def material(
 
 
 def drive(place: Doubles, at: Doubles) -> Doubles:
-    """Return U of points of the object, (2, ...), mm, in the linear theory of small angles."""
+    """Return U at points of the object, (2, ...), mm, in the linear theory of small angles."""
     if len(place) == 1:
         return np.stack([place[0] * at[1], -place[0] * at[0]])
     return np.broadcast_to(-place.reshape(2, *[1] * (at.ndim - 1)), at.shape)
 
 
 def on_object(place: Doubles, points: Doubles) -> Doubles:
-    """Return the points of the object, by their places at the press, that are now at points, (2, ...)."""
+    """Return the points of the object, by their positions at the press, that are now at points, (2, ...)."""
     if len(place) == 1:
         return _as_plane((points[0] + 1j * points[1]) * np.exp(1j * place[0]))
     return points + place.reshape(2, *[1] * (points.ndim - 1))
 
 
 def _behind(place: Doubles, at: Doubles, lag: Doubles) -> Doubles:
-    """Return where the skin was at the press over which points of the object are ahead by a lag."""
+    """Return the positions at the press of the skin, for points of the object that are ahead by a lag."""
     if len(place) != 1:
         return at + lag
     point, ahead = at[0] + 1j * at[1], lag[0] + 1j * lag[1]

@@ -1,4 +1,4 @@
-"""Slopes and their weights from normals: what ``slopes.cl`` computes, in NumPy with float64.
+"""Slopes and their weights from normals: ``slopes.cl`` in NumPy with float64.
 
 `mirrorskin.engine.rotation.normals_to_height.find_slopes` explains the variances and the bias.
 """
@@ -15,28 +15,28 @@ from mirrorskin.kernels.array_types import Doubles
 
 Array = NDArray[Any]
 
-_STEEPEST = math.cos(math.radians(80.0))  # of the largest zenith whose slope is used
+_STEEPEST = math.cos(math.radians(80.0))  # cosine of the largest zenith whose slope is used
 _WIDEST = 0.5**2  # radians^2: limit of the variance of an azimuth
 _AROUND = 2  # pixels on each side, in the window for the direction of the meridian
 _LEAST = float(np.finfo(np.float32).tiny)
 
 
 def slopes_find(least: float, vectors: Array, sigma: Array, contact: Array) -> tuple[Doubles, ...]:
-    """Return the slopes, NaN where nothing is known, and the squares of the normal's parts, 0 there.
+    """Return the slopes, NaN without a normal, and the squares of the normal's components, 0 there.
 
-    ``least`` is the squared sine of the tilt; infinite if it is unknown, then errors are isotropic.
+    ``least`` is the squared sine of the tilt; if it is infinite (unknown), errors are isotropic.
     """
     return find(least, vectors.astype(np.float64), sigma.astype(np.float64), contact)
 
 
 def slopes_weigh(least: float, lowest: float, highest: float, sigma: Array, dz_dx: Doubles,
                  squares_x: Doubles, squares_y: Doubles) -> tuple[Doubles, Doubles]:  # fmt: skip
-    """Return inverse variances of the slopes along x and y, within bounds; 0 where nothing is known."""
+    """Return inverse variances of the slopes along x and y, within bounds; 0 without a normal."""
     return weigh(least, (lowest, highest), sigma.astype(np.float64), dz_dx, squares_x, squares_y)
 
 
 def find(least: float, vectors: Array, sigma: Array, contact: Array) -> tuple[Array, Array, Array, Array]:
-    """Return what `slopes_find` does, in the precision of the arguments."""
+    """Return the result of `slopes_find` in the precision of the arguments."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     with np.errstate(invalid="ignore"):
         known = (contact != 0) & (z > 0) & (sigma > 0) & (sigma < np.inf)
@@ -49,12 +49,12 @@ def find(least: float, vectors: Array, sigma: Array, contact: Array) -> tuple[Ar
 def weigh(
     least: float, bounds: tuple[float, float], sigma: Array, dz_dx: Array, squares_x: Array, squares_y: Array
 ) -> tuple[Array, Array]:
-    """Return what `slopes_weigh` does, in the precision of the arguments.
+    """Return the result of `slopes_weigh` in the precision of the arguments.
 
-    The direction of the meridian is that of the surroundings: with a pixel's own azimuth, slopes that noise
-    shortened would get other weights than those that it lengthened, and their weighted mean would be biased.
-    Squares of components are equal on both sides of a ridge; noise of the azimuth reduces the contrast of
-    their means by exp(-2 variance). An error e of the azimuth also shortens the slope by e^2 / 2.
+    The direction of the meridian is taken from the surroundings: with a pixel's own azimuth, slopes shortened
+    by noise would get other weights than lengthened ones, and their weighted mean would be biased. Squares of
+    components are equal on both sides of a ridge; noise of the azimuth reduces the contrast of their means by
+    exp(-2 variance). An error e of the azimuth also shortens the slope by e^2 / 2.
     """
     known = np.isfinite(dz_dx)
     variance = np.where(known, sigma, 1) ** 2
@@ -71,7 +71,7 @@ def weigh(
 
 
 def _unsure(least: float, flat: Array, variance: Array) -> tuple[Array, Array]:
-    """Return the share of an angular error's variance along the meridian, and the azimuth's variance."""
+    """Return the share of the angular variance along the meridian, and the azimuth's variance."""
     share = 0.5 * np.minimum(least / np.maximum(flat, _LEAST), 1)
     return share, np.minimum((1 - share) * variance / np.maximum(flat, least), _WIDEST)
 

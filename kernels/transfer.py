@@ -1,7 +1,7 @@
-"""Copies between the host and a device with memory of its own.
+"""Copies between the host and a device with its own memory.
 
-Copies go through a few pinned staging buffers, so that the device fetches them at full speed while the host
-goes on. Several threads fill and empty the staging buffers, since one thread copies slower than the bus.
+Copies use a few pinned staging buffers, so that the device transfers them at full speed while the host
+continues. Several threads fill and empty the staging buffers, because one thread copies slower than the bus.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ THREADS = max(1, min(4, os.cpu_count() or 1))
 """Threads that copy between the host's memory and staging buffers."""
 
 SMALL = 2**18
-"""Bytes up to which a copy is on the kernels' queue: it takes less than waiting for another queue."""
+"""Maximum size of a copy on the kernels' queue, bytes: it takes less than waiting for another queue."""
 
-_PATIENCE = 0.1  # seconds after which the slots are counted again: some may be lost after an error
-_SHARE = 2**20  # bytes that are worth a thread
-_LINE = 256  # bytes that copies in a staging buffer are aligned to
+_PATIENCE = 0.1  # seconds after which the slots are counted again, because some may be lost after an error
+_SHARE = 2**20  # minimum number of bytes for a thread
+_LINE = 256  # alignment of copies in a staging buffer, bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class _Slot:
         return part
 
     def finish(self, device: Device) -> None:
-        """Wait until no copy uses the memory any more, and forget what it holds."""
+        """Wait until no copy uses the memory any more, and mark it as empty."""
         for event in self.under_way.values():
             if event.command_execution_status != cl.command_execution_status.COMPLETE:
                 device.profile.wait("staging", event)
@@ -81,14 +81,14 @@ class _Slot:
 
 
 class Transfers:
-    """The staging buffers of a device, made on first use."""
+    """The staging buffers of a device, created on first use."""
 
     def __init__(self) -> None:
         self._free: SimpleQueue[_Slot] = SimpleQueue()
         self._made = 0
         self._making = threading.Lock()
         self._uploading = threading.Lock()
-        self._open: _Slot | None = None  # the one that uploads fill
+        self._open: _Slot | None = None  # the slot filled by uploads
 
     def upload(
         self,
@@ -100,7 +100,7 @@ class Transfers:
     ) -> cl.Event:
         """Copy values to the device as a type, and return the event of the last copy.
 
-        The values may be overwritten at once; the copies may still be under way.
+        The values may be overwritten at once, although copies may still be in progress.
         """
         itemsize, offset = dtype.itemsize, target.offset
         queue = device.queue if values.size * itemsize <= SMALL else device.copies
@@ -129,7 +129,7 @@ class Transfers:
         queue: cl.CommandQueue,
         after: Sequence[cl.Event],
     ) -> None:
-        """Copy from the device to arrays in C order: all is enqueued at once and then waited for."""
+        """Copy from the device to arrays in C order: all copies are enqueued and then waited for."""
         rest = deque(_cut(reads))
         under_way: deque[tuple[_Slot, str, cl.Event, list[_Copy]]] = deque()
         try:
@@ -141,12 +141,12 @@ class Transfers:
                 _copy(copies)
                 under_way.popleft()
                 self._free.put(slot)
-        finally:  # after an error, copies may still be under way: these slots are not used again
+        finally:  # after an error, copies may still be in progress: these slots are not used again
             with self._making:
                 self._made -= len(under_way)
 
     def free(self, device: Device) -> None:
-        """Give the staging buffers that are not in use back to the system."""
+        """Return unused staging buffers to the system."""
         with self._uploading:
             if self._open is not None:
                 self._free.put(self._open)
@@ -163,7 +163,7 @@ class Transfers:
                 slot.mapping.release()
 
     def _room(self, device: Device, nbytes: int) -> _Slot:
-        """Return the slot that uploads fill, with room for a number of bytes."""
+        """Return the slot filled by uploads, with room for a number of bytes."""
         slot, self._open = self._open, None
         if slot is not None and slot.used + nbytes > SLOT:
             self._free.put(slot)
@@ -196,7 +196,7 @@ class Transfers:
 
 
 def _of_others(after: Sequence[cl.Event], queue: cl.CommandQueue) -> list[cl.Event]:
-    """Return the events of other queues, whose commands are sent to the device: a queue waits for its own."""
+    """Return the events of other queues, after submitting their commands: a queue waits for its own."""
     others = [event for event in after if event.command_queue != queue]
     for event in others:
         event.command_queue.flush()
@@ -210,7 +210,7 @@ def _enqueue_reads(
     queue: cl.CommandQueue,
     after: Sequence[cl.Event],
 ) -> tuple[str, cl.Event, list[_Copy]]:
-    """Enqueue as many copies as a slot has room for; return their names, the last event, and what to copy."""
+    """Enqueue as many copies as fit into a slot; return their names, the last event, and the host copies."""
     copies, names = [], dict[str, None]()
     after = _of_others(after, queue)
     while rest and slot.used + rest[0][1].nbytes <= SLOT:
@@ -228,7 +228,7 @@ def _enqueue_reads(
 
 
 def _make_slot(device: Device) -> _Slot:
-    """Return pinned memory, or any if there is none."""
+    """Return pinned memory, or unpinned memory if there is none."""
     flags = cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR
     try:
         with waiting:
@@ -240,7 +240,7 @@ def _make_slot(device: Device) -> _Slot:
 
 
 def _cut(reads: Iterable[tuple[Piece, NDArray[Any]]]) -> Iterator[tuple[Piece, NDArray[Any]]]:
-    """Cut what is to be read into pieces that fit in a slot."""
+    """Divide the rows to be read into pieces that fit into a slot."""
     for source, out in reads:
         offset = source.offset
         for piece in _pieces(out, SLOT // out.itemsize):
@@ -249,7 +249,7 @@ def _cut(reads: Iterable[tuple[Piece, NDArray[Any]]]) -> Iterator[tuple[Piece, N
 
 
 def _pieces(values: NDArray[Any], most: int, flat: bool | None = None) -> Iterator[NDArray[Any]]:
-    """Cut an array in parts of at most ``most`` elements, in C order, anywhere if ``flat``, or by rows."""
+    """Yield parts of an array of at most ``most`` elements, in C order, anywhere if ``flat``, or by rows."""
     if values.size <= most:
         yield values
         return
@@ -266,7 +266,7 @@ def _pieces(values: NDArray[Any], most: int, flat: bool | None = None) -> Iterat
 
 
 def _copy(copies: Sequence[_Copy]) -> None:
-    """Copy each second array to the first, in several threads if that is worth it."""
+    """Copy each second array to the first, in several threads if worthwhile."""
     total = sum(target.nbytes for target, _ in copies)
     share = max(_SHARE, -(-total // THREADS))
     work: deque[_Copy] = deque()

@@ -1,13 +1,13 @@
-"""The lit wall in the mirror sheet: what ``wall.cl`` computes, in plain NumPy with float64 inside.
+"""The lit wall in the mirror sheet: ``wall.cl`` in plain NumPy with float64.
 
-The body is a cylinder about the z axis; z = 0 is the sheet's rest plane, and the wall stands round it from
-there to its rim. A line of sight is mirrored at the sheet's normal n, and spread a little by the sheet's
-flakes; each of its rays goes on to the wall, or misses it ::
+The body is a cylinder about the z axis; z = 0 is the sheet's rest plane, and the wall surrounds it from there
+to its rim. A line of sight is reflected at the sheet's normal n, and spread slightly by the sheet's flakes;
+each of its rays meets the wall or misses it ::
 
     mirrored = d - 2 (d . n) n          |place + t ray| = radius across the axis
 
-With a = x ray_x + y ray_y (across the axis), the ray's cosine to the wall's normal is c / radius, and one
-over its way t is q, both free of cancellation and of division by the ray ::
+With a = x ray_x + y ray_y (across the axis), the ray's cosine to the wall's normal is c / radius, and the
+inverse of its length t is q, both without cancellation and without division by the ray ::
 
     c = sqrt(a^2 + (ray_x^2 + ray_y^2) room)      q = 1 / t = (a + c) / room      room = radius^2 - x^2 - y^2
 
@@ -25,17 +25,17 @@ Array = NDArray[Any]
 Floats = NDArray[np.float64]
 
 _TINY = 1e-20
-_LEAST = 1e-6  # one over a way that no ray goes, mm
+_LEAST = 1e-6  # inverse of a distance that no ray travels, mm
 _HARD = 1e30
 
 
 def wall_light(sheet: Array, places: Array, rays: Array, table: Array, radius: float, rim: float,
                gap: float, index: float, scatter: float, fade: float, asymmetry_x: float,
                asymmetry_y: float) -> Array:  # fmt: skip
-    """Return the share of the light, where radiance is 1 and lamps are brightest, by way of the sheet.
+    """Return the share of the light, relative to radiance 1 where lamps are brightest, seen in the sheet.
 
-    Dark is what comes from beyond the rim, from below the rest plane, by total reflection at the body's side,
-    or to a pixel outside the body.
+    Light from beyond the rim or below the rest plane, light that is totally reflected at the body's side, and
+    pixels outside the body are dark.
 
     Parameters
     ----------
@@ -49,11 +49,11 @@ def wall_light(sheet: Array, places: Array, rays: Array, table: Array, radius: f
         ``columns`` equal pieces and once beyond each edge, so that every place on the wall lies between four
     radius, rim, gap : of the body; of the wall's upper edge above the rest plane; between body and wall: mm
     index : refractive index of the body
-    scatter : largest angle between a ray and the mirrored one, radians, by which the kernel knows dark pixels
-        at a glance
+    scatter : largest angle between a ray and the reflected one, radians, with which the kernel detects dark
+        pixels quickly
     fade : angle over which a ray fades at the rim and at the rest plane, so that few rays make no visible
         steps, radians; 0 for hard edges
-    asymmetry_x, asymmetry_y : by what share of the mean the lamps light the wall's side at x and at y more
+    asymmetry_x, asymmetry_y : relative increase of the wall's brightness towards x and y
     """
     z, slope_x, slope_y = sheet.astype(np.float64)
     view_x, view_y = places[2:].astype(np.float64) if len(places) == 4 else np.zeros((2, z.size))
@@ -81,7 +81,7 @@ def wall_light(sheet: Array, places: Array, rays: Array, table: Array, radius: f
 
 
 def _leave(x: Floats, y: Floats, ray: Floats, radius: float) -> tuple[Floats, Floats]:
-    """Return a ray's cosine to the cylinder that it leaves, times its radius, and one over its way there."""
+    """Return a ray's cosine to the cylinder that it leaves, times the radius, and its inverse length."""
     room = radius * radius - x * x - y * y
     along = x * ray[0] + y * ray[1]
     cosine = np.sqrt(along * along + (ray[0] ** 2 + ray[1] ** 2) * room + _TINY)
@@ -91,9 +91,9 @@ def _leave(x: Floats, y: Floats, ray: Floats, radius: float) -> tuple[Floats, Fl
 def _steepest(x: Floats, y: Floats, ray: Floats, radius: float) -> Floats:
     """Return the unit vector across a ray along which its height at the wall rises fastest.
 
-    A turn of the ray moves the point where it meets the wall, of normal m, by t turn - t (m . turn / m .
-    ray) ray: its height rises fastest along (m . ray) z - ray_z m. Where nothing is steepest, any direction
-    will do.
+    A rotation of the ray moves the point where it meets the wall, of normal m, by t turn - t (m . turn / m .
+    ray) ray: its height rises fastest along (m . ray) z - ray_z m. If there is no such direction, any
+    direction is returned.
     """
     cosine, per_way = _leave(x, y, ray, radius)
     way = 1 / np.maximum(per_way, _LEAST)
@@ -105,10 +105,11 @@ def _steepest(x: Floats, y: Floats, ray: Floats, radius: float) -> Floats:
 
 def _cross_gap(x: Floats, y: Floats, ray: Floats, cosine: Floats, per_way: Floats, radius: float,
                gap: float, index: float) -> tuple[Floats, Floats, Floats, Floats]:  # fmt: skip
-    """Return where a ray meets the wall, one over a way that rises as far, and what share of it arrives.
+    """Return the intersection of a ray with the wall, an equivalent inverse length, and the transmission.
 
-    Without a gap nothing is lost. With one, the ray is refracted at the body's side (Snell), some of it is
-    reflected there (Fresnel, not polarised), and it crosses the gap.
+    The length is that of a straight ray with the same rise. Without a gap nothing is lost. With one, the ray is
+    refracted at the body's side (Snell), part of it is reflected there (Fresnel, unpolarised), and it crosses
+    the gap.
     """
     way = 1 / np.maximum(per_way, _LEAST)
     at_x, at_y = x + way * ray[0], y + way * ray[1]
@@ -129,7 +130,7 @@ def _cross_gap(x: Floats, y: Floats, ray: Floats, cosine: Floats, per_way: Float
 def _seen(
     z: Floats, ray: Floats, cosine: Floats, per_way: Floats, radius: float, rim: float, fade: float
 ) -> Floats:
-    """Return 1 for a ray below the rim and above the rest plane, 0 beyond, and fade in between."""
+    """Return 1 for a ray below the rim and above the rest plane, 0 beyond, with a fade in between."""
     edge = (rim - z) * per_way
     below = (edge - ray[2]) * cosine / np.hypot(cosine, radius * edge)  # the angle to the rim
     above = ray[2] + z * per_way  # and to the rest plane

@@ -334,7 +334,7 @@ def picture(path):
 
 NO_TRIANGLES = "contains no triangles, only points: export it as a mesh"
 BAD = {
-    "no tilt": (["axial", "--tilt", "0deg"], "tilt 0 degrees is not possible: give more than 0 and at most 30"),
+    "no tilt": (["axial", "--tilt", "0deg"], "tilt 0 degrees is not possible: give more than 0"),
     "much tilt": (["axial", "--tilt", "31deg"], "tilt 31 degrees is not possible"),
     "tilt back": (["axial", "--tilt=-2deg"], "tilt -2 degrees is not possible"),
     "tilt without a unit": (["axial", "--tilt", "2"], "--tilt 2: a unit is needed"),

@@ -204,7 +204,7 @@ def test_arguments_are_named_and_numbers_become_what_the_source_says(device):
     ("wrong", "message"),
     [
         ({"words": None, "size": 1}, r"missing: \['count'\]; unknown: \['size'\]; it takes"),
-        ({"words": 1, "count": 1}, "words takes an array"),
+        ({"words": 1, "count": 1}, "words must be an array"),
         ({"words": None, "count": 0.5}, "count cannot be 0.5"),
         ({"words": None, "count": 2**31}, "count cannot be 2147483648"),
     ],
@@ -310,7 +310,7 @@ def test_parts_of_several_arrays_are_waited_for_once(device):
 
 def test_a_lack_of_memory_is_told_apart(small_device):
     small_device.max_allocation = 100
-    with pytest.raises(DeviceMemoryError, match="no room for too much"):
+    with pytest.raises(DeviceMemoryError, match="no memory for too much"):
         small_device.array("too much", (101,), np.uint8)
     small_device.array("just enough", (100,), np.uint8)
 
@@ -318,7 +318,7 @@ def test_a_lack_of_memory_is_told_apart(small_device):
 def test_a_drivers_own_lack_of_memory_is_told_apart(small_device, monkeypatch):
     small_device.max_allocation = 2**60
     monkeypatch.setattr(small_device, "info", replace(small_device.info, shares_memory=False))
-    with pytest.raises(DeviceMemoryError, match="no room for maps"):
+    with pytest.raises(DeviceMemoryError, match="no memory for maps"):
         small_device.array("maps", (2**50,), np.uint8)
 
 
@@ -393,7 +393,7 @@ def test_a_queue_that_is_lost_is_said_so(device, monkeypatch):
         raise lost()
 
     monkeypatch.setattr(device, "queue", SimpleNamespace(flush=flush))
-    with pytest.raises(DeviceError, match=r"cannot begin its work: .*; if that goes on, choose another"):
+    with pytest.raises(DeviceError, match=r"cannot start its work: .*; if that goes on, choose another"):
         device.flush()
 
 

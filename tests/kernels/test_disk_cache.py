@@ -38,5 +38,5 @@ def test_a_folder_that_cannot_be_written_is_no_failure(folder, caplog):
     folder.write_text("a file where the folder should be")
     with caplog.at_level(logging.INFO):
         disk_cache.keep("ld", 1, b"system")
-    assert "found out again" in caplog.text
+    assert "computed again" in caplog.text
     assert disk_cache.recall("ld", 1) is None

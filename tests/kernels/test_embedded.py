@@ -262,9 +262,9 @@ def test_hidden_drivers_and_broken_libraries_are_named(tmp_path, monkeypatch):
         (
             "POCL_DEVICES",
             "bogus",
-            "no OpenCL device found: POCL_DEVICES is 'bogus', by which PoCL shows",
+            "no OpenCL device found: POCL_DEVICES is 'bogus', which makes PoCL show",
         ),
-        ("POCL_DEVICES", "", "no OpenCL device found: POCL_DEVICES is '', by which PoCL shows"),
+        ("POCL_DEVICES", "", "no OpenCL device found: POCL_DEVICES is '', which makes PoCL show"),
         ("POCL_MAX_PTHREAD_COUNT", "-3", "POCL_MAX_PTHREAD_COUNT is '-3': a whole number above 0 is needed"),
         ("PYOPENCL_BUILD_OPTIONS", "-bogus", "kernels here: PYOPENCL_BUILD_OPTIONS adds '-bogus'; unset it"),
     ],
