@@ -107,9 +107,9 @@ def _cross_gap(x: Floats, y: Floats, ray: Floats, cosine: Floats, per_way: Float
                gap: float, index: float) -> tuple[Floats, Floats, Floats, Floats]:  # fmt: skip
     """Return the intersection of a ray with the wall, an equivalent inverse length, and the transmission.
 
-    The length is that of a straight ray with the same rise. Without a gap nothing is lost. With one, the ray is
-    refracted at the body's side (Snell), part of it is reflected there (Fresnel, unpolarised), and it crosses
-    the gap.
+    The length is that of a straight ray with the same rise. Without a gap nothing is lost. With one, the ray
+    is refracted at the body's side (Snell), part of it is reflected there (Fresnel, unpolarised), and it
+    crosses the gap.
     """
     way = 1 / np.maximum(per_way, _LEAST)
     at_x, at_y = x + way * ray[0], y + way * ray[1]
