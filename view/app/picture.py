@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -91,6 +92,7 @@ class Shown:
     readings: Readings = field(default_factory=Readings)
 
 
+@functools.cache
 def palette_of(name: str) -> list[str]:
     """Return the colours of a colour map of Matplotlib."""
     from matplotlib import colormaps

@@ -9,6 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from mirrorskin import engine, io
 from mirrorskin.engine.options import Option
 from mirrorskin.engine.reconstruction import calibrated, method_for
@@ -88,6 +91,7 @@ class Session:
         self.now: Computed | None = None
         self.before: Computed | None = None
         self.problem = ""
+        self._samples: tuple[int, int, NDArray[Any]] | None = None
         self.pixel: tuple[int, int] | None = None  # row and column in the whole picture
         self.measured: io.Region | None = None  # pixels of the maps
         self.ends: Ends | None = None
@@ -191,7 +195,7 @@ class Session:
         self.region, self.frames = region, frames
         if self._part is not None:
             self._part.close()
-            self._part = None
+            self._part = self._samples = None
         self.measured = self.ends = None
         self._tell("part")
         self.compute()
@@ -241,6 +245,14 @@ class Session:
                 self.path, **self.opening.keywords, region=self.region, frames=self.frames
             )
         return self._part
+
+    def brightness(self, row: int, column: int) -> NDArray[Any]:
+        """Return the samples of a pixel of the part, (T,)."""
+        part = self.part()
+        if self._samples is None or self._samples[:2] != (row, column):
+            samples = [part.frame(number)[row, column] for number in range(part.shape[0])]
+            self._samples = row, column, np.array(samples, part.dtype)
+        return self._samples[2]
 
     def source(self) -> io.Source:
         """Return the part; for the method of the motion, with its calibration."""

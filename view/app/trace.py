@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io import Block
 from mirrorskin.io.types import UNDISTORTED, Floats
 from mirrorskin.view.app.session import Session
 
@@ -57,7 +56,7 @@ def trace_of(session: Session) -> Trace | None:
     if not (0 <= row < part.shape[1] and 0 <= column < part.shape[2]):
         return None
     axis, unit, position = _positions(session)
-    frames = _brightness(session, row, column)
+    frames = session.brightness(row, column)
     counts = frames.astype(np.float64)
     if part.motion == "axial":
         return _turn(session, row, column, position, frames, axis, unit)
@@ -78,20 +77,6 @@ def _positions(session: Session) -> tuple[str, str, Floats]:
     if part.twist is not None:
         return "twist", "deg", np.degrees(part.twist)
     return "frame", "", np.arange(part.shape[0], dtype=np.float64)
-
-
-def _brightness(session: Session, row: int, column: int) -> NDArray[Any]:
-    """Return the samples of a pixel, (T,)."""
-    part = session.part()
-    part.rewind()
-    room = np.empty((min(part.shape[0], 64), *part.shape[1:]), part.dtype)
-    blocks: list[Block] = [*_copied(part, room, row, column)]
-    return np.concatenate([one.frames for one in blocks])
-
-
-def _copied(part: Any, room: NDArray[Any], row: int, column: int) -> Any:
-    while (block := part.read(room)) is not None:
-        yield Block(block.frames[:, row, column].copy(), block.index)
 
 
 def _press(
