@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,9 +16,22 @@ from mirrorskin.cli.stack import RECORDING, stack_options, stack_words
 if TYPE_CHECKING:
     from mirrorskin.view.app import Opening
 
+_LIFETIME = 1000
+"""Milliseconds after which a rig is stopped whose page was closed, or lost its connection."""
+
 
 def command(
-    files: Annotated[list[Path], Argument(metavar="FILE", help="Recordings and results.")],
+    files: Annotated[
+        list[Path] | None, Argument(metavar="FILE", help="Recordings and results.", required=False)
+    ] = None,
+    rig: Annotated[
+        Path | None,
+        Option(
+            "--rig",
+            metavar="RIG.toml",
+            help="Rig to drive: live picture, moves by hand, runs. Nothing moves before 'Connect'.",
+        ),
+    ] = None,
     calibration: options.Calibration = None,
     device: options.Devices = None,
     operation: Annotated[
@@ -37,18 +51,30 @@ def command(
 
     It listens on this machine only, at an address that contains a secret.
     """
+    from mirrorskin import io
     from mirrorskin.view.app.server import AppServer, check_app
 
     check_app()
-    from mirrorskin.view.app.page import pages
+    if not files and rig is None:
+        raise io.InputError("nothing to show: name a recording or a result, or a rig with --rig RIG.toml")
+    openings = [_opening(path, calibration, device, operation, dict(chosen)) for path in files or ()]
+    with ExitStack() as stack:
+        control = None
+        if rig is not None:
+            from mirrorskin.hw.rig_file import load_rig
+            from mirrorskin.view.app.rig_control import RigControl
 
-    openings = [_opening(path, calibration, device, operation, dict(chosen)) for path in files]
-    server = AppServer(pages(files, openings), port or 0)
-    click.echo(server.address)
-    try:
-        server.run(browser=not no_browser)
-    except KeyboardInterrupt:
-        click.echo("ended", err=True)
+            control = RigControl(load_rig(rig))
+            stack.callback(control.close)
+        from mirrorskin.view.app.page import pages
+
+        lifetime = {} if control is None else {"lifetime": _LIFETIME}
+        server = AppServer(pages(files or (), openings, control), port or 0, **lifetime)
+        click.echo(server.address)
+        try:
+            server.run(browser=not no_browser)
+        except KeyboardInterrupt:
+            click.echo("ended", err=True)
 
 
 def _opening(

@@ -29,6 +29,7 @@ def command(
     """Move the stage, and record what the camera sees; what was taken is kept whatever happens."""
     from mirrorskin import io
     from mirrorskin.hw.rig.rig import open_rig
+    from mirrorskin.hw.rig.sweep import make_scan
     from mirrorskin.hw.rig_file import load_rig
     from mirrorskin.kernels.correlation import WINDOW
 
@@ -38,7 +39,7 @@ def command(
     known = scans.open_calibration(calibration, settings)
     with open_rig(settings, plan.in_steps) as rig:
         # Normals are computed from this number of frames of a turn; more would be of no use.
-        scan = scans.make_scan(rig, plan, given.get("settle"), given.get("frames"), turn_frames=WINDOW)
+        scan = make_scan(rig, plan, given.get("settle"), given.get("frames"), turn_frames=WINDOW)
         recorder = io.StreamRecorder(scan, output, compression.value, calibration=known, overwrite=overwrite)
         with scans.kept(recorder):
             _drain(recorder)

@@ -144,12 +144,13 @@ class _Live:
         from mirrorskin.cli.status import show_status
         from mirrorskin.engine.live import Loop
         from mirrorskin.hw.rig.rig import open_rig
+        from mirrorskin.hw.rig.sweep import make_scan
         from mirrorskin.io import Calibrated, StreamRecorder
 
         given, settings, known = self._given, self._settings, self._calibration
         with ExitStack() as stack:
             rig = stack.enter_context(open_rig(settings))
-            scan = scans.make_scan(rig, self._plan, given.get("settle"), given.get("frames"))
+            scan = make_scan(rig, self._plan, given.get("settle"), given.get("frames"))
             view = given["view"]
             shown = stack.enter_context(_viewer(view, scan.shape[1:], settings)) if view else None
             tell = stack.enter_context(show_status())

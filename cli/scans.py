@@ -15,9 +15,6 @@ from mirrorskin.cli.options import MotionName
 
 if TYPE_CHECKING:
     from mirrorskin.hw.rig.plans import Plan
-    from mirrorskin.hw.rig.rig import Rig
-    from mirrorskin.hw.rig.scan import StepScan
-    from mirrorskin.hw.rig.sweep import SweepScan
     from mirrorskin.hw.rig_file import RigSettings
     from mirrorskin.io import Calibration, StreamRecorder
 
@@ -87,22 +84,6 @@ def make_plan(context: click.Context, given: Mapping[str, Any], settings: RigSet
     check_steps(plan, given)
     check_plan(plan, settings.stage, settings.name)
     return plan
-
-
-def make_scan(
-    rig: Rig,
-    plan: Plan,
-    settle: float | None = None,
-    frames: int | None = None,
-    turn_frames: int | None = None,
-) -> StepScan | SweepScan:
-    """Join a rig and a plan to a source of frames; see ``StepScan`` and ``SweepScan``."""
-    from mirrorskin.hw.rig.scan import StepScan
-    from mirrorskin.hw.rig.sweep import SweepScan
-
-    if plan.in_steps:
-        return StepScan(rig, plan, SETTLE if settle is None else settle, frames or 1)
-    return SweepScan(rig, plan, turn_frames)
 
 
 def check_steps(plan: Plan, given: Mapping[str, Any]) -> None:

@@ -237,6 +237,7 @@ def take(
     from mirrorskin.cli.quantity import duration
     from mirrorskin.hw.rig.plans import check_plan
     from mirrorskin.hw.rig.rig import open_rig
+    from mirrorskin.hw.rig.sweep import make_scan
     from mirrorskin.hw.rig_file import load_rig
 
     settings = load_rig(rig_file)
@@ -249,7 +250,7 @@ def take(
         io.check_output(path, rig_file, replaces="anything" if overwrite else "nothing")
     with open_rig(settings) as rig:
         for place, path in zip(places, paths, strict=True):
-            scan = scans.make_scan(rig, place.plan, seconds, place.frames)
+            scan = make_scan(rig, place.plan, seconds, place.frames)
             scan.lift()
             click.echo(f"{place.prompt}, then press Enter", err=True)
             if not sys.stdin.readline():  # end of input

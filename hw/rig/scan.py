@@ -20,6 +20,9 @@ from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.stage import Position, Report
 from mirrorskin.io.types import Block, Closing, Floats, Header, InputError
 
+SETTLE = 0.1
+"""Seconds from rest to the first exposure, of a motion with stops, by default."""
+
 _DARK_FRAMES = 16
 
 _UNKNOWN_DELAY = 0.2  # assumed maximum delay of frames, seconds, if it is unknown
@@ -223,7 +226,7 @@ class StepScan(Scan):
     settle: float
     frames: int
 
-    def __init__(self, rig: Rig, plan: Plan, settle: float = 0.1, frames: int = 1) -> None:
+    def __init__(self, rig: Rig, plan: Plan, settle: float = SETTLE, frames: int = 1) -> None:
         if not 0 <= settle < np.inf:
             raise InputError(f"a settling time of {settle} s is not possible: give 0 or more")
         if frames < 1:

@@ -13,7 +13,7 @@ from mirrorskin.hw.camera import Frames
 from mirrorskin.hw.rig.delay import Delay, measure_delay
 from mirrorskin.hw.rig.plans import AxialPlan, Plan, Trapezoid
 from mirrorskin.hw.rig.rig import Move, Rig, untriggered
-from mirrorskin.hw.rig.scan import Scan
+from mirrorskin.hw.rig.scan import SETTLE, Scan, StepScan
 from mirrorskin.hw.rig.track import LiveTrack, Progress, Track, even_times
 from mirrorskin.io.types import Block, Floats
 
@@ -174,3 +174,16 @@ class SweepScan(Scan):
             return part
         skipped = -int(taken.number[part.start]) % self._every
         return slice(min(part.start + skipped, part.stop), part.stop, self._every)
+
+
+def make_scan(
+    rig: Rig,
+    plan: Plan,
+    settle: float | None = None,
+    frames: int | None = None,
+    turn_frames: int | None = None,
+) -> StepScan | SweepScan:
+    """Join a rig and a plan to a source of frames; see ``StepScan`` and ``SweepScan``."""
+    if plan.in_steps:
+        return StepScan(rig, plan, SETTLE if settle is None else settle, frames or 1)
+    return SweepScan(rig, plan, turn_frames)

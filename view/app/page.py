@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import panel as pn
 
@@ -19,7 +19,13 @@ from mirrorskin.view.app.save import SavePane
 from mirrorskin.view.app.session import Opening, Session
 from mirrorskin.view.app.surface import SurfacePane
 
+if TYPE_CHECKING:
+    from mirrorskin.view.app.rig import RigPane
+    from mirrorskin.view.app.rig_control import RigControl
+
 Shown = str | Path | io.Recording | io.Result
+
+_RIG = -1  # the choice of the rig, among numbers of files
 
 
 class App:
@@ -31,6 +37,8 @@ class App:
         What is shown; of several, one at a time.
     opening : Opening, or one for each source, optional
         How recordings are opened, and the device.
+    rig : RigControl, optional
+        A rig to drive.
 
     Attributes
     ----------
@@ -52,42 +60,73 @@ class App:
     (40, 40)
     """
 
-    def __init__(self, *sources: Shown, opening: Opening | Sequence[Opening] | None = None) -> None:
-        if not sources:
-            raise io.InputError("the application needs a recording or a result: name a file")
+    def __init__(
+        self,
+        *sources: Shown,
+        opening: Opening | Sequence[Opening] | None = None,
+        rig: RigControl | None = None,
+    ) -> None:
+        if not sources and rig is None:
+            raise io.InputError("the application needs a recording, a result or a rig: name a file")
         pn.extension()
         one = opening or Opening()
-        self._sources = sources
-        self._openings = [one] * len(sources) if isinstance(one, Opening) else [*one]
-        names = [_name_of(one, number) for number, one in enumerate(sources)]
+        openings = [one] * len(sources) if isinstance(one, Opening) else [*one]
+        self._sources = [*zip(sources, openings, strict=True)]
+        self.session: Session | None = None
+        self.rig: RigPane | None = None
+        self.recording: RecordingPane | None = None
+        self.options: OptionsPane | None = None
+        names = {_name_of(one, number): number for number, one in enumerate(sources)}
+        stop: list[Any] = []
+        if rig is not None:
+            from mirrorskin.view.app.rig import REFRESH, RigPane
+
+            self.rig = RigPane(rig, self.add)
+            names = {f"rig {rig.settings.name}": _RIG, **names}
+            stop = [self.rig.stop]
+            if pn.state.curdoc is not None and pn.state.curdoc.session_context is not None:
+                pn.state.add_periodic_callback(self.rig.refresh, REFRESH)
         self.choice = pn.widgets.Select(
-            options=dict(zip(names, range(len(names)), strict=True)), width=280, label="", value=0
+            options=names, width=280, label="", value=next(iter(names.values())), visible=len(names) > 1
         )
         self.choice.param.watch(lambda _: self._open(), "value")
         self._about = text(sizing_mode="stretch_width", margin=(9, 10))
-        self._body = pn.Row(sizing_mode="stretch_width", css_classes=["body"])
-        self.session: Session | None = None
+        self._body = pn.Row(sizing_mode="stretch_width")
         self._open()
         head = pn.Row(
+            *stop,
             text("<h1>mirrorskin</h1>", width=120),
-            *([self.choice] if len(sources) > 1 else []),
+            self.choice,
             self._about,
-            css_classes=["head"],
             sizing_mode="stretch_width",
+            styles={"position": "sticky", "top": "0", "z-index": "10", "background": "white"},
         )
         self.view = pn.Column(head, self._body, sizing_mode="stretch_width")
 
+    def add(self, name: str, source: Shown) -> None:
+        """Show another recording or result, which can be chosen from then on."""
+        self._sources.append((source, Opening()))
+        number = len(self._sources) - 1
+        self.choice.options = {**self.choice.options, f"{name} ({number + 1})": number}
+        self.choice.visible = True
+        self.choice.value = number
+
     def _open(self) -> None:
-        """Show the chosen file."""
+        """Show the chosen file, or the rig."""
         if self.session is not None:
             self.session.close()
+            self.session = self.recording = self.options = None
         number = self.choice.value
-        session = Session(self._sources[number], self._openings[number])
+        if number == _RIG:
+            assert self.rig is not None
+            self._body[:] = [self.rig.view]
+            self._describe()
+            return
+        session = Session(*self._sources[number])
         self.session = session
         session.watch("result", "problem", callback=self._describe)
         tabs: list[tuple[str, Any]] = []
         side: list[Any] = []
-        self.recording = self.options = None
         if session.whole is not None:
             self.options = OptionsPane(session)
             self.recording = RecordingPane(session)
@@ -107,21 +146,22 @@ class App:
     def _describe(self) -> None:
         """Say in the head what is shown."""
         session = self.session
-        assert session is not None
-        parts = [session.name] if len(self._sources) == 1 else []
+        if session is None:
+            self._about.object = ""
+            return
+        parts = [] if self.choice.visible else [session.name]
         if session.whole is not None:
             count, rows, columns = session.whole.shape
             parts.append(f"{session.whole.motion} motion, {count} frames of {columns} x {rows}")
+        told: Sequence[str] = ()
         if session.now is not None:
+            told = session.now.warnings
             parts.append(str(summarise(session.now.result)))
             if session.now.seconds:
                 parts.append(f"computed in {session.now.seconds:.2f} s")
-        told = (
-            ""
-            if session.now is None
-            else "".join(f'<p class="warning">{escape(one)}</p>' for one in session.now.warnings)
-        )
-        self._about.object = f'<p class="about">{"; ".join(map(escape, parts))}</p>{told}'
+        lines = [f'<p class="about">{escape("; ".join(parts))}</p>']
+        lines += [f'<p class="warning">{escape(one)}</p>' for one in told]
+        self._about.object = "".join(lines)
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> Any:
         """Show the application in a notebook."""
@@ -139,12 +179,23 @@ def _name_of(source: Shown, number: int) -> str:
     return source.name if isinstance(source, io.Recording) else f"result {number + 1}"
 
 
-def pages(sources: Sequence[Path], openings: Sequence[Opening]) -> Any:
-    """Return a function that makes the page of one browser window."""
+def pages(
+    sources: Sequence[Path], openings: Sequence[Opening], rig: RigControl | None = None
+) -> Callable[[], Any]:
+    """Return a function that makes a page; when the last page is closed, the rig is stopped."""
+    opened: list[App] = []
 
     def page() -> Any:
-        app = App(*sources, opening=openings)
-        pn.state.on_session_destroyed(lambda _: app.close())
+        app = App(*sources, opening=openings, rig=rig)
+        opened.append(app)
+
+        def close(_: Any) -> None:
+            app.close()
+            opened.remove(app)
+            if rig is not None and not opened:
+                rig.close()
+
+        pn.state.on_session_destroyed(close)
         return app.view
 
     return page

@@ -264,7 +264,7 @@ class Picture:
         self.figure.toolbar.active_scroll = wheel
         self.figure.grid.visible = False
         self.figure.xaxis.axis_label, self.figure.yaxis.axis_label = f"x ({unit})", f"y ({unit})"
-        self.source = ColumnDataSource(data={"image": [np.zeros((1, 1), np.float32)]})
+        self.source = ColumnDataSource(data={"image": [np.full((1, 1), np.nan, np.float32)]})
         self.marks = ColumnDataSource(data={"image": [np.zeros((1, 1), np.uint32)]})
         self.mapper = LinearColorMapper(palette=["#000000", "#ffffff"], nan_color=hex_of(MISSING_RGB))
         self.logarithmic = LogColorMapper(palette=["#000000"], low=1, high=10, nan_color=hex_of(MISSING_RGB))

@@ -39,6 +39,8 @@ class AppServer:
         Returns what Panel shows in a new browser window.
     port : int
         0 for any free one.
+    lifetime : int
+        Milliseconds after which a page that was closed, or lost its connection, is forgotten.
 
     Attributes
     ----------
@@ -51,7 +53,7 @@ class AppServer:
         The port cannot be used.
     """
 
-    def __init__(self, page: Callable[[], Any], port: int = 0) -> None:
+    def __init__(self, page: Callable[[], Any], port: int = 0, lifetime: int = 15_000) -> None:
         from panel.io.resources import DIST_DIR
         from panel.io.server import get_server
         from tornado.web import StaticFileHandler
@@ -71,6 +73,8 @@ class AppServer:
             show=False,
             start=False,
             session_token_expiration=86400,
+            unused_session_lifetime_milliseconds=lifetime,
+            check_unused_sessions_milliseconds=min(lifetime, 17_000),
         )
         _restore(interrupt)
         self.address = f"http://{HERE}:{port}/{token}/"

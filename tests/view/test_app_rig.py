@@ -1,0 +1,252 @@
+"""The application's rig, on simulated time: it shows, moves, runs, and stops whatever happens."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import panel as pn
+import pytest
+from simulated import simulate
+
+from mirrorskin import io
+from mirrorskin.hw.emulator.rig import EmulatedRig
+from mirrorskin.view.app import App
+from mirrorskin.view.app.page import pages
+from mirrorskin.view.app.rig import RigPane
+from mirrorskin.view.app.rig_control import RigControl, judge, vertical_plan
+
+SHAPE, PIXEL, RATE = (24, 32), 0.3, 50.0
+LONG = 120.0  # simulated seconds, after which what should have happened never will
+
+
+@pytest.fixture(params=[False])
+def emulated(request, clock, monkeypatch):
+    """An emulated rig, the control of it, and means to wait; the parameter says whether it has switches."""
+    with EmulatedRig(
+        shape=SHAPE, pixel_size=PIXEL, rate=RATE, delay=0.05, clock=clock, home=request.param
+    ) as rig:
+        simulate(monkeypatch, clock, rig.open_stage, rig.open_camera)
+        control = RigControl(rig.settings, clock=clock)
+
+        def until(condition):
+            end = clock.now() + LONG
+            while not condition():
+                assert clock.now() < end, (control.state, control.problem)
+                clock.sleep(0.02)
+
+        yield SimpleNamespace(rig=rig, control=control, until=until, clock=clock)
+        control.close()
+
+
+@pytest.fixture
+def ready(emulated):
+    """The same, connected, with a picture."""
+    emulated.control.connect()
+    emulated.until(lambda: emulated.control.state == "ready" and emulated.control.seen.frame is not None)
+    return emulated
+
+
+def travel(emulated):
+    return emulated.rig.where(emulated.clock.now()).travel
+
+
+def ended(emulated):
+    """Whether the thread that drives the rig has left it."""
+    return emulated.control.state == "disconnected"
+
+
+def test_nothing_moves_before_it_is_connected(emulated):
+    before = travel(emulated)
+    emulated.clock.sleep(1)
+    emulated.control.jog("travel", 0.5)
+    emulated.clock.sleep(1)
+    assert travel(emulated) == before
+    assert emulated.control.problem == "Connect first."
+
+
+def test_the_live_picture_goes_on(ready):
+    frames = ready.control.seen.frames
+    ready.clock.sleep(1)
+    assert ready.control.seen.frames > frames + RATE / 2
+    assert ready.control.seen.frame.shape == SHAPE
+
+
+def test_a_jog_moves_by_the_step(ready):
+    before = travel(ready)
+    ready.control.jog("travel", 0.25)
+    ready.until(lambda: ready.control.state == "ready" and not ready.rig.machine.moving())
+    ready.until(lambda: abs(travel(ready) - before - 0.25) < 1e-3)
+
+
+def test_pictures_come_while_the_stage_moves(ready):
+    ready.control.jog("travel", 2.0)
+    ready.until(lambda: ready.control.state == "moving")
+    frames = ready.control.seen.frames
+    ready.clock.sleep(0.5)
+    assert ready.control.state == "moving"
+    assert ready.control.seen.frames > frames
+
+
+def test_a_jog_beyond_the_limits_is_refused_and_nothing_moves(ready):
+    before = travel(ready)
+    ready.control.jog("travel", 50.0)
+    ready.until(lambda: ready.control.problem != "")
+    assert "beyond the axis" in ready.control.problem
+    assert ready.control.state == "ready"
+    assert travel(ready) == before
+
+
+def test_a_second_request_waits_for_the_first(ready):
+    ready.control.jog("travel", 2.0)
+    ready.until(lambda: ready.control.state == "moving")
+    ready.control.lift()
+    assert ready.control.problem == "Wait until the stage rests."
+
+
+def test_stop_ends_a_move_at_once(ready):
+    before = travel(ready)
+    ready.control.jog("travel", 3.0)
+    ready.until(lambda: travel(ready) > before + 0.1)
+    ready.control.stop()
+    ready.until(lambda: ended(ready) and not ready.rig.machine.moving())
+    assert travel(ready) < before + 1.5
+    assert "The stage was stopped." in ready.control.problem
+
+
+@pytest.mark.parametrize("emulated", [True], indirect=True)
+def test_stop_ends_the_homing_while_it_connects(emulated):
+    emulated.control.connect()
+    emulated.until(emulated.rig.machine.moving)
+    assert emulated.control.state == "connecting"
+    emulated.control.stop()
+    emulated.until(lambda: ended(emulated) and not emulated.rig.machine.moving())
+
+
+def test_stop_ends_a_run(ready):
+    ready.control.run(vertical_plan(0.0, 2.0, 0.2))
+    ready.until(lambda: ready.control.seen.update is not None and ready.rig.machine.moving())
+    ready.control.stop()
+    ready.until(lambda: ended(ready) and not ready.rig.machine.moving())
+    assert "The stage was stopped." in ready.control.problem
+
+
+def test_after_a_stop_it_can_be_connected_again(ready):
+    ready.control.stop()
+    ready.until(lambda: ended(ready))
+    ready.control.connect()
+    ready.until(lambda: ready.control.state == "ready")
+
+
+def test_closing_stops_what_moves(ready):
+    ready.control.jog("travel", 3.0)
+    ready.until(ready.rig.machine.moving)
+    ready.control.close()
+    ready.until(lambda: not ready.rig.machine.moving())
+    assert travel(ready) < -1.5
+
+
+@pytest.mark.parametrize("fault", ["stall", "silence", "alarm", "bug"])
+def test_a_fault_stops_the_stage_and_says_why(ready, fault):
+    before = travel(ready)
+    ready.control.jog("travel", 3.0)
+    ready.until(lambda: travel(ready) > before + 0.1)
+    if fault == "stall":
+        ready.rig.camera.stall()
+    elif fault == "silence":
+        ready.rig.port.silence()
+    elif fault == "alarm":
+        ready.rig.machine.alarm(1)
+    else:  # an error of the program itself
+        ready.control._look = lambda rig: 1 / 0
+    ready.until(lambda: ended(ready) and not ready.rig.machine.moving())
+    assert travel(ready) < before + 2.5
+    assert ready.control.problem
+
+
+def test_a_run_shows_heights_records_and_returns_a_result(ready, tmp_path):
+    path = tmp_path / "run.h5"
+    ready.control.run(vertical_plan(0.0, 1.5, 0.5), path)
+    ready.until(lambda: ready.control.result is not None and ready.control.state == "ready")
+    assert ready.control.problem == ""
+    assert np.isfinite(ready.control.result.height).sum() > 20
+    assert ready.control.seen.update.height is not None
+    assert ready.control.recorded == path
+    with io.open_recording(path) as recording:
+        assert recording.motion == "vertical"
+
+
+def test_a_recording_that_exists_is_not_replaced(ready, tmp_path):
+    path = tmp_path / "run.h5"
+    path.write_text("mine")
+    ready.control.run(vertical_plan(0.0, 1.5, 0.5), path)
+    assert "exists" in ready.control.problem
+    assert path.read_text() == "mine"
+    assert ready.control.state == "ready"
+
+
+def test_the_pane_shows_what_the_rig_shows(ready):
+    pane = RigPane(ready.control, lambda name, source: None)
+    assert pane.connect.disabled
+    assert not pane.start.disabled
+    assert "Saturated pixels" in pane.facts.object
+    assert "-4.000 mm" in pane._places["travel"].object
+    pane.jogs["travel", 1].param.trigger("clicks")
+    ready.until(lambda: abs(travel(ready) + 3.95) < 1e-3)
+
+
+def test_the_stop_button_stops(ready):
+    pane = RigPane(ready.control, lambda name, source: None)
+    ready.control.jog("travel", 3.0)
+    ready.until(ready.rig.machine.moving)
+    pane.stop.param.trigger("clicks")
+    ready.until(lambda: ended(ready) and not ready.rig.machine.moving())
+    pane.refresh()
+    assert not pane.connect.disabled
+    assert "was stopped" in pane.state.object
+
+
+def test_stop_is_at_the_head_whatever_the_page_shows(emulated, tmp_path):
+    app = App(rig=emulated.control)
+    app.add("a result", io.Result(height=np.zeros((8, 9), np.float32)))
+    assert app.session is not None
+    assert app.rig.stop in app.view[0]
+
+
+def test_a_plan_that_cannot_be_is_refused(ready):
+    pane = RigPane(ready.control, lambda name, source: None)
+    pane.press["stop"].value = -1.0
+    pane.start.param.trigger("clicks")
+    assert "does not go down" in ready.control.problem
+
+
+def test_the_recording_of_a_run_is_opened(ready, tmp_path):
+    app = App(rig=ready.control)
+    app.rig.file.value = str(tmp_path / "run.h5")
+    app.rig.start.param.trigger("clicks")
+    ready.until(lambda: ready.control.result is not None and ready.control.state == "ready")
+    app.rig.open.param.trigger("clicks")
+    assert app.session.whole is not None
+    app.close()
+
+
+def test_closing_the_last_page_stops_the_rig(ready, monkeypatch):
+    closed = []
+    monkeypatch.setattr(type(pn.state), "on_session_destroyed", lambda state, done: closed.append(done))
+    page = pages([], [], ready.control)
+    page()
+    page()
+    ready.control.jog("travel", 3.0)
+    ready.until(ready.rig.machine.moving)
+    closed[0](None)
+    assert ready.rig.machine.moving()
+    closed[1](None)
+    ready.until(lambda: not ready.rig.machine.moving())
+    assert ended(ready)
+
+
+def test_saturation_and_sharpness_are_judged():
+    frame = np.zeros((10, 10), np.uint8)
+    frame[:5] = 255
+    found = judge(frame)
+    assert found.saturated == 0.5
+    assert found.counts.sum() == 100
+    assert found.sharpness > judge(np.full((10, 10), 9, np.uint8)).sharpness == 0

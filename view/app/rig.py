@@ -1,0 +1,246 @@
+"""The pane of a rig: its live picture, moves by hand, and a run that shows heights while they grow."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import panel as pn
+from bokeh.models import ColumnDataSource, Range1d
+from bokeh.plotting import figure
+
+from mirrorskin.io import InputError, Result, pixel_axes
+from mirrorskin.view.app.look import heading, hint, plain_axes, problem, table, text
+from mirrorskin.view.app.picture import Picture, show_frame, show_map
+from mirrorskin.view.app.rig_control import RigControl, axial_plan, judge, vertical_plan
+from mirrorskin.view.canvas import extent
+from mirrorskin.view.result.sheet import sheet_of
+
+REFRESH = 150
+"""Milliseconds from one look at the rig to the next."""
+
+_PICTURE = 360, 300  # largest size, CSS pixels
+_HISTOGRAM = 360, 130
+_NARROW = 130  # width of a field
+_STEPS = {"mm": [0.01, 0.05, 0.1, 0.5, 1.0], "deg": [0.1, 0.5, 1.0, 5.0]}
+_NAMES = {"travel": "travel (down)", "pitch": "pitch", "roll": "roll", "x": "x", "y": "y", "twist": "twist"}
+_STATES = {
+    "disconnected": "not connected",
+    "connecting": "connecting",
+    "ready": "ready, the stage rests",
+    "moving": "the stage moves",
+}
+_SATURATED = 0.001  # share of the pixels above which the exposure is too long
+
+
+class RigPane:
+    """Buttons and pictures of a rig.
+
+    Attributes
+    ----------
+    stop : Button
+        Stops the stage; the page shows it at its head, whatever else it shows.
+    """
+
+    def __init__(self, control: RigControl, add: Callable[[str, Any], None]) -> None:
+        self.control, self._add = control, add
+        self._drawn: Any = None
+        self._shown: Any = None
+        self._saturated = ""
+        self.stop = pn.widgets.Button(label="STOP", color="danger", width=110, height=38)
+        self.stop.on_click(lambda _: self._stop())
+        home = control.settings.stage.home
+        label = "Connect, and home the stage (it moves)" if home else "Connect"
+        self.connect = pn.widgets.Button(label=label, color="primary", width=270)
+        self.connect.on_click(lambda _: self._ask(control.connect))
+        self.state = text(width=420)
+        self.facts = text(width=_PICTURE[0])
+        rows, columns = control.settings.camera.shape
+        x, y = pixel_axes((rows, columns), control.settings.camera.pixel_sides or (1.0, 1.0))
+        unit = "mm" if control.settings.camera.pixel_sides else "px"
+        self.camera = Picture(extent(x, y), unit, _PICTURE)
+        self.heights = Picture(extent(x, y), unit, _PICTURE)
+        self._axes: dict[str, Any] = {"x": x, "y": y} if unit == "mm" else {}
+        self.histogram = ColumnDataSource(data={"left": [], "right": [], "top": []})
+        self._places = {name: text(width=120) for name in control.settings.stage.axes}
+        self.steps = {
+            unit: pn.widgets.Select(label=f"Step ({unit})", options=values, value=values[1], width=_NARROW)
+            for unit, values in _STEPS.items()
+        }
+        self.view = pn.Row(
+            pn.Column(pn.pane.Bokeh(self.camera.figure), pn.pane.Bokeh(self._histogram()), self.facts),
+            pn.Column(
+                pn.Row(self.connect), self.state, *self._jogging(), *self._running(), width=440
+            ),
+            pn.Column(pn.pane.Bokeh(self.heights.figure), *self._about_run()),
+        )  # fmt: skip
+        self.refresh()
+
+    def _histogram(self) -> Any:
+        width, height = _HISTOGRAM
+        drawn = figure(
+            width=width + 60,
+            height=height,
+            tools="",
+            toolbar_location=None,
+            x_range=Range1d(0, 1),
+            y_range=Range1d(0, 1.05),
+        )
+        self._brightness = drawn.x_range
+        plain_axes(drawn)
+        drawn.quad("left", "right", "top", 0, source=self.histogram, color="#56606b", line_width=0)
+        drawn.xaxis.axis_label = "brightness (counts)"
+        drawn.yaxis.visible = False
+        return drawn
+
+    def _jogging(self) -> list[Any]:
+        """Return the buttons of moves by hand."""
+        axes = self.control.settings.stage.axes
+        units = list(dict.fromkeys(axis.unit for axis in axes.values()))
+        rows = []
+        self.jogs: dict[tuple[str, int], Any] = {}
+        for name, axis in axes.items():
+            buttons = []
+            for sign, label in ((-1, "\N{MINUS SIGN}"), (1, "+")):
+                button = pn.widgets.Button(label=label, width=44)
+                button.on_click(lambda _, name=name, sign=sign: self._jog(name, sign))
+                self.jogs[name, sign] = button
+                buttons.append(button)
+            low, high = axis.limits
+            limits = hint(f"{low:g} to {high:g} {axis.unit}")
+            name_of = text(f"<p>{_NAMES[name]}</p>{limits}", width=130)
+            rows.append(pn.Row(name_of, *buttons, self._places[name], margin=(0, 0)))
+        self.lift = pn.widgets.Button(label="Lift", width=90)
+        self.lift.on_click(lambda _: self._ask(self.control.lift))
+        return [heading("Move by hand"), pn.Row(*(self.steps[one] for one in units), self.lift), *rows]
+
+    def _running(self) -> list[Any]:
+        """Return the fields of a run."""
+        field = pn.widgets.FloatInput
+        kinds = ["press", *(["rotation"] if "pitch" in self.control.settings.stage.axes else [])]
+        self.motion = pn.widgets.Select(label="Motion", options=kinds, value="press", width=_NARROW)
+        deepest = self.control.settings.stage.press
+        self.press = {
+            "start": field(label="From travel (mm)", value=0.0, step=0.1, width=_NARROW),
+            "stop": field(label="To travel (mm)", value=min(1.5, deepest), step=0.1, width=_NARROW),
+            "speed": field(label="Speed (mm/s)", value=0.5, step=0.1, width=_NARROW),
+        }
+        self.turn = {
+            "press": field(label="At travel (mm)", value=min(1.0, deepest), step=0.1, width=_NARROW),
+            "tilt": field(label="Tilt (deg)", value=2.5, step=0.1, width=_NARROW),
+            "turns": field(label="Turns", value=1.0, step=1.0, width=_NARROW),
+            "rate": field(label="Turns per second", value=0.5, step=0.1, width=_NARROW),
+        }
+        self._fields = pn.Row(*self.press.values(), margin=0)
+        self.file = pn.widgets.TextInput(
+            label="Record to (may be empty)", placeholder="recording.h5", width=280
+        )
+        self.start = pn.widgets.Button(label="Start", color="primary", width=110, margin=(27, 10))
+        self.motion.param.watch(lambda _: self._choose_motion(), "value")
+        self.start.on_click(lambda _: self._start())
+        return [heading("Run and reconstruct"), self.motion, self._fields, pn.Row(self.file, self.start)]
+
+    def _about_run(self) -> list[Any]:
+        self.run = text(hint("While it runs, the heights grow here."), width=_PICTURE[0])
+        self.open = pn.widgets.Button(label="Show the result", width=200, visible=False)
+        self.open.on_click(lambda _: self._show_result())
+        return [self.run, self.open]
+
+    def _show_result(self) -> None:
+        """Show the recording of the last run, or its result if it was not recorded."""
+        control = self.control
+        if control.recorded is not None:
+            self._add(control.recorded.name, control.recorded)
+        elif control.result is not None:
+            self._add("live result", control.result)
+
+    def _choose_motion(self) -> None:
+        fields = self.press if self.motion.value == "press" else self.turn
+        self._fields[:] = list(fields.values())
+
+    def _stop(self) -> None:
+        self.control.stop()
+        self.refresh()
+
+    def _ask(self, request: Any) -> None:
+        request()
+        self.refresh()
+
+    def _jog(self, axis: str, sign: int) -> None:
+        unit = self.control.settings.stage.axes[axis].unit
+        step = float(self.steps[unit].value)
+        by = math.radians(step) if unit == "deg" else step
+        self._ask(lambda: self.control.jog(axis, sign * by))
+
+    def _start(self) -> None:
+        try:
+            if self.motion.value == "press":
+                plan = vertical_plan(**{name: one.value for name, one in self.press.items()})
+            else:
+                values = {name: one.value for name, one in self.turn.items()}
+                plan = axial_plan(**{**values, "tilt": math.radians(values["tilt"])})
+        except InputError as error:
+            self.control.problem = str(error)
+            self.refresh()
+            return
+        name = self.file.value.strip()
+        self._ask(lambda: self.control.run(plan, Path(name) if name else None))
+
+    def refresh(self) -> None:
+        """Show what the rig shows now."""
+        control, seen = self.control, self.control.seen
+        self.connect.disabled = control.state != "disconnected"
+        self.start.disabled = self.lift.disabled = control.state != "ready"
+        self.open.visible = control.result is not None and control.state != "moving"
+        for button in self.jogs.values():
+            button.disabled = control.state != "ready"
+        _set(self.state, f"<p>{_STATES[control.state]}</p>{problem(control.problem)}")
+        here = control.position
+        for name, place in self._places.items():
+            axis = control.settings.stage.axes[name]
+            value = "unknown" if here is None else f"{getattr(here, name) * axis.scale:.3f} {axis.unit}"
+            _set(place, f"<p>{value}</p>")
+        if seen.frame is not None and seen.frame is not self._drawn:
+            self._drawn = seen.frame
+            self._show_frame(seen.frame)
+        if seen.update is not self._shown:
+            self._shown = seen.update
+            self._show_run()
+
+    def _show_frame(self, frame: Any) -> None:
+        self.camera.show(show_frame(frame, "", automatic=False), about="live")
+        found = judge(frame)
+        share = found.counts / max(1, int(found.counts.max()))
+        self.histogram.data = {"left": found.edges[:-1], "right": found.edges[1:], "top": np.sqrt(share)}
+        self._brightness.end = float(found.edges[-1])
+        advice = ": shorten the exposure" if found.saturated > _SATURATED else ""
+        facts = {
+            "Saturated pixels": f"{100 * found.saturated:.2f} %{advice}",
+            "Sharpness": f"{found.sharpness:.2f} counts (larger is sharper)",
+            "Frames": f"{self.control.seen.frames}, {self.control.seen.rate:.1f} per second",
+        }
+        _set(self.facts, table(facts))
+
+    def _show_run(self) -> None:
+        update, status = self.control.seen.update, self.control.seen.status
+        if update is None or status is None:
+            return
+        facts = {
+            "Frames used": f"{status.used}, {status.skipped} skipped, {status.dropped} dropped",
+            "Position": f"{update.position:.3f}" if update.motion == "vertical" else "",
+        }
+        if update.contact_area is not None:
+            facts["Contact"] = f"{update.contact_area:.2f} mm²"
+        if update.height is not None and np.isfinite(update.height).any():
+            result = Result(height=update.height, **self._axes)
+            self.heights.show(show_map(sheet_of(result), "height"), about="while the stage moves")
+        _set(self.run, table({name: value for name, value in facts.items() if value}))
+
+
+def _set(pane: Any, content: str) -> None:
+    """Set a text, if it differs: each change is sent to the browser."""
+    if pane.object != content:
+        pane.object = content

@@ -1,0 +1,290 @@
+"""A rig that the application drives: one thread moves the stage and reads the camera, anyone may stop it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin import io
+from mirrorskin.engine.live import LiveOperation, Loop
+from mirrorskin.engine.live.status import Status, Update
+from mirrorskin.engine.reconstruction import method_for
+from mirrorskin.engine.rotation.last_turn import choose_window
+from mirrorskin.hw.clock import SYSTEM, Clock
+from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.rig import rig as rigs
+from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
+from mirrorskin.hw.rig.rig import Rig
+from mirrorskin.hw.rig.sweep import make_scan
+from mirrorskin.hw.rig_file import RigSettings, StageSettings
+from mirrorskin.hw.stage import Position, Stage
+
+State = Literal["disconnected", "connecting", "ready", "moving"]
+
+_SLOW = 0.1  # of an axis's speed, for moves by hand
+_LOOK = 0.02  # seconds from one look at a move to the next
+_MOST = 64  # frames that are taken at once
+_JOIN = 30.0  # seconds that the thread may take to close the rig
+_STOPPED = "The stage was stopped. Look at it, then connect again."
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the rig shows: the newest frame, and the maps of a live run."""
+
+    frame: NDArray[Any] | None = None
+    frames: int = 0
+    rate: float = float("nan")
+    update: Update | None = None
+    status: Status | None = None
+
+
+class RigControl:
+    """A rig behind buttons: connect, jog, lift, run, and stop, which works at any time.
+
+    One thread opens the rig, moves the stage and reads the camera. Whatever ends it stops the stage if it
+    moves: a fault, `stop`, `close`, or an error of this program. `stop` calls the stage from the caller's
+    thread, also while the rig is being opened and homed; afterwards the rig must be connected again.
+
+    Parameters
+    ----------
+    settings : RigSettings
+    clock : Clock
+
+    Attributes
+    ----------
+    state : {"disconnected", "connecting", "ready", "moving"}
+    problem : str
+        Why the last request was refused or the rig was disconnected.
+    seen : Seen
+    result : Result or None
+        That of the last run.
+    recorded : Path or None
+        The recording of the last run.
+    """
+
+    def __init__(self, settings: RigSettings, clock: Clock = SYSTEM) -> None:
+        self.settings, self._clock = settings, clock
+        self.state: State = "disconnected"
+        self.problem = ""
+        self.seen = Seen()
+        self.result: io.Result | None = None
+        self.recorded: Path | None = None
+        self._stage: Stage | None = None
+        self._task: Callable[[Rig], None] | None = None
+        self._stopping, self._closing = clock.event(), clock.event()
+        self._thread: Any = None
+
+    @property
+    def position(self) -> Position | None:
+        """Where the body stands; None if that is unknown."""
+        stage = self._stage
+        if stage is None:
+            return None
+        try:
+            return stage.report().position
+        except HardwareError:  # stopped, or lost; the thread finds out why
+            return None
+
+    def connect(self) -> None:
+        """Open the rig; a stage that has switches is homed."""
+        if self.state != "disconnected":
+            return
+        self._join()
+        self._stopping, self._closing = self._clock.event(), self._clock.event()
+        self._stage, self._task, self.problem, self.state = None, None, "", "connecting"
+        self._thread = self._clock.thread(self._work, f"{self.settings.name}: application")
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop the stage at once; the rig is then disconnected."""
+        self._stopping.set()
+        if self._stage is not None:
+            self._stage.stop()
+
+    def close(self) -> None:
+        """Stop what moves, and let the rig go."""
+        if self.state in ("connecting", "moving"):
+            self.stop()
+        self._closing.set()
+        self._join()
+
+    def jog(self, axis: str, by: float) -> None:
+        """Move one axis slowly by some mm or radians, within its limits."""
+
+        def task(rig: Rig) -> None:
+            here = rig.stage.report().position
+            place = replace(here, **{axis: getattr(here, axis) + by})
+            self._go(rig, place, _SLOW * self.settings.stage.axes[axis].top_speed)
+
+        self._give(task)
+
+    def lift(self) -> None:
+        """Set the body upright, lift it, and bring it to the middle."""
+
+        def task(rig: Rig) -> None:
+            for place in rig.stage.limits.way_up(rig.stage.report().position):
+                self._go(rig, place, None)
+
+        self._give(task)
+
+    def run(self, plan: Plan, record: Path | None = None) -> None:
+        """Move as planned, reconstruct meanwhile, and record if a file is given."""
+        if record is not None:
+            try:
+                io.check_output(record, replaces="nothing")
+            except io.InputError as error:
+                self.problem = str(error)
+                return
+        self._give(lambda rig: self._run(rig, plan, record))
+
+    def _give(self, task: Callable[[Rig], None]) -> None:
+        if self.state != "ready" or self._task is not None:
+            self.problem = "Connect first." if self.state == "disconnected" else "Wait until the stage rests."
+            return
+        self.problem, self._task = "", task
+
+    def _join(self) -> None:
+        if self._thread is not None:
+            self._thread.join(_JOIN)
+            self._thread = None
+
+    def _open_stage(self, settings: StageSettings) -> Stage:
+        """Open the stage, which can be stopped from then on."""
+        self._stage = rigs.open_stage(settings)
+        if self._stopping.is_set():
+            self._stage.stop()
+        return self._stage
+
+    def _work(self) -> None:
+        """Open the rig, do what is asked for, and close it; the thread."""
+        try:
+            with rigs.open_rig(self.settings, open_stage=self._open_stage) as rig:
+                self.state = "ready"
+                while not self._closing.is_set():
+                    self._look(rig)
+                    if self._task is not None:
+                        self._do(rig, self._task)
+        except Exception as error:
+            named = str(error) if hasattr(error, "exit_code") else f"{type(error).__name__}: {error}"
+            self.problem = _STOPPED if self._stopping.is_set() else named
+        finally:
+            self._stage, self._task, self.state = None, None, "disconnected"
+
+    def _do(self, rig: Rig, task: Callable[[Rig], None]) -> None:
+        self.state = "moving"
+        try:
+            task(rig)
+        except io.InputError as error:  # refused before anything moved, or the run has no result
+            self.problem = str(error)
+            rig.check()
+        self._task = None
+        self.state = "ready"
+
+    def _go(self, rig: Rig, place: Position, speed: float | None) -> None:
+        """Move to a place, and show what the camera sees meanwhile."""
+        move = rig.begin(lambda: rig.stage.move(place, speed))
+        while not move.join(_LOOK):
+            self._look(rig)
+        rig.end(move)
+
+    def _look(self, rig: Rig) -> None:
+        """Take the frames that wait, and keep the newest; raise what is wrong with the rig."""
+        rig.check()
+        if rig.stage.error is not None:
+            raise rig.stage.error
+        taken = rig.take(_MOST)
+        self._show(rig, taken.pixels[-1].copy(), len(taken.pixels))
+
+    def _show(self, rig: Rig, frame: NDArray[Any], count: int, **more: Any) -> None:
+        self.seen = replace(
+            self.seen,
+            frame=frame,
+            frames=self.seen.frames + count,
+            rate=rig.camera.counts.rate,
+            **more,
+        )
+
+    def _run(self, rig: Rig, plan: Plan, record: Path | None) -> None:
+        self.result = self.recorded = None
+        self.seen = replace(self.seen, update=None, status=None)
+        scan = make_scan(rig, plan)
+        recorder = None if record is None else io.StreamRecorder(scan, record)
+        source: io.LiveSource = scan if recorder is None else recorder
+
+        def on_update(update: Update, status: Status) -> None:
+            self._show(rig, update.picture, 1, update=update, status=status)
+
+        with ExitStack() as stack:
+            stack.enter_context(source)
+            operation = _live(source, plan, rig.rate)
+            operation.warm()
+            mark = None if recorder is None else recorder.mark
+            Loop(source, operation, on_update=on_update, stop=self._ending, mark=mark).run()
+        self.recorded = None if recorder is None else recorder.path
+        self.result = operation.result()
+
+    def _ending(self) -> bool:
+        return self._stopping.is_set() or self._closing.is_set()
+
+
+def _live(source: io.LiveSource, plan: Plan, rate: float) -> LiveOperation:
+    """Return the method of the motion, with a window of one turn for a rotation."""
+    computed = method_for(plan.motion)()
+    if not isinstance(plan, AxialPlan):
+        return LiveOperation(source, computed)
+    window, every = choose_window(plan.frames_a_turn(rate))
+    return LiveOperation(source, computed.with_options(window_frames=window), every=every)
+
+
+def vertical_plan(start: float, stop: float, speed: float) -> Plan:
+    """Return the plan of a press without a halt, mm and mm/s."""
+    return VerticalPlan(start, stop, speed=speed)
+
+
+def axial_plan(press: float, tilt: float, turns: float, rate: float) -> Plan:
+    """Return the plan of a rotation without a halt: mm, radians, and turns per second."""
+    return AxialPlan(press, tilt, turns, rate=rate)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What a frame shows of exposure and focus.
+
+    Attributes
+    ----------
+    saturated : float
+        Share of the pixels at the end of the scale.
+    sharpness : float
+        Standard deviation of the Laplacian, counts: the sharper the picture, the larger.
+    counts, edges : ndarray
+        Histogram of the brightness.
+    """
+
+    saturated: float
+    sharpness: float
+    counts: NDArray[np.int64]
+    edges: NDArray[np.float64]
+
+
+def judge(frame: NDArray[Any], bins: int = 64) -> Judged:
+    """Return exposure and focus of a frame.
+
+    Examples
+    --------
+    >>> judge(np.full((4, 4), 255, np.uint8)).saturated
+    1.0
+    """
+    import cv2
+
+    most = float(np.iinfo(frame.dtype).max) if frame.dtype.kind == "u" else float(np.nanmax(frame))
+    values = np.nan_to_num(frame.astype(np.float32))
+    counts, edges = np.histogram(values, bins, (0.0, max(most, 1e-9)))
+    saturated = float(np.mean(values >= most)) if frame.dtype.kind == "u" else 0.0
+    return Judged(saturated, float(cv2.Laplacian(values, cv2.CV_32F).std()), counts, edges)
