@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -52,7 +52,7 @@ def command(
     It listens on this machine only, at an address that contains a secret.
     """
     from mirrorskin import io
-    from mirrorskin.view.app.server import AppServer, check_app
+    from mirrorskin.view.app.server import AppServer, StopServer, check_app
 
     check_app()
     if not files and rig is None:
@@ -66,6 +66,8 @@ def command(
 
             control = RigControl(load_rig(rig))
             stack.callback(control.close)
+            stop = stack.enter_context(closing(StopServer(control.stop)))
+            control.stop_address = stop.address
         from mirrorskin.view.app.page import pages
 
         lifetime = {} if control is None else {"lifetime": _LIFETIME}

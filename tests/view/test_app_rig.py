@@ -187,7 +187,7 @@ def test_the_pane_shows_what_the_rig_shows(ready):
     pane = RigPane(ready.control, lambda name, source: None)
     assert pane.connect.disabled
     assert not pane.start.disabled
-    assert "Saturated pixels" in pane.facts.object
+    assert "Saturated" in pane.facts.object
     assert "-4.000 mm" in pane._places["travel"].object
     pane.jogs["travel", 1].param.trigger("clicks")
     ready.until(lambda: abs(travel(ready) + 3.95) < 1e-3)

@@ -14,7 +14,7 @@ import pytest
 from tornado.ioloop import IOLoop
 
 from mirrorskin.io import InputError
-from mirrorskin.view.app.server import AppServer
+from mirrorskin.view.app.server import AppServer, StopServer
 
 PATIENCE = 60.0  # seconds
 
@@ -117,3 +117,31 @@ def test_a_web_socket_without_the_token_is_refused(served):
 def test_a_port_that_is_in_use_is_refused_in_one_line(served):
     with pytest.raises(InputError, match=f"port {served.port} cannot be used .*choose another with --port"):
         AppServer(_page, served.port)
+
+
+@pytest.fixture
+def stopper():
+    """A server that stops something, and what was asked of it so far."""
+    asked = []
+    with closing(StopServer(lambda: asked.append("stop"))) as server:
+        yield server.address, asked
+
+
+def post(url):
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, method="POST"), timeout=PATIENCE) as reply:
+            return reply.status
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def test_a_post_to_the_secret_address_stops(stopper):
+    address, asked = stopper
+    assert post(address) == 204
+    assert asked == ["stop"]
+
+
+def test_a_post_to_another_address_stops_nothing(stopper):
+    address, asked = stopper
+    assert post(address.rpartition("/")[0] + "/other") == 404
+    assert asked == []

@@ -280,6 +280,8 @@ class Picture:
         if bar:
             for one in self._bars:
                 self.figure.add_layout(one, "right")
+        for one in (self._log, self._rgba, *self._bars):  # until a map is shown
+            one.visible = False
         self.hover = HoverTool(renderers=[self._plain], tooltips=[])
         self.figure.add_tools(self.hover)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -48,10 +49,13 @@ class RigPane:
     def __init__(self, control: RigControl, add: Callable[[str, Any], None]) -> None:
         self.control, self._add = control, add
         self._drawn: Any = None
+        self._range = math.inf, -math.inf  # of the heights of a run
         self._shown: Any = None
-        self._saturated = ""
         self.stop = pn.widgets.Button(label="STOP", color="danger", width=110, height=38)
         self.stop.on_click(lambda _: self._stop())
+        if control.stop_address:  # answered at once, also while this program computes
+            code = "fetch(address, {method: 'POST', mode: 'no-cors'})"
+            self.stop.js_on_click(args={"address": control.stop_address}, code=code)
         home = control.settings.stage.home
         label = "Connect, and home the stage (it moves)" if home else "Connect"
         self.connect = pn.widgets.Button(label=label, color="primary", width=270)
@@ -218,8 +222,8 @@ class RigPane:
         self._brightness.end = float(found.edges[-1])
         advice = ": shorten the exposure" if found.saturated > _SATURATED else ""
         facts = {
-            "Saturated pixels": f"{100 * found.saturated:.2f} %{advice}",
-            "Sharpness": f"{found.sharpness:.2f} counts (larger is sharper)",
+            "Saturated": f"{100 * found.saturated:.2f} %{advice}",
+            "Sharpness": f"{found.sharpness:.2f}, larger is sharper",
             "Frames": f"{self.control.seen.frames}, {self.control.seen.rate:.1f} per second",
         }
         _set(self.facts, table(facts))
@@ -227,17 +231,23 @@ class RigPane:
     def _show_run(self) -> None:
         update, status = self.control.seen.update, self.control.seen.status
         if update is None or status is None:
+            self._range = math.inf, -math.inf  # a run begins
             return
-        facts = {
-            "Frames used": f"{status.used}, {status.skipped} skipped, {status.dropped} dropped",
-            "Position": f"{update.position:.3f}" if update.motion == "vertical" else "",
-        }
+        facts = {"Frames used": f"{status.used}, {status.skipped} skipped, {status.dropped} dropped"}
+        if update.motion == "vertical":
+            facts["Travel"] = f"{update.position:.3f} mm"
+        else:
+            facts["Phase"] = f"{math.degrees(update.position) % 360:.1f} deg"
         if update.contact_area is not None:
             facts["Contact"] = f"{update.contact_area:.2f} mm²"
         if update.height is not None and np.isfinite(update.height).any():
             result = Result(height=update.height, **self._axes)
-            self.heights.show(show_map(sheet_of(result), "height"), about="while the stage moves")
-        _set(self.run, table({name: value for name, value in facts.items() if value}))
+            shown = show_map(sheet_of(result), "height")
+            # Colours change as little as possible.
+            self._range = min(self._range[0], shown.low), max(self._range[1], shown.high)
+            low, high = self._range
+            self.heights.show(replace(shown, low=low, high=high), about="while the stage moves")
+        _set(self.run, table(facts))
 
 
 def _set(pane: Any, content: str) -> None:

@@ -67,6 +67,8 @@ class RigControl:
         That of the last run.
     recorded : Path or None
         The recording of the last run.
+    stop_address : str
+        An address at which a POST calls `stop`; empty without one.
     """
 
     def __init__(self, settings: RigSettings, clock: Clock = SYSTEM) -> None:
@@ -76,6 +78,7 @@ class RigControl:
         self.seen = Seen()
         self.result: io.Result | None = None
         self.recorded: Path | None = None
+        self.stop_address = ""
         self._stage: Stage | None = None
         self._task: Callable[[Rig], None] | None = None
         self._stopping, self._closing = clock.event(), clock.event()

@@ -10,9 +10,11 @@ import asyncio
 import secrets
 import signal
 import socket
+import threading
 import webbrowser
 from collections.abc import Callable
 from contextlib import closing
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.util import find_spec
 from typing import Any
 
@@ -91,6 +93,44 @@ class AppServer:
     def close(self) -> None:
         """Stop serving, and close all pages."""
         self._server.stop(wait=False)
+
+
+class StopServer:
+    """A server that calls a function when its secret address receives a POST, such as `RigControl.stop`.
+
+    Threads of its own answer, so that it works while the server of the pages is busy, and for a page that
+    has lost its connection.
+
+    Attributes
+    ----------
+    address : str
+        With a token.
+    """
+
+    def __init__(self, stop: Callable[[], None]) -> None:
+        path = f"/{secrets.token_urlsafe(_TOKEN_BYTES)}"
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_POST(self) -> None:
+                known = secrets.compare_digest(self.path.encode(), path.encode())
+                if known:
+                    stop()
+                self.send_response(204 if known else 404)
+                self.end_headers()
+
+            def log_message(self, format: str, *args: Any) -> None:  # noqa: A002  # overrides
+                pass
+
+        self._server = ThreadingHTTPServer((HERE, 0), Handler)
+        self.address = f"http://{HERE}:{self._server.server_port}{path}"
+        self._thread = threading.Thread(target=self._server.serve_forever, name="stop", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Listen no longer."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
 
 
 def _handle(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
