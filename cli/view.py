@@ -43,14 +43,6 @@ def command(
             show_default="a window; where there is no screen, RES-view.png",
         ),
     ] = None,
-    space: Annotated[
-        str | None,
-        Option(
-            "--3d",
-            metavar="WHERE",
-            help="Show the surface in space instead, in a 'window', a 'browser', or write a FILE.rrd.",
-        ),
-    ] = None,
 ) -> None:
     """Show the maps of a result, a section and a histogram of heights."""
     from mirrorskin import io, view
@@ -58,30 +50,10 @@ def command(
 
     ends = None if section is None else segment(section, "--section")
     name = result.name if turn is None else f"{result.name}, turn {turn}"
-    if space is not None:
-        for option, given in (("--map", map_), ("--section", section), ("-o", output)):
-            if given is not None:
-                raise io.InputError(f"{option} needs pictures, which --3d does not draw. Remove one of them")
-        _show_in_space(result, turn, space, name)
-        return
     view.check_drawing()
     if output is not None:
         _check(output, result)
     _show(io.select_turn(io.open_result(result), turn), result, name, ends, map_, output)
-
-
-def _show_in_space(path: Path, turn: int | None, where: str, name: str) -> None:
-    from mirrorskin import io
-    from mirrorskin.view.space import show_surface
-    from mirrorskin.view.viewer import BROWSER, WINDOW, check_place
-
-    check_place(where, "--3d")
-    kept = where not in (WINDOW, BROWSER)
-    if kept:
-        io.check_output(Path(where), path)
-    show_surface(io.select_turn(io.open_result(path), turn), where, name)
-    if kept:
-        click.echo(printable(f"written to {where}: 'rerun {where}' shows it"))
 
 
 def _check(output: Path, result: Path) -> None:

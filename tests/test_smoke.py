@@ -105,7 +105,6 @@ def test_a_mesh_is_pressed_on():
 
 def test_views_and_a_report():
     done("view", "press-result.h5", "-o", "view.png")
-    done("view", "press-result.h5", "--3d", "view.rrd")
     done("report", "press-result.h5", "-o", "report.html")
 
 

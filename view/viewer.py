@@ -28,7 +28,7 @@ _VIEWERS: list[subprocess.Popen[bytes]] = []  # viewers outlive the streams
 def load_rerun() -> Any:
     """Return the module rerun, or raise InputError with the remedy."""
     if find_spec("rerun") is None:
-        raise InputError("live pictures and surfaces in space need rerun: pip install 'mirrorskin[live]'")
+        raise InputError("live pictures need rerun: pip install 'mirrorskin[live]'")
     import rerun
 
     return rerun

@@ -1,4 +1,4 @@
-"""``mirrorskin view``: pictures of a result, in a window, in a file, in a folder, or in space."""
+"""``mirrorskin view``: pictures of a result, in a window, in a file or in a folder."""
 
 import cv2
 import numpy as np
@@ -10,7 +10,7 @@ from shown import ball
 from mirrorskin import io
 from mirrorskin.cli import view as command
 from mirrorskin.cli.groups import make_command
-from mirrorskin.view import canvas, space, viewer
+from mirrorskin.view import canvas
 
 app = make_command(None, command.command)
 
@@ -103,10 +103,6 @@ def test_of_turns_one_is_chosen_and_a_picture_s_ending_may_be_in_capitals(result
         (["--section", "1mm,0mm"], "two points are needed"),
         (["--section", "0.9mm,0.9mm:1mm,1mm"], "no height is known along the section"),
         (["--turn", "0"], "leave --turn out"),
-        (["--3d", "here"], "--3d here: give window, browser or a FILE.rrd"),
-        (["--3d", "{}"], "give window, browser or a FILE.rrd"),
-        (["--3d", "window", "--map", "height"], "--map needs pictures, which --3d does not draw"),
-        (["--3d", "window", "-o", "a.png"], "-o needs pictures, which --3d does not draw"),
     ],
 )
 def test_what_cannot_be_is_one_clear_line(result, monkeypatch, words, told):
@@ -124,31 +120,6 @@ def test_a_picture_is_not_written_over_a_result_that_is_called_like_one(result):
     sly = result.rename(result.with_suffix(".png"))
     assert "is the input" in str(view(sly, "-o", sly).exception)
     assert io.open_result(sly).height is not None
-
-
-def test_a_surface_is_not_written_over_a_result_that_is_called_like_one(result):
-    sly = result.rename(result.with_suffix(".rrd"))
-    assert "is the input" in str(view(sly, "--3d", sly).exception)
-    assert io.open_result(sly).height is not None
-
-
-def test_a_surface_is_written_to_be_shown_later(result):
-    path = result.with_suffix(".rrd")
-    done = view(result, "--3d", path)
-    assert done.exit_code == 0, done.output
-    assert done.stdout == f"written to {path}: 'rerun {path}' shows it\n"
-    assert path.stat().st_size > 10_000
-    assert made(result) == []
-
-
-@pytest.mark.parametrize("where", [viewer.WINDOW, viewer.BROWSER])
-def test_a_surface_in_a_viewer_needs_no_word(result, monkeypatch, where):
-    shown = []
-    monkeypatch.setattr(space, "show_surface", lambda *told: shown.append(told))
-    done = view(result, "--3d", where)
-    assert (done.exit_code, done.output) == (0, "")
-    ((_, place, name),) = shown
-    assert (place, name) == (where, "ball.h5")
 
 
 def test_without_matplotlib_the_remedy_is_named(result, monkeypatch):

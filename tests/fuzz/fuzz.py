@@ -276,7 +276,6 @@ def _of_hdf5(path: Path, sound: Path, out: Path) -> list[Line]:
         ("export", path, "-o", out / "a.ply", "--points", "--turn", 0),
         ("view", path, "-o", out / "a.png"),
         ("view", path, "-o", out),
-        ("view", path, "--3d", out / "a.rrd"),
         ("report", path, "-o", out / "a.html"),
         ("report", path, "-o", out / "a.html"),
         ("measure", path),

@@ -219,6 +219,11 @@ def test_the_pointer_reads_a_height_with_its_standard_deviation_in_the_units_of_
     np.testing.assert_allclose(shown.readings.columns["sigma"][known], 1e3 * result.height_sigma[known], 1e-6)
 
 
+def test_warnings_of_a_result_are_shown_at_the_head():
+    app = App(ball().assign(process={"warnings": "frame 3: <lost>"}))
+    assert "frame 3: &lt;lost&gt;" in app._about.object
+
+
 def test_text_of_a_file_is_never_markup():
     codes = {0: "none", 1: "<img src=x onerror=alert(1)>"}
     declared = {"rust": io.Map("<b>rust</b>", codes=codes)}

@@ -11,6 +11,7 @@ import panel as pn
 
 from mirrorskin import io
 from mirrorskin.engine.summary import summarise
+from mirrorskin.io.findings import warnings_in
 from mirrorskin.view.app.look import text
 from mirrorskin.view.app.options import OptionsPane
 from mirrorskin.view.app.recording import RecordingPane
@@ -155,7 +156,7 @@ class App:
             parts.append(f"{session.whole.motion} motion, {count} frames of {columns} x {rows}")
         told: Sequence[str] = ()
         if session.now is not None:
-            told = session.now.warnings
+            told = warnings_in(session.now.result.process)
             parts.append(str(summarise(session.now.result)))
             if session.now.seconds:
                 parts.append(f"computed in {session.now.seconds:.2f} s")

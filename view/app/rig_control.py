@@ -166,7 +166,7 @@ class RigControl:
         return self._stage
 
     def _work(self) -> None:
-        """Open the rig, do what is asked for, and close it; the thread."""
+        """Open the rig, do the requested tasks, and close it; the thread."""
         try:
             with rigs.open_rig(self.settings, open_stage=self._open_stage) as rig:
                 self.state = "ready"

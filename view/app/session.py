@@ -61,7 +61,6 @@ class Computed:
     result: io.Result
     label: str
     seconds: float = 0.0
-    warnings: Sequence[str] = ()
 
 
 class Session:
@@ -265,8 +264,8 @@ class Session:
         try:
             source = self.source()
             source.rewind()
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always", io.MirrorskinWarning)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", io.MirrorskinWarning)  # the page shows them
                 result = run_class(self.kind, source, device=self.opening.device, **self.changed)
         except Exception as error:
             if not hasattr(error, "exit_code"):  # not one of the project's own
@@ -274,8 +273,7 @@ class Session:
             self.problem = str(error)
             self._tell("problem")
             return
-        told = [str(one.message) for one in caught]
-        self._keep(Computed(result, self.label(), time.perf_counter() - started, told))
+        self._keep(Computed(result, self.label(), time.perf_counter() - started))
 
     def label(self) -> str:
         """Return the options that were changed, in words."""
