@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -117,7 +116,7 @@ class Focus(Operation):
         sigma = np.sqrt(np.float32(variance) * spread + np.float32(excess) * gain)
         # The window shows the mean of its heights, which is not that of its middle on a curved surface.
         footprint = ((2 * self.radius + 1) ** 2 - 1) / 12
-        sigma = with_curvature(height, sigma, footprint, math.ceil(math.sqrt(footprint)))
+        sigma = with_curvature(height, sigma, footprint)
         return {"height": height, "height_sigma": sigma, "status": status, "sharpness": sharpness}
 
 

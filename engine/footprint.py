@@ -12,44 +12,49 @@ from numpy.typing import NDArray
 _AT_ONCE = 64  # rows processed at once
 
 
-def with_curvature(
-    height: NDArray[Any], sigma: NDArray[Any], variance: float, reach: int | None = None
-) -> NDArray[np.float32]:
+def with_curvature(height: NDArray[Any], sigma: NDArray[Any], variance: float) -> NDArray[np.float32]:
     """Return standard deviations, mm, with what a footprint may move where the surface is curved.
 
-    It is v / 2 times the root of the sum of all squared second derivatives, for a footprint of variance v,
-    square pixels. They are differences over ``reach`` pixels on each side, by default its standard deviation,
-    and their squares are averaged over as much.
+    It is v / 2 times the root of h_xx^2 + h_yy^2 + 2 h_xy^2 + 2 max(h_xx h_yy, 0), for a footprint of
+    variance v, square pixels: of a dome, v / 2 times the sum of both curvatures. The derivatives
+    are differences between pixels that are its standard deviation apart, rounded up, and their squares are
+    averaged over 3 x 3 of these.
     """
-    if reach is None:
-        reach = max(1, round(math.sqrt(variance)))
-    rows = height.shape[0]
-    edge = 2 * reach
-    padded = cv2.copyMakeBorder(height.astype(np.float32), edge, edge, edge, edge, cv2.BORDER_REPLICATE)
+    reach, (rows, columns) = math.ceil(math.sqrt(variance)), height.shape
+    padded = cv2.copyMakeBorder(height[::reach, ::reach].astype(np.float32), 2, 2, 2, 2, cv2.BORDER_REPLICATE)
     found, factor = np.empty(height.shape, np.float32), np.float32((variance / (2 * reach**2)) ** 2)
-    for start in range(0, rows, _AT_ONCE):  # parts that stay in the cache
-        stop = min(start + _AT_ONCE, rows)
-        squares = _curvature(padded[start : stop + 4 * reach], reach) * factor
-        squares += np.square(sigma[start:stop])
-        np.sqrt(squares, out=found[start:stop])
+    coarse_rows, coarse_columns = (size - 4 for size in padded.shape)
+    for start in range(0, coarse_rows, _AT_ONCE):  # parts that stay in the cache
+        stop = min(start + _AT_ONCE, coarse_rows)
+        squares: NDArray[Any] = _curvature(padded[start : stop + 4]) * factor
+        if reach > 1:
+            size = reach * coarse_columns, reach * (stop - start)
+            squares = np.asarray(cv2.resize(squares, size, interpolation=cv2.INTER_NEAREST))
+        part = slice(reach * start, min(reach * stop, rows))
+        squares = squares[: part.stop - part.start, :columns]
+        squares += np.square(sigma[part])
+        np.sqrt(squares, out=found[part])
     return found
 
 
-def _curvature(height: NDArray[Any], reach: int) -> NDArray[Any]:
-    """Return the mean square second differences, without the outer 2 ``reach`` rows and columns."""
-    across, mixed = np.zeros((2, 2 * reach + 1, 2 * reach + 1), np.float32)
-    across[reach, [0, reach, -1]] = 1, -2, 1
-    mixed[[0, 0, -1, -1], [0, -1, 0, -1]] = np.array([-1, 1, 1, -1]) / math.sqrt(8)  # 2 (mixed / 4)^2
-    squares = np.zeros(height.shape, np.float32)
-    for kernel in (across, across.T.copy(), mixed):
-        cv2.accumulateSquare(cv2.filter2D(height, -1, kernel), squares)
-    squares = squares[reach:-reach, reach:-reach]
+_ACROSS, _MIXED = np.zeros((2, 3, 3), np.float32)
+_ACROSS[1] = 1, -2, 1
+_MIXED[[0, 0, 2, 2], [0, 2, 0, 2]] = np.array([-1, 1, 1, -1]) / math.sqrt(8)  # 2 (h_xy)^2
+_ALONG = _ACROSS.T.copy()
+
+
+def _curvature(height: NDArray[Any]) -> NDArray[Any]:
+    """Return the mean of square second differences, without the outer 2 rows and columns."""
+    across, along = (cv2.filter2D(height, -1, kernel) for kernel in (_ACROSS, _ALONG))
+    squares = np.maximum(cv2.multiply(across, along, scale=2), np.float32(0))
+    for differences in (across, along, cv2.filter2D(height, -1, _MIXED)):
+        cv2.accumulateSquare(differences, squares)
+    squares, inside = squares[1:-1, 1:-1], (slice(1, -1),) * 2
     there = np.isfinite(squares)
-    window, inside = (2 * reach + 1, 2 * reach + 1), (slice(reach, -reach),) * 2
     if there.all():
-        return np.asarray(cv2.blur(squares, window))[inside]
+        return np.asarray(cv2.blur(squares, (3, 3)))[inside]
     total, share = (
-        np.asarray(cv2.blur(part, window))[inside]
+        np.asarray(cv2.blur(part, (3, 3)))[inside]
         for part in (np.where(there, squares, np.float32(0)), there.astype(np.float32))
     )
     mean: NDArray[Any] = np.divide(total, share, out=np.zeros_like(total), where=share > 0)

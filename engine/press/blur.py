@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from mirrorskin.engine.press.strokes import Strokes
 from mirrorskin.io import Result
 from mirrorskin.io.traces import FrameSamples
 from mirrorskin.kernels.array_types import Doubles
+from mirrorskin.kernels.least_squares import mad_sigma
 
 _SHARES = 0.16, 0.84  # of the way from dark to bright, two standard deviations of a blurred edge apart
 _STEEPEST = 0.75  # quantile of the slopes of those pixels that show the blur
@@ -27,6 +29,9 @@ _PIXEL = 1 / 12  # square pixels: variance of a pixel's area
 _SHARP = 0.2  # square pixels: variance of a footprint that is hardly larger than the pixel
 _BLURRED = 9.0  # square pixels: what is larger is no lens
 _LEAST_FRAMES = 8
+_OF_MEDIAN = math.sqrt(math.pi / 2)  # standard error of a median over that of a mean
+_UNSURE = 0.25, 1.0  # relative uncertainty of what interpolation adds: usual, and greatest
+_CLEAR = 3.0  # standard errors by which a blur differs from none
 _RESOLVED = 0.35  # steps of the travel within a standard deviation of the footprint on a slope
 
 
@@ -51,20 +56,20 @@ class LensBlur(Step):
     )
 
     def apply(self, result: Result, context: Context) -> Result:
-        """Return heights with larger standard deviations, and the blur in ``process``."""
-        variance = self._variance(result, context)
-        if variance is None:
+        """Return heights with larger standard deviations, and the blur in ``process`` if it is clear."""
+        footprint = self._footprint(result, context)
+        if footprint is None:
             return result
-        blur = {"blur": round(math.sqrt(variance - _PIXEL), 2)} if variance >= _SHARP else {}
+        blur = {"blur": round(math.sqrt(footprint.variance - _PIXEL), 2)} if footprint.clear else {}
         return result.assign(
-            height_sigma=with_curvature(result.height, result.height_sigma, variance),
+            height_sigma=with_curvature(result.height, result.height_sigma, footprint.variance),
             process={**result.process, **blur},
         )
 
-    def _variance(self, result: Result, context: Context) -> float | None:
-        """Return the variance of a pixel's footprint, square pixels; None if nothing is to be added."""
+    def _footprint(self, result: Result, context: Context) -> _Footprint | None:
+        """Return a pixel's footprint; None if nothing is to be added."""
         if self.blur is not None:
-            return self.blur**2 + _PIXEL if self.blur else None
+            return _Footprint(self.blur**2 + _PIXEL, True) if self.blur else None
         operation = context.operation
         if not isinstance(operation, PressOperation) or isinstance(operation, Strokes):
             return None
@@ -72,24 +77,61 @@ class LensBlur(Step):
         if samples is None or samples.count != len(travel) or len(travel) < _LEAST_FRAMES:
             return None
         found = _footprint(samples, travel, operation, result.height)
-        return _PIXEL if found is None and isinstance(operation, ChangePoint) else found
+        return _Footprint(_PIXEL) if found is None and isinstance(operation, ChangePoint) else found
+
+
+@dataclass(frozen=True)
+class _Footprint:
+    """Variance of the area that a pixel sees, square pixels, and whether it clearly exceeds the pixel."""
+
+    variance: float
+    clear: bool = False
+
+
+@dataclass(frozen=True)
+class _Quarter:
+    """Pixels of similar slopes: medians of their square slopes and of the square spreads of their edges.
+
+    ``error`` is the standard error of the latter.
+    """
+
+    slope: float
+    spread: float
+    error: float
+    count: int
+
+    @classmethod
+    def of(cls, slope: Doubles, spread: Doubles) -> _Quarter:
+        """Return the medians over pixels with both."""
+        usable = np.isfinite(spread)
+        slope, spread = slope[usable] ** 2, spread[usable] ** 2
+        if not spread.size:
+            return cls(0.0, 0.0, 0.0, 0)
+        middle = float(np.median(spread))
+        error = _OF_MEDIAN * mad_sigma(spread - middle) / math.sqrt(spread.size)
+        return cls(float(np.median(slope)), middle, error, spread.size)
 
 
 def _footprint(
     samples: FrameSamples, travel: Doubles, operation: PressOperation, height: NDArray[Any]
-) -> float | None:
-    """Return the variance of a pixel's footprint, square pixels; None if it is sharp or not resolved."""
+) -> _Footprint | None:
+    """Return a pixel's footprint; None if it is sharp or not resolved."""
     rows, columns = samples.rows, samples.columns
     inner = np.ix_((rows > 0) & (rows < height.shape[0] - 1), (columns > 0) & (columns < height.shape[1] - 1))
     row, column = (part[inner].ravel() for part in np.meshgrid(rows, columns, indexing="ij"))
-    if not row.size:
-        return None
     across = (height[row, column + 1] - height[row, column - 1]) / 2
     along = (height[row + 1, column] - height[row - 1, column]) / 2
     slope = np.hypot(across, along).astype(np.float64)
-    values = samples.values[:, *inner].reshape(len(travel), -1).astype(np.float32)
-    order = np.argsort(travel, kind="stable")  # of a release, the travel falls
-    values, travel = values[order], travel[order]
+    sloped = np.isfinite(slope) & np.isfinite(height[row, column]) & (slope > 0)
+    if np.count_nonzero(sloped) < _FEWEST:
+        return None
+    ordered = np.sort(slope[sloped])
+    least, most = (ordered[round(share * (len(ordered) - 1))] for share in (1 - _STEEPEST, _STEEPEST))
+    sloped &= (slope <= least) | (slope >= most)  # the others show less
+    row, column, slope = row[sloped], column[sloped], slope[sloped]
+    values = samples.values[:, *inner].reshape(len(travel), -1)[:, sloped].astype(np.float32)
+    if travel[-1] < travel[0]:  # of a release
+        values, travel = values[::-1], travel[::-1]
     few = max(1, len(travel) // 10)
     ends = values[:few].mean(axis=0), values[-few:].mean(axis=0)
     dark, bright = (
@@ -99,23 +141,24 @@ def _footprint(
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = (values - dark) / (bright - dark)
     spread = (_first(shares, travel, _SHARES[1]) - _first(shares, travel, _SHARES[0])) / 2
-    usable = np.isfinite(spread) & np.isfinite(slope) & (slope > 0)
-    if np.count_nonzero(usable) < _FEWEST:
-        return None
-    spread, slope = spread[usable], slope[usable]
-    step, squares = float(np.median(np.diff(travel))), spread**2
-    flat, steep = (
-        (float(np.median(squares[part])), float(np.median(slope[part] ** 2)))
-        for part in (slope <= np.quantile(slope, 1 - _STEEPEST), slope >= np.quantile(slope, _STEEPEST))
-    )
-    if steep[1] < _STEEPER * flat[1]:
+    flat, steep = (_Quarter.of(slope[part], spread[part]) for part in (slope <= least, slope >= most))
+    if min(flat.count, steep.count) < _FEWEST // 4 or steep.slope < _STEEPER * flat.slope:
         return None
     # What flat parts show as well is no footprint: interpolation, or a skin that touches slowly.
+    step = float(np.median(np.diff(travel)))
     interpolated = _INTERPOLATED * step**2
-    variance = (steep[0] - interpolated - max(flat[0] - interpolated, 0.0)) / (steep[1] - flat[1])
-    if not _SHARP <= variance <= _BLURRED or math.sqrt(variance * steep[1]) < _RESOLVED * step:
+    variance = (steep.spread - interpolated - max(flat.spread - interpolated, 0.0)) / (
+        steep.slope - flat.slope
+    )
+    if not _SHARP <= variance <= _BLURRED or math.sqrt(variance * steep.slope) < _RESOLVED * step:
         return None
-    return variance
+    usual, greatest = (
+        math.hypot(steep.error, flat.error, unsure * interpolated) / (steep.slope - flat.slope)
+        for unsure in _UNSURE
+    )
+    if variance - _PIXEL <= _CLEAR * usual:
+        return None
+    return _Footprint(math.hypot(variance, usual), variance - _PIXEL > _CLEAR * greatest)
 
 
 def _first(shares: NDArray[Any], travel: Doubles, level: float) -> Doubles:

@@ -52,10 +52,13 @@ def test_the_blur_is_estimated(blur):
     assert reconstruct(pressed(blur)[0]).process["blur"] == pytest.approx(blur, rel=0.15)
 
 
-@pytest.mark.parametrize("every", [1, 2])
-def test_nothing_is_added_to_a_sharp_picture(every):
+@pytest.mark.parametrize("method", ["threshold", "change-point"])
+@pytest.mark.parametrize("size", [14, 60])
+@pytest.mark.parametrize("every", [1, 2, 5])
+def test_no_blur_is_found_in_a_sharp_picture(every, size, method):
     travel = TRAVEL[::every]
-    assert "blur" not in reconstruct(pressed(0.0, travel=travel)[0], travel).process
+    frames = pressed(0.0, travel=travel)[0][:, :size, :size]
+    assert "blur" not in reconstruct(frames, travel, method=method).process
 
 
 def test_a_release_shows_the_same_blur_as_a_press():
