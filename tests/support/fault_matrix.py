@@ -21,6 +21,7 @@ import numpy as np
 from independent_camera import (
     DARK,
     FAULTS,
+    POINTS,
     READ_NOISE,
     SPAN,
     Fault,
@@ -222,9 +223,16 @@ def _press(surface: Surface, step: float, fault: Fault, seed: int) -> ArrayRecor
     frames = record(_touched(surface), travel, fault, seed)
     dark, bright = references(SHAPE, fault, seed + 1)
     header = {"pixel_size": (PIXEL, PIXEL), "dark": dark.astype("f4"), "bright": bright.astype("f4")}
-    if fault.stated:
+    if not fault.stated:
+        return _opened(frames, {"travel": travel}, header, fault)
+    if fault.jitter:
         header["travel_sigma"] = fault.jitter * step
-    return _opened(frames, {"travel": travel}, header, fault)
+    if fault.shutter:  # the travel and the time of a frame are those of its middle row
+        header["line_time"] = fault.shutter * POINTS / (POINTS * SHAPE[0] - 1)
+        travel = travel + fault.shutter * step / 2
+    source = _opened(frames, {"travel": travel}, header, fault)
+    source.time = np.arange(len(travel), dtype=float)
+    return source
 
 
 def _turn(surface: Surface, fault: Fault, seed: int, count: int = 16) -> ArrayRecording:

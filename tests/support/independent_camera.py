@@ -47,7 +47,7 @@ class Fault:
     jitter : float
         Standard deviation of the position, steps from frame to frame.
     stated : bool
-        Whether the user states the jitter.
+        Whether the user states the jitter, or the shutter.
     dropped, duplicated : bool
         Whether the frame in the middle is missing, or is there twice; nobody noticed.
     hot : float
@@ -106,6 +106,7 @@ FAULTS = (
     Fault("dropped frame", dropped=True),
     Fault("repeated frame", duplicated=True),
     Fault("rolling shutter", shutter=1.0),
+    Fault("rolling shutter, stated", shutter=1.0, stated=True),
     Fault("hot 0.1 %", hot=0.001),
     Fault("outliers 1 %", outliers=0.01),
     Fault("gain 3 %", gain=0.03),
