@@ -32,7 +32,7 @@ from suite.scenes import (
 from mirrorskin import engine
 from mirrorskin.engine.live import LiveOperation
 from mirrorskin.engine.streaming import push_block
-from mirrorskin.io import Block, Header
+from mirrorskin.io import Block, Header, pixel_axes
 from mirrorskin.kernels.device import Device
 
 Call = Callable[[], object]
@@ -129,17 +129,28 @@ def surfaces(shape: Shape, device: Device) -> Iterator[tuple[str, Call]]:
         )
 
 
+def pressed_and_turned(shape: Shape) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return maps of a press and of a rotation of the same wavy surface, which agree within their errors."""
+    generator, step, noise = np.random.default_rng(0), 0.05, 0.01
+    x, y = (2 * np.pi * axis / 6 for axis in pixel_axes(shape, (PIXEL, PIXEL)))
+    y = y[:, np.newaxis]
+    height = 0.6 * np.sin(x) * np.cos(y) - 1.0
+    along_x, along_y = 0.2 * np.pi * np.cos(x) * np.cos(y), -0.2 * np.pi * np.sin(x) * np.sin(y)
+    along_x, along_y = (slope + generator.normal(0, noise, shape) for slope in (along_x, along_y))
+    normal = np.stack([-along_x, -along_y, np.ones(shape)], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    seen = np.where(height < -0.5, (np.floor(height / step) + 0.5) * step, np.nan)  # a hole at each top
+    heights = {"height": seen, "height_sigma": np.where(np.isfinite(seen), step / np.sqrt(12), np.nan)}
+    normals = {"normals": normal, "normals_sigma": np.full(shape, noise)}
+    return tuple({name: map_.astype(np.float32) for name, map_ in one.items()} for one in (heights, normals))
+
+
 def others(shape: Shape, device: Device) -> Iterator[tuple[str, Call]]:
     """Give what is measured at one size only."""
     half = 512, 512
-    levels: dict[str, Any] = {"dark": DARK, "bright": BRIGHT, "device": device}
-    onset = engine.find_onset(tiled(half, 64, fill_press), travel_of(64), **levels)
-    normals = engine.estimate_normals(tiled(half, 16, fill_turns), phases(16), device=device, **TURN)
-    yield "fuse, 512 x 512", partial(engine.fuse, onset, normals, PIXEL, device=device)
-    there = [
-        {name: placed(values, device) for name, values in one.maps().items()} | {"process": one.process}
-        for one in (onset, normals)
-    ]
+    heights, normals = pressed_and_turned(half)
+    yield "fuse, 512 x 512", partial(engine.fuse, heights, normals, PIXEL, device=device)
+    there = [{name: placed(values, device) for name, values in one.items()} for one in (heights, normals)]
     yield "fuse, 512 x 512, maps on the device", lambda: engine.fuse(*there, PIXEL)
     heap = SCENES["leaves"]((256, 256))
     steep: dict[str, Any] = {"normals": heap.normals, "mask": heap.mask, "pixel_size": heap.pixel_size}
