@@ -42,7 +42,7 @@ test-lowest: $(READY)
 	mkdir -p $(LOWEST)
 	uv() { $(BIN)/python -m uv --quiet --no-python-downloads "$$@"; }
 	uv pip compile --resolution lowest-direct --python-version 3.11 --output-file $(LOWEST)/requirements.txt \
-	    $(addprefix --extra ,cluster live mcap mesh metrology s3 video view xarray zarr) pyproject.toml
+	    $(addprefix --extra ,app cluster live mcap mesh metrology s3 video view xarray zarr) pyproject.toml
 	uv venv --clear --python 3.11 $(LOWEST)/venv
 	uv pip install --python $(LOWEST)/venv --requirement $(LOWEST)/requirements.txt pytest
 	uv pip install --python $(LOWEST)/venv --no-deps --editable .

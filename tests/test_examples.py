@@ -139,7 +139,14 @@ def grown(printed):
     assert error < 8
 
 
+def clicked(printed):
+    found = numbers(printed, r"onset at (\S+) ± (\S+) mm, true (\S+) mm")
+    ((onset, sigma, true),) = found
+    assert abs(onset - true) < 3 * sigma
+
+
 QUICK = {
+    "app": clicked,
     "coin": measured,
     "focus": focused,
     "fringes": unwrapped,

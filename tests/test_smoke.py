@@ -108,6 +108,14 @@ def test_views_and_a_report():
     done("report", "press-result.h5", "-o", "report.html")
 
 
+def test_the_application():
+    from mirrorskin.view.app import App
+
+    with contextlib.closing(App("press.h5", "press-result.h5")) as app:
+        app.options.widgets["threshold"].value = 0.4
+        assert app.session.before is not None
+
+
 def test_a_batch_on_two_processes():
     assert "2 done" in done("batch", "press.h5", "turn.h5", "-o", "results", "--workers", "2")
 

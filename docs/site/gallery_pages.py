@@ -19,6 +19,7 @@ _ORDER = [
     "coin",
     "fused",
     "own_data",
+    "app",
     "live_heights",
     "fringes",
     "focus",

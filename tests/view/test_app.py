@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
+import panel as pn
 import param
 import pytest
 from shown import ball
@@ -217,6 +218,10 @@ def test_the_pointer_reads_a_height_with_its_standard_deviation_in_the_units_of_
     np.testing.assert_allclose(shown.readings.columns["value0"][known], result.height[known])
     known = np.isfinite(result.height_sigma)
     np.testing.assert_allclose(shown.readings.columns["sigma"][known], 1e3 * result.height_sigma[known], 1e-6)
+
+
+def test_in_a_notebook_scripts_come_with_the_page(app):
+    assert pn.config.inline
 
 
 def test_warnings_of_a_result_are_shown_at_the_head():

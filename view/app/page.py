@@ -69,7 +69,7 @@ class App:
     ) -> None:
         if not sources and rig is None:
             raise io.InputError("the application needs a recording, a result or a rig: name a file")
-        pn.extension()
+        pn.extension(inline=True)  # in a notebook, no other machine is asked for scripts
         one = opening or Opening()
         openings = [one] * len(sources) if isinstance(one, Opening) else [*one]
         self._sources = [*zip(sources, openings, strict=True)]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.metrology import Quantity
 from mirrorskin.io.types import UNDISTORTED, Floats
 from mirrorskin.view.app.session import Session
 
@@ -91,12 +92,12 @@ def _press(
         facts["Status"] = codes.get(int(status), "unknown")
     if height is not None and math.isfinite(height):
         filled = bool(_at(session, "filled", row, column) or 0)
-        error = f" ± {1e3 * sigma:.2f} µm" if sigma is not None and math.isfinite(sigma) else ""
-        facts["Height"] = f"{height:.4f} mm{error}{' (filled, not measured)' if filled else ''}"
+        error = math.nan if sigma is None else sigma
+        facts["Height"] = f"{Quantity(height, error, 'mm')}{', filled, not measured' if filled else ''}"
         if filled:
             height = math.nan
         else:
-            facts[f"Travel at the {event}"] = f"{-height:.4f} mm{error}"
+            facts[f"Travel at the {event}"] = str(Quantity(-height, error, "mm"))
     at = math.nan if height is None else -float(height)
     return Trace(
         travel, counts, axis, unit, levels, at, math.nan if sigma is None else float(sigma), facts=facts
