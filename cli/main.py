@@ -50,7 +50,7 @@ PURPOSES = {
     "batch": "Reconstruct many recordings.",
     "app": "Show recordings and results in the browser: click, change options, measure, save.",
     "view": "Show the maps of a result, a section and a histogram of heights.",
-    "measure": "Measure a height map: heights, areas, volumes, plane or sphere, roughness, steps.",
+    "measure": "Measure a height map: heights, areas, volumes, plane or sphere, texture, profiles, steps.",
     "report": "Write a page with pictures, numbers and the surface.",
     "export": "Write a result as meshes, points, surface files, pictures, tables or arrays.",
     "score": "Compare a result with the ground truth of a simulation.",

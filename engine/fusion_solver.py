@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -87,6 +88,7 @@ class FusionSolver:
         self._robust, self._device = robust, device
         self._near: Result | None = None
         self._slope_error, self._disagreement = SlopeError(), Disagreement()
+        self._correlation = 0.0
 
     def surface(self, slopes: Slopes, *, sigma: bool = True) -> Result:
         """Return the surface of the heights and given slopes.
@@ -116,8 +118,9 @@ class FusionSolver:
 
     @property
     def process(self) -> dict[str, ProcessValue]:
-        """What is known of the last surface: how heights and slopes contradict each other."""
-        return describe_disagreement(self._disagreement, self._slope_error)
+        """What is known of the last surface: contradictions, and the correlation of the errors of heights."""
+        said = describe_disagreement(self._disagreement, self._slope_error)
+        return {**said, "height_correlation": self._correlation}
 
     def _fit(self, slopes: Slopes, sigma: bool) -> tuple[Result, Disagreement]:
         """Return the surface of heights and slopes, and their disagreement."""
@@ -134,6 +137,7 @@ class FusionSolver:
         # Outliers are not part of the surface, but may count in the next call.
         self._near = near.assign(height=np.where(surface.component < 0, near.height, surface.height))
         found = find_disagreement(surface.height, height, weight, slopes, self._pixel_size)
+        self._correlation = _correlation_length(extended, weight)
         if surface.height_sigma is not None:
             surface = _add_error_of_averaging(_set_sigma_of_lone_pixels(surface, weight))
         return surface, found
@@ -155,6 +159,19 @@ class FusionSolver:
             device=self._device,
             **options,
         )
+
+
+def _correlation_length(slopes: Slopes, weight: Doubles) -> float:
+    """Return the length, mm, over which errors of heights are correlated: their sigma over that of slopes.
+
+    See `mirrorskin.engine.metrology.noise`. Heights without a weight make the others less dense.
+    """
+    known = slopes.known
+    if not known.any():
+        return 0.0
+    height_weight = float(np.mean(weight[known | (weight > 0)]))
+    slope_deviation = float(np.mean(np.sqrt(slopes.weights[:, known])))
+    return slope_deviation / math.sqrt(height_weight) if height_weight > 0 else math.inf
 
 
 def _correct_overstated(press: AbsoluteHeights, surface: Result, slopes: Slopes) -> AbsoluteHeights:

@@ -2,13 +2,17 @@
 
 from mirrorskin.engine.metrology.forms import Plane, Sphere, fit_plane, fit_sphere
 from mirrorskin.engine.metrology.measures import FormName, Measures, measure
+from mirrorskin.engine.metrology.parameters import PARAMETERS, Parameter
+from mirrorskin.engine.metrology.profile import profile_parameters
 from mirrorskin.engine.metrology.quantity import Quantity
 from mirrorskin.engine.metrology.sections import Section, Step, section, section_columns, step_height
 from mirrorskin.engine.metrology.texture import Roughness, roughness
 
 __all__ = [
+    "PARAMETERS",
     "FormName",
     "Measures",
+    "Parameter",
     "Plane",
     "Quantity",
     "Roughness",
@@ -18,6 +22,7 @@ __all__ = [
     "fit_plane",
     "fit_sphere",
     "measure",
+    "profile_parameters",
     "roughness",
     "section",
     "section_columns",

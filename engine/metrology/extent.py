@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,19 +153,26 @@ def areas(patch: Patch) -> dict[str, Quantity]:
     """Return the projected areas with a height and in contact, and the area of the surface in contact, mm2.
 
     The end of contact is known within half a pixel, with the same sign everywhere: so the border is
-    uncertain by half a pixel's width in total. Without a map of contact, the area with a height is used, and
-    its name says so if part of it was filled. The surface area of a pixel is its area over the normal's z.
+    uncertain by half a pixel's width in total; it is unknown if all of it is the picture's border. Without a
+    map of contact, a press is in contact where it has a height, and the name says so if part of it was
+    filled; other heights have no contact. The surface area of a pixel is its area over the normal's z.
     """
     filled = np.isfinite(patch.filled)
     quantities = {"measured area": _area(patch, patch.measured)}
     if filled.any():
         quantities["measured area with filled"] = _area(patch, patch.measured | filled)
-    guessed = filled.any() and not patch.contact_given
-    quantities["contact area with filled" if guessed else "contact area"] = _area(patch, patch.contact)
+    in_contact = patch.contact_given or patch.of_press
+    if in_contact:
+        guessed = filled.any() and not patch.contact_given
+        contact = _area(patch, patch.contact)
+        if contact.sigma == 0 and contact.value > 0:  # all of its border is that of the picture
+            contact = replace(contact, sigma=math.nan)
+        quantities["contact area with filled" if guessed else "contact area"] = contact
     if patch.secant is not None:
         known = patch.contact & np.isfinite(patch.secant)
         if known.any():
-            quantities["contact surface area"] = _surface(patch, known, patch.secant)
+            name = "contact surface area" if in_contact else "measured surface area"
+            quantities[name] = _surface(patch, known, patch.secant)
     return quantities
 
 

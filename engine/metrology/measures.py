@@ -1,10 +1,11 @@
-"""Measures of a result: heights, areas, volumes, forms, roughness and sections."""
+"""Measures of a result: heights, areas, volumes, forms, texture, profiles and sections."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -13,13 +14,17 @@ from numpy.typing import ArrayLike
 from mirrorskin.engine.inputs import Maps, as_result
 from mirrorskin.engine.metrology.extent import areas, border, heights, volume
 from mirrorskin.engine.metrology.forms import Plane, Sphere, fit_plane, fit_sphere
+from mirrorskin.engine.metrology.noise import realisations
+from mirrorskin.engine.metrology.parameters import PARAMETERS
 from mirrorskin.engine.metrology.patch import Patch, patch_of
+from mirrorskin.engine.metrology.profile import profile_parameters
 from mirrorskin.engine.metrology.quantity import Quantity
 from mirrorskin.engine.metrology.sections import Point, along, step_height
 from mirrorskin.engine.metrology.sections import section as cut
-from mirrorskin.engine.metrology.texture import roughness
+from mirrorskin.engine.metrology.texture import DRAWS, FormRemoval, roughness
 from mirrorskin.io import InputError, Region, Result
 from mirrorskin.io.arguments import as_array_or_number, check_number, checked
+from mirrorskin.kernels.array_types import Doubles
 
 FormName = Literal["plane", "sphere", "none"]
 
@@ -30,7 +35,31 @@ _CLEAR = 2.0  # smallest step that is reported, in standard uncertainties
 _POWERS = {"mm2": 2, "mm3": 2, "sphere radius": 2}
 _POWERS |= dict.fromkeys(("sphere centre x", "sphere centre y", "section length", "distance in space"), 1)
 _POWERS |= dict.fromkeys(("step at", "plane tilt", "slope", "slope beside step"), 1)
+_POWERS |= {name: one.pixel_power for name, one in PARAMETERS.items() if one.pixel_power}
 _RATIO = 2.0  # Birge's ratio above which a surface does not have the form
+_SCALE = "calibration scale"  # contribution to an uncertainty
+# The contribution that quantities of a group have alone.
+_CAUSES = {"form": "fit", "areas and volumes": "heights, border", "section": "heights, pixel size"}
+_SECTION = {"section length", "height difference", "distance in space", "slope"}
+_SECTION |= {"step height", "step at", "slope beside step"}
+
+
+def group_of(name: str) -> str:
+    """Return the heading under which a quantity is listed.
+
+    Examples
+    --------
+    >>> [group_of(name) for name in ("highest point", "Sq", "volume above rim")]
+    ['heights', 'texture: height', 'areas and volumes']
+    """
+    first = name.partition(" ")[0]
+    if first in PARAMETERS:
+        return PARAMETERS[first].group
+    if first in ("plane", "sphere"):
+        return "form"
+    if name in _SECTION:
+        return "section"
+    return "areas and volumes" if "area" in name or "volume" in name else "heights"
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,21 +72,29 @@ class Measures:
         By name, in reading order.
     notes : list of str
         What is omitted, and what is assumed.
+    budget : dict of str to dict of str to float
+        The contributions to the standard uncertainty of each quantity, in its unit; their root sum of squares
+        is the standard uncertainty.
     """
 
     quantities: dict[str, Quantity]
     notes: list[str]
+    budget: dict[str, dict[str, float]] = field(default_factory=dict)
 
 
-@checked(pixel_size=as_array_or_number, cutoff=check_number)
+@checked(
+    pixel_size=as_array_or_number, s_filter=check_number, l_filter=check_number, noise_length=check_number
+)
 def measure(
     result: Maps,
     *,
     pixel_size: ArrayLike | None = None,
     region: Region | None = None,
     form: FormName | None = None,
-    cutoff: float | None = None,
+    s_filter: float | None = None,
+    l_filter: float | None = None,
     section: tuple[Point, Point] | None = None,
+    noise_length: float | None = None,
 ) -> Measures:
     """Measure the height map of a result.
 
@@ -70,17 +107,23 @@ def measure(
     region : Region, optional
         Part of the picture to measure, in its pixels; by default all of it.
     form : {"plane", "sphere", "none"}, optional
-        Form that is fitted, and from which roughness is measured; by default the sphere if its residual is
-        less than half of the plane's, otherwise the plane. Without a form, roughness is that of the heights.
-    cutoff : float, optional
-        Longest wavelength that counts as roughness, mm.
+        Form that is fitted and removed before texture is measured; by default the sphere if its residual is
+        less than half of the plane's, otherwise the plane. Without a form, texture is that of the heights.
+    s_filter, l_filter : float, optional
+        Nesting indices, mm, of the filters that remove shorter, and longer waves from the texture
+        (ISO 16610-61). With an L-filter the profile of the section is the roughness profile, with
+        R-parameters; without, it is the primary profile, with P-parameters.
     section : ((float, float), (float, float)), optional
         Both ends of a section to measure, mm from the picture's centre.
+    noise_length : float, optional
+        Length over which errors of heights are correlated, mm: 0 for independent ones, infinity for those of
+        integrated slopes. By default that of the result: 0 for a press and for heights of unknown origin.
 
     Returns
     -------
     Measures
-        Heights, areas, volumes, the form, roughness, and the section, each with its standard uncertainty.
+        Heights, areas, volumes, the form, texture (ISO 25178-2), and the section with its profile
+        (ISO 21920-2), each with its standard uncertainty.
 
     Raises
     ------
@@ -96,15 +139,22 @@ def measure(
     """
     maps = as_result(result, "result", pixel_size=pixel_size)
     patch, comparable = patch_of(maps, region)
+    if noise_length is not None:
+        patch = replace(patch, noise_length=noise_length)
     quantities, notes = heights(patch), list(patch.notes)
     quantities |= areas(patch)
     quantities |= _volumes(patch, quantities.get("rim height"))
-    quantities |= _forms(patch, form, cutoff, notes)
+    form_removed = _remove_form(patch, form, notes)
+    quantities |= form_removed.quantities
+    budget: dict[str, dict[str, float]] = {}
+    quantities |= _texture(patch, form_removed, (s_filter, l_filter), notes, budget)
     if section is not None:
         quantities |= _section(comparable, section, notes)
+        quantities |= _profile(patch, form_removed, comparable, section, l_filter, notes, budget)
     lens = None if maps.calibration is None else maps.calibration.lens
     scale = 0.0 if lens is None else lens.scale_sigma
-    return Measures(_scaled(quantities, scale), [*notes, *_assumed(patch, scale)])
+    quantities, budget = _scaled(quantities, budget, scale)
+    return Measures(quantities, [*notes, *_assumed(patch, scale)], budget)
 
 
 def _volumes(patch: Patch, base: Quantity | None) -> dict[str, Quantity]:
@@ -118,37 +168,139 @@ def _volumes(patch: Patch, base: Quantity | None) -> dict[str, Quantity]:
     return volumes
 
 
-def _forms(
-    patch: Patch, form: FormName | None, cutoff: float | None, notes: list[str]
-) -> dict[str, Quantity]:
-    """Return the form that fits the surface, and its roughness."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Removed:
+    """Heights without their form, and what the removal does to errors of heights."""
+
+    about: str  # from which texture is measured
+    residual: Doubles  # (H, W), mm
+    quantities: dict[str, Quantity]
+    shapes: list[Doubles]  # (H, W): shapes that the form takes from the noise
+    errors: list[Doubles]  # (H, W), mm: errors of the form
+    share: Doubles | float  # of an error of a height that is an error of the residual
+
+
+def _remove_form(patch: Patch, form: FormName | None, notes: list[str]) -> _Removed:
+    """Fit the form and return what it leaves."""
     fitted = _fit(patch, form)
-    about, residual = "their mean", patch.height
-    quantities: dict[str, Quantity] = {}
-    if fitted is not None:
-        kind = "plane" if isinstance(fitted, Plane) else "sphere"
-        about, residual, quantities = f"the {kind}", fitted.residual, fitted.quantities()
-        if fitted.outliers:
-            notes.append(
-                f"outliers left out of the fit of the {kind}, but not of its residual: {fitted.outliers}"
-            )
-        if fitted.birge > _RATIO:
-            notes.append(
-                f"the surface is no {kind} within its errors:"
-                f" what the fit leaves is {fitted.birge:.0f} times as large"
-            )
-    rough = roughness(residual, patch.pixel_size, cutoff=cutoff, sigma=patch.sigma)
-    waves = "" if cutoff is None else f", of waves up to {cutoff:g} mm"
-    notes.append(f"roughness by ISO 25178-2 from {about}{waves}, over {rough.pixels} pixels, noise included")
-    if rough.left_out:
+    if fitted is None:
+        return _Removed("their mean", patch.height, {}, [], [], 1.0)
+    kind = "plane" if isinstance(fitted, Plane) else "sphere"
+    if fitted.outliers:
         notes.append(
-            f"pixels left out of roughness, too near to holes or ends for the filter: {rough.left_out}"
+            f"outliers left out of the fit of the {kind}, but not of its residual: {fitted.outliers}"
         )
-    if rough.uncertain:
+    if fitted.birge > _RATIO:
         notes.append(
-            f"pixels left out of roughness and lowest point, far less certain than others: {rough.uncertain}"
+            f"the surface is no {kind} within its errors:"
+            f" what the fit leaves is {fitted.birge:.0f} times as large"
         )
-    return quantities | rough.quantities()
+    shapes, errors, share = _sensitivity(patch, fitted)
+    return _Removed(f"the {kind}", fitted.residual, fitted.quantities(), shapes, errors, share)
+
+
+def _sensitivity(
+    patch: Patch, fitted: Plane | Sphere
+) -> tuple[list[Doubles], list[Doubles], Doubles | float]:
+    """Return the shapes of a form, its errors, and the share of errors of heights perpendicular to it."""
+    x, y = np.meshgrid(patch.x - np.mean(patch.x), patch.y - np.mean(patch.y))
+    if isinstance(fitted, Plane):
+        slope, azimuth = math.radians(fitted.tilt.value), math.radians(fitted.azimuth.value)
+        down, across = (
+            x * math.cos(azimuth) + y * math.sin(azimuth),
+            y * math.cos(azimuth) - x * math.sin(azimuth),
+        )
+        turn = min(math.radians(fitted.azimuth.sigma) * math.tan(slope), math.radians(fitted.tilt.sigma))
+        return [x, y], [math.radians(fitted.tilt.sigma) * down, turn * across], math.cos(slope)
+    x, y = np.meshgrid(patch.x - fitted.x.value, patch.y - fitted.y.value)
+    radius = fitted.radius.value
+    up = np.sqrt(np.maximum(1 - (x**2 + y**2) / radius**2, 0.0))  # cosine of the inclination
+    return [x, y, up], [fitted.radius.sigma * up], up
+
+
+def _texture(
+    patch: Patch,
+    removed: _Removed,
+    filters: tuple[float | None, float | None],
+    notes: list[str],
+    budget: dict[str, dict[str, float]],
+) -> dict[str, Quantity]:
+    """Return the areal parameters of what the form leaves."""
+    s_filter, l_filter = filters
+    found = roughness(
+        removed.residual,
+        patch.pixel_size,
+        s_filter=s_filter,
+        l_filter=l_filter,
+        sigma=None if patch.sigma is None else patch.sigma * removed.share,
+        noise_length=patch.noise_length,
+        form=removed.shapes,
+        form_errors=removed.errors,
+    )
+    names = (("S", s_filter), ("L", l_filter))
+    used = "".join(f", {name}-filter {length:g} mm" for name, length in names if length is not None)
+    notes.append(
+        f"texture by ISO 25178-2 from {removed.about}{used}, over {found.pixels} pixels, noise included"
+    )
+    notes.extend(found.notes)
+    if found.left_out:
+        notes.append(
+            f"pixels left out of texture, too near to holes or ends for the filter: {found.left_out}"
+        )
+    if found.uncertain:
+        notes.append(
+            f"pixels left out of texture and lowest point, far less certain than others: {found.uncertain}"
+        )
+    budget |= found.budget
+    return found.parameters
+
+
+def _profile(
+    patch: Patch,
+    removed: _Removed,
+    result: Result,
+    ends: tuple[Point, Point],
+    l_filter: float | None,
+    notes: list[str],
+    budget: dict[str, dict[str, float]],
+) -> dict[str, Quantity]:
+    """Return the profile parameters of what the form leaves along a section."""
+    along_section = _Sampler(patch, result, ends)
+    profile = cut(along_section.result_of(removed.residual), *ends)
+    step = float(profile.distance[1] - profile.distance[0])
+    errors: Iterator[Doubles] = iter(())
+    if patch.sigma is not None:
+        known = np.isfinite(removed.residual)
+        without_form = FormRemoval(known, removed.shapes)
+        drawn = realisations(patch.sigma * removed.share, known, patch.pixel_size, patch.noise_length, DRAWS)
+        errors = (along_section(without_form(noise)) for noise in drawn)
+    try:
+        quantities, parts = profile_parameters(profile.height, step, l_filter=l_filter, errors=errors)
+    except InputError as error:
+        notes.append(f"no profile parameters: {error}")
+        return {}
+    kind = "primary profile" if l_filter is None else f"roughness profile, L-filter {l_filter:g} mm"
+    notes.append(f"profile by ISO 21920-2 from {removed.about}: {kind}, without an S-filter")
+    budget |= parts
+    return quantities
+
+
+class _Sampler:
+    """Values of a patch along a section of the whole picture."""
+
+    def __init__(self, patch: Patch, result: Result, ends: tuple[Point, Point]) -> None:
+        self._place, self._ends = patch.place, ends
+        self._result = result.assign(height_sigma=None, filled=None)
+
+    def result_of(self, values: Doubles) -> Result:
+        """Return the result with values of the patch as heights; NaN elsewhere."""
+        assert self._result.height is not None
+        whole = np.full(self._result.height.shape, np.nan, np.float32)
+        whole[self._place] = values
+        return self._result.assign(height=whole)
+
+    def __call__(self, values: Doubles) -> Doubles:
+        return cut(self.result_of(values), *self._ends).height
 
 
 def _fit(patch: Patch, form: FormName | None) -> Plane | Sphere | None:
@@ -190,22 +342,30 @@ def _section(result: Result, ends: tuple[Point, Point], notes: list[str]) -> dic
     return quantities
 
 
-def _scaled(quantities: dict[str, Quantity], scale: float) -> dict[str, Quantity]:
-    """Add the relative uncertainty of the pixel size, ``scale``, to the quantities."""
+def _scaled(
+    quantities: dict[str, Quantity], budget: dict[str, dict[str, float]], scale: float
+) -> tuple[dict[str, Quantity], dict[str, dict[str, float]]]:
+    """Add the relative uncertainty of the pixel size, ``scale``, to the quantities and to their budget."""
     scaled: dict[str, Quantity] = {}
+    parts: dict[str, dict[str, float]] = {}
     for name, quantity in quantities.items():
         if name == "sphere centre z":
             change = 2 * quantities["sphere radius"].value
         else:
-            change = _POWERS.get(quantity.unit, _POWERS.get(name, 0)) * quantity.value
+            change = _POWERS.get(name, _POWERS.get(quantity.unit, 0)) * quantity.value
         scaled[name] = replace(quantity, sigma=math.hypot(quantity.sigma, scale * change))
-    return scaled
+        parts[name] = budget.get(name, {_CAUSES.get(group_of(name), "heights"): quantity.sigma})
+        if scale and change:
+            parts[name] = parts[name] | {_SCALE: abs(scale * change)}
+    return scaled, parts
 
 
 def _assumed(patch: Patch, scale: float) -> list[str]:
     """Return notes on the assumptions behind values and uncertainties."""
     size = f"known within {100 * scale:.2g} %" if scale else "taken as exact"
     notes = [f"± is the standard uncertainty (k = 1); the pixel size is {size}"]
+    if patch.sigma is not None:
+        notes.append(f"errors of heights are {_correlation(patch.noise_length)}")
     filled = int(np.count_nonzero(np.isfinite(patch.filled)))
     if filled:
         notes.append(f"pixels filled, not measured, that count only in what says 'filled': {filled}")
@@ -216,3 +376,11 @@ def _assumed(patch: Patch, scale: float) -> list[str]:
     if patch.sigma is None:
         notes.append("the result has no standard deviations of heights: uncertainties of these are unknown")
     return notes
+
+
+def _correlation(length: float) -> str:
+    if math.isinf(length):
+        return "those of integrated slopes, which neighbours share"
+    if length > 0:
+        return f"correlated over {length:.2g} mm"
+    return "independent from pixel to pixel"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,9 @@ from mirrorskin.io.result import select_turn
 from mirrorskin.kernels.array_types import Doubles
 
 Mask = NDArray[np.bool_]
+
+CORRELATION = "height_correlation"
+"""Name in the process of a result: length over which errors of heights are correlated, mm."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,6 +34,9 @@ class Patch:
     y: Doubles  # (H,), float64
     pixel_size: tuple[float, float]  # millimetres along x and y
     absolute: bool  # whether heights are relative to the sheet's rest plane, not to the mean of a component
+    place: tuple[slice, slice]  # of the patch in the picture
+    noise_length: float  # millimetres over which errors of heights are correlated
+    of_press: bool  # whether heights are those of a press, which has heights only in contact
     notes: tuple[str, ...]  # what is omitted
 
     @property
@@ -91,9 +98,20 @@ def patch_of(result: Result, region: Region | None = None) -> tuple[Patch, Resul
         y=result.y[part[0]],
         pixel_size=pixel_size,
         absolute=absolute,
+        place=part,
+        noise_length=_noise_length(result),
+        of_press="event" in result.process,
         notes=(*left_out, *notes),
     )
     return patch, result.assign(height=np.where(known, height, np.float32(np.nan)))
+
+
+def _noise_length(result: Result) -> float:
+    """Return the length over which errors of heights are correlated, mm; 0 for independent ones."""
+    fused = result.process.get(CORRELATION)
+    if fused is not None:
+        return float(fused)
+    return math.inf if "integration" in result.process else 0.0
 
 
 def _known(result: Result, height: NDArray[np.float32], filled: Mask) -> tuple[Mask, list[str]]:

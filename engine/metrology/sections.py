@@ -303,7 +303,8 @@ def _lines(x: Doubles, z: Doubles) -> tuple[Doubles, Doubles, float]:
 def along(section: Section) -> dict[str, Quantity]:
     """Return the length of a section, and difference, distance and slope between its outermost heights.
 
-    Errors of both heights are assumed to be independent. InputError if fewer than two were measured.
+    Errors of both heights are assumed to be independent. A height is a mean over its pixel, so positions
+    along the section are known within half a sample. InputError if fewer than two were measured.
     """
     known = np.flatnonzero(_measured(section))
     if known.size < 2:
@@ -315,11 +316,14 @@ def along(section: Section) -> dict[str, Quantity]:
     rise = float(section.height[last] - section.height[first])
     rise_sigma = math.hypot(section.sigma[first], section.sigma[last])
     length = math.hypot(run, rise)
+    run_sigma = math.sqrt(2 / 12) * float(section.distance[1])
     return {
         "section length": Quantity(float(section.distance[-1]), 0.0, "mm"),
         "height difference": Quantity(rise, rise_sigma, "mm"),
-        "distance in space": Quantity(length, abs(rise) / length * rise_sigma, "mm"),
+        "distance in space": Quantity(length, math.hypot(rise * rise_sigma, run * run_sigma) / length, "mm"),
         "slope": Quantity(
-            math.degrees(math.atan2(rise, run)), math.degrees(rise_sigma * run / length**2), "deg"
+            math.degrees(math.atan2(rise, run)),
+            math.degrees(math.hypot(run * rise_sigma, rise * run_sigma) / length**2),
+            "deg",
         ),
     }

@@ -1,74 +1,130 @@
-"""Areal roughness: Sa, Sq and Sz of ISO 25178-2, and the Gaussian filter of ISO 16610-61."""
+"""Texture of a surface: the areal parameters of ISO 25178-2 with their standard uncertainties."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.metrology import areal
+from mirrorskin.engine.metrology.filters import Gaussian
 from mirrorskin.engine.metrology.fitting import find_uncertain
-from mirrorskin.engine.metrology.quantity import Quantity, micrometres
+from mirrorskin.engine.metrology.noise import realisations
+from mirrorskin.engine.metrology.parameters import PARAMETERS
+from mirrorskin.engine.metrology.propagation import (
+    ANY_DIRECTION,
+    HOPELESS,
+    NOISE,
+    NOISE_BIAS,
+    NoiseChanges,
+    add_noise,
+    change,
+)
+from mirrorskin.engine.metrology.quantity import Quantity
 from mirrorskin.io import InputError
 from mirrorskin.kernels.array_types import Doubles
 
-_ALPHA = math.sqrt(math.log(2) / math.pi)  # constant of the Gaussian filter, which halves waves at the cutoff
-_COVERED = 0.95  # smallest share of the filter's weight on known pixels
-_TAIL = 4.0  # half-width of the filter, in standard deviations
+Mask = NDArray[np.bool_]
+EDGES, FORM, DIRECTION = "filter edges", "form", "no direction"
+"""Contributions to an uncertainty, besides those of the noise."""
+
+DRAWS = 24
+"""Realisations of the noise; half as many for maps with many pixels."""
+
+_MANY = 500_000  # pixels
+_UNIFORM = 1 / math.sqrt(3)  # standard deviation of a uniform distribution between -1 and 1
+_LEVEL = 0.1  # relative uncertainty of standard deviations, whose squares are right within a fifth
+_DOMINATES = 0.5  # share of Sq^2 that is noise, from which on noise determines the parameters
+_ISOTROPIC = 0.5  # texture aspect ratio above which a texture has no direction
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Roughness:
-    """Height parameters of ISO 25178-2 over the definition area: the known pixels.
+    """Areal parameters of ISO 25178-2 over the definition area: the known pixels.
 
     Attributes
     ----------
-    sa, sq : Quantity
-        Arithmetical mean and root mean square of the heights, µm.
-    sz : Quantity
-        Sum of highest peak and deepest pit, µm.
-    noise : Quantity
-        Sq of a perfect surface: the root mean square of the standard deviations, µm.
+    parameters : dict of str to Quantity
+        By name, as in `PARAMETERS`; also "Sq of noise", the Sq of a perfect surface that is measured and
+        filtered in the same way, and "Sq without noise", the square root of the difference of the squares.
+    budget : dict of str to dict of str to float
+        Contributions to the standard uncertainty of each parameter, in its unit.
     pixels, left_out, uncertain : int
-        Numbers of known pixels that count, that are too near to an end or a hole for the filter, and that are
-        ignored because their standard deviation is much larger than that of others.
+        Numbers of known pixels that count, that are too near to an end or a hole for the filters, and that
+        are ignored because their standard deviation is much larger than that of others.
+    notes : list of str
+        What the noise does to the parameters.
     """
 
-    sa: Quantity
-    sq: Quantity
-    sz: Quantity
-    noise: Quantity
+    parameters: dict[str, Quantity]
+    budget: dict[str, dict[str, float]]
     pixels: int
     left_out: int
     uncertain: int
+    notes: list[str] = field(default_factory=list)
 
-    def quantities(self) -> dict[str, Quantity]:
-        """Return its quantities by name."""
-        quantities = {"Sa": self.sa, "Sq": self.sq, "Sz": self.sz}
-        return quantities | {"Sq of noise": self.noise} if math.isfinite(self.noise.value) else quantities
+    @property
+    def sa(self) -> Quantity:
+        """Arithmetical mean height, µm."""
+        return self.parameters["Sa"]
+
+    @property
+    def sq(self) -> Quantity:
+        """Root mean square height, µm."""
+        return self.parameters["Sq"]
+
+    @property
+    def sz(self) -> Quantity:
+        """Maximum height, µm."""
+        return self.parameters["Sz"]
 
 
 def roughness(
     residual: ArrayLike,
     pixel_size: tuple[float, float],
     *,
-    cutoff: float | None = None,
+    s_filter: float | None = None,
+    l_filter: float | None = None,
     sigma: ArrayLike | None = None,
+    noise_length: float = 0.0,
+    form: Sequence[ArrayLike] = (),
+    form_errors: Sequence[ArrayLike] = (),
 ) -> Roughness:
-    """Return the roughness of a surface from its residual, (H, W) mm with NaN where undefined.
+    """Return the texture parameters of a surface from its residual, with their standard uncertainties.
 
-    ``pixel_size`` is along x and y, mm. ``cutoff``, mm, is the nesting index of the L-filter: longer waves
-    are removed, and pixels with more than a twentieth of the filter's weight on holes or outside the picture
-    do not count. ``sigma``, (H, W) mm, are the heights' standard deviations.
+    Parameters
+    ----------
+    residual : array_like, (H, W)
+        Distances from the form, mm; NaN where undefined.
+    pixel_size : (float, float)
+        Along x and y, mm.
+    s_filter, l_filter : float, optional
+        Nesting indices, mm, of the Gaussian filters (ISO 16610-61) that remove shorter, and longer waves. A
+        pixel is left out if more than a twentieth of a filter's weight is on holes or outside the picture.
+    sigma : array_like, (H, W), optional
+        Standard deviations of the heights, mm.
+    noise_length : float, optional
+        Length over which the errors of heights are correlated, mm: 0 for independent ones, infinity for those
+        of integrated slopes.
+    form : sequence of array_like, (H, W)
+        Shapes that were removed with the form, such as x and y of a plane: they are removed from the noise.
+    form_errors : sequence of array_like, (H, W)
+        Errors of the form, mm, each of one standard uncertainty.
 
-    Values include noise: Sq^2 is the sum of the squares of surface and noise if these are uncorrelated. In
-    any case noise changes Sq by at most its root mean square, and Sa by at most its mean magnitude: these are
-    the uncertainties. Noise increases Sz by at most the range of the noise; the errors of the highest and the
-    lowest pixel are added.
+    Returns
+    -------
+    Roughness
+        Parameters are those of the surface including its noise, as other programs compute them. Their
+        uncertainty contains the random change by noise, and its mean change, from realisations of the noise
+        that are added to the surface.
 
-    Pixels that are far more uncertain than others (see `find_uncertain`) are excluded, because their errors
-    would determine Sz. Outliers of a form's fit are included, because they may be texture.
+    Raises
+    ------
+    InputError
+        No pixel is left; a filter is shorter than two pixels.
 
     Examples
     --------
@@ -81,54 +137,183 @@ def roughness(
         raise InputError("there is no height to measure the roughness of")
     spread = np.full_like(height, np.nan) if sigma is None else np.asarray(sigma, np.float64)
     uncertain = find_uncertain(spread, known)
-    height = np.where(uncertain, np.nan, height)
-    if cutoff is not None:
-        height = height - long_waves(height, pixel_size, cutoff)
-    kept = np.isfinite(height)
-    if not kept.any():
-        raise InputError(f"a cutoff of {cutoff:g} mm is too long for this surface: choose a shorter one")
-    values, errors = height[kept] - np.mean(height[kept]), spread[kept]
-    noise = float(np.sqrt(np.mean(errors**2)))
-    span = 2 * noise * math.sqrt(2 * math.log(values.size))
-    ends = math.hypot(errors[np.argmax(values)], errors[np.argmin(values)])
+    box = _bounding_box(known & ~uncertain)
+    height, spread = height[box], spread[box]
+    form, form_errors = ([np.asarray(one, np.float64)[box] for one in maps] for maps in (form, form_errors))
+    chain = _Chain.of((known & ~uncertain)[box], pixel_size, s_filter, l_filter, form)
+    texture = chain.filtered(height)
+    evaluate = _Evaluation(chain.kept, pixel_size)
+    values = evaluate(texture)
+    noise = None
+    if np.isfinite(spread[chain.known]).all():
+        noise = _noise_changes(chain, evaluate, texture, values, (spread, pixel_size, noise_length))
+    systematic = {
+        EDGES: change(evaluate, texture, chain.edge_errors(height)),
+        FORM: change(evaluate, texture, [chain.filtered(one) for one in form_errors]),
+    }
+    parameters, budget = {}, {}
+    for name, value in values.items():
+        parts = {cause: found[name] for cause, found in systematic.items() if name in found}
+        if name == "Std" and values["Str"] > _ISOTROPIC:
+            parts = {DIRECTION: ANY_DIRECTION}
+        if noise is not None:
+            parts = {NOISE: noise.random[name], NOISE_BIAS: noise.bias[name]} | parts
+        spread_of = math.sqrt(sum(one**2 for one in parts.values())) if noise is not None else math.nan
+        parameters[name] = Quantity(value, spread_of, PARAMETERS[name].unit)
+        budget[name] = parts
+    if noise is not None:
+        parameters = _with_noise(parameters, noise)
     return Roughness(
-        micrometres(float(np.mean(abs(values))), noise * math.sqrt(2 / math.pi)),
-        micrometres(float(np.sqrt(np.mean(values**2))), noise),
-        micrometres(float(np.ptp(values)), math.hypot(span / math.sqrt(3), ends)),
-        micrometres(noise, np.nan),
-        values.size,
-        int(np.count_nonzero(known & ~uncertain & ~kept)),
+        parameters,
+        budget,
+        int(np.count_nonzero(chain.kept)),
+        int(np.count_nonzero(chain.known & ~chain.kept)),
         int(np.count_nonzero(uncertain)),
+        [] if noise is None else _notes(parameters, noise),
     )
 
 
-def long_waves(height: Doubles, pixel_size: tuple[float, float], cutoff: float) -> Doubles:
-    """Smooth a height map by the areal Gaussian filter of ISO 16610-61, which halves waves at the cutoff, mm.
-
-    Values are weighted means over known pixels; NaN if these have less than 95 % of the weight.
-    """
-    if not cutoff >= 2 * max(pixel_size):
-        raise InputError(f"a cutoff of {cutoff:g} mm is shorter than two pixels: choose a longer one")
-    # exp(-pi (r / (alpha cutoff))^2) as a normal distribution.
-    spread = _ALPHA * cutoff / math.sqrt(2 * math.pi)
-    known = np.isfinite(height)
-    if min(count * size for count, size in zip(height.shape[::-1], pixel_size, strict=True)) < 2 * spread:
-        return np.full(height.shape, np.nan)  # too little weight everywhere
-    weight = _blur(known.astype(np.float64), spread, pixel_size)
-    blurred = _blur(np.where(known, height, 0.0), spread, pixel_size)
-    covered = known & (weight >= _COVERED)
-    return np.where(covered, blurred / np.where(covered, weight, 1), np.nan)
+def _bounding_box(known: Mask) -> tuple[slice, slice]:
+    """Return the rows and columns that contain all known pixels."""
+    rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
-def _blur(values: Doubles, spread: float, pixel_size: tuple[float, float]) -> Doubles:
-    """Convolve with a normal distribution of a standard deviation in mm; values outside are 0."""
-    from scipy import fft
+class FormRemoval:
+    """What the removal of a form leaves of noise: the part that is orthogonal to the form's shapes."""
 
-    for axis, size in zip((1, 0), pixel_size, strict=True):
-        reach, count = math.ceil(_TAIL * (spread / size)), values.shape[axis]
-        weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (spread / size)) ** 2)
-        weights /= weights.sum()
-        length = fft.next_fast_len(count + 2 * reach, real=True)
-        wave = fft.rfft(values, length, axis=axis) * np.expand_dims(fft.rfft(weights, length), 1 - axis)
-        values = np.asarray(fft.irfft(wave, length, axis=axis).take(range(reach, reach + count), axis))
-    return values
+    def __init__(self, known: Mask, form: Sequence[ArrayLike]) -> None:
+        rows = [np.ones(np.count_nonzero(known))]
+        rows += [np.asarray(shape, np.float64)[known] for shape in form]
+        shapes, _ = np.linalg.qr(np.stack(rows).T)
+        self._known, self._shapes = known, np.ascontiguousarray(shapes.T)
+
+    def __call__(self, noise: Doubles) -> Doubles:
+        """Return the rest of noise, (H, W); 0 where heights are not known."""
+        inside = noise[self._known]
+        rest = np.zeros_like(noise, np.float64)
+        rest[self._known] = inside - (self._shapes @ inside) @ self._shapes
+        return rest
+
+
+@dataclass(frozen=True, slots=True)
+class _Chain:
+    """What is done to heights, and to their noise alike: form removal of the noise, S-filter, L-filter."""
+
+    known: Mask
+    kept: Mask
+    short: Gaussian | None
+    long: Gaussian | None
+    form: FormRemoval
+
+    @classmethod
+    def of(
+        cls,
+        known: Mask,
+        pixel_size: tuple[float, float],
+        s_filter: float | None,
+        l_filter: float | None,
+        form: Sequence[ArrayLike],
+    ) -> _Chain:
+        sizes, kept = pixel_size[::-1], known
+        filters = []
+        for cutoff in (s_filter, l_filter):
+            one = None if cutoff is None else Gaussian.of(kept, sizes, cutoff)
+            kept = kept if one is None else one.covered
+            if not kept.any():
+                raise InputError(
+                    f"a cutoff of {cutoff:g} mm is too long for this surface: choose a shorter one"
+                )
+            filters.append(one)
+        return cls(known, kept, filters[0], filters[1], FormRemoval(known, form))
+
+    def filtered(self, height: Doubles) -> Doubles:
+        """Return the waves between both filters, with the mean 0, (H, W); 0 where left out."""
+        if self.short is not None:
+            height = self.short.long_waves(height)
+        if self.long is not None:
+            height = height - self.long.long_waves(height)
+        return np.where(self.kept, height - np.mean(height[self.kept]), 0.0)
+
+    def edge_errors(self, height: Doubles) -> list[Doubles]:
+        """Return the error, (H, W), by the weight that the L-filter misses at edges and holes."""
+        if self.long is None:
+            return []
+        height = height if self.short is None else self.short.long_waves(height)
+        waves = self.long.long_waves(height)[self.kept]
+        errors = np.where(self.kept, (1 - self.long.weight) * np.std(waves) * _UNIFORM, 0.0)
+        return [np.where(self.kept, errors - np.mean(errors[self.kept]), 0.0)]
+
+
+class _Evaluation:
+    """All parameters of a texture, (H, W), that is 0 where left out and has the mean 0."""
+
+    def __init__(self, kept: Mask, pixel_size: tuple[float, float]) -> None:
+        self._kept, self._pixel_size = kept, pixel_size
+        self._slopes = areal.Slopes.of(kept)
+        self.correlation = areal.Autocorrelation(kept, pixel_size)
+        self._spectrum = areal.AngularSpectrum(kept, pixel_size)
+
+    def __call__(self, texture: Doubles) -> dict[str, float]:
+        values = texture[self._kept]
+        found = areal.height_parameters(values) | areal.functional_parameters(values)
+        found |= self._slopes.hybrid_parameters(texture, self._pixel_size)
+        found |= self.correlation.lengths(self.correlation.of(texture))
+        found["Std"] = self._spectrum.direction(texture)
+        return {name: found[name] for name in PARAMETERS if name in found}
+
+
+def _noise_changes(
+    chain: _Chain,
+    evaluate: _Evaluation,
+    texture: Doubles,
+    values: Mapping[str, float],
+    noise: tuple[Doubles, tuple[float, float], float],
+) -> NoiseChanges:
+    """Return how noise, of given sigma, pixel size and length, changes the parameters."""
+    count = DRAWS if np.count_nonzero(chain.kept) <= _MANY else DRAWS // 2
+    correlation = evaluate.correlation
+    total = np.zeros(1)
+
+    def errors() -> Iterator[Doubles]:
+        nonlocal total
+        for one in realisations(noise[0], chain.known, *noise[1:], count):
+            error = chain.filtered(chain.form(one))
+            total = total + correlation.of(error)
+            yield error
+
+    changes = add_noise(values, "Sq", evaluate, texture, chain.kept, errors())
+    # The autocorrelation is the sum of those of surface and noise.
+    cleaned = correlation.lengths(correlation.of(texture) - total / count)
+    rest = max(1 - changes.share, 1 - HOPELESS)
+    for name, value in cleaned.items():  # the random error is larger relative to what is left
+        changes.bias[name] = math.hypot(values[name] - value, changes.random[name] * math.sqrt(rest**-2 - 1))
+    return changes
+
+
+def _with_noise(parameters: dict[str, Quantity], noise: NoiseChanges) -> dict[str, Quantity]:
+    """Add the Sq of the noise, and that without it."""
+    found: dict[str, Quantity] = {}
+    for name, quantity in parameters.items():
+        found[name] = quantity
+        if name == "Sq":
+            square = quantity.value**2 - noise.level**2
+            value = math.sqrt(max(square, 0.0))
+            error = math.hypot(noise.square_spread, 2 * _LEVEL * noise.level**2)
+            found["Sq of noise"] = Quantity(noise.level, _LEVEL * noise.level, "µm")
+            found["Sq without noise"] = Quantity(value, math.sqrt(value**2 + error) - value, "µm")
+    return found
+
+
+def _notes(parameters: Mapping[str, Quantity], noise: NoiseChanges) -> list[str]:
+    """Return comments where noise determines the parameters."""
+    measured, level = parameters["Sq"].value, noise.level
+    said = f"Sq is {measured:.3g} µm, and that of the noise {level:.3g} µm"
+    if level > measured:
+        return [
+            f"{said}: the surface cannot be distinguished from a smooth one. Standard deviations of heights"
+            " are too large here, or describe errors that neighbours share"
+        ]
+    if level**2 > _DOMINATES * measured**2:
+        return [f"{said}: noise determines the texture parameters; 'Sq without noise' is the surface's own"]
+    return []

@@ -31,7 +31,7 @@ def test_a_cap_has_the_numbers_of_its_closed_form(ball):
     assert told["rim height"] == pytest.approx(-SAG, rel=2e-2)
     assert told["height above rim"] == pytest.approx(SAG, rel=2e-2)
     assert told["measured area"] == pytest.approx(np.pi * WIDTH**2, rel=1e-3)
-    assert told["contact area"] == told["measured area"]
+    assert "contact area" not in told
     assert told["volume above rim"] == pytest.approx(
         volume - (told["rim height"] + SAG) * np.pi * WIDTH**2, rel=1e-3
     )
@@ -60,10 +60,10 @@ def test_the_surface_in_contact_is_that_of_the_normals(ball):
     normals[np.isnan(ball.height)] = NAN
     told = engine.measure(
         ball.assign(normals=normals, normals_sigma=np.full(SHAPE, 1e-3, np.float32))
-    ).quantities["contact surface area"]
+    ).quantities["measured surface area"]
     assert told.value == pytest.approx(2 * np.pi * RADIUS * SAG, rel=1e-3)
     assert 0.5e-3 < told.sigma / told.value < 1e-2
-    assert "contact surface area" not in engine.measure(ball).quantities
+    assert "measured surface area" not in engine.measure(ball).quantities
 
 
 def test_a_map_of_contact_gives_the_contact_area(ball):
@@ -120,11 +120,12 @@ def test_filled_heights_are_measured_separately(ball):
         assert np.isfinite(told[name].sigma)
     assert np.isnan(told["volume above rim with filled"].sigma)
     # What a press fills it touched, or else surrounded: nobody knows.
-    assert told["contact area with filled"] == whole["contact area"]
-    assert "contact area" not in told
+    pressed = engine.measure(ball.assign(filled=filled, height_sigma=sigma, process={"event": "onset"}))
+    assert pressed.quantities["contact area with filled"] == whole["measured area"]
+    assert not {"contact area", "contact area with filled"} & set(told)
     contact = np.isfinite(ball.height).astype(np.uint8)
     sure = ball.assign(filled=filled, height_sigma=sigma, contact=contact)
-    assert engine.measure(sure).quantities["contact area"] == whole["contact area"]
+    assert engine.measure(sure).quantities["contact area"] == whole["measured area"]
     assert told["highest point"].value < -0.09
     assert told["highest point with filled"].value == pytest.approx(0, abs=1e-4)
     assert told["height above rim with filled"].value == pytest.approx(
@@ -154,10 +155,10 @@ def test_roughness_is_that_from_the_form(ball):
     wave = 0.002 * np.cos(2 * np.pi * x / 0.2)
     told = values(result_of(ball.height + wave, SIZE))
     assert told["Sq"] == pytest.approx(2 * np.sqrt(0.5 * (1 - WIDTH**2 / (2 * RADIUS**2))), rel=1e-2)
-    filtered = engine.measure(result_of(ball.height + wave, SIZE), cutoff=0.4)
+    filtered = engine.measure(result_of(ball.height + wave, SIZE), l_filter=0.4)
     assert filtered.quantities["Sq"].value == pytest.approx(told["Sq"] * (1 - 0.5**4), rel=0.02)
-    assert any("of waves up to 0.4 mm" in note for note in filtered.notes)
-    assert any(note.startswith("pixels left out of roughness") for note in filtered.notes)
+    assert any("L-filter 0.4 mm" in note for note in filtered.notes)
+    assert any(note.startswith("pixels left out of texture") for note in filtered.notes)
 
 
 def test_a_region_is_measured_alone(ball):
@@ -243,7 +244,7 @@ def test_uncertain_pixels_count_neither_as_lowest_nor_as_rough():
     found = engine.measure(result_of(height, height_sigma=sigma), form="plane")
     assert found.quantities["lowest point"].value > -0.005
     assert found.quantities["Sz"].value < 10
-    assert "pixels left out of roughness and lowest point, far less certain than others: 2" in found.notes
+    assert "pixels left out of texture and lowest point, far less certain than others: 2" in found.notes
     sure = engine.measure(result_of(height, sigma=0.001), form="plane").quantities
     assert sure["lowest point"].value == pytest.approx(-0.8)
     assert sure["Sz"].value > 800

@@ -178,8 +178,9 @@ def test_lengths_and_slope_are_those_between_the_ends():
     assert told["distance in space"].value == pytest.approx(2.5)
     assert told["slope"].value == pytest.approx(np.degrees(np.arctan(0.75)))
     assert told["height difference"].sigma == pytest.approx(0.01 * np.sqrt(2), rel=1e-4)
-    assert told["distance in space"].sigma == pytest.approx(0.6 * 0.01 * np.sqrt(2), rel=1e-4)
-    assert told["slope"].sigma == pytest.approx(np.degrees(0.01 * np.sqrt(2) * 2 / 2.5**2), rel=1e-4)
+    rise, run = 0.01 * np.sqrt(2), FINE[0] / np.sqrt(6)  # the ends are known within half a pixel
+    assert told["distance in space"].sigma == pytest.approx(np.hypot(0.6 * rise, 0.8 * run), rel=1e-4)
+    assert told["slope"].sigma == pytest.approx(np.degrees(np.hypot(0.8 * rise, 0.6 * run) / 2.5), rel=1e-4)
     assert "step height" not in told
 
 

@@ -1,0 +1,81 @@
+"""Profile parameters of waves, whose values are known in closed form."""
+
+import numpy as np
+import pytest
+from height_maps import places, result_of
+
+from mirrorskin import engine, io
+from mirrorskin.engine.metrology import profile_parameters
+
+STEP = 0.01
+
+
+def wave(length=0.5, amplitude=0.002, count=1001):
+    return amplitude * np.sin(2 * np.pi * STEP * np.arange(count) / length + 0.1)
+
+
+def values(heights, **options):
+    return {name: one.value for name, one in profile_parameters(heights, STEP, **options)[0].items()}
+
+
+def test_a_sine_has_its_closed_form():
+    found = values(wave())
+    assert found["Pa"] == pytest.approx(4 / np.pi, rel=2e-3)
+    assert found["Pq"] == pytest.approx(2 / np.sqrt(2), rel=2e-3)
+    assert (found["Pz"], found["Pt"]) == pytest.approx((4, 4), rel=1e-3)
+    assert found["Psk"] == pytest.approx(0, abs=1e-2)
+    assert found["Pku"] == pytest.approx(1.5, rel=2e-3)
+    assert found["PSm"] == pytest.approx(0.5, rel=1e-6)
+
+
+def test_the_filter_halves_waves_of_its_length():
+    found = values(wave(length=0.8), l_filter=0.8)
+    assert found["Rt"] == pytest.approx(2, rel=0.02)
+    assert found["RSm"] == pytest.approx(0.8, rel=0.01)
+
+
+def test_the_height_of_section_lengths_is_a_mean_and_the_total_one_is_not():
+    heights = wave(length=0.1)
+    heights[500:510] *= 5
+    found = values(heights, l_filter=0.8)
+    assert found["Rt"] > 2.5 * 4
+    assert found["Rz"] < 1.5 * 4
+
+
+def test_small_peaks_do_not_count_in_the_spacing():
+    assert values(wave() + wave(length=0.03, amplitude=0.0001))["PSm"] == pytest.approx(0.5, rel=0.01)
+
+
+def test_holes_end_a_stretch_in_which_spacings_are_counted():
+    heights = wave()
+    heights[400:420] = np.nan
+    assert values(heights)["PSm"] == pytest.approx(0.5, rel=1e-3)
+
+
+def test_without_two_rises_there_is_no_spacing():
+    assert np.isnan(values(wave(length=50.0))["PSm"])
+
+
+def test_too_few_samples_are_refused():
+    with pytest.raises(io.InputError, match="at least 8 measured samples"):
+        values(np.zeros(7))
+
+
+def test_a_section_has_the_parameters_of_its_profile():
+    x, _ = places((60, 300), (0.02, 0.02))
+    height = 0.002 * np.sin(2 * np.pi * x / 0.5) + 0.3 * x
+    result = result_of(height, (0.02, 0.02), sigma=1e-5)
+    ends = (-2.5, 0.0), (2.5, 0.0)
+    found = engine.measure(result, form="plane", section=ends)
+    assert found.quantities["Pq"].value == pytest.approx(2 / np.sqrt(2) / np.sqrt(1.09), rel=0.02)
+    assert found.quantities["PSm"].value == pytest.approx(0.5, rel=0.01)
+    assert 0 < found.quantities["Pq"].sigma < 0.01
+    rough = engine.measure(result, form="plane", section=ends, l_filter=0.8).quantities
+    assert {"Ra", "Rq", "Rz", "Rt", "Rsk", "Rku", "RSm"} <= set(rough)
+    assert not any(name.startswith("P") for name in rough)
+
+
+def test_a_section_that_is_too_short_for_a_profile_is_a_note():
+    result = result_of(np.zeros((20, 20)), (0.1, 0.1), sigma=0.001)
+    found = engine.measure(result, form="none", section=((-0.2, 0.0), (0.2, 0.0)))
+    assert any(note.startswith("no profile parameters: a profile needs at least") for note in found.notes)

@@ -1,0 +1,170 @@
+"""Standard uncertainties of texture parameters against independent draws of the noise."""
+
+import numpy as np
+import pytest
+from height_maps import places, result_of
+from scipy import ndimage
+
+from mirrorskin import engine
+from mirrorskin.engine.metrology import PARAMETERS, profile_parameters, roughness
+
+SHAPE, SIZE = (90, 110), (0.04, 0.04)
+WHITE, CORRELATED, RELATIVE = 0.0, 0.16, np.inf
+DRAWS = 40
+# Parameters whose change by noise is extrapolated, not known in closed form, may claim more.
+EXACT = ("Sa", "Sq", "Sz", "Sdq", "Sdr", "Sk", "Vmc", "Vvc", "Sal")
+
+
+def surface(seed=2):
+    white = np.random.default_rng(seed).standard_normal(SHAPE)
+    smooth = ndimage.gaussian_filter(white, 2.5, mode="wrap")
+    x, y = places(SHAPE, SIZE)
+    inside = (np.hypot(x / 2.2, y / 1.8) < 1) & (np.hypot(x - 0.4, y) > 0.2)
+    return np.where(inside, 0.001 * smooth / smooth.std(), np.nan)
+
+
+def waves(length):
+    """Return the power of the waves of twice the picture, of errors of absolute heights and slopes."""
+    rows, columns = (np.fft.fftfreq(2 * count) for count in SHAPE)
+    power = (2 * np.sin(np.pi * rows[:, None])) ** 2 + (2 * np.sin(np.pi * columns)) ** 2
+    power += 0 if np.isinf(length) else (SIZE[0] / length) ** 2
+    power[0, 0] = power[0, 0] or np.inf
+    return 1 / power
+
+
+def drawn(length, rng):
+    power = waves(length)
+    field = np.fft.ifft2(np.fft.fft2(rng.standard_normal(power.shape)) * np.sqrt(power)).real
+    field = field[: SHAPE[0], : SHAPE[1]]
+    return field - field[np.isfinite(surface())].mean() if np.isinf(length) else field
+
+
+def spread(length):
+    """Return the standard deviation of draws over the surface."""
+    rng, inside = np.random.default_rng(99), np.isfinite(surface())
+    return np.sqrt(np.mean([np.mean(drawn(length, rng)[inside] ** 2) for _ in range(60)]))
+
+
+SPREADS = {length: spread(length) for length in (CORRELATED, RELATIVE)}
+
+
+def noise(length, rng):
+    """Return errors of variance 1."""
+    return rng.standard_normal(SHAPE) if length == WHITE else drawn(length, rng) / SPREADS[length]
+
+
+def pulls(level, length, l_filter=None, draws=DRAWS):
+    """Return (value - truth) / sigma of each parameter, (draws,), at noise of a share of the surface's Sq."""
+    true = {name: one.value for name, one in roughness(surface(), SIZE, l_filter=l_filter).parameters.items()}
+    true["Sq without noise"] = true["Sq"]
+    rng = np.random.default_rng(round(100 * level) + 7)
+    sigma = np.full(SHAPE, 0.001 * level)
+    found: dict[str, list[float]] = {}
+    for _ in range(draws):
+        measured = surface() + sigma * noise(length, rng)
+        claimed = sigma * (1 + 0.1 * rng.standard_normal())  # the level of the noise is known within a tenth
+        for name, one in roughness(
+            measured, SIZE, l_filter=l_filter, sigma=claimed, noise_length=length
+        ).parameters.items():
+            if name in true and name != "Std":
+                found.setdefault(name, []).append((one.value - true[name]) / one.sigma)
+    return {name: np.array(one) for name, one in found.items()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("length", [WHITE, CORRELATED, RELATIVE])
+@pytest.mark.parametrize(("level", "l_filter"), [(0.1, None), (0.3, None), (0.3, 1.0), (0.6, None)])
+def test_chi_square_is_about_one(level, length, l_filter):
+    chi2 = {name: float(np.mean(one**2)) for name, one in pulls(level, length, l_filter).items()}
+    assert {name: value for name, value in chi2.items() if value > 3} == {}
+    assert {name: chi2[name] for name in EXACT if chi2[name] < 0.3} == {}
+
+
+def test_chi_square_of_the_main_parameters_is_about_one():
+    chi2 = {name: float(np.mean(one**2)) for name, one in pulls(0.3, WHITE, draws=16).items()}
+    assert all(0.4 < chi2[name] < 2.5 for name in ("Sa", "Sq", "Sq without noise", "Sdq", "Sal", "Sk")), chi2
+
+
+@pytest.mark.parametrize("length", [WHITE, CORRELATED, RELATIVE])
+def test_sq_without_noise_is_that_of_the_surface_where_noise_is_as_large(length):
+    rng, true = np.random.default_rng(3), roughness(surface(), SIZE).sq.value
+    sigma = np.full(SHAPE, 0.001)
+    measured = surface() + sigma * noise(length, rng)
+    found = roughness(measured, SIZE, sigma=sigma, noise_length=length).parameters
+    assert abs(found["Sq without noise"].value - true) < 3 * found["Sq without noise"].sigma
+    assert found["Sq without noise"].sigma < 0.4 * true
+
+
+def notes_of(level):
+    rng = np.random.default_rng(4)
+    sigma = np.full(SHAPE, 0.001 * level)
+    return roughness(surface() + sigma * rng.standard_normal(SHAPE), SIZE, sigma=sigma).notes
+
+
+def test_a_note_says_that_noise_determines_the_texture():
+    (note,) = notes_of(1.5)
+    assert "noise determines the texture parameters; 'Sq without noise' is the surface's own" in note
+    assert notes_of(0.3) == []
+
+
+def test_a_note_says_that_sq_is_below_that_of_the_noise():
+    error = 0.001 * np.random.default_rng(5).standard_normal(SHAPE)
+    (note,) = roughness(error, SIZE, sigma=np.full(SHAPE, 0.002)).notes
+    assert note.startswith("Sq is ")
+    assert "cannot be distinguished from a smooth one" in note
+
+
+def test_what_noise_hides_is_unknown():
+    sigma = np.full(SHAPE, 0.002)
+    measured = surface() + sigma * np.random.default_rng(6).standard_normal(SHAPE)
+    found = roughness(measured, SIZE, sigma=sigma).parameters
+    assert np.isnan([found[name].sigma for name in ("Ssk", "Sku", "Smr1", "Smr2")]).all()
+
+
+def test_the_parts_of_the_budget_add_up():
+    result = result_of(surface(), SIZE, sigma=1e-4)
+    found = engine.measure(result, l_filter=1.0, section=((-1.5, 0.0), (1.5, 0.0)))
+    for name, parts in found.budget.items():
+        sigma = found.quantities[name].sigma
+        if np.isfinite(sigma):
+            assert np.sqrt(sum(one**2 for one in parts.values())) == pytest.approx(sigma), name
+    assert {"noise, random", "noise, systematic", "filter edges", "form"} <= set(found.budget["Sq"])
+
+
+def test_realisations_are_the_same_in_each_call():
+    sigma = np.full(SHAPE, 2e-4)
+    first, second = (roughness(surface(), SIZE, sigma=sigma).parameters["Sz"].sigma for _ in range(2))
+    assert first == second
+
+
+def test_a_noise_length_is_taken_from_the_result():
+    sigma = 3e-5
+    fused = result_of(surface(), SIZE, sigma=sigma, process={"height_correlation": 0.2})
+    slopes = result_of(surface(), SIZE, sigma=sigma, process={"integration": "multigrid"})
+    said = {"correlated over 0.2 mm": fused, "those of integrated slopes": slopes}
+    for words, result in said.items():
+        assert any(words in note for note in engine.measure(result).notes)
+    plain, given = (engine.measure(fused, noise_length=one).quantities for one in (0.0, 0.2))
+    assert plain["Sdq"].sigma > 1.5 * given["Sdq"].sigma
+
+
+def test_uncertainties_of_a_profile_cover_what_went_wrong():
+    rng = np.random.default_rng(8)
+    wave = 0.002 * np.sin(0.13 * np.arange(400))
+    true, _ = profile_parameters(wave, 0.01)
+    chi2 = {name: [] for name in true}
+    for _ in range(60):
+        errors = (0.0004 * rng.standard_normal(400) for _ in range(24))
+        found, _ = profile_parameters(wave + 0.0004 * rng.standard_normal(400), 0.01, errors=errors)
+        for name, one in found.items():
+            chi2[name].append(((one.value - true[name].value) / one.sigma) ** 2)
+    assert all(np.mean(one) < 2.5 for one in chi2.values()), chi2
+    assert all(np.mean(chi2[name]) > 0.4 for name in ("Pa", "Pq"))
+
+
+def test_parameters_scale_with_the_pixel_size_as_declared():
+    plain, wide = (roughness(surface(), (f * SIZE[0], f * SIZE[1])).parameters for f in (1.0, 1.01))
+    for name, one in plain.items():
+        if one.value and np.isfinite(one.value):
+            power = PARAMETERS[name].pixel_power
+            assert wide[name].value / one.value == pytest.approx(1.01**power, rel=1e-3), name
