@@ -2,8 +2,7 @@
 
 Heights from slopes and absolute heights minimise sum (z - h)^2 / sh^2 + sum |grad z - s|^2 / ss^2, so the
 spectrum of their errors is proportional to 1 / (k^2 + 1 / L^2) with L = sh / ss: white for L = 0, as of a
-press; that of integrated slopes for L = infinity. See docs/method/measures.md, "Uncertainty of texture
-parameters".
+press; that of integrated slopes for L = infinity.
 """
 
 from __future__ import annotations

@@ -710,11 +710,11 @@ def roughness() -> Answer:
     )
     residual[10:13, 20:23] = np.nan
     plain = engine_roughness(residual, PIXEL)
-    fine = engine_roughness(residual, PIXEL, cutoff=0.8, sigma=np.full(x.shape, 1e-3))
+    fine = engine_roughness(residual, PIXEL, l_filter=0.8, sigma=np.full(x.shape, 1e-3))
     counts = [[one.pixels, one.left_out, one.uncertain] for one in (plain, fine)]
     return {
-        "plain": numbers(plain.quantities()),
-        "fine": numbers(fine.quantities()),
+        "plain": numbers(plain.parameters),
+        "fine": numbers(fine.parameters),
         "counts": np.array(counts),
     }
 
@@ -746,7 +746,7 @@ def section_and_step() -> Answer:
 def measure() -> Answer:
     found = {
         "all": engine.measure(cap()),
-        "sphere": engine.measure(cap(), form="sphere", cutoff=0.5, section=((-1.0, 0.0), (1.0, 0.3))),
+        "sphere": engine.measure(cap(), form="sphere", l_filter=0.5, section=((-1.0, 0.0), (1.0, 0.3))),
         "part": engine.measure(cap(), region=io.Region((10, 40), (5, 50)), form="plane"),
     }
     return {name: {**numbers(one.quantities), "notes": one.notes} for name, one in found.items()}
