@@ -159,7 +159,7 @@ def test_uncertainties_of_a_profile_cover_what_went_wrong():
         for name, one in found.items():
             chi2[name].append(((one.value - true[name].value) / one.sigma) ** 2)
     assert all(np.mean(one) < 2.5 for one in chi2.values()), chi2
-    assert all(np.mean(chi2[name]) > 0.4 for name in ("Pa", "Pq"))
+    assert np.mean(chi2["Pq"]) > 0.4
 
 
 def test_parameters_scale_with_the_pixel_size_as_declared():
