@@ -43,9 +43,9 @@ _Made = TypeVar("_Made")
 
 
 def device_error(device: Device, what: str, error: cl.Error) -> DeviceError:
-    """Return an error with the operation that a device could not do, the reason, and the remedy."""
+    """Return an error that names the failed operation, the reason and the remedy."""
     return DeviceError(
-        f"{device.info.title} cannot {what}: {error}; if that goes on, choose another ('mirrorskin devices')"
+        f"{device.info.title} cannot {what}: {error}; if this persists, choose another ('mirrorskin devices')"
     )
 
 
@@ -89,7 +89,7 @@ class Array:
     arrived : pyopencl.Event or None
         A copy under way that kernels have to wait for.
     last_use : pyopencl.Event or None
-        The last kernel that took it as an argument, unless it was written after that.
+        The last kernel launched with it, unless it was written later.
     """
 
     shape: tuple[int, ...]
@@ -114,7 +114,7 @@ class Array:
         self.nbytes: int = math.prod(shape) * dtype.itemsize
         if self.nbytes > device.max_allocation:
             raise DeviceMemoryError(_no_room(device, name, self.nbytes))
-        # A device that shares memory sees the host's writes from its first kernel on.
+        # Shared memory needs no buffer yet: the first kernel sees all earlier writes of the host.
         if not self.is_shared:
             self._allocate()
         else:
@@ -149,13 +149,13 @@ class Array:
         return (self[row] for row in range(len(self)))
 
     def __getitem__(self, rows: int | slice) -> Array:
-        """Return some rows, without a step, on the device: itself for all rows, otherwise a copy."""
+        """Return rows (an index, or a slice without a step) on the device: a copy unless all are selected."""
         start, shape = self._part(rows)
         return self if shape == self.shape else self.cut(start // self.dtype.itemsize, shape)
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
         if copy is False:
-            raise ValueError(f"{self.name} is on a device: its values have to be copied")
+            raise ValueError(f"{self.name} is on a device and has to be copied: omit copy=False")
         return self.read().astype(self.dtype if dtype is None else dtype, copy=False)
 
     def __dlpack__(self, **options: Any) -> object:
@@ -172,7 +172,7 @@ class Array:
         return np.empty(0).__dlpack_device__()
 
     def __del__(self) -> None:
-        # A command may still use this memory, which another array gets next. On a lost device none does.
+        # A command may still use this memory, which another array will reuse. On a lost device none does.
         if not self.is_shared:
             self._give_back()
         elif self.latest is not None:
@@ -180,7 +180,7 @@ class Array:
 
     @_wrap_cl_errors
     def write(self, values: NDArray[Any], row: int = 0) -> None:
-        """Write values in C order from a row on; the values may be changed at once."""
+        """Copy values, in C order, to the rows from ``row`` on; the caller may change them immediately."""
         row_size = math.prod(self.shape[1:])
         whole = row == 0 and values.size == row_size * self.shape[0]
         if self._is_parked:
@@ -206,7 +206,7 @@ class Array:
 
     @_wrap_cl_errors
     def read(self, rows: int | slice = slice(None), after: cl.Event | None = None) -> NDArray[Any]:
-        """Wait for the device and return a copy of some rows, without a step.
+        """Wait for the device and return a copy of rows (an index, or a slice without a step).
 
         ``after`` is the kernel to wait for if later ones only read; by default all commands are waited for.
         """
@@ -247,7 +247,7 @@ class Array:
 
     @_wrap_cl_errors
     def cut(self, start: int, shape: tuple[int, ...]) -> Array:
-        """Return a copy, on the device, of the elements from an index on, in another shape."""
+        """Return a copy, on the device, of the elements from index ``start`` on, with another shape."""
         copied = Array(self.device, self.name, shape, self.dtype, zeroed=False)
         if copied.nbytes == 0:
             return copied
@@ -307,7 +307,7 @@ class Array:
         elif self._mapped is None and self._buffer is not None:
             if self.last_use is not None:
                 self.device.profile.wait(self.name, self.last_use)
-            self._buffer = None  # a new one sees the host's writes, without using the queue
+            self._buffer = None  # a new buffer contains the host's writes without a command on the queue
 
     def _map(self) -> None:
         """Make the device's writes to shared memory visible to the host."""
@@ -333,7 +333,7 @@ class Array:
         self.arrived, self.last_use = event, None
 
     def _copy_up(self, values: NDArray[Any], start: int) -> None:
-        """Copy values to the device from an offset in bytes on."""
+        """Copy values to the device; ``start`` is an offset in bytes."""
         if values.size == 0:
             return
         if start == 0 and values.size * self.dtype.itemsize == self.nbytes:
@@ -440,7 +440,7 @@ def fetch(parts: Sequence[tuple[Array, int | slice]], keep: Sequence[bool] = ())
 
 
 def _put(target: NDArray[Any], values: NDArray[Any], first: int) -> None:
-    """Write values to elements from an index on."""
+    """Write values to the elements from index ``first`` on."""
     target.reshape(-1)[first : first + values.size].reshape(values.shape)[...] = values
 
 
@@ -451,7 +451,7 @@ def _empty(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
 
 
 class BorrowedBuffer:
-    """Memory of another owner that kernels read in place; it stays alive until they are done.
+    """Memory of another owner that kernels read in place; it stays alive until they have finished.
 
     ``name``, ``host``, ``shape``, ``nbytes``, ``buffer``, ``arrived`` and ``last_use`` are like those of an
     `Array`; nothing is copied.
@@ -469,7 +469,7 @@ class BorrowedBuffer:
         self.shape, self.nbytes = values.shape, values.nbytes
         self.last_use: cl.Event | None = None
         self._lock = threading.RLock()
-        # Kernels only read it. But Intel's runtime copies read-only memory that is not aligned to 128 bytes.
+        # Kernels only read it, but Intel's runtime copies read-only memory that is not aligned to 128 bytes.
         access = cl.mem_flags.READ_WRITE if values.flags.writeable else cl.mem_flags.READ_ONLY
         flags = access | cl.mem_flags.USE_HOST_PTR
         loaded = as_strided(values.reshape(-1).view(np.uint8), (values.nbytes + SLACK,))

@@ -38,8 +38,8 @@ RIGHT, DOWN = 1, 2
 def breaks_curl(flags: Flags, slope_x: Floats, slope_y: Floats, width: float, height: float) -> Doubles:
     """Return the sum of the four links around a corner of pixels, as a slope.
 
-    The corner is right and below of each pixel; 0 if a link is missing. Slopes are to the right and *down*
-    the picture; width and height are those of a pixel, relative to their geometric mean.
+    The corner is at the lower right of each pixel; 0 if a link is missing. Slopes are to the right and *down*
+    the picture; ``width`` and ``height`` of a pixel are relative to their geometric mean.
     """
     curl = np.zeros(flags.shape)
     across = (slope_x[:, 1:].astype(np.float64) + slope_x[:, :-1]) / 2
@@ -52,7 +52,7 @@ def breaks_curl(flags: Flags, slope_x: Floats, slope_y: Floats, width: float, he
 
 
 def breaks_sum(values: Floats, reach: int, downwards: bool) -> Doubles:
-    """Return sums over as many pixels on either side, along rows or columns."""
+    """Return sums over 2 reach + 1 pixels centred on each pixel, along rows or columns."""
     one = values.astype(np.float64) if downwards else values.T.astype(np.float64)
     ring = np.pad(one, ((reach, reach), (0, 0)))
     sums = sum((ring[i : i + len(one)] for i in range(2 * reach + 1)), np.zeros(one.shape))
@@ -62,9 +62,9 @@ def breaks_sum(values: Floats, reach: int, downwards: bool) -> Doubles:
 def breaks_spread(curl: Floats, sums: Floats, reach: int, noise: float, wide: bool) -> Doubles:
     """Return the evidence of a tear at each corner, in excess of the noise.
 
-    ``sums`` are sums of the curl over a square of 2 reach + 1 on each side, about zero where it alternates
-    along a slanted crease. The result is their magnitude over the side, or the geometric mean of that and the
-    curl of the corner, which is better localised.
+    ``sums`` are sums of the curl over squares with sides of 2 reach + 1 corners. They are near zero where the
+    curl alternates along a slanted crease. If ``wide``, the evidence is |sum| / (2 reach + 1); otherwise it
+    is the geometric mean of that and |curl|, which is better localised.
     """
     mean = np.abs(sums.astype(np.float64)) / (2 * reach + 1)
     tears = np.zeros(curl.shape)
@@ -77,7 +77,7 @@ def breaks_trust(right: Floats, down: Floats, slope_x: Floats, slope_y: Floats, 
     """Return weights of the links to the right and down, and their slopes.
 
     ``facing`` are the cosines a, ``right`` and ``down`` the weights w, ``noise`` is n^2, and n^2 / v is at
-    least ``least``. A link's slope is that of the sum of both normals, which is exact on a sphere.
+    least ``least``. The slope of a link is computed from the sum of both normals, which is exact on a sphere.
     """
     one = _trust(right, slope_x, facing, tears, noise, bend, tear, least)
     other = _trust(down.T, slope_y.T, facing.T, tears.T, noise, bend, tear, least)
@@ -106,8 +106,8 @@ def breaks_links(weight_x: Floats, weight_y: Floats, rise_x: Floats, rise_y: Flo
                  sharpness: float, most: float) -> tuple[Doubles, Doubles, Doubles, float]:  # fmt: skip
     """Return links to the right and down, the right-hand side of the equations, and the broken links.
 
-    Links whose k m^2 exceeds ``most`` are cut; ``held`` is the right-hand side of known heights. A broken
-    link counts as k m^2 / (1 + k m^2); the kernel writes a sum for each of its items.
+    Links whose k m^2 exceeds ``most`` are cut. ``held`` is the right-hand side of known heights. Each link
+    adds k m^2 / (1 + k m^2) to the number of broken links; the kernel writes one sum per work-item.
     """
     u = heights.astype(np.float64)
     x = _links(weight_x, rise_x, slope_x, u, width, slack, sharpness, most)

@@ -43,25 +43,25 @@ SINGLE, RAMP = 1 / 3, 1 / 5
 def changepoint_scan(frames: Array, first: int, level: int, least: int, quiet: np.float32, dark: Array,
                      gain: Array, start: Array, excess: Array, below: Array,
                      ring: Array) -> None:  # fmt: skip
-    """Go through a block of frames for a change between known levels; the maps are changed in place.
+    """Search a block of frames for a change between known levels; the maps are updated in place.
 
-    Page's form of the cumulative sum: the excess over the level is added up and never falls below zero; the
-    change lies after the frame in which it last was zero, which is its most likely place. All is counted in
-    whole units, so that neither the length of a stack nor a device's rounding makes a difference.
+    This is Page's cumulative sum: the excess over the level is accumulated and clipped at zero. The most
+    likely change is after the last frame in which the sum was zero. Sums are integers, so the result does not
+    depend on the length of the stack or on the rounding of a device.
 
     Parameters
     ----------
     frames : (n, P), uint8, uint16 or float32
     first : number of the block's first frame in the stack
     level : units, of ``UNIT`` from dark to bright, at which a pixel is light
-    least : units of excess that decide a change; so does an excess that lasts for ``REACH`` frames
-    quiet : square counts; times the square of the gain, the excess that noise makes up
-    dark, gain : (P,), counts without light, and one over the counts from dark to bright; of a release, counts
-        with full light, and one over the counts from there to dark
+    least : excess, in units, that confirms a change; an excess for ``REACH`` frames confirms it as well
+    quiet : counts^2; times gain^2, it is the excess caused by noise
+    dark, gain : (P,), counts without light, and 1 / (counts from dark to bright). For a release: counts with
+        full light, and 1 / (counts from bright to dark), which is negative
     start : (P,), first frame after the change; ``INVALID`` after a NaN sample
-    excess : (P,), units so far; ``DECIDED`` once the change is certain
-    below : (P,), last frame in which the sample was nearer to dark than to the level
-    ring : (SLOTS, P), samples of the frames around the change, each at its number modulo ``SLOTS``
+    excess : (P,), accumulated excess, units; ``DECIDED`` once the change is confirmed
+    below : (P,), last frame whose sample was closer to dark than to the level
+    ring : (SLOTS, P), ring buffer of the samples around the change; frame t is in slot t % ``SLOTS``
     """
     alarm = np.maximum(least, excess_of_noise(quiet, gain))
     for number, frame in enumerate(frames, start=first):
@@ -88,22 +88,21 @@ def changepoint_sum(frames: Array, total: Floats) -> None:
 
 def changepoint_split(frames: Array, first: int, mean: Floats, weight: Array, total: Floats, start: Array,
                       since: Array, score: Array, ring: Array) -> None:  # fmt: skip
-    """Go through a block of frames for a change between unknown levels; the maps are changed in place.
+    """Search a block of frames for a change between unknown levels; the maps are updated in place.
 
-    Splitting T frames into k and T - k explains D^2 T / (k (T - k)) of the square deviations, with D the sum
-    of the first k deviations from the mean. The k that explains most is the most likely change; D must be
-    negative, that is, the second level be the higher one, or positive for a release.
+    Splitting T frames into k and T - k explains D^2 T / (k (T - k)) of the sum of squared deviations, with D
+    the sum of the first k deviations from the mean. The k that explains most is the most likely change. D
+    must be negative (the second level is higher), or positive for a release.
 
     Parameters
     ----------
     frames, first, ring : as of ``changepoint_scan``
-    mean : (P,), counts, of all frames; of the kernel's as of ``total`` the sum of two floats
-    weight : (T + 1,), 1 / sqrt(k (T - k)) for each k, or its negative if the second level should be the lower
-        one; 0 at both ends
+    mean : (P,), mean of all frames, counts; the kernel stores it and ``total`` as sums of two floats
+    weight : (T + 1,), 1 / sqrt(k (T - k)) for each k, negative for a release; 0 at both ends
     total : (P,), sum of the deviations so far, counts
     start : (P,), first frame after the best split so far
-    since : (P,), frame from which on the ring lacks none
-    score : (P,), -D times the weight, of the best split
+    since : (P,), frame from which on the ring buffer is complete
+    score : (P,), -D times the weight for the best split
     """
     for number, frame in enumerate(frames, start=first):
         total += frame - mean
@@ -119,26 +118,27 @@ def changepoint_split(frames: Array, first: int, mean: Floats, weight: Array, to
 def changepoint_heights(start: Array, excess: Array, below: Array, since: Array, dark: Array, gain: Array,
                         ring: Array, travel: Floats, noise: float, quiet: np.float32, level: float,
                         own: bool) -> tuple[Floats, Floats, Array]:  # fmt: skip
-    """Turn changes into heights, standard deviations (mm) and status, from the samples around them.
+    """Return heights, standard deviations (mm) and status, from the samples around the changes.
 
-    Each hypothesis says which of these samples lie on the dark level, which are under way, and which lie on
-    the light level. The levels may differ from those given; the samples under way lie on a straight line that
-    meets both levels between the frames where it should. Each says when the level was crossed, and how likely
-    the samples are. The answer is the mean over all hypotheses, and the standard deviation that of the
-    answers they give: the Bayes estimate, whose mean square error is the least. Behind a lens that blurs, no
-    change is a straight line: where the samples on both sides of the crossing are under way, its variance
-    contains the square distance to the crossing of a blurred edge between them. A pixel may also hover about
-    its level, and noise say when it passes: where the samples do not rise, the change may be anywhere since
-    the last frame that was nearer to dark.
+    A hypothesis divides these samples into three groups: on the dark level, in transition, and on the light
+    level. The levels may differ from the given ones. The samples in transition are on a straight line, which
+    meets both levels between the adjacent samples. A hypothesis determines the crossing of the level and the
+    likelihood of the samples. The result is the posterior mean and standard deviation over all hypotheses
+    (the Bayes estimate, which minimises the mean square error).
+
+    A lens blurs the edge, so the transition is not a straight line. If the samples on both sides of the
+    crossing are in transition, the squared distance to the crossing of a blurred edge is added to the
+    variance. If the samples do not rise significantly, as at a pixel that hovers about its level, noise
+    determines the crossing: the change may be anywhere since the last frame closer to dark.
 
     Parameters
     ----------
-    start, excess, below, since, dark, gain, ring : as the passes leave them
-    travel : (T,), mm, one a frame; the kernel takes each as the sum of two floats
+    start, excess, below, since, dark, gain, ring : results of the passes above
+    travel : (T,), mm, per frame; the kernel takes each as the sum of two floats
     noise : standard deviation of a sample, counts
     quiet : as of ``changepoint_scan``
-    level : share of the way from dark to bright whose crossing is looked for
-    own : whether that is the way between the pixel's own levels instead
+    level : the level to be crossed, as a share of the range from dark to bright
+    own : whether the share refers to the pixel's own levels instead of the given ones
     """
     never = excess <= excess_of_noise(quiet, gain)
     status = np.select([start == INVALID, never, start == 0], [0, 2, 3], 1).astype(np.uint8)
@@ -169,7 +169,7 @@ def changepoint_heights(start: Array, excess: Array, below: Array, since: Array,
 
 
 def excess_of_noise(quiet: np.float32, gain: Array) -> Array:
-    """Return the units of excess caused by noise; computed in passing by the kernel."""
+    """Return the excess caused by noise, in units; inlined in the kernel."""
     share = np.minimum(quiet * gain * gain, np.float32(1000))
     return np.asarray(np.rint(share * np.float32(UNIT)), np.int32)
 

@@ -19,11 +19,12 @@ Labels = NDArray[np.int32]
 
 def components_sum(flags: Flags, labels: Labels, relief: Array, plane: Triple, heights: Array | None,
                    height_weights: Array | None, components: int) -> tuple[Doubles, Doubles]:  # fmt: skip
-    """Return for each component a sum of heights, and its divisor for the mean; (components,) each.
+    """Return a sum of heights for each component, and its divisor for the mean; (components,) each.
 
-    With known heights it is the mean excess of the other heights over these, with their weights. ``labels``
-    are the component numbers of pixels, -1 without a result; ``plane`` is its rise per column and per row,
-    and its height in the top left pixel, mm. Each of the kernel's items sums over a strip of rows.
+    If heights are known, it is the weighted sum of the excess of the computed heights over these. ``labels``
+    are the component numbers of pixels, -1 without a result; ``plane`` is the rise of the plane per column
+    and per row, and its height in the top left pixel, mm. Each of the kernel's items sums over a strip of
+    rows.
     """
     risen, share = relief + _level(plane, flags.shape), (labels >= 0).astype(np.float64)
     if heights is not None:
@@ -39,11 +40,11 @@ def components_sum(flags: Flags, labels: Labels, relief: Array, plane: Triple, h
 def components_offsets(
     sums: Array, totals: Array, unknown: Array, of_unknown: int, mean: float, offsets: Array
 ) -> None:
-    """Write the offsets that give some components a mean; those of the others are unchanged.
+    """Write the offsets that set the mean of the selected components; other offsets are unchanged.
 
-    These are the components without a known height if ``of_unknown`` is 1, otherwise all others. ``sums`` and
-    ``totals``, (strips, components), are those of `components_sum`; ``unknown`` is 1 for a component without
-    a known height.
+    Components without a known height are selected if ``of_unknown`` is 1, otherwise those with one.
+    ``sums`` and ``totals``, (strips, components), are results of `components_sum`; ``unknown`` is 1 for a
+    component without a known height.
     """
     sum_, total = (part.sum(axis=0, dtype=np.float64) for part in (sums, totals))
     means = np.divide(sum_, total, out=np.zeros(len(sum_)), where=total > 0)

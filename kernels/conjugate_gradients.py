@@ -54,14 +54,14 @@ def conjugate_gradients(
 ) -> Solution:
     """Minimise ``x A x / 2 - b x`` for symmetric positive definite A.
 
-    The memory of the previous direction is that of Polak and Ribiere, which vanishes when the face changes.
-    With limits, the unknowns are projected after each step (Polonsky and Keer, Wear 231, 1999, 206-219).
-    Sums are NumPy's: the threads of BLAS cost more than they save at the sizes of a map.
+    Directions follow the formula of Polak and Ribiere; the iteration restarts when the face changes. With
+    limits, the unknowns are projected after each step (Polonsky and Keer, Wear 231, 1999, 206-219). Sums are
+    computed by NumPy: for the size of a map, the threads of BLAS cost more than they save.
 
     Parameters
     ----------
     product
-        Returns A times an increment of x: its rounding errors are relative to increments, which become small.
+        Returns A times an increment of x. Increments become small, and so do their rounding errors.
     target
         b.
     face
@@ -77,7 +77,7 @@ def conjugate_gradients(
     limit
         Returns the x within the limits that is closest to an x: the same array if it is within them.
     axes
-        Axes of one system; several are solved at once along the others. By default, all are one system.
+        Axes of one system; systems along the other axes are solved simultaneously. By default all axes.
     """
     x = np.zeros_like(target) if start is None else start
     if moved is None:

@@ -1,14 +1,13 @@
 // Least squares of mean, cosine and sine over the phases of a rotation. Specification: correlation.py.
 //
 // FRAME  type of a sample
-// BITS   its width; samples of 32 bits are no counts
+// BITS   its width; samples of 32 bits are not counts
 // TILE   pixels of one work-item: 1 on a GPU, many on a CPU
 
 #pragma OPENCL FP_CONTRACT OFF
 #include "common.clh"
 
-// --- The fit from sums
-// --------------------------------------------------------------------------------------------
+// --- The fit from sums --------------------------------------------------------------------------------------------
 
 #if TILE > 1 && defined(cl_khr_fp64)  // float64 of a CPU is faster than pairs of floats
 typedef double Exact;
@@ -36,8 +35,7 @@ typedef Pair Exact;
         residual[p] = root((left < 0 ? 0 : left) * fit[27]); \
     }
 
-// --- Sums of integer counts: nothing is rounded
-// -------------------------------------------------------------------
+// --- Sums of integer counts: nothing is rounded -------------------------------------------------------------------
 
 #if BITS < 32
 #if BITS == 8
@@ -158,8 +156,7 @@ __kernel void correlation_convert(
 }
 #endif
 
-// --- Sums of any samples minus their references
-// --------------------------------------------------------------------
+// --- Sums of any samples minus their references -------------------------------------------------------------------
 
 enum { TOTAL, COSINE, SINE, SQUARE, SUMS };
 

@@ -5,10 +5,10 @@ w_k (E_k - a - b cos alpha_k - c sin alpha_k)^2. With X the matrix of rows (1, c
 weights, four sums over the samples suffice: Z'E, where Z is W X up to rounding, and E'W E.
 
 Integer counts of frames with weight 1 are summed as integers, with the cosines and sines of Z rounded to
-multiples of a unit. So nothing is lost, however long a stack is and however it is divided. The rounding of Z
-is harmless: (Z'X)^-1 Z'E is an instrumental-variable estimate (Reiersol, Econometrica 9, 1941), exact for
-samples that satisfy the model, and SS is then E'W E - beta' X'W X beta. Otherwise it differs from least
-squares by the noise times the rounding, less than a part in 100 000 of the noise.
+multiples of a unit. The sums are therefore exact for any length and any division of a stack. The rounding of
+Z is harmless: (Z'X)^-1 Z'E is an instrumental-variable estimate (Reiersol, Econometrica 9, 1941), exact for
+samples that satisfy the model, and SS is then E'W E - beta' X'W X beta. For other samples the difference from
+least squares is the noise times the rounding, less than 1e-5 of the noise.
 
 Other samples are summed as pairs of floats, which are as accurate as float64, after subtracting the first
 sample; Z is then rounded to float32.
@@ -94,9 +94,9 @@ def correlation_convert(used: int, cosines: int, sines: int, unit: float, total:
 
 def correlation_sum(frames: Array, place: Array, basis: Array, fresh: bool, reference: Array, total: Floats,
                     cosine: Floats, sine: Floats, square: Floats) -> None:  # fmt: skip
-    """Add frames of any weights to the sums so far.
+    """Add frames of any weights to sums.
 
-    If ``fresh``, there are none, and the first sample becomes the reference, which is subtracted from all.
+    If ``fresh``, new sums start with the first sample as the reference, which is subtracted from all samples.
     ``basis``, (m, 3), contains for each frame its weight, and the weight times cosine and sine of its phase.
     The kernel stores each sum as a pair of floats.
     """

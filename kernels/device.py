@@ -104,22 +104,22 @@ def open_device(choice: Choice = None) -> Device:
     ----------
     choice : str, int, Device, list of them, or None
         A number of ``list_devices``, ``"gpu"``, ``"cpu"``, or a part of the platform's and device's
-        names. None takes what ``PYOPENCL_CTX`` names, else the best GPU that works, else the best CPU. The
-        best of a kind is one with its own memory, then the one with the largest product of compute units and
-        memory. Of several devices, the first is opened; see `open_devices`.
+        names. None selects the device in ``PYOPENCL_CTX``; if that is not set, the best GPU that works, then
+        the best CPU. Devices with their own memory are preferred, then those with the largest product of
+        compute units and memory. Of several devices, the first is opened; see `open_devices`.
 
     Raises
     ------
     UnknownDeviceError
-        No device, or more than one, answers to the name.
+        No device, or more than one, matches the name.
     DeviceError
-        There is no OpenCL device at all, or it cannot run a kernel; or this process was forked from one that
-        had opened a device, whose driver's threads it lacks.
+        There is no OpenCL device, or it cannot run a kernel; or this process was forked from one that had
+        opened a device, and has no driver threads.
     """
     if any(device.process != os.getpid() for device in opened_devices()):
         raise DeviceError(
-            "this process was forked from one that had used OpenCL, whose threads it lacks: start it with "
-            "multiprocessing.get_context('spawn')"
+            "this process was forked from one that had used OpenCL, so it has no driver threads: "
+            "start it with multiprocessing.get_context('spawn')"
         )
     choice = _checked(choice)
     if isinstance(choice, Device):
@@ -140,8 +140,8 @@ def open_devices(choice: Choice = None) -> list[Device]:
     Parameters
     ----------
     choice : str, Device, sequence of them, or None
-        ``"all"`` takes all devices that work of the kind and the platform of the one that `open_device` takes
-        by default, which comes first; of a sequence, each item is opened. Anything else is one device.
+        ``"all"`` opens the default device of `open_device`, and then all others of the same kind and platform
+        that work. A sequence opens each of its items. Any other choice opens one device.
 
     Raises
     ------
@@ -193,13 +193,13 @@ def opened_devices() -> list[Device]:
 
 
 def free_memory() -> None:
-    """Return the memory that is cached between calls to the system.
+    """Release the memory that is cached between calls.
 
-    Arrays of the engine and the maps that it returns use memory that is reused once it is no longer
-    referenced, because its pages are already mapped. At most `mirrorskin.kernels.memory.KEPT`, 512 MB, is
-    cached while unused, in addition to the solver of the last call of `mirrorskin.engine.integrate`: some 100
-    bytes per pixel, for pictures up to 8 Mpx. On a device with its own memory, at most an eighth of that is
-    cached as well, and 48 MB of the host's memory for copies.
+    Memory of arrays and maps is reused once it is no longer referenced, because its pages are already mapped.
+    Unused memory of at most `mirrorskin.kernels.memory.KEPT`, 512 MB, is cached. The solver of the last call
+    of `mirrorskin.engine.integrate` is cached in addition: about 100 bytes per pixel, for pictures up to
+    8 Mpx. For a device with its own memory, at most an eighth of that memory is cached as well, and 48 MB of
+    host memory for copies.
 
     Examples
     --------
@@ -227,7 +227,7 @@ class Device:
     profile : Profile
         Statistics of the work so far.
     max_allocation : int
-        Bytes that one array may take.
+        Maximum size of an array, bytes.
     layout : Layout
         How work is divided: for the cores of a CPU, or for the lanes of other devices.
     enqueuing : threading.Lock
@@ -293,7 +293,7 @@ class Device:
         return Array(self, name, shape, np.dtype(dtype), zeroed)
 
     def from_host(self, name: str, values: ArrayLike, dtype: DTypeLike = np.float32) -> Array:
-        """Return a new array with some values; if there are none, it has one meaningless element.
+        """Return a new array with the given values; without values, it has one undefined element.
 
         Parameters
         ----------
@@ -317,8 +317,8 @@ class Device:
     def borrow(self, name: str, values: NDArray[Any]) -> BorrowedBuffer | None:
         """Return another owner's memory for use by kernels in place; the device must share the host's memory.
 
-        None if this is not possible: values that are not in C order or aligned, or that are not followed by
-        64 readable bytes; or a device that refuses memory such as a file's.
+        None if this is not possible: the values are not in C order, not aligned or not followed by 64
+        readable bytes, or the device refuses the memory, such as a mapped file.
 
         Parameters
         ----------
@@ -400,9 +400,9 @@ class Device:
         return kernel
 
     def with_new_queue(self) -> Device:
-        """Return the same device with queues of its own, whose kernels need not wait for earlier ones.
+        """Return the same device with new queues, whose kernels do not wait for earlier kernels.
 
-        Arrays may be passed between them; a kernel waits for their ``arrived``.
+        Arrays can be used on both; a kernel waits for their ``arrived``.
         """
         other = copy.copy(self)
         other.queue, other.copies = _queues(self.context)
@@ -468,9 +468,7 @@ class Device:
             text = str(file) if written else path.read_text(encoding="utf-8")
             source = _with_includes(path.name, text) + more
         except OSError as error:
-            raise DeviceError(
-                f"the kernel {path} cannot be read ({error}); install mirrorskin anew"
-            ) from error
+            raise DeviceError(f"the kernel {path} cannot be read ({error}); reinstall mirrorskin") from error
         start = time.perf_counter()
         try:
             with _without_build_logs, waiting:
@@ -611,7 +609,7 @@ class Kernel:
         Raises
         ------
         TypeError
-            An argument is missing, unknown, or no number where one is needed.
+            An argument is missing, unknown, or not a number where one is needed.
         """
         args = self._in_order(arguments)
         group = self.group
@@ -639,7 +637,7 @@ class Kernel:
         key: object = value
         if isinstance(value, Operand):
             value = value.buffer
-            # Not id(), which the buffer of a deleted array may have had.
+            # Not id(): a new buffer may have the id of a deleted one.
             key = value.__dict__.setdefault("number", next(_numbers))
         elif value is not None:
             key = value.tobytes()  # 0 and -0 are equal
@@ -672,7 +670,7 @@ class Kernel:
 
 
 def _group_of(kernel: cl.Kernel, device: cl.Device, wanted: int) -> int:
-    """Return the size of a work-group: the kernel's requirement, otherwise the desired and allowed one."""
+    """Return the size of a work-group: required by the kernel, or the desired one within the limits."""
     ask = cl.kernel_work_group_info
     demanded = int(kernel.get_work_group_info(ask.COMPILE_WORK_GROUP_SIZE, device)[0])
     if demanded:
@@ -693,7 +691,7 @@ def _find() -> list[cl.Device]:
     embedded.prepare()
     try:
         platforms = cl.get_platforms()
-    except cl.LogicError:  # the loader's way to report that there is none
+    except cl.LogicError:  # raised by the loader if there is no platform
         return []
     return [device for platform in platforms for device in _devices_of(platform)]
 
@@ -730,7 +728,7 @@ def _is_pocl(device: cl.Device) -> bool:
 
 
 def _choose(choice: str | None) -> list[cl.Device]:
-    """Return the devices of a choice, one or several of a kind: the first of them that works."""
+    """Return the devices that match a choice, the best first; the first that works is to be used."""
     devices = _find()
     if not devices:
         reason = embedded.why_no_device()
@@ -797,7 +795,7 @@ def _open_if_it_works(device: cl.Device) -> Device | None:
 def _are_alike(one: DeviceInfo, other: DeviceInfo) -> bool:
     """Return whether devices are of one kind and platform.
 
-    Another platform may offer the same hardware once more, and compute other last digits.
+    Another platform may list the same hardware again, with results that differ in the last digits.
     """
     return (one.platform, one.kind) == (other.platform, other.kind)
 
@@ -817,7 +815,7 @@ def _with_includes(name: str, text: str) -> str:
 
 
 def _shared(name: str) -> str:
-    """Return a file that kernels include."""
+    """Return the text of a file that kernels include."""
     return _with_includes(name, (_FOLDER / name).read_text(encoding="utf-8"))
 
 

@@ -28,7 +28,7 @@ def recall(topic: str, circumstances: object) -> bytes | None:
 
 
 def keep(topic: str, circumstances: object, answer: bytes) -> None:
-    """Cache a value atomically; without a writable folder it will be computed again."""
+    """Cache a value atomically; if the folder is not writable, the value is computed again next time."""
     record = _record(topic, circumstances)
     partial = record.with_suffix(f".{os.getpid()}-{threading.get_native_id()}")
     try:

@@ -10,7 +10,7 @@ first), so that a window may extend beyond the picture.
 
 In a window, the frame is modelled as the reference, displaced by an affine field, times a gain and plus a
 plane of brightness. This has ten parameters: displacement to the right and down at the window's centre, four
-derivatives of these, brightness and its two slopes, gain. Their columns are those of `basis`.
+derivatives of these, brightness and its two slopes, gain. `basis` returns the columns of the design matrix.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def displacement_pad(frame: Array, padded: Array) -> None:
 def displacement_filter(step: int, source: Array, filtered: Array) -> None:
     """Write the spline's coefficients along one axis: ``step`` is 1 along rows, else the length of a row.
 
-    Values so near the start or end of the whole map that samples are missing are unchanged.
+    Values near the start and end of the map, where samples are missing, are unchanged.
     """
     flat, out, reach = source.reshape(-1).astype(np.float64), filtered.reshape(-1), TAPS * step
     middle = flat[reach:-reach].copy()
@@ -58,9 +58,9 @@ def displacement_filter(step: int, source: Array, filtered: Array) -> None:
 
 
 def displacement_across(window: int, frame: Array, sums: Array, counts: Array) -> None:
-    """Write the sum of the valid samples of a row around each pixel, and their number, mirrored at the ends.
+    """Write the sum and the number of the valid samples of a row around each pixel; ends are mirrored.
 
-    Valid samples are finite, and below the greatest value of an integer type.
+    Valid samples are finite, and below the maximum of an integer type.
     """
     samples, known = _known(frame)
     for values, summed in ((np.where(known, samples, 0.0), sums), (known, counts)):
@@ -79,7 +79,8 @@ def displacement_planes(
 ) -> None:
     """Write the four planes of a reference, (4, H + 2 halo, W + 2 halo), and fill the differences with 0.
 
-    ``coefficients`` are those of its spline, ``sums`` and ``counts`` as of `displacement_across`.
+    ``coefficients`` are the coefficients of its spline; ``sums`` and ``counts`` are results of
+    `displacement_across`.
     """
     samples, known = _known(frame)
     c = coefficients[MARGIN - 1 : 1 - MARGIN, MARGIN - 1 : 1 - MARGIN].astype(np.float64)
@@ -173,14 +174,14 @@ def displacement_warp(
 
     Parameters
     ----------
-    step, start : pixels from node to node, and the place of the first node's centre on either axis
-    halo : pixels round the reference's planes
-    coefficients : of the frame's spline, padded
+    step, start : distance between nodes, and position of the first node's centre on either axis, pixels
+    halo : margin of the planes, pixels
+    coefficients : spline coefficients of the frame, padded
     planes : (4, H + 2 halo, W + 2 halo), of the reference
-    field : (2, rows, columns) of nodes, displacement of the frame to the right and down, pixels
-    difference : (2, H + 2 halo, W + 2 halo), the reference minus the frame, plus the derivatives times the
-        field, so that it is the derivatives times the displacement; and the variance of that, of samples with
-        noise of variance 1; 0 where the reference has no measurement, NaN where the frame ends
+    field : (2, rows, columns), displacement of the frame at the nodes to the right and down, pixels
+    difference : (2, H + 2 halo, W + 2 halo). First, the reference minus the frame plus the derivatives times
+        the field, which equals the derivatives times the displacement. Second, its variance for noise of
+        variance 1. 0 where the reference has no measurement, NaN outside the frame
     """
     rows, columns = (length - 2 * halo for length in planes.shape[1:])
     right, down = interpolate_nodes(field, start, step, (rows, columns))
@@ -235,9 +236,9 @@ def displacement_normals(
     Parameters
     ----------
     step, first, window, planes : as of ``displacement_solve``
-    inverse : (10, 10, rows, columns) of nodes; NaN where it does not exist within rounding: where a column
-        is 0 or not finite, or where the inverse has a Frobenius norm above 1e5 once the diagonal is made 1
-    summary : (4, rows, columns): the inverse's elements 00, 10 and 11, and the window's number of samples
+    inverse : (10, 10, rows, columns); NaN where the matrix is singular within rounding: a column is 0 or not
+        finite, or after scaling the diagonal to 1 the Frobenius norm of the inverse exceeds 1e5
+    summary : (4, rows, columns), elements 00, 10 and 11 of the inverse, and number of samples in the window
     """
     node_rows, node_columns = inverse.shape[2:]
     for row in range(node_rows):
@@ -268,16 +269,16 @@ def displacement_solve(
     inverse: Array,
     answer: Array,
 ) -> None:
-    """Write each node's displacement: least squares in its window.
+    """Write the displacement of each node: least squares in its window.
 
     Parameters
     ----------
-    step, first, window : pixels: from node to node, to where the first window begins, of a window's side
+    step, first, window : distance between nodes, start of the first window, side of a window; pixels
     planes, difference, field : as of ``displacement_warp``
-    inverse : (10, 10, nodes), of the normal matrix of the window's columns; NaN where there is none
-    answer : (9, nodes): displacement, pixels to the right and down; the derivatives of the first and of the
-        second to the right and down, for each half of the window; gain; sum of the squares that are left; and
-        sum of the variances of the differences, of samples with noise of variance 1
+    inverse : (10, 10, nodes), as of ``displacement_normals``
+    answer : (9, nodes): displacement to the right and down, pixels; derivatives of the first and of the
+        second to the right and down, per half window; gain; residual sum of squares; and sum of the variances
+        of the differences for noise of variance 1
     """
     node_rows, node_columns = field.shape[1:]
     for row in range(node_rows):

@@ -93,8 +93,8 @@ def pairs(chosen: Pass) -> tuple[Array, Array]:
     """Return the positions of the pairs of a pass.
 
     ``places``, (WAYS, 3, steps, 2), are columns to the right and rows down, for three parallel lines; the
-    other position is the negative. ``distances``, (WAYS, 3, steps), are those from the pixel along the
-    direction; 0 for duplicates.
+    second position of a pair is the negative. ``distances``, (WAYS, 3, steps), are measured from the pixel
+    along the direction; 0 for duplicates.
     """
     angle = np.pi / WAYS * np.arange(WAYS)
     along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, np.newaxis, np.newaxis]
@@ -130,8 +130,9 @@ def edges_clean(contact: Array) -> Array:
 def edges_cells(vectors: Array, sigma: Array, contact: Array, clean: Array) -> Doubles:
     """Return the cells of one pixel each, (6, H + 2 MARGIN, W + 2 MARGIN), invalid in the margin.
 
-    Vectors are unit normals, NaN where there is none, sigma their standard error, radians. A normal counts
-    only if contact and cleaned contact are set: pixels flagged along a crease saw both of its sides in turn.
+    ``vectors`` are unit normals, or NaN; ``sigma`` is their standard error, radians. A normal is valid only
+    if both ``contact`` and ``clean`` are set: a pixel that only ``clean`` adds along a crease has seen both
+    sides of it in turn.
     """
     known = (clean != 0) & (contact != 0) & np.isfinite(vectors).all(axis=-1) & (sigma >= 0)
     known &= sigma < np.inf
@@ -160,9 +161,9 @@ def edges_join(cells: Doubles, edges: Array) -> Doubles:
 def edges_jumps(cells: Doubles, chosen: Pass, limits: Limits, doubt: Array) -> tuple[Doubles, Array]:
     """Return strengths and directions of the jumps of the normal.
 
-    The strength is the jump in standard errors, in the direction in which that is largest; 0 where there is
-    no edge. The direction is counted clockwise from x as seen in the picture. ``doubt``, (H, W), is updated
-    in place: 1 where the passes so far are too noisy to decide; decided pixels have no jump.
+    The strength is the largest jump over all directions, in standard errors; 0 where there is no edge.
+    Directions are numbered clockwise from x as seen in the picture. ``doubt``, (H, W), is updated in place:
+    1 where all passes so far were too noisy to decide. Pixels already decided get no jump.
     """
     strength, way = np.zeros(doubt.shape), np.zeros(doubt.shape, np.uint8)
     jump, error, least = np.zeros(doubt.shape), np.zeros(doubt.shape), np.full(doubt.shape, np.inf)
@@ -241,8 +242,8 @@ def _straight(sums: Doubles, chosen: Pass) -> tuple[Doubles, Doubles, Mask, Mask
 def edges_thin(strength: Doubles, way: Array, chosen: Pass, edges: Array) -> Array:
     """Add lines, where the strength has a maximum across them, to those drawn so far.
 
-    A pixel is not drawn if a line of earlier passes is within ``guard`` of it, in the direction of its jump
-    or up to 45 degrees from that: it would be the same line.
+    A pixel is not drawn if a line of an earlier pass is within ``guard`` pixels in the direction of its jump,
+    or up to 45 degrees from that: it would duplicate that line.
     """
     added = np.array(edges)
     for row, column in np.argwhere(strength > 0):
@@ -281,7 +282,7 @@ def edges_bound(clean: Array, edges: Array) -> Array:
     """Draw the pixels in contact with one of four neighbours out of contact; adjacent lines are removed."""
     touched = np.pad(clean != 0, 1, constant_values=True)
     inner = touched[:-2, 1:-1] & touched[2:, 1:-1] & touched[1:-1, :-2] & touched[1:-1, 2:]
-    # The picture's border does not count: beyond it everything counts as in contact.
+    # The border of the picture is not an edge: everything beyond it is treated as in contact.
     bound = (clean != 0) & ~inner
     around = np.pad(bound, 1)
     rows, columns = clean.shape

@@ -45,12 +45,12 @@ _patched = False
 def prepare() -> None:
     """Prepare PoCL's environment; call it before OpenCL's platforms are listed.
 
-    PoCL gets folders for its caches, and its compiler the name of this processor.
+    It sets the cache folders of PoCL, and the name of this processor for its compiler.
 
     Raises
     ------
     DeviceError
-        PoCL would end the process for lack of address space.
+        The address space is too small: PoCL would end the process.
     """
     global _processor, _patched
     with _lock:
@@ -64,7 +64,7 @@ def prepare() -> None:
             _processor, _patched = ensure_name(library)
         except OSError as error:
             _processor = "unknown"
-            _log.info("PoCL is not patched, and may not know this processor: %s", error)
+            _log.info("PoCL is not patched, and may not recognise this processor: %s", error)
 
 
 def compiler() -> object:
@@ -82,10 +82,10 @@ def note(driver: str) -> str:
 
 @functools.cache
 def verify(device: cl.Device) -> None:
-    """Check that PoCL can run a kernel; call it before the first one, which could end the process.
+    """Check that PoCL can run a kernel; call it before the first kernel, which could end the process.
 
-    A child process tries, with the system's linker and then with that of the package ``ziglang``. Success is
-    cached in the user's cache folder, for this PoCL, processor, linker and Python.
+    A child process runs a kernel with the system's linker, and then with the linker of the package
+    ``ziglang``. Success is cached in the user's cache folder, for this PoCL, processor, linker and Python.
 
     Raises
     ------
@@ -170,7 +170,7 @@ def find_library() -> Path | None:
 # --- The linker ----------------------------------------------------------------------------------------
 #
 # PoCL links each kernel with the system's `ld` and the development files of libgcc and libc. The package
-# `ziglang` holds LLVM's linker; a small `ld` in front of it leaves those files out: kernels need none.
+# `ziglang` contains LLVM's linker. A wrapper named `ld` omits those files, which kernels do not need.
 
 _LD = """\
 #!/bin/sh
@@ -288,7 +288,7 @@ def kernel_cache() -> Path:
 
 
 def _why_no_cache() -> str | None:
-    """Test the folders that PoCL and pyopencl must be able to write; return None if both can be."""
+    """Return why PoCL or pyopencl cannot write its cache folder, and the remedy; None if both can."""
     variable = "POCL_CACHE_DIR" if "POCL_CACHE_DIR" in os.environ else "XDG_CACHE_HOME"
     needed = [("PoCL", kernel_cache(), variable)]
     if "PYOPENCL_NO_CACHE" not in os.environ:
@@ -312,7 +312,7 @@ def _provide_caches() -> None:
     try:
         folder = tempfile.mkdtemp(prefix="mirrorskin-cache-")
     except OSError:
-        return  # there is no device then, and the message names the problem
+        return  # no device is found then, and its message names the problem
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     os.environ.update(XDG_CACHE_HOME=folder, POCL_CACHE_DIR=str(Path(folder, "pocl")))
     _log.warning("%s; until then kernels are compiled again by every command", problem)
@@ -320,8 +320,8 @@ def _provide_caches() -> None:
 
 # --- The address space -----------------------------------------------------------------------------------
 #
-# PoCL aborts, and LLVM in it crashes, where a limit to the address space ('ulimit -v') refuses a thread or
-# memory. Measured with PoCL 3.0 on two cores, from before its first call to the end of a command: 0.84 GB.
+# PoCL aborts, or its LLVM crashes, if threads or memory exceed the limit of the address space ('ulimit -v').
+# A command with PoCL 3.0 uses 0.84 GB of address space on two cores.
 
 _PLACE, _PLACE_PER_CORE = 800 << 20, 80 << 20  # bytes; a thread has a stack (8 MB) and a heap (64 MB)
 

@@ -2,7 +2,7 @@
 
 
 class DeviceError(Exception):
-    """A device cannot do its work; the message is one line with the reason and the remedy."""
+    """A device failed; the message is one line with the reason and the remedy."""
 
     exit_code = 1
 

@@ -3,14 +3,14 @@
 Noise is a pure function of the seed, the frame and the pixel. Random words come from Philox4x32-10 (Salmon,
 Moraes, Dror and Shaw: Parallel random numbers: as easy as 1, 2, 3. SC11, 2011, doi 10.1145/2063384.2063405),
 which has no state except a counter and a key, and passes TestU01's BigCrush. Box and Muller's transform
-converts two words to two independent normal numbers of up to 6.6 standard deviations. Those of the device
-differ by 1e-6. Its integer counts differ by one where they are next to a half: 5 in a million for 8 bits, 1
-in a thousand for 16 bits.
+converts two words to two independent normal numbers of up to 6.6 standard deviations. The normal numbers of
+the device differ by 1e-6. Its integer counts differ by one where the unrounded value is close to a half: for
+5 in a million counts of 8 bits, and 1 in a thousand of 16 bits.
 
-Shot noise is Poisson's: in electrons, its variance is the mean. A normal number z is transformed by Cornish
-and Fisher's first term, s z + b (z^2 - 1), such that mean and variance of read and shot noise together are
-exact. Their third moment is too small by 4 b^3, which is 2 % of it at one electron. Below that light the
-counts are not Poisson distributed.
+Shot noise is Poisson noise: in electrons, its variance is the mean. A normal number z is transformed by the
+first term of Cornish and Fisher, s z + b (z^2 - 1), such that the mean and variance of read and shot noise
+together are exact. The third moment is too small by 4 b^3, which is 2 % of it at one electron. With less
+light the counts are not Poisson distributed.
 """
 
 from __future__ import annotations

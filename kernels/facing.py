@@ -1,6 +1,6 @@
 """Slopes from normals that are seen along z, and their weights: ``facing.cl`` in NumPy.
 
-`mirrorskin.engine.integration.camera.find_slopes` explains them.
+See `mirrorskin.engine.integration.camera.find_slopes` for the derivation.
 """
 
 from __future__ import annotations

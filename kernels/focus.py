@@ -19,11 +19,12 @@ def focus_scan(frames: Array, first: int, radius: int, reach: int, best: Array, 
     ----------
     frames : (n, H, W), uint8, uint16 or float32
     first : number of the block's first frame in the stack
-    radius : pixels of the window on each side; at the border it has those that there are
-    reach : frames that are kept on each side of the peak
-    best : (H, W), frame of the greatest sum of squares of a window's samples less their mean
-    peak : (2 reach + 1, H, W), that sum in the frames around the best; NaN where there is none
-    recent : (reach, H, W), the sum in the last frames: frame t in plane t % reach
+    radius : half-width of the window, pixels; windows are truncated at the border
+    reach : number of frames kept on each side of the peak
+    best : (H, W), frame with the largest contrast: the sum of squared deviations of the samples of a window
+        from their mean
+    peak : (2 reach + 1, H, W), contrast in the frames around the best; NaN for a missing frame
+    recent : (reach, H, W), contrast in the last frames: frame t in plane t % reach
     """
     for t, frame in enumerate(frames.astype(np.float64), first):
         size, border = (2 * radius + 1, 2 * radius + 1), radius
@@ -54,17 +55,17 @@ def focus_fit(radius: int, reach: int, variance: float, least_contrast: float, l
     Parameters
     ----------
     radius, reach, best, peak : as of `focus_scan`
-    variance : of a sample, counts^2
-    least_contrast : of a peak above that of noise, in standard errors
-    least_curvature : of a peak, in standard errors
-    places : (T, 2 reach + 1), travel of the frames around each frame, from there, in units
+    variance : variance of a sample, counts^2
+    least_contrast : minimum contrast of a peak in excess of that of noise, standard errors
+    least_curvature : minimum curvature of a peak, standard errors
+    places : (T, 2 reach + 1), travel of the frames around each frame, relative to it, in ``unit``
     travel : (T,), mm
-    unit : mm
-    height : (H, W), mm; NaN where there is no peak, as ``spread``
+    unit : unit of ``places``, mm
+    height : (H, W), mm; ``height`` and ``spread`` are NaN where there is no peak
     spread : (H, W), variance of the height, mm^2, for noise of variance 1
-    gain : (H, W), that if all logarithms had the variance 1
-    misfit : (H, W), estimate of the variance of the logarithms in excess of noise, of four points or more;
-        else NaN. Residuals have a chi-square distribution with n degrees of freedom, whose median is
+    gain : (H, W), variance of the height, mm^2, if all logarithms had the variance 1
+    misfit : (H, W), estimated variance of the logarithms in excess of noise; NaN for less than four points.
+        The residual sum of squares has a chi-square distribution with n degrees of freedom, whose median is
         (1 - 2 / 9n)^3 n (Wilson and Hilferty 1931)
     sharpness : (H, W), standard deviation of the window's samples in the sharpest frame, without the noise
     status : (H, W), codes of FocusStatus

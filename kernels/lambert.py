@@ -30,10 +30,10 @@ def lambert_add(frames: Array, lights: Array, fresh: bool, darks: Array, shadow:
     frames : (n, P), uint8, uint16 or float32
     lights : (n, 3)
     darks : (P,) or (1,), counts without light, which are subtracted
-    shadow : counts above dark from which on, exclusively, a sample counts
-    bright : counts up to which, exclusively, a sample counts
-    triangle : (11, P), R by rows with a diagonal that is not negative, its last element squared, which is
-        the sum of the squares that the fit leaves; and the number of samples that counted
+    shadow : lower limit of usable samples (exclusive), counts above dark
+    bright : upper limit of usable samples (exclusive), counts
+    triangle : (11, P). First R by rows, with a diagonal that is not negative; its last element is squared,
+        and is then the residual sum of squares. Then the number of usable samples
     """
     if fresh:
         triangle[:] = 0
@@ -58,11 +58,12 @@ def lambert_normals(triangle: Array, normals: Array, normals_spread: Array, albe
     Parameters
     ----------
     triangle : as of `lambert_add`
-    normals : (P, 3), unit vectors; NaN, as ``albedo``, where the lamps that count are coplanar
-    normals_spread, albedo_spread : (P,), standard deviations for samples with noise of deviation 1
+    normals : (P, 3), unit vectors; ``normals`` and ``albedo`` are NaN if the lamps of the usable samples are
+        coplanar
+    normals_spread, albedo_spread : (P,), standard deviations for noise of standard deviation 1
     albedo : (P,)
-    residual : (P,), standard deviation of a sample; NaN unless more than three count
-    samples : (P,), number of samples that counted
+    residual : (P,), standard deviation of a sample; NaN unless more than three samples are usable
+    samples : (P,), number of usable samples
     """
     r00, r01, r02, r03, r11, r12, r13, r22, r23, rest, used = triangle.astype(np.float64)
     size = np.sqrt(r00**2 + r01**2 + r02**2 + r11**2 + r12**2 + r22**2)

@@ -12,9 +12,9 @@ class Layout:
     Attributes
     ----------
     words : int
-        Words of one work-item, in kernels that take pixels side by side.
+        Vectors per work-item, in kernels that process vectors of pixels.
     tile : int
-        Pixels of one work-item, in kernels that take them one by one.
+        Pixels per work-item, in kernels that process single pixels.
     group : int
         Work-items of a work-group.
     """

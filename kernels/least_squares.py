@@ -17,8 +17,8 @@ A fit has three parts that are independent of each other.
 3. *A scale*. ``mad_sigma`` is the standard deviation of most residuals. With ``rescale``,
    ``fit`` estimates the noise from the residuals, and fits again.
 
-The covariance of a fit is the inverse of its normal matrix. How residuals are correlated, and by how much
-they exceed their standard deviations, is known to the caller, who multiplies by it.
+The covariance of a fit is the inverse of its normal matrix. It assumes independent residuals with the given
+standard deviations; for others, the caller passes a factor (`Fit.covariance`).
 
 Fits whose steps are of another kind have their own loops, with the losses and the scale of this module: many
 small fits at once (`engine.calibration.marks`), rotations from sums on a device (`engine.pose.fit`), sparse
@@ -42,12 +42,12 @@ from mirrorskin.kernels.array_types import Doubles
 
 _MEDIAN = 0.6744897501960817  # median magnitude of a standard normal variate
 _TOLERANCE = 1e-8  # relative decrease of the cost that ends the iteration
-_STEPS = 100  # steps, at most
+_STEPS = 100  # maximum number of steps
 _RIDGE = 1e-12  # relative to the curvature: keeps the damped matrix regular
 _SINGULAR = 1e-13  # relative to the largest eigenvalue of scaled equations: directions without information
 _DIFFERENCE = 1e-8  # step of forward differences; relative for parameters above 1
-_ROUNDS = 8  # fits with noise from the residuals of the one before, at most
-_ALIKE = 0.01  # relative change of this noise below which they end
+_ROUNDS = 8  # maximum number of fits with noise estimated from the preceding fit
+_ALIKE = 0.01  # relative change of this noise that ends the repetition
 
 
 def mad_sigma(residuals: Doubles) -> float:
@@ -64,7 +64,7 @@ class Loss(NamedTuple):
     limit: float
     rho: Callable[[Doubles], Doubles]
     slope: Callable[[Doubles], Doubles]  # derivative of rho
-    curvature: Callable[[Doubles], Doubles] | None = None  # half that of the loss, if it is smooth and convex
+    curvature: Callable[[Doubles], Doubles] | None = None  # half of the loss's, if smooth and convex
 
     def cost(self, residuals: Doubles) -> float:
         """Return the sum of the losses."""
@@ -126,7 +126,7 @@ Bounds = tuple[Doubles, Doubles]
 
 
 class Damping(NamedTuple):
-    """How steps are damped: the matrix that is added to the normal matrix, times a factor."""
+    """Damping of steps: a matrix times a factor is added to the normal matrix."""
 
     first: float = 1e-4  # factor of the first step
     relaxed: float = 30.0  # divisor of the factor after each step that decreases the cost
@@ -222,7 +222,7 @@ def _scale(matrix: Doubles) -> Doubles:
 
 
 class Prior(NamedTuple):
-    """What is known before: combinations of the parameters, divided by their standard deviations."""
+    """Prior information: linear combinations of the parameters, divided by their standard deviations."""
 
     rows: Doubles  # (m, k)
     values: Doubles  # (m,): their means
@@ -239,7 +239,7 @@ class Fit:
     ----------
     parameters : ndarray, (k,)
     residuals : ndarray, (n,)
-        In their unit.
+        In the unit of the samples.
     noise : float or ndarray, (n,)
         Standard deviations of the residuals.
     cost : float
@@ -284,13 +284,13 @@ class Fit:
     def covariance(self, excess: float = 1.0) -> Doubles:
         """Return the covariance of the parameters, (k, k).
 
-        ``excess`` is the ratio of the residuals' variance to that of their standard deviations, or of that of
-        means of residuals if these are correlated.
+        ``excess`` is the ratio of the actual to the assumed variance of the residuals, or, if residuals are
+        correlated, of their means.
         """
         return inverse(self._matrix(excess))
 
     def _matrix(self, excess: float = 1.0) -> Doubles:
-        # Not by BLAS, whose threads wait for each other if other programs use the cores as well.
+        # Without BLAS: its threads wait for each other while other programs use the cores.
         weighted = self.jacobian * (self.information / excess)[:, np.newaxis]
         matrix: Doubles = np.einsum("nk,nl->kl", weighted, self.jacobian)
         return matrix if self._prior is None else matrix + self._prior.rows.T @ self._prior.rows

@@ -11,7 +11,7 @@ Array = NDArray[Any]
 
 
 def read_all(words: Array, each: int, stride: int) -> Array:
-    """Read all words, (n, lanes), once; return a sum modulo 2^32 for each item, so that all are needed.
+    """Read all words, (n, lanes), once; return a sum modulo 2^32 per item, so that no load is optimised away.
 
     An item reads ``each`` words, every ``stride``-th of a block of ``stride * each``.
     """

@@ -36,9 +36,9 @@ def links_flags(dz_dx: Array, dz_dy: Array, mask: Array | None, weight_x: Array 
                 height_weights: Array | None) -> Flags:  # fmt: skip
     """Return flags of the pixels, including their links, (H, W), a sum of the flags above.
 
-    Neighbours are linked if the slopes of both count along the link. Missing slopes and known heights are not
-    finite, missing weights and the mask are 0; all but the slopes may be None: for uniform weights, or
-    ``weight_y`` if it equals ``weight_x``.
+    Neighbours are linked if both slopes along the link are valid. Invalid slopes and unknown heights are not
+    finite; invalid weights and masked pixels are 0. All but the slopes may be None: without ``weight_x``
+    weights are uniform, without ``weight_y`` it equals ``weight_x``.
     """
     wanted = np.ones(dz_dx.shape, bool) if mask is None else mask != 0
     along_x = wanted if weight_x is None else wanted & (weight_x > 0)
@@ -59,8 +59,8 @@ def links_flags(dz_dx: Array, dz_dy: Array, mask: Array | None, weight_x: Array 
 def links_cut(dz_dx: Array, dz_dy: Array, edges: Array, flags: Flags) -> Flags:
     """Return the flags without the links across edges.
 
-    A pixel on an edge keeps one link, to the neighbour off the edge with the most similar slopes; among
-    equals to the one on the right, on the left, below, above, in this order.
+    A pixel on an edge keeps one link, to the neighbour off the edge with the most similar slopes. If several
+    are equal, the order is right, left, below, above.
     """
     cut, marked = flags.copy(), edges != 0
     for row, column in np.argwhere(marked):
@@ -112,15 +112,15 @@ def links_join(dz_dx: Array, dz_dy: Array, flags: Flags, weight_x: Array | None,
     dz_dx, dz_dy, flags, heights, height_weights
         See ``links_flags``.
     weight_x, weight_y : ndarray, (H, W), float32, or None
-        See there; with ``owned`` the links' own weights, of the link to the right and of the one below.
+        See ``links_flags``; if ``owned``, weights of the links to the right and down.
     weights : (float, float, float)
         Factors of the weights of links to the right and down, and of known heights.
     size : (float, float)
         Width and height of a pixel, mm.
     plane : (float, float, float)
-        Slopes along x and y, and height in the picture's top left pixel, of what the heights are relative to.
+        Reference plane of the relief: slopes along x and y, and height in the top left pixel.
     owned : bool
-        Whether the weights are of links, not of pixels.
+        Whether ``weight_x`` and ``weight_y`` are weights of links, not of pixels.
     """
     (right, across), (down, along) = _steps(
         dz_dx, dz_dy, flags, weight_x, weight_y, weights, size, plane, owned
@@ -139,7 +139,7 @@ def links_misfit(dz_dx: Array, dz_dy: Array, flags: Flags, weight_x: Array | Non
                  owned: bool = False) -> float:  # fmt: skip
     """Return the sum that the heights minimise, for ``relief``, (H, W), the heights above the plane.
 
-    The other parameters are those of ``links_join``. The kernel returns a sum for each of its items.
+    For the other parameters see ``links_join``. The kernel returns a sum for each of its items.
     """
     (right, across), (down, along) = _steps(
         dz_dx, dz_dy, flags, weight_x, weight_y, weights, size, plane, owned

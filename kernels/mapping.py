@@ -33,7 +33,7 @@ class Mapping:
         offset: int = 0,
         after: Sequence[cl.Event] = (),
     ) -> None:
-        """Map a part of a buffer, which starts at an offset in bytes, once some events are over."""
+        """Map a part of a buffer, starting at an offset in bytes, after some events."""
         self._maps: list[cl.MemoryMap] = []  # empty after the release
         view, _ = cl.enqueue_map_buffer(
             queue, buffer, flags, offset, shape, dtype, wait_for=after, is_blocking=True
@@ -46,7 +46,7 @@ class Mapping:
             self.release()
 
     def release(self, queue: cl.CommandQueue | None = None) -> None:
-        """Unmap the buffer, unless that was done before; by default on the queue that mapped it."""
+        """Unmap the buffer if it is still mapped; by default on the queue that mapped it."""
         try:
             mapped = self._maps.pop()  # at once, so that no two threads have it
         except IndexError:

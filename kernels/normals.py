@@ -10,8 +10,8 @@ normal: a third step would move it by less than a hundredth of its standard erro
 when the normal moves, where u is the unit vector that points away from a; so sum u u' (gain / noise)^2 is the
 Fisher information, and the trace of its inverse the predicted mean square of the angle to the true normal.
 
-`normals_paper` is eq. 14-22: t is approximated by theta + d cos(phi - alpha), which is valid only well above
-d.
+`normals_paper` implements eq. 14-22: t is approximated by theta + d cos(phi - alpha), which is valid only if
+theta is much larger than d.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ _REACH = 0.25  # maximum step, radians
 _NO_ANSWER = 1.0  # standard error, radians, above which there is no result
 _LEAST = 3  # minimum number of valid samples within their range
 _STEADY = 1e-6  # amplitude, radians, below which rounding determines the azimuth
-_MARGIN = 3.0  # standard deviations from the ends of the range that a sample must have to count as within it
+_MARGIN = 3.0  # minimum distance of a sample within the range from its ends, standard deviations
 _MODEL = 0.2  # RMS error of the model in contact, as a share of the tilt
-_DOUBT = 2.0  # factor by which the variance of the noise may be wrong
+_DOUBT = 2.0  # tolerated ratio of the actual to the assumed variance of the noise
 _REST = 0.5  # share of the tilt below which a mean zenith is that of a sheet at rest
 _MOST = 2.0  # maximum amplitude, in tilts: a pixel with constant brightness looks level and tilted
 _STILL = 0.25  # share of the tilt below which a sheet does not follow the object
@@ -62,15 +62,16 @@ class Limits(NamedTuple):
     Attributes
     ----------
     noise : float
-        Sum of squares that noise explains, in variances of a sample.
+        Largest sum of squares that is attributed to noise, in variances of a sample.
     model : float
-        Sum of squares that the model may leave out, radians squared.
+        Largest sum of squares that is attributed to errors of the model, radians squared.
     still : float
-        Least tilt that a sheet in contact shows, less three standard errors, radians.
+        Minimum apparent tilt of a sheet in contact, radians; three standard errors are tolerated.
     most : float
-        Largest tilt that it shows, more three standard errors, radians.
+        Maximum apparent tilt of a sheet in contact, radians; three standard errors are tolerated.
     rest : float
-        Least mean of the zeniths that it shows, radians. At rest it is 0, in contact the tilt or more.
+        Minimum mean zenith of a sheet in contact, radians: the mean is 0 at rest, and at least the tilt in
+        contact.
     """
 
     noise: float
@@ -83,7 +84,7 @@ class Limits(NamedTuple):
 def contact_limits(freedom: int, tilt: float) -> Limits:
     """Return the limits for a fit with a number of degrees of freedom, (frames - 3).
 
-    The noise's share is the 99.9 % quantile of chi-square, approximated by n + 4.37 sqrt(n) + 5.7 within 3 %.
+    ``noise`` is based on the 99.9 % quantile of chi-square, n + 4.37 sqrt(n) + 5.7 within 3 %.
     """
     noise = _DOUBT * (freedom + 4.37 * math.sqrt(freedom) + 5.7)
     return Limits(noise, (freedom + 3) * (_MODEL * tilt) ** 2, _STILL * tilt, _MOST * tilt, _REST * tilt)
@@ -101,7 +102,7 @@ class Answer:
         Predicted RMS angle to the true normal, radians.
     contact : ndarray, (n,), bool
     mean, cosine, sine, residual : ndarray, (n,), float64
-        Of the samples' fit with one wave a turn, counts.
+        Fit of the samples with one wave per turn, counts.
     """
 
     vectors: Doubles
@@ -120,11 +121,11 @@ def normals_exact(
 
     Parameters
     ----------
-    frames : (N, n), samples of n pixels. Whole counts at the ends of their type are clipped: their likelihood
-        is that of being beyond. A NaN is a missing sample
+    frames : (N, n), samples of n pixels. Integer counts at the ends of their type are clipped: their
+        likelihood is the probability of a value beyond that end. NaN marks a missing sample
     turn : (6, N), cosine and sine of each phase, root of its weight, and its shares in mean, cosine and sine
-    scale : (4,) or (4, n), counts at zenith 0, radians per count, and the zeniths between which brightness is
-        linear. Samples expected outside of them carry no information on the direction
+    scale : (4,) or (4, n), counts at zenith 0, radians per count, and the range of zeniths in which
+        brightness is linear. Samples expected outside this range carry no information on the direction
     tilt : radians
     """
     samples = Samples(frames, turn, scale, noise)
@@ -259,11 +260,11 @@ class Samples:
 
 def conclude(normal: Doubles, sums: Sums, samples: Samples, usable: Array, tilt: float, limits: Limits,
              model: float | Doubles, rest: NDArray[np.bool_]) -> Answer:  # fmt: skip
-    """Return the standard error of a direction, and whether it is one of a lasting contact.
+    """Return the answer for a direction: its standard error, and whether there was contact in all frames.
 
-    The sums are those at the direction, or next to it; ``usable`` is the number of valid samples within their
-    range; ``model`` is the sum of squares of the model's error, in the unit of the samples, squared; ``rest``
-    is where the sheet is at rest.
+    ``sums`` are evaluated at the direction or near it. ``usable`` is the number of valid samples within their
+    range, ``model`` the sum of the squared model errors, in the squared unit of the samples, and ``rest``
+    marks pixels where the sheet is at rest.
     """
     det = sums.m11 * sums.m22 - sums.m12**2
     touching, misfit = touches(sums, det, samples, tilt, limits, model, rest)
@@ -278,7 +279,7 @@ def touches(
     sums: Sums, det: Doubles, samples: Samples, tilt: float, limits: Limits, model: float | Doubles,
     rest: NDArray[np.bool_],
 ) -> tuple[NDArray[np.bool_], Doubles]:  # fmt: skip
-    """Return where residuals are those of a lasting contact, and the factor by which errors exceed the noise.
+    """Return where residuals indicate contact in all frames, and the ratio of the residuals to the noise.
 
     ``det`` is the determinant of the equations.
     """

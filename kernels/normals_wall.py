@@ -51,13 +51,13 @@ class Wall(NamedTuple):
     curve : ndarray, (n,), float64
         The light as a polynomial in q.
     reach : (float, float)
-        The q between which it holds.
+        Range of q in which the curve is valid.
     ends : (float, float)
-        The least and the greatest light within reach.
+        Minimum and maximum light in this range.
     inverse : ndarray, (m,), float64
-        q as a polynomial in the light, about; lights are held between the ends.
+        Approximation of q by a polynomial in the light, which is clipped to ``ends``.
     sense : float
-        1 where a steeper mirror is brighter, -1 where it is darker.
+        1 if a steeper mirror is brighter, -1 if it is darker.
     pivot : (float, float, float)
         From the wall's axis, mm.
     follows : bool
@@ -82,9 +82,9 @@ def normals_wall(
 ) -> Answer:
     """Return the maximum-likelihood normals; samples expected out of range carry no information.
 
-    The arguments are those of ``normals_exact``, except for ``scale``, (5, n): counts without light; light
-    per count; x and y from the wall's axis on the rest plane, and z of the object in the mean pose, mm. The
-    model's error is an angle of the meridian here as well.
+    Arguments as for ``normals_exact``, except ``scale``, (5, n): counts without light; light per count; x and
+    y from the wall's axis on the rest plane, and z of the object in the mean pose, mm. As there, the error of
+    the model is an angle along the meridian.
     """
     ends = np.broadcast_to(np.array(wall.ends)[:, np.newaxis], (2, scale.shape[1]))
     samples = Samples(frames, turn, np.concatenate([scale[:2], ends]), noise)

@@ -5,7 +5,7 @@
 //
 // For the end of the light state (`release` = 1) samples are complemented, which exchanges dark and light.
 //
-// Maps are planes of `stride` pixels, the first `pixels` of which belong to the picture:
+// A map is a plane of `stride` pixels; only the first `pixels` are in the picture:
 //
 // levels   counts at which a pixel turns light, NaN if it cannot; counts of its dark plateau
 // marks    the smallest light sample; the smallest that is not certainly dark; the smallest near the level
@@ -49,8 +49,7 @@ typedef uint Count;
 #define LEAST(a, b) LESSER(a, b)
 #endif
 
-// --- Light samples
-// ----------------------------------------------------------------------------------------------
+// --- Light samples ------------------------------------------------------------------------------------------------
 
 float next_up(const float x)
 {
@@ -135,8 +134,7 @@ __kernel void onset_sure(
     for (int p = 0; p < width; ++p) marks[2 * stride + base + p] = nears[p];
 }
 
-// --- Samples around an onset
-// --------------------------------------------------------------------------------------
+// --- Samples around an onset --------------------------------------------------------------------------------------
 
 // The last frame below `bound`, from frame `from` of a pixel's `series` backwards; the very first counts as
 // dark. The series starts with frame `first`; `last` is the sample before it, and `known` the result there.
@@ -176,8 +174,7 @@ float2 answer(
     return (float2)(-(from + step * share), (look ? known : 0) + (guess ? guessed : 0));
 }
 
-// --- Frame by frame
-// ---------------------------------------------------------------------------------------------
+// --- Frame by frame -----------------------------------------------------------------------------------------------
 
 // Finds the last frames, up to `from`, that were certainly dark and that were not near the level, and the
 // sample after the latter.
@@ -428,7 +425,7 @@ __kernel void onset_scan(
 
     for (int p = 0; p < width; ++p) left[base + p] = remain[p];
     if (!subframe) return;
-    // If the last sample is near the level, the next block could not determine since when.
+    // If the last sample is near the level, the next block cannot determine how long it has been.
     __global const FRAME *restrict final = frames + (size_t)(count - 1) * pixels;
     for (int low = 0, high; low < width; low = high) {
         high = min(low + CHUNK, width);

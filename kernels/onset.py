@@ -95,15 +95,15 @@ def onset_scan(frames: Array, first: int, hold: int, light: Array, sure: Array, 
     ----------
     frames : (n, P), uint8, uint16 or float32
     first : number of the block's first frame in the stack
-    hold : light frames in a row that make an onset
+    hold : number of consecutive light frames that confirm an onset
     light, sure, near : (P,), smallest samples that are light, not certainly dark, near the level
-    onset : (P,), frame at which the run started; ``DARK`` without one, ``INVALID`` after a NaN sample
-    below : (P,), last certainly dark frame before the run; the first frame counts as dark. The kernel keeps
+    onset : (P,), first frame of the run; ``DARK`` without a run, ``INVALID`` after a NaN sample
+    below : (P,), last certainly dark frame before the run; the first frame counts as dark. The kernel stores
         it only where it is not the last frame before the run
-    foot, risen : (P,), last frame before the run that was not near the level, as ``below``, and the sample
-        after it
-    last : (P,), the sample before the block
-    before, at, after : (P,), samples one before and at the onset, and the lesser of the two that follow it
+    foot, risen : (P,), last frame before the run that was not near the level, stored like ``below``, and the
+        sample after it
+    last : (P,), last sample of the preceding block
+    before, at, after : (P,), samples before and at the onset, and the smaller one of the next two
     """
     for number, frame in enumerate(frames, start=first):
         undecided = (onset == DARK) | ((onset >= 0) & (number - onset < hold))
@@ -145,23 +145,24 @@ def onset_heights(onset: Array, below: Array, foot: Array, risen: Array, before:
     behind a lens that blurs: the difference of the two crossings is added to the standard deviation of a
     sample in transition.
 
-    A pixel may also hover about its level, where noise determines the crossing: its step is within the noise,
-    or it was near the level for longer than its step would take. The crossing may then be at any time since
-    the last frame in which it was certainly dark. But if it had risen to its light plateau in one step, and
-    noise hid this at first because that plateau is near the level, the change was in that step. A sample off
-    its plateau by less than an eighth of the step may still be on it, with light from its neighbours.
+    A pixel may also hover about its level, so that noise determines the crossing: its step is within the
+    noise, or it stays near the level for longer than its step takes. The crossing may then be anywhere since
+    the last frame in which the pixel was certainly dark. There is one exception: if a pixel rises to its
+    light plateau in one step, and the plateau is so near the level that noise delays the onset, the crossing
+    is in that step. A sample that differs from its plateau by less than an eighth of the step is treated as
+    on the plateau, because neighbours contribute light.
 
     Without `subframe` the height is that of the paper's equation 4, at the onset itself, whose error is half
     a step on average and up to a whole one.
 
     Parameters
     ----------
-    onset, below, foot, risen, before, at, after : as ``onset_scan`` leaves them
+    onset, below, foot, risen, before, at, after : results of ``onset_scan``
     level, dark : (P,), counts at which a pixel turns light, and of the dark plateau
-    threshold : the share of the way from the dark plateau to the light one at which the level is
-    travel : (T,), mm, one a frame
+    threshold : level, as a share of the range from the dark to the light plateau
+    travel : (T,), mm, per frame
     noise : standard deviation of a sample, counts
-    dark_tolerance, light_tolerance : counts by which a sample on a plateau may differ from it
+    dark_tolerance, light_tolerance : largest difference of a sample on a plateau from the plateau, counts
     """
     status = np.select([onset == INVALID, onset == DARK, onset == 0], [0, 2, 3], 1).astype(np.uint8)
     height = np.full(onset.shape, np.nan)

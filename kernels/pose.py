@@ -52,10 +52,9 @@ def pose_equations(step: int, first: Array, second: Array, poses: Array, sums: A
     first, second : (H, W, 8)
         Records; the two maps may be of different sizes.
     poses : (count, 25)
-        Matrix of the rotation (9), translation (3), the point that further rotations are about (3), x and y
-        of the first map's first pixel and the pixel's size along x and y (4), the same of the second (4),
-        and of both the squared sine of the tilt (2), with which the normals were measured; 1 of normals whose
-        error is the same in all directions.
+        Rotation matrix (9); translation (3); centre of further rotations (3); x and y of the first pixel and
+        pixel size along x and y of the first map (4), and of the second (4); squared sines of the tilts with
+        which the normals of both maps were measured (2), or 1 for normals with isotropic errors.
     sums : (count, blocks, PARTS[-1] or PARTS[-2])
         See `PARTS`.
     """
@@ -116,8 +115,8 @@ def _upright(x: Doubles, y: Doubles) -> Doubles:
 def _interpolate(second: Doubles, place: Doubles, grid: Array) -> tuple[Doubles, Doubles, NDArray[np.bool_]]:
     """Return the records at positions, (8, n), the sums of squared weights, and where four pixels exist.
 
-    All numbers are interpolated linearly. Each pixel adds to the height half of the rise given by its own
-    normal, so that a paraboloid remains one.
+    All numbers are interpolated linearly. To the height, each pixel adds half of the rise computed from its
+    normal, which makes the interpolation exact for paraboloids.
     """
     rows, columns = second.shape[:2]
     x0, y0, step_x, step_y = grid
@@ -167,8 +166,8 @@ def _trace(other: Doubles, xx: Doubles, xy: Doubles, yy: Doubles) -> Doubles:
 def _turn_curvature(turn: Array, x: Doubles, y: Doubles, curvature: Doubles) -> Doubles:
     """Return the second derivatives of a surface's height after a rotation.
 
-    The surface is F = z - h(x, y) = 0, with gradient G and second derivatives M; those of the turned height
-    are -(M_ab + M_az h_b + M_bz h_a + M_zz h_a h_b) / G_z with h_a = -G_a / G_z.
+    The surface is F = z - h(x, y) = 0, with gradient G and second derivatives M. The second derivatives of
+    the rotated height are -(M_ab + M_az h_b + M_bz h_a + M_zz h_a h_b) / G_z with h_a = -G_a / G_z.
     """
     gradient = turn @ _upright(x, y)
     xx, xy, yy = curvature

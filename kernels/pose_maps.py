@@ -1,6 +1,6 @@
 """Records of a map for the fit of a motion: ``pose_maps.cl`` in NumPy with float64.
 
-Records are those of `mirrorskin.kernels.pose`.
+For the format of records see `mirrorskin.kernels.pose`.
 """
 
 from __future__ import annotations
@@ -69,10 +69,10 @@ def pose_records(
 ) -> None:
     """Write the records of a map without second derivatives, (H, W, 8), and its slopes, (2, H, W).
 
-    Records and slopes of a pixel that is not used are NaN. All maps but the height may be missing (None).
-    Normals are those of the ``gradient``, (H, W, 2), if there are none. Heights of components whose offset is
-    unknown are not compared. A pixel is not used if it is filled, steep, or at most two pixels away from an
-    edge or a pixel without contact.
+    Records and slopes of unused pixels are NaN. All maps but the height may be None. Without normals, they
+    are computed from the ``gradient``, (H, W, 2). Heights of components with unknown offset are not compared.
+    A pixel is not used if it is filled, steep, or at most two pixels away from an edge or a pixel without
+    contact.
     """
     if normals is None:
         assert gradient is not None
@@ -110,17 +110,18 @@ def pose_curvature(step_x: float, step_y: float, slopes: Array, records: Array) 
 
 
 def pose_halve(fine: Array, records: Array) -> None:
-    """Write records at half the resolution: means of 2 x 2 pixels, if all four are known."""
+    """Write records at half the resolution: means of 2 x 2 pixels, if all four are valid."""
     rows, columns = records.shape[:2]
     records[...] = fine[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2, 8).mean(axis=(1, 3))
     records[..., [2, 4]] /= 4
 
 
 def pose_summary(x0: float, y0: float, step_x: float, step_y: float, records: Array, summary: Array) -> None:
-    """Write what each strip of 16 pixels of a row contains, (strips, 6), row after row.
+    """Write six numbers for each strip of 16 pixels of a row, (strips, 6), row after row.
 
-    The number of known pixels, and of those with a height or a normal to compare; the sums of x, y and z; and
-    the sum of squared distances from the strip's mean, mm^2. ``x0`` and ``y0`` are those of the first pixel.
+    They are the number of valid pixels, the number with a height or a normal to compare, the sums of x, y and
+    z, and the sum of squared distances from the mean of the strip, mm^2. ``x0`` and ``y0`` are the position
+    of the first pixel.
     """
     rows, columns = records.shape[:2]
     row, column = np.indices((rows, columns))

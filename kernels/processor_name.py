@@ -60,7 +60,7 @@ def ensure_name(library: Path) -> tuple[str, bool]:
         return known, False
     name = choose_name(_read_flags())
     _answer_with(start, name)
-    _log.info("PoCL does not know this processor; it compiles for %s", name)
+    _log.info("PoCL does not recognise this processor; it compiles for %s", name)
     return name, True
 
 

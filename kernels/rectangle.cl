@@ -16,8 +16,8 @@
 // `size`, its transform is a convolution of `size` points (Bluestein 1970).
 //
 // The spectrum is stored in strips of 2 * LANES slots, for modes k, k + 1 ... of rows and then length - k, length - k - 1 ...
-// A strip contains so many numbers of each of `padded` rows, and a group transforms its columns at once. Numbers of similar
-// magnitude are paired, because each is affected by the rounding of the other.
+// A strip contains these slots for each of `padded` rows, and a group transforms all columns of a strip at once. Numbers of
+// similar magnitude are paired, because each is affected by the rounding of the other.
 
 #include "common.clh"
 

@@ -54,8 +54,8 @@ __kernel void registration_admit(
     }
 }
 
-// Each position has five numbers: its location in the padded frame, and the four samples of which it is the
-// mean.
+// Each of `places` has five numbers: a location in the padded frame, and the locations of the four samples to
+// be averaged.
 __kernel void registration_mend(const int count, __global const int *restrict places, OUT padded)
 {
     const int first = get_global_id(0) * TILE, end = min(first + TILE, count);

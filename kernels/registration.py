@@ -1,16 +1,25 @@
 """Registration of frames: ``registration.cl`` in plain NumPy with float64.
 
-A sample between pixels is that of the cubic through the four nearest samples of a row and of a column
-(Lagrange's formula): 16 samples, with weights that sum to one. Independent noise of the samples is scaled by
-the root of the weights' sum of squares, 0.64 to 1.
+Frames are interpolated by the cubic through the four nearest samples of a row and of a column (Lagrange's
+formula): 16 samples, with weights that sum to one. Independent noise of the samples is scaled by the root of
+the sum of the squared weights, 0.64 to 1.
 
-RMS errors in counts, for frames of the twin with pixels of 0.05 mm, a gain of 265 counts per radian, and a
-lens that blurs by 0.5 pixels, of linear interpolation, Keys' cubic convolution, this, and the quintic through
-six samples: ball 0.08, 0.03, 0.03, 0.02; ridges every 2 mm 0.70, 0.19, 0.19, 0.13; ridges every 0.6 mm 4.2,
-1.4, 1.3, 0.7; coin 1.8, 0.8, 0.8, 0.6. The noise of a sample is 1.5 counts, and is scaled on average by 0.67,
-0.80, 0.77 and 0.82. So the error of linear interpolation exceeds the noise; the gain of six samples is below
-the noise, at twice the work, and they lose more around missing samples. At the creases of a picture without
-blur no formula helps.
+RMS errors in counts for frames of the digital twin, with pixels of 0.05 mm, a gain of 265 counts per radian
+and a lens that blurs by 0.5 pixels:
+
+==========================  ======  ==========  ==========  =======
+object                      linear  Keys cubic  this cubic  quintic
+==========================  ======  ==========  ==========  =======
+ball                        0.08    0.03        0.03        0.02
+ridges every 2 mm           0.70    0.19        0.19        0.13
+ridges every 0.6 mm         4.2     1.4         1.3         0.7
+coin                        1.8     0.8         0.8         0.6
+scale of the noise (mean)   0.67    0.80        0.77        0.82
+==========================  ======  ==========  ==========  =======
+
+The noise of a sample is 1.5 counts. The error of linear interpolation exceeds it. The quintic through six
+samples improves by less than the noise, takes twice the operations, and loses more pixels around missing
+samples. No formula is accurate at creases of a picture without blur.
 """
 
 from __future__ import annotations
@@ -43,8 +52,8 @@ def registration_admit(frame: Array, offset: Array, gain: Array, padded: Array) 
 def registration_mend(places: Array, padded: Array) -> None:
     """Replace each sample that is never valid by the mean of four samples.
 
-    ``places``, (n, 5), are their positions in the padded frame, row by row, and the positions of the four
-    samples, which are not replaced themselves.
+    ``places``, (n, 5), are the flat positions of the sample and of the four samples in the padded frame. None
+    of the four is replaced itself.
     """
     flat = padded.reshape(-1)
     flat[places[:, 0]] = flat[places[:, 1:]].astype(np.float64).mean(axis=1)
@@ -75,10 +84,9 @@ def registration_resample(
     shift : (2, 4) or (2, 7), displacement of the point of a pixel to the right and down, pixels: a constant,
         and coefficients of column, row and height in mm; optionally also of the column's square, the column
         times the row, and the row's square
-    registered : (H, W), counts on the scale of the pixel that they come to, NaN where one of the 16 samples
-        is missing
-    noise : (2, H, W), sums over the frames: of the squared factors by which the noise of a sample is scaled,
-        and of the samples; both are added to where there is a sample
+    registered : (H, W), counts on the scale of the target pixel; NaN where one of the 16 samples is missing
+    noise : (2, H, W), sums over the frames, updated where there is a sample: of the squared factors that
+        scale the noise of a sample, and of the samples
     """
     rows, columns = height.shape
     column, row = np.meshgrid(np.arange(float(columns)), np.arange(float(rows)))

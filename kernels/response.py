@@ -49,12 +49,12 @@ def wall_light(place: ArrayLike, normals: ArrayLike, geometry: Sequence[float], 
     Parameters
     ----------
     place : (5, n) or (5, N, n), x and y on the rest plane from the body's axis, mm; height z of the mirror,
-        mm; by how much the line of sight moves along x and y for each millimetre of z
+        mm; shift of the line of sight along x and y per mm of z
     normals : (N, n, 3), unit vectors in the body's frame
     geometry : radius of the body and height of the wall, mm; half-angle of the scatter, radians
     lamps : relative increase of the wall's brightness towards x and y
     curve : polynomial in q, from the lowest power on
-    reach : lowest and highest q at which the curve is known
+    reach : range of q in which the curve is valid
     """
     _, _, ray = _follow(place, normals, geometry[0])
     q = half_tangent(ray.height, geometry[0])
@@ -111,8 +111,8 @@ def follow(point: Doubles, sight: Doubles, normal: Doubles, radius: float, close
     """Return lines of sight from points of mirrors to the wall.
 
     Points, (3, ...), are mm from the body's axis and above the rest plane; ``sight`` and ``normal`` are unit
-    vectors. Outside the wall the result is undefined, or that for ``closest``: the least difference of the
-    squared radius and a point's squared distance from the axis.
+    vectors. Outside the wall the result is undefined, unless ``closest`` is given: the lower limit of the
+    squared radius minus the squared distance from the axis.
     """
     x, y, z = point
     ray = sight - 2 * (sight * normal).sum(axis=0) * normal
@@ -132,7 +132,7 @@ def half_tangent(height: Doubles, radius: float) -> Doubles:
 def level(q: Doubles, curve: ArrayLike, reach: Sequence[float]) -> tuple[Doubles, Doubles]:
     """Return the curve's value and slope; the slope is constant out of reach."""
     polynomial = np.polynomial.polynomial
-    powers = np.append(np.asarray(curve, np.float64), 0.0)  # a constant has a slope, too
+    powers = np.append(np.asarray(curve, np.float64), 0.0)  # so that a constant curve has a derivative
     held = np.asarray(np.clip(q, reach[0], reach[1]), np.float64)
     slope = np.asarray(polynomial.polyval(held, polynomial.polyder(powers)), np.float64)
     return polynomial.polyval(held, powers) + slope * (q - held), slope

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 def samples_take(
     lines: int, count: int, values: NDArray[Any], first: int, apart: int, step: int
 ) -> NDArray[Any]:
-    """Return every ``step``-th value of lines that start ``apart``, from a first one on, (lines, count)."""
+    """Return values of an array, (lines, count): value j of line i has index first + i apart + j step."""
     flat = values.reshape(-1)[first:]
     strides = apart * flat.itemsize, step * flat.itemsize
     return as_strided(flat, (lines, count), strides, writeable=False).copy()

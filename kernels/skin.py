@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.kernels.array_types import Doubles
 
-ROUNDS = 200  # fixed-point iterations to a point of the skin; each gains a factor of the surface's strain
+ROUNDS = 200  # maximum number of fixed-point iterations; each reduces the error by the surface's strain
 CLOSE = 1e-4  # tolerance of a point of the skin, pixels
 FLAKES = 512  # period of the coefficients of flakes along each axis
 
@@ -34,10 +34,10 @@ def skin_displacement(
 
     Parameters
     ----------
-    shift : (2, R, C), u along x and y (up), mm; beyond its edge it continues as it ends
-    displacement : (2, H, W), mm; a guess before, NaN where the skin's surface would fold afterwards
-    place_x, place_y : of the body, mm; or the angle, radians, and nothing
-    along_x, along_y : mm, size of a pixel of both maps, which have the same centre
+    shift : (2, R, C), u along x and y (up), mm; extrapolated by its border values
+    displacement : (2, H, W), mm; the initial value, replaced by the result: NaN where the skin would fold
+    place_x, place_y : position of the body, mm; for a twist the angle, radians, and an ignored number
+    along_x, along_y : pixel size of both maps, which have the same centre, mm
     twist : 1 for a twist
     """
     rows, columns = displacement.shape[1:]
@@ -70,16 +70,16 @@ def skin_flakes(
     spacing: float,
     twist: int = 0,
 ) -> Doubles:
-    """Return the share of flakes, (H, W), that pixels see on the skin: a cubic B-spline, 0 to 1.
+    """Return the share of flakes on the skin seen by each pixel, (H, W): a cubic B-spline, 0 to 1.
 
     Parameters
     ----------
     shift, place_x, place_y, along_x, along_y, twist : see `skin_displacement`
-    seen : (2, H, W), mm from a pixel along x and y to the point that it sees
-    flakes : (`FLAKES`, `FLAKES`), coefficients by x and y, 0 or 1, which repeat without end
-    cell_x, cell_y, part_x, part_y : (W,) and (H,), where the skin that was at pixels at the press has its
-        coefficients: a whole number, and the rest
-    spacing : of coefficients, mm
+    seen : (2, H, W), offset along x and y from a pixel to the point that it sees, mm
+    flakes : (`FLAKES`, `FLAKES`), coefficients by x and y, 0 or 1, periodic
+    cell_x, cell_y, part_x, part_y : (W,) and (H,), position among the coefficients of the skin that was at
+        each pixel at the press: integer part, and remainder
+    spacing : distance of coefficients, mm
     """
     from scipy.ndimage import map_coordinates
 

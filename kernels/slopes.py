@@ -1,6 +1,6 @@
 """Slopes and their weights from normals: ``slopes.cl`` in NumPy with float64.
 
-`mirrorskin.engine.rotation.normals_to_height.find_slopes` explains the variances and the bias.
+See `mirrorskin.engine.rotation.normals_to_height.find_slopes` for the variances and the bias.
 """
 
 from __future__ import annotations
@@ -51,10 +51,11 @@ def weigh(
 ) -> tuple[Array, Array]:
     """Return the result of `slopes_weigh` in the precision of the arguments.
 
-    The direction of the meridian is taken from the surroundings: with a pixel's own azimuth, slopes shortened
-    by noise would get other weights than lengthened ones, and their weighted mean would be biased. Squares of
-    components are equal on both sides of a ridge; noise of the azimuth reduces the contrast of their means by
-    exp(-2 variance). An error e of the azimuth also shortens the slope by e^2 / 2.
+    The direction of the meridian is averaged over the surroundings: if it depended on the noise of the pixel
+    itself, slopes shortened and lengthened by noise would get different weights, and the weighted mean would
+    be biased. Squares of components are averaged, because they are equal on both sides of a ridge; noise of
+    the azimuth reduces the contrast of their means by exp(-2 variance). An error e of the azimuth also
+    shortens the slope by e^2 / 2.
     """
     known = np.isfinite(dz_dx)
     variance = np.where(known, sigma, 1) ** 2

@@ -40,19 +40,20 @@ def wall_light(sheet: Array, places: Array, rays: Array, table: Array, radius: f
     Parameters
     ----------
     sheet : (3, P), height of the sheet, mm, and its slopes along x and y, at the points that the pixels see
-    places : (2, P) or (4, P), x and y of each pixel on the rest plane, mm; by how much the line of sight
-        moves along x and y for each millimetre of z, if it is not straight
-    rays : (S, 3), how the sheet spreads a mirrored ray: parts of unit vectors along that ray, along the
-        direction in which the ray's height at the wall changes fastest, and across both
-    table : (rows + 2, columns + 2), the wall's radiance, unrolled from inside: its rows go down from the rim
-        to the rest plane, its columns counter-clockwise from azimuth -pi to pi; at the middle of ``rows`` by
-        ``columns`` equal pieces and once beyond each edge, so that every place on the wall lies between four
-    radius, rim, gap : of the body; of the wall's upper edge above the rest plane; between body and wall: mm
+    places : (2, P) or (4, P), x and y of each pixel on the rest plane, mm; for oblique lines of sight also
+        their shift along x and y per mm of z
+    rays : (S, 3), spread of a reflected ray by the sheet: components of unit vectors along that ray, along
+        the direction in which its height at the wall changes fastest, and across both
+    table : (rows + 2, columns + 2), radiance of the wall, unrolled as seen from inside: rows from the rim
+        down to the rest plane, columns counter-clockwise from azimuth -pi to pi. Samples are in the middle of
+        ``rows`` x ``columns`` equal tiles, with one more beyond each edge for the interpolation
+    radius, rim, gap : radius of the body, height of the rim above the rest plane, and width of the gap
+        between body and wall, mm
     index : refractive index of the body
-    scatter : largest angle between a ray and the reflected one, radians, with which the kernel detects dark
-        pixels quickly
-    fade : angle over which a ray fades at the rim and at the rest plane, so that few rays make no visible
-        steps, radians; 0 for hard edges
+    scatter : largest angle between a ray and the reflected one, radians; the kernel uses it to skip dark
+        pixels
+    fade : angle over which a ray fades at the rim and at the rest plane, radians, which avoids visible steps
+        if there are few rays; 0 for hard edges
     asymmetry_x, asymmetry_y : relative increase of the wall's brightness towards x and y
     """
     z, slope_x, slope_y = sheet.astype(np.float64)
@@ -107,9 +108,9 @@ def _cross_gap(x: Floats, y: Floats, ray: Floats, cosine: Floats, per_way: Float
                gap: float, index: float) -> tuple[Floats, Floats, Floats, Floats]:  # fmt: skip
     """Return the intersection of a ray with the wall, an equivalent inverse length, and the transmission.
 
-    The length is that of a straight ray with the same rise. Without a gap nothing is lost. With one, the ray
-    is refracted at the body's side (Snell), part of it is reflected there (Fresnel, unpolarised), and it
-    crosses the gap.
+    A straight ray of the equivalent length has the same rise. Without a gap the transmission is 1. With a
+    gap, the ray is refracted at the side of the body (Snell) and partly reflected there (Fresnel,
+    unpolarised), and crosses the gap.
     """
     way = 1 / np.maximum(per_way, _LEAST)
     at_x, at_y = x + way * ray[0], y + way * ray[1]

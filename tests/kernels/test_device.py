@@ -384,7 +384,7 @@ def test_a_cache_that_cannot_be_written_is_said_so(device, monkeypatch):
 
 
 def test_a_kernel_that_cannot_be_read_is_said_so(device, tmp_path):
-    with pytest.raises(DeviceError, match=r"gone\.cl cannot be read .*; install mirrorskin anew"):
+    with pytest.raises(DeviceError, match=r"gone\.cl cannot be read .*; reinstall mirrorskin"):
         device.kernel(tmp_path / "gone.cl", "copy_all")
 
 
@@ -393,7 +393,7 @@ def test_a_queue_that_is_lost_is_said_so(device, monkeypatch):
         raise lost()
 
     monkeypatch.setattr(device, "queue", SimpleNamespace(flush=flush))
-    with pytest.raises(DeviceError, match=r"cannot start its work: .*; if that goes on, choose another"):
+    with pytest.raises(DeviceError, match=r"cannot start its work: .*; if this persists, choose another"):
         device.flush()
 
 
