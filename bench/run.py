@@ -49,8 +49,8 @@ def main() -> None:
 @click.argument("patterns", nargs=-1, metavar="[CASE]...")
 @click.option("--output", "-o", type=_FILE, metavar="RUN.json", help="Write a run, and its tables to RUN.md.")
 @click.option("--folder", type=_FILE, metavar="DIR", help="Folder for temporary files of 2 GB.")
-@click.option("--device", metavar="NAME", help="As in 'mirrorskin devices'.")
-@click.option("--quick", is_flag=True, help="Small inputs, to check that works agree.")
+@click.option("--device", metavar="NAME", help="A device listed by 'mirrorskin devices'.")
+@click.option("--quick", is_flag=True, help="Small inputs, only to check that results agree.")
 @click.option("--list", "list_", is_flag=True, help="Print the names of the cases only.")
 def run_cases(
     patterns: tuple[str, ...],
@@ -78,7 +78,7 @@ def run_cases(
                 click.echo(f"{len(cases) + 1} of {len(names)}: {name}", err=True)
                 cases.append(CASES[name](opened, quick))
     finally:
-        if cases:  # also before an error or Ctrl-C: what is done took minutes
+        if cases:  # also after an error or Ctrl-C: finished cases took minutes
             run = describe_run(opened, cases, quick)
             click.echo(report.as_markdown(run))
             if output is not None:
@@ -91,7 +91,7 @@ def run_cases(
 @click.argument("before", type=_FILE, metavar="A.json")
 @click.argument("after", type=_FILE, metavar="B.json")
 def compare_runs(before: Path, after: Path) -> None:
-    """Compare two runs work by work: what changed by more than its rounds vary."""
+    """Compare the times of two runs with the variation between rounds."""
     click.echo(compare.as_text(open_run(before), open_run(after)))
 
 
@@ -128,7 +128,7 @@ def choose(patterns: Iterable[str]) -> list[str]:
 
 
 def check_accuracy(cases: Iterable[Case]) -> None:
-    """Raise InaccurateError if a bound of accuracy was missed: a device that is fast and wrong fails."""
+    """Raise InaccurateError if a bound of accuracy was missed: a device must not be fast but wrong."""
     missed = [
         f"{case.name}, {target.what}: {target.measured}, must be {target.bound}"
         for case in cases
@@ -143,7 +143,7 @@ def check_accuracy(cases: Iterable[Case]) -> None:
 
 @contextmanager
 def _temporary_files(folder: Path | None) -> Iterator[None]:
-    """Let temporary files, also those of programs that are started, go to a folder."""
+    """Place temporary files, also of child processes, in a folder."""
     if folder is None:
         yield
         return

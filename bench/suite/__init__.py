@@ -1,1 +1,1 @@
-"""The benchmark suite of the developers: cases, one module for each subject, and the pages made of runs."""
+"""The benchmark suite for developers: cases, one module per subject, and pages generated from runs."""

@@ -26,21 +26,21 @@ Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _FRAMES = 40
-_STEP = 0.05  # mm of travel a frame
+_STEP = 0.05  # travel per frame, mm
 _LEVELS = {"uint8": (20.0, 220.0), "uint16": (300.0, 3500.0), "float32": (20.0, 220.0)}
 _CHANGE_NOISE = 0.01  # divided by bright minus dark
 _SHAPE, _SMALL = (240, 320), (48, 64)
 
 
 def run_press(device: Device, quick: bool) -> Case:
-    """Compare onsets and change-points of sudden changes and ramps with their truth, in each type.
+    """Compare onsets and change-points of sudden changes and ramps with the truth, for each sample type.
 
-    A sudden change is anywhere in the interval between two frames, so that its error has a uniform
-    distribution. On a ramp, a straight line through the samples on both sides of the level gives the
-    crossing, whose error is due to their noise alone.
+    A sudden change may be anywhere between two frames, so its error is distributed uniformly. On a ramp, the
+    crossing is computed from a straight line through the samples on both sides of the level, and its error is
+    due to their noise alone.
     """
     shape = _SMALL if quick else _SHAPE
-    slack = 4 / np.sqrt(2 * shape[0] * shape[1])  # of a root mean square: four of its standard errors
+    slack = 4 / np.sqrt(2 * shape[0] * shape[1])  # four standard errors of a root mean square
     targets = []
     for kind in _LEVELS:
         targets += _sudden(kind, shape, device, slack)
@@ -72,7 +72,7 @@ def _ramps(kind: str, shape: tuple[int, int], device: Device, slack: float) -> l
     noise = _press_noise(kind)
     onset = find_onset(frames, **known, noise=noise, device=device)
     change = find_change_point(frames, **known, noise=noise, device=device)
-    share = np.ceil(place) - place  # of the interval after the crossing
+    share = np.ceil(place) - place  # share of the interval after the crossing
     span = _LEVELS[kind][1] - _LEVELS[kind][0]
     line = noise * lasts / span * np.sqrt(np.mean(share**2 + (1 - share) ** 2))
     best = noise * lasts / span / np.sqrt(lasts)  # Cramer-Rao bound for known levels
@@ -98,7 +98,7 @@ def _changes(kind: str, place: Doubles, lasts: float) -> tuple[NDArray[Any], dic
 
 
 def _press_noise(kind: str) -> float:
-    """Return the standard deviation of a sample, counts, including that of rounding."""
+    """Return the standard deviation of a sample, including rounding, counts."""
     light = _CHANGE_NOISE * (_LEVELS[kind][1] - _LEVELS[kind][0])
     return light if kind == "float32" else float(np.hypot(light, 1 / np.sqrt(12)))
 
@@ -116,7 +116,7 @@ def _rms(error: Doubles) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 
-# Degrees. At the tilt a normal is parallel to an axis of the body, where linear theory has its limit.
+# Degrees. A normal inclined by the tilt is parallel to an axis of the body, where linear theory fails.
 _BINS = (0, 1), (1, 2), (2.4, 2.6), (3, 5), (5, 10), (10, 20), (20, 35), (35, 50), (50, 58)
 _DRAWS, _FEW_DRAWS = 10_000, 2_000
 _PHASES = np.arange(STEPS, dtype=np.float64) * (2 * np.pi / STEPS)
@@ -133,7 +133,7 @@ class Sensor:
 
     @property
     def spread(self) -> float:
-        """Standard deviation of a sample, including that of rounding."""
+        """Standard deviation of a sample, including rounding."""
         return self.noise if self.kind == "float32" else float(np.hypot(self.noise, 1 / np.sqrt(12)))
 
     @property
@@ -150,7 +150,7 @@ _SENSORS = (
 
 
 def expose(normals: Doubles, sensor: Sensor, seed: int) -> NDArray[Any]:
-    """Return the frames, (STEPS, ...), of normals, (..., 3), by equation 10, with noise."""
+    """Return noisy frames, (STEPS, ...), of normals, (..., 3), computed by equation 10."""
     angle = np.arccos(np.clip(_axes() @ np.moveaxis(normals, -1, 0).reshape(3, -1), -1, 1))
     counts = sensor.offset + sensor.gain * angle.reshape(STEPS, *normals.shape[:-1])
     counts += np.random.default_rng(seed).normal(0, sensor.noise, counts.shape)
@@ -165,7 +165,7 @@ def toward(zenith: Doubles, azimuth: Doubles) -> Doubles:
 
 
 def run_normals(device: Device, quick: bool) -> Case:
-    """Compare normals with the Cramer-Rao bound of equation 10 in bins of zenith, in each type."""
+    """Compare normals with the Cramer-Rao bound of equation 10 in bins of zenith, for each sample type."""
     draws = _FEW_DRAWS if quick else _DRAWS
     slack = 0.02 + 3 / np.sqrt(draws)
     generator = np.random.default_rng(5)
@@ -201,7 +201,7 @@ def _score_normals(truth: Doubles, sensor: Sensor, device: Device, slack: float)
 
 
 def _bound(normals: Doubles, sensor: Sensor) -> Doubles:
-    """Return the least mean square error of an unbiased estimate, radians squared, (...).
+    """Return the minimum mean square error of an unbiased estimate, radians squared, (...).
 
     Each frame measures the angle to an axis: the information is (gain / sigma)^2 times the sum of u u', with
     u the tangent at the normal that points away from the axis. Its trace is N, and its determinant in the
@@ -224,11 +224,11 @@ def _axes() -> Doubles:
 
 
 _PIXEL = 0.05  # mm
-_RADIUS = 5.0  # of the ball, mm
-_PRESS_STEP = 0.1  # of the press, mm
-_LIT = np.radians([11.8, 45.0])  # zeniths that turn light
+_RADIUS = 5.0  # radius of the ball, mm
+_PRESS_STEP = 0.1  # travel per frame of the press, mm
+_LIT = np.radians([11.8, 45.0])  # zeniths between which a pixel is light
 _DEEP = np.radians(57.0)  # zenith up to which the sheet touches the ball
-_SLOPE_NOISE = 0.02  # of a slope
+_SLOPE_NOISE = 0.02  # standard deviation of a slope
 
 
 class Known(NamedTuple):
@@ -240,7 +240,7 @@ class Known(NamedTuple):
 
 
 def run_surfaces(device: Device, quick: bool) -> Case:
-    """Compare heights from exact slopes with analytic surfaces: whole pictures, masks and noise."""
+    """Compare heights from slopes of analytic surfaces with the truth: whole pictures, masks and noise."""
     shape = (45, 60) if quick else (600, 801)
     targets = []
     for name, (make, bound) in _SURFACES.items():
@@ -259,7 +259,7 @@ def _plane(x: Doubles, y: Doubles) -> Known:
 
 
 def _cubic(x: Doubles, y: Doubles) -> Known:
-    """Return a polynomial of third degree, which the rule of four pixels integrates exactly."""
+    """Return a cubic polynomial, which the four-pixel formula integrates exactly."""
     u, v = x / np.ptp(x), y / np.ptp(x)
     height = np.ptp(x) * (0.3 * u**3 - 0.2 * u**2 + 0.4 * v**3 + 0.1 * u)
     return Known(height, 0.9 * u**2 - 0.4 * u + 0.1, 1.2 * v**2)
@@ -273,7 +273,7 @@ def _bump(x: Doubles, y: Doubles) -> Known:
 
 
 def _waves(x: Doubles, y: Doubles) -> Known:
-    """Return waves 40 pixels long, across each other."""
+    """Return crossed waves with a wavelength of 40 pixels."""
     k = 2 * np.pi / (40 * _PIXEL)
     return Known(
         0.3 / k * np.sin(k * x) * np.cos(k * y),
@@ -291,7 +291,7 @@ _SURFACES: dict[str, tuple[Callable[[Doubles, Doubles], Known], float]] = {
 
 
 def _noisy(device: Device, quick: bool) -> list[Target]:
-    """Return the target that the errors of noisy slopes agree with sigma."""
+    """Return the target that errors of heights from noisy slopes agree with sigma."""
     shape, draws = ((24, 30), 3) if quick else ((60, 80), 20)
     known = _waves(*_grid(shape))
     generator, square = np.random.default_rng(9), []
@@ -306,7 +306,7 @@ def _noisy(device: Device, quick: bool) -> list[Target]:
 
 
 def run_fusion(device: Device, quick: bool) -> Case:
-    """Compare the fused surface of a ball with it: a press in steps, and a turn of equation 10 with noise."""
+    """Compare a ball fused from a stepwise press and a noisy turn by equation 10 with the truth."""
     size = 101 if quick else 201
     x, y = _grid((size, size))
     x, y = 201 / size * x, 201 / size * y

@@ -1,6 +1,6 @@
-"""A batch of small recordings: the time of a file beyond computation, reading and writing.
+"""A batch of small recordings: the overhead per file in addition to computation, reading and writing.
 
-Target: at most 5 ms a file.
+Target: at most 5 ms per file.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ BATCH, LOOP = f"{OURS}, batch", f"{OURS}, open, reconstruct and save in a loop"
 LEAST = "kernels and plain reads and writes alone"
 
 _COUNT, _SHAPE, _FEW, _QUICK = 200, (32, 480, 640), 3, (12, 48, 64)
-_BOUND = 5.0  # ms a file
+_BOUND = 5.0  # ms per file
 _ROUNDS = 5
 _COPIES = 16  # of the frames of a file: the limits exceed the cache
 
 
 def run_batch(device: Device, quick: bool) -> Case:
-    """Time a batch next to its minimum: frames mapped into memory, kernels, and maps written as bytes."""
+    """Time a batch and the minimum: mapping the frames into memory, the kernels, writing maps as bytes."""
     count, shape = (_FEW, _QUICK) if quick else (_COUNT, _SHAPE)
     size, extra = count * math.prod(shape), MAPS * math.prod(shape[1:])
     check_memory("batch-small", size + 2 * extra)
@@ -77,7 +77,7 @@ CASES: Cases = {"batch-small": run_batch}
 
 
 def _record_all(press: Frames, count: int, folder: Path) -> list[Path]:
-    """Write recordings of one press: all have the same frames."""
+    """Write recordings with the same frames of a press."""
     first, *others = [folder / f"press-{number:03}.h5" for number in range(count)]
     record(press, first)
     for path in others:
@@ -87,7 +87,7 @@ def _record_all(press: Frames, count: int, folder: Path) -> list[Path]:
 
 
 def _frames_offset(path: Path) -> int:
-    """Return the byte of a recording at which its frames start."""
+    """Return the offset of the frames in a recording, bytes."""
     import h5py
 
     from mirrorskin.io.layout import STACK
@@ -126,7 +126,7 @@ def _loop(jobs: list[Job], device: Device) -> dict[str, NDArray[Any]]:
 
 
 def _run(jobs: list[Job], device: Device) -> None:
-    """Run the batch; no job may fail or find its result."""
+    """Run the batch; no job may fail, or find an existing result."""
     for outcome in run_local(jobs, Plan(), [device]):
         if outcome.state != "done":
             raise DisagreementError(f"{BATCH}: {outcome.job.source.name} {outcome.state}: {outcome.message}")

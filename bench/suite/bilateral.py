@@ -20,13 +20,13 @@ _MOST, _CLOSE = 5000, 1e-3  # iterations of conjugate gradients, and the relativ
 def integrate_bilaterally(
     scene: Scene, k: float = 2.0, most: int = 150, rest: float = 1e-4
 ) -> tuple[Map, int]:
-    """Return heights, (H, W), and the number of times that weights were found.
+    """Return heights, (H, W), and the number of iterations.
 
-    With z the depth in pixels, a pixel has four equations, to its right and left, up and down: n_z times the
-    one-sided difference of z is n_x or n_y. Where there are both sides, the squares are weighted by
-    w = 1 / (1 + exp(-k (b^2 - a^2))), a and b being n_z times the difference on this side and on the other;
-    w is 1/2 at first. Weights and z are found in turns, z by conjugate gradients with Jacobi preconditioner
-    from the last z, until the energy changes by less than `rest` of itself.
+    With z the depth in pixels, a pixel has four equations, to the right, left, up and down: n_z times the
+    one-sided difference of z is n_x or n_y. If a pixel has neighbours on both sides, the squares are weighted
+    by w = 1 / (1 + exp(-k (b^2 - a^2))), where a and b are n_z times the differences on this and on the other
+    side; initially w = 1/2. Weights and z are updated alternately until the relative change of the energy is
+    below `rest`; z is updated by conjugate gradients with a Jacobi preconditioner, from the last z.
     """
     from scipy import sparse
     from scipy.special import expit
@@ -51,7 +51,7 @@ def integrate_bilaterally(
 
 
 def _solve(matrix: Any, source: Map, start: Map) -> Map:
-    """Solve by conjugate gradients; those of SciPy spend most of their time on threads for sums."""
+    """Solve by conjugate gradients; SciPy's solver spends most of its time on threads for sums."""
 
     def dot(one: Map, other: Map) -> float:
         return float(np.einsum("i,i", one, other))

@@ -1,4 +1,4 @@
-"""Whole calls: functions on arrays without peers, and commands and imports in processes of their own."""
+"""Whole calls: functions on arrays without peers, and commands and imports in new processes."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ from suite.scenes import (
 
 _HD, _QUICK = (1080, 1920), (48, 64)
 _PRESS = 16  # frames
-_WORKING = 400  # bytes of a pixel for maps and what is kept
+_WORKING = 400  # bytes per pixel for maps and cached memory
 _BYTE = np.dtype(np.uint8)
 
 _SCENE, _QUICK_SCENE = (480, 480), (96, 96)
-_FRAMES = 30  # of a press that a command reconstructs
+_FRAMES = 30  # frames of the press that a command reconstructs
 _FIELD = 12.0  # side of its picture, mm
 _ROUNDS = 7
-_WITHIN = {"reconstruct press": 0.5, "reconstruct turn": 0.5, "fuse": 1.5}  # seconds of a command
+_WITHIN = {"reconstruct press": 0.5, "reconstruct turn": 0.5, "fuse": 1.5}  # limits of commands, seconds
 _KINDS = "upload", "kernel", "download"
 
 Call = tuple[Callable[[], object], int, int]
@@ -105,7 +105,7 @@ def run_function(function: str, device: Device, quick: bool) -> Case:
 
 
 def run_commands(device: Device, quick: bool) -> Case:
-    """Time commands from process start to end: a press, a turn, and both fused."""
+    """Time commands from process start to end: reconstruction of a press and of a turn, and fusion."""
     shape, name = _QUICK_SCENE if quick else _SCENE, "call-commands"
     movements = {"press": Vertical(np.linspace(0.1, 3.0, _FRAMES)), "turn": Axial(phases(STEPS), TILT, 1.0)}
     rows, notes, targets = [], [], []
@@ -131,7 +131,7 @@ def run_commands(device: Device, quick: bool) -> Case:
 
 
 def run_import(_: Device, quick: bool) -> Case:
-    """Time processes that import the engine, what a press or a turn needs of it, and NumPy alone."""
+    """Time processes that import the engine, only `reconstruct`, and only NumPy."""
     lines = "import mirrorskin.engine", "from mirrorskin.engine import reconstruct", "import numpy"
     rounds = 1 if quick else _ROUNDS
     rows = [_time_process(line, [sys.executable, "-c", line], rounds) for line in lines]
@@ -139,9 +139,9 @@ def run_import(_: Device, quick: bool) -> Case:
 
 
 def _time_process(name: str, command: list[str], rounds: int, output: Path | None = None) -> Row:
-    """Time a process after one untimed run; the profile in its JSON is the device's account.
+    """Time a process after one untimed run; device times are read from the profile in its JSON.
 
-    The `output` is removed before each run, since it takes longer to replace a file.
+    The `output` is removed before each run, because replacing a file takes longer.
     """
     seconds: list[float] = []
     profiles: list[list[dict[str, Any]]] = []

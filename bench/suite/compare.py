@@ -1,4 +1,4 @@
-"""Two runs side by side: which works take longer now, and whether by more than their rounds vary."""
+"""Comparison of two runs: which works take longer, and by more than the variation between rounds."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ Verdict = Literal["faster", "slower", "as before", "unknown"]
 
 HEAD = ("work", "A, ms", "B, ms", "B / A", "quartiles", "verdict", "A, of limit", "B, of limit")
 
-_SAME = 0.05  # by which the bytes of a limit differ if another shape of its kernel was the fastest
-_LEAST = 3  # rounds for a spread
+_SAME = 0.05  # relative difference of the bytes of a limit if another shape of its kernel was the fastest
+_LEAST = 3  # minimum number of rounds for quartiles
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,12 +29,12 @@ class Difference:
     before, after : float
         Median seconds.
     ratio, lower, upper : float
-        After divided by before for the same amount of work; its bounds by the quartiles of both.
+        ``after`` divided by ``before`` for the same amount of work, and its bounds from the quartiles.
     verdict : str
         ``slower`` or ``faster`` if the quartiles of the two do not overlap, else ``as before``;
         ``unknown`` for fewer than three rounds.
     shares : (float, float)
-        Of the limit in the same run; NaN without one.
+        Bandwidth as a share of the limit in the same run; NaN without a limit.
     """
 
     name: str
@@ -49,15 +49,15 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What two runs have in common, and what differs.
+    """The comparison of two runs.
 
     Attributes
     ----------
     cases : dict of list of Difference
-        By the name of the case.
+        Differences by the name of the case.
     warnings, targets, apart : tuple of str
-        Why the comparison is not a fair one; targets that only one of the runs met; works of one run only,
-        or with another amount of work.
+        Reasons why the runs are not comparable; targets met by only one of them; works that are in one run
+        only, or that have different amounts of work.
     """
 
     cases: dict[str, list[Difference]]
@@ -67,7 +67,7 @@ class Comparison:
 
     @property
     def summary(self) -> tuple[str, ...]:
-        """How many works changed; limits, which belong to the machine, are counted separately."""
+        """Numbers of changed works; limits, which are properties of the machine, are counted separately."""
         every = [one for rows in self.cases.values() for one in rows]
         limits, works = ([one for one in every if ("limit" in one.name) is kind] for kind in (True, False))
         return tuple(
@@ -99,7 +99,7 @@ def compare(before: Run, after: Run) -> Comparison:
 
 
 def as_text(before: Run, after: Run) -> str:
-    """Compare two runs, and return titles, tables and what else differs."""
+    """Compare two runs, and return titles, tables and other differences as text."""
     found = compare(before, after)
     parts = [f"A: {before.title}", f"B: {after.title}", *(f"warning: {line}" for line in found.warnings)]
     for name, rows in found.cases.items():
@@ -124,7 +124,7 @@ def as_rows(differences: Sequence[Difference]) -> list[list[str]]:
 
 
 def _aligned(rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Give the lines of a table; all columns but the first are set to the right."""
+    """Yield the lines of a table; all columns but the first are right-aligned."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for first, *cells in rows:
         numbers = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
@@ -151,7 +151,7 @@ def _difference(before: Row, after: Row, shares: tuple[float, float]) -> Differe
 
 
 def _size(row: Row) -> float:
-    """Return the amount of work in the unit in which it is counted."""
+    """Return the amount of work of a row, in its own unit."""
     return float(row.bytes or row.operations or 1)
 
 
@@ -164,7 +164,7 @@ def _is_same_work(before: Row, after: Row) -> bool:
 
 
 def _warnings(before: Run, after: Run) -> Iterator[str]:
-    """Give what differs between two runs in addition to the code."""
+    """Yield the differences between two runs other than the code."""
     if before.machine != after.machine:
         yield f"other machine or device: {before.machine} / {after.machine}"
     if before.system != after.system:

@@ -23,16 +23,16 @@ Floats = NDArray[np.float32]
 Counts = NDArray[np.uint8]
 
 _QUICK = (16, 48, 64)
-_MAPS = 4 * 4  # bytes of a pixel: mean, cosine, sine and residual
-_WORKING = 128  # bytes of a pixel for what all works keep
-_TILE = 1024  # pixels of Numba
-_SAMPLES = 65_536  # of a tile of NumPy: more leave the cache, fewer pay for calls
+_MAPS = 4 * 4  # bytes per pixel: mean, cosine, sine and residual
+_WORKING = 128  # bytes per pixel of working memory of all works
+_TILE = 1024  # pixels per tile for Numba
+_SAMPLES = 65_536  # samples per tile for NumPy: more exceed the cache, fewer increase the overhead of calls
 
 
 def run_stack(name: str, shape: tuple[int, int, int], device: Device, quick: bool) -> Case:
-    """Time the fit of a wave to a stack, the limits and the peers; their maps must agree first.
+    """Time the fit of a wave to a stack, the limits and the peers, after checking that their maps agree.
 
-    Bytes are those of the frames and of the four maps, each once.
+    The bytes of frames and maps are counted once.
     """
     shape = _QUICK if quick else shape
     count, pixels = shape[0], math.prod(shape[1:])
@@ -81,7 +81,7 @@ CASES: Cases = {
 
 
 def _numpy(frames: Counts, phase: Doubles) -> Floats:
-    """Fit tiles that stay in the cache, in single precision and in place."""
+    """Fit tiles that fit into the cache, in single precision and in place."""
     maps, raw = np.empty((4, frames[0].size), np.float32), frames.reshape(len(frames), -1)
     fit, model = fit_matrix(phase).astype(np.float32), basis(phase)
     gram, size = (model.T @ model).astype(np.float32), _SAMPLES // len(frames)
@@ -109,10 +109,10 @@ def _numba(frames: Counts, phase: Doubles) -> Floats:
 
 @functools.cache
 def _numba_kernel() -> Any:  # noqa: C901  # functions to compile
-    """Compile all: tiles of pixels on all cores, frame by frame so that the inner loops are vector code.
+    """Compile the fit: tiles of pixels on all cores, frame by frame so that inner loops are vectorised.
 
-    The sums of a tile share one array with constant offsets: of several arrays the compiler would not know
-    that they do not overlap, and emit scalar code.
+    The sums of a tile are in one array, at constant offsets. With several arrays the compiler would have to
+    assume that they overlap, and emit scalar code.
     """
     import numba
 

@@ -1,7 +1,7 @@
-"""Objects that hide parts of themselves, by formula: normals, mask and the heights that they must give.
+"""Analytic objects that hide parts of themselves: normals, mask and true heights.
 
-Each object is a height over the plane of the picture, seen along z by parallel rays: where several overlap,
-the highest one is visible.
+Each object is a height over the plane of the picture, viewed along z by parallel rays; if several overlap,
+the highest is visible.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from suite.scenes import Shape
 Map = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Surface = Callable[[Map, Map], Map]
-"""x and y to heights, mm; NaN outside of the object."""
+"""Function from x and y to heights, mm; NaN outside the object."""
 
-SPAN = 100.0  # of the picture's shorter side, mm
-NOISE = 1.0  # degrees, in each direction
+SPAN = 100.0  # length of the picture's shorter side, mm
+NOISE = 1.0  # standard deviation of a normal in each direction, degrees
 
-_STEP = 1e-5  # mm, of the difference quotients for slopes
+_STEP = 1e-5  # step of the difference quotients for slopes, mm
 _GRAZING = 0.05  # smallest z component of a normal, as in photometric stereo
 _FACING = 0.2  # the same of both surfaces at a seam that determines their relative height
 
 
 class Scene(NamedTuple):
-    """What is visible, and its true heights.
+    """The visible surfaces, and their true heights.
 
-    Normals, (H, W, 3), have x to the right, y up the picture and z to the viewer; NaN outside the mask.
-    `piece` numbers the surfaces that are connected: nothing determines the height of one relative to the
-    next; -1 outside.
+    Normals, (H, W, 3), have x to the right, y up the picture and z towards the viewer; NaN outside the mask.
+    `piece` is the number of the connected surface, -1 outside. The relative height of two pieces is
+    undetermined.
     """
 
     normals: Map
@@ -53,7 +53,7 @@ class Scene(NamedTuple):
 
 
 def _see(shape: Shape, surfaces: Sequence[Surface], noise: float = 0.0, *, ragged: bool = False) -> Scene:
-    """Look at surfaces; `ragged` removes patches of the mask along its border."""
+    """Return the scene of surfaces; `ragged` removes patches of the mask along its border."""
     rows, columns = shape
     pixel = SPAN / min(shape)
     x, y = np.meshgrid(
@@ -82,7 +82,7 @@ def _see(shape: Shape, surfaces: Sequence[Surface], noise: float = 0.0, *, ragge
 
 
 def _limit(normals: Map) -> Map:
-    """Return unit normals that face the viewer by the smallest angle that is measured."""
+    """Return unit normals whose z component is at least the smallest that is measured."""
     normals = normals / np.linalg.norm(normals, axis=0)
     normals[2] = np.maximum(normals[2], _GRAZING)
     return np.asarray(normals / np.linalg.norm(normals, axis=0))
@@ -99,9 +99,9 @@ def _tear(mask: Mask) -> Mask:
 
 
 def _pieces(height: Map, normals: Map, number: NDArray[np.int_], pixel: float) -> NDArray[np.int32]:
-    """Return the number of each pixel's connected surface; two that meet at a visible seam are connected.
+    """Return the number of the connected surface of each pixel; surfaces that meet at a visible seam are one.
 
-    At a seam the rise from a pixel to the next is between those according to the slopes of both.
+    At a seam, the rise from a pixel to the next is between the rises computed from the slopes of both.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -145,12 +145,12 @@ def _ellipsoid(centre: Sequence[float], radii: Sequence[float], axes: Map) -> Su
 
 
 def ball(shape: Shape) -> Scene:
-    """Return a ball in front of a leaning wall, which it does not touch."""
+    """Return a ball in front of an inclined wall, which it does not touch."""
     return _see(shape, [_plane(0.2, -0.1), _ellipsoid((5, -3, 45), (28, 28, 28), np.eye(3))])
 
 
 def torus(shape: Shape) -> Scene:
-    """Return a ring that leans, half sunk into a ground, so that it stands above it on one side."""
+    """Return an inclined ring, half embedded in a ground, so that one side is above it."""
 
     def ring(x: Map, y: Map) -> Map:
         return np.asarray(3 + 0.35 * x + np.sqrt(11**2 - (np.hypot(x, y) - 28) ** 2))
@@ -159,7 +159,7 @@ def torus(shape: Shape) -> Scene:
 
 
 def stairs(shape: Shape) -> Scene:
-    """Return five leaning steps on a floor: each ends in a cliff on three sides and in a seam on one."""
+    """Return five inclined steps on a floor: each ends in cliffs on three sides and in a seam on one."""
 
     def step(number: int, x: Map, y: Map) -> Map:
         inside = (np.abs(x) < 30 - 3 * number) & (y > 9 * number - 30) & (y < 9 * number - 12)
@@ -169,7 +169,7 @@ def stairs(shape: Shape) -> Scene:
 
 
 def leaves(shape: Shape) -> Scene:
-    """Return leaves on a ground at random angles, which hide it and each other."""
+    """Return leaves at random angles, which hide the ground and each other."""
     generator = np.random.default_rng(3)
 
     def leaf(numbers: Map, x: Map, y: Map) -> Map:
@@ -202,7 +202,7 @@ def folds(shape: Shape, noise: float = NOISE) -> Scene:
 
 
 def heap(number: int, shape: Shape) -> Scene:
-    """Return a random heap of ellipsoids, on a ground or in front of nothing; noisy and torn if odd."""
+    """Return a random heap of ellipsoids, with or without a ground; noisy and torn if ``number`` is odd."""
     generator = np.random.default_rng(number)
     surfaces: list[Surface] = [_plane(*generator.uniform(-0.3, 0.3, 2))] if number % 3 else []
     for _ in range(generator.integers(8, 20)):
@@ -216,4 +216,4 @@ SCENES: dict[str, Callable[..., Scene]] = {
     scene.__name__: scene for scene in (ball, torus, stairs, leaves, folds)
 }
 HELD_OUT: dict[str, Callable[..., Scene]] = {f"heap {k}": partial(heap, k) for k in range(10)}
-"""Heaps on which no setting of the engine was chosen."""
+"""Held-out heaps, which were not used to choose settings of the engine."""

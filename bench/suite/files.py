@@ -1,4 +1,4 @@
-"""Recordings for the cases: frames in memory as a source, files, and the path from a file to a result."""
+"""Recordings for the cases: sources in memory, files, and the path from a file to a result."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from suite.scenes import STEPS, TILT, fill_press, fill_turns, phases, references
 
 PATH = f"{OURS}, file to result"
 ROUNDS = 7
-MAPS = 128  # bytes a pixel for all maps, in memory or in files
+MAPS = 128  # bytes per pixel for all maps, in memory or in files
 
 _PAGE, _PADDING = 4096, 64  # frames start on a page, and a kernel may load the last word as a whole
-_LEANS = 7.0  # mm from the centre of the picture to where the pressed ball leans by 45 degrees
-_DIFFERENT = 64  # turns, after which the frames repeat
+_LEANS = 7.0  # distance from the centre of the picture at which the pressed ball has a zenith of 45°, mm
+_DIFFERENT = 64  # number of turns after which the frames repeat
 
 
 class Frames(Closing):
@@ -45,11 +45,11 @@ class Frames(Closing):
 
     @property
     def block(self) -> io.Block:
-        """All frames at once, for a device to work in."""
+        """All frames as one block, which a device can use in place."""
         return self._part(0, len(self._frames))
 
     def first(self, count: int) -> Frames:
-        """Return the first frames as a source of their own."""
+        """Return a source of the first frames."""
         return Frames(self._frames[:count], self.header, self._positions[:count])
 
     def rewind(self) -> None:
@@ -69,7 +69,7 @@ class Frames(Closing):
 
 
 def shared_memory(shape: tuple[int, ...], dtype: Any = np.uint8) -> NDArray[Any]:
-    """Allocate frames in which a device may work; the pages are touched, so that they exist when timed."""
+    """Allocate memory that a device can use in place; its pages are mapped before anything is timed."""
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
     raw = np.full(size + _PAGE + _PADDING, 1, np.uint8)
     start = -raw.ctypes.data % _PAGE
@@ -78,7 +78,7 @@ def shared_memory(shape: tuple[int, ...], dtype: Any = np.uint8) -> NDArray[Any]
 
 
 def make_press(shape: tuple[int, int, int]) -> Frames:
-    """Return a press of a ball, uint8, with references of each pixel."""
+    """Return a press of a ball, uint8, with reference levels of each pixel."""
     frames = shared_memory(shape)
     fill_press(frames)
     dark, bright = references(shape[1:], frames.dtype)
@@ -115,7 +115,7 @@ def new_folder(name: str, needed: int) -> Iterator[Path]:
 
 
 def record(source: Frames, path: Path, compression: Compression = "raw") -> None:
-    """Write a recording and wait for the disk, so that nothing is written while others are timed."""
+    """Write a recording and wait for the disk, so that no write is pending during timing."""
     source.rewind()
     with io.Recorder(source, path, compression, overwrite=True) as recorder:
         recorder.drain()
@@ -139,7 +139,7 @@ def to_result(
 
 
 def to_new_results(source: Path, target: Path, device: Device, **options: Any) -> Callable[[], io.Result]:
-    """Return the same as a function that writes a new file each time: to replace one takes longer."""
+    """Return a function that does the same with a new file each time, because replacing one takes longer."""
     numbers = count()
 
     def work() -> io.Result:

@@ -22,7 +22,7 @@ _CHOSEN = (
     ("integrate-mask", "from slopes", "the same within a mask"),
     ("file-lab", "file to result", "HDF5 file to saved heights, 256 frames of 1080p"),
 )
-"""The cases and the parts of their works, in the order of the table, with what they are called there."""
+"""Case, part of the work, and title in the table, in the order of the table."""
 _COLOURS = {
     "NumPy": "tab:blue",
     "SciPy": "tab:cyan",

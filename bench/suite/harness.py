@@ -1,4 +1,4 @@
-"""What cases share: timing with limits and peers, comparison of maps, targets, and checks of what is free."""
+"""Common parts of cases: timing with limits and peers, comparison of maps, targets, free memory."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from mirrorskin.kernels.device import Device
 
 Run = Callable[[Device, bool], Case]
 Cases = dict[str, Run]
-"""The functions that run cases, by name: device, and whether the case is to be small and quick."""
+"""Functions that run cases, by name; arguments are the device, and whether the case is small and quick."""
 
-_SECOND_CALL, _FIRST_CALL, _OTHER = 1.3, 1.6, 3e-3  # times of the kernels that calls may take, and s more
-_PEERS = {"NumPy": 10.0}  # times as fast as which we want to be; 1 for the others
+# Limits of calls: the time of the kernels times a factor, plus seconds.
+_SECOND_CALL, _FIRST_CALL, _OTHER = 1.3, 1.6, 3e-3
+_PEERS = {"NumPy": 10.0}  # target speed relative to peers; 1 for the others
 _MEMINFO = Path("/proc/meminfo")
 
 
@@ -32,7 +33,7 @@ class DisagreementError(Exception):
 
 
 class InaccurateError(Exception):
-    """The answers of a device are farther from the truth than allowed; the message names the number."""
+    """The results of a device differ from the truth by more than the bound; the message states the number."""
 
     exit_code = 1
 
@@ -70,7 +71,7 @@ def within(what: str, value: float, low: float, high: float) -> Target:
 
 
 def ratio_target(what: str, bound: float, ours: Row, theirs: Row, than: str, *, faster: bool) -> Target:
-    """Return the target that one work is `bound` times as fast as another, or takes `bound` times as long."""
+    """Return the target that a work is `bound` times as fast as another, or takes `bound` times as long."""
     mine, other = (1e3 * row.wall.median for row in (ours, theirs))
     ratio = other / mine if faster else mine / other
     met = ratio >= bound if faster else ratio <= bound
@@ -80,9 +81,9 @@ def ratio_target(what: str, bound: float, ours: Row, theirs: Row, than: str, *, 
 
 
 def call_targets(rows: Mapping[str, Row], faster: Mapping[str, float] | None = None) -> tuple[Target, ...]:
-    """Return the targets of a whole call: little more time than its kernels, and less than each peer.
+    """Return the targets of a whole call: little overhead beyond its kernels, and faster than each peer.
 
-    `faster` specifies for peers, or single works of theirs, how many times as fast as these we want to be.
+    `faster` specifies the target speed relative to peers, or to single works of peers.
     """
     goals = {**_PEERS, **(faster or {})}
     targets = []
@@ -105,7 +106,7 @@ def agree(
     tolerance: Mapping[str, Any] | None = None,
     whose: str = OURS,
 ) -> None:
-    """Raise DisagreementError unless maps are the expected ones, NaN where those are NaN."""
+    """Raise DisagreementError unless maps equal the expected ones within a tolerance, with the same NaN."""
     for word, right in expected.items():
         if word not in found:
             raise DisagreementError(f"{name}: there is no {word}; nothing was timed")
@@ -133,7 +134,7 @@ def check_memory(name: str, needed: int) -> None:
 
 
 def free_memory() -> int | None:
-    """Return the bytes that are available to a new program; None where the system does not report them."""
+    """Return the bytes available to a new program; None if the system does not report them."""
     try:
         lines = _MEMINFO.read_text(encoding="ascii").splitlines()
     except OSError:
@@ -145,7 +146,7 @@ def missing(*libraries: str) -> dict[str, str]:
     """Return the libraries that are not installed, as in `Case.absent`."""
     from importlib.util import find_spec
 
-    # An idle thread of GNU OpenMP spins for milliseconds, on a core that the next work needs. The variable
-    # is read once, when the library is loaded.
+    # An idle thread of GNU OpenMP spins for milliseconds on a core that the next work needs. The variable is
+    # read once, when the library is loaded.
     os.environ.setdefault("GOMP_SPINCOUNT", "2000")
     return {library: "not installed" for library in libraries if find_spec(library) is None}

@@ -1,8 +1,8 @@
 """Heights from slopes: the engine, the limits, SciPy and OpenCV on a full picture, pyamg within a mask.
 
-Targets, from slopes: five times as fast as SciPy's cosine transforms on a full picture, a hundred times as
-fast as pyamg (Ruge-Stuben, conjugate gradients) within a mask to the same error, fifty times with cuts, a
-live frame of 640 x 480 in 4 ms, and sixteen surfaces at once in six times the time of one.
+Targets, from slopes to heights: five times as fast as SciPy's cosine transforms on a full picture; 100 times
+as fast as pyamg (Ruge-Stuben, conjugate gradients) within a mask for the same error, 50 times with cuts; a
+live frame of 640 x 480 in 4 ms; sixteen surfaces at once in six times the time of one.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ from mirrorskin.kernels.device import Device
 from suite.harness import Cases, agree, call_targets, check_memory, missing, ratio_target
 from suite.scenes import PIXEL, Shape, blob_mask, drifting_slopes, noisy_slopes, random_cuts
 
-Floats = NDArray[Any]  # float32, or float64 where an exact answer is wanted
+Floats = NDArray[Any]  # float32, or float64 for exact results
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Flags = NDArray[np.uint8]
 
-SLOPES = "from slopes"  # without standard deviations, as peers do it
+SLOPES = "from slopes"  # without standard deviations, like the peers
 PYAMG = "pyamg"
-_SCIPY, _MASK, _CUTS = 5.0, 100.0, 50.0  # times as fast as SciPy, and as pyamg, that we want to be
-_FRAME = 4e-3  # seconds of a live frame
-_SIGMA = 2.5  # times of a call without sigma that one with it may take
-_SIDES, _TOGETHER = 16, 6.0  # surfaces at once, and times of a call for one that they may take
+_SCIPY, _MASK, _CUTS = 5.0, 100.0, 50.0  # target speed relative to SciPy, and to pyamg
+_FRAME = 4e-3  # limit for a live frame, seconds
+_SIGMA = 2.5  # limit of a call with sigma, in times of a call without
+_SIDES, _TOGETHER = 16, 6.0  # number of surfaces at once, and limit in times of a call for one
 
 _MPIXEL, _LIVE, _QUICK = (1024, 1024), (480, 640), (48, 64)
-_FULL, _MASKED = 2 * 4 + 4, 2 * 4 + 1 + 4  # bytes of a pixel: slopes, mask and heights
-_WORKING, _DIRECT = 400, 1200  # bytes of a pixel for what all works keep, and for the direct solution
-_FRAMES, _CHANGE = 16, 0.01  # of a circle of live frames, and the change from one to the next
-_NEAR = {"full": 1e-4, "mask": 1e-3, "live": 1e-2}  # of the range, by which heights may differ
+_FULL, _MASKED = 2 * 4 + 4, 2 * 4 + 1 + 4  # bytes per pixel: slopes, mask and heights
+_WORKING, _DIRECT = 400, 1200  # bytes per pixel: working memory of all works, and the direct solution
+_FRAMES, _CHANGE = 16, 0.01  # number of live frames in a cycle, and relative change between frames
+_NEAR = {"full": 1e-4, "mask": 1e-3, "live": 1e-2}  # tolerated differences of heights, shares of their range
 _AROUND = ((0, 1), (0, -1), (1, 0), (-1, 0))  # right, left, below and above
-_NEVER, _MOST = 1e-14, 40  # of pyamg: a residual that stops no run, and the most iterations
+_NEVER, _MOST = 1e-14, 40  # pyamg: tolerance that is never reached, and maximum number of iterations
 
 
 def run_rectangle(name: str, shape: Shape, device: Device, quick: bool) -> Case:
-    """Time heights of a full picture, the limits and the peers; heights must agree first."""
+    """Time heights of a full picture, the limits and the peers, after checking that heights agree."""
     shape = _QUICK if quick else shape
     moved = _FULL * math.prod(shape)
     check_memory(name, _WORKING * math.prod(shape))
@@ -73,7 +73,7 @@ def run_rectangle(name: str, shape: Shape, device: Device, quick: bool) -> Case:
 
 
 def run_mask(name: str, cuts: int, device: Device, quick: bool) -> Case:
-    """Time heights within a mask, cut or not, the limits, and pyamg until its error is as small as ours."""
+    """Time heights within a mask, with or without cuts, the limits, and pyamg to the same error."""
     shape = _QUICK if quick else _MPIXEL
     check_memory(name, (_WORKING + _DIRECT) * math.prod(shape))
     slopes, mask, edges = noisy_slopes(shape), blob_mask(shape), random_cuts(shape, cuts) if cuts else None
@@ -102,9 +102,9 @@ def run_mask(name: str, cuts: int, device: Device, quick: bool) -> Case:
 
 
 def run_frames(device: Device, quick: bool) -> Case:
-    """Time live frames within a mask: slopes in, heights out, each frame slightly different from the last.
+    """Time live frames within a mask, from slopes to heights; each differs slightly from the preceding one.
 
-    A round is a circle of frames. The limits are those of the bytes of one frame.
+    A round is a cycle of frames. The limits are for the bytes of one frame.
     """
     shape = _QUICK if quick else _LIVE
     mask, frames = blob_mask(shape), drifting_slopes(shape, _FRAMES, _CHANGE)
@@ -121,7 +121,7 @@ def run_frames(device: Device, quick: bool) -> Case:
 
     def check(results: dict[str, Any]) -> None:
         truth.check(OURS, results[OURS], "live")
-        seconds.clear()  # of the warm-up
+        seconds.clear()  # removes the warm-up
 
     moved = _MASKED * math.prod(shape)
     works = {OURS: Work(circle, _FRAMES * moved, _FRAMES)}
@@ -183,7 +183,7 @@ CASES: Cases = {
 def _calls(
     slopes: Floats, mask: Flags | None, edges: Flags | None, moved: int, device: Device
 ) -> dict[str, Work]:
-    """Return `integrate` with its defaults, that is with sigma, and without sigma."""
+    """Return calls of `integrate` with its defaults, which include sigma, and without sigma."""
 
     def call(sigma: bool) -> Floats:
         height: Floats = engine.integrate(
@@ -200,7 +200,7 @@ def _calls(
 
 
 def _targets(rows: Mapping[str, Row], peer: str, faster: float) -> tuple[Target, ...]:
-    """Return the targets of the whole call: a peer's time, and with sigma little more than without."""
+    """Return the targets of the whole call: relative to a peer, and for the overhead of sigma."""
     plain = rows[f"{OURS}, {SLOPES}"]
     sigma = ratio_target(OURS, _SIGMA, rows[OURS], plain, "without sigma", faster=False)
     return *call_targets(rows, {peer: faster}), sigma
@@ -212,7 +212,7 @@ def _errors(errors: Mapping[str, float]) -> str:
 
 
 def solve_with_scipy(source: Floats, inverse: Floats) -> Floats:
-    """Solve with the cosine transforms of SciPy, on all cores, the second one in place."""
+    """Solve with SciPy's cosine transforms on all cores, the second one in place."""
     from scipy.fft import dctn, idctn
 
     spectrum = dctn(source, workers=THREADS)
@@ -222,7 +222,7 @@ def solve_with_scipy(source: Floats, inverse: Floats) -> Floats:
 
 
 def _opencv(source: Floats, inverse: Floats) -> Floats:
-    """Solve with those of OpenCV, for pictures of even sizes."""
+    """Solve with OpenCV's cosine transforms, for pictures of even sizes."""
     import cv2
 
     spectrum = cv2.dct(source)
@@ -277,8 +277,8 @@ def _pyamg_works(
 class Graph(NamedTuple):
     """The least-squares problem u_j - u_i = d on every link, for heights u.
 
-    `right`, (H, W - 1), and `down`, (H - 1, W), are the links; `source`, (H, W) float64, is for each pixel
-    the sum of d over links that end in it, minus that over links that start there.
+    `right`, (H, W - 1), and `down`, (H - 1, W), are the links. `source`, (H, W) float64, is the sum of d over
+    the links that end in a pixel, minus the sum over the links that start there.
     """
 
     right: Mask
@@ -287,7 +287,7 @@ class Graph(NamedTuple):
 
 
 def link(slopes: Floats, mask: Flags | None = None, edges: Flags | None = None) -> Graph:
-    """Return the graph of slopes dz/dx and dz/dy, (2, H, W), as the engine makes it, in plain arrays."""
+    """Return the graph of slopes dz/dx and dz/dy, (2, H, W), equal to the engine's, as plain arrays."""
     known = np.isfinite(slopes[0]) & np.isfinite(slopes[1])
     if mask is not None:
         known &= mask != 0
@@ -304,7 +304,7 @@ def link(slopes: Floats, mask: Flags | None = None, edges: Flags | None = None) 
 
 
 def _cut(right: Mask, down: Mask, known: Mask, edges: Mask, slopes: Floats) -> None:
-    """Keep of the links of each pixel on an edge that to the most similar neighbour which is on none."""
+    """Keep one link of each pixel on an edge: to the most similar neighbour that is not on an edge."""
     right &= ~(edges[:, :-1] | edges[:, 1:])
     down &= ~(edges[:-1] | edges[1:])
     free, values = np.pad(known & ~edges, 1), np.pad(slopes, ((0, 0), (1, 1), (1, 1)))
@@ -366,7 +366,7 @@ def assemble(graph: Graph) -> System:
 
 
 class Truth:
-    """The direct solution of one problem in double precision, and how far an answer is from it."""
+    """The direct solution of one problem in double precision, and the errors of other solutions."""
 
     def __init__(self, system: System, wanted: Mask) -> None:
         import scipy.sparse as sparse
@@ -375,31 +375,31 @@ class Truth:
 
         self.system, self.wanted = system, wanted
         self.count, self._label = connected_components(system.matrix, directed=False)
-        first = np.unique(self._label, return_index=True)[1]  # pixel of each component, held at 0
+        first = np.unique(self._label, return_index=True)[1]  # pixel of each component, fixed at 0
         held = sparse.csc_matrix((np.ones(len(first)), (first, first)), system.matrix.shape)
-        # The matrix is symmetric and positive definite: no search for pivots.
+        # The matrix is symmetric and positive definite: no pivoting is needed.
         options: dict[str, Any] = {"permc_spec": "MMD_AT_PLUS_A", "options": {"SymmetricMode": True}}
         factors = splu((system.matrix + held).tocsc(), diag_pivot_thresh=0.0, **options)
         self.values = self.centred(factors.solve(system.source))
         self.span, self.map = float(np.ptp(self.values)), self.as_map(self.values)
 
     def centred(self, answer: Floats) -> Doubles:
-        """Return an answer, (N,) or (H, W), at the pixels of the equations with mean 0 in each component."""
+        """Return heights, (N,) or (H, W), at the pixels of the equations, with mean 0 in each component."""
         values = (answer if answer.ndim == 1 else answer[self.system.linked]).astype(np.float64)
         sums, sizes = np.bincount(self._label, values, self.count), np.bincount(self._label)
         return np.asarray(values - (sums / sizes)[self._label])
 
     def check(self, name: str, height: Floats, how: str) -> None:
-        """Raise DisagreementError unless a map of heights is near the direct solution."""
+        """Raise DisagreementError unless a map of heights is close to the direct solution."""
         near = {"height": _NEAR[how] * self.span}
         agree(name, {"height": height}, {"height": self.map}, near, whose="a direct solution")
 
     def error(self, answer: Floats) -> float:
-        """Return the root mean square error of an answer, in ranges of the heights."""
+        """Return the root mean square error of heights, as a share of their range."""
         return float(np.sqrt(np.mean(np.square(self.centred(answer) - self.values)))) / self.span
 
     def as_map(self, values: Doubles) -> NDArray[np.float32]:
-        """Return heights as a map: 0 at wanted pixels without a link, NaN where none is wanted."""
+        """Return heights as a map: 0 at pixels of the mask without a link, NaN outside the mask."""
         heights = np.where(self.wanted, np.float32(0), np.float32(np.nan))
         heights[self.system.linked] = values
         return heights

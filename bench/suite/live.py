@@ -1,7 +1,7 @@
-"""Whole live runs: frames from memory at their times; the rate that is sustained, and the latency.
+"""Whole live runs with frames from memory at their times: sustained rate and latency.
 
-Targets: 1000 frames/s of 640 x 480 and 150 of 1920 x 1200 in a press without loss; in a rotation with normals
-and heights of 640 x 480, 60 updates a second, from frame to height in 15 ms (99 %: 30 ms).
+Targets: a press without loss at 1000 frames/s of 640 x 480 and 150 frames/s of 1920 x 1200; a rotation with
+normals and heights of 640 x 480 at 60 updates/s, with a latency from frame to height of 15 ms (99 %: 30 ms).
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from suite.files import shared_memory
 from suite.harness import Cases, Run
 from suite.scenes import SCALES, STEPS, TILT, fill_press, fill_turns
 
-_SLOTS = 256  # frames of the ring buffer, as of a camera
+_SLOTS = 256  # frames of the ring buffer, as in a camera
 _PIXEL, _DEPTH = 0.03, 3.0  # mm
-_PRESS = 256  # different frames of a press; each is repeated
+_PRESS = 256  # number of different frames of a press; each is repeated
 _TURNS = 64  # frames after which a rotation repeats
-_KEPT_UP = 0.99  # of the specified frame rate
-_NEAR = 1e-2  # of the range, by which the last heights may differ from the converged ones
-_UPDATES, _MEDIAN, _SLOWEST = 60, 15, 30  # a second, and ms from frame to height
+_KEPT_UP = 0.99  # minimum rate, as a share of the specified frame rate
+_NEAR = 1e-2  # tolerated difference of the last heights from the converged ones, as a share of the range
+_UPDATES, _MEDIAN, _SLOWEST = 60, 15, 30  # updates/s, and ms from frame to height
 
 
 class Paced(Closing):
-    """A live source of frames from memory which starts with the first read and does not wait, as a camera.
+    """A live source of frames from memory, which like a camera does not wait for its reader.
 
-    A read waits for the next frame, and returns it with those that arrived since the last read. They are
-    copied to a ring buffer, as by a camera, and lent. A reader that is later than the ring is long loses
-    the oldest of them; `Block.dropped` is their number.
+    It starts with the first read. A read waits for the next frame, and returns it with all frames since the
+    last read, in place in a ring buffer. If the reader is late by more than the length of the ring buffer,
+    the oldest frames are lost; `Block.dropped` is their number.
     """
 
     name, rewindable = "memory", False
@@ -113,7 +113,7 @@ class Paced(Closing):
 
 @dataclass(frozen=True, slots=True)
 class LiveCase:
-    """Frames of uint8, (H, W), at a rate for some seconds; `least` is the rate that must be sustained."""
+    """Frames of uint8, (H, W), at a rate for some seconds; `least` is the rate to be sustained."""
 
     name: str
     shape: tuple[int, int]
@@ -123,7 +123,7 @@ class LiveCase:
 
     @property
     def count(self) -> int:
-        """Frames."""
+        """Number of frames."""
         return round(self.rate * self.seconds)
 
     @property
@@ -144,7 +144,7 @@ class Ran:
 
 
 def run_press(case: LiveCase, device: Device, quick: bool) -> Case:
-    """Find heights during a press."""
+    """Compute heights during a press."""
     frames = np.empty((_PRESS, *case.shape), np.uint8)
     fill_press(frames)
     source = Paced(
@@ -162,7 +162,7 @@ def run_press(case: LiveCase, device: Device, quick: bool) -> Case:
 
 
 def run_rotation(case: LiveCase, device: Device, quick: bool) -> Case:
-    """Find normals, edges and heights during a rotation."""
+    """Compute normals, edges and heights during a rotation."""
     offset, gain, noise = SCALES["uint8"]
     frames = np.empty((_TURNS, *case.shape), np.uint8)
     fill_turns(frames)
@@ -203,7 +203,7 @@ def _run(source: Paced, operation: LiveOperation) -> Ran:
 
 
 def judge_press(ran: Ran, least: float) -> tuple[Target, ...]:
-    """Judge the sustained rate, and losses."""
+    """Return the targets of the sustained rate and of losses."""
     rate, lost = ran.status.used / ran.seconds, ran.status.dropped + ran.status.skipped
     bound, met = f"at least {least:g} a second", rate >= _KEPT_UP * least
     return (
@@ -213,7 +213,7 @@ def judge_press(ran: Ran, least: float) -> tuple[Target, ...]:
 
 
 def judge_rotation(ran: Ran, rms: float) -> tuple[Target, ...]:
-    """Judge updates, their latency, and the difference of the heights from the converged ones."""
+    """Return the targets of updates, their latency, and the difference from the converged heights."""
     rate, shown = ran.status.updates / ran.seconds, ran.status.latency[RAISED]
     median, p99 = 1e3 * shown.median, 1e3 * shown.p99
     what = "frame in to height out"

@@ -14,12 +14,12 @@ from suite.harness import Cases, check_memory, time_call
 from suite.scenes import SCALES, STEPS, TILT, fill_turns, phases, turn_noise
 
 _QUICK = (48, 64)
-_MAPS = 3 * 4 + 4 + 1 + 4  # bytes of a pixel: normal, sigma, contact and mean
-_WORKING = 160  # bytes of a pixel for what all works keep
+_MAPS = 3 * 4 + 4 + 1 + 4  # bytes per pixel: normal, sigma, contact and mean
+_WORKING = 160  # bytes per pixel of working memory of all works
 
 
 def run_normals(name: str, kind: str, shape: tuple[int, int], device: Device, quick: bool) -> Case:
-    """Time the exact method on one turn; bytes are those of the frames and of the maps, each once."""
+    """Time the exact method on one turn; the bytes of frames and maps are counted once."""
     shape, dtype = _QUICK if quick else shape, np.dtype(kind)
     moved = math.prod(shape) * (STEPS * dtype.itemsize + _MAPS)
     check_memory(name, 2 * moved + _WORKING * math.prod(shape))

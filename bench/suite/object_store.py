@@ -1,4 +1,4 @@
-"""An S3-compatible server in a process of its own: moto's, for measurements and tests on one machine."""
+"""An S3-compatible server (moto) in a separate process, for measurements and tests on one machine."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SERVE = (
 
 @contextmanager
 def object_store(bucket: str) -> Iterator[Any]:
-    """Serve an empty bucket; meanwhile the environment leads there. Needs `moto[server]` and `s3fs`."""
+    """Serve an empty bucket, to which environment variables point. Needs `moto[server]` and `s3fs`."""
     import s3fs
 
     with subprocess.Popen(

@@ -28,23 +28,24 @@ Shape = tuple[int, int, int]
 _HD, _MEMORY, _QUICK = (64, 1080, 1920), (240, 2160, 3840), (12, 48, 64)
 _BYTE = np.dtype(np.uint8)
 _THRESHOLD = 0.5
-_MAPS = 64  # bytes a pixel for all maps
+_MAPS = 64  # bytes per pixel for all maps
 _PLATEAU, _CONFIDENT = (
     3.0,
     6.0,
 )  # standard deviations from the plateau, and below the level: docs/method/press.md
-# Threads of the pool, and pixels of a tile: more leave the cache, fewer pay more for each call. NumPy has one
-# core, as most people use it; PyTorch has its own threads.
+# Threads of the pool, and pixels per tile: more exceed the cache, fewer increase the overhead of calls. NumPy
+# uses one core, as usual; PyTorch has its own threads.
 _TILES = {"NumPy": (1, 262_144), "OpenCV": (THREADS, 400_000), "PyTorch": (1, 1_200_000)}
 _NUMBA_TILE = 16_384
-_COUNTABLE = 255  # frames that a byte counts
+_COUNTABLE = 255  # maximum number of frames counted in a byte
 
 
 def run_onset(name: str, shape: Shape, stack: StackName, full: bool, device: Device, quick: bool) -> Case:
-    """Time the onset, the limits and the peers on one stack; their maps must agree first.
+    """Time the onset, the limits and the peers on one stack, after checking that their maps agree.
 
-    `full` is the full default: references of each pixel, hold 2, sub-frame; heights, sigma and status are
-    compared. Else there is one threshold for all pixels, and the frames' numbers are compared (equation 4).
+    `full` is the full default: reference levels of each pixel, hold 2, sub-frame interpolation; heights,
+    sigma and status are compared. Otherwise there is one threshold for all pixels, and the numbers of frames
+    are compared (equation 4).
     """
     shape = _QUICK if quick else shape
     check_memory(name, 2 * math.prod(shape) + _MAPS * math.prod(shape[1:]))
@@ -100,7 +101,7 @@ CASES: Cases = {name: functools.partial(run_onset, name, *options) for name, opt
 
 
 class References(NamedTuple):
-    """Levels of each pixel before the first frame, () or (H, W).
+    """Reference levels of each pixel, or of all: (H, W) or ().
 
     `level` is the float32 at which it turns light, NaN for a dead pixel, `light` the smallest sample that is
     light, `dark` its dark plateau.
@@ -111,7 +112,7 @@ class References(NamedTuple):
     dark: NDArray[np.float32]
 
     def of(self, rows: slice) -> References:
-        """Return those of some rows; those of all pixels as they are."""
+        """Return the levels of some rows; common levels are returned unchanged."""
         return References(*(values[rows] if values.ndim else values for values in self))
 
 
@@ -119,7 +120,7 @@ def _peers(
     full: bool, frames: NDArray[Any], travel: NDArray[np.float64], known: References, absent: dict[str, str]
 ) -> dict[str, Callable[[], object]]:
     libraries: dict[str, Library] = {"NumPy": _numpy, "OpenCV": _opencv}
-    if "torch" not in absent and not full:  # heights would be NumPy's, as OpenCV's are
+    if "torch" not in absent and not full:  # heights would be computed by NumPy, as for OpenCV
         libraries["PyTorch"] = _torch
     noise = estimate_noise(thin_out(frames[0]), thin_out(frames[1]), True)
     run = _heights if full else _onsets
@@ -137,7 +138,7 @@ def _peers(
 
 
 def _in_tiles(tiles: tuple[int, int], frames: NDArray[Any], fill: Callable[[slice], None]) -> None:
-    """Fill all rows in tiles, given as (cores, pixels of a tile)."""
+    """Fill all rows in tiles; ``tiles`` is (cores, pixels of a tile)."""
     threads, pixels = tiles
     count = max(1, min(pixels // frames.shape[2], -(-frames.shape[1] // threads)))
     with ThreadPoolExecutor(threads) as pool:
@@ -177,9 +178,9 @@ def _heights(
 
 
 def _first_light(library: Library, frames: NDArray[Any], light: Levels, hold: int) -> NDArray[np.int32]:
-    """Return the first frame of the first run of `hold` light frames, 1 or 2, or of one at the end.
+    """Return the first frame of the first run of `hold` (1 or 2) light frames, or of a run at the end.
 
-    It is -1 without one. A library counts the frames that leave a pixel undecided.
+    It is -1 without a run. The library counts the frames in which a pixel is undecided.
     """
     shape = frames.shape[1:]
     less, count = library(light)
@@ -195,7 +196,7 @@ def _first_light(library: Library, frames: NDArray[Any], light: Levels, hold: in
 
 
 def _dark_frames(frames: NDArray[Any], hold: int, less: Less) -> Iterator[Flags]:
-    """Yield for each frame where no run of `hold` light frames starts, in a mask that is reused."""
+    """Yield for each frame the mask of pixels where no run of `hold` light frames starts; it is reused."""
     dark, after = np.empty((2, *frames.shape[1:]), np.uint8)
     less(frames[0], dark)
     for frame in frames[1:]:
@@ -210,8 +211,8 @@ def _dark_frames(frames: NDArray[Any], hold: int, less: Less) -> Iterator[Flags]
 Less = Callable[[NDArray[Any], Flags], object]
 Count = Callable[[Flags, Flags, Flags], None]
 Library = Callable[[Levels], tuple[Less, Count]]
-"""Levels to two functions that work in place: `less` makes a mask of where a frame is below them, 1 or 255,
-and `count` takes what is not in a mask from the undecided pixels, and adds 1 to the counts of the rest."""
+"""Returns two in-place functions for levels. `less` computes the mask (1 or 255) of samples below the levels.
+`count` removes pixels outside a mask from the undecided pixels, and adds 1 to the counts of the others."""
 
 
 def _numpy(light: Levels) -> tuple[Less, Count]:
@@ -263,7 +264,7 @@ def _answer(
     sure = onset_sure(level, light, _CONFIDENT * noise)
 
     def last_below(bounds: NDArray[Any]) -> NDArray[np.intp]:
-        """Go back from the onsets to the last frames that are below some bounds, or the first of all."""
+        """Return the last frames before the onsets with samples below some bounds, or the first frame."""
         frame, todo = start - 1, np.arange(len(start))
         while len(todo := todo[frame[todo] > 0]):
             todo = todo[frames[frame[todo], row[todo], column[todo]] >= bounds[todo]]
@@ -281,7 +282,7 @@ def _answer(
 
 
 def _numba_onsets(frames: NDArray[Any], light: Levels) -> NDArray[np.int32]:
-    """Find onsets with Numba: tiles on all cores, frame by frame so that the inner loop is vector code."""
+    """Find onsets with Numba: tiles on all cores, frame by frame so that the inner loop is vectorised."""
     onset = np.empty(frames.shape[1:], np.int32)
     _numba_scan(1, whole=False)(frames.reshape(len(frames), -1), light[()], onset.reshape(-1))
     return onset
@@ -301,7 +302,7 @@ def _numba_heights(
 
 @functools.cache
 def _numba_scan(hold: int, *, whole: bool) -> Any:  # noqa: C901  # to compile
-    """Compile the search for onsets, with a level of each pixel or one for all, and heights if `whole`."""
+    """Compile the search for onsets, with levels per pixel or one for all, and heights if `whole`."""
     import numba
 
     numba.set_num_threads(min(THREADS, numba.config.NUMBA_NUM_THREADS))
@@ -312,7 +313,7 @@ def _numba_scan(hold: int, *, whole: bool) -> Any:  # noqa: C901  # to compile
         undecided, few = np.ones(pixels, np.uint8), np.zeros(pixels, np.uint8)
         onset[:] = 0
         for t in range(count):
-            # Slices of a row, which Numba knows to be contiguous, unlike slices of all rows.
+            # Numba recognises slices of one row as contiguous, but not slices of all rows.
             now, then = frames[t, first:end], frames[min(t + hold, count) - 1, first:end]
             for p in range(pixels):
                 sample = now[p] if hold == 1 else min(now[p], then[p])

@@ -1,8 +1,8 @@
-"""Whole paths from a file to a result in a file: a press, turns, what a lab would write, and memory.
+"""Whole paths from a file to a result in a file: a press, turns, a typical script of a lab, and memory.
 
-Targets: contiguous frames in 1.25 times the time of the computation in memory, compressed ones in 1.15 times
-the time of decoding, turns at 70 % of the bandwidth of memory, ten times as fast as h5py and NumPy, and
-within the memory that is allowed.
+Targets: contiguous frames in 1.25 times the time of the computation in memory; compressed frames in 1.15
+times the time of decoding; turns at 70 % of the memory bandwidth; ten times as fast as h5py and NumPy; memory
+within the limit.
 """
 
 from __future__ import annotations
@@ -62,12 +62,12 @@ _ZARR = (480, 480, 640)
 _PAGE = 4096
 _LIMIT_SHARE = 0.7
 _ROUNDING = 1e-6  # mm
-_TIMES, _MORE = 10, 1.1  # size of a file divided by the budget; memory that may be taken divided by it
-_FEW = 8  # frames that are reconstructed before memory is watched
+_TIMES, _MORE = 10, 1.1  # size of a file, and tolerated memory, divided by the budget
+_FEW = 8  # frames that are reconstructed before memory is measured
 
 
 def run_press(name: str, compression: Literal["raw", "bitshuffle"], device: Device, quick: bool) -> Case:
-    """Time the path of a press next to its parts; results must be those of the frames in memory first."""
+    """Time the path of a press and its parts, after checking that results equal those from memory."""
     shape = _QUICK if quick else _PRESS
     stored = "contiguous" if compression == "raw" else "bitshuffle-LZ4, one chunk a frame"
     title = f"full default, references of each pixel; {_size(shape)}, {stored}"
@@ -75,7 +75,7 @@ def run_press(name: str, compression: Literal["raw", "bitshuffle"], device: Devi
 
 
 def run_turns(device: Device, quick: bool) -> Case:
-    """Time the path of very many turns to normals next to its parts."""
+    """Time the path of many turns to normals, and its parts."""
     shape = _QUICK_TURNS if quick else _TURNS
     title = (
         f"exact method to normals, mean of {shape[0] // STEPS} turns, no heights; {_size(shape)}, contiguous"
@@ -127,7 +127,7 @@ def _beside_memory(
 
 
 def run_zarr(name: str, place: str, device: Device, quick: bool) -> Case:
-    """Time the path of a press in Zarr next to that in HDF5; in an object store next to its objects alone."""
+    """Time the path of a press in Zarr and in HDF5; for an object store, also reading its objects alone."""
     in_store = name == "file-s3"
     absent = missing("zarr", "s3fs", "moto") if in_store else missing("zarr")
     shape = _QUICK if quick else _ZARR
@@ -174,13 +174,13 @@ def _size(shape: Shape) -> str:
 
 
 def _buffer(recording: io.Recording) -> NDArray[Any]:
-    """Return a buffer of frames as large as that of a reconstruction."""
+    """Return a buffer for as many frames as a reconstruction reads at once."""
     length = MEMORY_LIMIT // (2 * math.prod(recording.shape[1:]) * recording.dtype.itemsize)
     return shared_memory((min(max(1, length), recording.shape[0]), *recording.shape[1:]), recording.dtype)
 
 
 def _fetch(recording: io.Recording, buffer: NDArray[Any]) -> None:
-    """Read all frames; of mapped ones, one byte a page."""
+    """Read all frames; if they are mapped, one byte per page."""
     recording.rewind()
     while (block := recording.read(buffer)) is not None:
         if block.lent:
@@ -199,7 +199,7 @@ def _read_with_h5py(path: Path, dataset: str) -> None:
 
 
 def run_lab(device: Device, quick: bool) -> Case:
-    """Time what a lab would write next to the full default and equation 4; heights must agree first."""
+    """Time a typical script of a lab, the full default and equation 4, after checking that heights agree."""
     shape = _QUICK if quick else _LAB
     size, extra = math.prod(shape), MAPS * math.prod(shape[1:])
     check_memory("file-lab", 4 * size + extra)
@@ -243,7 +243,7 @@ def _lab_argmax(path: Path, dataset: str, dark: Floats, bright: Floats, target: 
         light = np.empty(stack.shape, bool)
         for number in range(len(stack)):
             light[number] = (stack[number] - dark) / span >= 0.5
-    light[:-1] &= light[1:]  # two in a row, so that a spike of noise makes no onset
+    light[:-1] &= light[1:]  # two consecutive frames, so that a spike is not an onset
     onset = np.where(light.any(axis=0), light.argmax(axis=0), -1)
     return _save(onset, travel, target)
 
@@ -259,7 +259,7 @@ def _save(onset: NDArray[Any], travel: NDArray[np.float64], target: Path) -> Flo
 
 
 def run_budget(device: Device, quick: bool) -> Case:
-    """Reconstruct files ten times as large as the allowed memory, in processes that watch their memory."""
+    """Reconstruct files ten times as large as the memory limit, in processes that measure their memory."""
     shape = _QUICK if quick else _BUDGET
     size, budget = math.prod(shape), math.prod(shape) // _TIMES
     title = f"peak memory of a process from file to result, file {_TIMES} times the budget; {_size(shape)}"
@@ -290,7 +290,7 @@ def run_budget(device: Device, quick: bool) -> Case:
 
 
 def _write_long(press: Frames, path: Path) -> None:
-    """Write compressed chunks of few pixels and many frames, as for access along time."""
+    """Write compressed chunks of few pixels and many frames, as used for access along time."""
     import h5py
     import hdf5plugin
 
@@ -318,10 +318,10 @@ _KINDS: dict[str, Callable[[Frames, Path], None]] = {
 
 
 def _watch_memory() -> None:
-    """Reconstruct the files of the command line, and print as JSON how many bytes that took in addition.
+    """Reconstruct the files of the command line, and print as JSON the additional memory in bytes.
 
-    The first number includes pages of mapped files, the second is the peak of the process's own memory. A
-    recording of few frames is reconstructed before, so that everything is loaded.
+    The first number includes pages of mapped files; the second is the peak of private memory. A recording of
+    few frames is reconstructed first, so that all code is loaded.
     """
     few, source, target, budget, number = sys.argv[1:]
     device, limit = open_device(number), int(budget)

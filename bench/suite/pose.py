@@ -17,17 +17,17 @@ from suite.harness import Cases
 
 _SHAPE, _QUICK = (240, 320), (60, 80)
 _FIELD = 8.0  # mm across
-_FRAMES = 24  # of a circle that ends where it starts
-_REACH, _TURN = 0.4, 0.2  # mm and rad, of the circle
+_FRAMES = 24  # number of frames along a circle that ends at its start
+_REACH, _TURN = 0.4, 0.2  # amplitudes of position and angle, mm and rad
 _SIGMA, _NORMAL_SIGMA = 1e-3, 0.01  # mm and rad
-_BYTES = 32  # of the record of a pixel
-_RATE = 200.0  # target, results a second
+_BYTES = 32  # bytes of the record of a pixel
+_RATE = 200.0  # target, results per second
 
 
 def run_track(device: Device, quick: bool) -> Case:
-    """Time a tracker along a closed path: results in, the motion since the first one out.
+    """Time a tracker along a closed path: from results to the motion since the first result.
 
-    Bytes are those of the records of both maps that are compared, each once.
+    The bytes of the records of both compared maps are counted once.
     """
     shape = _QUICK if quick else _SHAPE
     angles = 2 * math.pi * np.arange(_FRAMES + 1) / _FRAMES
@@ -63,7 +63,7 @@ def run_track(device: Device, quick: bool) -> Case:
 
 
 def surface(shape: tuple[int, int], right: float, up: float, turn: float, seed: int) -> Result:
-    """Return waves on a dome, rotated about z and moved, with noise of their standard deviations."""
+    """Return waves on a dome, rotated about z and translated, with noise of the stated deviations."""
     rng = np.random.default_rng(seed)
     x, y = pixel_axes(shape, (_FIELD / shape[1], _FIELD / shape[1]))
     across, high = np.meshgrid(x - right, y - up)

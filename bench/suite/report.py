@@ -16,8 +16,8 @@ TARGET_HEAD = ("target", "bound", "measured", "met")
 
 LEGEND = (
     "ms: median by the host's clock, from the call to its return; kernels and copies: as reported by "
-    "the device. of limit: bandwidth divided by that of the first row, by the clock; then the same "
-    "of kernels alone. Bytes are those of the input and of the output, each once."
+    "the device. of limit: bandwidth divided by the bandwidth of the first row, by the clock; then "
+    "the same for kernels alone. Bytes of input and output are counted once."
 )
 
 _ABOUT = (
@@ -80,13 +80,13 @@ def as_notes(case: Case) -> list[str]:
 
 
 def as_table(head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: bool = True) -> str:
-    """Return a table of a page; columns of numbers, those after the first, are set to the right."""
+    """Return a table of a page; if ``numbers``, all columns but the first are right-aligned."""
     lines = [head, ["---"] + ["---:" if numbers else "---"] * (len(head) - 1), *rows]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |" for cells in lines)
 
 
 def as_markdown(run: Run) -> str:
-    """Return a run with all its tables and notes as a page, and the versions and machine at its end."""
+    """Return the page of one run: all tables and notes, then versions and machine."""
     parts = [f"# Benchmarks, run of {run.date[:10]}", LEGEND]
     for case in run.cases:
         parts.append(f"## {case.name}: {case.title}")
@@ -116,10 +116,7 @@ def as_page(runs: Mapping[Path, Run], chart: str) -> str:
 
 
 def as_chart(runs: Mapping[Path, Run]) -> bytes | None:
-    """Return the chart of a page of some runs, SVG; None if they contain nothing that it shows.
-
-    It shows the machine of the first run.
-    """
+    """Return the chart of a page, SVG, for the machine of the first run; None if it has no such works."""
     shown = glance.entries(_first(_gather(runs.values())))
     return glance.draw(shown) if shown else None
 
@@ -129,7 +126,7 @@ def _first(machines: Mapping[str, Machine]) -> Machine:
 
 
 def _gather(runs: Iterable[Run]) -> dict[str, Machine]:
-    """Return cases by machine; of a case that several runs of one machine have, the last one counts."""
+    """Return cases by machine; if several runs of a machine contain a case, the last one is used."""
     machines: dict[str, dict[str, Case]] = {}
     for run in runs:
         machines.setdefault(run.machine, {}).update({case.name: case for case in run.cases})
@@ -157,7 +154,7 @@ def _runs(runs: Mapping[Path, Run]) -> str:
 def _topic(
     title: str, about: str, machines: Mapping[str, Machine], describe: Callable[[Machine], list[str]]
 ) -> list[str]:
-    """Return a heading and the parts of each machine; nothing if no machine has any."""
+    """Return a heading and the parts of each machine; nothing if all are empty."""
     parts = []
     for name, machine in machines.items():
         if mine := describe(machine):
@@ -201,7 +198,7 @@ def _calls(machine: Machine) -> list[str]:
 
 
 def _peers(machine: Machine) -> list[str]:
-    """Return each work of ours that a peer does too, or that has a target, next to the fastest peer."""
+    """Return each work of the engine that has a peer or a target, with the fastest peer."""
     cells = []
     for case in machine.values():
         if case.name.startswith(("accuracy-", "call-")):
@@ -221,12 +218,12 @@ def _peers(machine: Machine) -> list[str]:
 
 
 def _is_ours(row: Row) -> bool:
-    """Return whether a row is the engine's: by its name, or because it used the device."""
+    """Return whether a row is a work of the engine: by its name, or because it used the device."""
     return OURS in row.name or "kernel" in row.device
 
 
 def _fastest(row: Row, works: Iterable[Row]) -> Row | None:
-    """Return the fastest peer that does the same: the part after the comma of their names is equal."""
+    """Return the fastest peer with the same result: the names are equal after the comma."""
     same = [one for one in works if not _is_ours(one) and _part(one) == _part(row)]
     return min(same, key=lambda one: one.wall.median, default=None)
 
@@ -245,14 +242,14 @@ def _pair(case: Case, row: Row, rival: Row | None) -> list[str]:
 
 
 def _accuracy(machine: Machine) -> list[str]:
-    """Return how many bounds each case of accuracy keeps, and which it does not."""
+    """Return a table of the accuracy cases: number of bounds met, and those missed."""
     cells = []
     for case in machine.values():
         if case.name.startswith("accuracy-"):
             missed = [f"{one.what}: {one.measured}" for one in case.targets if not one.met]
-            kept = f"{len(case.targets) - len(missed)} of {len(case.targets)}"
-            cells.append([case.name, case.title, kept, "; ".join(missed) or "none"])
-    head = ("case", "about", "bounds that are kept", "missed")
+            met = f"{len(case.targets) - len(missed)} of {len(case.targets)}"
+            cells.append([case.name, case.title, met, "; ".join(missed) or "none"])
+    head = ("case", "about", "bounds met", "missed")
     return [as_table(head, cells, numbers=False)] if cells else []
 
 

@@ -1,8 +1,8 @@
-"""Heights where surfaces hide parts of themselves: `robust`, plain least squares, and the published method.
+"""Heights of surfaces that hide parts of themselves: `robust`, plain least squares, and a published method.
 
-Targets, on every scene: no larger an error than the published method and half of it on average, never more
-than a tenth above that of plain least squares, twenty times as fast as the method; and 3 s for a megapixel.
-Heaps on which no setting was chosen are judged by medians and the worst.
+Targets on every scene: an error no larger than with the published method, and half of it on average; at most
+10 % more than with plain least squares; twenty times as fast as the published method; 3 s for a megapixel.
+For held-out heaps, the median and the maximum are tested.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from suite.harness import Cases, at_most, ratio_target
 _SHAPE, _QUICK, _LARGE = (256, 256), (24, 24), (1024, 1024)
 _PLAIN, _PEER, _HARDEST = "plain", "Cao et al.", "leaves"
 _ROUNDS, _FASTER, _WORSE, _MEAN, _SECONDS = 3, 20.0, 1.1, 0.5, 3.0
-_BYTES = 3 * 4 + 1 + 4  # of a pixel: normals, mask and heights
+_BYTES = 3 * 4 + 1 + 4  # bytes per pixel: normals, mask and heights
 
 
 def run_robust(device: Device, quick: bool) -> Case:
-    """Time each scene, ours in turns and the published method once, and compare heights with the truth."""
+    """Time each scene, the published method only once, and compare heights with the truth."""
     shape = _QUICK if quick else _SHAPE
     rows, notes, targets, ratios = [], [], [], []
     for name, make in list(SCENES.items())[:: 4 if quick else 1]:
@@ -72,7 +72,7 @@ def run_robust(device: Device, quick: bool) -> Case:
 def _compare(
     name: str, scene: Scene, device: Device, quick: bool
 ) -> tuple[list[Row], tuple[float, float, float], int]:
-    """Return rows and errors of ours, plain and the published method, and the steps of that."""
+    """Return rows and errors (ours, plain, published), and the iterations of the published method."""
     size = _BYTES * scene.mask.size
     works = {
         f"{OURS}, {name}": Work(lambda: _integrate(scene, True, device), size),

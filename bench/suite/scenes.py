@@ -18,21 +18,21 @@ LEVELS = {
     "float32": (16, 224),
 }  # counts in the dark and in the light
 TILT = float(np.radians(2.5))
-STEPS = 8  # frames of one turn
+STEPS = 8  # frames per turn
 PIXEL = 0.01  # size of a pixel of slopes, mm
 NOISE = 0.02  # standard deviation of a slope
 
-_NOISE = 1.5 / 208  # of a press, divided by bright minus dark
-_DEAD = 10_000  # one pixel of this number has no bright reference
-_NAN = 1_000_000  # one float sample of this number is NaN
+_NOISE = 1.5 / 208  # standard deviation of a sample of a press, divided by bright minus dark
+_DEAD = 10_000  # one in this number of pixels has no bright reference
+_NAN = 1_000_000  # one in this number of float samples is NaN
 _STEEPEST = np.radians(60)  # zenith at the rim of a ball
 _RIM = 0.97  # fraction of the radius beyond which contact is lost on one side
-_SAG = np.radians(15)  # by which the zenith is smaller where contact is lost
+_SAG = np.radians(15)  # decrease of the zenith where contact is lost
 _LOST = 0.3  # cosine between lean and azimuth above which contact is lost
-_WAVES, _FINEST = 12, 12.0  # of slopes; periods of the finest wave along the longer side
+_WAVES, _FINEST = 12, 12.0  # number of waves; periods of the finest wave along the longer side
 _SLOPE = 0.3  # root mean square of the slopes
 _BLOB, _OUTSIDE = 25, 0.35  # blobs of a mask along the shorter side, fraction of the pixels outside
-_LENGTHS = (0.1, 0.4)  # of cuts, divided by the shorter side
+_LENGTHS = (0.1, 0.4)  # range of the lengths of cuts, divided by the shorter side
 
 
 class Scale(NamedTuple):
@@ -57,7 +57,7 @@ def press_noise(dtype: np.dtype[Any]) -> float:
 
 
 def turn_noise(dtype: np.dtype[Any]) -> float:
-    """Return the standard deviation of a sample of a turn, counts, including that of rounding."""
+    """Return the standard deviation of a sample of a turn, including rounding, counts."""
     noise = SCALES[dtype.name].noise
     return noise if dtype.kind == "f" else float(np.hypot(noise, 1 / np.sqrt(12)))
 
@@ -88,9 +88,9 @@ def references(shape: Shape, dtype: np.dtype[Any]) -> tuple[Floats, Floats]:
 def fill_press(frames: NDArray[Any], stack: StackName = "press") -> None:
     """Fill a stack, (T, H, W), in place.
 
-    ``press``: the contact of a ball grows outwards from a hole at its level top, each pixel takes one to
-    four frames to turn light, and the corners stay dark. ``random``: each pixel turns light at once at a
-    random time, an eighth never, so that neighbours differ and no part of the picture is finished early.
+    ``press``: the contact of a ball grows outwards from a hole around its apex; each pixel takes one to four
+    frames to turn light, and the corners stay dark. ``random``: each pixel turns light in one frame at a
+    random time, and one in eight never does, so neighbours differ and no part of the picture ends early.
     """
     shape = (frames.shape[1], frames.shape[2])
     generator = np.random.default_rng(0)
@@ -106,7 +106,7 @@ def fill_press(frames: NDArray[Any], stack: StackName = "press") -> None:
         counts += dark
         counts += grain[offset : offset + counts.size].reshape(shape)
         if frame.dtype.kind == "f":
-            # Fractions that sums of float32 represent exactly, so that no answer depends on rounding.
+            # Fractions that float32 sums represent exactly, so that results do not depend on rounding.
             np.divide(np.rint(64 * counts), 64, out=frame)
         else:
             _round(counts, frame)
@@ -115,9 +115,9 @@ def fill_press(frames: NDArray[Any], stack: StackName = "press") -> None:
 
 
 def _front(count: int, shape: Shape, generator: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return the frame at which each pixel starts to turn light, and the fraction that it gains a frame."""
+    """Return the frame in which each pixel starts to turn light, and its increase per frame."""
     y, x = np.meshgrid(*(np.linspace(-1.05, 1.05, n) for n in shape), indexing="ij")
-    radius = np.hypot(x, y)  # 1 where the ball leans by 45 degrees
+    radius = np.hypot(x, y)  # 1 at a zenith of 45 degrees
     drop = np.sqrt(2) - np.sqrt(np.maximum(2 - radius**2, 1))
     start = 1 + 0.9 * count * drop / (np.sqrt(2) - 1)
     start[(radius < 0.3) | (radius > 1)] = np.inf
@@ -204,10 +204,10 @@ def noisy_slopes(shape: Shape, seed: int = 0) -> Floats:
 
 
 def drifting_slopes(shape: Shape, count: int, share: float) -> list[Floats]:
-    """Return noisy slopes of `count` frames on a circle, each equally different from the next.
+    """Return noisy slopes of `count` frames on a circle, with equal changes between consecutive frames.
 
-    The change from a frame to the next has a root mean square of `share` of that of the slopes: half of it
-    in the surface, half in the noise.
+    The root mean square of a change is `share` times the root mean square of the slopes: half of it is in the
+    surface, half in the noise.
     """
     middle = noisy_slopes(shape)
     axes = []

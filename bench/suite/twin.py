@@ -1,4 +1,4 @@
-"""How fast the digital twin renders: it has to drive the live loop."""
+"""Speed of the digital twin, which must be fast enough for the live loop."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def run_twin(device: Device, quick: bool) -> Case:
     turn = _make(shape, Axial(np.arange(shape[0]) * 2 * np.pi / 8, np.radians(2.5), 1.0), device)
     frames = np.empty(shape, np.uint8)
     side = min(512, max(shape[1:]))
-    steps = np.linspace(1.0, 3.0, 21)  # mm, each time 0.1 mm deeper
+    steps = np.linspace(1.0, 3.0, 21)  # mm, in steps of 0.1 mm
     elastic = _make((len(steps), side, side), Vertical(steps), device, contact="elastic")
     step = itertools.cycle(range(len(steps)))
     works = {

@@ -30,8 +30,8 @@ HEAD = """# Public calls on OpenCL runtimes for CPUs
 
 By `tests/portability/runtimes.py`: processor time of a call on all cores, ms, the median of up to 15 calls
 with pictures of 1 Mpx, on {processor}. In the layout "cores" a work-item loops over a tile; in "lanes" it
-takes one pixel. A runtime compiled for the processor itself, which has AVX-512, or for the one that is
-named: code for AVX2 then, which says nothing of the caches and units of processors without AVX-512.
+takes one pixel. Runtimes compiled either for this processor, which has AVX-512, or for the named one, with
+AVX2. The latter does not represent the caches and execution units of processors without AVX-512.
 """
 Column = dict[str, Any]
 
