@@ -13,6 +13,7 @@ from mirrorskin.engine.fusion_solver import AbsoluteHeights, FusionSolver
 from mirrorskin.engine.inputs import Maps, as_result, pixel_size_of
 from mirrorskin.engine.method import Context, Method, undistorted
 from mirrorskin.engine.nearest_fill import fill_with_nearest
+from mirrorskin.engine.press.blur import PIXEL, LensBlur
 from mirrorskin.engine.press.intervals import heights_as_intervals
 from mirrorskin.engine.press.press import Press
 from mirrorskin.engine.provenance import attach_provenance, naming
@@ -215,13 +216,12 @@ def fuse_recordings(
     common: dict[str, Any] = {"memory_limit": memory_limit, "device": opened}
     turn = Rotation(**{**_options_of(rotation), **common})
     _check_rotation(axial, turn)
-    pressed, known = _press(
-        Press(**{"blur": 0.0, **_options_of(press), **common, "fill": False}), vertical, progress
-    )
+    pressed, known, footprint = _press({**_options_of(press), **common, "fill": False}, vertical, progress)
     if not np.isfinite(pressed.height).any():
         raise InputError(f"{vertical.name}: no pixel turned light, so no height is known to fuse")
     before = fill_with_nearest(pressed.height)
-    solver, passes = FusionSolver(known, pixel_size, robust, opened[0]), _passes(axial, register)
+    solver = FusionSolver(known, pixel_size, robust, opened[0], footprint)
+    passes = _passes(axial, register)
     for number in range(passes):
         method = turn.with_options(heights=before) if register else turn
         done = vertical.shape[0] + number * axial.shape[0]
@@ -276,8 +276,14 @@ def _options_of(method: Method | Mapping[str, Any] | None) -> Mapping[str, Any]:
     return method.chosen() if isinstance(method, Method) else method or {}
 
 
-def _press(method: Press, vertical: Source, progress: Progress | None) -> tuple[Result, AbsoluteHeights]:
-    """Return the maps of a press, and its heights as intervals between frames."""
+def _press(
+    options: Mapping[str, Any], vertical: Source, progress: Progress | None
+) -> tuple[Result, AbsoluteHeights, float]:
+    """Return the maps of a press, its heights as intervals between frames, and the area that a pixel sees.
+
+    Slopes determine how far a lens that blurs has moved each height, but they are blurred as well.
+    """
+    lens, method = LensBlur(blur=options.get("blur")), Press(**{**options, "blur": 0.0})
     with naming(vertical):
         plan = method.plan(vertical)
         found = feed(vertical, plan.operation, plan.frames, progress)
@@ -289,7 +295,9 @@ def _press(method: Press, vertical: Source, progress: Progress | None) -> tuple[
     middle, between = heights_as_intervals(height, sigma, plan.operation.pushed("travel"))
     # Steps, such as the correction for the elastomer, move heights and change their sigma.
     sigma = result.height_sigma * (between / sigma)
-    return result, AbsoluteHeights.of(result.height + (middle - height), sigma)
+    footprint = lens.footprint(result, Context(vertical, plan.operation, plan.stream or vertical))
+    variance = footprint.variance if footprint is not None and footprint.clear else PIXEL
+    return result, AbsoluteHeights.of(result.height + (middle - height), sigma), variance
 
 
 def _rotate(method: Rotation, axial: Source, progress: Progress | None) -> tuple[Result, Slopes]:

@@ -105,8 +105,11 @@ def find_disagreement(
     )
 
 
-def describe_disagreement(found: Disagreement, error: SlopeError) -> dict[str, ProcessValue]:
-    """Return what a result's process says of a disagreement, and of the error that was removed before."""
+def describe_disagreement(found: Disagreement, error: SlopeError, scatter: float) -> dict[str, ProcessValue]:
+    """Return what a result's process says of a disagreement, and of the error that was removed before.
+
+    ``scatter`` is the factor by which the errors of slopes exceed those stated.
+    """
     process: dict[str, ProcessValue] = {}
     findings = []
     if error != SlopeError():
@@ -129,6 +132,12 @@ def describe_disagreement(found: Disagreement, error: SlopeError) -> dict[str, P
                 " steady?",
             )
         )
+    if scatter > 1:
+        text = (
+            f"neighbouring slopes contradict each other as if their errors were {scatter:.2g} times those"
+            " stated, which height_sigma includes"
+        )
+        findings.append(Finding("slope scatter", text, False))
     return process | in_process(findings, {})
 
 

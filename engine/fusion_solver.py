@@ -18,6 +18,7 @@ from mirrorskin.engine.fusion_agreement import (
 )
 from mirrorskin.engine.integration.integration import integrate
 from mirrorskin.engine.integration.validation import check_pixel_size
+from mirrorskin.engine.press.blur import PIXEL
 from mirrorskin.engine.press.holes import fill_holes
 from mirrorskin.engine.press.intervals import estimate_interval_errors, fit_paraboloids, interval_evidence
 from mirrorskin.engine.rotation.normals_to_height import Slopes
@@ -41,7 +42,10 @@ _SEVERAL = 6.0  # smallest range of heights, in half intervals, for uniformly di
 _NEARLY_ALL = 0.9  # quantile of the errors from which the used share of the intervals is estimated
 _LEAST_USED = 0.5  # smallest used share of the intervals
 _FIRST = 1e-4  # tolerance of the surfaces before the last; with 1e-5, errors are the same within 0.1 %
-_AVERAGED = 1 / 24  # error of a pixel's mean height, in second differences
+_USUAL_MISFIT = 0.25  # median square misfit of slopes whose errors are as stated, in variances
+_FEWEST = 1000  # slopes that tell it
+_LEAST_MISFIT = 1.15  # ratio of the median to this from which on it is no chance
+_COMPARED = 1 << 16  # slopes whose misfit is computed
 _CORRECTIONS = 3  # largest number of corrections of the slopes
 _IMPROVED = 0.5  # share of the disagreement that a correction must leave at most
 _ITERATIONS = 5  # largest number of updates of the components' offsets
@@ -83,12 +87,19 @@ class FusionSolver:
     integration does not converge.
     """
 
-    def __init__(self, press: AbsoluteHeights, pixel_size: ArrayLike, robust: bool, device: Device) -> None:
+    def __init__(
+        self,
+        press: AbsoluteHeights,
+        pixel_size: ArrayLike,
+        robust: bool,
+        device: Device,
+        footprint: float = PIXEL,
+    ) -> None:
         self._press, self._pixel_size = press, check_pixel_size(pixel_size)
-        self._robust, self._device = robust, device
+        self._robust, self._device, self._footprint = robust, device, footprint
         self._near: Result | None = None
         self._slope_error, self._disagreement = SlopeError(), Disagreement()
-        self._correlation = 0.0
+        self._correlation, self._scatter = 0.0, 1.0
 
     def surface(self, slopes: Slopes, *, sigma: bool = True) -> Result:
         """Return the surface of the heights and given slopes.
@@ -119,7 +130,7 @@ class FusionSolver:
     @property
     def process(self) -> dict[str, ProcessValue]:
         """What is known of the last surface: contradictions, and the correlation of the errors of heights."""
-        said = describe_disagreement(self._disagreement, self._slope_error)
+        said = describe_disagreement(self._disagreement, self._slope_error, self._scatter)
         return {**said, "height_correlation": self._correlation}
 
     def _fit(self, slopes: Slopes, sigma: bool) -> tuple[Result, Disagreement]:
@@ -139,7 +150,9 @@ class FusionSolver:
         found = find_disagreement(surface.height, height, weight, slopes, self._pixel_size)
         self._correlation = _correlation_length(extended, weight)
         if surface.height_sigma is not None:
-            surface = _add_error_of_averaging(_set_sigma_of_lone_pixels(surface, weight))
+            self._scatter = _scatter(surface.height, slopes, self._pixel_size)
+            surface = surface.assign(height_sigma=surface.height_sigma * np.float32(self._scatter))
+            surface = _add_error_of_averaging(_set_sigma_of_lone_pixels(surface, weight), self._footprint)
         return surface, found
 
     def filled(self, surface: Result) -> Result:
@@ -301,11 +314,35 @@ def _set_sigma_of_lone_pixels(surface: Result, weight: Doubles) -> Result:
     return surface.assign(height_sigma=sigma)
 
 
-def _add_error_of_averaging(surface: Result) -> Result:
+def _scatter(surface: NDArray[np.floating], slopes: Slopes, pixel_size: tuple[float, float]) -> float:
+    """Return by which factor the errors of slopes exceed those stated, from their misfit; at least 1.
+
+    Errors that are the same in all frames, such as a gain of each pixel, do not show in the residuals of
+    the frames, but make neighbouring slopes contradict each other. Errors of the zenith are in one of two
+    directions: their variance is then larger by 2 r - 1, if that of both together is larger by r.
+    """
+    misfits = []
+    for axis, slope, variance in (
+        (1, slopes.dz_dx * pixel_size[0], pixel_size[0] ** 2),
+        (0, -slopes.dz_dy * pixel_size[1], pixel_size[1] ** 2),
+    ):
+        maps = [surface, slope, slopes.weights[1 - axis]]
+        height, rise, weight = (values.T if axis == 0 else values for values in maps)
+        each = max(1, height.size // _COMPARED)
+        height, rise, weight = (values[::each].astype(np.float64) for values in (height, rise, weight))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            error = np.diff(height, axis=1) - (rise[:, 1:] + rise[:, :-1]) / 2
+            misfits.append(error**2 / (variance * (1 / weight[:, 1:] + 1 / weight[:, :-1]) / 4))
+    misfit = np.concatenate([one[np.isfinite(one)] for one in misfits])
+    ratio = float(np.median(misfit)) / _USUAL_MISFIT if misfit.size >= _FEWEST else 0.0
+    return float(np.sqrt(2 * ratio - 1)) if ratio > _LEAST_MISFIT else 1.0
+
+
+def _add_error_of_averaging(surface: Result, footprint: float) -> Result:
     """Add what a pixel's mean over its area differs from its middle, where the surface is curved, to sigma.
 
-    The mean of a height z over a pixel of sides a, b exceeds that in its middle by
-    (a^2 z_xx + b^2 z_yy) / 24.
+    The mean of a height z over an area with the variances a^2, b^2 exceeds that in its middle by
+    (a^2 z_xx + b^2 z_yy) / 2.
     """
     height, inside = surface.height.astype(np.float64), surface.component >= 0
     if surface.edges is not None:
@@ -315,7 +352,7 @@ def _add_error_of_averaging(surface: Result) -> Result:
         if height.shape[axis] > 2:
             middle = tuple(slice(1, -1) if axis == one else slice(None) for one in (0, 1))
             bend[middle] += np.diff(np.where(inside, height, np.nan), 2, axis=axis)
-    sigma = np.hypot(surface.height_sigma, np.nan_to_num(bend) * _AVERAGED)
+    sigma = np.hypot(surface.height_sigma, np.nan_to_num(bend) * footprint / 2)
     return surface.assign(height_sigma=sigma.astype(np.float32))
 
 

@@ -20,12 +20,14 @@ from mirrorskin.io.traces import FrameSamples
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma
 
+PIXEL = 1 / 12
+"""Variance of a pixel's area, square pixels."""
+
 _SHARES = 0.16, 0.84  # of the way from dark to bright, two standard deviations of a blurred edge apart
 _STEEPEST = 0.75  # quantile of the slopes of those pixels that show the blur
 _STEEPER = 1.5  # ratio of the square slopes of these pixels to those of the flattest ones
 _FEWEST = 16  # of these pixels
 _INTERPOLATED = 0.34**2  # square steps: what interpolation adds to the variance of an edge within one step
-_PIXEL = 1 / 12  # square pixels: variance of a pixel's area
 _SHARP = 0.2  # square pixels: variance of a footprint that is hardly larger than the pixel
 _BLURRED = 9.0  # square pixels: what is larger is no lens
 _LEAST_FRAMES = 8
@@ -57,19 +59,19 @@ class LensBlur(Step):
 
     def apply(self, result: Result, context: Context) -> Result:
         """Return heights with larger standard deviations, and the blur in ``process`` if it is clear."""
-        footprint = self._footprint(result, context)
+        footprint = self.footprint(result, context)
         if footprint is None:
             return result
-        blur = {"blur": round(math.sqrt(footprint.variance - _PIXEL), 2)} if footprint.clear else {}
+        blur = {"blur": round(math.sqrt(footprint.variance - PIXEL), 2)} if footprint.clear else {}
         return result.assign(
             height_sigma=with_curvature(result.height, result.height_sigma, footprint.variance),
             process={**result.process, **blur},
         )
 
-    def _footprint(self, result: Result, context: Context) -> _Footprint | None:
+    def footprint(self, result: Result, context: Context) -> Footprint | None:
         """Return a pixel's footprint; None if nothing is to be added."""
         if self.blur is not None:
-            return _Footprint(self.blur**2 + _PIXEL, True) if self.blur else None
+            return Footprint(self.blur**2 + PIXEL, True) if self.blur else None
         operation = context.operation
         if not isinstance(operation, PressOperation) or isinstance(operation, Strokes):
             return None
@@ -77,11 +79,11 @@ class LensBlur(Step):
         if samples is None or samples.count != len(travel) or len(travel) < _LEAST_FRAMES:
             return None
         found = _footprint(samples, travel, operation, result.height)
-        return _Footprint(_PIXEL) if found is None and isinstance(operation, ChangePoint) else found
+        return Footprint(PIXEL) if found is None and isinstance(operation, ChangePoint) else found
 
 
 @dataclass(frozen=True)
-class _Footprint:
+class Footprint:
     """Variance of the area that a pixel sees, square pixels, and whether it clearly exceeds the pixel."""
 
     variance: float
@@ -114,7 +116,7 @@ class _Quarter:
 
 def _footprint(
     samples: FrameSamples, travel: Doubles, operation: PressOperation, height: NDArray[Any]
-) -> _Footprint | None:
+) -> Footprint | None:
     """Return a pixel's footprint; None if it is sharp or not resolved."""
     rows, columns = samples.rows, samples.columns
     inner = np.ix_((rows > 0) & (rows < height.shape[0] - 1), (columns > 0) & (columns < height.shape[1] - 1))
@@ -156,9 +158,9 @@ def _footprint(
         math.hypot(steep.error, flat.error, unsure * interpolated) / (steep.slope - flat.slope)
         for unsure in _UNSURE
     )
-    if variance - _PIXEL <= _CLEAR * usual:
+    if variance - PIXEL <= _CLEAR * usual:
         return None
-    return _Footprint(math.hypot(variance, usual), variance - _PIXEL > _CLEAR * greatest)
+    return Footprint(math.hypot(variance, usual), variance - PIXEL > _CLEAR * greatest)
 
 
 def _first(shares: NDArray[Any], travel: Doubles, level: float) -> Doubles:
