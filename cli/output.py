@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mirrorskin.io import Result
 
 _NO_GEL = "none: the calibration has no gel"
+_ASCII = {"±": "+-", "µ": "u", "°": " deg", "²": "^2", "³": "^3", "\u2212": "-"}
 _UNTOLD = "none: "  # begins the reason for a missing map in a process
 
 
@@ -84,10 +85,17 @@ def _words(components: int = 1, offset_unknown: int = 0) -> Iterator[str]:
 def printable(value: object) -> str:
     """Return a text in the encoding of standard output, without characters that control terminals.
 
-    Texts in files, and names of files, may hold any characters.
+    Texts in files, and names of files, may hold any characters. What the encoding lacks is written in ASCII
+    where that is usual, as in "+-" and "um", and as "?" otherwise.
     """
-    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
-    return text.printable(str(value).encode(encoding, "replace").decode(encoding))
+    encoding, said = getattr(sys.stdout, "encoding", None) or "utf-8", str(value)
+    try:
+        said.encode(encoding)
+    except UnicodeEncodeError:
+        for letter, ascii_text in _ASCII.items():
+            said = said.replace(letter, ascii_text)
+        said = said.encode(encoding, "replace").decode(encoding)
+    return text.printable(said)
 
 
 def print_json(value: Any) -> None:

@@ -22,7 +22,7 @@ turn = hw.Twin(
 result = fuse_recordings(press, turn)
 
 error = engine.score(result, press.truth).height
-print(f"RMS error {1000 * error.rms:.1f} um at {error.answered} pixels")
+print(f"RMS error {1000 * error.rms:.1f} µm at {error.answered} pixels")
 found = engine.measure(result, form="sphere").quantities
 for name in ("sphere radius", "sphere top", "sphere residual RMS"):
     print(f"{name}: {found[name]}")

@@ -44,7 +44,7 @@ def command(
         print_json(
             {
                 "calibration": str(calibration),
-                "numbers": [row._asdict() for row in rows],
+                "numbers": [row._asdict() | {"unit": row.unit.replace("µ", "u")} for row in rows],  # ASCII
                 "process": dict(parts.process),
                 "pictures": list(map(str, pictures)),
             }

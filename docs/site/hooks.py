@@ -43,7 +43,7 @@ _PACKAGES = {
         "engine.fusion": "one surface from heights and normals",
         "engine.pose": "motion of an object between results; stitching of results",
         "engine.force": "pressure, traction and forces from heights or displacements",
-        "engine.metrology": "planes, spheres, sections, steps, texture by ISO 25178-2, profiles; with uncertainties",
+        "engine.metrology": "planes, spheres, sections, steps, texture and profiles, with uncertainties",
         "engine.fringes": "phase of fringes, and its unwrapping",
         "engine.photometric": "normals and albedo from several lamps",
         "engine.focus": "heights from a focus stack",

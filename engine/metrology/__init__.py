@@ -1,5 +1,6 @@
 """Measurements on height maps, with uncertainties: forms, areas, volumes, sections, steps and roughness."""
 
+from mirrorskin.engine.metrology.extent import HighestPoint, highest_point
 from mirrorskin.engine.metrology.forms import Plane, Sphere, fit_plane, fit_sphere
 from mirrorskin.engine.metrology.measures import FormName, Measures, measure
 from mirrorskin.engine.metrology.parameters import PARAMETERS, Parameter
@@ -11,6 +12,7 @@ from mirrorskin.engine.metrology.texture import Roughness, roughness
 __all__ = [
     "PARAMETERS",
     "FormName",
+    "HighestPoint",
     "Measures",
     "Parameter",
     "Plane",
@@ -21,6 +23,7 @@ __all__ = [
     "Step",
     "fit_plane",
     "fit_sphere",
+    "highest_point",
     "measure",
     "profile_parameters",
     "roughness",

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.metrology.fitting import find_uncertain
-from mirrorskin.engine.metrology.patch import Patch
+from mirrorskin.engine.metrology.patch import Patch, patch_of
 from mirrorskin.engine.metrology.quantity import Quantity
 from mirrorskin.engine.metrology.sections import apex
+from mirrorskin.io import Result
 from mirrorskin.kernels.array_types import Doubles
 
 Mask = NDArray[np.bool_]
@@ -20,6 +21,30 @@ _REACH = 3  # pixels on either side of the highest one to which a paraboloid is 
 _ENOUGH = 20  # of these 49 pixels that must have a height
 _NEAR = 3.0  # standard deviations above the lowest pixel, up to which others count as candidates
 _UNIFORM = 1 / math.sqrt(3)  # standard deviation of a uniform distribution between -1 and 1
+
+
+@dataclass(frozen=True, slots=True)
+class HighestPoint:
+    """The highest measured point of a surface.
+
+    Attributes
+    ----------
+    height : Quantity
+        That of `measure`, mm.
+    x, y : float
+        Position of the highest pixel after a median filter, mm.
+    """
+
+    height: Quantity
+    x: float
+    y: float
+
+
+def highest_point(result: Result) -> HighestPoint:
+    """Return the highest measured point of a result with a pixel size."""
+    patch, _ = patch_of(result)
+    row, column = apex(patch.height)
+    return HighestPoint(_highest(patch), float(patch.x[column]), float(patch.y[row]))
 
 
 def heights(patch: Patch) -> dict[str, Quantity]:

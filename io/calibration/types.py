@@ -95,7 +95,7 @@ class Lens(Part):
         "size along x and y of a pixel of the undistorted map",
         "mm",
         title="pixel size along {}",
-        shown_unit="um",
+        shown_unit="µm",
         components="xy",
         valid=_above_zero,
     )
@@ -323,7 +323,7 @@ class Gel(Part):
         "RMS residual of the height on the calibration balls",
         "mm",
         title="left on the ball",
-        shown_unit="um",
+        shown_unit="µm",
         valid=_at_least_zero,
         default=0.0,
     )

@@ -1,5 +1,6 @@
 """What commands say besides what was asked for."""
 
+import io
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from commands import run
 
-from mirrorskin.cli.output import print_fields, report_missing_maps
+from mirrorskin.cli.output import print_fields, printable, report_missing_maps
 
 
 @pytest.mark.parametrize(
@@ -89,3 +90,9 @@ def test_what_is_logged_does_not_control_the_terminal():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
     assert done.stderr.splitlines()[-1] == "a?[2Jb"
+
+
+def test_what_the_encoding_of_a_terminal_lacks_is_written_in_ascii(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding="ascii"))
+    assert printable("5.00 ± 0.01 µm²") == "5.00 +- 0.01 um^2"
+    assert printable("五円") == "??"

@@ -7,7 +7,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from shown import ball, colours_at, rendered
 
-from mirrorskin import io
+from mirrorskin import engine, io
 from mirrorskin.engine.metrology import section
 from mirrorskin.io.maps import FocusStatus, PoseStatus, PressStatus, ReleaseStatus, SlipStatus, status_of
 from mirrorskin.view.colours import MISSING_RGB, normal_colours
@@ -151,19 +151,23 @@ def test_a_section_has_gaps_at_holes_and_what_was_filled_is_dashed():
     np.testing.assert_allclose(measured.get_xdata(), 0.1 * np.arange(60), atol=1e-9)
 
 
-def test_a_section_has_a_band_of_standard_deviations_that_can_be_seen():
+def test_a_section_has_a_band_of_two_standard_deviations():
     sheet, cut = cut_of(along())
     axes = panel_of(draw_section, sheet.result, cut)
-    (label,) = (name for name in named(axes) if name.endswith("sigma"))
-    times = int(label.split()[1])
-    assert 0.05 <= times * 0.01 / np.ptp(cut.height[np.isfinite(cut.height)]) < 0.17
     corners = np.concatenate([path.vertices for path in axes.collections[0].get_paths()])
     at_start = corners[np.isclose(corners[:, 0], 0), 1]
-    np.testing.assert_allclose(
-        [at_start.min(), at_start.max()], -1 + 0.01 * np.array([-times, times]), atol=1e-6
-    )
+    np.testing.assert_allclose([at_start.min(), at_start.max()], -1 + 0.01 * np.array([-2, 2]), atol=1e-6)
     assert not np.any((corners[:, 0] > 2.05) & (corners[:, 0] < 3.85))  # filled: nobody knows how well
-    assert named(axes) == {"measured", "highest measured", "filled", label}
+    assert named(axes) == {"measured", "highest of the section", "filled", "± 2 sigma: 20 µm"}
+
+
+def test_the_highest_point_of_the_surface_is_marked_with_its_measured_height():
+    result = ball(filled=None)
+    sheet, cut = sheet_of(result), section(result)
+    axes = panel_of(draw_section, sheet.result, cut)
+    told = engine.measure(result).quantities["highest point"].value
+    assert "highest point" in named(axes)
+    assert sheet.height_text(told) in [text.get_text() for text in axes.texts]
 
 
 def test_the_highest_measured_point_is_marked():
@@ -191,7 +195,7 @@ def test_a_section_without_errors_or_holes_tells_of_neither():
     level = io.Result(height=np.zeros((3, 9), np.float32), x=np.arange(9.0), y=np.arange(3.0)[::-1])
     sheet, cut = cut_of(level)
     axes = panel_of(draw_section, sheet.result, cut)
-    assert named(axes) == {"measured", "highest measured"}
+    assert named(axes) == {"measured", "highest point"}
     assert note(axes).startswith("A (0, 1) to B (8, 1) mm")
 
 

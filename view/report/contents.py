@@ -130,7 +130,7 @@ def _day(process: Mapping[str, object]) -> str:
     return str(process.get("date", "")).partition("T")[0]
 
 
-_UNITS = {"mm2": "mm²", "mm3": "mm³", "um": "µm"}
+_UNITS = {"mm2": "mm²", "mm3": "mm³", "ml/m2": "ml/m²", "deg": "°"}
 _DIGIT, _POINT = "\N{FIGURE SPACE}", "\N{PUNCTUATION SPACE}"
 
 

@@ -20,16 +20,16 @@ if TYPE_CHECKING:
     from mirrorskin.engine.metrology import Section
 
 _ROOM = 1.15  # range of the axis, relative to the range of the heights
-_TIMES = 1, 3, 10, 30, 100, 300, 1000  # possible widths of the band, in standard deviations
+_TIMES = 2  # standard deviations on either side: the expanded uncertainty, k = 2
+_AT_APEX = 2.0  # pixels from the highest point within which a section passes through it
 _TAIL = 0.1  # excess of the histogram's range over the range of the colours
-_SEEN = 0.05  # smallest visible width of a band, relative to the range of the heights
 _NEAR = 0.1  # of the width: labels closer to a side are aligned inwards
 
 
 def draw_section(axes: Axes, sheet: Sheet, cut: Section) -> None:
-    """Draw heights along a section, with a band of enough standard deviations to be visible.
+    """Draw heights along a section, with a band of two standard deviations, whose width the legend states.
 
-    Filled heights are dashed; a hole is a gap; the highest measured point is marked.
+    Filled heights are dashed; a hole is a gap; the highest point is marked.
     """
     scale = sheet.of_height.figure_scale
     height, sigma = scale * cut.height, scale * cut.sigma
@@ -42,9 +42,10 @@ def draw_section(axes: Axes, sheet: Sheet, cut: Section) -> None:
             cut.distance, _joined(height, cut.filled), color=FILLED, ls=(0, (2, 1)), lw=1.5, label="filled"
         )
     if np.isfinite(cut.sigma).any():
-        times = _visible(cut)
-        band = measured - times * sigma, measured + times * sigma
-        axes.fill_between(cut.distance, *band, color="tab:blue", alpha=0.25, lw=0, label=f"± {times} sigma")
+        band = measured - _TIMES * sigma, measured + _TIMES * sigma
+        width, unit = sheet.height_text(_TIMES * float(np.nanmedian(cut.sigma))).split(" ", 1)
+        label = f"± {_TIMES} sigma: {float(width):.2g} {unit}"
+        axes.fill_between(cut.distance, *band, color="tab:blue", alpha=0.25, lw=0, label=label)
     stretched = _stretch(axes, sheet, cut)
     for name, end in (("A", 0), ("B", 1)):
         axes.annotate(
@@ -67,12 +68,6 @@ def draw_section(axes: Axes, sheet: Sheet, cut: Section) -> None:
     entitle(axes, "Section", f"{_ends(cut, sheet.unit)}{stretched}")
 
 
-def _visible(cut: Section) -> int:
-    """Return the number of standard deviations that makes the band visible."""
-    spread, sigma = float(np.nanmax(cut.height) - np.nanmin(cut.height)), float(np.nanmedian(cut.sigma))
-    return next((times for times in _TIMES if times * sigma >= _SEEN * spread), _TIMES[-1])
-
-
 def _joined(height: Floats, filled: NDArray[np.bool_]) -> Floats:
     """Return the filled heights, and the adjacent measured ones, so that the lines connect."""
     near: NDArray[np.bool_] = filled.copy()
@@ -82,14 +77,14 @@ def _joined(height: Floats, filled: NDArray[np.bool_]) -> Floats:
 
 
 def _draw_apex(axes: Axes, sheet: Sheet, cut: Section) -> None:
-    """Mark the highest measured point."""
+    """Mark the highest point of the surface, if the section has it, or that of the section."""
     distance = cut.distance
-    top = int(np.nanargmax(np.where(cut.filled, np.nan, cut.height)))
-    drawn = sheet.of_height.figure_scale * float(cut.height[top])
-    axes.plot(distance[top], drawn, "v", color="tab:red", ms=5, label="highest measured")
+    top, height, label = _highest_point(sheet, cut)
+    drawn = sheet.of_height.figure_scale * height
+    axes.plot(distance[top], drawn, "v", color="tab:red", ms=5, label=label)
     share = (distance[top] - distance[0]) / (distance[-1] - distance[0] or 1.0)
     axes.annotate(
-        sheet.height_text(float(cut.height[top])),
+        sheet.height_text(height),
         (float(distance[top]), drawn),
         (0, 6),
         textcoords="offset points",
@@ -98,6 +93,19 @@ def _draw_apex(axes: Axes, sheet: Sheet, cut: Section) -> None:
         color="tab:red",
         path_effects=outlined(2.5),
     )
+
+
+def _highest_point(sheet: Sheet, cut: Section) -> tuple[int, float, str]:
+    """Return the sample, the height in mm and the name of the point to mark."""
+    from mirrorskin.engine.metrology import highest_point
+
+    top = int(np.nanargmax(np.where(cut.filled, np.nan, cut.height)))
+    if cut.unit == "mm":
+        point = highest_point(sheet.result)
+        near = np.hypot(cut.x - point.x, cut.y - point.y)
+        if np.min(near) <= _AT_APEX * float(cut.distance[1] - cut.distance[0]):
+            return int(np.argmin(near)), point.height.value, "highest point"
+    return top, float(cut.height[top]), "highest of the section"
 
 
 def _stretch(axes: Axes, sheet: Sheet, cut: Section) -> str:
