@@ -170,6 +170,14 @@ def test_every_format_is_exported_as_by_the_command(tmp_path, monkeypatch, kind)
     assert abs(len(written) - Path(f"command{suffix}").stat().st_size) <= 100  # names and dates
 
 
+def test_nothing_is_saved_for_options_without_a_result(press):
+    session = Session(press)
+    session.choose("event", "release")
+    pane = SavePane(session)
+    assert pane._file() is None
+    assert "no result has been computed with these options" in pane.problem.object
+
+
 def test_a_file_that_cannot_be_written_says_why(press):
     session = Session(press, Opening(operation="mirrorskin.engine:Onset"))
     session.now = type(session.now)(session.now.result.assign(height=None), "no heights")

@@ -162,6 +162,7 @@ class ResultPane:
     def _show_section(self) -> None:
         sheet = self._session.sheet(self._session.now)
         if sheet is None or sheet.result.height is None:
+            self.where.object = ""
             return
         try:
             cut = section(sheet.result, *(self._session.ends or ()))
@@ -184,6 +185,10 @@ class ResultPane:
         self.restart.disabled = region is None
         if sheet is None:
             return
+        if sheet.result.height is None:
+            self.measures.object, self.restart.visible = hint("This result has no heights to measure."), False
+            return
+        self.restart.visible = True
         if self._dragging is not None:
             self._dragging.box.visible = region is not None
             if region is not None:

@@ -92,8 +92,8 @@ class SavePane:
     def write(self) -> bytes:
         """Return the bytes of the file."""
         session, (suffix, with_section) = self._session, self.format.value
-        if session.now is None:
-            raise InputError("no result has been computed: see the message next to the options")
+        if session.now is None or session.failed:
+            raise InputError(f"no result has been computed with these options: {session.problem}")
         result = session.now.result
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, str(self.download.filename))

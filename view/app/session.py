@@ -90,6 +90,7 @@ class Session:
         self.now: Computed | None = None
         self.before: Computed | None = None
         self.problem = ""
+        self.failed = False  # whether the result is older than the options, which cannot be used
         self._samples: tuple[int, int, NDArray[Any]] | None = None
         self.pixel: tuple[int, int] | None = None  # row and column in the whole picture
         self.measured: io.Region | None = None  # pixels of the maps
@@ -270,9 +271,10 @@ class Session:
         except Exception as error:
             if not hasattr(error, "exit_code"):  # not one of the project's own
                 raise
-            self.problem = str(error)
+            self.problem, self.failed = str(error), True
             self._tell("problem")
             return
+        self.failed = False
         self._keep(Computed(result, self.label(), time.perf_counter() - started))
 
     def label(self) -> str:
