@@ -82,6 +82,14 @@ def test_the_previous_result_is_kept_next_to_the_new_one(app):
     assert len(app.result._pair) == 2
 
 
+def test_the_change_since_the_previous_result_is_shown(app):
+    app.options.widgets["threshold"].value = 0.3
+    app.result.compared.value = "change"
+    now, before = app.session.now.result.height, app.session.before.result.height
+    shown = app.result._pictures["before"].source.data["image"][0]
+    np.testing.assert_allclose(shown, now - before, atol=1e-6)
+
+
 def test_an_option_that_is_refused_says_why_and_keeps_the_result(app):
     first = app.session.now
     app.options.widgets["noise"].value = "-1"

@@ -30,7 +30,7 @@ from mirrorskin.io import Region
 from mirrorskin.io.maps import SIGMA
 from mirrorskin.io.opencv import encode
 from mirrorskin.view.app.look import plain_axes
-from mirrorskin.view.colours import FILLED_RGB, MISSING_RGB, apart, normal_colours, span
+from mirrorskin.view.colours import DIVERGING, FILLED_RGB, MISSING_RGB, apart, normal_colours, span
 from mirrorskin.view.result.maps import ball_colours, code_colours
 from mirrorskin.view.result.scale import UNDEFINED_NOTE, displayed_values, scale_of
 from mirrorskin.view.result.sheet import Sheet, percent
@@ -40,22 +40,25 @@ Edges = tuple[float, float, float, float]
 Point = tuple[float, float]
 
 _SHADES = 256
+_CHANGE_SHOWN = 99.5  # percentile of the magnitude at the ends of the colours of a change
+_READ = "@value0{custom}"
 _OPAQUE = 255
 _WORD = (
     'const found = words instanceof Map ? words.get(String(value)) : words[value]; return found ?? "unknown"'
 )
 _UNKNOWN = np.float32(3e38)
 """What stands for NaN, which Bokeh shows as it is."""
-_NUMBER = 'return value > 1e38 ? "unknown" : Number(value).toPrecision(5)'
+_NUMBER = "return value > 1e38 ? 'unknown' : `${Number(value).toPrecision(5)} ${unit}`"
 
 
 @dataclass(frozen=True)
 class Readings:
-    """What the pointer reads: values at pixels, (H, W), lines of text, and the words of codes."""
+    """What the pointer reads: values at pixels, (H, W), lines of text, words of codes, and units."""
 
     columns: dict[str, NDArray[Any]] = field(default_factory=dict)
     tooltips: Sequence[tuple[str, str]] = ()
     words: dict[str, dict[int, str]] = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -153,6 +156,21 @@ def show_map(sheet: Sheet, name: str, like: Shown | None = None) -> Shown:
     )
 
 
+def show_change(now: Shown, before: Shown) -> Shown:
+    """Return how the change from one map of numbers to another is drawn: in diverging colours."""
+    change = now.values - before.values
+    known = np.abs(change[np.isfinite(change)])
+    side = float(np.percentile(known, _CHANGE_SHOWN)) if known.any() else 0.0
+    _, side = apart(-side, side)
+    tooltips = [("x, y", "$x{0.000}, $y{0.000}"), ("Change", _READ)]
+    readings = Readings({"value0": _to_read(change)}, tooltips, units=now.readings.units)
+    caption = "The current result minus the previous one."
+    label = f"Change of {now.label[:1].lower()}{now.label[1:]}"
+    return Shown(
+        change, now.title, caption, label, palette_of(DIVERGING), -side, side, readings=readings
+    )  # fmt: skip
+
+
 def _key() -> str:
     """Return a picture of a ball with the colours of normals, x to the right and y up."""
     png = encode(".png", ball_colours()[..., [2, 1, 0, 3]])
@@ -165,6 +183,7 @@ def _read_at_pixels(sheet: Sheet, name: str) -> Readings:
     result, declared = sheet.result, sheet.result.declaration(name)
     columns: dict[str, NDArray[Any]] = {}
     words: dict[str, dict[int, str]] = {}
+    units: dict[str, str] = {}
     tooltips = [("x, y", f"$x{{0.000}}, $y{{0.000}} {sheet.unit}")]
     unit = declared.figure_unit
     if declared.codes:
@@ -177,12 +196,14 @@ def _read_at_pixels(sheet: Sheet, name: str) -> Readings:
         for number, part in enumerate(parts):
             key = f"value{number}"
             columns[key] = _to_read(values[..., number] if part else values)
-            tooltips.append((part or declared.title_of(name), f"@{key}{{custom}} {unit}".strip()))
+            units[key] = unit
+            tooltips.append((part or declared.title_of(name), f"@{key}{{custom}}"))
     sigma = f"{name}{SIGMA}"
     if sigma in result and result[sigma].ndim == 2:
         error = result.declaration(sigma)
         columns["sigma"] = _to_read(displayed_values(sheet, sigma))
-        tooltips.append(("Standard deviation", f"@sigma{{custom}} {error.figure_unit}"))
+        units["sigma"] = error.figure_unit
+        tooltips.append(("Standard deviation", "@sigma{custom}"))
     status = "status"
     if status in result and name != status and result.declaration(status).codes:
         columns["status"] = result[status]
@@ -192,7 +213,7 @@ def _read_at_pixels(sheet: Sheet, name: str) -> Readings:
         columns["filled"] = result.filled
         tooltips.append(("Origin", "@filled{custom}"))
         words["@filled"] = result.declaration("filled").codes
-    return Readings(columns, tooltips, words)
+    return Readings(columns, tooltips, words, units)
 
 
 def _to_read(values: NDArray[Any]) -> NDArray[np.float32]:
@@ -305,8 +326,9 @@ class Picture:
         empty = np.zeros(shown.values.shape, np.uint32)
         self.marks.data = {"image": [empty if marks is None else marks]}
         read = shown.readings
-        numbers = [name for name in read.columns if name.startswith(("sigma", "value"))]
-        formats = {f"@{name}": CustomJSHover(code=_NUMBER) for name in numbers}
+        formats = {
+            f"@{name}": CustomJSHover(args={"unit": unit}, code=_NUMBER) for name, unit in read.units.items()
+        }
         for column, codes in read.words.items():
             words = {str(code): text for code, text in codes.items()}
             formats[column] = CustomJSHover(args={"words": words}, code=_WORD)

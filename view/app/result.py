@@ -26,6 +26,7 @@ from mirrorskin.view.app.picture import (
     hex_of,
     pixel_at,
     region_between,
+    show_change,
     show_map,
 )
 from mirrorskin.view.app.session import Computed, Session
@@ -36,6 +37,7 @@ from mirrorskin.view.result.sheet import Sheet, percent
 _PICTURE = 410, 350  # largest size, CSS pixels
 _SECTION = 600, 230
 _DRAG = {"Draw a section": "section", "Draw a region to measure": "region", "Move the picture": "move"}
+_NEXT = {"previous result": "before", "change since then": "change", "nothing": ""}
 _BAND = 2  # standard deviations
 
 
@@ -45,7 +47,7 @@ class ResultPane:
     def __init__(self, session: Session) -> None:
         self._session = session
         self.map = pn.widgets.Select(label="Map", width=230)
-        self.compared = pn.widgets.Checkbox(label="Show the previous result", value=True)
+        self.compared = pn.widgets.Select(label="Next to it", options=_NEXT, value="before", width=170)
         self.marked = pn.widgets.Checkbox(label="Mark filled heights", value=True)
         self.drag = pn.widgets.RadioButtonGroup(options=_DRAG, value="section", color="default")
         self.turn = pn.widgets.IntInput(label="Turn", start=0, width=80, visible=False)
@@ -69,7 +71,7 @@ class ResultPane:
         session.watch("ends", callback=self._show_section)
         self._show()
         self.view = pn.Column(
-            pn.Row(self.map, self.turn, pn.Column(self.compared, self.marked), pn.Column(self.drag)),
+            pn.Row(self.map, self.turn, self.compared, pn.Column(self.drag, self.marked)),
             self._pair,
             self.caption,
             pn.Row(
@@ -111,7 +113,7 @@ class ResultPane:
         before = self._session.sheet(self._session.before) if self.compared.value else None
         fits = before is not None and name in before.result and before.place == sheet.place
         if before is not None and fits:
-            self._draw("before", before, show_map(before, name, now), self._session.before)
+            self._draw_next(before, show_map(before, name, now), now)
         other = [self._panes["before"]] if fits else []
         if self._session.before is None and self._session.whole is not None:
             other = [
@@ -132,6 +134,13 @@ class ResultPane:
         self._dragging = Dragging(now, self._drawn, self.drag.value)
         now.figure.on_event(Tap, self._tapped)
         self._panes = {name: pn.pane.Bokeh(one.figure) for name, one in self._pictures.items()}
+
+    def _draw_next(self, before: Sheet, shown: Shown, now: Shown) -> None:
+        """Draw the previous map, or the change since then, which codes and directions do not have."""
+        if self.compared.value == "change" and now.values.dtype.kind == "f":
+            self._pictures["before"].show(show_change(now, shown))
+        else:
+            self._draw("before", before, shown, self._session.before)
 
     def _draw(self, which: str, sheet: Sheet, shown: Shown, computed: Computed | None) -> None:
         assert computed is not None
