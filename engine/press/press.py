@@ -16,6 +16,7 @@ from mirrorskin.engine.press.blur import LensBlur
 from mirrorskin.engine.press.changepoint import ChangePoint
 from mirrorskin.engine.press.crossing import Event, PressOperation
 from mirrorskin.engine.press.estimated_levels import estimate_levels
+from mirrorskin.engine.press.level_errors import LevelErrors
 from mirrorskin.engine.press.levels import Levels
 from mirrorskin.engine.press.no_answer import with_reason
 from mirrorskin.engine.press.onset import Onset
@@ -278,6 +279,7 @@ class Press(Method):
             self.make(PositionErrors),
             *shutter,
             self.make(LensBlur),
+            self.make(LevelErrors),
             self.make(Elastomer, threshold=lowest),
             self.make(HoleFilling),
         ]
