@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -19,6 +21,7 @@ from mirrorskin.kernels.device import C_TYPES
 
 _LARGEST = 1e18  # noise whose square a float32 holds
 _LEAST_CONTRAST = 5.0  # smallest contrast of a peak above that of noise, in standard errors
+_LEAST_SHARE = 0.1  # of the pixels of a window with a peak, below which errors do not grow any more
 _LEAST_CURVATURE = 3.0  # smallest curvature of a peak, in standard errors
 
 
@@ -117,7 +120,37 @@ class Focus(Operation):
         # The window shows the mean of its heights, which is not that of its middle on a curved surface.
         footprint = ((2 * self.radius + 1) ** 2 - 1) / 12
         sigma = with_curvature(height, sigma, footprint)
+        sigma = np.hypot(sigma, _off_centre(height, sharpness, footprint))
+        # Where few pixels around have a peak, noise and their surroundings decided which ones.
+        peaks = cv2.blur(np.isfinite(height).astype(np.float32), (2 * self.radius + 1,) * 2)
+        sigma = sigma / np.maximum(peaks, _LEAST_SHARE) ** 2
         return {"height": height, "height_sigma": sigma, "status": status, "sharpness": sharpness}
+
+
+def _off_centre(height: NDArray[Any], sharpness: NDArray[Any], variance: float) -> NDArray[np.float32]:
+    """Return standard deviations, mm, because uneven texture is not centred in the window.
+
+    The squares of samples of a texture whose logarithm rises by g per pixel have their centre g times the
+    variance of the window away.
+    """
+    reach = math.ceil(math.sqrt(variance))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        texture = 2 * np.log(sharpness)
+    product = np.float32(variance**2) * _slopes(texture, reach) * _slopes(height, reach)
+    known = np.isfinite(product)
+    window = 2 * reach + 1, 2 * reach + 1
+    total, share = (
+        cv2.blur(part, window) for part in (np.where(known, product, 0), known.astype(np.float32))
+    )
+    return np.sqrt(np.divide(total, share, out=np.zeros_like(total), where=share > 0))
+
+
+def _slopes(values: NDArray[Any], reach: int) -> NDArray[np.float32]:
+    """Return the sum of the squares of both slopes over ``reach`` pixels on each side."""
+    padded = cv2.copyMakeBorder(values.astype(np.float32), reach, reach, reach, reach, cv2.BORDER_REPLICATE)
+    across = padded[reach:-reach, 2 * reach :] - padded[reach:-reach, : -2 * reach]
+    down = padded[2 * reach :, reach:-reach] - padded[: -2 * reach, reach:-reach]
+    return np.asarray((across**2 + down**2) / (4 * reach**2), np.float32)
 
 
 find_focus = travel_function(
@@ -130,8 +163,10 @@ find_focus = travel_function(
     is, a parabola through log S (Nayar and Nakagawa 1994), weighted by the inverse of the variance of log S,
     noise^2 (2 (N - 1) noise^2 + 4 S) / S^2 (a non-central chi-square). The standard error follows from these
     and from the median misfit of such curves in the picture. Where the surface is curved, half of the
-    window's variance, ((2 radius + 1)^2 - 1) / 12 square pixels, times its second derivatives is added. With
-    ``reach=1``, which fits three samples exactly, it is unknown: NaN.
+    window's variance, ((2 radius + 1)^2 - 1) / 12 square pixels, times its second derivatives is added; where
+    it is inclined and the texture uneven, that variance times its slope and the slope of log S. The sum is
+    divided by the square of the share of the window's pixels that have a peak. With ``reach=1``, which fits
+    three samples exactly, it is unknown: NaN.
 
     Returns
     -------

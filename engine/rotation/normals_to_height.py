@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -55,14 +55,34 @@ def slopes_of(
     if contact is None:
         contact = result.contact
     tilt, turns = process.get("tilt"), process.get("turns", 1)
-    return find_slopes(
+    sigma, gain = result.normals_sigma, process.get("pixel_gain_sigma")
+    along = np.float32(gain) * result.zenith if isinstance(gain, int | float) else None
+    if along is not None:  # it is part of the standard deviation of normals
+        sigma = _without(sigma, along)
+        independent_sigma = None if independent_sigma is None else _without(independent_sigma, along)
+    slopes = find_slopes(
         normals,
-        result.normals_sigma,
+        sigma,
         np.ones(normals.shape[:-1], np.uint8) if contact is None else contact,
         float(tilt) if isinstance(tilt, int | float) else None,
         int(turns) if isinstance(turns, int | float) else 1,
         independent_sigma,
     )
+    return slopes if along is None else _with_zenith_errors(slopes, along)
+
+
+def _without(sigma: Floats, part: Floats) -> Floats:
+    """Return a standard deviation without an independent part of it."""
+    return np.asarray(np.sqrt(np.maximum(sigma**2 - part**2, np.float32(1e-6) * sigma**2)))
+
+
+def _with_zenith_errors(slopes: Slopes, sigma: Floats) -> Slopes:
+    """Return slopes with weights for additional errors of the zenith, radians: they are along the slope."""
+    square = slopes.dz_dx**2 + slopes.dz_dy**2
+    factor = ((1 + square) * sigma) ** 2 / np.maximum(square, np.float32(1e-12))
+    parts = np.stack([slopes.dz_dx**2 * factor, slopes.dz_dy**2 * factor])
+    weights = np.where(slopes.known, slopes.weights / (1 + slopes.weights * np.nan_to_num(parts)), 0)
+    return replace(slopes, weights=weights.astype(np.float32))
 
 
 def find_slopes(

@@ -37,6 +37,7 @@ from mirrorskin.engine.rotation.steps import (
     Integration,
     PhaseErrors,
     RegistrationErrors,
+    ResponseErrors,
 )
 from mirrorskin.engine.streaming import feed
 from mirrorskin.io import Block, Calibrated, Header, InputError, Recording, Source, WallResponse, open_heights
@@ -259,7 +260,14 @@ class Rotation(Method):
         )
 
     def _steps(self) -> list[Step]:
-        return [Edges(), RegistrationErrors(), PhaseErrors(), self.make(Integration), CalibrationErrors()]
+        return [
+            Edges(),
+            RegistrationErrors(),
+            PhaseErrors(),
+            ResponseErrors(),
+            self.make(Integration),
+            CalibrationErrors(),
+        ]
 
     def _process(self) -> dict[str, ProcessValue]:
         origin = "estimate" if self.tilt == "estimate" else "recording" if self.tilt is None else "given"

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import partial
+from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.frames import QUANTUM, thin_out
 from mirrorskin.engine.method import Context, Step
 from mirrorskin.engine.options import option
 from mirrorskin.engine.rotation.curl import AzimuthError, find_azimuth_error
@@ -15,6 +18,8 @@ from mirrorskin.engine.rotation.edges import find_edges
 from mirrorskin.engine.rotation.normals import Normals, azimuth_of
 from mirrorskin.engine.rotation.normals_to_height import Slopes, integrate_normals, slopes_of
 from mirrorskin.engine.rotation.registration import Registered
+from mirrorskin.engine.rotation.residual_noise import CountNoise
+from mirrorskin.engine.rotation.swing import Swing, find_swing
 from mirrorskin.io import Result
 from mirrorskin.io.findings import Finding, with_findings
 from mirrorskin.kernels.least_squares import mad_sigma
@@ -102,14 +107,24 @@ class Integration(Step):
 
 
 class CalibrationErrors(Step):
-    """Add the standard errors of a calibrated response, common to neighbours, to those of the normals."""
+    """Add errors of the response, which are common to neighbours, to those of normals and heights.
+
+    They are the standard errors of a calibrated response, or the range of the swing of a linear one that does
+    not fit to it, as a share of zeniths and, about, of heights.
+    """
 
     def apply(self, result: Result, context: Context) -> Result:
-        """Return the result with another ``normals_sigma``, if the operation has a response."""
-        operation = context.operation
-        if not isinstance(operation, Normals) or operation.response is None:
+        """Return the result with other ``normals_sigma`` and ``height_sigma``, if the response has errors."""
+        operation, share = context.operation, result.process.get("swing_range")
+        if isinstance(operation, Normals) and operation.response is not None:
+            return result.assign(normals_sigma=np.hypot(result.normals_sigma, operation.response.sigma))
+        if not isinstance(share, float):
             return result
-        return result.assign(normals_sigma=np.hypot(result.normals_sigma, operation.response.sigma))
+        sigma = np.hypot(result.normals_sigma, np.float32(share) * result.zenith)
+        result = result.assign(normals_sigma=sigma)
+        if result.height is None:
+            return result
+        return result.assign(height_sigma=np.hypot(result.height_sigma, np.float32(share) * result.height))
 
 
 class PhaseErrors(Step):
@@ -141,6 +156,59 @@ class PhaseErrors(Step):
         sigma = np.hypot(result.normals_sigma, np.float32(error.sigma) * sine)
         result = result.assign(normals=normals, azimuth=partial(azimuth_of, normals), normals_sigma=sigma)
         return with_findings(result, _rotated(error))
+
+
+class ResponseErrors(Step):
+    """Compare the swing of the brightness with what tilt and gain predict.
+
+    Gains of pixels are added to the errors; a response that is not as stated, uneven light and blur are
+    warnings: see `mirrorskin.engine.rotation.swing`. A calibrated response is not judged.
+    """
+
+    def apply(self, result: Result, context: Context) -> Result:
+        """Return the result with other ``normals_sigma``, or with a warning."""
+        operation = context.operation
+        if not isinstance(operation, Normals) or operation.response is not None or result.normals.ndim == 4:
+            return result
+        process = result.process
+        frames, slope = int(process["frames"]), float(process["shot_noise"])
+        base = float(process["noise"]) ** 2 - slope * float(np.nanmedian(thin_out(result.mean)))
+        swing = find_swing(
+            result.normals,
+            result.mean,
+            result.modulation,
+            result.contact,
+            cast("ArrayLike", operation.zenith_gain),
+            float(process["tilt"]),
+            CountNoise(base / frames, slope / frames, QUANTUM**2 / frames),
+        )
+        if swing.gain > 0:
+            sigma = np.hypot(result.normals_sigma, np.float32(swing.gain) * result.zenith)
+            process = {**process, "pixel_gain_sigma": swing.gain}
+            result = result.assign(normals_sigma=sigma, process=process)
+        if (share := max(swing.response, swing.light)) > 0:
+            result = result.assign(process={**process, "swing_range": share})
+        return with_findings(result, *_uneven(swing))
+
+
+def _uneven(swing: Swing) -> Iterator[Finding]:
+    if swing.gain > 0:
+        text = f"the gains of pixels differ by {100 * swing.gain:.2g} %, which is part of the errors"
+        yield Finding("pixel gains", text, False)
+    causes = []
+    if swing.response > 0:
+        causes.append(f"differs by {100 * swing.response:.2g} % from zenith to zenith, as with gamma")
+    if swing.light > 0:
+        causes.append(f"differs by {100 * swing.light:.2g} % from place to place, as in uneven light")
+    if swing.blur > 0:
+        causes.append(f"is weak at tops and edges, as if a lens blurs by {swing.blur:.2g} pixels")
+    if causes:
+        yield Finding(
+            "swing",
+            f"the brightness does not swing as tilt and gain predict: its swing {' and '.join(causes)} (or"
+            " points move in the picture), so normals and heights may be wrong by more than their sigma."
+            " Calibrate the zenith, focus, or register (--heights)",
+        )
 
 
 def _rotated(error: AzimuthError) -> Finding:

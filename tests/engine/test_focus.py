@@ -138,3 +138,20 @@ FRAMES = textured().astype(np.float32)
 def test_bad_input_is_one_line(arguments, line):
     with pytest.raises(io.InputError, match=re.escape(line)):
         engine.focus.find_focus(**{"frames": FRAMES, "travel": TRAVEL, "noise": 1, **arguments})
+
+
+def test_texture_that_is_uneven_on_a_slope_is_part_of_the_error():
+    slope = 4.2 + 0.05 * (np.arange(SHAPE[1]) - 23.5)
+    fading = np.linspace(1, 0.1, SHAPE[1])
+    frames = 120 + (textured(sharpest=slope) - 120) * fading
+    found = engine.focus.find_focus(noisy(frames, 0.05, 0), TRAVEL, noise=0.05)
+    ratio = (found.height + slope)[6:-6, 6:-6] / found.height_sigma[6:-6, 6:-6]
+    assert 0.1 < np.mean(ratio**2) < 1  # 2.0 without
+
+
+def test_errors_grow_where_few_pixels_around_have_a_peak():
+    frames = textured()
+    frames[:, :, 24:] = 120  # no texture there
+    found = engine.focus.find_focus(noisy(frames, 0.5, 0), TRAVEL, noise=0.5)
+    inside, border = np.nanmedian(found.height_sigma[:, 10]), np.nanmedian(found.height_sigma[:, 24])
+    assert border > 2 * inside

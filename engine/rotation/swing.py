@@ -1,0 +1,172 @@
+"""What the swing of the brightness of a rotation shows about its response.
+
+The mean of a pixel's brightness determines the zenith; how much it swings follows from the slope of the
+response there. Three errors change the swing, each in its own way:
+
+- a response that is not as stated (gamma): it depends on the zenith, and uneven light (vignetting): on the
+  place in the picture;
+- gains of pixels: it differs from pixel to pixel, in excess of noise;
+- blur: it is smaller where the azimuth changes from pixel to pixel.
+
+Points that move in the picture while the body leans change it where the surface is curved; a sphere shows
+nothing of all this, as its zenith, its place and its curvature change together.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.engine.rotation.residual_noise import CountNoise
+from mirrorskin.kernels.array_types import Doubles
+from mirrorskin.kernels.least_squares import mad_sigma
+
+_STEEP = 3.0  # tilts, from which on the zenith and the swing are independent
+_REACH, _LINES = 2, 128  # pixels between the middle and its neighbours; lines of pixels that are used
+_FEWEST = 400  # pixels
+_ROUNDS, _OUTLYING = 4, 4.0  # iterations, and standard deviations beyond which a pixel is left out
+_CLEAR, _CLEAR_GAIN = 6.0, 5.0  # standard errors from which on an effect is one
+_UNEVEN = 0.03  # least range of the swing, as a share of it, that is a response or uneven light
+_ALONE = 0.25  # least share of an effect's variance that the others do not explain
+_JOINED = 1.25  # ratio of that error to that of independent values
+_WIDELY = 100  # pixels: a tip is not blur
+_BLUR = 0.4  # pixels: least standard deviation of a lens's point spread
+_GAIN = 0.01  # least standard deviation of the gains of pixels
+
+
+@dataclass(frozen=True, slots=True)
+class Swing:
+    """Effects on the swing of the brightness; 0 if one is not significant.
+
+    Attributes
+    ----------
+    response, light : float
+        Range of the swing, as a share of it, over the zeniths and over the places of the picture.
+    gain : float
+        Standard deviation of the gains of pixels.
+    blur : float
+        Standard deviation of the point spread, pixels.
+    """
+
+    response: float = 0.0
+    light: float = 0.0
+    gain: float = 0.0
+    blur: float = 0.0
+
+
+def find_swing(
+    normals: NDArray[np.floating],
+    mean: NDArray[np.floating],
+    modulation: NDArray[np.floating],
+    usable: NDArray[Any],
+    zenith_gain: ArrayLike,
+    tilt: float,
+    noise_of_mean: CountNoise,
+) -> Swing:
+    """Return what the swing of brightness shows.
+
+    ``normals``, (H, W, 3), ``mean`` and ``modulation``, (H, W) counts, are used at ``usable`` pixels, (H, W).
+    """
+    rows, columns = usable.shape
+    thin = max(1, math.isqrt(int(np.count_nonzero(usable))) // _LINES)
+    if min(rows, columns) <= 2 * _REACH:
+        return Swing()
+    down, right = np.arange(_REACH, rows - _REACH, thin), np.arange(_REACH, columns - _REACH, thin)
+    scale = np.broadcast_to(np.abs(np.asarray(zenith_gain, np.float64)), usable.shape)
+
+    def look(rows_down: int, columns_right: int) -> tuple[Doubles, ...]:
+        """Return zenith, its sine's direction and the ratio of the swing, NaN where it is not usable."""
+        at = np.ix_(down + rows_down, right + columns_right)
+        x, y, z = np.moveaxis(normals[at].astype(np.float64), -1, 0)
+        flat = np.hypot(x, y)
+        zenith = np.where((usable[at] > 0) & (flat > math.sin(_STEEP * tilt)), np.arctan2(flat, z), np.nan)
+        return zenith, x / flat, y / flat, modulation[at] / (scale[at] * _expected(zenith, tilt))
+
+    with np.errstate(divide="ignore", invalid="ignore"):
+        middle = look(0, 0)
+        east, west, north, south = (
+            look(*place) for place in ((0, _REACH), (0, -_REACH), (-_REACH, 0), (_REACH, 0))
+        )
+        apart = 2 * _REACH
+        pairs = (east, west), (north, south)
+        turning = np.sum([((one[k] - other[k]) / apart) ** 2 for one, other in pairs for k in (1, 2)], axis=0)
+        bending = ((east[0] - west[0]) * middle[1] + (north[0] - south[0]) * middle[2]) / apart
+        zenith = (east[0] + west[0] + north[0] + south[0]) / 4  # without the error of this pixel
+        rough = middle[3] - (east[3] + west[3] + north[3] + south[3]) / 4
+        at = np.ix_(down, right)
+        noise = math.sqrt(2) * noise_of_mean.at(mean[at]) / (scale[at] * tilt)
+    known = np.isfinite(rough) & np.isfinite(turning) & np.isfinite(noise) & (noise > 0)
+    if np.count_nonzero(known) < _FEWEST:
+        return Swing()
+    y, x = (
+        np.broadcast_to(one, known.shape)[known]
+        for one in np.ix_(1 - 2 * down / (rows - 1), 2 * right / (columns - 1) - 1)
+    )
+    noise, rough = noise[known], rough[known]
+    gain = _gain(rough, noise)
+    columns_of = np.stack([
+        np.ones_like(x), turning[known], bending[known], zenith[known] - np.mean(zenith[known]),
+        x, y, x * x, x * y, y * y,
+    ], axis=1)  # fmt: skip
+    return _fit(middle[3][known], columns_of, np.hypot(noise, gain), gain)
+
+
+def _expected(zenith: Doubles, tilt: float) -> Doubles:
+    """Return the swing of the angle to the body's axis, radians."""
+    return np.asarray(np.interp(zenith, *_swings(tilt)))
+
+
+@functools.lru_cache(4)
+def _swings(tilt: float) -> tuple[Doubles, Doubles]:
+    """Return zeniths, and the swing of the angle to the body's axis at each."""
+    zenith = np.linspace(0, math.pi / 2, 256)
+    phase = np.arange(32) * 2 * math.pi / 32
+    lean = np.multiply.outer(np.sin(zenith) * math.sin(tilt), np.cos(phase))
+    angle = np.arccos(np.clip((np.cos(zenith) * math.cos(tilt))[:, np.newaxis] - lean, -1, 1))
+    return zenith, np.abs(2 * np.mean(angle * np.cos(phase), axis=1))
+
+
+def _gain(rough: Doubles, noise: Doubles) -> float:
+    """Return the standard deviation of gains, from what differs from the mean of four neighbours."""
+    ratio = rough / (noise * math.sqrt(1.25))
+    # Neighbours are in several means, so that the error of the variance is larger than of independent values.
+    excess = float(np.mean(ratio[np.abs(ratio) <= _OUTLYING * mad_sigma(ratio)] ** 2)) - 1
+    gain = math.sqrt(max(excess, 0)) * float(np.median(noise))
+    return gain if excess > _CLEAR_GAIN * _JOINED * math.sqrt(2 / len(rough)) and gain > _GAIN else 0.0
+
+
+def _fit(swing: Doubles, columns: Doubles, noise: Doubles, gain: float) -> Swing:
+    """Fit the effects to the ratio of the swing to the expected one."""
+    kept = np.full(len(swing), True)
+    for _ in range(_ROUNDS):
+        weighted = columns[kept] / noise[kept, np.newaxis]
+        matrix = weighted.T @ weighted
+        if np.linalg.cond(matrix) > 1e12:
+            return Swing(gain=gain)
+        inverse = np.linalg.inv(matrix)
+        fit = inverse @ (weighted.T @ (swing[kept] / noise[kept]))
+        left = (swing - columns @ fit) / noise
+        kept = np.abs(left) <= _OUTLYING * max(mad_sigma(left), 1e-12)
+    covariance = inverse * max(1.0, float(np.mean(left[kept] ** 2)))
+
+    def effect(chosen: slice) -> float:
+        """Return the range of an effect if it is significant, and not that of another one."""
+        part, own = fit[chosen], columns[kept, chosen] - columns[kept, chosen].mean(axis=0)
+        others = np.delete(columns[kept], np.r_[chosen], axis=1)
+        shown = own @ part
+        spare = shown - others @ np.linalg.lstsq(others, shown, rcond=None)[0]
+        chi2 = float(part @ np.linalg.solve(covariance[chosen, chosen], part))
+        extent = float(np.ptp(np.percentile(shown, [5, 95]))) / abs(fit[0])
+        alone = float(np.var(spare)) > _ALONE * float(np.var(shown))
+        return extent if alone and chi2 > len(part) * _CLEAR**2 and extent > _UNEVEN else 0.0
+
+    turning = columns[kept, 1]
+    number = float(np.sum(turning**2)) ** 2 / float(np.sum(turning**4))  # of pixels that decide about blur
+    spread = math.sqrt(-2 * min(fit[1], 0.0))
+    blurred = -fit[1] > _CLEAR * math.sqrt(covariance[1, 1]) and spread > _BLUR and number > _WIDELY
+    return Swing(effect(slice(3, 4)), effect(slice(4, 9)), gain, spread if blurred else 0.0)

@@ -1,0 +1,99 @@
+"""What the swing of the brightness of a rotation shows: gamma, vignetting, gains of pixels, and blur."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import rotations
+from rotations import Setup
+from scipy.ndimage import gaussian_filter
+
+from mirrorskin import engine, io
+from mirrorskin.io.arrays import ArrayRecording
+
+SIZE, PIXEL, COUNT = 72, 0.05, 16
+SETUP = Setup(noise=1.2, offset=20.0, phase=tuple(np.arange(COUNT) * 2 * np.pi / COUNT))
+FULL = 200.0  # counts above dark
+
+
+@cache
+def waves():
+    """Return the normals of a wavy surface, (H, W, 3)."""
+    x, y = np.meshgrid(*io.pixel_axes((SIZE, SIZE), (PIXEL, PIXEL)))
+    u, v = 2 * np.pi * x / 1.6, 2 * np.pi * y / 1.9
+    slope = 0.8 * np.cos(u) * np.cos(v) + 0.1, -0.7 * np.sin(u) * np.sin(v)
+    normal = np.stack([-slope[0], -slope[1], np.ones_like(x)], axis=-1)
+    return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+
+
+def shares(normals):
+    """Return the light of each frame, as a share of full light."""
+    return (rotations.levels(normals, SETUP) - 20) / FULL
+
+
+def result_of(light):
+    counts = np.rint(20 + FULL * light + np.random.default_rng(1).normal(0, SETUP.noise, light.shape))
+    header = {"tilt": SETUP.tilt, "zenith_gain": SETUP.slope, "zenith_offset": 20.0}
+    header["pixel_size"] = PIXEL, PIXEL
+    frames = counts.clip(0, 255).astype(np.uint8)
+    return engine.reconstruct(ArrayRecording(frames, {"phase": np.array(SETUP.phase)}, header))
+
+
+def warned(light, words):
+    with pytest.warns(io.MirrorskinWarning, match=words):
+        return result_of(light)
+
+
+def chi2(result):
+    error = np.linalg.norm(np.cross(result.normals.astype(float), waves()), axis=-1)
+    return np.nanmean((error / result.normals_sigma) ** 2)
+
+
+def uneven():
+    """Return shares of the light that reach the pixels: less in the corners."""
+    x, y = np.meshgrid(np.linspace(-1, 1, SIZE), np.linspace(-1, 1, SIZE))
+    return 1 - 0.1 * (x**2 + y**2) / 2
+
+
+def gains():
+    return 1 + 0.03 * np.random.default_rng(5).standard_normal((SIZE, SIZE))
+
+
+def test_light_as_stated_has_no_finding():
+    process = result_of(shares(waves())).process
+    assert not {"warnings", "notes", "pixel_gain_sigma", "swing_range"} & set(process)
+
+
+def test_a_response_that_is_not_linear_is_found():
+    warned(shares(waves()) ** 0.85, "from zenith to zenith, as with gamma")
+
+
+def test_uneven_light_is_found():
+    warned(shares(waves()) * uneven(), "from place to place, as in uneven light")
+
+
+def test_errors_of_normals_in_uneven_light_include_it():
+    assert chi2(warned(shares(waves()) * uneven(), "uneven")) < 1.2
+
+
+def test_a_lens_that_blurs_is_found():
+    blurred = np.stack([gaussian_filter(frame, 1.5, mode="nearest") for frame in shares(waves())])
+    warned(blurred, r"as if a lens blurs by 1\.6 pixels")
+
+
+def test_gains_of_pixels_are_estimated():
+    assert result_of(shares(waves()) * gains()).process["pixel_gain_sigma"] == pytest.approx(0.03, abs=0.006)
+
+
+def test_gains_of_pixels_are_part_of_the_errors_of_normals():
+    assert 0.8 < chi2(result_of(shares(waves()) * gains())) < 1.25
+
+
+def test_gains_of_pixels_are_part_of_the_errors_of_heights():
+    even, differing = result_of(shares(waves())), result_of(shares(waves()) * gains())
+    assert np.median(differing.height_sigma) > 1.5 * np.median(even.height_sigma)
+
+
+def test_a_plate_shows_nothing():
+    plate = np.broadcast_to(rotations.direction(np.radians(20), 0.3), (SIZE, SIZE, 3))
+    assert "warnings" not in result_of(shares(plate) ** 0.85).process
