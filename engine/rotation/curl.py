@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma
 
-_LOOPS, _LEAST, _LINES = 40, 3, 128  # of the extent of the normals: half a side of a loop; its least; loops
+_LOOPS, _LEAST, _LINES = 40, 3, 48  # of the extent of the normals: half a side of a loop; its least; loops
 _FEWEST = 200  # loops
 _ROUNDS, _OUTLYING = 4, 4.0  # iterations, and standard deviations beyond which a loop is left out
 _EXPLAINED = np.array([0.2, 0.5])  # least share of the curl that an angle explains, and one that changes
@@ -85,11 +85,11 @@ def _regression(curl: Doubles, divergence: Doubles, place: Doubles, overlap: flo
     columns = np.stack([divergence, divergence * place], axis=1)
     kept = np.full(len(curl), True)
     for _ in range(_ROUNDS):
-        matrix = columns[kept].T @ columns[kept]
+        matrix = np.einsum("ni,nj->ij", columns[kept], columns[kept])
         if np.linalg.cond(matrix) > 1e9:
             return None
-        fit = np.linalg.solve(matrix, columns[kept].T @ curl[kept])
-        left = curl - columns @ fit
+        fit = np.linalg.solve(matrix, np.einsum("ni,n->i", columns[kept], curl[kept]))
+        left = curl - np.einsum("ni,i->n", columns, fit)
         kept = np.abs(left) <= _OUTLYING * max(mad_sigma(left), 1e-12)
     spread = np.sqrt(np.diag(np.linalg.inv(matrix)) * float(np.mean(left[kept] ** 2)) * overlap)
     explained = 1 - float(np.var(left[kept])) / max(float(np.var(curl[kept])), 1e-30)

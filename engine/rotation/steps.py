@@ -172,7 +172,7 @@ class ResponseErrors(Step):
             return result
         process = result.process
         frames, slope = int(process["frames"]), float(process["shot_noise"])
-        base = float(process["noise"]) ** 2 - slope * float(np.nanmedian(thin_out(result.mean)))
+        base = float(process["noise"]) ** 2 - slope * _median(result.mean)
         swing = find_swing(
             result.normals,
             result.mean,
@@ -189,6 +189,13 @@ class ResponseErrors(Step):
         if (share := max(swing.response, swing.light)) > 0:
             result = result.assign(process={**process, "swing_range": share})
         return with_findings(result, *_uneven(swing))
+
+
+def _median(values: NDArray[np.floating]) -> float:
+    """Return the median of some of the values that are numbers; 0 if none is."""
+    some = thin_out(values)
+    some = some[np.isfinite(some)]
+    return float(np.median(some)) if some.size else 0.0
 
 
 def _uneven(swing: Swing) -> Iterator[Finding]:

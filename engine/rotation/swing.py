@@ -27,14 +27,14 @@ from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma
 
 _STEEP = 3.0  # tilts, from which on the zenith and the swing are independent
-_REACH, _LINES = 2, 128  # pixels between the middle and its neighbours; lines of pixels that are used
+_REACH, _LINES = 2, 48  # pixels between the middle and its neighbours; lines of pixels that are used
 _FEWEST = 400  # pixels
 _ROUNDS, _OUTLYING = 4, 4.0  # iterations, and standard deviations beyond which a pixel is left out
 _CLEAR, _CLEAR_GAIN = 6.0, 5.0  # standard errors from which on an effect is one
 _UNEVEN = 0.03  # least range of the swing, as a share of it, that is a response or uneven light
 _ALONE = 0.25  # least share of an effect's variance that the others do not explain
 _JOINED = 1.25  # ratio of that error to that of independent values
-_WIDELY = 100  # pixels: a tip is not blur
+_WIDELY, _TURNING = 100, 0.02  # pixels: a tip is not blur; square of the turning of azimuths, 1/pixel^2
 _BLUR = 0.4  # pixels: least standard deviation of a lens's point spread
 _GAIN = 0.01  # least standard deviation of the gains of pixels
 
@@ -145,28 +145,40 @@ def _fit(swing: Doubles, columns: Doubles, noise: Doubles, gain: float) -> Swing
     kept = np.full(len(swing), True)
     for _ in range(_ROUNDS):
         weighted = columns[kept] / noise[kept, np.newaxis]
-        matrix = weighted.T @ weighted
+        matrix = _gram(weighted)
         if np.linalg.cond(matrix) > 1e12:
             return Swing(gain=gain)
         inverse = np.linalg.inv(matrix)
-        fit = inverse @ (weighted.T @ (swing[kept] / noise[kept]))
-        left = (swing - columns @ fit) / noise
+        fit = inverse @ np.sum(weighted * (swing[kept] / noise[kept])[:, np.newaxis], axis=0)
+        left = (swing - np.sum(columns * fit, axis=1)) / noise
         kept = np.abs(left) <= _OUTLYING * max(mad_sigma(left), 1e-12)
     covariance = inverse * max(1.0, float(np.mean(left[kept] ** 2)))
 
+    products = _gram(columns[kept])
+    sums, number = products[0], products[0, 0]  # the first column is 1
+
     def effect(chosen: slice) -> float:
         """Return the range of an effect if it is significant, and not that of another one."""
-        part, own = fit[chosen], columns[kept, chosen] - columns[kept, chosen].mean(axis=0)
-        others = np.delete(columns[kept], np.r_[chosen], axis=1)
-        shown = own @ part
-        spare = shown - others @ np.linalg.lstsq(others, shown, rcond=None)[0]
+        part, others = fit[chosen], np.delete(np.arange(len(fit)), np.r_[chosen])
+        mixed = part @ products[chosen, others]
+        square = float(part @ products[chosen, chosen] @ part)
+        spare = square - float(mixed @ np.linalg.solve(products[np.ix_(others, others)], mixed))
+        alone = spare > _ALONE * (square - float(part @ sums[chosen]) ** 2 / number)
         chi2 = float(part @ np.linalg.solve(covariance[chosen, chosen], part))
-        extent = float(np.ptp(np.percentile(shown, [5, 95]))) / abs(fit[0])
-        alone = float(np.var(spare)) > _ALONE * float(np.var(shown))
-        return extent if alone and chi2 > len(part) * _CLEAR**2 and extent > _UNEVEN else 0.0
+        extent = float(np.ptp(np.percentile(columns[kept, chosen] @ part, [5, 95]))) / abs(float(fit[0]))
+        return extent if alone and chi2 > len(part) * _CLEAR**2 else 0.0
 
     turning = columns[kept, 1]
-    number = float(np.sum(turning**2)) ** 2 / float(np.sum(turning**4))  # of pixels that decide about blur
-    spread = math.sqrt(-2 * min(fit[1], 0.0))
-    blurred = -fit[1] > _CLEAR * math.sqrt(covariance[1, 1]) and spread > _BLUR and number > _WIDELY
-    return Swing(effect(slice(3, 4)), effect(slice(4, 9)), gain, spread if blurred else 0.0)
+    deciding = float(np.sum(turning**2)) ** 2 / float(np.sum(turning**4))  # pixels
+    spread = math.sqrt(-2 * min(float(fit[1]), 0.0))
+    widely = deciding > _WIDELY and float(np.percentile(turning, 95)) > _TURNING
+    blurs = spread > _BLUR and widely and effect(slice(1, 2)) > 0
+    response, light = (
+        extent if extent > _UNEVEN else 0.0 for extent in (effect(slice(3, 4)), effect(slice(4, 9)))
+    )
+    return Swing(response, light, gain, spread if blurs else 0.0)
+
+
+def _gram(columns: Doubles) -> Doubles:
+    """Return the products of columns; unlike a product of matrices, it starts no threads."""
+    return np.asarray(np.einsum("ni,nj->ij", columns, columns))

@@ -663,6 +663,7 @@ def uneven(counts):
     return 20 + (counts - 20) * np.linspace(0.95, 1.05, counts.shape[2])
 
 
+@pytest.mark.filterwarnings("ignore:.*does not swing as tilt and gain predict")
 def test_what_a_press_and_a_rotation_disagree_about_is_part_of_the_standard_deviation():
     with pytest.warns(io.MirrorskinWarning, match=r"disagree by [\d.]+ µm"):
         result = fuse_recordings(pressed_waves(1), turned_waves(2, light=uneven), register=False)

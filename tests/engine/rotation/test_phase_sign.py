@@ -30,5 +30,5 @@ def test_a_mirrored_surface_is_told(shape):
 
 
 @pytest.mark.parametrize("shape", ["coin", "cone", "sphere", "texture", "plane"])
-def test_a_surface_as_it_is_has_no_warning(shape):
-    assert warnings_of(shape, 1) == ""
+def test_a_surface_as_it_is_is_not_mirrored(shape):
+    assert "reversed" not in warnings_of(shape, 1)
