@@ -18,9 +18,12 @@ from mirrorskin.io.positions import check_strokes
 from mirrorskin.io.types import FRAME_DTYPES
 from mirrorskin.kernels.array import fetch
 from mirrorskin.kernels.device import C_TYPES
+from mirrorskin.kernels.least_squares import mad_sigma
 
 _LARGEST = 1e18  # noise whose square a float32 holds
 _LEAST_CONTRAST = 5.0  # smallest contrast of a peak above that of noise, in standard errors
+_BETWEEN = 2 / 3  # variance of noise between pixels two reaches apart, whose windows overlap
+_UNUSUAL = 3.0  # standard deviations from the median misfit, beyond which a pixel has its own
 _LEAST_SHARE = 0.1  # of the pixels of a window with a peak, below which errors do not grow any more
 _LEAST_CURVATURE = 3.0  # smallest curvature of a peak, in standard errors
 
@@ -114,20 +117,38 @@ class Focus(Operation):
         )  # fmt: skip
         found = fetch([(array, slice(None)) for array in maps.values()])
         height, spread, gain, misfit, sharpness, status = found
-        misfit = misfit[np.isfinite(misfit)]
-        excess = max(0.0, float(np.median(misfit))) if misfit.size else np.nan
-        sigma = np.sqrt(np.float32(variance) * spread + np.float32(excess) * gain)
+        sigma = np.sqrt(np.float32(variance) * spread + self._excess(misfit) * gain)
         # The window shows the mean of its heights, which is not that of its middle on a curved surface.
         footprint = ((2 * self.radius + 1) ** 2 - 1) / 12
-        sigma = with_curvature(height, sigma, footprint)
-        sigma = np.hypot(sigma, _off_centre(height, sharpness, footprint))
+        off_centre = _off_centre(height, sigma, sharpness, footprint)
+        sigma = np.hypot(with_curvature(height, sigma, footprint), off_centre)
         # Where few pixels around have a peak, noise and their surroundings decided which ones.
         peaks = cv2.blur(np.isfinite(height).astype(np.float32), (2 * self.radius + 1,) * 2)
         sigma = sigma / np.maximum(peaks, _LEAST_SHARE) ** 2
         return {"height": height, "height_sigma": sigma, "status": status, "sharpness": sharpness}
 
+    def _excess(self, misfit: NDArray[Any]) -> NDArray[np.float32]:
+        """Return the variance of log S in excess of noise: the median, or more where curves fit less well."""
+        known = np.isfinite(misfit)
+        usual = max(0.0, float(np.median(misfit[known]))) if known.any() else np.nan
+        around = _mean_around(misfit, self.radius // 2)
+        unusual = (
+            around > usual + _UNUSUAL * mad_sigma(around[known].astype(np.float64)) if known.any() else False
+        )
+        return np.where(unusual, around, np.float32(usual))
 
-def _off_centre(height: NDArray[Any], sharpness: NDArray[Any], variance: float) -> NDArray[np.float32]:
+
+def _mean_around(values: NDArray[Any], reach: int) -> NDArray[np.float32]:
+    """Return the means of the values that are numbers, over ``reach`` pixels on each side; 0 of none."""
+    known = np.isfinite(values)
+    size = 2 * reach + 1, 2 * reach + 1
+    total, share = (cv2.blur(part.astype(np.float32), size) for part in (np.where(known, values, 0), known))
+    return np.asarray(np.divide(total, share, out=np.zeros_like(total), where=share > 0))
+
+
+def _off_centre(
+    height: NDArray[Any], sigma: NDArray[Any], sharpness: NDArray[Any], variance: float
+) -> NDArray[np.float32]:
     """Return standard deviations, mm, because uneven texture is not centred in the window.
 
     The squares of samples of a texture whose logarithm rises by g per pixel have their centre g times the
@@ -136,13 +157,10 @@ def _off_centre(height: NDArray[Any], sharpness: NDArray[Any], variance: float) 
     reach = math.ceil(math.sqrt(variance))
     with np.errstate(divide="ignore", invalid="ignore"):
         texture = 2 * np.log(sharpness)
-    product = np.float32(variance**2) * _slopes(texture, reach) * _slopes(height, reach)
-    known = np.isfinite(product)
-    window = 2 * reach + 1, 2 * reach + 1
-    total, share = (
-        cv2.blur(part, window) for part in (np.where(known, product, 0), known.astype(np.float32))
-    )
-    return np.sqrt(np.divide(total, share, out=np.zeros_like(total), where=share > 0))
+    noise = sigma**2 * np.float32(_BETWEEN / reach**2)
+    slope = np.maximum(_slopes(height, reach) - noise, 0)
+    product = np.float32(variance**2) * _slopes(texture, reach) * slope
+    return np.sqrt(_mean_around(product, reach))
 
 
 def _slopes(values: NDArray[Any], reach: int) -> NDArray[np.float32]:
@@ -162,11 +180,11 @@ find_focus = travel_function(
     minus the contribution (N - 1) noise^2 of noise. A Gaussian is fitted to the peak and its neighbours, that
     is, a parabola through log S (Nayar and Nakagawa 1994), weighted by the inverse of the variance of log S,
     noise^2 (2 (N - 1) noise^2 + 4 S) / S^2 (a non-central chi-square). The standard error follows from these
-    and from the median misfit of such curves in the picture. Where the surface is curved, half of the
-    window's variance, ((2 radius + 1)^2 - 1) / 12 square pixels, times its second derivatives is added; where
-    it is inclined and the texture uneven, that variance times its slope and the slope of log S. The sum is
-    divided by the square of the share of the window's pixels that have a peak. With ``reach=1``, which fits
-    three samples exactly, it is unknown: NaN.
+    and from the median misfit of such curves in the picture, or that in the window if it is unusual. Where
+    the surface is curved, half of the window's variance, ((2 radius + 1)^2 - 1) / 12 square pixels, times its
+    second derivatives is added; where it is inclined and the texture uneven, that variance times its slope
+    and the slope of log S. The sum is divided by the square of the share of the window's pixels that have a
+    peak. With ``reach=1``, which fits three samples exactly, it is unknown: NaN.
 
     Returns
     -------
