@@ -136,7 +136,7 @@ def as_array_or_number(name: str, value: Any) -> Any:
 
 
 def check_number(name: str, value: Any) -> Any:
-    """Return a number, or raise InputError if it is something else."""
+    """Return a number; InputError for anything else."""
     scalar = isinstance(value, np.ndarray | np.generic) and not value.ndim and value.dtype.kind in "buif"
     if not (scalar or isinstance(value, Real)):
         raise InputError(f"{name} is {shown(value)}: a number is needed")
@@ -149,14 +149,14 @@ def or_none(check: Check) -> Check:
 
 
 def check_count(name: str, value: Any) -> Any:
-    """Return a whole number, or raise InputError if it is something else."""
+    """Return a whole number; InputError for anything else."""
     if not hasattr(value, "__index__") or isinstance(value, bool | np.ndarray):
         raise InputError(f"{name} is {shown(value)}: a whole number is needed")
     return value
 
 
 def check_flag(name: str, value: Any) -> bool:
-    """Return a flag as a bool, or raise InputError if it is something else."""
+    """Return a flag as a bool; InputError for anything else."""
     if not isinstance(value, bool | np.bool_):
         raise InputError(f"{name} is {shown(value)}: use True or False")
     return bool(value)
@@ -174,7 +174,7 @@ def check_kind(kind: type) -> Check:
 
 
 def check_path(name: str, value: Any) -> Any:
-    """Return a path, or raise InputError if it is something else."""
+    """Return a path; InputError for anything else."""
     if not isinstance(value, str | os.PathLike):
         raise InputError(f"{name} is {shown(value)}: a path is needed")
     return value

@@ -215,7 +215,7 @@ class ArrayRecording(Recording):
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """Convert what NumPy raises for a damaged file to a one-line error that names the file."""
+    """Convert NumPy's exceptions for a damaged file to a one-line error that names the file."""
     try:
         yield
     except (InputError, MemoryError):

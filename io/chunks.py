@@ -113,7 +113,8 @@ class Chunks:
         try:
             decode(self._codecs, mask, packed, out)
         except ValueError:
-            # Chunks that are partly outside the dataset may have skipped its filters, as HDF5 does not say.
+            # # Chunks that are partly outside the dataset may have skipped its filters; HDF5 does not report
+            # it.
             at_edge = any(a + c > n for a, c, n in zip(corner, self.shape, self._whole, strict=True))
             if not at_edge or mask or packed.size != out.size:
                 raise
@@ -121,7 +122,7 @@ class Chunks:
 
 
 def find_codecs(dataset: h5py.h5d.DatasetID) -> list[Codec] | str:
-    """Return the functions that undo a dataset's filters, in the order of writing, or why there are none."""
+    """Return the functions that undo a dataset's filters, in the order of writing, or the obstacle."""
     plist = dataset.get_create_plist()
     filters = [plist.get_filter(index) for index in range(plist.get_nfilters())]
     codecs: list[Codec] = []

@@ -1,4 +1,4 @@
-"""Tables of colours: what the indices of a picture with one stand for."""
+"""Colour tables of pictures that store indices."""
 
 from __future__ import annotations
 

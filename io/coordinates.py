@@ -27,7 +27,7 @@ _FIJI = "element_size_um"  # attribute that Fiji and ilastik write: the size of 
 
 @dataclass
 class Coordinates:
-    """What the axes of a stack state, and what is doubtful about it.
+    """Values stated by the axes of a stack, and doubts about them.
 
     Attributes
     ----------

@@ -80,7 +80,7 @@ def _is_exported(path: Path) -> bool:
 
 
 def protected_kind(path: Path) -> str:
-    """Return the kind of a file that cannot be computed again; an empty text for other files."""
+    """Return the kind of a file that cannot be computed again; "" for other files."""
     with path.open("rb") as file:
         head = file.read(_HEAD)
         if head.startswith(_MCAP):

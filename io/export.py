@@ -107,7 +107,7 @@ def export_result(
 
 
 def check_export(result: Result, path: str | Path) -> None:
-    """Refuse what cannot be exported, before any work is done."""
+    """Raise InputError for a result that cannot be exported, before any work is done."""
     suffix = Path(path).suffix.lower()
     if suffix not in FORMATS:
         wrong = f"{suffix} is not a supported format" if suffix else "its name has no suffix"
@@ -175,7 +175,7 @@ def _table(columns: Mapping[str, NDArray[Any]], units: Mapping[str, str], notes:
 
 
 def _commented(notes: Mapping[str, str]) -> StringIO:
-    """Return notes as lines that begin with ``#``, to which a table can be added."""
+    """Return notes as lines that begin with ``#``; a table may follow."""
     text = StringIO(newline="")
     for name, note in notes.items():
         text.write(f"# {name}: {one_line(note)}\n")

@@ -1,4 +1,4 @@
-"""What users should know about frames and results: as warnings, and in ``process``."""
+"""Warnings and notes about frames and results, for the user and for ``process``."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _BETWEEN = "; "
 
 
 class MirrorskinWarning(UserWarning):
-    """Input or a result that may not mean what it seems to; the message is one line with the remedy."""
+    """A warning that input or a result may be wrong; the message is one line with the remedy."""
 
     exit_code = 2
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Something about frames or a result that its user should know.
+    """A fact about frames or a result that the user should know.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ def with_findings(result: Result, *findings: Finding) -> Result:
 
 
 def named(name: str, said: str) -> str:
-    """Return what was said of a source, after its name."""
+    """Return the text of a finding, after the name of its source."""
     return said if said.startswith(name) else f"{name}: {said}"
 
 

@@ -86,7 +86,7 @@ def _find_sequence(folder: Path) -> tuple[NDArray[np.int64], tuple[Path, ...], t
 
 
 def _longest(families: _Families) -> _Families:
-    """Return the family with the most files, and those that cannot be told from it."""
+    """Return the family with the most files, and the other families with as many."""
     most = max(map(len, families.values()), default=0)
     return {key: family for key, family in families.items() if len(family) >= min(most, 2)}
 
@@ -118,7 +118,7 @@ def _families(files: list[Path], pattern: str) -> _Families:
 
 
 def _lost(numbers: NDArray[np.int64]) -> tuple[NDArray[np.int32], tuple[Finding, ...]]:
-    """Return the frames lost before each number, and what is found about the numbers."""
+    """Return the frames lost before each number, and the findings about the numbers."""
     steps = np.diff(numbers)
     stride = int(np.gcd.reduce(steps)) if steps.size else 1
     missing = steps // stride - 1

@@ -1,4 +1,4 @@
-"""Files of other programs that hold frames, and the reader of each kind."""
+"""Readers of files of other programs that contain frames."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Kind = Literal["", "array", "folder", "MCAP", "picture", "TIFF", "video"]
 
 
 def kind_of_frames(path: Path) -> Kind:
-    """Return what a path is by its name, and whether it is a folder; an empty text for HDF5 and Zarr."""
+    """Return the kind of a path, judged by its name, and whether it is a folder; "" for HDF5 and Zarr."""
     if is_zarr(path):
         return ""
     with suppress(OSError):  # reported when it is opened

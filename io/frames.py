@@ -1,4 +1,4 @@
-"""Readers of frames in files of other programs: what they have in common, and what they find."""
+"""The common base of the readers of frames in files of other programs."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class FrameReader(Closing, ABC):
 
     @property
     def chunk(self) -> tuple[int, int, int]:
-        """Shape of what is stored in one piece."""
+        """Shape of one stored block."""
         return self.length, *self.shape[1:]
 
     @abstractmethod
@@ -93,7 +93,7 @@ def kind_of(shape: Sequence[int], dtype: np.dtype[Any]) -> str:
 
 
 def lost_frames(lost: NDArray[np.int32]) -> tuple[Finding, ...]:
-    """Return what is found about the frames lost before each frame."""
+    """Return the findings about the frames lost before each frame."""
     if not lost.any():
         return ()
     count, gaps = int(lost.sum()), np.flatnonzero(lost)

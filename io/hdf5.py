@@ -268,7 +268,7 @@ class Hdf5File(Closing):
         return tuple(str(first_value(text)) for text in self.load(node))
 
     def walk(self, node: Node, name: str, depth: int = 0) -> Node | None:
-        """Do what ``find`` does, starting at any object, after ``depth`` links."""
+        """Apply ``find`` to any object, after ``depth`` links."""
         if depth > _LINKS_DEEP:
             raise InputError(f"{self.where(node)}: its links form a cycle; name the dataset itself")
         for part in name.split("/"):

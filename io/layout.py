@@ -106,7 +106,7 @@ def _width(name: str) -> Shape:
 
 
 class Layout:
-    """Reader of the properties of a part of a stack; those of another program's are its coordinates."""
+    """Reader of the properties of a part of a stack; from coordinates if another program wrote it."""
 
     def __init__(
         self,
@@ -127,7 +127,7 @@ class Layout:
         pixel_size: tuple[float, float] | None,
         override_motion: bool = False,
     ) -> Header:
-        """Read the properties of the whole stack; those that are given may be missing."""
+        """Read the properties of the whole stack; the file may lack those that are given."""
         own = self._text(f"{STAGE}/motion")
         if motion and own in MOTIONS and own != motion and not override_motion:
             raise InputError(
@@ -192,7 +192,7 @@ class Layout:
         return found
 
     def findings(self) -> tuple[Finding, ...]:
-        """Read what was found about the frames when they were imported."""
+        """Read the findings about the frames at import."""
         text = self._text(FINDINGS)
         try:
             return msgspec.json.decode(text, type=tuple[Finding, ...]) if text else ()

@@ -544,7 +544,7 @@ def is_deviation(name: str) -> bool:
 
 
 def is_builtin(name: str) -> bool:
-    """Return whether a name belongs to the table: a map, or the standard deviation of one."""
+    """Return whether a name is that of a built-in map, or of its standard deviation."""
     return name in TABLE or (is_deviation(name) and name.removesuffix(SIGMA) in TABLE)
 
 
@@ -555,7 +555,7 @@ def place_of(name: str) -> tuple[int, bool]:
 
 
 def declaration_of(name: str, declared: Mapping[str, Map] | None = None) -> Map:
-    """Return the declaration of a map: the result's own, the table's, or an empty one.
+    """Return the declaration of a map: the result's own, the built-in one, or an empty one.
 
     The standard deviation of a declared map needs no declaration.
 
@@ -604,7 +604,7 @@ def check_declarations(declarations: Mapping[str, Map]) -> None:
 def check_new(declarations: Mapping[str, Map], others: Container[str] = ()) -> None:
     """Raise InputError if declarations contradict each other, or the names of other maps in one result.
 
-    This is for declarations in programs; those of files are read as they are.
+    Only declarations in programs are checked; those in files are accepted unchanged.
     """
     check_declarations(declarations)
     for name, one in declarations.items():

@@ -39,7 +39,7 @@ _METRE = 1e-3  # m per mm
 _SECOND = 1_000_000_000  # nanoseconds
 _FRAME = "sensor"  # coordinate frame: x right and y up in the picture, z towards the sensor
 _ENCODINGS = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2", "32FC1": "f4"}
-# Where blue, green, red and opacity are.
+# # Positions of blue, green, red and opacity.
 _COLOURS = {"rgb8": [2, 1, 0], "bgr8": [0, 1, 2], "rgba8": [2, 1, 0, 3], "bgra8": [0, 1, 2, 3]}
 _NAMES = {np.dtype(np.uint8): "mono8", np.dtype(np.uint16): "mono16", np.dtype(np.float32): "32FC1"}
 _FLOAT32 = 7  # datatype of a PointField
@@ -302,7 +302,7 @@ class GrowingMessages(Closing):
     publish = flush
 
     def finish(self, positions: Mapping[str, Floats], state: str) -> None:
-        """Write the positions, using those of the frames where there are no better ones, and the index."""
+        """Write the positions and the index; a frame without a better position keeps its own."""
         for name, live in self._positions.items():
             better = np.asarray(positions.get(name, live), np.float64)[: self.count]
             values = np.where(np.isfinite(better), better, live[: len(better)])

@@ -1,4 +1,4 @@
-"""Loading of a user's own class, specified in a command or a file."""
+"""Load a user's own class, named in a command or a file."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ class PhaseCheck:
         self._counts, self._left = counts[:, used], left[:, used]
 
     def jump(self) -> tuple[int, int, float] | None:
-        """Return from which frame on phases are wrong, by how many steps, and the step; None if nowhere."""
+        """Return the first frame with wrong phases, the number of steps, and the step; None if all fit."""
         step = float(np.median(np.diff(self._phase))) if self.possible else 0.0
         if step == 0:
             return None

@@ -201,7 +201,7 @@ def _png_chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def _essential_chunks(data: bytes, name: str) -> list[bytes]:
-    """Check each chunk of a PNG, and keep those needed for the picture: libpng prints about the others."""
+    """Check each chunk of a PNG, and keep those that the picture needs: libpng prints about the others."""
     kept, at, kind = list[bytes](), len(_PNG_MARK), b""
     while kind != b"IEND":
         size = int.from_bytes(data[at : at + 4], "big")

@@ -121,7 +121,7 @@ def check_phase(phase: ArrayLike | None, count: int, name: str) -> NDArray[np.fl
 
 
 def step_in_degrees(phase: NDArray[np.float64]) -> float:
-    """Return the usual step of phases, radians, if it is more than a turn, as in degrees; else 0.
+    """Return the usual step of phases, radians, if it exceeds a turn, so that it is in degrees; else 0.
 
     Examples
     --------

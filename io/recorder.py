@@ -252,7 +252,7 @@ class Recorder(TeeSource[Source]):
         return block
 
     def drain(self, progress: Callable[[int], None] | None = None) -> Check:
-        """Write all frames, and return what they show; ``progress`` is called with the number so far."""
+        """Write all frames, and return the findings; ``progress`` is called with the number so far."""
         watch = Watch(self.source)
         length = max(1, _BLOCK // (self.shape[1] * self.shape[2] * self.dtype.itemsize))
         room = np.empty((min(length, self.shape[0]), *self.shape[1:]), self.dtype)

@@ -392,7 +392,7 @@ def _used(
 def _find_stack(
     file: Hdf5File, dataset: str | None, ours: bool
 ) -> tuple[h5py.Dataset, RecordingState, Decoding]:
-    """Find the stack of frames, its state, and how it is stored; refuse one that cannot be read."""
+    """Find the stack of frames, its state, and its storage; InputError for one that cannot be read."""
     if dataset is None:
         dataset = STACK if ours else _only_stack(file)
     stack = file.follow(dataset, "name the stack with --dataset")
@@ -416,7 +416,7 @@ def _find_stack(
 
 
 def _decoding(file: Hdf5File, stack: h5py.Dataset, ours: bool, where: str) -> Decoding:
-    """Return how the frames follow from what a stack stores, which its attributes and its axes state."""
+    """Return the conversion of stored values to frames, from the attributes and axes of the stack."""
     with as_input_error(where):
         dtype = stack.dtype.newbyteorder("=")
     frame_dtype(dtype, where)

@@ -220,7 +220,7 @@ class Result(Shown, Mapping[str, Any]):
         return name if name in self._maps else None
 
     def _own_name(self, quantity: str) -> str:
-        """Return the name of a quantity in this result; the quantity itself if there is none."""
+        """Return the name of a quantity in this result; the quantity itself if it has none."""
         if quantity in self._maps:
             return quantity
         base = quantity.removesuffix(SIGMA) if is_deviation(quantity) else quantity
@@ -376,7 +376,7 @@ def result_of(
 
 
 def check_maps(declarations: Mapping[str, Map], *others: str) -> None:
-    """Raise InputError if maps cannot be declared like this, or with these other names in one result."""
+    """Raise InputError if maps cannot be declared in this way, or together with these names."""
     check_new(declarations, others)
     for name in (*others, *declarations):
         if not may_name_a_map(name):

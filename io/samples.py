@@ -1,4 +1,4 @@
-"""What stored samples mean: packed and unknown values (CF conventions), order of axes, types of integers."""
+"""Meaning of stored samples: packed and unknown values (CF conventions), order of axes, types of integers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ATTRIBUTES = (
     "scale_factor",
     "add_offset",
 )
-"""Attributes of the CF conventions, sections 2.5.1 and 8.1, that define what stored values mean."""
+"""Attributes of the CF conventions, sections 2.5.1 and 8.1, that define the meaning of stored values."""
 
 _EXACT = 1 << 24  # float32 is exact to half a count up to this number
 _PIECE = 8_000_000  # bytes of stored samples that are decoded at once
@@ -33,9 +33,9 @@ _TARGETS = {"b": np.uint8, "i": np.uint16, "u": np.uint16, "f": np.float32}  # b
 
 
 class Packing(NamedTuple):
-    """How values are stored: ``value = stored * scale + offset``, unknown if missing or not valid.
+    """Packing of values: ``value = stored * scale + offset``, unknown if missing or not valid.
 
-    ``unsigned``: stored integers are unsigned though their type is not.
+    ``unsigned``: stored integers are unsigned although their type is signed.
     """
 
     scale: float = 1.0
@@ -58,11 +58,11 @@ class Packing(NamedTuple):
         return f"{', '.join(others)} and {last}" if others else last
 
     def stored(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return values as they are stored, of the type that they have."""
+        """Return values in their stored type."""
         return values.view(values.dtype.str.replace("i", "u")) if self.unsigned else values
 
     def unpack(self, values: NDArray[Any], dtype: DTypeLike) -> NDArray[Any]:
-        """Return the values that stored ones stand for; NaN where they are unknown."""
+        """Return the unpacked values; NaN for unknown ones."""
         stored = self.stored(values)
         if not (self.missing or self.scale != 1 or self.offset != 0 or np.isfinite(self.valid).any()):
             return stored
@@ -77,7 +77,7 @@ class Packing(NamedTuple):
 
 
 def packing_of(attributes: Mapping[str, Any], dtype: np.dtype[Any], where: str) -> Packing | None:
-    """Return how values are stored, from the attributes of the CF conventions; None if as they are.
+    """Return the packing of values, from the attributes of the CF conventions; None if they are not packed.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def convert_samples(
 
 
 class Reader(Protocol):
-    """Reads parts of stored frames; ``chunk`` is the shape of what is read at once, ``length`` its frames."""
+    """Reader of stored frames; ``chunk`` is the shape of one read, ``length`` its number of frames."""
 
     how: str
     length: int
@@ -200,7 +200,7 @@ class Reader(Protocol):
 
     @property
     def chunk(self) -> Sequence[int]:
-        """Shape of what is stored in one piece."""
+        """Shape of one stored block."""
 
     def fetch(self, spans: Sequence[Span], out: NDArray[Any], /) -> None:
         """Write a part, one span for each axis, into ``out``."""
@@ -211,7 +211,7 @@ class Reader(Protocol):
 
 @dataclass(frozen=True)
 class Decoding:
-    """How frames follow from a stored array of three axes.
+    """Conversion of a stored array of three axes to frames.
 
     Attributes
     ----------
@@ -254,7 +254,7 @@ class Decoding:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is converted."""
+        """Findings about the conversion."""
         found = []
         if self.order != (0, 1, 2):
             shown = "the order of MATLAB" if self.matlab else f"the dimensions ({', '.join(self.names)})"
@@ -361,7 +361,7 @@ def order_of(names: Sequence[str], where: str) -> tuple[int, int, int]:
 
 
 def _kind_of(name: str) -> str:
-    """Return what the name of an axis says that it is; "" if that is not known."""
+    """Return the kind of an axis, judged by its name; "" if unknown."""
     word = name.lower().strip()
     for kind, names in (("rows", _ROWS), ("columns", _COLUMNS), ("frames", _FRAMES), ("colours", _COLOURS)):
         if word in names:

@@ -112,10 +112,10 @@ class Hdf5Frames(Closing):
 class Stack:
     """Some frames (``numbers``, in order) of the first ``count`` of a dataset, and the ``region`` of each.
 
-    ``decoding`` says how they follow from what the dataset stores.
+    ``decoding`` converts stored values to frames.
 
-    A chunk is unpacked once: if chunks contain more frames than are read at a time, these are kept in memory,
-    up to ``limit`` bytes, or on disk.
+    Each chunk is unpacked once: chunks that contain more frames than one read are kept in memory, up to
+    ``limit`` bytes, or on disk.
     """
 
     shape: tuple[int, int, int]
@@ -149,7 +149,7 @@ class Stack:
 
     @property
     def how(self) -> str:
-        """How frames are read, as text."""
+        """Return how frames are read, as text."""
         return self._how or self._frames.how
 
     def read(self, start: int, out: NDArray[Any]) -> NDArray[Any]:
@@ -180,7 +180,7 @@ class Stack:
             self._frames.fetch((frames, self._region.rows, self._region.columns), out)
 
     def _run(self, start: int, most: int) -> Span:
-        """Return the consecutive frames of the dataset from a selected one on: first and end."""
+        """Return the consecutive frames of the dataset that begin with a selected one: first and end."""
         numbers = self._numbers[start : start + most]
         gaps = np.flatnonzero(np.diff(numbers) != 1)
         return int(numbers[0]), int(numbers[gaps[0] if gaps.size else -1]) + 1
@@ -191,7 +191,7 @@ class Stack:
         return max(start, self._first), min(start + self._frames.length, self._end)
 
     def _unpack(self, start: int, stop: int) -> None:
-        """Unpack all chunks of some frames into memory; if they do not fit, those of all frames to disk."""
+        """Unpack all chunks of some frames into memory; if they do not fit, all frames to disk."""
         frame, count = math.prod(self.shape[1:]) * self.dtype.itemsize, self._end - self._first
         length = min(self._frames.length, count)
         fits = length * frame + self._frames.scratch_bytes <= self._limit
@@ -229,7 +229,7 @@ class Stack:
 def _open(
     dataset: h5py.Dataset, place: Place, count: int, limit: int, threads: int | None
 ) -> RawFrames | Chunks | Hdf5Frames:
-    """Open the frames: directly if they are contiguous, else by chunks, else through HDF5."""
+    """Open the frames: directly if they are contiguous, otherwise by chunks, otherwise through HDF5."""
     why, codecs = _why_only_hdf5(dataset), find_codecs(dataset.id)
     if why or isinstance(codecs, str):
         return Hdf5Frames(dataset, why or str(codecs))

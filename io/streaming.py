@@ -297,7 +297,7 @@ class StreamRecorder(TeeSource[LiveSource]):
         return file
 
     def _name(self, part: Path) -> Path:
-        """Give the recording the first free name: that of ``path``, or another one next to it."""
+        """Give the recording the first free name: ``path``, or a similar one."""
         target = Path(os.path.realpath(self.path))
         with suppress(FileExistsError):
             link_new(part, target)
@@ -460,8 +460,8 @@ class Column:
 class GrowingRecording(Closing):
     """A recording to which frames are appended; after ``publish`` other programs can read it.
 
-    Raw frames are contiguous as long as there are no more than expected. Unless marked otherwise by ``mark``,
-    a frame counts as used.
+    Raw frames are contiguous unless there are more than expected. A frame counts as used unless ``mark``
+    marked it otherwise.
     """
 
     def __init__(
@@ -597,7 +597,7 @@ class GrowingRecording(Closing):
         self._state[()] = state.encode()[:_STATE_LENGTH].decode(errors="ignore")
 
     def _hold(self, size: int) -> None:
-        """Preallocate space for ``size`` bytes of frames, and for the values that belong to them."""
+        """Preallocate space for ``size`` bytes of frames, and for their values."""
         self._reserve(self._file.id.get_filesize() + size + self._spare)
 
     def _reserve(self, end: int) -> None:

@@ -55,7 +55,7 @@ def lock(file: int | _HasDescriptor, *, shared: bool = False, wait: bool = True)
 
 
 def reserve_space(descriptor: int, start: int, size: int) -> None:
-    """Make a file long enough for a part of it; on Linux, also reserve the space for it on the disk.
+    """Extend a file for one of its parts; on Linux, also reserve the disk space.
 
     Raises
     ------

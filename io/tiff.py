@@ -38,7 +38,7 @@ _DECODED = {1, 5, 6, 7, 8, 32773, 32946}  # compressions: none, LZW, JPEG, defla
 _NONE, _LOSSY = 1, {6: "JPEG", 7: "JPEG", 34892: "JPEG"}  # compressions
 _SEPARATE = 2  # planar configuration: one plane per colour
 _MICROMETRE = ("micron", "um", "\\u00B5m")  # as ImageJ writes it
-# Tags of a page that say how its samples are packed: type and number.
+# # Tags of a page about the packing of samples: type and number.
 _PACKING = {266: "H", 317: "H", 322: "I", 323: "I", 278: "I"}
 _JPEG_TABLES, _SUBSAMPLING, _ORIENTATION = 347, 530, 274
 _LAST_UPRIGHT = 4  # orientation; in the others rows and columns are exchanged
@@ -228,7 +228,7 @@ class TiffFrames(WholeFrames):
         return values[..., 0] if samples == 1 else values[..., [2, 1, 0, 3][:samples]]
 
     def _decode(self, page: Any, planar: bool, name: str) -> NDArray[Any]:
-        """Decode the samples of a compressed page by OpenCV, which is given them as a TIFF of its own."""
+        """Decode the samples of a compressed page with OpenCV, wrapped in a TIFF of their own."""
         offsets, counts = page.dataoffsets, page.databytecounts
         planes = self._page.samplesperpixel if planar else 1
         each = len(offsets) // planes
@@ -332,7 +332,7 @@ def _describe(series: Any) -> str:
 
 
 def _numbers(name: str, series: Any, channel: int | None) -> tuple[NDArray[np.intp], int | None]:
-    """Return the pages of a series that are frames, in order, and the colour of each that is asked for."""
+    """Return the pages of a series that are frames, in order, and the requested colour of each."""
     inner = len(series.keyframe.shape)  # axes within a page: rows, columns, and perhaps colours
     axes, shape = series.axes, series.shape
     if axes.endswith("S") and not series.keyframe.axes.endswith("S") and shape[-1] == 1:
@@ -367,7 +367,7 @@ def _orientation(page: Any) -> int:
 
 
 def _upright(picture: NDArray[Any], orientation: int) -> NDArray[Any]:
-    """Turn and mirror a picture as it is displayed."""
+    """Turn and mirror a picture for display."""
     if orientation > _LAST_UPRIGHT:  # the first stored row is a column of the displayed picture
         picture = picture.swapaxes(0, 1)
     return picture[:: -1 if orientation in (3, 4, 7, 8) else 1, :: -1 if orientation in (2, 3, 6, 7) else 1]

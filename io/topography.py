@@ -1,7 +1,7 @@
 """Heights for programs of surface metrology: X3P, SUR, GSF, and TIFF of float32.
 
-All of them hold one height for each pixel, NaN or a mark where undefined, and the size of the pixels. X3P has
-its first row at the lowest y; the others begin at the top, as pictures do.
+Each format stores the pixel size and one height per pixel, NaN or a mark where undefined. X3P begins with the
+row of the lowest y; the others begin at the top, like pictures.
 """
 
 from __future__ import annotations

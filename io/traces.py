@@ -1,4 +1,4 @@
-"""What the brightness of a grid of pixels over all frames shows."""
+"""Checks of the brightness of a grid of pixels over all frames."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _OUTLIERS, _FLASH = 0.003, 0.2  # share of such samples, and of the pixels of a 
 _NOISY = 0.3  # share of the pixels that differ between frames because of noise
 _AS_ONE = 0.5  # mean direction of the pixels' phases above which all respond alike
 _HARMONICS = 3  # of the phase, that describe the brightness of a pixel
-_THIN = 4  # an axis that is so many times shorter than both others may be a wrong one
+_THIN = 4  # # an axis shorter than both others by this factor may be a wrong one
 
 
 Samples = NDArray[np.float32]
@@ -97,7 +97,7 @@ def named_frames(numbers: Sequence[int] | NDArray[np.intp]) -> str:
 
 
 class Traces:
-    """The brightness of each pixel of the grid over the frames, and what it shows."""
+    """The brightness of each pixel of a grid over the frames, and the findings about it."""
 
     def __init__(self, samples: NDArray[Any], motion: Motion, series: Mapping[str, Floats]) -> None:
         self._grid = samples.shape
@@ -133,7 +133,7 @@ class Traces:
         return facts
 
     def findings(self, shape: tuple[int, int, int], moved: bool, phased: bool) -> Iterator[Finding]:
-        """Yield what is doubtful."""
+        """Yield the findings."""
         if not self._known:
             return
         repeated = list(self._repeated())
@@ -183,7 +183,7 @@ class Traces:
         return f" ({int(high).bit_length()} bits in use{lower})"
 
     def _end(self) -> float:
-        """Return the end of the scale: that of the fewest usual bits that hold all counts."""
+        """Return the end of the scale: the smallest usual number of bits that can represent all counts."""
         if not self._integer:
             return math.inf
         bits = next(bits for bits in (8, 10, 12, 14, 16) if self._highest.max() < 2**bits)
@@ -207,7 +207,7 @@ class Traces:
         return np.asarray(basis @ (basis.T @ self._counts))
 
     def _noise(self) -> float:
-        """Return about the standard deviation of a sample: what changes least explains."""
+        """Return the standard deviation of a sample: the smallest of several estimates."""
         steps = np.diff(self._counts, axis=0)
         found = [_MAD * float(np.median(np.median(np.abs(steps), axis=1))) / math.sqrt(2)]
         if self._fit is not None:
@@ -300,7 +300,7 @@ class Traces:
             )
 
     def _outliers(self) -> float:
-        """Return the share of samples that stand out of the brightness of their pixel of a press."""
+        """Return the share of samples that deviate strongly from the brightness of their pixel in a press."""
         steps = np.diff(self._counts, axis=0)
         limit = max(_CLEAR * self.noise, _OUTLYING * self.span)
         apart = (np.minimum(steps[:-1], -steps[1:]) > limit) | (np.maximum(steps[:-1], -steps[1:]) < -limit)
@@ -321,7 +321,7 @@ class Traces:
         return float(np.mean(change > 0.5)), float(np.mean(change < -0.5))
 
     def _rising_axis(self) -> str:
-        """Return along what the brightness of the pictures rises or falls as in a press; "" if nothing."""
+        """Return the axis along which the pictures' brightness rises or falls as in a press; "" if none."""
         samples = self._pictures
         for axis, name in ((2, "rows"), (1, "columns")):
             series = np.moveaxis(samples, axis, 0).reshape(samples.shape[axis], -1)
@@ -360,7 +360,7 @@ class Traces:
 
     @functools.cached_property
     def _flicker(self) -> tuple[float, float] | None:
-        """Return the standard deviation of the common light, and that of its noise, as shares."""
+        """Return the standard deviations of the common light and of its noise, as shares; None if unknown."""
         if self._fit is not None and len(self._counts) >= 2 * (2 * _HARMONICS + 1):
             left = self._counts - self._fit
             if float(np.mean(left**2)) > 0.02 * float(np.var(self._counts)):

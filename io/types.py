@@ -173,7 +173,7 @@ class Source(Protocol):
 
     @property
     def motion(self) -> Motion:
-        """How the body moves."""
+        """Motion of the body."""
 
     @property
     def rewindable(self) -> bool:
@@ -205,8 +205,8 @@ class LiveSource(Source, Protocol):
     def positions(self) -> Mapping[str, Floats]:
         """Return the best estimate of the positions of all frames read so far.
 
-        It can also be called after the source was left. NaN marks frames for which there is no better
-        estimate than that in the blocks.
+        It can also be called after the source was closed. NaN: the position in the block is the best
+        estimate.
 
         Returns
         -------

@@ -55,7 +55,7 @@ _SYMBOL = re.compile(r"[^\W\d]+|°")  # pint evaluates arithmetic, so only singl
 
 
 def in_base(symbol: str, kind: Kind) -> float:
-    """Return the number of base units in a unit; ValueError if it is unknown or measures something else.
+    """Return the number of base units in a unit; ValueError if it is unknown or measures another quantity.
 
     Examples
     --------
@@ -74,7 +74,7 @@ def is_common(symbol: str, kind: Kind | None = None) -> bool:
 
 
 def conversion_factor(unit: str, wanted: str, where: str) -> float:
-    """Return the factor that converts a value in a file from its unit to a base unit, or to one over it."""
+    """Return the factor from a unit in a file to a base unit, or to its inverse."""
     if unit == wanted:
         return 1.0
     over, _, base = wanted.rpartition("/")

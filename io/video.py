@@ -368,7 +368,7 @@ def _plane(frame: VideoFrame, number: int, dtype: np.dtype[Any]) -> NDArray[Any]
 
 
 def _upright(frame: VideoFrame, picture: NDArray[Any]) -> NDArray[Any]:
-    """Turn and mirror a picture as the display matrix of its frame states."""
+    """Turn and mirror a picture by the display matrix of its frame."""
     data: Any = frame.side_data.get("DISPLAYMATRIX")
     if data is None:
         return picture

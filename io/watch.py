@@ -1,4 +1,4 @@
-"""Watching frames while they are read: facts, and what a person who saw the numbers would object to."""
+"""Checks of frames while they are read: facts, and the doubts of an expert about the numbers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Limits = tuple[float, float]
 
 @dataclass(frozen=True)
 class Check:
-    """What is known of frames, and what is doubtful; ``print`` shows it.
+    """Facts and doubts about frames; ``print`` shows them.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class Watch:
                 parts.append(values)
 
     def check(self, field_limits: Limits = FIELD, travel_limits: Limits = TRAVEL) -> Check:
-        """Return what the frames so far show."""
+        """Return the findings about the frames so far."""
         series, traces = self._look()
         source = self._source
         facts = {"frames": f"{self.samples.count} of {source.shape[2]} x {source.shape[1]}, {source.dtype}"}
@@ -83,7 +83,7 @@ class Watch:
         return Check(source.name, facts, self._findings(series, traces, field_limits, travel_limits))
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return what a user should know about the frames so far."""
+        """Return the findings about the frames so far, for the user."""
         return self._findings(*self._look(), FIELD, TRAVEL)
 
     def _look(self) -> tuple[dict[str, Floats], Traces]:
@@ -143,7 +143,7 @@ def _geometry(
     field_limits: Limits,
     travel_limits: Limits,
 ) -> Iterator[Finding]:
-    """Yield what is wrong with lengths: a wrong unit is a factor of 1000."""
+    """Yield findings about lengths; a wrong unit changes them by a factor of 1000."""
     size = source.header.pixel_size
     if size is not None:
         _, rows, columns = getattr(source, "full_shape", source.shape)

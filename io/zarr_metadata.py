@@ -56,7 +56,7 @@ class ArrayMetadata:
 
     @property
     def nbytes(self) -> int:
-        """Size in memory in bytes; for texts, that of their pointers."""
+        """Size in memory in bytes; texts count as pointers."""
         return math.prod(self.shape) * (0 if self.dtype is None else int(self.dtype.itemsize))
 
 
@@ -311,7 +311,7 @@ def compressors_of(array: ArrayMetadata) -> str:
 
 def too_many(path: Path) -> InputError:
     """Return the error for a store with too many groups and arrays."""
-    return InputError(f"{path} holds more than {MOST_NODES} groups and arrays: copy what is wanted")
+    return InputError(f'f"{path} contains more than {MOST_NODES} groups and arrays: copy those you need"')
 
 
 def is_name(name: str) -> bool:

@@ -118,7 +118,7 @@ def _too_large(what: str, most: int) -> InputError:
 
 
 class LimitedStore(WrapperStore[Any]):  # type: ignore[misc]  # where it is not installed
-    """A store that refuses what is too large, too slow, missing, or outside of it."""
+    """A store that refuses objects that are too large, too slow, missing, or outside of it."""
 
     def __init__(self, store: Any, path: Path) -> None:
         super().__init__(store)

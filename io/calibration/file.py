@@ -134,7 +134,7 @@ def update_calibration(
 
 
 def write_calibration(file: h5py.File, calibration: Calibration, place: str) -> None:
-    """Write a calibration to the group ``place``, which may exist."""
+    """Write a calibration to the group ``place``, which may exist already."""
     for item in calibration_items(calibration, place):
         write_item(file, item)
 

@@ -233,7 +233,7 @@ def median(values: Any) -> float:
 
 @dataclass_transform(eq_default=False, frozen_default=True, field_specifiers=(parameter,))
 def part(cls: type[T]) -> type[T]:
-    """Make a dataclass of a class whose attributes are declared by `parameter`."""
+    """Make a dataclass of a class that declares its attributes by `parameter`."""
     made = dataclass(frozen=True, slots=True, eq=False)(cls)
     lines = ["Attributes", "----------"]
     for name, one in parameters(made).items():

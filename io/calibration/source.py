@@ -38,7 +38,10 @@ def differ(one: Size, other: Size) -> bool:
 def outdated(
     calibration: Calibration, pixel_size: Size, parts: Iterable[str] = SIZED
 ) -> Iterator[tuple[str, Size]]:
-    """Yield the parts that were made with another pixel size, as far as it is recorded, and that size."""
+    """Yield the parts that were made with another pixel size, and that size.
+
+    Parts without a recorded size are skipped.
+    """
     there = calibration.parts()
     for part in parts:
         facts = [calibration.process.get(f"{PARTS[part].command}.{fact}") for fact in size_facts(pixel_size)]
@@ -69,7 +72,7 @@ def check_camera(
     what: str,
     remedy: str = "calibrate again, or give that camera's",
 ) -> None:
-    """Refuse a calibration of another camera: other name (empty: any), picture size or data type.
+    """Raise InputError for a calibration of another camera: its name (empty: any), picture size or type.
 
     The message contains ``what`` the camera belongs to, and the ``remedy``.
     """
@@ -231,7 +234,7 @@ class Calibrated:
         check_sizes(self.whole, size, self.name, used)
 
     def _movement(self, own: Header, precession: Precession) -> dict[str, Any]:
-        """Return tilt and pivot of the precession; undetermined values are those of the source."""
+        """Return tilt and pivot of the precession; the source's own values where the calibration has none."""
         tilt = precession.tilt
         unknown = own.pivot or (np.nan,) * 3
         places = zip(precession.pivot, unknown, strict=True)

@@ -85,8 +85,8 @@ class References(Part):
 class Lens(Part):
     """Mapping from pixels to positions on the sheet.
 
-    The undistorted map has as many pixels as the picture, all of one size; its centre and that of the picture
-    are the same point of the sheet. See ``mirrorskin.engine.undistort``.
+    The undistorted map has as many pixels as the picture, all of one size, and the same centre. See
+    ``mirrorskin.engine.undistort``.
     """
 
     command: ClassVar[str] = "scale"
@@ -122,7 +122,7 @@ class Lens(Part):
     scale_sigma: float = parameter("relative standard error of the pixel size", title="", default=math.nan)
 
     def standard_errors(self) -> Mapping[str, float]:
-        """Return those of the pixel size."""
+        """Return the standard errors of the pixel size."""
         sizes = zip("xy", self.pixel_size, strict=True)
         return {f"pixel_size_{axis}": size * self.scale_sigma for axis, size in sizes}
 
@@ -193,7 +193,7 @@ class WallResponse(Part):
     )
 
     def standard_errors(self) -> Mapping[str, float]:
-        """Return those of the fitted parameters; 0 if fixed."""
+        """Return the standard errors of the fitted parameters; 0 for fixed ones."""
         names = (name.replace("lamp_", "lamps_") for name in self.parameters)
         return dict(zip(names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
@@ -364,7 +364,7 @@ class Stiffness(Part):
     presses: int = parameter("number of presses used", valid=lambda value: value >= 1, default=1)
 
     def standard_errors(self) -> Mapping[str, float]:
-        """Return that of the modulus."""
+        """Return the standard error of the modulus."""
         return {"modulus": self.modulus_sigma}
 
     @property
