@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mirrorskin.view.app import Opening
 
 _LIFETIME = 1000
-"""Milliseconds after which a rig is stopped whose page was closed, or lost its connection."""
+"""Milliseconds after which a rig is stopped if its page was closed or lost its connection."""
 
 
 def command(
@@ -82,7 +82,7 @@ def command(
 def _opening(
     path: Path, calibration: Path | None, device: str | None, operation: str | None, chosen: dict[str, Any]
 ) -> Opening:
-    """Return how a file is opened; it is opened once, so that faults are reported before anything else."""
+    """Return how to open a file; it is opened once, so that faults are reported first."""
     from mirrorskin import io
     from mirrorskin.view.app.session import Opening, holds_result
 

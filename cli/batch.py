@@ -1,4 +1,4 @@
-"""``mirrorskin batch``: many recordings become results."""
+"""``mirrorskin batch``: compute results of many recordings."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def command(
 
     plan = dataclasses.replace(read_settings(settings, bytes_of(memory, "--memory")), strict=strict)
     warnings.simplefilter("ignore", MirrorskinWarning)  # outcomes contain them
-    # All are named before they are divided, so that every machine gives a result the same name.
+    # # All are named before they are divided, so that a result has the same name on every machine.
     jobs = make_jobs(found, output)
     if parts > 1:
         jobs = sorted(jobs, key=lambda job: job.target)[part - 1 :: parts]
@@ -161,14 +161,14 @@ def _is_result(path: Path, folder: Path) -> bool:
 
 
 def _prepare(folder: Path, jobs: Sequence[Job]) -> None:
-    """Create the folder, check that it can be written to, and remove what a killed batch left there."""
+    """Create the folder, check that it can be written to, and remove temporary files of a killed batch."""
     from mirrorskin import io
     from mirrorskin.io.atomic import remove_leftovers
     from mirrorskin.io.os_errors import as_input_error
 
-    with as_input_error(f"{folder} cannot be made", "choose another folder with -o"):
+    with as_input_error(f"{folder} cannot be created", "choose another folder with -o"):
         if folder.exists() and not folder.is_dir():
-            raise io.InputError(f"{folder} is no folder: name one with -o")
+            raise io.InputError(f"{folder} is not a folder: name one with -o")
         if not folder.parent.is_dir():
             raise io.InputError(f"{folder}: there is no folder {folder.parent}: make it first")
         folder.mkdir(exist_ok=True)
@@ -190,7 +190,7 @@ def _run(
     scheduler: str | None,
     show: _Show,
 ) -> Generator[Outcome, None, None]:
-    """Run the jobs here, or on a cluster; devices are opened and workers started only if there is work."""
+    """Run the jobs here, or on a cluster; devices are opened and workers started only if there are jobs."""
     from mirrorskin.engine.batch.work import find_settled
 
     todo = []
@@ -265,14 +265,14 @@ def _show_batch(total: int, as_json: bool) -> Iterator[_Show]:
 
 
 def _problem(outcome: Outcome) -> str:
-    """Return a line about what is wrong, and with which file."""
+    """Return a line that names the file and what is wrong with it."""
     name, message = str(outcome.job.source), " ".join(outcome.message.split())
     message = _OPTIONS.sub(r"\1 in [stack] of --settings", message)
     return printable(message if name in message else f"{name}: {message}")
 
 
 class _Show:
-    """Shows the progress of a batch: a line for each file, if wanted."""
+    """Display of the progress of a batch: a line for each file, if wanted."""
 
     def __init__(self, wanted: bool) -> None:
         self._wanted = wanted
@@ -281,7 +281,7 @@ class _Show:
         """Receive, from any thread, the number of frames of a job that were read."""
 
     def ended(self, outcome: Outcome, /) -> None:
-        """Receive the outcome of a job."""
+        """Receive the outcome of a job, from any thread."""
         if not self._wanted:
             return
         line = f"{outcome.state}: {printable(str(outcome.job.source))}"
@@ -293,7 +293,7 @@ class _Show:
 
 
 class _Table(_Show):
-    """The files in progress, the last that ended, and a bar of all."""
+    """Table of the files in progress and the last that ended, with a progress bar."""
 
     def __init__(self, total: int) -> None:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn

@@ -65,14 +65,14 @@ class Term:
 
     @property
     def metavar(self) -> str:
-        """What help shows in place of a value."""
+        """Placeholder for a value in help."""
         shown = self.unit if self.kind == "text" else self.unit.upper()
         plain = shown or ("N" if self.kind == "integer" else "NUMBER")
         several = {"numbers": "[,...]", "map": "|FILE"}.get(self.kind, "")
         return "|".join([_UNITS.get(self.unit, (plain,))[0] + several, *self.words])
 
     def read(self, text: str, where: str) -> Any:
-        """Return the value that a text on the command line stands for, in the option's unit."""
+        """Return the value of a text on the command line, in the option's unit."""
         if self.kind == "numbers":
             if self.unit in _UNITS:
                 from mirrorskin.cli.quantity import refuse_decimal_comma
@@ -82,7 +82,7 @@ class Term:
         return self.read_one(text, where)
 
     def read_one(self, text: str, where: str) -> Any:
-        """Return the value that a text stands for; ``where`` begins messages."""
+        """Return the value of a text; ``where`` begins messages."""
         from mirrorskin.cli import quantity
         from mirrorskin.io import InputError
 
@@ -204,10 +204,7 @@ def term(
 
 
 class ClassCommand(Command):
-    """A command one of whose words may be MODULE:CLASS: then it has the options of that class.
-
-    They replace other options of the engine. The tilt of a live rotation is for the stage and the class.
-    """
+    """A command with a word that may be MODULE:CLASS, which adds the options of that class."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Load the class, and parse the arguments with its options."""
@@ -255,7 +252,7 @@ class ClassCommand(Command):
         return [*rest[:count], *ctx.meta[_LOADED][1], *rest[count:]]
 
     def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write what the command does, and the class."""
+        """Write the help of the command, and that of the class."""
         super().format_help_text(ctx, formatter)
         if _LOADED in ctx.meta:
             kind = ctx.meta[_LOADED][0]
@@ -266,7 +263,7 @@ class ClassCommand(Command):
 
 
 def terms_of(kinds: Mapping[str, type[Any]]) -> list[Term]:
-    """Return the options of classes, by the motion that each is for; those of one name become one.
+    """Return the options of classes by motion; options of one name become one.
 
     A class with the motion ``""`` is for any motion.
     """
@@ -280,7 +277,7 @@ def terms_of(kinds: Mapping[str, type[Any]]) -> list[Term]:
 
 
 def term_of(one: Option) -> Term:
-    """Return what a command needs of a declaration."""
+    """Return the term of a declaration."""
     shown = one.shown_default
     if not shown and one.default is not None:
         shown = f"{one.default:g}" if isinstance(one.default, float) else str(one.default)

@@ -1,4 +1,4 @@
-"""``mirrorskin demo``: the figures of the paper, from its experiments on the digital twin."""
+"""``mirrorskin demo``: the figures of the paper, from experiments on the digital twin."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Draw = Callable[..., None]
 
 @dataclass(frozen=True)
 class Experiment:
-    """An object of the twin under a square picture; `frames` are those of the press or of the turn."""
+    """An object of the twin under a square picture; `frames`: of the press or of the turn."""
 
     object: str
     title: str
@@ -151,7 +151,7 @@ def _announce(number: int, title: str) -> None:
 def _drawing() -> Iterator[Draw]:
     """Draw figures in a thread, while kernels of the next experiment are compiled and run."""
     with warnings.catch_warnings(), ThreadPoolExecutor(max_workers=1) as thread:
-        # Threads share the filters of warnings: those that one restores must have what the other ignores.
+        # # Set here because threads share the filters: a thread that restores them removes those of another.
         warnings.filterwarnings("ignore", "Non-empty compiler output")
         figures = []
 
@@ -279,7 +279,7 @@ def _judge(results: Results, truth: io.Truth) -> Scores:
 
 
 def _print_heights(scores: Mapping[str, Scores]) -> None:
-    """Print the errors of all heights, and what the columns are."""
+    """Print the errors of all heights, and explain the columns."""
     rows = [
         [figure, method, *_height_cells(score)]
         for figure, by_method in scores.items()
@@ -303,7 +303,7 @@ def _height_cells(score: Score) -> list[str]:
 
 
 def _print_normals(scores: Scores) -> None:
-    """Print the errors of all normals, and what the columns are."""
+    """Print the errors of all normals, and explain the columns."""
     print_table(_NORMALS, [[_TURN, method, *_normal_cells(score)] for method, score in scores.items()])
     click.echo(_NORMALS_LEGEND)
 

@@ -1,4 +1,4 @@
-"""``mirrorskin devices``: what can run it."""
+"""``mirrorskin devices``: the OpenCL devices of this machine."""
 
 from __future__ import annotations
 

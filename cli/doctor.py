@@ -1,4 +1,4 @@
-"""``mirrorskin doctor``: what an installation has, for reports of faults."""
+"""``mirrorskin doctor``: a description of an installation, for reports of faults."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def command(as_json: options.Json = False) -> None:
 
 
 def _device() -> str:
-    """Return the default device and its driver, or why there is none."""
+    """Return the default device and its driver, or why no device can be used."""
     from mirrorskin.kernels.device import open_device
     from mirrorskin.kernels.errors import DeviceError
 
@@ -72,7 +72,7 @@ def _version(package: str) -> str | None:
 
 
 def _extras() -> dict[str, str]:
-    """Return whether the packages of each extra are installed, or which are missing."""
+    """Return for each extra whether its packages are installed, or which are missing."""
     missing: dict[str, list[str]] = {}
     for line in metadata.requires("mirrorskin") or ():
         match = _REQUIREMENT.match(line)

@@ -1,4 +1,4 @@
-"""``mirrorskin export``: a result as files that other programs open."""
+"""``mirrorskin export``: a result as files for other programs."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def command(
 
 
 def _part(output: list[Path], result: Path, turn: int | None) -> tuple[list[Path], list[Path]]:
-    """Return the outputs in Zarr and the others, after checking all of them."""
+    """Check all outputs, and return those in Zarr and the others."""
     from mirrorskin.io import InputError, check_output
     from mirrorskin.io.url import is_zarr
     from mirrorskin.io.zarr_export import check_store

@@ -1,4 +1,4 @@
-"""``mirrorskin fuse``: a press and a rotation become one surface."""
+"""``mirrorskin fuse``: one surface from a press and a rotation."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def command(
 
 
 def _open(path: Path, place: Motion, known: StackOptions, limit: int) -> Recording:
-    """Open a recording; a file in another layout has the motion of its place on the command line."""
+    """Open a recording; the command line determines the motion of a file in another layout."""
     from mirrorskin import io
     from mirrorskin.io.foreign import kind_of_frames
     from mirrorskin.io.layout import MARK

@@ -47,19 +47,19 @@ class MotionOption(click.Option):
         super().__init__(names, **{"show_default": True, **settings})
 
     def get_help_extra(self, ctx: click.Context) -> Any:
-        """Return what help adds to the text, without click's parentheses around a default."""
+        """Return the additions to an option's help, without click's parentheses around a default."""
         shown = {"default": self.show_default} if isinstance(self.show_default, str) else {}
         return {**super().get_help_extra(ctx), **shown}
 
 
 def for_motions(motions: Sequence[str], text: str) -> str:
-    """Return a text that begins with the motions that it is about, unless these are all."""
+    """Return a text after the motions to which it applies, unless these are all."""
     nouns = ", ".join(_NOUNS.get(one, one) for one in motions)
     return text if not motions or {*MOTIONS} <= {*motions} else f"{nouns}: {text}"
 
 
 def refuse_foreign(context: click.Context, motion: str, name: str = "this") -> None:
-    """Raise InputError if an option on the command line does not apply to a motion, that of ``name``."""
+    """Raise InputError if an option on the command line does not apply to the motion of ``name``."""
     from mirrorskin.io import InputError
 
     for one in context.command.get_params(context):
@@ -91,7 +91,7 @@ class Group(click.Group):
         return list(self.commands)
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Return matching commands and options; unlike that of click, it imports no command."""
+        """Return matching commands and options; unlike click's method, it imports no command."""
         commands = [
             CompletionItem(name, help=purpose)
             for name, purpose in self.purposes().items()
@@ -155,12 +155,12 @@ def make_command(
 
 
 class Command(click.Command):
-    """A command whose help lists arguments as well, and whose defaults are the user's."""
+    """A command whose help also lists arguments, and which uses the user's defaults."""
 
     def make_context(
         self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
     ) -> click.Context:
-        """Return the context of the command, with the user's defaults of its options."""
+        """Return the context of the command, with the user's defaults."""
         if not extra.get("resilient_parsing"):  # a shell completes it
             from mirrorskin.cli.defaults import option_defaults
 

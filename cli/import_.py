@@ -1,4 +1,4 @@
-"""``mirrorskin import``: other people's frames become a recording."""
+"""``mirrorskin import``: a recording from frames of other programs."""
 
 from __future__ import annotations
 

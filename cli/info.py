@@ -1,4 +1,4 @@
-"""``mirrorskin info``: what a file holds."""
+"""``mirrorskin info``: the contents of a file."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def command(
 
 
 def _verify(file: Path) -> str:
-    """Tell that all frames are as they were recorded; InputError if they are not, or if nothing can tell."""
+    """Report that all frames are as recorded; InputError if they are not, or if it cannot be checked."""
     from mirrorskin import io
 
     with io.open_recording(file) as recording:

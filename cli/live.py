@@ -31,7 +31,7 @@ _OPTIONS = (
     *("threshold", "hold", "subframe", "fill", "modulus", "noise"),
     *("window_frames", "robust", "contact", "window_size", "window_step"),
 )  # of the methods, which live runs have as well
-# What would bring a map that is missing: keys of the rig file.
+# # Keys of the rig file that are needed for a map.
 _REMEDIES = {
     "zenith": "zenith_gain in the rig file",
     "height": "pixel_size in the rig file",
@@ -103,7 +103,7 @@ def command(
 
 
 class _Live:
-    """A run whose result is kept whatever ends it; the command's options are `given`."""
+    """A run whose result is kept however it ends; `given`: the command's options."""
 
     def __init__(
         self,
@@ -140,7 +140,7 @@ class _Live:
         self._save()
 
     def _reconstruct(self) -> None:
-        """Open all, begin with the work when it is warm, and leave the stage at rest."""
+        """Open source and devices, start when the work is compiled, and leave the stage at rest."""
         from mirrorskin.cli.status import show_status
         from mirrorskin.engine.live import Loop
         from mirrorskin.hw.rig.rig import open_rig
@@ -186,7 +186,7 @@ class _Live:
                 gc.unfreeze()
 
     def _prepare(self, source: LiveSource, rate: float) -> LiveOperation:
-        """Join the operation and the source, which has references and calibration."""
+        """Connect the operation with the source, its references and its calibration."""
         from mirrorskin.engine import Rotation
         from mirrorskin.engine.live import LiveOperation
         from mirrorskin.engine.rotation.last_turn import choose_window
@@ -200,7 +200,7 @@ class _Live:
         return LiveOperation(source, computed.with_options(window_frames=window), every=every)
 
     def _save(self) -> None:
-        """Write the result, if that is asked for, and say what it lacks."""
+        """Write the result, if requested, and print which maps are missing."""
         output = self._given["output"]
         if output is None:
             return
@@ -222,7 +222,7 @@ class _Live:
 
 
 class _Guard:
-    """While frames are pushed, signals that end the program wait: what was pushed and counted agrees."""
+    """While frames are pushed, signals that end the program wait, so that frames and their count agree."""
 
     def __init__(self) -> None:
         self._handlers: dict[int, Any] = {}
@@ -231,7 +231,7 @@ class _Guard:
 
     @contextmanager
     def installed(self) -> Iterator[None]:
-        """Take over the signals for a while."""
+        """Take over the signals within a context."""
         if threading.current_thread() is threading.main_thread():
             numbers = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
             self._handlers = {n: handler for n in numbers if callable(handler := signal.getsignal(n))}
@@ -264,7 +264,7 @@ class _Guard:
 
 @contextmanager
 def _viewer(where: str, shape: tuple[int, int], settings: RigSettings) -> Iterator[Newest]:
-    """Show pictures in a thread of its own, and say in the end if that failed."""
+    """Show pictures in a separate thread; report at the end if that failed."""
     from mirrorskin.cli.status import Newest
     from mirrorskin.view.live import LiveView
 

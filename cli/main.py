@@ -1,6 +1,6 @@
-"""The command ``mirrorskin``: names the commands, and turns the project's errors into one line.
+"""The command ``mirrorskin``: lists the commands, and prints errors of the project as one line.
 
-Nothing heavy is imported here or at the top of a command's module, nor any command's module here: ``--help``
+Nothing slow is imported here or at the top of a command's module, nor any command's module here: ``--help``
 must be quick.
 """
 
@@ -32,7 +32,7 @@ _STOPPING = b"mirrorskin: it is being stopped; two more Ctrl-C end it at once\n"
 _LESS = "take a smaller region or fewer frames, or end other programs"
 _LEAST = 512 << 20  # bytes of address space, without which NumPy's libraries end the process
 _REFUSED = ("failed to map segment", "annot allocate memory", "can't start new thread")
-"""What libraries say when the system gives them no memory or thread."""
+"""Messages of libraries that got no memory or thread from the system."""
 _HELP = "NoArgsIsHelpError"  # of a group that no command was named of; its message is the group's help
 
 PURPOSES = {
@@ -63,7 +63,7 @@ PURPOSES = {
     "twin": "Emulate a whole rig: its stage and its camera.",
     "bench": "Time the core operations and the limits of a device.",
 }
-"""What the commands are for, in the order of the help; each stands in the module of its name."""
+"""Purpose of each command, in the order of the help; a command is in the module of its name."""
 
 
 def _common(
@@ -134,7 +134,7 @@ class _OneLine:
             sys.exit(_INTERRUPTED)
         if isinstance(error, Exception) and self.signalled:
             sys.exit(self.signalled)
-        # The classes that carry a code are not named here: importing them takes longer than --help may.
+        # # Classes that carry a code are not imported here: that takes longer than --help may take.
         lacking = _lacking(error)
         no_memory = isinstance(error, MemoryError) or bool(lacking)
         code = 1 if no_memory else getattr(error, "exit_code", None)
@@ -159,7 +159,7 @@ class _OneLine:
 
 
 def _lacking(error: BaseException | None) -> str:
-    """Return the line in which a library says that the system refused memory or a thread, if it does."""
+    """Return a library's line that the system refused memory or a thread; "" if there is none."""
     if not isinstance(error, ImportError | OSError | RuntimeError) or getattr(error, "exit_code", None):
         return ""
     lines = str(error).splitlines()
@@ -167,7 +167,7 @@ def _lacking(error: BaseException | None) -> str:
 
 
 def _end(number: int, frame: FrameType | None) -> None:
-    """End the program by an exception; leave what that began alone, unless the user insists."""
+    """End the program by an exception; do not interrupt its clean-up unless the user insists."""
     if not _OneLine.signalled:
         _OneLine.signalled = 128 + number
         if not _OneLine.debug:  # network reads that never finish would be reported when the program ends
@@ -185,10 +185,10 @@ def _end(number: int, frame: FrameType | None) -> None:
 
 @contextmanager
 def _ended_by_signals() -> Iterator[None]:
-    """Let signals end the program by an exception, so that nothing half-written stays behind.
+    """Let signals end the program by an exception, so that no file remains half-written.
 
-    Further signals must not interrupt what the first one began: a stage is stopped, files are completed, and
-    threads are waited for, since OpenCL aborts a program that leaves it at work.
+    Further signals must not interrupt the clean-up: the stage is stopped, files are completed, and threads
+    are waited for, because OpenCL aborts a program that ends while it works.
     """
     _OneLine.signalled = _OneLine.insisted = 0
 
@@ -200,7 +200,7 @@ def _ended_by_signals() -> Iterator[None]:
     told = sys.unraisablehook
 
     def insist(lost: sys.UnraisableHookArgs) -> None:
-        """Raise it once more if it was lost, as exceptions are in destructors and callbacks."""
+        """Raise the exception again if it was lost, as in destructors and callbacks."""
         if not isinstance(lost.exc_value, KeyboardInterrupt | SystemExit) or not hasattr(signal, "setitimer"):
             told(lost)
             return
@@ -220,7 +220,7 @@ def _ended_by_signals() -> Iterator[None]:
 
 
 def _complete(instruction: str) -> None:
-    """Print a shell's completion script, or what completes its command line, as the instruction asks."""
+    """Print a shell's completion script, or the completions of its command line, by an instruction."""
     if shell_complete(app, {}, "mirrorskin", _COMPLETE, instruction):
         raise click.UsageError(
             f"{_COMPLETE}={instruction}: no such instruction. Use bash_source, zsh_source or fish_source"
@@ -228,13 +228,13 @@ def _complete(instruction: str) -> None:
 
 
 class OutputError(Exception):
-    """Standard output did not take what was written: its disk is full, or its reader has ended."""
+    """Standard output cannot be written: its disk is full, or its reader has ended."""
 
     exit_code = 1
 
 
 class _StandardOutput(FileIO):
-    """Standard output whose errors differ from those of other files."""
+    """Standard output, with its own exception for errors."""
 
     def write(self, data: Any) -> int:
         if not data:  # Click tries streams with nothing, which /dev/full refuses
@@ -242,7 +242,7 @@ class _StandardOutput(FileIO):
         try:
             return super().write(data)
         except OSError as error:
-            # What waits to be written goes nowhere: Python would report it once more when it ends.
+            # # Unwritten output is discarded: Python would otherwise report the error once more when it ends.
             os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
             broken = isinstance(error, BrokenPipeError)
             message = "" if broken else f"standard output could not be written: {error.strerror}"
@@ -250,7 +250,7 @@ class _StandardOutput(FileIO):
 
 
 class _StandardError(FileIO):
-    """Standard error that drops what cannot be written: there is nowhere to report it."""
+    """Standard error; text that cannot be written is dropped: there is no other place to report it."""
 
     def write(self, data: Any) -> int:
         with suppress(OSError):
@@ -259,9 +259,9 @@ class _StandardError(FileIO):
 
 
 def _guard_streams() -> None:
-    """Make standard output and standard error usable where they are closed, full, or no longer read.
+    """Make standard output and standard error usable if they are closed, full, or no longer read.
 
-    A closed one becomes ``/dev/null``: the next file that is opened would take its place otherwise.
+    A closed one becomes ``/dev/null``: otherwise the next opened file would get its number.
     """
     for name in ("stdin", "stdout", "stderr"):
         if getattr(sys, name) is None:
@@ -300,7 +300,7 @@ def main() -> None:
 
 
 def program() -> None:
-    """Run the command line as a program of its own."""
+    """Run the command line as a separate program."""
     _guard_streams()
     try:
         main()

@@ -1,4 +1,4 @@
-"""``mirrorskin measure``: numbers of a height map, with their uncertainties."""
+"""``mirrorskin measure``: measures of a height map, with their uncertainties."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _EXPANDED = ("± is the standard uncertainty (k = 1)", "± is the expanded uncer
 
 
 class FormName(StrEnum):
-    """What is fitted to the surface."""
+    """Form that is fitted to the surface."""
 
     plane = "plane"
     sphere = "sphere"

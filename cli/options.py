@@ -1,4 +1,4 @@
-"""Options that several commands share, worded once."""
+"""Options that several commands share."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mirrorskin.cli.groups import Argument, Option
 
 
 class MotionName(StrEnum):
-    """How the sensor's body moved."""
+    """Motion of the sensor's body."""
 
     vertical = "vertical"
     axial = "axial"
@@ -19,7 +19,7 @@ class MotionName(StrEnum):
 
 
 class CompressionName(StrEnum):
-    """How frames are packed in a recording."""
+    """Compression of the frames in a recording."""
 
     raw = "raw"
     bitshuffle = "bitshuffle"

@@ -1,7 +1,7 @@
-"""Quantities with units, as they are written on the command line: a number and a unit, such as ``0.1mm``.
+"""Quantities on the command line: a number and a unit, such as ``0.1mm``.
 
-Each function takes the text and the option that it was given for, which messages name, and raises
-`mirrorskin.io.InputError` with an example of what to write.
+Each function receives the text and the name of its option, and raises `mirrorskin.io.InputError` with an
+example of a correct value.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def segment(text: str, option: str = "") -> tuple[tuple[float, float], tuple[flo
 
 
 def compliance(text: str, option: str = "") -> float:
-    """Return by how much a newton moves something, as in ``0.01mm/N``, in mm/N."""
+    """Return a compliance, as in ``0.01mm/N``, in mm/N."""
     distance, slash, newton = text.strip().rpartition("/")
     if not slash or newton.strip() != "N":
         raise _error(text, option, "a length for each newton is needed", "0.01mm/N")
@@ -70,7 +70,7 @@ def compliance(text: str, option: str = "") -> float:
 
 
 def force(text: str, option: str = "") -> float:
-    """Return a force above 0, as in ``1.5N``, or that of a weight, as in ``150g``, in newtons."""
+    """Return a force above 0, as in ``1.5N``, or a weight, as in ``150g``, in newtons."""
     return _above_zero(read_quantity(text, option, "force"), text, option, "force")
 
 
@@ -181,7 +181,7 @@ def _scaled(
 
 
 def decimal_comma(text: str) -> str:
-    """Return a number that is written with a decimal comma with a point instead; "" for any other text.
+    """Return a number with a decimal comma in a form with a point; "" for any other text.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""``mirrorskin rig``: a stage and a camera, before they are used."""
+"""``mirrorskin rig``: check a stage and a camera, and move the stage by hand."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ RigFile = Annotated[
 
 
 class AxisName(StrEnum):
-    """The motions that a stage may have an axis for."""
+    """Motions for which a stage may have an axis."""
 
     travel = "travel"
     pitch = "pitch"
@@ -89,7 +89,7 @@ def check(
 
 @app.add
 def home(rig: RigFile) -> None:
-    """Find the switches of all axes; then the stage knows where it stands."""
+    """Move all axes to their switches, which define the position of the stage."""
     with _opened(rig) as stage:
         stage.home()
 
@@ -106,8 +106,8 @@ def lift(rig: RigFile) -> None:
 @app.add
 def jog(
     rig: RigFile,
-    axis: Annotated[AxisName, Argument(help="What is moved.")],
-    by: Annotated[str, Option(metavar="LENGTH|ANGLE", help="How far from where it stands: 0.5mm, -1deg.")],
+    axis: Annotated[AxisName, Argument(help="Motion whose axis is moved.")],
+    by: Annotated[str, Option(metavar="LENGTH|ANGLE", help="Distance or angle of the move: 0.5mm, -1deg.")],
 ) -> None:
     """Move one axis a little, slowly and within its limits."""
     from dataclasses import replace
@@ -134,7 +134,7 @@ def probe(
         str | None,
         Option("--from", metavar="LENGTH", help="First travel.  [default: the least of its limits]"),
     ] = None,
-    step: Annotated[str, Option(metavar="LENGTH", help="From place to place.")] = "0.05mm",
+    step: Annotated[str, Option(metavar="LENGTH", help="Distance between the frames.")] = "0.05mm",
 ) -> None:
     """Lower the body until the picture shows contact, lift it, and print the zero of the travel."""
     from mirrorskin.cli.quantity import length
@@ -149,16 +149,16 @@ def probe(
         contact = find_contact(opened, first, each)
     zero = travel.coordinate(contact)
     click.echo(
-        f"{rig}: first contact at a travel of {contact:.4g} mm, give or take {each / 2:.2g} mm;"
+        f"{rig}: first contact at a travel of {contact:.4g} ± {each / 2:.2g} mm;"
         f" for a travel of 0 there set zero = {zero:.6g} in [stage.travel]"
     )
 
 
 @app.add
 def unlock(rig: RigFile) -> None:
-    """End an alarm, a hold or an open door after a look at the machine, or stop what moves it.
+    """End an alarm, a hold or an open door after a look at the machine, or stop its movement.
 
-    Without switches its coordinates count from then on as they are; with switches it must be homed next.
+    Without switches the present coordinates stay valid; with switches the stage must be homed next.
     """
     with _opened(rig, unlock=True):
         pass
@@ -166,7 +166,7 @@ def unlock(rig: RigFile) -> None:
 
 @contextmanager
 def _opened(rig: Path, unlock: bool = False) -> Iterator[Stage]:
-    """Open the stage alone; say in the end where it stands."""
+    """Open only the stage; print its position at the end."""
     from mirrorskin.hw.rig.check import in_words
     from mirrorskin.hw.rig.rig import open_stage
     from mirrorskin.hw.rig_file import load_rig

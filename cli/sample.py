@@ -1,4 +1,4 @@
-"""``mirrorskin sample``: example data, as a real sensor produces them."""
+"""``mirrorskin sample``: example data like those of a real sensor."""
 
 from __future__ import annotations
 
@@ -205,7 +205,7 @@ def _make_video(path: Path, replaces: Replaces) -> None:
 
 
 def _make_calibration(folder: Path, replaces: Replaces) -> None:
-    """Record what a sensor with a real wall, uneven lamps and a lens near the sheet is calibrated with."""
+    """Record the calibration frames of a sensor with a real wall, uneven lamps and a lens near the sheet."""
     import numpy as np
 
     from mirrorskin.hw.twin import Body, Camera, Vertical
@@ -224,7 +224,7 @@ def _make_calibration(folder: Path, replaces: Replaces) -> None:
 
 
 def _record_flat(path: Path, camera: hw.twin.Camera, light: float, replaces: Replaces) -> None:
-    """Record a field that is all alike."""
+    """Record a uniform field."""
     import numpy as np
 
     from mirrorskin import io

@@ -74,7 +74,7 @@ PLAN = Terms(
 
 
 def make_plan(context: click.Context, given: Mapping[str, Any], settings: RigSettings) -> Plan:
-    """Return the plan that a command's options describe, which the rig can follow."""
+    """Return the plan described by a command's options; the rig can follow it."""
     from mirrorskin.hw.rig.plans import check_plan
 
     motion = str(context.params["motion"])
@@ -87,7 +87,7 @@ def make_plan(context: click.Context, given: Mapping[str, Any], settings: RigSet
 
 
 def check_steps(plan: Plan, given: Mapping[str, Any]) -> None:
-    """Refuse options of motions with stops for a motion without."""
+    """Raise InputError for options of motions with stops if the motion has none."""
     from mirrorskin.io import InputError
 
     if given.get("settle", 0) < 0:
@@ -98,7 +98,7 @@ def check_steps(plan: Plan, given: Mapping[str, Any]) -> None:
 
 
 def open_calibration(path: Path | None, settings: RigSettings) -> Calibration | None:
-    """Open a calibration, if there is one, and refuse that of another camera before anything moves."""
+    """Open a calibration, if one is given; InputError for another camera, before anything moves."""
     import numpy as np
 
     from mirrorskin import io
@@ -114,7 +114,7 @@ def open_calibration(path: Path | None, settings: RigSettings) -> Calibration | 
 
 @contextmanager
 def kept(recorder: StreamRecorder | None) -> Iterator[None]:
-    """Report which frames of a recording that was cut short were kept, and where; the exit code is 1."""
+    """Report which frames of an interrupted recording were kept, and where; the exit code is 1."""
     from mirrorskin.hw.errors import HardwareError
     from mirrorskin.io import InputError
     from mirrorskin.io.layout import COMPLETE

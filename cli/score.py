@@ -1,4 +1,4 @@
-"""``mirrorskin score``: how far a result is from the truth."""
+"""``mirrorskin score``: the deviation of a result from the truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The settings of a batch, a file of TOML: what the stacks lack, and options of what is computed."""
+"""Settings of a batch, a TOML file: properties that the stacks lack, and options of the computation."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _text(example: str) -> Meta:
 
 
 def read_settings(path: Path | None, memory_limit: int) -> Plan:
-    """Read what a batch does with every recording."""
+    """Read the settings of a batch, which apply to every recording."""
     if path is None:
         return Plan(memory_limit=memory_limit)
     kinds: dict[str, type[Any]] = {table: method_for(motion) for motion, table in TABLES.items()}
@@ -55,7 +55,7 @@ def read_settings(path: Path | None, memory_limit: int) -> Plan:
 def _operation_of(path: Path) -> str:
     """Return the class of the table [operation], with the whole path of a file; "" without that table.
 
-    `load_toml` reports what else is wrong with the file.
+    `load_toml` reports other faults of the file.
     """
     text = read_text(path, _REMEDY)
     try:
@@ -135,7 +135,7 @@ def _with_key(message: str, kind: type[Any]) -> str:
 
 
 def _opening(values: dict[str, Any], where: str) -> dict[str, Any]:
-    """Convert [stack] to keywords of ``open_recording``; refuse what no stack can have."""
+    """Convert [stack] to keywords of ``open_recording``; InputError for those that no stack can have."""
     read = {}
     for one in STACK.terms:
         if one.name in values:

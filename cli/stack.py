@@ -65,7 +65,7 @@ STACK = Terms(
         term("frames", "only frames A to B - 1; the first frame is 0", "range"),
     ]
 )
-"""What a recording may lack, and the part of it that is used."""
+"""Properties that a recording may lack, and the part of it that is used."""
 RECORDING = STACK.without("tilt")
 CHOICE = STACK.only("dataset", "channel")
 IMPORTED = STACK.without("motion", "region", "frames")
@@ -73,11 +73,11 @@ FORMATS = (
     "HDF5, Zarr, NPY, NPZ, TIFF, MCAP, a video (AVI, MP4, MOV, MKV), or a folder of numbered pictures"
     " (PNG, TIFF, BMP, PGM, JPEG)"
 )
-"""What frames are read from."""
+"""Source of the frames."""
 
 
 def stack_options(given: dict[str, Any], where: str = "--") -> StackOptions:
-    """Return keywords of `io.open_recording`, and remove their options, except the tilt, from those given.
+    """Remove the options of a stack, except the tilt, and return keywords of `io.open_recording`.
 
     Messages put ``where`` before an option's name.
     """
@@ -140,14 +140,14 @@ def _phase(values: Mapping[str, Any]) -> StackOptions:
 
 @dataclass(frozen=True, slots=True)
 class Listed:
-    """The positions that a file lists, one a frame, mm or radians; see ``io.Positions``."""
+    """Positions listed by a file, one per frame, mm or radians; see ``io.Positions``."""
 
     path: Path
     what: str
     values: tuple[float, ...]
 
     def positions(self, count: int) -> Floats:
-        """Return the positions of ``count`` frames; InputError if the file lists another number."""
+        """Return the positions of ``count`` frames; InputError if their number differs."""
         import numpy as np
 
         from mirrorskin.io import InputError
@@ -160,7 +160,7 @@ class Listed:
 
 
 def read_phases(path: Path) -> Listed:
-    """Read the phase of each frame: angles with units, or numbers under a heading that states the unit."""
+    """Read the phase of each frame: angles with units, or numbers under a heading with a unit."""
     from mirrorskin.cli.table import read_column
 
     remedy, names = "write one angle a frame in it, such as 178.1deg", (("phase", "phases"), ("angle",))

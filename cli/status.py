@@ -1,4 +1,4 @@
-"""What live work shows while it runs: its rates and latencies on a terminal, pictures in a viewer."""
+"""Status of live work: rates and latencies on a terminal, pictures in a viewer."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LOOK = 0.2  # seconds after which a waiting viewer looks whether it is over
 
 
 class Newest:
-    """Hands updates to a viewer in a thread of its own: one that is slow misses some, and holds up nobody."""
+    """Passes updates to a viewer in a separate thread; a slow viewer misses some, and delays nothing."""
 
     def __init__(self, viewer: LiveView) -> None:
         self._viewer = viewer
@@ -28,18 +28,18 @@ class Newest:
         self._next: tuple[Update, Status] | None = None
         self._over = False
         self.error: Exception | None = None
-        # One that hangs must not keep the program from ending.
+        # # A viewer that hangs must not keep the program from ending.
         self._thread = threading.Thread(target=self._show, name="viewer", daemon=True)
         self._thread.start()
 
     def show(self, update: Update, status: Status) -> None:
-        """Show this next, instead of what has not been shown yet."""
+        """Replace the update that is shown next."""
         with self._change:
             self._next = update, status
             self._change.notify()
 
     def close(self) -> None:
-        """Show the last update, and wait until that is done, for some seconds at most."""
+        """Show the last update, and wait for it, some seconds at most."""
         with self._change:
             self._over = True
             self._change.notify()
@@ -55,7 +55,7 @@ class Newest:
             self._viewer.close()
 
     def _wait(self) -> tuple[Update, Status] | None:
-        """Return what is to be shown next, or None at the end."""
+        """Return the update that is shown next, or None at the end."""
         with self._change:
             while self._next is None and not self._over:
                 self._change.wait(_LOOK)
@@ -70,7 +70,7 @@ class Board:
         self._status: Status | None = None
 
     def tell(self, status: Status) -> None:
-        """Take note, from any thread."""
+        """Receive a status, from any thread."""
         self._status = status
 
     def render(self) -> Table:
@@ -106,7 +106,7 @@ def show_status() -> Iterator[Callable[[Status], None]]:
 
 
 def summary(status: Status) -> str:
-    """Say in a line how well the work kept up."""
+    """Return a line about how well the work kept up with the camera."""
     from mirrorskin.engine.live import SHOWN
 
     line = (

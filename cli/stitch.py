@@ -1,4 +1,4 @@
-"""``mirrorskin stitch``: results of several touches become one larger surface."""
+"""``mirrorskin stitch``: one larger surface from several touches."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables of text: a value of each frame or recording, in a column whose unit the first line may state."""
+"""Tables of text: a value of each frame or recording, in a column with an optional unit in the first line."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _SEPARATOR = re.compile("sep=(.)", re.IGNORECASE)  # a first line that Excel wri
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A line of a table: where it is, for messages, and its cells without surrounding blanks."""
+    """A line of a table: its place, for messages, and its cells without surrounding blanks."""
 
     where: str
     cells: tuple[str, ...]
@@ -35,7 +35,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """The names of the columns, as the first line states them, or none; and the other lines."""
+    """The names of the columns, if the first line contains names, and the other lines."""
 
     heading: tuple[str, ...]
     rows: tuple[Row, ...]
@@ -113,9 +113,7 @@ def read_column(
 
 
 def unit_of(heading: str, kind: Kind, where: str) -> str:
-    """Return the unit that the heading of a column states; "" if it states none.
-
-    Units are in brackets, after a slash, or the last word: ``travel [um]``, ``position/µm``, ``z_um``.
+    """Return the unit in the heading of a column; "" if there is none.
 
     Raises
     ------
@@ -143,7 +141,7 @@ def _without_comment(line: str) -> tuple[str, str]:
 
 
 def _cells(line: str, delimiter: str) -> tuple[str, ...]:
-    """Return the cells of a line; empty ones at its end are left out."""
+    """Return the cells of a line, without empty ones at its end."""
     if not delimiter:
         return tuple(_SPACED_UNIT.sub("", line).split())
     try:
@@ -156,7 +154,7 @@ def _cells(line: str, delimiter: str) -> tuple[str, ...]:
 
 
 def _heading(line: str, delimiter: str, columns: int) -> tuple[str, ...]:
-    """Return the names of columns; of a single column, all of the line."""
+    """Return the names of columns; the whole line if there is only one column."""
     if columns == 1:
         return (line.strip(' \t,;"'),) if line else ()
     if delimiter:
@@ -181,7 +179,7 @@ def _column_of(path: Path, table: Table, what: str, names: Sequence[Sequence[str
 
 
 def _states_all_units(table: Table) -> bool:
-    """Return whether each value has its own unit, so that it is a list over several lines."""
+    """Return whether each value has its own unit: then the values are a list over several lines."""
     return all(_VALUE.match(cell) and not _PLAIN.fullmatch(cell) for row in table.rows for cell in row.cells)
 
 
@@ -192,11 +190,7 @@ def _value(cell: str, where: str, kind: Kind, factor: float | None) -> float:
 
 
 def _refuse_decimal_commas(path: Path, contents: Sequence[tuple[int, str]]) -> None:
-    """Raise InputError if commas separate the digits of numbers, and not numbers.
-
-    They do if each line, or each word of the only line, is two whole numbers with a comma between them; or if
-    a unit follows.
-    """
+    """Raise InputError if commas separate the digits of numbers instead of the numbers."""
     words = contents
     if len(contents) == 1:
         words = [(number, word) for number, text in contents for word in text.split()]

@@ -1,4 +1,4 @@
-"""``mirrorskin twin serve``: an emulated rig, which needs no hardware."""
+"""``mirrorskin twin serve``: an emulated rig that needs no hardware."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def serve(
 
 
 def _start_in_background() -> None:
-    """Run this command in a session of its own; return when it is ready, or exit with its code."""
+    """Run this command in a separate session; return when it is ready, or exit with its code."""
     from mirrorskin.hw.errors import HardwareError
 
     reading, writing = os.pipe()

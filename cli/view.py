@@ -1,4 +1,4 @@
-"""``mirrorskin view``: look at a result."""
+"""``mirrorskin view``: pictures of a result."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def command(
 
 
 def _check(output: Path, result: Path) -> None:
-    """Refuse a place that cannot be written to, before anything is drawn."""
+    """Raise InputError for a place that cannot be written to, before anything is drawn."""
     from mirrorskin import io
     from mirrorskin.view.canvas import FIGURE_SUFFIXES
 

@@ -1,4 +1,4 @@
-"""``mirrorskin bench``: how fast a device is, compared with its own limits and with a committed table."""
+"""``mirrorskin bench``: the speed of a device, compared with its limits and with a committed table."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def _print(run: Run, table: Run) -> None:
 
 
 def _cells(case: Case, row: Row, before: Row | None) -> Iterator[str]:
-    """Give the cells of a row, with those of the same row of the table."""
+    """Return the cells of a row, with those of the same row of the table."""
     from mirrorskin.cli.bench.records import as_ms, as_percent
 
     wall = row.wall

@@ -1,4 +1,4 @@
-"""Runs of a benchmark: what was measured, on which machine; as objects and as JSON files."""
+"""Runs of a benchmark, with the machine, as objects and as JSON files."""
 
 from __future__ import annotations
 
@@ -86,12 +86,12 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def is_limit(self) -> bool:
-        """Whether the row measures what the machine can do."""
+        """Whether the row measures a limit of the machine."""
         return "limit" in self.name
 
     @property
     def kernel(self) -> float:
-        """Median seconds in kernels, as reported by the device; NaN if there were none."""
+        """Median seconds in kernels, as reported by the device; NaN if it reports none."""
         return self.device["kernel"].median if "kernel" in self.device else float("nan")
 
     @property
@@ -101,7 +101,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def kernel_bandwidth(self) -> float:
-        """Bytes per second of the kernels' time; NaN if there were none."""
+        """Bytes per second of kernel time; NaN if the device reports none."""
         return self.bytes / (self.kernel or float("nan"))
 
 
@@ -136,7 +136,7 @@ class Case(msgspec.Struct, frozen=True):
     targets: tuple[Target, ...] = ()
 
     def share(self, row: Row) -> float:
-        """Return the bandwidth of a row divided by that of the limit, by the clock; NaN without a limit."""
+        """Return the bandwidth of a row divided by the limit, by the clock; NaN without a limit."""
         limit = self._limit()
         return row.bandwidth / limit.bandwidth if limit else float("nan")
 
@@ -160,7 +160,7 @@ class Machine(msgspec.Struct, frozen=True):
 
 
 class Run(msgspec.Struct, frozen=True, kw_only=True):
-    """Cases, and what they were run with."""
+    """Cases, and the machine and versions they ran with."""
 
     date: str
     commit: str | None

@@ -1,4 +1,4 @@
-"""What the commands that calibrate a part have in common: recordings, the file, the report."""
+"""Common parts of the commands that calibrate: recordings, the file, the report."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def camera_name(names: Sequence[str]) -> str:
 
 
 def _one_camera(sources: Sequence[Source], calibration: Calibration | None, output: Path) -> CameraId:
-    """Return the camera of all recordings, which is that of the calibration."""
+    """Return the common camera of all recordings; a calibration must be of it too."""
     from mirrorskin import io
     from mirrorskin.io.calibration.source import check_camera
 
@@ -144,7 +144,7 @@ def process_of(source: Source | None = None, **facts: ProcessValue | list[Path])
 
 
 class Capture(NamedTuple):
-    """How recordings are captured, if a rig is given."""
+    """Settings of a capture, if a rig is given."""
 
     rig: Path | None = None
     places: Callable[[], list[Place]] = list  # called with a rig only; may remove options of the stack
@@ -153,7 +153,7 @@ class Capture(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """A part of a calibration, and what is reported of it."""
+    """A part of a calibration, and the report about it."""
 
     part: Part
     facts: Mapping[str, ProcessValue | list[Path]]  # provenance

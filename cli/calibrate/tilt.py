@@ -86,7 +86,7 @@ def command(
 def _brightness(
     source: Source, calibration: Calibration | None, gain: float | None, offset: float | None
 ) -> Brightness:
-    """Return the response of the calibration, or else the linear one of the recording and the options."""
+    """Return the response of the calibration, or else a linear one from the recording and the options."""
     from dataclasses import replace
 
     import numpy as np

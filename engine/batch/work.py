@@ -92,7 +92,7 @@ def _compute(
     target, digest = outcome.job.target, plan.digest(source.motion)
     if _has_result(outcome.job, source, digest):
         return replace(outcome, state="kept", message=_KEPT)
-    with as_input_error(f"{target.parent} cannot be made", "choose another folder for results"):
+    with as_input_error(f"{target.parent} cannot be created", "choose another folder for results"):
         target.parent.mkdir(parents=True, exist_ok=True)
     io.check_output(target, outcome.job.source)
     opened = open_device(device)

@@ -186,8 +186,8 @@ def test_a_terminal_shows_a_table(monkeypatch):
     [
         ("x*.h5 -o out", "x*.h5: no file matches"),
         ("a.h5 -o no/out", "there is no folder no: make it first"),
-        ("a.h5 -o a.h5", "a.h5 is no folder"),
-        ("a.h5 -o /proc/out", "/proc/out cannot be made"),
+        ("a.h5 -o a.h5", "a.h5 is not a folder"),
+        ("a.h5 -o /proc/out", "/proc/out cannot be created"),
         ("a.h5", "-o"),
         ("-o out", "FILE..."),
         ("a.h5 -o out --memory 5", "a unit is needed"),

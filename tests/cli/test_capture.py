@@ -325,7 +325,7 @@ def test_a_stage_that_is_said_to_home_and_does_not_is_refused(emulated, tmp_path
 def test_contact_is_found_and_the_zero_told(emulated):
     ended = done("rig probe", emulated[1], "--from", "-1mm", "--step", "0.2mm")
     found = re.search(
-        r"first contact at a travel of (\S+) mm, give or take 0.1 mm; .* set zero = (\S+) in", ended.out
+        r"first contact at a travel of (\S+) ± 0.1 mm; .* set zero = (\S+) in", ended.out
     )
     assert (
         -0.11 <= float(found[1]) <= 0.31
