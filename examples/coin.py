@@ -1,8 +1,8 @@
-"""A coin, and how deep its relief is.
+"""The depth of a coin's relief.
 
-A press on a 5 yen coin in steps of 0.02 mm: the paper's Fig. 6. The coin's faces are level and stay dark;
-its slopes turn bright one after the other, and the areas between them are filled smoothly. A cross-section
-goes through the middle.
+A press on a 5 yen coin in steps of 0.02 mm: the paper's Fig. 6. The coin's faces are level and stay dark; its
+slopes turn bright one after the other, and the areas between them are filled smoothly. A cross-section goes
+through the middle.
 """
 
 import numpy as np

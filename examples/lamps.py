@@ -1,7 +1,7 @@
-"""Normals, albedo and heights under one lamp after another.
+"""Normals, albedo and heights from pictures under one lamp after another.
 
-A matt relief with a printed pattern is photographed under eight lamps. The brightness of each pixel gives
-its normal and its albedo, without confusing print with shape, and integration gives heights.
+A matt relief with a printed pattern is photographed under eight lamps. The brightness of each pixel gives its
+normal and its albedo, so that print is not mistaken for shape; integration gives heights.
 """
 
 import matplotlib.pyplot as plt

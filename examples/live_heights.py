@@ -1,6 +1,6 @@
-"""Heights while the body goes down.
+"""Heights while the body moves down.
 
-Frames of a simulated press are pushed one by one, as from a camera, and maps are taken while they arrive.
+Frames of a simulated press are pushed one by one, as from a camera, and maps are read while they arrive.
 """
 
 import math

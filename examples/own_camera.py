@@ -1,6 +1,6 @@
-"""Your own camera and stage: frames of OpenCV become heights while the body goes down.
+"""Your own camera and stage: heights from OpenCV frames while the body moves down.
 
-``python own_camera.py`` takes the first camera, ``python own_camera.py press.avi`` the frames of a video.
+``python own_camera.py`` uses the first camera, ``python own_camera.py press.avi`` the frames of a video.
 """
 
 import math

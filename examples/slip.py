@@ -41,7 +41,7 @@ def rms(error):
 
 
 def draw_map(panel, values, contact, sticks, label, title, **colours):
-    """Draw a map with the border of the contact (black) and that of the part that sticks (red)."""
+    """Draw a map with the borders of the contact (black) and of the sticking part (red)."""
     side = SIZE * PIXEL / 2
     panel.set_facecolor("lightsteelblue")  # undefined
     picture = panel.imshow(values, extent=(-side, side, -side, side), **colours)

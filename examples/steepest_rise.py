@@ -26,7 +26,7 @@ class SteepestRise(engine.Operation):
         self.heights = np.full(shape, np.nan, np.float32)
 
     def push(self, frames, *, travel):
-        """Take in the next frames, (n, H, W), and the travel of each, mm."""
+        """Process the next frames, (n, H, W), and the travel of each, mm."""
         for frame, at in zip(frames.astype(np.float32), travel, strict=True):
             if self.last is not None:
                 rise = frame - self.last[0]

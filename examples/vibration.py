@@ -31,18 +31,18 @@ def simulate(thing, movement, *, camera=LAB, **sensor):
 
 
 def rms(values):
-    """Return the root mean square of the values that there are."""
+    """Return the root mean square of the defined values."""
     return float(np.sqrt(np.nanmean(np.square(values, dtype=float))))
 
 
-# 16 strokes of a stage with a backlash of 0.05 mm: on the way up it lags behind the travel that it reports.
+# # 16 strokes of a stage with a backlash of 0.05 mm: on the way up it lags behind the reported travel.
 TRAVEL, TURN, BACKLASH, STROKES = 1.2, 0.388, 0.05, 16
 travel = TRAVEL / 2 * (1 - np.cos(TURN * np.arange(round(STROKES * math.tau / TURN))))
 true = [0.0]
 for place in travel[1:]:
     true.append(float(np.clip(true[-1], place, place + BACKLASH)))
 twin, frames = simulate("sphere", Vertical(np.array(true)), references="exact")
-# Pixels that hardly turn bright, at the zenith where the wall begins, are crossed by noise.
+# # At the zenith where the wall begins, pixels hardly turn bright, and noise crosses their threshold.
 truth = np.where(twin.truth.zenith > math.radians(14), twin.truth.height, np.nan)
 reached = truth > -TRAVEL + BACKLASH
 search = engine.press.Strokes(dark=twin.header.dark, bright=twin.header.bright)

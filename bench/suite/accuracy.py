@@ -65,7 +65,7 @@ def _sudden(kind: str, shape: tuple[int, int], device: Device, slack: float) -> 
 
 
 def _ramps(kind: str, shape: tuple[int, int], device: Device, slack: float) -> list[Target]:
-    """Return targets of ramps of 6 frames, and of the error relative to that of the best estimate."""
+    """Return targets of ramps of 6 frames, and of the error relative to the best estimate's."""
     lasts = 6.0
     place = np.random.default_rng(2).uniform(2 + lasts, _FRAMES - 2 - lasts, shape)
     frames, known = _changes(kind, place, lasts)
@@ -104,7 +104,7 @@ def _press_noise(kind: str) -> float:
 
 
 def _frame_error(found: Result, place: Doubles) -> Doubles:
-    """Return the error of the height in frames; NaN without an answer."""
+    """Return the error of the height in frames; NaN if there is no height."""
     return np.asarray(-found.height.astype(np.float64) / _STEP - place)
 
 

@@ -77,7 +77,7 @@ class Paced(Closing):
         return {self._position: np.concatenate([np.empty(0), *self._read])}
 
     def rewind(self) -> None:
-        """Refuse: time cannot be repeated."""
+        """Raise an error: time cannot be repeated."""
         raise RuntimeError("a live source cannot be rewound")
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:

@@ -29,7 +29,7 @@ class Publisher(Node):
         self.surface = self.create_publisher(PointCloud2, "surface", 1)
 
     def show(self, update, status):
-        """Publish an update; the loop calls it in a thread of its own."""
+        """Publish an update; the loop calls it in a separate thread."""
         self.camera.publish(self.picture(update.picture))
         if update.height is not None:
             self.height.publish(self.picture(update.height * np.float32(1e-3)))
