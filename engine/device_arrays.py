@@ -45,7 +45,7 @@ def as_any_array_or_number(name: str, value: Any) -> Any:
 
 
 def device_of(choice: Choice, *arrays: Any) -> Device:
-    """Return the device that is chosen, by default that of the arrays; InputError if one is on another.
+    """Return the chosen device, by default the arrays' own; InputError if an array is on another one.
 
     Arrays on the host are on no device.
     """
@@ -66,7 +66,7 @@ def device_of(choice: Choice, *arrays: Any) -> Device:
 
 
 def device_of_maps(choice: Choice, *results: Result) -> Device:
-    """Return the device that is chosen, by default that of the first map of the results that is on one."""
+    """Return the chosen device, by default that of the first map of the results that is on one."""
     maps = (result.on_device(name) for result in results for name in result)
     there = next((one for one in maps if isinstance(one, Array)), None)
     return there.device if there is not None and choice is None else open_device(choice)
@@ -75,10 +75,10 @@ def device_of_maps(choice: Choice, *results: Result) -> Device:
 def operand_of(
     result: Result, quantity: str, dtype: DTypeLike, shape: tuple[int, ...], device: Device
 ) -> Operand | None:
-    """Return a map of a result for kernels, or None if there is none; InputError if it has another shape.
+    """Return a map of a result for kernels, or None if there is none; InputError if its shape differs.
 
-    A map that is on the device in this type is used as it is. Any other is converted on the host, where flags
-    (uint8) are 1 for all values but 0.
+    A map on the device in this type is not copied. Any other is converted on the host, where flags (uint8)
+    are 1 for all values but 0.
     """
     name = result.name_of(quantity)
     if name is None:

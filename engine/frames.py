@@ -90,7 +90,7 @@ def thin_out(frames: AnyArray) -> NDArray[np.float64]:
 
 
 def thinned(frames: AnyArray) -> NDArray[Any]:
-    """Return what `thin_out` does, in the frames' type."""
+    """Return the frames thinned out by `thin_out`, in their own type."""
     samples: NDArray[Any]
     *count, rows, columns = frames.shape
     step, pixels = thinning((rows, columns)), rows * columns

@@ -37,7 +37,7 @@ _STRIPES = {
     "border": Map("number of the stripe that begins at the pixel", dtype="int32", undefined=-1),
     "border_risk": Map("probability that the number is wrong by 1 where there is no border, or the reverse"),
 }
-_MISFIT = 4.0  # noise: residual of samples that are no cosine of the shift
+_MISFIT = 4.0  # _MISFIT = 4.0 # noise: residual above which samples do not follow a cosine of the shift
 _UNCLEAR = 0.5  # distance of a bit from the threshold, RMS distances, below which the pixel is on a border
 
 
@@ -102,7 +102,7 @@ class Fringes(Operation):
         frame_weights: ArrayLike | None = None,
         lent: bool = False,
     ) -> None:
-        """Take in the next frames, (n, H, W), the shift of the pattern in each, (n,) radians, and weights."""
+        """Process the next frames, (n, H, W), the shift of the pattern in each, (n,) radians, and weights."""
         weights = check_weights(frame_weights, len(frames))
         self._fit.push(frames, phase=phase, frame_weights=weights, lent=lent)
         self._weights.append(weights)
@@ -122,7 +122,7 @@ class Fringes(Operation):
         noise = seen if self._noise is None else self._noise
         matrix = fit_matrix(self.pushed("phase")[used], weights[used])
         (cc, cs), (_, ss) = ((matrix @ (matrix / weights[used]).T)[1:, 1:]).tolist()
-        # sin p = sine / modulation, and so for the cosine; without modulation there is no error bound.
+        # # sin p = sine / modulation, likewise the cosine; without modulation there is no error bound.
         variance = (cc * fit.sine - 2 * cs * fit.cosine) * fit.sine + ss * fit.cosine * fit.cosine
         square = modulation * modulation
         spread = np.full(square.shape, np.inf, np.float32)

@@ -132,7 +132,7 @@ def fuse(
 
 
 def _maps_of(name: str, maps: Maps, *needed: str) -> Result:
-    """Return maps as a result, if it has those that are needed."""
+    """Return maps as a result; InputError if it lacks a required map."""
     result = as_result(maps, name, quantity=needed[0])
     missing = [one for one in needed if result.name_of(one) is None]
     if missing:
@@ -175,7 +175,7 @@ def fuse_recordings(
 ) -> Result:
     """Reconstruct a press and a rotation on the same object, and join them to one surface.
 
-    The axial frames are registered for the pivot's shift with the press's heights, then again with those of
+    The axial frames are registered for the pivot's shift with the heights of the press, then with those of
     the joined surface, until points move by less than a fiftieth of a pixel; at most three times. A source
     that cannot be read twice is registered once.
 

@@ -65,7 +65,7 @@ def as_result(
 
 
 def pixel_size_of(result: Result, name: str, pixel_size: ArrayLike | None = None) -> tuple[float, float]:
-    """Return millimetres along x and y of a pixel, as specified, or those of the result.
+    """Return millimetres along x and y of a pixel, as given, or from the result.
 
     Raises
     ------

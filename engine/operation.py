@@ -204,7 +204,7 @@ class Operation(ThreadSafe, OnDevice):
 
     @property
     def passes(self) -> int:
-        """How often all frames are pushed: 1, or 2."""
+        """Number of times that all frames are pushed: 1, or 2."""
         return 1
 
     @property
@@ -234,13 +234,13 @@ class Operation(ThreadSafe, OnDevice):
         self.start(self.shape, self.dtype)
 
     def reset(self) -> None:
-        """Forget the frames so far, and what was estimated from them."""
+        """Forget the frames so far, and all estimates from them."""
         self._forget()
         if self.dtype is not None:
             self.clear()
 
     def push(self, *args: Any, **kwargs: Any) -> None:
-        """Take in the next frames."""
+        """Process the next frames."""
         raise NotImplementedError(f"{type(self).__name__} has no push(frames)")
 
     def result(self) -> Any:

@@ -125,7 +125,7 @@ class PhotometricStereo(Operation):
         """Do nothing: the first frame overwrites the sums."""
 
     def push(self, frames: NDArray[Any], *, phase: ArrayLike | None = None) -> None:
-        """Take in the next frames, (n, H, W), and the azimuth of each lamp, (n,) radians."""
+        """Process the next frames, (n, H, W), and the azimuth of each lamp, (n,) radians."""
         lights = self._lights_of(len(frames), phase)
         pixels = self.shape[0] * self.shape[1]
         self._add(

@@ -31,7 +31,7 @@ class Receiver(Protocol):
         """What ``push`` takes of each frame, and whether it needs it."""
 
     def push(self, *args: Any, **kwargs: Any) -> None:
-        """Take in the next frames."""
+        """Process the next frames."""
 
 
 def feed(

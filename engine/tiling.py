@@ -128,7 +128,7 @@ class Band:
         self.maps: dict[str, Array] = _Maps(device, maps, shape, self.stride)
         self._most = device.max_allocation // (self.pixels * dtype.itemsize)  # frames in one buffer
         if self._most < least:
-            raise DeviceMemoryError(f"{device.info.title} has no room for {least} frames")
+            raise DeviceMemoryError(f"{device.info.title} has no memory for {least} frames")
         self.length: int = min(length, self._most)
         self._places = [] if device.info.shares_memory else _places(device, self.length, least, shape, dtype)
         self._borrowed: BorrowedBuffer | None = None
@@ -199,7 +199,7 @@ class Band:
         if isinstance(frames, Array):
             if not self._only:
                 raise DeviceMemoryError(
-                    f"{self.device.info.title} has no room for maps beside {len(frames)} frames: "
+                    f"{self.device.info.title} has no memory for maps besides {len(frames)} frames: "
                     "pass the frames as a NumPy array"
                 )
             yield Staged(frames, slice(0, len(frames)))

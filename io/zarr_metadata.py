@@ -311,7 +311,7 @@ def compressors_of(array: ArrayMetadata) -> str:
 
 def too_many(path: Path) -> InputError:
     """Return the error for a store with too many groups and arrays."""
-    return InputError(f'f"{path} contains more than {MOST_NODES} groups and arrays: copy those you need"')
+    return InputError(f"{path} contains more than {MOST_NODES} groups and arrays: copy those you need")
 
 
 def is_name(name: str) -> bool:

@@ -166,7 +166,7 @@ class _Batch:
         raise InputError(f"worker {worker} of {self._name} {problem}")
 
     def _run(self, function: Callable[..., Any], *values: Any) -> dict[str, Any]:
-        """Call a function on each worker, and return what it returned or raised."""
+        """Call a function on each worker, and return its results or exceptions."""
         run = functools.partial(self._client.run, function, *values, on_error="return")
         answers: dict[str, Any] = self._checked(run, _CHECK)
         # An OSError means that the worker was lost.
@@ -231,7 +231,7 @@ def _local_cluster(workers: int) -> Iterator[Any]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Suppress Dask's messages: outcomes and errors describe what went wrong."""
+    """Suppress Dask's messages: outcomes and errors describe all faults."""
     names = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]
     loggers = [logging.getLogger(name) for name in names]
     levels = [logger.level for logger in loggers]

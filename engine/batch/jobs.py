@@ -97,7 +97,7 @@ TABLES: Mapping[Motion, str] = {
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is done with every recording of a batch; can be pickled."""
+    """Settings for every recording of a batch; can be pickled."""
 
     opening: Mapping[str, Any] = field(default_factory=dict)  # keywords of `io.open_recording`
     press: Mapping[str, Any] = field(default_factory=dict)  # options of `engine.Press`
@@ -148,7 +148,7 @@ def _code(kind: type) -> str:
 
 
 def _as_json(value: Any) -> Any:
-    """Convert a value to what JSON can hold."""
+    """Convert a value to JSON types."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {entry.name: _as_json(getattr(value, entry.name)) for entry in dataclasses.fields(value)}
         return {type(value).__name__: fields}

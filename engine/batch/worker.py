@@ -50,7 +50,7 @@ class Enlist(WorkerPlugin):
         self.program, self.sizes, self.trace = program, sizes, trace
 
     async def setup(self, worker: Any) -> None:
-        """Give the worker the resource that jobs need if it can take part; called by Dask."""
+        """Create the resource that jobs need on a worker that can take part; called by Dask."""
         installed = version("mirrorskin")
         problem = None
         if installed != self.program:

@@ -1,4 +1,4 @@
-"""A ball of known size: what each pixel sees of it, and its position in a picture."""
+"""A ball of known size: its image at each pixel, and its position in a picture."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mirrorskin.kernels.least_squares import geman_mcclure
 
 
 class BallSight(NamedTuple):
-    """What n pixels see of a ball in T poses; NaN where they do not see it in contact."""
+    """The points of a ball that n pixels see in T poses; NaN where they do not see it in contact."""
 
     contact: NDArray[np.bool_]  # (T, n): whether the sheet touches the ball there (paper, eq. 1)
     z: Doubles  # (T, n): height of the visible point above the rest plane, mm
@@ -181,7 +181,7 @@ class _Gradients(NamedTuple):
 def _outline(
     frame: NDArray[Any], pixel_size: tuple[float, float], radius: float
 ) -> tuple[_Circle, Doubles] | None:
-    """Return the circle on which the light of a frame ends, if there is one, and its standard errors."""
+    """Return the circle where the light of a frame ends, and its standard errors; None if none."""
     circle = _find_circle(_gradients(*_downscale(frame, pixel_size, _COARSE), _BLUR), radius)
     small = _downscale(frame, pixel_size, _LONGEST)
     fitted = None
@@ -220,7 +220,7 @@ def _gradients(small: Doubles, corner: Doubles, step: Doubles, blur: float) -> _
 
 
 def _find_circle(picture: _Gradients, radius: float) -> _Circle | None:
-    """Return the circle on which most of the outline of a bright area is, if there is one."""
+    """Return the circle that contains most of the outline of a bright area; None if there is none."""
     places, inwards = _edges(picture)
     pixel = picture.pixel
     best, votes = None, 0.0
@@ -238,7 +238,7 @@ def _find_circle(picture: _Gradients, radius: float) -> _Circle | None:
 
 
 def _edges(picture: _Gradients) -> tuple[Doubles, Doubles]:
-    """Return the points that are steepest along their own slope, and the directions uphill, (2, n) each."""
+    """Return the points of greatest slope along their gradient, and the uphill directions, (2, n) each."""
     steepness = picture.steepness
     threshold = max(_CLEAR * float(np.median(steepness)), _FAINT * float(steepness.max()), 1e-12)
     rows, columns = np.nonzero(steepness > threshold)

@@ -119,7 +119,7 @@ def locate_marks(picture: NDArray[Any], board: Board, name: str) -> Marks:
 
 
 def _centre_predicted(picture: Doubles, board: Board, fit: CameraFit, points: Doubles, name: str) -> Marks:
-    """Return those marks at points of the board, (n, 2), that are close to the places predicted by a fit."""
+    """Return the marks at points of the board, (n, 2), that are close to their places predicted by a fit."""
     starts, pitch = fit.places(0, points), _pitch(fit.places(0, board.marks()))
     reach = 0.45 * pitch
     if isinstance(board, Charuco):
@@ -236,7 +236,7 @@ class CameraFit:
         return tuple(float(np.sqrt(np.mean(np.sum(part**2, axis=1)))) for part in self.residuals())
 
     def uncertainty(self) -> tuple[float, float]:
-        """Return the relative standard error of the scale, and that of the map near its corners, pixels."""
+        """Return the relative standard error of the scale, and the map's near its corners, pixels."""
         base = self.lens(self.parameters)
         sides = zip(base.shape[::-1], base.pixel_size, strict=True)
         x, y = (_OUT * (side - 1) / 2 * size for side, size in sides)

@@ -85,7 +85,7 @@ class Level(NamedTuple):
 
 
 def level_above(moments: Moments, floor: float | None) -> Level:
-    """Estimate the level of samples that are clipped at a floor (counts), if there is one.
+    """Estimate the level of samples that may be clipped at a floor, counts.
 
     The standard error is that of the mean, with a variance between the pixel's own and the mean one of pixels
     of this level (Buehlmann's credibility), plus the error of rounding. Clipping raises the mean of samples:
@@ -96,7 +96,7 @@ def level_above(moments: Moments, floor: float | None) -> Level:
 
 
 def level_below(moments: Moments, top: float | None) -> Level:
-    """Estimate the level of samples that are clipped at a top, counts, if there is one: see `level_above`."""
+    """Estimate the level of samples that may be clipped at a top, counts: see `level_above`."""
     end = None if top is None else -top
     level = _level(moments, -moments.mean, -moments.highest, moments.at_highest, end)
     return level._replace(value=-level.value)

@@ -312,7 +312,7 @@ def _residual_rms(model: _Model, parameters: Doubles) -> dict[str, float]:
 
 
 def _precession(model: _Model, fit: _Fit, notes: list[str], depth_sigma: float) -> Precession:
-    """Return the precession of a fit, and add notes about what is not determined."""
+    """Return the precession of a fit, and add notes about undetermined parameters."""
     tilt, offset, oval_x, oval_y, *rest = (float(value) for value in fit.parameters[: len(NAMES)])
     errors = np.sqrt(np.diag(fit.covariance))
     sigma = {name: float(error) for name, error in zip(NAMES, errors, strict=False)}

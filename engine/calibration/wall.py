@@ -215,7 +215,7 @@ def _refit(
 ) -> tuple[Touch, Doubles]:
     """Fit again, to at most ``count`` of the samples that are inside and in contact.
 
-    Also returned are the residuals of all samples in standard deviations, NaN where there is no contact.
+    Also return the residuals of all samples in standard deviations, NaN without contact.
     """
     named, _, centres = model.split(fit.parameters)
     touched = model.meet_balls(samples, named, centres).z >= _TOUCHED

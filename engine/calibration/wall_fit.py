@@ -126,7 +126,7 @@ def _choose(
 
 
 def pivot_of(source: Source, precession: Precession | None) -> Pivot:
-    """Return the pivot of the calibration, else of the recording, else 0, with its standard deviations."""
+    """Return the pivot of the calibration, else of the recording, else 0, with standard deviations."""
     phase_sigma = _RECORDED_PHASE
     if precession is not None:
         phase_sigma = _calibrated_sigma(precession, "phase_offset", _CALIBRATED_PHASE)

@@ -153,7 +153,7 @@ def meet_balls(samples: LightSamples, named: Mapping[str, float], centres: Doubl
 
 
 def look(place: Doubles, named: Mapping[str, float]) -> tuple[Doubles, Doubles]:
-    """Return positions relative to the axis, mm, and slopes of lines of sight, of places on the rest plane.
+    """Return positions relative to the axis, mm, and slopes of lines of sight, for places on the rest plane.
 
     All are (2, N): the lines pass ``position + z slope``.
     """

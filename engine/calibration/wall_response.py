@@ -50,7 +50,7 @@ def threshold_zenith(
     *,
     z: ArrayLike = 0.0,
 ) -> Doubles:
-    """Return the smallest zenith at which mirrors are bright, radians; NaN if there is none up to 45 degrees.
+    """Return the smallest zenith of bright mirrors, radians; NaN if there is none up to 45 degrees.
 
     Parameters
     ----------
@@ -82,8 +82,8 @@ def threshold_zenith(
 def full_light(response: WallResponse, places: Doubles, zenith: Doubles, azimuth: Doubles) -> Doubles:
     """Return shares of the pixels' full light, (n,), also where part of a scattered ray misses the wall.
 
-    ``places`` are x and y on the rest plane and the mirror's height, (3, n), mm; zenith and azimuth are those
-    of its normal. Outside its reach the wall is as bright as at the end of the reach.
+    ``places`` are x and y on the rest plane and the mirror's height, (3, n), mm; zenith and azimuth are its
+    normal's. Outside its reach the wall is as bright as at the end of the reach.
     """
     z, radius = places[2], response.radius
     from_axis = places[:2] - np.reshape(response.axis, (2, 1))
@@ -147,7 +147,7 @@ def make_response(
 
 
 def _reach(named: Mapping[str, float], shares: tuple[float, float] = (0.0, 1.0)) -> tuple[float, float]:
-    """Return the q between which the whole scattered ray meets the wall, and there are samples."""
+    """Return the range of q in which the whole scattered ray meets the wall, and there are samples."""
     whole, spread = math.atan2(named["rim"], named["radius"]), _MARGIN * named["scatter"]
     low = max(spread, (1 - shares[1]) * whole)
     high = min(whole - spread, (1 - shares[0]) * whole)
@@ -279,7 +279,7 @@ def _normal_slopes(fit: WallFit, places: Doubles, azimuth: Doubles, zenith: Doub
 def _light_of_turn(
     parameters: Doubles, rising: bool, places: Doubles, zenith: Doubles, azimuth: Doubles
 ) -> Doubles:
-    """Return the light of normals at places on the rest plane in the frames of a rotation, (n, frames)."""
+    """Return the light, (n, frames), of normals at places on the rest plane in the frames of a rotation."""
     named, steps, _ = model.split(parameters)
     phase = np.arange(_FRAMES) * 2 * np.pi / _FRAMES
     turns = rotations(_LEAN * np.stack([np.cos(phase), np.sin(phase)], axis=1))

@@ -154,7 +154,7 @@ def _force(pressure: NDArray[np.float32], contact: NDArray[np.bool_], force: flo
 
 
 def modulus_of(result: Result, modulus: float | None, modulus_sigma: float) -> tuple[float, float]:
-    """Return Young's modulus and its standard deviation, as specified, or those of a result's calibration."""
+    """Return Young's modulus and its standard deviation, as given, or from a result's calibration."""
     if modulus is not None:
         return check_modulus(modulus), modulus_sigma
     stiffness = None if result.calibration is None else result.calibration.stiffness
@@ -167,7 +167,7 @@ def check_modulus(modulus: float) -> float:
     """Return Young's modulus, or raise InputError if it is not possible."""
     if not 1e-9 < modulus < 1e9:
         raise InputError(
-            f"a modulus of {modulus:g} MPa cannot be: give Young's modulus, above 0, as in 0.1 MPa"
+            f"a modulus of {modulus:g} MPa is not possible: give Young's modulus, above 0, as in 0.1 MPa"
         )
     return modulus
 
@@ -176,7 +176,7 @@ def _check(**values: tuple[float, float]) -> None:
     for name, (value, least) in values.items():
         if not (math.isfinite(value) and value >= least):
             bound = "a finite number" if least == -math.inf else f"{least:g} or more"
-            raise InputError(f"{name} {value:g} cannot be: give {bound}")
+            raise InputError(f"{name} {value:g} is not possible: give {bound}")
 
 
 def force_of_press(fit: PressFit, known: Stiffness | float) -> Result:

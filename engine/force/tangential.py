@@ -164,7 +164,7 @@ def _checked(
         raise InputError(f"sigma has shape {spread.shape}: it must be that of the map, {moved.shape[:2]}")
     spread = np.broadcast_to(spread[..., np.newaxis] if spread.ndim == 2 else spread, moved.shape)
     if window_size < 1:
-        raise InputError(f"window_size {window_size} cannot be: give pixels, 1 or more")
+        raise InputError(f"window_size {window_size} is not possible: give pixels, 1 or more")
     known = np.isfinite(moved).all(axis=-1)
     if known.any() and not (farthest := np.abs(moved[known]).max()) < _FARTHEST:
         raise InputError(f"a displacement is {farthest:.3g} mm: less than {_FARTHEST:g} are needed")

@@ -1,4 +1,4 @@
-"""The part of a picture that has an answer."""
+"""The part of a picture with an answer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Mask = NDArray[np.bool_]
 
 
 def find_box(shape: tuple[int, int], answered: Callable[[Box], Mask]) -> Box:
-    """Return the smallest box that contains all pixels with an answer; the whole picture without any.
+    """Return the smallest box that contains all pixels with an answer; the whole picture if there are none.
 
     ``answered`` returns a mask of the pixels of a box. It is only called for the margins and a few lines.
     """

@@ -1,4 +1,4 @@
-"""Inputs of an integration whose slopes or normals are on a device, and stay there."""
+"""Inputs of an integration whose slopes or normals are on a device."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from mirrorskin.kernels.samples import take_samples
 def check_device_inputs(
     dz_dx: Any, dz_dy: Any, normals: Any, pixel_size: Any, mask: Any, slope_weights: Any, edges: Any
 ) -> Inputs:
-    """Return what `check_inputs` does for slopes or normals on a device, with one weight for all."""
+    """Return the result of `check_inputs` for slopes or normals on a device, with one weight for all."""
     check_one_source(dz_dx, dz_dy, normals)
     maps = [normals] if normals is not None else [dz_dx, dz_dy]
     axes = 3 if normals is not None else 2
@@ -73,7 +73,7 @@ def _find_slopes(normals: Array, weight: float) -> tuple[list[Array], list[Array
 
 
 def _clip(weights: Array) -> float:
-    """Clip weights within what can be solved, and return their median."""
+    """Clip weights to the range that can be solved, and return their median."""
     typical = median_weight([sample_evenly(weights)])
     device, pixels = weights.device, math.prod(weights.shape)
     device.kernel("facing", "facing_clip")(
@@ -90,7 +90,7 @@ def sample_evenly(map_: Array) -> Floats:
 
 
 def sample_grid(map_: Array, down: int, across: int) -> Floats:
-    """Return every so many pixels of a map, from the middle of the first step on."""
+    """Return every n-th pixel of a map, beginning in the middle of the first step."""
     rows, columns = map_.shape
     shape = len(range(down // 2, rows, down)), len(range(across // 2, columns, across))
     return take_samples(map_, down // 2 * columns + across // 2, down * columns, across, shape)

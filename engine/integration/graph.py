@@ -96,7 +96,7 @@ class PixelGraph:
             self._run("links_cut", {"MASK": int(bool(mask))}, **slopes, **edges, flags=uncut, cut=self.flags)
 
     def set_slopes(self, inputs: Inputs) -> None:
-        """Replace the slopes; weights and flags stay."""
+        """Replace the slopes, and keep weights and flags."""
         self._inputs, self._slopes = inputs, self._share(dz_dx=inputs.dz_dx, dz_dy=inputs.dz_dy)
 
     def mean_plane(self, inputs: Inputs) -> Plane:
@@ -134,7 +134,7 @@ class PixelGraph:
     def misfit(
         self, reliefs: Array, plane: Plane = LEVEL, links: Links | None = None, number: int = 0
     ) -> float:
-        """Return the least-squares sum, without unit, of heights above a plane, ``reliefs`` at a number."""
+        """Return the least-squares sum, without unit, for heights above a plane: ``reliefs`` at an index."""
         layout = self.device.layout
         group = layout.group if layout.tile == 1 else 1
         sums = self.array("sums", shape=(-(-self._items("links_misfit") // group),))

@@ -20,7 +20,7 @@ STRENGTH = 0.25
 """Relative weight from which a link joins its nodes in one aggregate; see ``multigrid_parts``."""
 
 LANES = 16, 8, 4
-"""Numbers of right sides that are solved at once, if there are several."""
+"""Numbers of right sides that can be solved at once."""
 
 _VECTOR = 16  # the length of a row is a multiple of it: two of a kernel's vectors
 _BEFORE = _VECTOR  # nodes before the first level, which vectors left of its margin read
@@ -261,7 +261,7 @@ class Hierarchy:
         self.between("coarsen", number, **self.graph, **moves, **coarse)
 
     def _build_tail(self, tail: int, *, plain: bool, strength: float = STRENGTH) -> None:
-        """Build the levels after that of a number, in one work-group."""
+        """Build the levels after a given one, in one work-group."""
         arguments: dict[str, Any] = {"from": tail, "last": len(self.levels) - 1, "levels": self.table}
         arguments |= {"plain": plain, "strength": strength, **self.graph, "inverse": self.inverse}
         arguments |= {"parts": self._parts, "wanted": self._wanted, "to": self.to, "touched": self._touched}

@@ -304,7 +304,7 @@ class _Gradients:
                 if sides and not (history[0, 2] <= self._given).all():  # ignore a start that is worse than 0
                     self.begin(self._sources, None, self._batch)
                     return self._iterate(goal, limit, deadline)
-            # Steps of no length, where a product is not positive, leave heights and residual as they are.
+            # # A step of length 0, where a product is not positive, leaves heights and residual unchanged.
             steps = int((history[:, 0] > 0).any(axis=1).sum())
             done = first + steps
             product, _, rest = history[max(steps, 1) - 1]
@@ -378,7 +378,7 @@ class _Gradients:
 
 
 def _cycles_to(goal: float, residual: Doubles, last: Doubles, cycles: int) -> int:
-    """Return after how many more cycles residuals may be at the goal, from what some cycles reduced."""
+    """Return the number of further cycles to reach the goal, from the reduction by some cycles."""
     rate = np.log(residual / last) / max(cycles, 1)
     further = np.log(goal / residual) / rate
     if not (np.isfinite(further).all() and (rate < 0).all()):

@@ -91,7 +91,7 @@ def seems_full(inputs: Inputs) -> bool:
         return False
     rows = slice(None, None, _SAMPLED if min(inputs.shape) > 1 else 1)
     values = inputs.dz_dx, inputs.dz_dy, inputs.known_heights
-    # What is on a device is not looked at: an undefined slope shows in the heights.
+    # # Data on a device are not checked: an undefined slope shows in the heights.
     return all(bool(np.isfinite(map_[rows]).all()) for map_ in values if isinstance(map_, np.ndarray))
 
 
@@ -200,7 +200,7 @@ class Rectangle:
         return self._deviation[1]
 
     def _excess(self, misfit: float, known: bool) -> float:
-        """Return the misfit over that expected for noise of variance 1; NaN if there is no loop of links."""
+        """Return the misfit over that expected for noise of variance 1; NaN without a loop of links."""
         rows, columns = self.shape[-2:]
         links, pixels = rows * (columns - 1) + (rows - 1) * columns, rows * columns
         unit = expected_misfit(links, pixels, pixels * known, int(not known), self._weights)

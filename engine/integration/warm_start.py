@@ -25,7 +25,7 @@ _CHECK_INTERVAL = 8  # frames between checks of the gap, which wait for the devi
 
 
 class WarmStartIntegrator(ThreadSafe):
-    """Integrate slopes on the device frame after frame; heights follow those of `Integrator` by a step.
+    """Integrate slopes on the device frame after frame; heights are one step behind those of `Integrator`.
 
     Attributes
     ----------

@@ -84,7 +84,7 @@ class LiveOperation(ThreadSafe):
         self.operation.warm()
 
     def push(self, frames: NDArray[Any], **positions: Any) -> None:
-        """Take in the next frames."""
+        """Process the next frames."""
         with naming(self._source):
             self.operation.push(frames, **positions)
 

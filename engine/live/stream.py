@@ -1,4 +1,4 @@
-"""Frames of one's own camera: pushed from any thread, and looked at at any time."""
+"""Frames of your own camera: pushed from any thread; maps can be read at any time."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _ENDLESS = 1 << 40  # frames that a stream may have
 
 
 class Stream(Closing):
-    """Push frames of one's own camera and stage into an operation, and look at its maps at any time.
+    """Push frames of your own camera and stage into an operation, and read its maps at any time.
 
-    A thread of its own runs the operation by the policy of `Loop`: frames that waited longer than ``latency``
+    A separate thread runs the operation by the policy of `Loop`: frames that waited longer than ``latency``
     are skipped, except for the newest one.
 
     Parameters
@@ -83,7 +83,7 @@ class Stream(Closing):
         self._thread.start()
 
     def push(self, frames: ArrayLike, *, time: float | None = None, **positions: ArrayLike) -> None:
-        """Take in the next frame, (H, W), or frames, (n, H, W): they are copied, and processed later.
+        """Process the next frame, (H, W), or frames, (n, H, W): they are copied, and processed later.
 
         Parameters
         ----------
@@ -106,13 +106,13 @@ class Stream(Closing):
         return self._source.now()
 
     def latest(self) -> Update | None:
-        """Return the newest maps, for a display; None before there are any. It does not wait."""
+        """Return the newest maps, for a display, without waiting; None before the first ones."""
         self._source.check()
         return self._latest
 
     @property
     def status(self) -> Status:
-        """How many frames were used, skipped and lost, and how long they took."""
+        """Numbers of used, skipped and lost frames, and their latencies."""
         return self._loop.status
 
     def result(self) -> Result:
@@ -155,7 +155,7 @@ def _header(operation: Operation | Method, motion: Motion | None, header: Header
 
 
 class _Pushed(Closing):
-    """A live source whose frames are put into it by another thread."""
+    """A live source whose frames come from another thread."""
 
     name = "stream"
     rewindable = False
@@ -227,13 +227,13 @@ class _Pushed(Closing):
         return Block(part, first, time=np.array(times), dropped=lost, **known)
 
     def wait(self) -> None:
-        """Wait until nothing waits and the reader asks for more."""
+        """Wait until no frame waits and the reader asks for more."""
         with self._changed:
             self._changed.wait_for(lambda: (self._idle and not self._waiting) or self._stopped)
             self._check()
 
     def close(self) -> None:
-        """Let the reader end after the frames that wait."""
+        """Let the reader end after the waiting frames."""
         with self._changed:
             self._ended = True
             self._changed.notify_all()

@@ -26,7 +26,7 @@ Grid = tuple[float, float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """What a map contains.
+    """Contents of a map.
 
     Attributes
     ----------

@@ -56,7 +56,7 @@ class Pose:
 
     @property
     def sigma(self) -> Doubles:
-        """Standard deviations of the six parts, (6,); infinite of those in undetermined directions."""
+        """Standard deviations of the six parts, (6,); infinite for undetermined directions."""
         free = (np.abs(self.undetermined) > _SHARE).any(axis=0)
         return np.where(free, np.inf, np.sqrt(np.diag(self.covariance)))
 

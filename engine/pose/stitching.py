@@ -276,7 +276,7 @@ class _Moved:
         with_normals: bool,
         before: _Sums | None,
     ) -> _Moved:
-        """Move a touch; an unknown offset is determined from those before."""
+        """Move a touch; an unknown offset is determined from earlier touches."""
         assert touch.height is not None
         left, top, step_x, step_y = known.grid
         height = np.asarray(touch.height, np.float32).copy()

@@ -47,7 +47,7 @@ class ChangePoint(PressOperation):
 
     @property
     def passes(self) -> int:
-        """How often all frames are pushed: twice if a level is unknown."""
+        """Number of times that all frames are pushed: twice if a level is unknown."""
         return 2 if self.dark is None or self.bright is None else 1
 
     def check_options(self) -> None:
@@ -132,7 +132,7 @@ class ChangePoint(PressOperation):
         for_each_band(self._bands, begin_split)
 
     def push(self, frames: NDArray[Any], *, travel: ArrayLike, lent: bool = False) -> None:
-        """Take in the next frames, (n, H, W), and the travel of each, (n,) mm."""
+        """Process the next frames, (n, H, W), and the travel of each, (n,) mm."""
         first = len(self._travel)
         if any(first + len(frames) >= len(weight) for weight in self._weights.values()):
             raise InputError("the second pass has more frames than the first. Push the same frames twice")

@@ -235,7 +235,7 @@ class Crossing:
         for_each_band(self._bands, set_levels)
 
     def push(self, frames: NDArray[Any], travel: ArrayLike, lent: bool = False) -> None:
-        """Take in the next frames, (n, H, W), and the travel of each; InputError if it reverses."""
+        """Process the next frames, (n, H, W), and the travel of each; InputError if it reverses."""
         first, last = self._travel.count, self._travel.values[-1:]
         self._travel.extend(check_travel(travel, len(frames), "travel", after=last, falls=self._release))
         self._noise.look(frames)

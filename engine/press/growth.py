@@ -99,7 +99,7 @@ class Growth(CorrelationOperation):
 
     @property
     def passes(self) -> int:
-        """How often all frames are pushed: twice if the travel is not available in advance."""
+        """Number of times that all frames are pushed: twice if the travel is not available in advance."""
         return 2 if self.travel_wave is None else 1
 
     def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
@@ -121,7 +121,7 @@ class Growth(CorrelationOperation):
         self._wave = first_harmonic(self.pushed("travel"), self.count)
 
     def push(self, frames: NDArray[Any], *, travel: ArrayLike, lent: bool = False) -> None:
-        """Take in the next frames, (n, H, W), and the travel of each, (n,) mm."""
+        """Process the next frames, (n, H, W), and the travel of each, (n,) mm."""
         check_strokes(travel, len(frames), "travel")
         if self._wave is None:  # in the first pass
             return

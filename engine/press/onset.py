@@ -62,7 +62,7 @@ class ThresholdOperation(CrossingOperation):
             search.reset()
 
     def push(self, frames: NDArray[Any], *, travel: ArrayLike, lent: bool = False) -> None:
-        """Take in the next frames, (n, H, W), and the travel of each, (n,) mm."""
+        """Process the next frames, (n, H, W), and the travel of each, (n,) mm."""
         for search in self._searches:
             search.push(frames, travel, lent)
 

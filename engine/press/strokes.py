@@ -72,7 +72,7 @@ class Strokes(CrossingOperation):
         self._noise: float | None = None
 
     def push(self, frames: NDArray[Any], *, travel: ArrayLike, lent: bool = False) -> None:
-        """Take in the next frames, (n, H, W), and the travel of each, (n,) mm."""
+        """Process the next frames, (n, H, W), and the travel of each, (n,) mm."""
         values = check_strokes(travel, len(frames), "travel")
         before = self._travel[-1:]
         turns = (stroke_starts(np.concatenate([before, values]), self._direction) - len(before)).tolist()

@@ -81,7 +81,7 @@ class CorrelationOperation(Operation):
         return self._sums.room
 
     def _push(self, frames: AnyArray, alpha: Doubles, weights: Doubles, lent: bool) -> None:
-        """Take in frames with the phase and the weight of each."""
+        """Process frames with the phase and the weight of each."""
         if lent and self.count == 0 and self._window() is None and StackSums.take(frames, weights):
             self._stack = frames, alpha, weights  # summed and solved by one kernel, unless more frames follow
             return
@@ -151,7 +151,7 @@ class Correlate(CorrelationOperation):
         frame_weights: ArrayLike | None = None,
         lent: bool = False,
     ) -> None:
-        """Take in the next frames, (n, H, W), the phase of each, (n,) radians, and their weights, (n,)."""
+        """Process the next frames, (n, H, W), the phase of each, (n,) radians, and their weights, (n,)."""
         alpha = self.harmonic * check_phase(phase, len(frames), "phase")
         weights = check_weights(frame_weights, len(frames))
         self._push(frames, alpha, weights, lent)

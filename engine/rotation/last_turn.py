@@ -97,7 +97,7 @@ class LastTurn(Normals):
         self.clear()
 
     def clear(self) -> None:
-        """Forget the frames so far, and what was estimated from them."""
+        """Forget the frames so far, and all estimates from them."""
         super().clear()
         self._has_estimate, self._updates = False, 0
         if self.response is not None:

@@ -59,7 +59,7 @@ class MovingNormals(NormalsOperation):
         return NormalKernel(self, self.devices, shape, dtype, poses=True)
 
     def clear(self) -> None:
-        """Forget the frames so far, and what was estimated from them."""
+        """Forget the frames so far, and all estimates from them."""
         super().clear()
         self._direction: float | None = None
 
@@ -71,7 +71,7 @@ class MovingNormals(NormalsOperation):
         frame_weights: ArrayLike | None = None,
         lent: bool = False,
     ) -> None:
-        """Take in the next frames, (n, H, W), the axis in each, (n, 3), with travel (n, 4), and weights.
+        """Process the next frames, (n, H, W), the axis in each, (n, 3), with travel (n, 4), and weights.
 
         Axes are unit vectors towards the camera; travel is in mm.
         """

@@ -122,7 +122,7 @@ class NormalsOperation(SensorOptions, Operation):
         return room_of(self._bands, min(band.length for band in self._bands))
 
     def clear(self) -> None:
-        """Forget the frames so far, and what was estimated from them."""
+        """Forget the frames so far, and all estimates from them."""
         self._model = self._kernel.model
         self._lent: AnyArray | None = None  # a whole stack, which is used without a copy
         self._phase = np.empty((0, self._width) if self._width else 0)  # of the frames in the buffer
@@ -137,7 +137,7 @@ class NormalsOperation(SensorOptions, Operation):
         return self._buffer[len(self._phase) :]
 
     def _push(self, frames: AnyArray, where: Doubles, frame_weights: ArrayLike | None, lent: bool) -> None:
-        """Take in frames and the position of each, part by part as the buffer has space for them."""
+        """Process frames and the position of each, part by part as the buffer has space for them."""
         weights = check_weights(frame_weights, len(frames))
         first = self.count == 0 and len(self._phase) == 0
         if lent and first and np.all(weights > 0):  # otherwise frames would be moved in the caller's memory
@@ -216,7 +216,7 @@ class NormalsOperation(SensorOptions, Operation):
         check_phases(where, weights)
 
     def _take(self, frames: NDArray[Any], phase: Doubles, weights: Doubles) -> None:
-        """Take in frames that fit into the buffer, and estimate the turns that are complete."""
+        """Process frames that fit into the buffer, and estimate the turns that are complete."""
         turns = self._cut(np.concatenate([self._phase, phase]))
         here = self._buffer[len(self._phase) :][: len(frames)]
         if frames.ctypes.data != here.ctypes.data or not frames.flags.c_contiguous:
@@ -498,7 +498,7 @@ class Normals(NormalsOperation):
         return result.assign(normals_sigma=sigma, process={**result.process, **self._light.process})
 
     def clear(self) -> None:
-        """Forget the frames so far, and what was estimated from them."""
+        """Forget the frames so far, and all estimates from them."""
         self._light, self._weighted = None, False
         if self.window_frames is None:
             super().clear()
@@ -513,7 +513,7 @@ class Normals(NormalsOperation):
         frame_weights: ArrayLike | None = None,
         lent: bool = False,
     ) -> None:
-        """Take in the next frames, (n, H, W), the phase of each, (n,) radians, and their weights, (n,)."""
+        """Process the next frames, (n, H, W), the phase of each, (n,) radians, and their weights, (n,)."""
         alpha = check_phase(phase, len(frames), "phase")
         self._weighted |= frame_weights is not None
         if self.window_frames is None:

@@ -62,12 +62,12 @@ class NormalWindow:
         return self._sums.bands
 
     def reset(self) -> None:
-        """Forget the frames so far, and what was estimated from them."""
+        """Forget the frames so far, and all estimates from them."""
         self._sums.reset()
         self._model, self.count = self._kernel.model, 0
 
     def push(self, frames: NDArray[Any], phase: Doubles) -> None:
-        """Take in the next frames, (n, H, W), and their phases, (n,) radians."""
+        """Process the next frames, (n, H, W), and their phases, (n,) radians."""
         filling = max(0, min(len(frames), self.length - self.count))
         for part in (slice(filling), slice(filling, None)):
             if len(frames[part]) > 0:

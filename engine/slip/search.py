@@ -181,7 +181,7 @@ class Slip(Operation):
     def push(
         self, frames: NDArray[Any], *, displacement: ArrayLike | None = None, twist: ArrayLike | None = None
     ) -> None:
-        """Take in the next frames, (n, H, W), and the body's displacement, (n, 2) mm, or twist, (n,) rad."""
+        """Process the next frames, (n, H, W), and the body's displacement, (n, 2) mm, or twist, (n,) rad."""
         width, values = ((2,), displacement) if twist is None else ((), twist)
         assert values is not None
         places = check_finite(values, len(frames), self._position, width=width).reshape(len(frames), -1)

@@ -29,7 +29,7 @@ def press(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def address(press):
-    """The address of the application, in a process of its own."""
+    """The address of the application, in a separate process."""
     command = [sys.executable, "-m", "mirrorskin.cli.main", "app", str(press), "--no-browser"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         yield server.stdout.readline().strip()

@@ -1,4 +1,4 @@
-"""``mirrorskin twin serve`` in a process of its own, as another terminal meets it."""
+"""``mirrorskin twin serve`` in a separate process, as another terminal meets it."""
 
 from __future__ import annotations
 

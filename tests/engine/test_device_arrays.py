@@ -339,6 +339,6 @@ def test_frames_without_room_for_maps_beside_them_are_refused(card, monkeypatch)
     frames = ours(card, PRESS)
     monkeypatch.setattr(card, "max_allocation", 4 * PRESS[0].size)
     with pytest.raises(
-        DeviceMemoryError, match="has no room for maps beside 16 frames: pass the frames as a"
+        DeviceMemoryError, match="has no memory for maps besides 16 frames: pass the frames as a"
     ):
         engine.find_onset(frames, TRAVEL, **LEVELS)

@@ -29,7 +29,7 @@ fill = device.kernel({source!r}, "fill")
 
 
 def run_script(device, script):
-    """Run a script in a process of its own, whose abort would be a failure here."""
+    """Run a script in a separate process, whose abort would be a failure here."""
     start = START.format(choice=device.info.title, source=FILL)
     command = [sys.executable, "-P", "-c", start + script]
     return subprocess.run(command, capture_output=True, text=True, timeout=300)

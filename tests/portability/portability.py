@@ -1,7 +1,7 @@
 """Run the device tests on every OpenCL implementation that is here: ``make portability``.
 
 ``portability.py [--whole] [NAME...]``: every device test, not the part that takes 20 minutes; only those with
-one of these in their names. Each runs in a process of its own that sees no other device. Intel's runtime, and
+one of these in their names. Each runs in a separate process that sees no other device. Intel's runtime, and
 a root of Debian's testing that holds Mesa and a younger PoCL, are looked for in the folder
 MIRRORSKIN_PORTABILITY, else in the user's cache (tests/portability/README.md).
 """

@@ -1,7 +1,7 @@
 """Time every public call on each OpenCL runtime for CPUs that is here.
 
 ``runtimes.py [NAME...] [--output TABLE.json]``: the runtimes of ``portability.py``, or those with one of
-these in their names, each in a process of its own with caches of its own. ``--layouts cores lanes`` compares
+these in their names, each in a separate process with caches of its own. ``--layouts cores lanes`` compares
 how work is cut: an item loops over a tile, or takes one pixel. ``--targets znver3`` has the wheel's PoCL also
 compile for that processor, whose instructions this one must have: code for AVX2 can be tried where there
 is AVX-512. A number is the median of a call's processor time on all cores, ms: it depends little on what else

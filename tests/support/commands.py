@@ -66,7 +66,7 @@ print(json.dumps(list(sys.modules)))
 
 
 def loaded(*words: str, **variables: str) -> set[str]:
-    """Return which modules a command imports, in a process of its own with these environment variables."""
+    """Return which modules a command imports, in a separate process with these environment variables."""
     command, environment = [sys.executable, "-c", _LOADED, *words], {**os.environ, **variables}
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     return set(json.loads(done.stdout))
