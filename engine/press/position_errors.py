@@ -1,4 +1,4 @@
-"""Errors of the frames' positions, which the smoothness of a surface reveals."""
+"""Errors of the frames' positions, estimated from the smoothness of the surface."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ _ALONE = 0.7  # greatest jump elsewhere, relative to it
 
 
 class PositionErrors(Step):
-    """Compare the travel of the frames with the surface, and report what does not fit.
+    """Compare the travel of the frames with the surface, and report contradictions.
 
-    If a frame was exposed at another travel than stated, then all heights near it are shifted, wherever in
-    the picture they are. A surface has no reason to bend at just these heights, so that the error of
-    each frame is found: the errors e make the bends of rows of four pixels least, relative to their rise, so
-    that no scale is preferred. What varies slowly with height may be the surface itself and is ignored.
+    If a frame was exposed at another travel than stated, all heights near it are shifted, wherever in the
+    picture they are. A surface does not bend at just these heights, so that the error of each frame can be
+    estimated: the errors e minimise the bends of rows of four pixels, relative to their rise, so that no
+    scale is preferred. A slow change with height may belong to the surface itself and is ignored.
 
     Random errors are added to the standard deviation of heights; one missing step is a lost frame.
     """
@@ -80,10 +80,10 @@ class PositionErrors(Step):
 class _Errors:
     """Estimated errors of frames at some travel, (n,), mm, and where they are meaningful.
 
-    ``clear`` tells of the intervals between the frames, (n - 1,), whether heights spread over them: many
-    heights at one distance from the frames, as those of a plate, tell nothing. ``jumps`` are the errors of
-    all later frames if they are the same, with their standard errors; ``reach`` is the distance of the pixels
-    in a row.
+    ``clear``, (n - 1,), is True for the intervals between frames over which heights are spread: many heights
+    at one distance from the frames, as of a plate, contain no information. ``jumps`` are the errors of all
+    later frames if they are the same, with their standard errors; ``reach`` is the distance of the pixels in
+    a row.
     """
 
     travel: Doubles
@@ -202,7 +202,7 @@ def _find_errors(height: NDArray[Any], pushed: Doubles) -> _Errors | None:
 
 
 def _apart(travel: Doubles, least: float) -> Doubles:
-    """Return travel, in ascending order, without what is closer to the one before than a distance."""
+    """Return travel, in ascending order, without values closer to the one before than a distance."""
     if np.diff(travel).min() >= least:
         return travel
     kept = [0]
@@ -229,7 +229,7 @@ def _pixels_of(height: NDArray[Any], reach: int, most: int) -> Doubles:
 
 
 def _rows_of(pixels: Doubles, travel: Doubles, step: float) -> _Rows:
-    """Return those of rows of four pixels that are on a slope."""
+    """Return the rows of four pixels that are on a slope."""
     each = np.diff(pixels, axis=0)
     rises = (each > 0).all(axis=0) | (each < 0).all(axis=0)
     rises &= np.abs(pixels[3] - pixels[0] + pixels[2] - pixels[1]) > 4 * _LEAST_RISE * step
@@ -247,7 +247,7 @@ def _rows_of(pixels: Doubles, travel: Doubles, step: float) -> _Rows:
 
 
 def _spread(heights: Doubles, travel: Doubles) -> NDArray[np.bool_]:
-    """Return of each interval between frames whether the heights in it differ enough."""
+    """Return for each interval between frames whether the heights in it differ enough."""
     interval = np.clip(np.searchsorted(travel, heights, side="right") - 1, 0, len(travel) - 2)
     share = (heights - travel[interval]) / (travel[interval + 1] - travel[interval])
     part = np.clip((share * _BINS).astype(np.intp), 0, _BINS - 1)

@@ -11,10 +11,10 @@ from mirrorskin.kernels.array_types import Doubles
 
 
 class RollingShutter(Step):
-    """Give each row the travel that the body had when the row was exposed.
+    """Correct the heights for the travel of the body when each row was exposed.
 
-    The time and the travel of a frame are those of its middle row. With ``line_time`` l, row r of R is
-    exposed (r - (R - 1) / 2) l later; the body goes on in between as it does from frame to frame.
+    The time and the travel of a frame belong to its middle row. With ``line_time`` l, row r of R is exposed
+    (r - (R - 1) / 2) l later; in between, the body moves as from frame to frame.
     """
 
     line_time: float | None = option(
@@ -55,7 +55,7 @@ class RollingShutter(Step):
 
 
 def _travel_at(when: Doubles, time: Doubles, travel: Doubles) -> Doubles:
-    """Return the travel at times; before the first and after the last frame, the body moves as beside it."""
+    """Return the travel at times; outside the frames, the speed is that of the nearest interval."""
     order = np.argsort(time)
     time, travel = time[order], travel[order]
     speeds = np.diff(travel) / np.diff(time)

@@ -59,7 +59,7 @@ class FrameLight:
     drift: float
 
     def remove(self, frames: NDArray[Any], first: int, dark: ArrayLike) -> NDArray[np.float32]:
-        """Return frames, (n, H, W), of which the first has a number, in steady light; NaN where clipped."""
+        """Return frames, (n, H, W), from number ``first`` on, in steady light; NaN where clipped."""
         part = slice(first, first + len(frames))
         gain, offset = (values[part, np.newaxis, np.newaxis] for values in (self.gain, self.offset))
         low = np.asarray(dark, np.float64)
@@ -68,7 +68,7 @@ class FrameLight:
 
     @property
     def process(self) -> dict[str, str]:
-        """What was corrected, for a result's process."""
+        """Entries of a result's process about the correction."""
         known = {"flicker": f"{100 * self.flicker:.2g} %", "drift": f"{self.drift:.2g} counts"}
         return {name: f"{known[name]}, corrected" for name in self.kinds}
 
@@ -123,7 +123,7 @@ def find_frame_light(
     at_steep, at_level = (_fitted(*one, whole_fit.known) for one in chosen[1:])
     if at_steep is None or at_level is None:
         return None
-    # A response that is not as stated looks different at other zeniths; light does not.
+    # # A wrong response differs between zeniths; a change of the light does not.
     middle = float(np.median(counts[:, usable] - low[usable]))
     difference = np.std(at_steep.change(middle) - at_level.change(middle))
     return whole_fit.light() if difference < _ALIKE * np.std(whole_fit.change(middle)) else None
@@ -133,7 +133,7 @@ def _fitted(
     counts: Doubles, phase: Doubles, tilt: float, gain: Doubles, base: Doubles, dark: Doubles, wave: Doubles,
     known: NDArray[np.bool_] | None = None,
 ) -> _Fit | None:  # fmt: skip
-    """Return the fit of what is known, or significant, to some pixels; None if too few pixels follow it."""
+    """Return the fit of known, or significant, errors to some pixels; None if too few follow it."""
     fit = _Fit(counts, phase, tilt, gain, base, dark, wave)
     if known is not None:
         fit.leave_out(~known)
@@ -259,7 +259,7 @@ class _Fit:
 
     @property
     def significant(self) -> NDArray[np.bool_]:
-        """Whether flicker and drift are, (2,)."""
+        """Whether flicker and drift are significant, (2,)."""
         *_, matrix, noise = self._normal_equations()
         frames = self._light.shape[1]
         variance = np.diag(np.linalg.inv(matrix)).reshape(2, frames) * noise
@@ -269,13 +269,13 @@ class _Fit:
         return np.asarray((chi2 > frames + _CLEAR * math.sqrt(2 * frames)) & (np.array(sizes) > 1))
 
     def leave_out(self, chosen: NDArray[np.bool_]) -> None:
-        """Assume that gains, offsets or both are those of steady light, (2,)."""
+        """Assume steady light for gains, offsets or both, (2,)."""
         self._light[chosen], self._prior[chosen] = 0.0, _STEADY
         self.known &= ~chosen
         self._look()
 
     def change(self, level: float) -> Doubles:
-        """Return by how much frames are brighter at a level of the light, counts, (T,)."""
+        """Return the excess of frames at a level of the light, counts, (T,)."""
         excess, offset = self._light
         return np.asarray(level * excess + offset)
 

@@ -1,4 +1,4 @@
-"""The fit to frames at given poses: the body's axis in each, and what the axes determine of a normal."""
+"""The fit to frames at given poses: the body's axis in each, and the resulting information about a normal."""
 
 from __future__ import annotations
 

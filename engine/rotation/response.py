@@ -74,7 +74,7 @@ class Response:
             return np.asarray((mean - swing > low) & (mean + swing < high))
 
     def too_level(self, mean: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Return where the surface is so level that it reflects what is above the wall's rim."""
+        """Return where the surface is so level that it reflects the space above the wall's rim."""
         wall = self.wall
         rim = float(np.polynomial.polynomial.polyval(wall.reach[1], wall.curve))
         with np.errstate(invalid="ignore"):

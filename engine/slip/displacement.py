@@ -28,7 +28,7 @@ MAPS = {
     ),
     "status": replace(status_of(DisplacementStatus), per_frame=True),
 }
-"""Declarations of the maps of `find_displacement`: each component has a standard deviation of its own."""
+"""Declarations of the maps of `find_displacement`: each component has its own standard deviation."""
 
 _RANK = np.array([1, 0, 2, 3], np.uint8)  # rank of a status: a pixel has the highest of its nodes
 _MOST_STEP = 64  # largest distance of nodes, pixels

@@ -445,7 +445,7 @@ class _Course:
         return unit
 
     def along(self, moved: Doubles) -> Doubles:
-        """Return the components of displacements, (..., rows, columns, 2), along that of the object."""
+        """Return the components of displacements, (..., rows, columns, 2), along the object's."""
         return np.asarray(np.sum(moved * self._unit, axis=-1))
 
     def departures(self, moved: Doubles, covariance: Doubles) -> tuple[Doubles, Doubles]:

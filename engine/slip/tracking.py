@@ -112,8 +112,8 @@ class Tracker:
     def to_pixels(self, values: Doubles, on_device: bool = False) -> AnyArray:
         """Return values of the nodes, (rows, columns) or ([T,] rows, columns, n), at all pixels.
 
-        They are cubic, where nodes are missing linear, and else NaN. ``on_device``: those of (T, rows,
-        columns, n) stay on the device if it can hold them in one array.
+        They are cubic, linear where nodes are missing, and otherwise NaN. ``on_device``: values of (T, rows,
+        columns, n) stay on the device if it can store them in one array.
         """
         return self.finest.to_pixels(values, logarithms=False, on_device=on_device)
 
@@ -348,7 +348,7 @@ class _Level:
         return np.asarray(smooth, np.float64)
 
     def at_nodes(self, field: Doubles, level: _Level, scale: float) -> Doubles:
-        """Return a field of another level's nodes at those of this one, with pixels larger by a scale."""
+        """Return a field of another level at the nodes of this one, whose pixels are larger by a scale."""
         if level is self:
             return field
         from scipy.ndimage import map_coordinates
