@@ -1,4 +1,4 @@
-"""The devices that the tests run on: every one that OpenCL finds, in every way of holding memory."""
+"""The devices of the tests: all that OpenCL finds, with each kind of memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the documentation tells people to type can be typed: the first steps run, all else is understood."""
+"""Commands in the documentation are valid: the first steps run, all others are parsed."""
 
 import re
 import shlex

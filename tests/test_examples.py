@@ -1,4 +1,4 @@
-"""The examples in docstrings run, and print what they say; those of the folder of examples run."""
+"""The examples in docstrings run, with the printed output; those of the folder of examples run."""
 
 import doctest
 import importlib

@@ -1,4 +1,4 @@
-"""The house's import rule (pyproject.toml, importlinter) holds."""
+"""The import rules of the layers (pyproject.toml, importlinter) hold."""
 
 import importlib.metadata
 import re

@@ -1,4 +1,4 @@
-"""Systems without what only Linux has: the packages can be imported, and arrays are computed."""
+"""Systems without Linux's features: the packages can be imported, and arrays are computed."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Commands of the README and the twin's page run as they stand there, and give right numbers.
+"""Commands of the README and the twin's page run unchanged, and give right numbers.
 
 Some simulations of the twin's page run with fewer pixels.
 """

@@ -1,4 +1,4 @@
-"""The node of examples/ros2 on a rig of fakes: what it publishes, as another program reads it in a bag.
+"""The node of examples/ros2 on a rig of fakes: its messages, read by another program from a bag.
 
 ROS 2's own Python packages are not on the package index. `rosbags` has the definitions of their messages.
 """

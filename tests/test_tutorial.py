@@ -1,4 +1,4 @@
-"""The commands of the tutorial run, in its order, on photographs like those that it names."""
+"""The commands of the tutorial run in its order, on photographs like those described."""
 
 import re
 import shlex

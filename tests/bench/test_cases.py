@@ -1,4 +1,4 @@
-"""Each case runs at a tiny size, its works agree, and it returns what reports are made of."""
+"""Each case runs at a tiny size, its works agree, and it returns the data of reports."""
 
 import numpy as np
 import pytest

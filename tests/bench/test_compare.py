@@ -1,4 +1,4 @@
-"""Two runs: what changed by more than its rounds vary, and whether they may be compared at all."""
+"""Comparison of two runs: changes beyond the scatter of rounds, and runs that cannot be compared."""
 
 import re
 

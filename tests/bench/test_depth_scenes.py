@@ -1,4 +1,4 @@
-"""Scenes that hide parts of themselves: normals, heights and pieces belong together."""
+"""Scenes that hide parts of themselves: normals, heights and pieces are consistent."""
 
 import numpy as np
 import pytest

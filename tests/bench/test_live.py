@@ -1,4 +1,4 @@
-"""The live cases run, and their source gives frames when they are due."""
+"""The live cases run, and their source delivers frames on schedule."""
 
 import numpy as np
 import pytest

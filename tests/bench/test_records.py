@@ -1,4 +1,4 @@
-"""Runs are read again as they were written, old ones too; anything else is refused in one line."""
+"""Runs, old ones included, are read as they were written; anything else is refused in one line."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Runs as tables and as a page; the page of the committed runs is the one in the docs."""
+"""Runs as tables and as a page; the page in the documentation is that of the committed runs."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The harness: turns, medians, the device's account, and no timing of what is wrong."""
+"""The harness: order of turns, medians, device times, and no timing of wrong answers."""
 
 import numpy as np
 import pytest

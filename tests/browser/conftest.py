@@ -1,4 +1,4 @@
-"""A browser in which pages are opened from disk, and what they ask for and complain of is kept."""
+"""A browser that opens pages from disk, and logs their requests and errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page of a result in a real browser: it opens from disk, shows all there is, and asks for nothing."""
+"""The page of a result in a real browser: it opens from disk, shows everything, and requests nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``mirrorskin app``: what it refuses, and how it begins and ends."""
+"""``mirrorskin app``: refusals, start and end."""
 
 import importlib.util
 import os

@@ -1,4 +1,4 @@
-"""Stacks that NumPy wrote, and the travel of each frame in a file: through the command line and in Python."""
+"""Stacks written by NumPy, and the travel of each frame in a file: on the command line and in Python."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that are wrong in rarer ways, and real processes: one line, exit code 2, and nothing written."""
+"""Rare faults of files, in real processes: one line, exit code 2, and nothing written."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``mirrorskin batch``: what it finds, what it says, and what it leaves behind."""
+"""``mirrorskin batch``: the files it finds, its messages, and the files it leaves."""
 
 import io as streams
 import json

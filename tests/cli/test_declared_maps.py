@@ -1,4 +1,4 @@
-"""A map that a user declares is treated like a built-in one by everything that takes results."""
+"""A map declared by a user is treated like a built-in one by everything that reads results."""
 
 from __future__ import annotations
 

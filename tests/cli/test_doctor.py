@@ -1,4 +1,4 @@
-"""`mirrorskin doctor`: what a report of a fault should contain, also where something is missing."""
+"""`mirrorskin doctor`: a complete description for reports of faults, also if something is missing."""
 
 import json
 from importlib.metadata import PackageNotFoundError, version

@@ -1,4 +1,4 @@
-"""Frames of every format: what commands make of them is what they make of the same frames as an array."""
+"""Frames of every format: commands give the same result as with the same frames in an array."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`mirrorskin fuse`: a press and a rotation in, one surface out; and what is refused."""
+"""`mirrorskin fuse`: one surface from a press and a rotation; and refusals."""
 
 from __future__ import annotations
 

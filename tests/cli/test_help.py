@@ -1,4 +1,4 @@
-"""`mirrorskin --help`: quick, as no command is needed for it, and true to what commands say themselves."""
+"""`mirrorskin --help`: quick, without importing commands, and consistent with their own help."""
 
 import ast
 import subprocess

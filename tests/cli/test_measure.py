@@ -1,4 +1,4 @@
-"""``mirrorskin measure``: numbers with units and uncertainties, to read and for programs."""
+"""``mirrorskin measure``: values with units and uncertainties, as text and as JSON."""
 
 import json
 

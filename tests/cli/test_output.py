@@ -1,4 +1,4 @@
-"""What commands say besides what was asked for."""
+"""Output of commands besides their results."""
 
 import io
 import subprocess

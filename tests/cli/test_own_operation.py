@@ -1,4 +1,4 @@
-"""An operation outside of the repository, of at most 40 lines, gets what built-in ones get."""
+"""An operation outside the repository, of at most 40 lines, has all features of built-in ones."""
 
 from __future__ import annotations
 

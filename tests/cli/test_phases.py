@@ -1,4 +1,4 @@
-"""Files of phases: what is read of them, and what is refused in one line."""
+"""Files of phases: accepted forms, and refusals in one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bad input gets one clear line, exit code 2, and nothing is written."""
+"""Bad input: one clear line, exit code 2, and nothing written."""
 
 import h5py
 import numpy as np

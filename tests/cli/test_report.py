@@ -1,4 +1,4 @@
-"""`mirrorskin report`: where its page goes, and what it refuses."""
+"""`mirrorskin report`: place of its page, and refusals."""
 
 from __future__ import annotations
 

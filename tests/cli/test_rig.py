@@ -1,4 +1,4 @@
-"""Rig files on the command line: written to begin with, and checked on an emulated controller and a film."""
+"""Rig files on the command line: templates, and checks on an emulated controller and a film."""
 
 import io
 import json

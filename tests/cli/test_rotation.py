@@ -1,4 +1,4 @@
-"""`mirrorskin reconstruct` on a rotation: what each option does, and what is refused."""
+"""`mirrorskin reconstruct` on a rotation: effect of each option, and refusals."""
 
 from __future__ import annotations
 

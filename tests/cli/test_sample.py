@@ -1,4 +1,4 @@
-"""Samples: the same press as a recording and as other programs have it."""
+"""Samples: the same press as a recording and in formats of other programs."""
 
 import h5py
 import numpy as np

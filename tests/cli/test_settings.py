@@ -1,4 +1,4 @@
-"""The settings of a batch: every key arrives, and what cannot be used is told with its place."""
+"""The settings of a batch: every key has an effect, and errors name their place."""
 
 import math
 import re

@@ -1,4 +1,4 @@
-"""Signals that come more than once, and limits of the system: one line, and never an abort."""
+"""Repeated signals and limits of the system: one line, and never an abort."""
 
 import os
 import resource

@@ -1,4 +1,4 @@
-"""`mirrorskin simulate`: what is asked for is what the recording shows, and what cannot be is refused."""
+"""`mirrorskin simulate`: recordings are as requested, and impossible requests are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Slides and twists on the command line: simulated, reconstructed, scored and looked at."""
+"""Slides and twists on the command line: simulated, reconstructed, scored and displayed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What commands import: libraries that take long to import are loaded only by what needs them."""
+"""Imports of commands: slow libraries are loaded only by commands that need them."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""``mirrorskin twin serve`` in a separate process, as another terminal meets it."""
+"""``mirrorskin twin serve`` in a separate process, as used from another terminal."""
 
 from __future__ import annotations
 

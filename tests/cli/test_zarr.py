@@ -1,4 +1,4 @@
-"""Stacks in Zarr on the command line: at addresses as in folders; refusals of one line."""
+"""Stacks in Zarr on the command line: at addresses as in folders; refusals in one line."""
 
 from __future__ import annotations
 

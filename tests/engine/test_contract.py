@@ -1,4 +1,4 @@
-"""What holds for every operation, whatever it computes; a test fails if a class of the engine has no case."""
+"""Rules for every operation; a test fails if an operation of the engine has no case."""
 
 from __future__ import annotations
 

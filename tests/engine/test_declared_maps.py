@@ -1,4 +1,4 @@
-"""Maps that an operation declares: what is refused when its class is defined, and when it returns them."""
+"""Maps declared by an operation: refusals when its class is defined, and when it returns them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames and maps on a device: the answers of arrays on the host, and no copies in between."""
+"""Frames and maps on a device: the same answers as for arrays on the host, and no copies in between."""
 
 import numpy as np
 import pyopencl as cl

@@ -1,4 +1,4 @@
-"""Focus variation: the height of a texture that defocus blurs, and its standard error as the scatter."""
+"""Focus variation: the height of a texture that defocus blurs, and its standard error."""
 
 import re
 

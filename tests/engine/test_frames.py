@@ -1,4 +1,4 @@
-"""The noise is told from two looks at the same pixels, whatever else happens between them."""
+"""The noise is estimated from two samples of each pixel, whatever else changes between them."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Fringes: phases as they were encoded, standard errors as the scatter, and orders right or marked."""
+"""Fringes: decoded phases are right, standard errors equal the scatter, and orders are right or marked."""
 
 import re
 

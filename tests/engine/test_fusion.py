@@ -1,4 +1,4 @@
-"""Heights of a press and normals of a rotation make one surface: by eq. 10, on the twin, and in part."""
+"""One surface from heights of a press and normals of a rotation: by eq. 10, on the twin, and in part."""
 
 from dataclasses import replace
 from functools import cache

@@ -1,4 +1,4 @@
-"""What consumes maps takes them from results, mappings, datasets, files and arrays alike."""
+"""Functions of maps accept results, mappings, datasets, files and arrays."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""A GPU that shares the host's memory: the answers of one with its own memory, and nothing is copied."""
+"""A GPU that shares the host's memory: the same answers as with its own memory, and no copies."""
 
 import dataclasses
 

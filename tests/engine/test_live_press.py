@@ -1,4 +1,4 @@
-"""Heights of a press while it goes on are those that are found afterwards."""
+"""Heights of a press in progress equal those found afterwards."""
 
 import numpy as np
 import pytest

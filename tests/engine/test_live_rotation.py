@@ -1,4 +1,4 @@
-"""A rotation while it goes on: normals of its last turn, heights that follow, edges now and then."""
+"""A rotation in progress: normals of its last turn, heights that follow, and edges at intervals."""
 
 import math
 import threading

@@ -1,4 +1,4 @@
-"""Displacement and slip while a body slides are those that are found afterwards."""
+"""Displacement and slip of a slide in progress equal those found afterwards."""
 
 import numpy as np
 import pytest

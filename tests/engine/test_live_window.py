@@ -1,4 +1,4 @@
-"""The sliding window's normals and correlation are those of its frames alone, however they came."""
+"""Normals and correlation of the sliding window depend only on its frames."""
 
 import numpy as np
 import pytest

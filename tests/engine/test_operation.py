@@ -1,4 +1,4 @@
-"""Operations of users: the answer is NumPy's, wherever frames come from and however they are divided."""
+"""Operations of users: NumPy's answer, for any source of frames and any division into blocks."""
 
 import re
 from pathlib import Path

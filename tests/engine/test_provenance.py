@@ -1,4 +1,4 @@
-"""What a result says of how it came about, and how complaints name their source."""
+"""The process in a result, and the name of the source in messages."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Scores against errors that were put in by hand."""
+"""Scores, compared with errors added by hand."""
 
 import numpy as np
 import pytest

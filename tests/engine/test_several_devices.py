@@ -1,4 +1,4 @@
-"""A picture that is divided among devices has the answer of one device; one that fails stops the others."""
+"""A picture divided among devices has the answer of one device; one that fails stops the others."""
 
 import os
 import subprocess

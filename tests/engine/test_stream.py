@@ -1,4 +1,4 @@
-"""Frames of one's own camera: maps are those of a recording, and faults reach the thread that pushes."""
+"""Frames of the user's own camera: maps equal those of a recording, and faults reach the pushing thread."""
 
 import math
 import threading

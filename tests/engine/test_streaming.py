@@ -1,4 +1,4 @@
-"""The one loop: each frame once, in order, whatever room there is, and no harm where reading fails."""
+"""The common loop: each frame once, in order, for any free memory, and no damage if reading fails."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Several threads: no two are inside of one object, and every answer is that of one thread."""
+"""Several threads: calls of one object do not overlap, and every answer equals that of one thread."""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor

@@ -1,4 +1,4 @@
-"""A picture that a device cannot hold in one piece is worked on in bands, with the same answer."""
+"""A picture that is too large for a device is processed in bands, with the same answer."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What each call moves between the host and a device with its own memory: no entry of the table may rise."""
+"""Copies of each call between the host and a device with its own memory: no table entry may rise."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""A call that fails, whichever it is: one line, no half-written file, and the next command works."""
+"""A failing call of any kind: one line, no half-written file, and the next command works."""
 
 import gc
 import re

@@ -1,4 +1,4 @@
-"""Calls of every public function with one argument replaced by something that it is not.
+"""Calls of every public function with one wrong argument.
 
 ``CALLS`` has a sound call of each; ``odd_values`` makes what may be given in an argument's place. A call may
 answer or refuse in one line, and nothing else.

@@ -1,4 +1,4 @@
-"""Damaged files of every kind, read as users read them: nothing may crash, hang, or end in a traceback.
+"""Damaged files of every kind, read with the commands: nothing may crash, hang, or end in a traceback.
 
 ``make fuzz`` damages every kind of file that a command reads, what a controller says, and the arrays that
 public functions are given, and has a process of its own read each. What was accepted is exported in every

@@ -1,4 +1,4 @@
-"""Ways to make a sound file unsound: in its bytes, in what it states, and in what it is."""
+"""Ways to damage a file: in its bytes, in its metadata, and in its kind."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Public functions answer, or refuse in a line, whatever they are given."""
+"""Public functions answer, or refuse in one line, for any arguments."""
 
 import math
 

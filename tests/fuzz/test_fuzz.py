@@ -1,4 +1,4 @@
-"""Damaged files, some hundred of them; ``make fuzz`` goes on for an hour."""
+"""Some hundred damaged files; ``make fuzz`` continues for an hour."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The commands, run in this process in a folder that all cases share; each makes what it needs first."""
+"""Commands, run in this process in a common folder; each case first makes the files that it needs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tell how answers differ from the frozen ones: python tests/golden/compare.py [CASE...] [--freeze]."""
+"""Compare answers with the frozen ones: python tests/golden/compare.py [CASE...] [--freeze]."""
 
 from __future__ import annotations
 

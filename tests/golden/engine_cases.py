@@ -1,4 +1,4 @@
-"""The estimators, called as users of Python do; names of arguments and of answers stand here only."""
+"""The estimators, called from Python; all names of arguments and answers are in this file."""
 
 from __future__ import annotations
 

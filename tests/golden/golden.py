@@ -1,4 +1,4 @@
-"""Frozen answers: what a case is, how its answers are kept, and how two of them differ."""
+"""Frozen answers: definition of a case, storage of its answers, and their comparison."""
 
 from __future__ import annotations
 

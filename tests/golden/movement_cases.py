@@ -1,4 +1,4 @@
-"""Cases of strokes, of poses, of forces, of a texture that moves, and of objects that move."""
+"""Cases of strokes, poses, forces, a moving texture, and moving objects."""
 
 from __future__ import annotations
 

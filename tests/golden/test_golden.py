@@ -1,4 +1,4 @@
-"""No answer has changed since it was frozen; ``compare.py`` says how, and freezes others."""
+"""No answer has changed since it was frozen; ``compare.py`` prints differences, and freezes new answers."""
 
 from __future__ import annotations
 

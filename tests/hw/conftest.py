@@ -1,4 +1,4 @@
-"""What tests of hardware have in common: stages on simulated time."""
+"""Common parts of the tests of hardware: stages on simulated time."""
 
 import pytest
 from scripted_grbl import ScriptedGrbl, stage_settings

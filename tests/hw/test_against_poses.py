@@ -1,4 +1,4 @@
-"""The twin's sheet in every pose against the tests' own geometry, in float64."""
+"""The twin's sheet in every pose, compared with the tests' own geometry in float64."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The twin's optics against the tests' own rays, followed one by one in float64."""
+"""The twin's optics, compared with the tests' own rays, traced one by one in float64."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The twin's camera: its levels, its noise against closed forms, and that both can be had again."""
+"""The twin's camera: its levels, its noise compared with closed forms, and that both are reproducible."""
 
 from __future__ import annotations
 

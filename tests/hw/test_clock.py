@@ -1,4 +1,4 @@
-"""Time that jumps: the order of threads is always the same, and a wait for what never comes is an error."""
+"""Simulated time: the order of threads is reproducible, and an endless wait is an error."""
 
 from __future__ import annotations
 

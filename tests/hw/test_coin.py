@@ -1,4 +1,4 @@
-"""The coin: what is struck on it, and that this sensor can see all its ramps."""
+"""The coin: its relief, and that this sensor can see all its ramps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Elastic contact against the closed forms of contact mechanics, and against dense matrices."""
+"""Elastic contact, compared with closed forms of contact mechanics and with dense matrices."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The emulated controller obeys and moves as GRBL 1.1 and mechanics say."""
+"""The emulated controller replies and moves like GRBL 1.1 on a real machine."""
 
 from __future__ import annotations
 

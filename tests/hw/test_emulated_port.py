@@ -1,4 +1,4 @@
-"""The emulated controller behind a pseudo-terminal; its faults are those of the line in memory."""
+"""The emulated controller behind a pseudo-terminal; its faults equal those of the line in memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The twin seen wherever its body is, and as a camera."""
+"""The twin as a camera, at any position of its body."""
 
 from __future__ import annotations
 

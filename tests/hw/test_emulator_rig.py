@@ -1,4 +1,4 @@
-"""The emulated stage and the twin on it, as one: what is commanded is what is seen."""
+"""The emulated stage with the twin on it: the frames show the commanded positions."""
 
 from __future__ import annotations
 

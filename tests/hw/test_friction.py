@@ -1,4 +1,4 @@
-"""Stick and slip against the closed forms for balls and discs, and against the law of friction itself."""
+"""Stick and slip, compared with closed forms for balls and discs, and with the law of friction."""
 
 from __future__ import annotations
 

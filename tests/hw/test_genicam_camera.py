@@ -1,4 +1,4 @@
-"""Cameras by GenICam: Aravis' fake ones, one in the library, and one that sends packets on loopback."""
+"""GenICam cameras: Aravis' fake ones, in the library and as packets on loopback."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The driver in front of the emulated controller on simulated time, and of a real firmware on its own."""
+"""The driver with the emulated controller on simulated time, and with a real firmware."""
 
 from __future__ import annotations
 

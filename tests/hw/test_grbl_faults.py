@@ -1,4 +1,4 @@
-"""Whatever goes wrong with a GRBL controller or its line, the stage stops and says what it was."""
+"""After any fault of a GRBL controller or its line the stage stops, and the message states the cause."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Motion in pieces is that of one line, and ends soon after the host was killed."""
+"""Motion in pieces equals that of one line, and ends soon after the host was killed."""
 
 from __future__ import annotations
 

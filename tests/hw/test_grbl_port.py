@@ -1,4 +1,4 @@
-"""Real ports: what cannot be opened, what is no stage, and stages that work until the other side is gone."""
+"""Real ports: failures to open, devices that are no stages, and stages that are disconnected."""
 
 from __future__ import annotations
 

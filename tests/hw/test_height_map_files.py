@@ -1,4 +1,4 @@
-"""Objects out of files."""
+"""Objects from files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames that come when they are due."""
+"""Live frames arrive on schedule."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A stage behind a controller that speaks as Marlin goes in steps, and stops on faults."""
+"""A stage with a Marlin controller moves in steps, and stops on faults."""
 
 from dataclasses import replace
 

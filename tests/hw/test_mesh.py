@@ -1,4 +1,4 @@
-"""Meshes against closed forms and against brute force."""
+"""Meshes, compared with closed forms and exhaustive search."""
 
 from __future__ import annotations
 

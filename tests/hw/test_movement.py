@@ -1,4 +1,4 @@
-"""Where the object is in the body's frame: against rotations written out here."""
+"""The object's position in the body's frame, compared with explicit rotations."""
 
 from __future__ import annotations
 

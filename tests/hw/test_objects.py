@@ -1,4 +1,4 @@
-"""The objects' surfaces against geometry of the tests' own, and the optics against the body's."""
+"""The objects' surfaces, compared with the tests' own geometry; the optics, with the body's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is seen in the mirror: patterns, ideal optics and the traced wall, against what is told by hand."""
+"""The picture in the mirror: patterns, ideal optics and the traced wall, calculated by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The stage of docs/stages.md, in front of a controller that is made up, moves a rig and stops on faults."""
+"""The stage of docs/stages.md moves a rig with a fake controller, and stops on faults."""
 
 import builtins
 import re

@@ -1,4 +1,4 @@
-"""The blur of the camera's lens against the Gaussian that it is said to be."""
+"""The blur of the camera's lens, compared with the documented Gaussian."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The references as a lab takes them, against what no lab knows."""
+"""References as taken in a laboratory, compared with the twin's true levels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Captures on the emulated rig are as good as what the twin renders directly at the same places."""
+"""Captures on the emulated rig are as accurate as frames rendered directly at the same places."""
 
 import math
 from dataclasses import replace

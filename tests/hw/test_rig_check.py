@@ -1,4 +1,4 @@
-"""What a check of a rig finds, on a stage and a camera that do as the test says."""
+"""Findings of a rig check, on a stage and a camera with given faults."""
 
 import logging
 import math

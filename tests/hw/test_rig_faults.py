@@ -1,4 +1,4 @@
-"""What goes wrong on a rig while it captures: the stage stops, and what was taken is kept.
+"""Faults of a rig during capture: the stage stops, and the frames so far are kept.
 
 On the emulator always, and on a real firmware as well with `make test-hardware GRBL=PATH`.
 """

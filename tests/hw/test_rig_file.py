@@ -1,4 +1,4 @@
-"""Rig files: every key arrives in our units, and what cannot be used is told with file, key and remedy."""
+"""Rig files: every key is read in base units, and errors name file, key and remedy."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Whatever goes wrong, the stage stops; on made-up hardware that can go wrong at will."""
+"""After any fault the stage stops; on fake hardware with faults of every kind."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Scans of a stage and a camera that are made up, so that every frame tells where it was exposed."""
+"""Scans with a fake stage and camera, whose frames record where they were exposed."""
 
 import math
 from dataclasses import replace

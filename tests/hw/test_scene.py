@@ -1,4 +1,4 @@
-"""The light of each frame: what is worked out, when, and that it is the same however it is asked for."""
+"""The light of each frame: what is computed, when, and that it is the same for any order of requests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the named objects are: closed forms, symmetries, and how large they are."""
+"""The named objects: closed forms, symmetries, and sizes."""
 
 from __future__ import annotations
 

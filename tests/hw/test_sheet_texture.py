@@ -1,4 +1,4 @@
-"""What is seen of the sheet: textures without an end, which move with the skin to a fraction of a pixel."""
+"""The visible texture of the sheet: unbounded, and moving with the skin to a fraction of a pixel."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The elastic sheet in the sensor: how much of it is worked out, what pixels see of it, where it ends."""
+"""The elastic sheet in the sensor: its computed part, its pixels, and its end."""
 
 from __future__ import annotations
 

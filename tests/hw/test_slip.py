@@ -1,4 +1,4 @@
-"""The skin's history against the books: where it sticks, when it breaks loose, and where it goes."""
+"""The skin's history, compared with theory: sticking, slipping and displacement."""
 
 from __future__ import annotations
 

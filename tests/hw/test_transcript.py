@@ -1,4 +1,4 @@
-"""The emulated controller answers as GRBL's own firmware did, and the driver knows grblHAL's answers."""
+"""The emulated controller answers like GRBL's own firmware, and the driver knows grblHAL's answers."""
 
 import re
 from pathlib import Path

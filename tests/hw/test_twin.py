@@ -1,4 +1,4 @@
-"""The twin as a source: what its frames show, and that they are the same however they are read."""
+"""The twin as a source: its frames, and that they are the same for any way of reading."""
 
 from __future__ import annotations
 

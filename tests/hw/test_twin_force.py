@@ -1,4 +1,4 @@
-"""The force that the twin knows of each frame, against the closed forms for balls."""
+"""The twin's force of each frame, compared with closed forms for balls."""
 
 from __future__ import annotations
 

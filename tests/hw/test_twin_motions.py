@@ -1,4 +1,4 @@
-"""The twin in all its movements: what it tells of them, and that its frames can be had again."""
+"""The twin in all its movements: positions and truth, and reproducible frames."""
 
 from __future__ import annotations
 

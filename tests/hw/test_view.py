@@ -1,4 +1,4 @@
-"""The camera's lines of sight inside the body, against Snell, Fermat and straight lines."""
+"""The camera's lines of sight inside the body, compared with Snell, Fermat and straight lines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that exist whole or not at all, and what is left of those whose writers were killed."""
+"""Files appear complete or not at all; temporary files of killed writers."""
 
 import fcntl
 import re

@@ -1,4 +1,4 @@
-"""The plausibility report: what a person who saw the numbers would object to is found, and nothing else."""
+"""The plausibility report: it contains an expert's doubts about the numbers, and no others."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Chunks read past HDF5: what comes out is what HDF5 gives, and every chunk is unpacked once."""
+"""Chunks read without HDF5: the same values as by HDF5, and every chunk is unpacked once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Unpacking single chunks: the right bytes, and no harm from wrong ones."""
+"""Unpacking of single chunks: correct bytes, and no damage by wrong ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames in one piece: read directly, from files that other programs may cut."""
+"""Contiguous frames: read directly, from files that other programs may shorten."""
 
 from __future__ import annotations
 

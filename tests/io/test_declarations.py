@@ -1,4 +1,4 @@
-"""Declarations of maps: what a `Map` accepts, what a result makes of them, and what files may contain."""
+"""Declarations of maps: values accepted by `Map`, use in results, and permitted contents of files."""
 
 from __future__ import annotations
 

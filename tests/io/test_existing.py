@@ -1,4 +1,4 @@
-"""Which files a new one replaces: what is in the name's place at the start, and just before the end."""
+"""Files that a new one may replace: checked at the start, and just before the end."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Telling recordings apart without reading all of them."""
+"""Fingerprints distinguish recordings without reading them completely."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Other people's HDF5: every way of storing a stack is read alike; what cannot be is refused in one line."""
+"""HDF5 files of other programs: every way of storing a stack is read; refusals are one line."""
 
 from __future__ import annotations
 

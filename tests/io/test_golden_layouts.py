@@ -1,4 +1,4 @@
-"""Kept files of each layout are read as what they were, and what is written now has all that they have."""
+"""Stored files of each layout are still read correctly, and new files contain all that they do."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Heights that are known already, from results and simulations."""
+"""Known heights, from results and simulations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that a later version laid out in another way are refused, not misread."""
+"""Files of a later layout are refused, not misread."""
 
 import h5py
 import numpy as np

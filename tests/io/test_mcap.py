@@ -1,4 +1,4 @@
-"""ROS 2 messages in MCAP files, read back by the reader of their own packages, and by ours."""
+"""ROS 2 messages in MCAP files, read by the reader of their own packages and by mirrorskin."""
 
 import tracemalloc
 from contextlib import suppress

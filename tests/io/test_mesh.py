@@ -1,4 +1,4 @@
-"""A map of heights as triangles."""
+"""Conversion of a height map to triangles."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings of all four motions: what is kept of each, in which units, and what need not be known."""
+"""Recordings of all four motions: stored values, units, and optional values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two viewers of NeXus files, silx and NeXpy's library, find what to plot of ours, its axes and its units."""
+"""Two viewers of NeXus files, silx and NeXpy's library, find maps, axes and units in our files."""
 
 import json
 import subprocess

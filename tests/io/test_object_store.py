@@ -1,4 +1,4 @@
-"""Zarr in an object store that speaks S3: moto's server, where 'moto[server]' is installed."""
+"""Zarr in an object store with S3's protocol: moto's server, if 'moto[server]' is installed."""
 
 from __future__ import annotations
 

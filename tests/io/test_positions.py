@@ -1,4 +1,4 @@
-"""The checks of travel and phase."""
+"""Checks of travel and phase."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a recording looks like in the file, and that it is there whole or not at all."""
+"""The contents of a recording's file, which appears complete or not at all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reading a recording of ours: what it says, in which units, what overrides it, and what is refused."""
+"""Reading our own recordings: values, units, overriding options, and refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A part of a recording: a rectangle of the picture, some of its frames, and what is known of just these."""
+"""A part of a recording: a rectangle of the picture, some of its frames, and their properties."""
 
 from __future__ import annotations
 

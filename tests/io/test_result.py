@@ -1,4 +1,4 @@
-"""What a result looks like in the file, that it comes back as it was, and what is not a result."""
+"""The contents of a result's file, that it is read back unchanged, and files that are no results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stacks of other programs whose metadata say what their values and axes mean."""
+"""Stacks of other programs, read by their metadata about values and axes."""
 
 from __future__ import annotations
 

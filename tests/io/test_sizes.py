@@ -1,4 +1,4 @@
-"""Files of kilobytes that state gigabytes: refused by what they state, before memory is taken."""
+"""Small files that claim gigabytes are refused before memory is allocated."""
 
 import io as memory
 import resource

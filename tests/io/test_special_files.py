@@ -1,4 +1,4 @@
-"""FIFOs, sockets, devices and folders in place of files: refused in one line before they are opened."""
+"""FIFOs, sockets, devices and folders instead of files: refused in one line before they are opened."""
 
 import os
 import socket

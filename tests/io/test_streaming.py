@@ -1,4 +1,4 @@
-"""Recordings that are written while frames come: what is in them, and what is left when something fails."""
+"""Recordings written while frames arrive: their contents, also after a failure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stacks in TIFF: what their metadata say is a frame, value by value."""
+"""Stacks in TIFF: frames are those described by the metadata, value by value."""
 
 import struct
 

@@ -1,4 +1,4 @@
-"""One turn of a result that has maps of each."""
+"""One turn of a result with maps of each turn."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings that are being written, or whose writer was killed; and what a live run made of one."""
+"""Recordings in progress or with a killed writer, and the results of their live runs."""
 
 from __future__ import annotations
 

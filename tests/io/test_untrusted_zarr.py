@@ -1,4 +1,4 @@
-"""Zarr from unknown hands: it runs no code, takes limited memory and time, and is refused in one line."""
+"""Zarr of unknown origin: it runs no code, uses limited memory and time, and is refused in one line."""
 
 from __future__ import annotations
 
@@ -470,7 +470,7 @@ def test_many_nodes_are_refused(tmp_path, monkeypatch, consolidated):
     if consolidated:
         consolidated_2(folder)
     monkeypatch.setattr(zarr_metadata, "MOST_NODES", 5)
-    assert "holds more than 5 groups and arrays" in refused(folder)
+    assert "contains more than 5 groups and arrays" in refused(folder)
 
 
 def test_many_files_in_a_folder_are_refused(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""Zarr: the same recordings and results as in HDF5, from folders, zips and stores with addresses."""
+"""Zarr: the same recordings and results as in HDF5, in folders, zips and stores with addresses."""
 
 from __future__ import annotations
 

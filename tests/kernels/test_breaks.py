@@ -1,4 +1,4 @@
-"""Links that let go: what the reference promises."""
+"""Links that break: properties of the reference."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Conjugate gradients, against dense solvers."""
+"""Conjugate gradients, compared with dense solvers."""
 
 import numpy as np
 import pytest

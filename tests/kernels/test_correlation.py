@@ -1,4 +1,4 @@
-"""Correlation: the reference against exact numbers."""
+"""Correlation: the reference, compared with exact numbers."""
 
 from fractions import Fraction
 

@@ -1,4 +1,4 @@
-"""What is kept in the user's cache folder."""
+"""The contents of the user's cache folder."""
 
 import logging
 

@@ -1,4 +1,4 @@
-"""Displacement of a texture: the reference against closed forms, and the kernels against it."""
+"""Displacement of a texture: the reference compared with closed forms, and the kernels with it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The edges' kernels do what their reference does, and that is what it says."""
+"""The edges' kernels equal their reference, and the reference is correct."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stands between PoCL and its first kernel. Every try is a real child process."""
+"""Preparations before PoCL's first kernel, each in a real child process."""
 
 import ctypes
 import hashlib

@@ -1,4 +1,4 @@
-"""Exposure: the generator and its noise against closed forms."""
+"""Exposure: the generator and its noise, compared with closed forms."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The contrast around each pixel: the kernel against the reference, and that against exact numbers."""
+"""The contrast around each pixel: the kernel compared with the reference, and that with exact numbers."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Programs that PoCL built are loaded as bitcode by the next process, and built again where that fails."""
+"""Programs built by PoCL are loaded as bitcode by the next process, or built again if that fails."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""Least squares over lamps: the reference against the normal equations."""
+"""Least squares over lamps: the reference compared with the normal equations."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Fits against SciPy's and against theory."""
+"""Fits, compared with SciPy's and with theory."""
 
 from __future__ import annotations
 

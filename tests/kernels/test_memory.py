@@ -1,4 +1,4 @@
-"""Memory of arrays is used again, no more of it is kept than allowed, and no two arrays share it."""
+"""Memory of arrays is reused, its amount is limited, and no two arrays share it."""
 
 import threading
 

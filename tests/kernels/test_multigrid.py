@@ -1,4 +1,4 @@
-"""Levels, cycles and passes of a device against those of the reference."""
+"""Levels, cycles and passes of a device, compared with the reference."""
 
 from typing import Any
 

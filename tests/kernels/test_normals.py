@@ -1,4 +1,4 @@
-"""Normals: the reference against plain searches for the likeliest, and the kernels against the reference."""
+"""Normals: the reference compared with simple searches for the maximum, and the kernels with it."""
 
 from dataclasses import fields, replace
 

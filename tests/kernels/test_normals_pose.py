@@ -1,4 +1,4 @@
-"""Normals and slopes at any known poses: the kernel against its reference."""
+"""Normals and slopes at any known poses: the kernel compared with its reference."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Normals under a wall: the reference against plain searches and rays, and the kernel against it."""
+"""Normals under a wall: the reference compared with simple searches and rays, and the kernel with it."""
 
 import math
 

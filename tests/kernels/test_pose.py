@@ -1,4 +1,4 @@
-"""Normal equations of a rigid motion: the reference against differences, and the kernel against it."""
+"""Normal equations of a rigid motion: the reference compared with differences, and the kernel with it."""
 
 from __future__ import annotations
 

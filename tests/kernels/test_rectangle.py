@@ -1,4 +1,4 @@
-"""The rectangle's kernels do what their reference does, and that is what it says."""
+"""The rectangle's kernels equal their reference, and the reference is correct."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each kernel against its reference: a function for each kernel returns what both are given."""
+"""Each kernel, compared with its reference: a function per kernel returns both results."""
 
 import math
 import re

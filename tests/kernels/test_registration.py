@@ -1,4 +1,4 @@
-"""Resampling along with the object: the reference against closed forms."""
+"""Registration: the reference, compared with closed forms."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The slopes' kernels do what their reference does, and that is what slopes from normals are offline."""
+"""The slopes' kernels equal their reference, and that equals offline slopes from normals."""
 
 import math
 

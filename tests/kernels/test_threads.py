@@ -1,4 +1,4 @@
-"""Threads on one device: no answer is mixed up, and nothing ends the process."""
+"""Threads on one device: answers are not mixed up, and the process does not abort."""
 
 import subprocess
 import sys

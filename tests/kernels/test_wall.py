@@ -1,4 +1,4 @@
-"""The wall in the mirror: the reference against plain geometry."""
+"""The wall in the mirror: the reference, compared with plain geometry."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run one small kernel on the only OpenCL device there is: a sound one, or one with a known fault.
+"""Run one small kernel on the only OpenCL device: a correct one, or one with a known fault.
 
 ``python faults.py [FAULT]`` prints the driver's version. Only a device that watches may be given
 a fault: on any other it may do anything.

@@ -1,4 +1,4 @@
-"""Every public call on a picture of a given size, with what it did on the device."""
+"""Every public call on a picture of a given size, with its work on the device."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compile every kernel for GPUs that are not here, and compare with what it took: ``make gpu-check``.
+"""Compile every kernel for GPUs that are not present, and compare their needs: ``make gpu-check``.
 
 ``gpu_check.py [FILE...] [--freeze]``: only these of the kernels' files; keep what is found as the new table.
 Options are those of programs that are built while the frozen cases run on a device that is cut as a GPU

@@ -1,4 +1,4 @@
-"""What each public call would have a GPU do: launches, waits and copies; ``make gpu-check``.
+"""Work of each public call on a GPU: launches, waits and copies; ``make gpu-check``.
 
 ``gpu_counts.py [--freeze]``: print the table, and keep it. Calls have 1 Mpx unless their name says otherwise,
 and are counted when they are made again. The predicted time is the sum of launches, waits, copies and kernels

@@ -1,4 +1,4 @@
-"""Run the device tests on every OpenCL implementation that is here: ``make portability``.
+"""Run the device tests on every OpenCL implementation of this machine: ``make portability``.
 
 ``portability.py [--whole] [NAME...]``: every device test, not the part that takes 20 minutes; only those with
 one of these in their names. Each runs in a separate process that sees no other device. Intel's runtime, and

@@ -1,4 +1,4 @@
-"""Time every public call on each OpenCL runtime for CPUs that is here.
+"""Time every public call on each OpenCL runtime for CPUs of this machine.
 
 ``runtimes.py [NAME...] [--output TABLE.json]``: the runtimes of ``portability.py``, or those with one of
 these in their names, each in a separate process with caches of its own. ``--layouts cores lanes`` compares

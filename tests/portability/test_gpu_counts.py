@@ -1,4 +1,4 @@
-"""No call may have a GPU do more than the table says; the table is kept by ``gpu_counts.py --freeze``."""
+"""No call may do more on a GPU than in the table; ``gpu_counts.py --freeze`` updates the table."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""Recordings, what an undisturbed batch makes of them, and the table of what was disturbed."""
+"""Recordings, the results of an undisturbed batch, and the table of disturbances."""
 
 from __future__ import annotations
 

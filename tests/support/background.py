@@ -1,4 +1,4 @@
-"""Programs as a terminal finds them, and servers that outlive the command that started them."""
+"""Programs started from a terminal, and servers that outlive the command that started them."""
 
 from __future__ import annotations
 

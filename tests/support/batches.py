@@ -1,4 +1,4 @@
-"""Small recordings of each kind, sound and bad, for batches."""
+"""Small recordings of each kind, good and bad, for batches."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs of benchmarks, made up."""
+"""Artificial runs of benchmarks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a calibration reaches, by issue: the whole way from flat fields and balls to objects never seen.
+"""The accuracy of a calibration: from flat fields and balls to objects outside the calibration.
 
 ``python tests/support/calibration_report.py [--quick] [--cache DIR] [--only zenith,tilt,...]`` prints the
 targets and what was measured, before the calibration and after it. Light that was traced is kept in the

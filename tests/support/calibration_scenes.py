@@ -1,4 +1,4 @@
-"""A lab to calibrate in: the twin behind a real wall, with pixels, lamps and a lens that are not ideal.
+"""A laboratory for calibrations: the twin with a real wall and imperfect pixels, lamps and lens.
 
 The light of a press is worked out once, and kept where a folder is given; any camera then looks at it, with
 noise of its own in each take. Objects are those of the judge (`calibration_scorer`), in closed form.

@@ -1,4 +1,4 @@
-"""How far a calibrated sensor's answers are from the truth, and how far they may be.
+"""Errors of a calibrated sensor's answers, and their limits.
 
 It shares no code with mirrorskin. All is float64, from first principles, and written to be read:
 

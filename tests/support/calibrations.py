@@ -1,4 +1,4 @@
-"""Calibrations that are made up, and whether two are the same."""
+"""Artificial calibrations, and their comparison."""
 
 from __future__ import annotations
 

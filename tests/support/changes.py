@@ -1,4 +1,4 @@
-"""What the change-point's NumPy references make of a stack, in one block."""
+"""The change-point's NumPy references, applied to a stack in one block."""
 
 from __future__ import annotations
 

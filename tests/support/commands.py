@@ -1,4 +1,4 @@
-"""The command line: run in this process, which is quick, and the paper's experiments at a size that is."""
+"""The command line, run in this process, which is quick, and the paper's experiments at a small size."""
 
 from __future__ import annotations
 

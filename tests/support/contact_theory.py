@@ -1,4 +1,4 @@
-"""What is true of rigid bodies pressed into, and dragged along, an incompressible elastic half-space.
+"""Exact contact of rigid bodies with an incompressible elastic half-space, pressed and sheared.
 
 The tests' own book of contact mechanics. It shares no code with mirrorskin; all is float64, mm, N, N/mm^2.
 E is Young's modulus, G = E / 3 the shear modulus, E* = E / (1 - 0.25) = 4 E / 3 the modulus of contact with a

@@ -1,4 +1,4 @@
-"""Objects whose creases are known, and how well lines drawn on a map of normals follow them.
+"""Objects with known creases, and the accuracy of lines drawn on a map of normals.
 
 It shares no code with mirrorskin. All is float64: millimetres, x to the right, y up the picture, z to the
 camera; places on the picture are (row, column) of pixel centres. The objects are heights and slopes by

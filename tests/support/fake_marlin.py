@@ -1,4 +1,4 @@
-"""A controller that speaks as Marlin 2 does, in the place of a serial port.
+"""A controller with Marlin 2's protocol, in place of a serial port.
 
 Written after the firmware's documentation of its G-codes: lines wait for moves where the firmware's do.
 """

@@ -1,4 +1,4 @@
-"""Each estimator against each fault of a camera: is its standard deviation still true, or does it warn?
+"""Each estimator with each fault of a camera: is its standard deviation still true, or is there a warning?
 
 ``python tests/support/fault_matrix.py`` (in the environment) prints the cells; ``--freeze`` stores them in
 ``tests/support/fault_matrix.json`` and writes the tables of docs/faults.md. It refuses if a standard

@@ -1,4 +1,4 @@
-"""Stacks as HDF5 itself gives them, beside what we read, and how often each chunk was unpacked."""
+"""Stacks read by HDF5 and by our reader, and the number of times that each chunk was unpacked."""
 
 from __future__ import annotations
 

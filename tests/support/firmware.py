@@ -1,4 +1,4 @@
-"""A real firmware, GRBL 1.1 or grblHAL, compiled as a program, in an emulated machine's place.
+"""A real firmware, GRBL 1.1 or grblHAL, compiled as a program, in place of an emulated machine.
 
 It speaks on its standard streams, keeps its settings in the folder that it runs in, and writes its steps to a
 file; docs/rig.md says how it is built. It does not write its last steps before a halt: at rest its own report

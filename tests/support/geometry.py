@@ -1,4 +1,4 @@
-"""What is true of a ball, a cone and a plane under the sensor: the tests' own book of geometry.
+"""Exact geometry of a ball, a cone and a plane under the sensor, independent of the code under test.
 
 It shares no code with mirrorskin, so that what it says of the twin and of the engine is a second opinion.
 All is float64, from first principles, and written to be read:

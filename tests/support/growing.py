@@ -1,4 +1,4 @@
-"""A live source that is made up, and a process that records it: ``python growing.py FILE PACKING RATE``."""
+"""An artificial live source, and a process that records it: ``python growing.py FILE PACKING RATE``."""
 
 from __future__ import annotations
 

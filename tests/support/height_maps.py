@@ -1,4 +1,4 @@
-"""Surfaces that geometry can be told of in closed form, as results to measure."""
+"""Surfaces with measures in closed form, as results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A camera that shares nothing with the twin: what it records of a scene, and everything that can go wrong.
+"""A camera independent of the twin: its frames of a scene, and all its possible faults.
 
 The light of a scene is computed at 4 x 4 points of each pixel, blurred by a lens, averaged over the pixel,
 and turned into counts by a sensor with shot noise and read noise.

@@ -1,4 +1,4 @@
-"""Calls that fail: the n-th of a kind raises what a machine in trouble makes it raise."""
+"""Failing calls: the n-th of a kind raises the exception of a real failure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The twin's pictures of balls and flats while the body leans as it likes: not only round a circle."""
+"""The twin's pictures of balls and flats with any inclination of the body, not only along a circle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Faults of a line: each reply and each byte fails once, or again and again."""
+"""Faults of a line: each reply and each byte fails once, or repeatedly."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rigs that meet with a mishap while they move: what can happen, and what must hold afterwards."""
+"""Mishaps of rigs in motion: their list, and the conditions that must hold afterwards."""
 
 from __future__ import annotations
 

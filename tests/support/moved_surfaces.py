@@ -1,4 +1,4 @@
-"""Surfaces of known form, moved as a rigid body, as maps with noise; and errors of a pose found from them.
+"""Surfaces of known form, moved as rigid bodies, as maps with noise; and errors of the found poses.
 
 It shares no code with mirrorskin but the type of a result. Float64; millimetres and radians.
 """

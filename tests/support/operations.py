@@ -1,4 +1,4 @@
-"""Every built-in operation with frames, positions and options that it can work on."""
+"""Every built-in operation, with suitable frames, positions and options."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where an object is in a moved sensor body's frame, and what the camera sees of it: the tests' own book.
+"""An object's position in a moved sensor body's frame, and its picture, independent of the code under test.
 
 It shares no code with mirrorskin. All is float64, from first principles, and written to be read; millimetres
 and radians, x to the right, y up the picture, z towards the camera.

@@ -1,4 +1,4 @@
-"""Stacks for the onset's tests, and second opinions on what its answer is."""
+"""Stacks for the onset's tests, and independent searches for the onset."""
 
 from __future__ import annotations
 

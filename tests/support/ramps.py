@@ -1,4 +1,4 @@
-"""Noisy ramps whose half-way crossing is known, and how far off an estimate of it is.
+"""Noisy ramps with a known half-way crossing, and the errors of its estimates.
 
 ``python tests/support/ramps.py`` prints, for each noise, the error of the best fixed threshold and of the
 change-point.

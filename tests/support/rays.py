@@ -1,4 +1,4 @@
-"""What a mirror under the camera shows of the lit wall: rays followed one by one, the tests' own book.
+"""The lit wall in a mirror under the camera: rays traced one by one, independent of the code under test.
 
 It shares no code with mirrorskin. All is float64, from first principles, slow, and written to be read:
 radians, and vectors of three numbers in the body's frame: mm, z = 0 the sheet's rest plane, z to the camera.

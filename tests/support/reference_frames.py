@@ -1,4 +1,4 @@
-"""Frames of a camera whose pixels are known, as references are taken from them."""
+"""Frames of a camera with known pixels, as taken for references."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Kernels and their references with the same arguments by name, and their answers, compared."""
+"""Kernels and their references, called with the same arguments by name, and compared."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A stage and a camera that do what they are told, with neither threads nor a twin."""
+"""A fake stage and a fake camera that obey at once, without threads or a twin."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What goes wrong on a rig while it captures, and how that ends; run, it prints a table.
+"""Faults of a rig during capture, and how a capture ends; as a program, it prints a table.
 
 ``python tests/support/rig_faults.py [PROGRAM ...]`` has every fault on the emulated controller, on simulated
 time, and on each real firmware whose program is given.

@@ -1,4 +1,4 @@
-"""What the documentation's first commands must give: heights as good as their standard deviations say."""
+"""Required scores of the documentation's first commands: errors consistent with standard deviations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an axial rotation makes of a normal (eq. 10), how well that can be known at best, and how well it was.
+"""Samples of an axial rotation (eq. 10), the lowest possible errors of a normal, and its actual errors.
 
 It shares no code with mirrorskin. All is float64, from first principles, and written to be read: radians,
 counts, unit vectors of three numbers, z towards the camera.

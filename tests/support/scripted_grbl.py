@@ -1,4 +1,4 @@
-"""A GRBL controller in memory: crude motion, a log of all it was sent, and faults."""
+"""A GRBL controller in memory: simple motion, a log of everything it received, and faults."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A serial port in memory whose other end is a script, on the clock of the test."""
+"""A serial port in memory with a script at its other end, on the clock of the test."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The figures of ``docs/sensor.md``: the sensor cut through its axis, and what its sizes cost."""
+"""The figures of ``docs/sensor.md``: the sensor's section, and errors as functions of its dimensions."""
 
 from __future__ import annotations
 

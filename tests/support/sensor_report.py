@@ -1,4 +1,4 @@
-"""What the twin says of how to build a sensor and its rig: the tables and figures of ``docs/sensor.md``.
+"""The twin's recommendations for building a sensor and its rig: tables and figures of ``docs/sensor.md``.
 
 ``python tests/support/sensor_report.py [--only NAME,...] [--figures DIR]`` prints the tables as Markdown, and
 draws them with ``--figures``. All numbers are of the paper's body and of a ball of 10 mm, unless the table

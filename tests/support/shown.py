@@ -1,4 +1,4 @@
-"""Results that have everything a picture can show, and what a figure shows where."""
+"""Results with everything that a picture can show, and the contents of figures."""
 
 from __future__ import annotations
 

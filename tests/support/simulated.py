@@ -1,4 +1,4 @@
-"""Commands on simulated time: what they open rigs, stages and cameras with."""
+"""Commands on simulated time: their rigs, stages and cameras."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Heights from slopes, as they must be: assembled and solved in float64, the plainest way.
+"""Heights from slopes, assembled and solved in float64 in the simplest way.
 
 It shares no code with mirrorskin. A pixel is an unknown, a link joins two 4-neighbours, and a link wants the
 difference of its ends to be its edge's slope times the pixel size, as strongly as its weight says. Matrices

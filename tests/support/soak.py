@@ -1,4 +1,4 @@
-"""Batches that are ended at random moments: how often, of what, and what must be left of them."""
+"""Batches ended at random moments: how often, which, and the state that must remain."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A speckle of cosines: a texture that is known between the pixels, and so wherever it has moved."""
+"""A texture of cosines, known between the pixels and after any movement."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small stacks, a source that is made of them, and what to ask of the files that hold them."""
+"""Small stacks, sources of them, and checks of the files that contain them."""
 
 from __future__ import annotations
 

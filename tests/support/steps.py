@@ -1,4 +1,4 @@
-"""Surfaces whose depth jumps, or only seems to, and where on them normals determine the height.
+"""Surfaces with real and apparent jumps of depth, and the areas where normals determine the height.
 
 Nowhere do normals tell how deep a step is that no slope leads up or down. So heights are compared within
 each part of the picture that hangs together, each about its own median. Within it, pixels count whose height

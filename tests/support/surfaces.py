@@ -1,4 +1,4 @@
-"""Surfaces whose heights and slopes are known by formula, and the regions on which to look at them.
+"""Surfaces with heights and slopes by formula, and regions for comparisons.
 
 It shares no code with mirrorskin. All is float64; x and y are in pixels from the picture's centre, y up, and
 heights in pixels too: `sample` scales them to a pixel size. So a surface is the same number of pixels large

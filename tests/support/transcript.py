@@ -1,4 +1,4 @@
-"""What real firmwares answer, as transcripts: the emulated controller is held to GRBL's, the driver to both.
+"""Transcripts of real firmwares, with which emulated controller and driver are compared.
 
 ``python tests/support/transcript.py PROGRAM > tests/hw/grbl-1.1h.txt`` makes it anew; docs/rig.md tells how
 the program is built.

@@ -1,4 +1,4 @@
-"""What shows that a pickle was decoded."""
+"""Objects that reveal whether a pickle was decoded."""
 
 from __future__ import annotations
 

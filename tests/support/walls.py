@@ -1,4 +1,4 @@
-"""How bright mirrors under a lit cylinder look, from first principles; all is float64.
+"""Brightness of mirrors under a lit cylinder, from first principles in float64.
 
 It shares no code with mirrorskin: the wall is found by halving the way, turns are products of plain matrices.
 """

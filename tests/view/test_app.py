@@ -1,4 +1,4 @@
-"""The application's panes, without a browser: what a click, an option or a region changes."""
+"""The application's panes, without a browser: effects of a click, an option or a region."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""What the application saves and copies: files by the exporters, and texts that compute the same numbers."""
+"""Files saved by the application, and copied commands that compute the same numbers."""
 
 import shlex
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The application's rig, on simulated time: it shows, moves, runs, and stops whatever happens."""
+"""The application's rig, on simulated time: it displays, moves, runs, and always stops."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""The server of the application: nothing without the token, no foreign page, no other machine."""
+"""The server of the application: no access without the token, from foreign pages or other machines."""
 
 import asyncio
 import http.client

@@ -1,4 +1,4 @@
-"""Figures and numbers of calibrations that are made up: what is drawn is what they say."""
+"""Figures and numbers of artificial calibrations: the drawings show their values."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Colours of heights are those of their scale, whatever the surface around."""
+"""Colours of heights follow their scale, whatever the surface around."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The page of a result: it needs nothing else, tells the truth, and lets nobody in."""
+"""The page of a result: it needs no other file, shows true values, and executes no foreign code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A result has the pictures of what it knows, side by side, and none of them lies on another."""
+"""A result has pictures of all its maps, side by side, without overlap."""
 
 import itertools
 

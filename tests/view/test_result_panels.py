@@ -1,4 +1,4 @@
-"""Each panel shows its map, where it lies and in words that are true."""
+"""Each panel shows its map at the right place, with a true description."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Figures are drawn, and say what they need."""
+"""Figures of heights are drawn, and errors state which maps are missing."""
 
 import cv2
 import numpy as np

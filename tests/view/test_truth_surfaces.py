@@ -1,4 +1,4 @@
-"""The figure of one surface: its errors, and those of the cuts, are the result's own."""
+"""The figure of one surface: its errors, and those of the sections, equal the result's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Windows are opened where there is a screen, and only there."""
+"""Windows are opened only if there is a screen."""
 
 import matplotlib
 import pytest

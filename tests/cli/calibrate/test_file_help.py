@@ -1,4 +1,4 @@
-"""``mirrorskin calibrate`` names its commands, and help imports nothing heavy."""
+"""``mirrorskin calibrate`` lists its commands, and help imports nothing slow."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""``--calibration`` of reconstruct, capture and live: what it changes, what is written, what is refused."""
+"""``--calibration`` of reconstruct, capture and live: effects, written values, refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``mirrorskin calibrate references`` from recordings to the calibration file."""
+"""``mirrorskin calibrate references``: from recordings to the calibration file."""
 
 from pathlib import Path
 

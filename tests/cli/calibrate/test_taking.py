@@ -1,4 +1,4 @@
-"""Recordings for a calibration, taken on an emulated rig as its user is asked to."""
+"""Recordings for a calibration, captured on an emulated rig whose user follows the prompts."""
 
 import dataclasses
 import io as texts

@@ -1,4 +1,4 @@
-"""``mirrorskin calibrate zenith``: what reaches the fit, what is written and told, what is refused."""
+"""``mirrorskin calibrate zenith``: input of the fit, written and printed values, refusals."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Each recording has a result of its own name, and none is overwritten."""
+"""Each recording has a result with its own name, and none is overwritten."""
 
 from pathlib import Path
 

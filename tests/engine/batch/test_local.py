@@ -1,4 +1,4 @@
-"""A batch on this machine's devices: all are used, and it ends when it is told to."""
+"""A batch on this machine's devices: all are used, and it ends on request."""
 
 import os
 import signal

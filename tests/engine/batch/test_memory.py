@@ -1,4 +1,4 @@
-"""Memory that was freed is used again, and not asked of the system anew."""
+"""Freed memory is used again, instead of new memory from the system."""
 
 import platform
 import subprocess

@@ -1,4 +1,4 @@
-"""A plan's key changes with what changes results, and with nothing else."""
+"""A plan's key depends on everything that changes results, and on nothing else."""
 
 import json
 import pickle

@@ -1,4 +1,4 @@
-"""One job: done, kept or failed, and never raised."""
+"""One job ends as done, kept or failed, and never raises."""
 
 import os
 import pickle

@@ -1,4 +1,4 @@
-"""A ball as each frame sees it, against the book's poses, and found in the twin's pictures."""
+"""A ball in each frame, compared with independent poses, and found in the twin's pictures."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The whole way, small: flat fields and nine balls, then objects that were not used for the calibration.
+"""A small complete calibration: flat fields and nine balls, then scores on other objects.
 
 ``tests/support/calibration_report.py`` goes it with all pixels, and prints what the issue asks for.
 """

@@ -1,4 +1,4 @@
-"""The modulus from presses of known force: its error is honest, and what it is learned from is checked."""
+"""The modulus from presses of known force: true errors, and checked input."""
 
 from __future__ import annotations
 

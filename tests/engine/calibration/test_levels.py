@@ -1,4 +1,4 @@
-"""Levels behind samples that are noisy, rounded and clipped, against exact sums and known truths."""
+"""Levels of noisy, rounded and clipped samples, compared with exact sums and known truths."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""References measured from frames of pixels that are known, with defects put in."""
+"""References measured from frames of known pixels with artificial defects."""
 
 import numpy as np
 import pytest

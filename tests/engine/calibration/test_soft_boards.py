@@ -1,4 +1,4 @@
-"""Boards in soft, dim and noisy pictures are found, and their marks are where the camera sees them."""
+"""Boards in soft, dim and noisy pictures are found, with their marks at the right places."""
 
 import functools
 from itertools import product

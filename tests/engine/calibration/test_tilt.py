@@ -1,4 +1,4 @@
-"""Precessions found from the twin's turns on balls and plates, and from tracks without pictures."""
+"""Precessions from the twin's turns on balls and plates, and from tracks without pictures."""
 
 from dataclasses import replace
 

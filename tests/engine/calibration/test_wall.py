@@ -1,4 +1,4 @@
-"""The zenith's calibration, from presses under the twin's wall to the light of normals that it never saw."""
+"""The zenith's calibration: from presses under the twin's wall to the light of normals outside the fit."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""The printed pattern as a monotone curve, against quadrature and closed forms."""
+"""The printed pattern as a monotone curve, compared with quadrature and closed forms."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""The model that is fitted: against the kernels' formula, the ball's geometry, and differences."""
+"""The fitted model, compared with the kernels' formula, the ball's geometry, and differences."""
 
 import math
 

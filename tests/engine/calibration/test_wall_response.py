@@ -1,4 +1,4 @@
-"""Where mirrors turn light, against closed forms of the cylinder."""
+"""The zenith at which mirrors turn light, compared with closed forms of the cylinder."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""From samples to a response: prints of any kind, gels that leave the ball early, presses that do not fit."""
+"""From samples to a response: any print, gels that leave the ball early, presses that do not fit."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Normal force and pressure: of known shapes by closed forms, and of the twin's presses by its own scale."""
+"""Normal force and pressure: closed forms of known shapes, and the twin's presses with its own scale."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tangential force and traction: of Mindlin's and Cattaneo's contacts, and of the twin's skin."""
+"""Tangential force and traction: Mindlin's and Cattaneo's contacts, and the twin's skin."""
 
 from __future__ import annotations
 

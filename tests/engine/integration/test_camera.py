@@ -1,4 +1,4 @@
-"""Depths from the normals that a pinhole camera sees: against spheres and planes, in closed form."""
+"""Depths from the normals seen by a pinhole camera, compared with spheres and planes in closed form."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Components are what links connect, numbered in reading order."""
+"""Components are the sets of linked pixels, numbered in reading order."""
 
 from __future__ import annotations
 

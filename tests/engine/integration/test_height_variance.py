@@ -1,4 +1,4 @@
-"""Sigma is the standard deviation of the heights, by dense algebra in float64."""
+"""Sigma is the standard deviation of the heights, compared with dense algebra in float64."""
 
 from __future__ import annotations
 

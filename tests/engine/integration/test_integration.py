@@ -1,4 +1,4 @@
-"""Heights from slopes: against formulas, and a direct float64 solution (tests/support/slope_oracle.py)."""
+"""Heights from slopes, compared with formulas and a float64 solution (tests/support/slope_oracle.py)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The inverse of a graph Laplacian: against SciPy's sparse solvers in float64."""
+"""The inverse of a graph Laplacian, compared with SciPy's sparse solvers in float64."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The direct solver finds the heights of full rectangles of any shape, as exactly as float32 holds them."""
+"""The direct solver finds the heights of full rectangles of any shape to the precision of float32."""
 
 from __future__ import annotations
 

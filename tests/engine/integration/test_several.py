@@ -1,4 +1,4 @@
-"""Several surfaces at once: each as if it were alone."""
+"""Several surfaces at once: the same results as each one alone."""
 
 from __future__ import annotations
 

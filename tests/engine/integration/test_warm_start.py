@@ -1,4 +1,4 @@
-"""Heights that follow slopes come to those that fit best, and stay there."""
+"""Heights that follow changing slopes converge to the best fit, and remain there."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Values with their uncertainty, as they are read."""
+"""Formatting of values with their uncertainty."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""The motion of an object between two results against known motions, and its covariance against errors."""
+"""The motion of an object between two results, and its covariance, compared with known motions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Touches of one surface are put together where they belong, as well as their errors say."""
+"""Touches of one surface are put at the right places, within their stated errors."""
 
 from __future__ import annotations
 

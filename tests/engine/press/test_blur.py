@@ -1,4 +1,4 @@
-"""A lens that blurs moves the heights of a curved surface; their standard deviations contain that."""
+"""A blurring lens moves the heights of a curved surface; their standard deviations include that."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The change-point: better than any threshold, the kernels against their references, and what is refused."""
+"""The change-point: better than any threshold, kernels equal to their references, and refusals."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Presses of which nobody gave the counts of dark and light, against a surface that is known."""
+"""Presses without given counts of dark and light, compared with a known surface."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How contact grows with a dithering press: against Hertz, the twin in steps, and noise that is known."""
+"""Growth of contact in a dithering press, compared with Hertz, the twin in steps, and known noise."""
 
 from __future__ import annotations
 

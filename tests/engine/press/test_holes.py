@@ -1,4 +1,4 @@
-"""Holes filled, on terraces of bodies that are closed forms, and on the twin."""
+"""Filled holes, on terraces of bodies in closed form, and on the twin."""
 
 import geometry
 import numpy as np

@@ -1,4 +1,4 @@
-"""Intervals as likelihoods of heights, held against their derivatives; paraboloids through heights."""
+"""Intervals as likelihoods of heights, checked by derivatives; paraboloids through heights."""
 
 import numpy as np
 import pytest

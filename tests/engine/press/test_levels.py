@@ -1,4 +1,4 @@
-"""Several thresholds: bounds of the sheet's inclination, and what cannot be asked for."""
+"""Several thresholds: bounds of the sheet's inclination, and refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A stack far larger than the memory that was set for it goes through in blocks."""
+"""A stack far larger than the memory limit is processed in blocks."""
 
 import subprocess
 import sys

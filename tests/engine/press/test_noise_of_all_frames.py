@@ -1,4 +1,4 @@
-"""The noise of a press is that of all frames: the first two may be equal, or settle."""
+"""The noise of a press is estimated from all frames: the first two may be equal, or unsettled."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""Onset and release: kernels against their NumPy references, the references against a loop over pixels."""
+"""Onset and release: kernels equal their NumPy references, and these a loop over pixels."""
 
 import math
 

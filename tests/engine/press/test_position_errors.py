@@ -1,4 +1,4 @@
-"""Frames at another travel than stated are found by the bends of the surface at their heights."""
+"""Errors of the frames' travel are found from bends of the surface at their heights."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""From a source of a press or its release to a result: which frames and levels are used, and how well."""
+"""From a source of a press or its release to a result: used frames and levels, and accuracy."""
 
 import dataclasses
 from typing import get_args

@@ -1,4 +1,4 @@
-"""A rolling shutter exposes each row at another travel; heights are those of the travel of their row."""
+"""A rolling shutter exposes each row at another travel; heights are corrected for it."""
 
 import warnings
 

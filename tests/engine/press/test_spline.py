@@ -1,4 +1,4 @@
-"""Smooth surfaces within intervals, held against polynomials and against NumPy's least squares."""
+"""Smooth surfaces within intervals, compared with polynomials and NumPy's least squares."""
 
 import numpy as np
 import pytest

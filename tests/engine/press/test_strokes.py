@@ -1,4 +1,4 @@
-"""Onsets and releases of an oscillating press, against truth that is known and against the single search."""
+"""Onsets and releases of an oscillating press, compared with known truth and the single search."""
 
 from __future__ import annotations
 

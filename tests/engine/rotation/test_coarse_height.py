@@ -1,4 +1,4 @@
-"""How high the object stands, from normals that are exact."""
+"""The object's coarse height, from exact normals."""
 
 import math
 

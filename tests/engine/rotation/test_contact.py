@@ -1,4 +1,4 @@
-"""Lost contact on the twin: a ball that touches only part of the turn, told apart by the brightness alone."""
+"""Lost contact on the twin: a ball that touches in only part of the turn, detected by brightness alone."""
 
 from functools import cache
 from typing import NamedTuple

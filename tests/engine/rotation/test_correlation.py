@@ -1,4 +1,4 @@
-"""The correlation: least squares, however a stack is cut, for every type of frame and every phase."""
+"""The correlation is the least-squares fit for any division of a stack, type of frame and phase."""
 
 from itertools import pairwise
 

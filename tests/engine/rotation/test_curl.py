@@ -1,4 +1,4 @@
-"""Slopes that are rotated about the axis of the camera are found by their curl, and rotated back."""
+"""Slopes rotated about the axis of the camera are found by their curl, and rotated back."""
 
 from functools import cache
 

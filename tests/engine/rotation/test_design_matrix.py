@@ -1,4 +1,4 @@
-"""Phases: what a fit makes of samples, which phases determine none, and which frames make a turn."""
+"""Phases: the fit of samples, phases that determine none, and division into turns."""
 
 import numpy as np
 import pytest

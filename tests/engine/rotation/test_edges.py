@@ -1,4 +1,4 @@
-"""Lines at creases and where contact ends, on held-out objects (tests/support/creases.py)."""
+"""Lines at creases and at the end of contact, on held-out objects (tests/support/creases.py)."""
 
 from functools import cache
 

@@ -1,4 +1,4 @@
-"""Flicker and drift of a rotation are found and removed; the renderings share nothing with the twin."""
+"""Flicker and drift of a rotation are found and removed, in renderings independent of the twin."""
 
 from functools import cache
 

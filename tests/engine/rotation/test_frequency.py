@@ -1,4 +1,4 @@
-"""The estimated frequency against the Cramer-Rao bound, and what it is used for."""
+"""The estimated frequency, compared with the Cramer-Rao bound, and its use."""
 
 from __future__ import annotations
 

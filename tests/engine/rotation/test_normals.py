@@ -1,4 +1,4 @@
-"""Normals of turns that come block by block: the same however they are cut, and what is refused."""
+"""Normals of turns pushed block by block: equal for any division; and refusals."""
 
 from dataclasses import replace
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""Slopes of normals, and how sure they are: against closed forms, and against draws of eq. 10."""
+"""Slopes of normals and their standard deviations, compared with closed forms and draws of eq. 10."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Phases that run the wrong way round are told by slopes that do not fit together."""
+"""Reversed phases are detected by slopes that belong to no surface."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""Normals from any known poses: against the Cramer-Rao bound, and against the turn that is one of them."""
+"""Normals from any known poses, compared with the Cramer-Rao bound, and with a turn."""
 
 from __future__ import annotations
 

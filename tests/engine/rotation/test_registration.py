@@ -1,4 +1,4 @@
-"""Registered frames: where the object's points go, what eq. 10 says of them, and what must not be made up."""
+"""Registered frames: places of the object's points, eq. 10 there, and no invented values."""
 
 from __future__ import annotations
 

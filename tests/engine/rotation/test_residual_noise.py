@@ -1,4 +1,4 @@
-"""The noise by what waves of one and two a turn leave: that of reading, and that of light."""
+"""Read noise and shot noise, from the residuals of a fit of two harmonics."""
 
 import numpy as np
 import pytest

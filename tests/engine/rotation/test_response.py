@@ -1,4 +1,4 @@
-"""What a calibrated response becomes for the pixels of a picture, and normals from it."""
+"""A calibrated response for the pixels of a picture, and normals from it."""
 
 from dataclasses import replace
 

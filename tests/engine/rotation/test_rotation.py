@@ -1,4 +1,4 @@
-"""From an axial source to a result: what is asked for, what the source says, honest errors on the twin."""
+"""From an axial source to a result: options, the source's own values, true errors on the twin."""
 
 from dataclasses import replace
 from functools import cache

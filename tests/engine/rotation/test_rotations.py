@@ -1,4 +1,4 @@
-"""The tests' own book on axial rotations (tests/support/rotations.py), held against plainer ones."""
+"""The tests' own formulas of axial rotations (tests/support/rotations.py), compared with simpler ones."""
 
 from dataclasses import replace
 

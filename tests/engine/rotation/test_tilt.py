@@ -1,4 +1,4 @@
-"""The tilt, as far as the amplitude of the zenith's wave shows it."""
+"""The tilt, estimated from the amplitude of the zenith's wave."""
 
 from dataclasses import replace
 

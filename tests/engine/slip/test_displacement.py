@@ -1,4 +1,4 @@
-"""Displacement from frames: exact textures, the Cramer-Rao bound, and sheets that tell nothing."""
+"""Displacement from frames: exact textures, the Cramer-Rao bound, and sheets without texture."""
 
 from __future__ import annotations
 

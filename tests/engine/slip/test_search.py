@@ -1,4 +1,4 @@
-"""Slip from frames of a known course of stick and slip, of slides and of twists."""
+"""Slip from frames of known stick and slip, in slides and twists."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A source with a calibration: what its header and its phases become, and which calibration is refused."""
+"""A source with a calibration: its header and phases, and refused calibrations."""
 
 from dataclasses import fields, replace
 

@@ -1,4 +1,4 @@
-"""Calibration files: everything comes back, one part is replaced, what cannot be used is told in a line."""
+"""Calibration files: all is read back, parts are replaced, and errors are one line."""
 
 from dataclasses import replace
 from pathlib import Path

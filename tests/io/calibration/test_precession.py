@@ -1,4 +1,4 @@
-"""How a precession turns the phases of a recording into leans."""
+"""Conversion of a recording's phases to inclinations by a precession."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Parts of a calibration that were made with another pixel size are not used with this one."""
+"""Parts of a calibration made with another pixel size are not used with this one."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Results to export: small, of oblong pixels, and nowhere symmetric."""
+"""Results to export: small, with oblong pixels, and without symmetry."""
 
 from __future__ import annotations
 

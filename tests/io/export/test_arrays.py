@@ -1,4 +1,4 @@
-"""Plain arrays as NumPy opens them."""
+"""Plain arrays, opened by NumPy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Heights in 16 bits as OpenCV, Pillow and tifffile open them."""
+"""Heights in 16 bits, opened by OpenCV, Pillow and tifffile."""
 
 from __future__ import annotations
 

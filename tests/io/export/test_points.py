@@ -1,4 +1,4 @@
-"""Points without a surface: PLY as trimesh opens it, and text as NumPy does."""
+"""Points without a surface: PLY opened by trimesh, and text by NumPy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What cannot be exported is one line that says why and what to do, and leaves nothing behind."""
+"""Refusals of exports: one line with cause and remedy, and no file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Surfaces as trimesh opens them."""
+"""Surfaces, opened by trimesh."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables as the standard library and NumPy read them."""
+"""Tables, read by the standard library and NumPy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Texts of a result in files that are text, or have text in them: printable, and each in its line."""
+"""Texts of a result in text files, or as texts in other files: printable, and each on one line."""
 
 import csv
 import json
