@@ -42,7 +42,7 @@ def test_frames_come_when_they_are_due_and_those_that_wait_come_together():
     np.testing.assert_array_equal(source.positions()["phase"], phase[:5])
 
 
-def test_what_a_late_reader_loses_is_told():
+def test_what_a_late_reader_loses_is_reported():
     clock, frames = SimulatedClock(), turn_frames(SHAPE)
     source = paced(frames, turn_header(), phases(SHAPE[0]), 10.0, clock, slots=4)
     room, given = np.empty((8, *SHAPE[1:]), np.uint8), []

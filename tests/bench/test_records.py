@@ -73,7 +73,7 @@ def refused(path):
         (b"{}", "missing required field `date`"),
     ],
 )
-def test_what_is_no_run_is_refused(tmp_path, content, said):
+def test_what_is_not_a_run_is_refused(tmp_path, content, said):
     path = tmp_path / "other.json"
     path.write_bytes(content)
     assert said in refused(path)

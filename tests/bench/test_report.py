@@ -29,7 +29,7 @@ def test_the_page_in_the_docs_is_that_of_the_committed_runs():
     assert (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8") == page, made
 
 
-def test_each_run_has_its_tables_beside_it():
+def test_each_run_has_its_tables_next_to_it():
     for path in COMMITTED:
         assert path.with_suffix(".md").read_text(encoding="utf-8").count("\n## ") == 1 + len(
             open_run(path).cases

@@ -179,7 +179,7 @@ def test_what_one_points_at_is_read(opening, path):
     assert opened.point(0.002, 0.002) == ""
 
 
-def test_what_one_points_at_from_the_side_lies_on_the_surface(opening, path):
+def test_what_one_points_at_from_the_side_is_on_the_surface(opening, path):
     opened = opening(path)
     found = []
     for across in np.linspace(0.35, 0.65, 4):
@@ -316,7 +316,7 @@ def test_a_lost_context_comes_back(opening, path):
     [{"script": "HTMLCanvasElement.prototype.getContext = () => null"}, {"java_script_enabled": False}],
     ids=["no WebGL", "no scripts"],
 )
-def test_where_a_surface_cannot_be_drawn_the_pictures_stand_and_a_sentence_says_why(opening, path, how):
+def test_if_a_surface_cannot_be_drawn_pictures_are_shown_with_the_reason(opening, path, how):
     page = opening(path, **how).page
     assert "WebGL 2" in page.locator(".without").inner_text()
     assert page.locator(".without").is_visible()

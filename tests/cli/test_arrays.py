@@ -130,7 +130,7 @@ def test_an_array_that_cannot_be_used_is_refused_in_a_line(words, said):
     refused(said, "reconstruct", *words, "-o", "out.h5")
 
 
-def test_what_an_array_or_an_archive_holds_is_told():
+def test_what_an_array_or_an_archive_holds_is_reported():
     assert run("info ball.npy").out.split("\n")[1].split(maxsplit=1)[1] == "12 x 12 x 16, uint8"
     told = json.loads(run("info ball.npz --json").out)
     assert (told["travel"], told["dark"]) == ("12, float64", "one number, float64")
@@ -186,7 +186,7 @@ def test_a_recording_has_its_own_travel(folder):
         engine.reconstruct(opened, travel=TRAVEL)
 
 
-def test_levels_that_nobody_gave_are_named():
+def test_levels_that_were_not_given_are_named():
     words = ("reconstruct", "ball.npy", *STEPS, *SIZE, "-o", "out.h5", "--overwrite")
     said = run(*words).said
     assert "ball.npy: no dark and bright given: estimated as " in said
@@ -195,7 +195,7 @@ def test_levels_that_nobody_gave_are_named():
     assert "no dark" not in run(*words, "--dark", 0, "--bright", 255).said
 
 
-def test_the_line_of_a_file_in_a_batch_names_levels_that_nobody_gave():
+def test_the_line_of_a_file_in_a_batch_names_levels_that_were_not_given():
     Path("batch.toml").write_text('[stack]\ntravel-step = "0.1mm"\npixel-size = "0.4mm"\n')
     out = run("batch ball.npy -o out --settings batch.toml").out
     assert "; no dark and bright given: estimated as " in out
@@ -238,7 +238,7 @@ def test_a_slide_without_contact_ends_with_the_reason():
     assert "mirrorskin: none.h5: no slip onset at any pixel: " in ended.said
 
 
-def test_a_twist_in_degrees_is_said():
+def test_a_twist_in_degrees_is_reported():
     frames = np.random.default_rng(1).integers(80, 120, (6, 40, 40)).astype(np.uint8)
     np.savez("twist.npz", frames=frames, twist=2.0 * np.arange(6))
     with io.open_recording("twist.npz") as recording:

@@ -239,7 +239,7 @@ def test_references_may_be_unknown_at_some_pixels():
 
 
 @pytest.mark.parametrize("name", ["five yen.h5", "Münze 五円.h5"])
-def test_any_name_will_do(name):
+def test_any_name_is_accepted(name):
     record(sphere(), Path(name))
     done("reconstruct", name)
     result = name.replace(".h5", "-result.h5")
@@ -247,7 +247,7 @@ def test_any_name_will_do(name):
     assert io.open_result(result).process["source"] == name
 
 
-def test_a_name_that_is_no_text_will_do():
+def test_a_name_that_is_not_text_is_accepted():
     name = Path(os.fsdecode(b"no \xff text.h5"))
     record(sphere(), Path("plain.h5")).rename(name)
     assert process("reconstruct", name, "-o", "result.h5")[0] == 0

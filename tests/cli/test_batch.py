@@ -34,7 +34,7 @@ def presses(*names):
         press(Path(name))
 
 
-def test_bad_recordings_of_every_kind_are_told_and_the_rest_is_done():
+def test_bad_recordings_of_every_kind_are_reported_and_the_rest_is_done():
     for name, make in SOUND.items():
         make(Path(name))
     bad = [make(Path(f"{make.__name__}.h5")).name for make in BAD]
@@ -111,7 +111,7 @@ def test_a_motion_that_contradicts_a_file_fails_it():
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
-def test_a_name_that_is_no_text_is_shown_as_well_as_can_be(monkeypatch, encoding):
+def test_a_name_that_is_not_text_is_shown_as_well_as_can_be(monkeypatch, encoding):
     for name in (b"a\xff.h5", b"a\nb.h5", "é.h5".encode()):
         press(Path(os.fsdecode(name)))
     out = streams.TextIOWrapper(streams.BytesIO(), encoding, errors="strict")
@@ -130,7 +130,7 @@ def test_a_name_that_is_no_text_is_shown_as_well_as_can_be(monkeypatch, encoding
     assert "3 done, 0 kept, 1 failed" in lines[5]
 
 
-def test_json_tells_of_every_file():
+def test_json_lists_every_file():
     presses("a.h5")
     missing(Path("b.h5"))
     code, out, said = run("batch a.h5 b.h5 -o out --json")

@@ -134,7 +134,7 @@ def test_a_rotation_without_a_halt_becomes_a_recording(emulated, tmp_path):
         assert (recording.phase[0], recording.phase[-1]) == pytest.approx((0.0, 6.28), abs=0.1)
 
 
-def test_a_capture_that_is_cut_short_says_what_it_kept(emulated, tmp_path, monkeypatch):
+def test_a_capture_that_is_cut_short_reports_what_it_kept(emulated, tmp_path, monkeypatch):
     path = tmp_path / "short.h5"
     rig, _ = emulated
     appended = io.StreamRecorder.read
@@ -322,11 +322,9 @@ def test_a_stage_that_is_said_to_home_and_does_not_is_refused(emulated, tmp_path
     assert not rig.machine.moving()
 
 
-def test_contact_is_found_and_the_zero_told(emulated):
+def test_contact_is_found_and_the_zero_printed(emulated):
     ended = done("rig probe", emulated[1], "--from", "-1mm", "--step", "0.2mm")
-    found = re.search(
-        r"first contact at a travel of (\S+) ± 0.1 mm; .* set zero = (\S+) in", ended.out
-    )
+    found = re.search(r"first contact at a travel of (\S+) ± 0.1 mm; .* set zero = (\S+) in", ended.out)
     assert (
         -0.11 <= float(found[1]) <= 0.31
     )  # the sphere's top lies at 0, and its light needs a pixel of contact

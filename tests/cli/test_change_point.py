@@ -53,6 +53,6 @@ def test_the_method_reaches_the_engine(folder, levels):
         (["--method", "guess"], "guess"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(folder, words, said):
+def test_impossible_input_is_refused_in_one_line(folder, words, said):
     refused(said, *GIVEN, *words)
     assert not (folder / "press-result.h5").exists()

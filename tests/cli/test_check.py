@@ -68,7 +68,7 @@ def test_other_commands_write_nothing_if_it_is_strict(words):
     refused("the travel is 1900 mm", *words.split(), "--travel-step", "100mm", "--strict", "-o", "out.h5")
 
 
-def test_a_batch_tells_warnings_of_each_recording():
+def test_a_batch_reports_warnings_of_each_recording():
     done("import simulated.npy --motion vertical --travel-step 100mm -o far.h5")
     ended = done("batch press.h5 far.h5 -o results")
     (line,) = (line for line in ended.out.splitlines() if "far.h5" in line)

@@ -74,7 +74,7 @@ def test_a_sphere_is_pressed_reconstructed_and_scored(folder):
     assert "height RMS error" in mirrorskin("score", "sphere-result.h5", "--truth", "sphere.h5", cwd=folder)
 
 
-def test_a_result_tells_how_it_came_about(folder):
+def test_a_result_states_how_it_was_made(folder):
     result = io.open_result(folder / "sphere-result.h5")
     assert result.process["threshold"] == 0.5
     assert result.process["hold"] == 2
@@ -113,7 +113,7 @@ def test_a_memory_limit_changes_nothing(folder):
     np.testing.assert_array_equal(small.height, large.height)
 
 
-def test_info_tells_what_a_file_holds(folder):
+def test_info_prints_what_a_file_holds(folder):
     assert "30 of 70 x 60, uint8" in mirrorskin("info", "sphere.h5", cwd=folder)
     assert json.loads(mirrorskin("info", "sphere-result.h5", "--json", cwd=folder))["kind"] == "result"
 

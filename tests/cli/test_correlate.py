@@ -174,5 +174,5 @@ def test_a_frequency_takes_the_place_of_the_phase(frequency, harmonic, amplitude
         (["--frequency", "3", "--frame-rate", "0"], "frame_rate 0.0: a number in frames/s above 0 is needed"),
     ],
 )
-def test_a_frequency_that_cannot_be_is_one_line(words, line):
+def test_an_impossible_frequency_is_one_line(words, line):
     refused(line, "correlate", oscillating(), *words)

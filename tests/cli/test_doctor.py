@@ -29,7 +29,7 @@ def test_the_device_is_the_default_one(facts):
     assert facts()["device"].startswith(device.open_device().info.title)
 
 
-def test_without_a_device_it_says_why(facts, monkeypatch):
+def test_without_a_device_it_states_the_reason(facts, monkeypatch):
     def refuse(choice=None):
         raise DeviceError("no OpenCL device found")
 

@@ -47,7 +47,7 @@ def place_of_top(path):
     return vertices[np.argmax(vertices[:, 2]), :2]
 
 
-def test_each_file_is_written_and_told_in_a_line():
+def test_each_file_is_written_and_printed_in_a_line():
     names = ["ball.ply", "ball.stl", "ball.xyz", "ball.png", "ball.tif", "ball.csv", "ball.npz"]
     ended = run("export ball-result.h5", *(word for name in names for word in ("-o", name)))
     assert (ended.code, ended.said) == (0, "")
@@ -142,7 +142,7 @@ def test_a_filled_height_is_told_apart_in_a_cross_section():
         ("", "Missing option '--output'"),
     ],
 )
-def test_what_cannot_be_is_one_line_and_writes_nothing(words, line):
+def test_impossible_input_is_one_line_and_writes_nothing(words, line):
     before = {path: path.stat().st_mtime_ns for path in Path().iterdir()}
     refused(line, f"export ball-result.h5 {words}")
     assert {path: path.stat().st_mtime_ns for path in Path().iterdir()} == before
@@ -156,6 +156,6 @@ def test_a_result_without_a_pixel_size_is_refused_but_for_its_arrays():
     assert run("export bare-result.h5 -o bare.npz").code == 0
 
 
-def test_a_file_that_is_no_result_is_one_line():
+def test_a_file_that_is_not_a_result_is_one_line():
     Path("notes.txt").write_text("no result")
     refused("notes.txt is not an HDF5 file", "export notes.txt -o a.ply")

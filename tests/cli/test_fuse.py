@@ -103,7 +103,7 @@ def test_a_press_and_a_rotation_become_one_surface():
     assert "height RMS error" in run("score press-fused.h5 --truth press.h5").out
 
 
-def test_json_tells_the_engine_s_surface_and_where_it_came_from():
+def test_json_contains_the_engine_s_surface_and_where_it_came_from():
     result, ended = fuse("--json")
     told = json.loads(ended.out)
     assert told["output"] == "out.h5"
@@ -187,7 +187,7 @@ def test_a_recording_of_the_other_motion_is_refused(names):
     assert any(name in line for name in names)
 
 
-def test_a_result_is_no_recording():
+def test_a_result_is_not_a_recording():
     io.save_result(io.Result(height=np.zeros(SHAPE, np.float32)), "out.h5")
     refused("out.h5 is a result", "fuse", *("press.h5", "out.h5"))
 

@@ -57,7 +57,7 @@ def test_no_command_needs_anything_heavy_before_it_runs():
         ["simulate", "vertical", "--object", "no.stl", "-o", "a.h5"],
     ],
 )
-def test_a_file_that_is_not_there_is_told_before_anything_heavy_is_imported(words):
+def test_a_file_that_is_not_there_is_reported_before_anything_heavy_is_imported(words):
     assert not loaded(*words) & set(HEAVY)
 
 
@@ -110,7 +110,7 @@ def test_a_name_that_is_misspelt_is_answered_with_the_one_that_was_meant():
     refused("'reconstruct'", "reconstuct")
 
 
-def test_a_name_that_nobody_knows_is_refused():
+def test_an_unknown_name_is_refused():
     refused("No such command 'import_'", "import_")
 
 

@@ -83,7 +83,7 @@ def counted(text):
     return [int(number) for number in found.groups()]
 
 
-def test_a_press_is_told_recorded_and_kept(fake, tmp_path):
+def test_a_press_is_reported_recorded_and_kept(fake, tmp_path):
     record, output = tmp_path / "rec.h5", tmp_path / "res.h5"
     done = fake.run(*PRESS, "--record", str(record), "-o", str(output))
     assert done.exit_code == 0, done.output
@@ -110,7 +110,7 @@ def test_frames_and_heights_go_into_an_mcap_file(fake, tmp_path):
     assert 1 <= found.count("/height") <= updates  # while one is written, others may be missed
 
 
-def test_strokes_are_joined_and_their_hysteresis_is_told(fake, tmp_path):
+def test_strokes_are_joined_and_their_hysteresis_is_reported(fake, tmp_path):
     output = tmp_path / "res.h5"
     words = ["--stop", "1mm", "--stroke-depth", "0.8mm", "--strokes", "4", "--speed", "2.5mm/s", *ALL]
     done = fake.run("vertical", *words, "-o", str(output))
@@ -138,7 +138,7 @@ def test_the_recording_replayed_gives_the_same_onset(fake, tmp_path):
     np.testing.assert_array_equal(search.result().height[measured], result.height[measured])
 
 
-def test_a_rotation_is_told_and_kept(fake, tmp_path):
+def test_a_rotation_is_reported_and_kept(fake, tmp_path):
     fake.picture = slanted()
     fake.camera_settings |= {"zenith_gain": math.radians(GAIN), "zenith_offset": OFFSET}
     output = tmp_path / "res.h5"
@@ -150,7 +150,7 @@ def test_a_rotation_is_told_and_kept(fake, tmp_path):
     assert result.height is not None
 
 
-def test_rocking_is_told_recorded_and_kept_and_repeated(fake, tmp_path):
+def test_rocking_is_reported_recorded_and_kept_and_repeated(fake, tmp_path):
     fake.picture = slanted()
     fake.camera_settings |= {"zenith_gain": math.radians(GAIN), "zenith_offset": OFFSET}
     record, output = tmp_path / "rec.h5", tmp_path / "res.h5"
@@ -257,7 +257,7 @@ def test_a_call_that_fails_stops_the_stage_and_keeps_what_there_is(fake, tmp_pat
         assert not list(tmp_path.glob("*.part"))
 
 
-def test_a_turn_that_is_cut_short_says_that_there_is_no_result(fake, tmp_path):
+def test_a_turn_that_is_cut_short_reports_that_there_is_no_result(fake, tmp_path):
     fake.picture = slanted()
     fake.camera_settings |= {"zenith_gain": math.radians(GAIN), "zenith_offset": OFFSET}
     picture = fake.picture
@@ -285,7 +285,7 @@ def test_a_turn_that_is_cut_short_says_that_there_is_no_result(fake, tmp_path):
         (["axial", "--rock", "--press", "1mm", "--speed", "5deg/s"], "zenith_gain"),
     ],
 )
-def test_what_cannot_be_is_one_clear_line(fake, words, told):
+def test_impossible_input_is_one_clear_line(fake, words, told):
     done = fake.run(*words)
     assert isinstance(done.exception, io.InputError)
     assert told in str(done.exception)
@@ -364,7 +364,7 @@ def test_ctrl_c_while_frames_are_pushed_comes_after_them():
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_a_slide_is_told_recorded_and_kept_and_repeated(fake, tmp_path):
+def test_a_slide_is_reported_recorded_and_kept_and_repeated(fake, tmp_path):
     texture = Speckle(4)
 
     def picture(place):
@@ -455,7 +455,7 @@ def test_an_operation_of_the_user_s_gives_the_same_live_as_over_the_recording(fa
         ([*TURN, "--operation", OWN], "but SteepestRise needs vertical motion"),
     ],
 )
-def test_an_operation_that_cannot_be_is_one_clear_line(fake, words, told):
+def test_an_impossible_operation_is_one_clear_line(fake, words, told):
     done = fake.run(*words)
     assert told in f"{done.exception} {done.output}"
     assert done.exit_code != 0

@@ -80,7 +80,7 @@ def test_one_turn_of_several_is_measured(tmp_path):
     refused("none of turn 2", "measure", path, "--turn", "2")
 
 
-def test_what_cannot_be_measured_is_told_in_a_line(ball, tmp_path):
+def test_what_cannot_be_measured_is_printed_in_a_line(ball, tmp_path):
     result = io.open_result(ball)
     io.save_result(result.assign(x=None, y=None), tmp_path / "unsized.h5")
     refused("reconstruct it again with --pixel-size", "measure", tmp_path / "unsized.h5")

@@ -33,7 +33,7 @@ from mirrorskin.cli.output import print_fields, printable, report_missing_maps
         ),
     ],
 )
-def test_what_is_missing_and_what_a_gel_did_is_told_in_a_line(process, said, capsys):
+def test_what_is_missing_and_what_a_gel_did_is_printed_in_a_line(process, said, capsys):
     report_missing_maps("a.h5", process, {"height": "it"})
     assert capsys.readouterr() == ("", f"{said}\n" if said else "")
 

@@ -129,7 +129,7 @@ def test_options_are_in_the_process(result):
         (["--margin", "-1"], "margin -1.0: a number in counts of at least 0"),
     ],
 )
-def test_an_option_that_cannot_be_is_one_line(folder, option, line):
+def test_an_impossible_option_is_one_line(folder, option, line):
     refused(line, *words(folder), *option, "-o", folder / "no.h5")
     assert not (folder / "no.h5").exists()
 

@@ -67,6 +67,6 @@ def test_a_file_that_lists_no_angles_is_one_line(tmp_path, content, line):
     assert str(caught.value) == f"{path}{line}"
 
 
-def test_a_folder_is_no_file_of_phases(tmp_path):
+def test_a_folder_is_not_a_file_of_phases(tmp_path):
     with pytest.raises(InputError, match="cannot be read: Is a directory; write one angle"):
         read_phases(tmp_path)

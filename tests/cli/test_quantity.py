@@ -288,7 +288,7 @@ def test_a_segment_is_two_points():
 @pytest.mark.parametrize(
     "text", ["1mm,1mm", "1mm,1mm:1mm,1mm", "1mm:2mm", "1mm,2mm:3mm,4mm:5mm,6mm", "1,2:3,4"]
 )
-def test_what_is_no_segment_is_refused(text):
+def test_what_is_not_a_segment_is_refused(text):
     with pytest.raises(InputError, match="--section"):
         segment(text, "--section")
 

@@ -57,5 +57,5 @@ def test_a_release_alone_is_made_by_a_step_below_zero(folder):
     assert score["median"] < 0.03
 
 
-def test_info_tells_how_far_a_recording_goes_and_back(folder):
+def test_info_prints_how_far_a_recording_goes_and_back(folder):
     assert json.loads(mirrorskin("info", "both.h5", "--json", cwd=folder))["travel"] == "0.1 to 3 to 0.1 mm"

@@ -20,7 +20,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_a_page_lies_beside_its_result_unless_a_place_is_given(folder, monkeypatch):
+def test_a_page_is_next_to_its_result_unless_a_place_is_given(folder, monkeypatch):
     monkeypatch.setattr(contents, "pictures_of", lambda *_: [])  # which take longest
     ended = run("report res.h5 --section=-0.3mm,0mm:0.3mm,0mm")
     assert (ended.code, ended.said) == (0, "")

@@ -59,7 +59,7 @@ def controller(folder, simulated, monkeypatch):
     return plug_in
 
 
-def test_a_sound_rig_is_told_in_a_table_and_nothing_moves(controller):
+def test_a_sound_rig_is_printed_in_a_table_and_nothing_moves(controller):
     machine = controller().machine
     before = machine.position()
     ended = run("rig check rig.toml")
@@ -75,7 +75,7 @@ def test_a_sound_rig_is_told_in_a_table_and_nothing_moves(controller):
         assert re.search(f"^ok +.*{said}", ended.out, re.MULTILINE), ended.out
 
 
-def test_a_rig_that_homes_and_moves_is_told_in_json_and_ends_where_it_homed(controller):
+def test_a_rig_that_homes_and_moves_is_printed_in_json_and_ends_where_it_homed(controller):
     machine = controller(home=True).machine
     ended = run("rig check rig.toml --move --json")
     told = json.loads(ended.out)

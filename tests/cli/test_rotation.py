@@ -95,7 +95,7 @@ def test_the_normals_become_heights_in_millimetres():
     assert "height" in json.loads(run("score out.h5 --truth turn.h5 --json").out)
 
 
-def test_without_a_pixel_size_there_are_no_heights_and_a_line_says_why():
+def test_without_a_pixel_size_there_are_no_heights_and_a_line_states_the_reason():
     turn(pixel_size=None)
     result, ended = reconstruct()
     assert ended.said == "turn.h5: no height: the recording has no pixel size; give --pixel-size\n"
@@ -150,7 +150,7 @@ def test_gain_offset_and_tilt_on_the_command_line_replace_the_recording_s():
     np.testing.assert_allclose(given.normals, own.normals, atol=1e-5)
 
 
-def test_a_tilt_that_nobody_knows_is_estimated():
+def test_an_unknown_tilt_is_estimated():
     turn("unknown.h5", tilt=None)
     result, _ = reconstruct("--tilt", "estimate", name="unknown.h5")
     assert np.mean(errors(result)) < 2
@@ -169,7 +169,7 @@ def test_heights_come_from_a_simulation_or_a_result():
     assert by_truth.process["heights"] != plain.process["heights"]
 
 
-def test_without_a_gain_there_is_no_zenith_and_a_line_says_why():
+def test_without_a_gain_there_is_no_zenith_and_a_line_states_the_reason():
     turn(zenith_gain=None)
     result, ended = reconstruct()
     assert ended.said == "turn.h5: no zenith: the recording has no zenith gain; give --zenith-gain\n"

@@ -70,7 +70,7 @@ def folder(monkeypatch):
 
 
 @pytest.mark.parametrize("place", ["mine_of_a_test", "mine_of_a_test.py"])
-def test_the_maps_are_written_and_told_in_a_line(place):
+def test_the_maps_are_written_and_printed_in_a_line(place):
     ended = run("run", f"{place}:Light", "press.h5", "--level", "50", "--memory", "100B")
     source = sphere()
     frames = source.read(np.empty(source.shape, source.dtype)).frames

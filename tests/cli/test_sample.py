@@ -60,7 +60,7 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
     refused("cannot be created", "sample pictures -o", tmp_path / "none" / "frames")
 
 
-def test_a_name_that_is_no_video_is_refused_in_one_line(tmp_path, capfd):
+def test_a_name_that_is_not_a_video_is_refused_in_one_line(tmp_path, capfd):
     refused("ends in .avi", "sample video -o", tmp_path / "press.txt")
     assert capfd.readouterr().err == ""  # nor does OpenCV print anything
 

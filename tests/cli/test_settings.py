@@ -227,7 +227,7 @@ def test_a_tilt_may_be_estimated(settings):
         ("stack", "travel_step = '1mm'", "travel_step is not known: did you mean travel-step?"),
     ],
 )
-def test_what_cannot_be_used_is_told_with_file_table_and_key(settings, table, line, said):
+def test_what_cannot_be_used_is_reported_with_file_table_and_key(settings, table, line, said):
     with pytest.raises(io.InputError) as refused:
         settings(f"[{table}]\n{line}\n")
     assert str(refused.value).startswith(f"b.toml: {table}.{said}")
@@ -273,7 +273,7 @@ class Band(engine.Operation):
         ),
     ],
 )
-def test_a_file_that_makes_no_sense_is_told(settings, text, said):
+def test_a_file_that_makes_no_sense_is_reported(settings, text, said):
     Path("mine.py").write_text(BAND)
     with pytest.raises(io.InputError) as refused:
         settings(text)

@@ -90,7 +90,7 @@ def test_a_body_rocks_or_spirals_as_it_is_told():
 
 
 @pytest.mark.parametrize("contact", ["conform", "elastic"])
-def test_an_object_lies_where_it_is_shifted_to(contact):
+def test_an_object_is_where_it_is_shifted_to(contact):
     words = ["--frames", "2", "--press", "1mm", "--contact", contact, *EXACT]
     centred, shifted = (
         simulate("horizontal", *words, *more)[1].truth for more in ([], ["--object-shift=1.2mm,-0.8mm"])
@@ -419,7 +419,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_what_cannot_be_is_refused_in_one_line(case):
+def test_impossible_input_is_refused_in_one_line(case):
     points("points.obj")
     wall("wall.obj")
     wide("wide.npy")
@@ -435,7 +435,7 @@ def test_a_refusal_leaves_the_recording_that_was_there():
     refused("tilt", "simulate axial", *SMALL, "--tilt", "0deg", "-o", "a.h5", "--overwrite")
 
 
-def test_an_input_is_not_overwritten_but_a_name_is_no_input():
+def test_an_input_is_not_overwritten_but_a_name_is_not_an_input():
     picture("wall.png")
     refused("is the input", "simulate vertical", *WALL, "--pattern", "wall.png", "-o", "wall.png")
     Path("sphere").mkdir()
@@ -495,7 +495,7 @@ def test_a_picture_can_stand_round_the_body():
         assert np.median(half[part][lit] > 120) == light
 
 
-def test_a_linear_pattern_tells_the_zenith_in_the_header():
+def test_a_linear_pattern_writes_the_zenith_to_the_header():
     found, recording = simulate("axial", "--pattern", "linear", "--frames", "2", "--dtype", "float32", *CLEAR)
     header, truth = recording.header, recording.truth
     # Between the zeniths that show the wall's rim and the horizon, counts go from dark to bright.
@@ -536,7 +536,7 @@ def test_frames_are_packed_as_asked(packing):
 
 
 @pytest.mark.parametrize("motion", ["horizontal", "twist"])
-def test_slides_and_twists_tell_their_motion_and_press(motion):
+def test_slides_and_twists_report_their_motion_and_press(motion):
     assert run("simulate", motion, *SMALL, "--frames", "3", *EXACT, "-o", "a.h5").code == 0
     facts = done("info a.h5")
     assert re.search(rf"motion +{motion}\n", facts.out)

@@ -124,7 +124,7 @@ def stuck_within(radius, truth):
     )
 
 
-def test_a_score_tells_the_radius_of_what_sticks_found_and_true(slide):
+def test_a_score_prints_the_true_and_found_radius_of_sticking(slide):
     with io.open_recording(slide) as recording:
         truth = recording.truth
     score = engine.score(stuck_within(0.7, truth), truth)
@@ -147,7 +147,7 @@ def test_slip_without_a_truth_of_it_is_left_out_or_refused_where_there_is_nothin
         engine.score(stuck_within(0.5, truth), bare)
 
 
-def test_only_the_last_displacement_is_told_unless_all_are_wanted(slide, contact, found):
+def test_only_the_last_displacement_is_reported_unless_all_are_wanted(slide, contact, found):
     target = slide.with_name("last.h5")
     assert run("reconstruct", slide, "--contact", contact, "-o", target).code == 0
     np.testing.assert_array_equal(io.open_result(target).displacement, found.displacement[-1])
@@ -198,17 +198,17 @@ def test_a_batch_takes_slides(slide, tmp_path):
         (["--frames", "0:2"], "at least 3"),
     ],
 )
-def test_what_says_nothing_of_a_slide_is_refused_in_a_line(slide, words, told):
+def test_what_contains_nothing_about_a_slide_is_refused_in_a_line(slide, words, told):
     refused(told, "reconstruct", slide, *words)
 
 
-def test_a_contact_that_is_only_estimated_is_told(slide, tmp_path):
+def test_a_contact_that_is_only_estimated_is_reported(slide, tmp_path):
     ended = done("reconstruct", slide, "-o", tmp_path / "found.h5")
     assert "contact is estimated" in ended.said
     assert "--contact" in ended.said
 
 
-def test_a_contact_by_the_light_of_a_press_is_told(slide, tmp_path):
+def test_a_contact_by_the_light_of_a_press_is_reported(slide, tmp_path):
     height = np.full((64, 64), np.nan, np.float32)
     height[20:40, 20:40] = 0
     io.save_result(io.Result(height=height), tmp_path / "press.h5")
@@ -241,13 +241,13 @@ def test_a_contact_of_no_use_is_refused_by_the_name_of_its_file(slide, tmp_path,
         (["--displacement-step", "0mm,0mm"], "the body does not move in these frames: take some"),
     ],
 )
-def test_frames_that_tell_no_slip_are_refused_by_the_name_of_their_file(tmp_path, words, told):
+def test_frames_that_show_no_slip_are_refused_by_the_name_of_their_file(tmp_path, words, told):
     path = simulate("horizontal", tmp_path, "--frames", 4, *words)
     said = refused(f"{path}: ", "reconstruct", path)
     assert told in said
 
 
-def test_a_press_that_knows_its_pressure_tells_contact_by_that(slide):
+def test_a_press_that_knows_its_pressure_determines_contact_from_it(slide):
     touched = np.zeros((64, 64), bool)
     touched[20:40, 20:40] = True
     press = io.Result(height=np.zeros((64, 64), np.float32), pressure=touched.astype(np.float32))

@@ -46,7 +46,7 @@ def test_a_full_disk_for_output_is_one_line(recording, words, unbuffered):
 
 
 @UNBUFFERED
-def test_a_reader_that_ends_early_is_no_error_to_report(recording, unbuffered):
+def test_a_reader_that_ends_early_is_not_an_error_to_report(recording, unbuffered):
     # The reader is gone before anything is written: it holds no end of the pipe.
     line = f"exec 3> >(exec true); wait $!; $M info {recording} >&3"
     assert shell(line, unbuffered) == (1, "")

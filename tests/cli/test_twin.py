@@ -98,7 +98,7 @@ def test_what_cannot_be_served_is_refused(words: tuple[str, ...], told: str, tmp
 
 
 @pytest.mark.parametrize("background", [(), ("--background",)])
-def test_someone_elses_rig_file_is_kept(background: tuple[str, ...], terminal: Terminal) -> None:
+def test_another_users_rig_file_is_kept(background: tuple[str, ...], terminal: Terminal) -> None:
     (terminal.folder / "rig").mkdir()
     path = terminal.folder / "rig" / "rig.toml"
     path.write_text("# mine\n")

@@ -33,7 +33,7 @@ def made(result):
     return sorted(str(one.relative_to(result.parent)) for one in result.parent.rglob("*.png"))
 
 
-def test_without_a_screen_a_picture_lies_beside_the_result(result):
+def test_without_a_screen_a_picture_is_next_to_the_result(result):
     done = view(result, "--map", "status")
     assert done.exit_code == 0, done.output
     assert "no screen" in done.stderr
@@ -105,7 +105,7 @@ def test_of_turns_one_is_chosen_and_a_picture_s_ending_may_be_in_capitals(result
         (["--turn", "0"], "leave --turn out"),
     ],
 )
-def test_what_cannot_be_is_one_clear_line(result, monkeypatch, words, told):
+def test_impossible_input_is_one_clear_line(result, monkeypatch, words, told):
     monkeypatch.chdir(result.parent)
     before = result.read_bytes()
     done = view(result, *(word.format(result) for word in words))

@@ -70,7 +70,7 @@ def test_a_pattern_does_not_look_into_stores(bucket):
     )  # fmt: skip
 
 
-def test_nothing_is_exported_beside_a_store_that_is_there(bucket):
+def test_nothing_is_exported_next_to_a_store_that_is_there(bucket):
     for words in (("reconstruct", "press.h5"), ("export", "press-result.h5", "-o", "taken.zarr")):
         assert run(*words).code == 0
     ended = run("export press-result.h5 -o a.ply -o taken.zarr")
@@ -114,7 +114,7 @@ def test_import_makes_hdf5_of_an_address(bucket):
         (("batch", "memory://bucket/x*", "-o", "r"), "memory://bucket/x*: no store matches"),
     ],
 )
-def test_what_cannot_be_is_one_line_with_its_address(bucket, words, said):
+def test_impossible_input_is_one_line_with_its_address(bucket, words, said):
     refused(said, *words)
 
 

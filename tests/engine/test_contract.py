@@ -247,7 +247,7 @@ LIVE = ["live Strokes", "live LastTurn", "live MovingNormals", "live Slip"]
 
 
 @pytest.mark.parametrize("name", [*ONCE.args[1], *LIVE])
-def test_each_answer_beside_pushes_is_that_of_a_single_thread(name):
+def test_each_answer_next_to_pushes_is_that_of_a_single_thread(name):
     case = CASES[name.removeprefix("live ")]
     slow = case.kind.__name__ in ("Slip", "LastTurn")
 

@@ -330,12 +330,12 @@ def test_slopes_and_normals_at_once_are_refused(device):
         engine.integrate(*slopes, 0.1, normals=ours(device, NORMALS))
 
 
-def test_a_slope_on_the_host_beside_one_on_the_device_is_refused(device):
+def test_a_slope_on_the_host_next_to_one_on_the_device_is_refused(device):
     with pytest.raises(io.InputError, match="two maps of slopes"):
         engine.integrate(ours(device, SLOPES[0]), SLOPES[1], 0.1)
 
 
-def test_frames_without_room_for_maps_beside_them_are_refused(card, monkeypatch):
+def test_frames_without_room_for_maps_next_to_them_are_refused(card, monkeypatch):
     frames = ours(card, PRESS)
     monkeypatch.setattr(card, "max_allocation", 4 * PRESS[0].size)
     with pytest.raises(

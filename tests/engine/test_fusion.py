@@ -219,7 +219,7 @@ def test_heights_near_normals_go_on_smoothly():
     assert (surface.component == 0).all()
 
 
-def test_terraces_tell_more_than_their_standard_deviations_say():
+def test_terraces_contain_more_information_than_their_standard_deviations():
     true, normals = plane(0.11, 0.07, (40, 40))
     step = 0.1
     terraces = (np.floor(true / step) + 0.5) * step
@@ -251,7 +251,7 @@ def terraced(step=0.1):
     return true, normals, terraces, np.full(true.shape, step / np.sqrt(12), np.float32)
 
 
-def test_heights_beside_the_normals_do_not_say_where_the_surface_is():
+def test_heights_next_to_the_normals_do_not_say_where_the_surface_is():
     true, normals, terraces, sigma = terraced()
     contact = np.ones(true.shape)
     contact[:, 54:] = 0

@@ -66,6 +66,6 @@ def test_a_whole_run_shows_how_far_the_body_has_come():
     ("given", "told"),
     [(source("vertical"), "Sliding needs horizontal or twist"), (source(pixel_size=None), "pixel size")],
 )
-def test_what_tells_no_slip_is_refused(given, told):
+def test_what_shows_no_slip_is_refused(given, told):
     with pytest.raises(InputError, match=told):
         LiveOperation(given, Sliding())

@@ -117,7 +117,7 @@ def test_a_window_that_is_not_full_has_no_normals():
         operation.result()
 
 
-def test_phases_that_tell_nothing_are_refused():
+def test_phases_that_contain_no_information_are_refused():
     operation = make(noise=1.0)
     push(operation, turn_frames(SHAPE), [21], np.zeros(21))
     with pytest.raises(InputError, match="8 frames at 1 phase do not determine"):

@@ -214,7 +214,7 @@ def pushing(push):
         ),
     ],
 )
-def test_what_is_no_operation_is_refused_in_a_line(operation, line):
+def test_what_is_not_an_operation_is_refused_in_a_line(operation, line):
     with pytest.raises(io.InputError, match=line) as refusal:
         engine.run(stack(), operation)
     assert "\n" not in str(refusal.value)
@@ -229,7 +229,7 @@ def test_what_is_no_operation_is_refused_in_a_line(operation, line):
         ({"factor": np.nan}, "factor nan: a number in mm"),
     ],
 )
-def test_options_that_cannot_be_are_refused_in_a_line(options, line):
+def test_impossible_options_are_refused_in_a_line(options, line):
     with pytest.raises(io.InputError, match=line):
         Moments(**options)
 
@@ -362,7 +362,7 @@ def number(default=1.0, **settings):
         ),
     ],
 )
-def test_a_class_that_cannot_be_is_refused_where_it_is_defined(attributes, line):
+def test_an_impossible_class_is_refused_where_it_is_defined(attributes, line):
     with pytest.raises(io.InputError, match=line) as caught:
         declared(**attributes())
     assert "\n" not in str(caught.value)
@@ -405,7 +405,7 @@ def test_it_is_shown_with_the_options_that_are_given():
         ({"light": np.zeros((5, 7)), "program": "mine"}, "returns program, which has a meaning already"),
     ],
 )
-def test_results_that_cannot_be_are_refused_in_a_line(returned, line):
+def test_impossible_results_are_refused_in_a_line(returned, line):
     own = declared(result=lambda self: returned, level=number())
     with pytest.raises(io.InputError, match=line) as caught:
         engine.run(FRAMES, own)

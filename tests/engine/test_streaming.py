@@ -79,7 +79,7 @@ def test_frames_that_a_source_lends_are_pushed_where_they_lie(device, longest):
         assert told == ([1, 2, 5, 8, 9, 10] if longest == 3 else [1, 2, 9, 10])
 
 
-def test_a_source_that_ends_early_is_no_error(device):
+def test_a_source_that_ends_early_is_not_an_error(device):
     keeper = Keeper(device, 4)
     feed(Source(6), keeper, range(9))
     assert keeper.seen == list(range(6))

@@ -20,7 +20,7 @@ def slopes(number):
     return (0.01 * number * np.ones(SHAPE), np.linspace(0, 0.02 * number, SHAPE[1]) * np.ones(SHAPE))
 
 
-def test_results_beside_pushes_are_those_of_a_single_thread():
+def test_results_next_to_pushes_are_those_of_a_single_thread():
     """Of an integrator; operations have a contract."""
     alone, shared, done = engine.Integrator(SHAPE, 0.1), engine.Integrator(SHAPE, 0.1), threading.Event()
     known = set()

@@ -71,7 +71,7 @@ def test_levels_grow_with_the_bits(dtype: str, bits: int | None, levels: tuple[f
         ({"distance": 0}, "distance 0"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(values: dict[str, Any], words: str) -> None:
+def test_impossible_input_is_refused_in_one_line(values: dict[str, Any], words: str) -> None:
     with pytest.raises(InputError, match=words) as refused:
         make_camera(**values)
     assert "\n" not in str(refused.value)

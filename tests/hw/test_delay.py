@@ -59,7 +59,7 @@ def test_frames_that_are_late_in_turn_make_the_delay_as_uncertain():
         assert least <= error < most
 
 
-def test_frames_of_a_camera_that_keeps_time_lie_on_a_line():
+def test_frames_of_a_camera_that_keeps_time_are_on_a_line():
     even = np.arange(300) / 60
     arrival = even + 0.003 * np.random.default_rng(3).standard_normal(len(even))
     times, _ = frame_times(np.arange(300), arrival)

@@ -145,7 +145,7 @@ def test_a_flexible_stage_takes_its_share_of_the_travel() -> None:
     assert found.force == pytest.approx(hertz.force, rel=0.002)
 
 
-def test_a_press_that_does_not_come_to_rest_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_press_that_does_not_come_to_rest_reports_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(elastic, "ITERATIONS", 3)
     with pytest.raises(RuntimeError, match="did not converge in 3 iterations"):
         press(space((40, 40), (0.1, 0.1)), rough((40, 40)))

@@ -137,14 +137,14 @@ def test_a_program_leads_to_its_place(lines: list[str], place: tuple[float, floa
     assert bench.place() == pytest.approx(place, abs=1e-9)
 
 
-def test_settings_and_build_are_told() -> None:
+def test_settings_and_build_are_reported() -> None:
     lines = Bench({110: 1234.5, 27: 0.5}).send("$$")
     assert lines[-1] == "ok"
     assert {"$110=1234.500", "$27=0.5", "$13=0", "$132=200.000"} < set(lines)
     assert Bench().send("$I") == ["[VER:1.1h.20190830:]", "[OPT:V,15,128]", "ok"]
 
 
-def test_a_report_tells_state_place_speed_and_now_and_then_the_offset() -> None:
+def test_a_report_contains_state_place_speed_and_now_and_then_the_offset() -> None:
     bench = Bench()
     bench.send("G1X30F600")
     bench.wait(0.5)
@@ -196,7 +196,7 @@ def test_only_a_host_that_counts_characters_loses_nothing(counts: bool) -> None:
 
 
 @pytest.mark.parametrize(("distance", "speed"), [(10.0, 20.0), (0.5, 20.0), (-7.0, 5.0), (0.001, 20.0)])
-def test_a_line_goes_by_its_trapezoid(distance: float, speed: float) -> None:
+def test_a_line_depends_on_its_trapezoid(distance: float, speed: float) -> None:
     bench = Bench()
     bench.send(f"G1X{distance}F{speed * 60}")
     begin, size = bench.now - 0.0005, abs(distance)
@@ -362,7 +362,7 @@ def test_a_reset_in_a_move_stops_dead_and_locks() -> None:
     assert bench.place() == pytest.approx((place[0] + 1, 0, 0))
 
 
-def test_a_reset_at_rest_or_held_is_no_alarm() -> None:
+def test_a_reset_at_rest_or_held_is_not_an_alarm() -> None:
     bench = Bench()
     bench.write("\x18")
     assert bench.hear() == BANNER

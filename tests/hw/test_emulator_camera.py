@@ -185,7 +185,7 @@ def test_a_stalled_camera_says_nothing(running) -> None:
     assert camera.error is None
 
 
-def test_a_lost_camera_tells_readers(running) -> None:
+def test_a_lost_camera_is_reported_to_readers(running) -> None:
     camera = running(still)
     take(camera, 2)
     camera.lose()
@@ -195,7 +195,7 @@ def test_a_lost_camera_tells_readers(running) -> None:
 
 
 @pytest.mark.parametrize("given", [{"delay": -0.1}, {"jitter": math.nan}])
-def test_what_cannot_be_is_refused(given: dict[str, float]) -> None:
+def test_impossible_input_is_refused(given: dict[str, float]) -> None:
     with pytest.raises(InputError, match=f"^{next(iter(given))} .* is not possible"):
         TwinCamera(make_twin(MOVEMENTS["press"]), still, **given)
 

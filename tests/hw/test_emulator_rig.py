@@ -137,7 +137,7 @@ def test_a_rig_that_homes_is_locked_until_it_has_and_knows_its_place_then(runnin
 
 
 @pytest.mark.parametrize("home", [False, True])
-def test_all_places_that_the_settings_allow_lie_on_the_axes(running, home: bool) -> None:
+def test_all_places_that_the_settings_allow_are_on_the_axes(running, home: bool) -> None:
     rig = running(home=home)
     stage = rig.settings.stage
     assert stage.port == rig.port.url

@@ -158,7 +158,7 @@ def test_a_body_that_stands_still_does_not_slip() -> None:
     np.testing.assert_array_equal(contact.traction, held)
 
 
-def test_a_step_that_does_not_settle_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_that_does_not_settle_reports_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(friction, "ITERATIONS", 2)
     with pytest.raises(RuntimeError, match="did not converge in 2 iterations"):
         Friction(SPACE, BALL, MU).move(push(0.5 * FAR))

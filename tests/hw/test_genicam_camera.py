@@ -181,7 +181,7 @@ def test_a_camera_that_is_lost_comes_back_and_its_numbers_go_on(served, monkeypa
     assert camera.counts.dropped == missing
 
 
-def test_without_the_library_the_remedy_is_told(monkeypatch) -> None:
+def test_without_the_library_the_remedy_is_reported(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "gi", None)
     with pytest.raises(
         InputError, match=r"need Aravis, which is not installed .*pip install 'mirrorskin\[genicam\]'$"

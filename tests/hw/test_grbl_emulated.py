@@ -95,7 +95,7 @@ def test_a_stage_that_was_homed_knows_its_place_at_once_and_goes_on(clock):
         assert rig.where(clock.now()).travel == pytest.approx(0, abs=0.01)
 
 
-def test_reports_tell_where_the_machine_was(bench):
+def test_reports_state_where_the_machine_was(bench):
     begun, speed = bench.clock.now(), 4.0
     bench.stage.move(Position(2.0), speed)
     bench.stage.wait()

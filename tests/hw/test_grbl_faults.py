@@ -116,7 +116,7 @@ def _jump(*place):
         (_jump(34, 44, 10), "beyond the limits"),
     ],
 )
-def test_what_happens_in_motion_is_told(moving, fault, told):
+def test_what_happens_in_motion_is_reported(moving, fault, told):
     stage, port = moving
     fault(port)
     assert told in failure(stage)
@@ -147,7 +147,7 @@ def test_homing_may_end_beyond_the_limits(opened, clock):
     stage.wait()
 
 
-def test_a_stage_that_rests_elsewhere_than_it_was_sent_says_so(opened):
+def test_a_stage_that_rests_elsewhere_than_it_was_sent_reports_it(opened):
     stage, port = opened()
     port.on_move = lambda: port.plan.__setitem__(-1, ([30.0, 40.0, 8.0], 0.1))
     stage.move(Position(1.0), 10.0)
@@ -182,7 +182,7 @@ def test_a_refused_move_stops_the_stage(opened):
     assert port.held_at
 
 
-def test_an_answer_that_was_lost_is_told(opened):
+def test_an_answer_that_was_lost_is_reported(opened):
     stage, port = opened()
     port.run = lambda line: port.say("o")
     with pytest.raises(HardwareError, match="has not answered"):

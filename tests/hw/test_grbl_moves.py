@@ -119,7 +119,7 @@ def test_without_a_speed_the_slowest_axis_sets_the_time():
         (Position(1), math.inf, "positive"),
     ],
 )
-def test_a_speed_that_cannot_be_is_refused(place, speed, told):
+def test_an_impossible_speed_is_refused(place, speed, told):
     rig = axes()
     rig.limit("pitch", math.degrees(0.1) if place.travel else 1e9)
     with pytest.raises(InputError, match=f"^rig: .*{told}"):
@@ -173,7 +173,7 @@ def test_every_line_of_a_precession_fits_a_line_of_the_controller():
         (math.radians(0.01), 1.0, 0.1, "too slow for the controller"),
     ],
 )
-def test_a_precession_that_cannot_be_is_refused(tilt, turns, rate, told):
+def test_an_impossible_precession_is_refused(tilt, turns, rate, told):
     with pytest.raises(InputError, match=f"^rig: .*{told}"):
         axes().arcs(tilt, turns, rate, 0.0, NONE)
 

@@ -49,7 +49,7 @@ def test_each_reply_is_read(line, reply):
         (b"Grbl 3.7 [FluidNC v3.7.8 (wifi) '$' for help]", (3, 7)),
     ],
 )
-def test_the_banner_tells_the_version(line, version):
+def test_the_banner_contains_the_version(line, version):
     banner = parse(line)
     assert isinstance(banner, Banner)
     assert banner.version == version

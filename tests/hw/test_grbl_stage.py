@@ -16,7 +16,7 @@ DOWN = TravelAxis(letter="Z", direction=-1, zero=-5.0, limits=(-5.0, 3.0), speed
 LEAN = math.radians(2.5)
 
 
-def test_it_tells_where_it_is_and_who_it_is(opened, clock):
+def test_it_reports_its_position_and_identity(opened, clock):
     stage, _ = opened(ScriptedGrbl(clock, place=(31.0, 40.0, 9.0)))
     report = stage.report()
     assert report.state == "idle"
@@ -119,7 +119,7 @@ def test_a_slow_axis_has_longer_for_its_hold(opened, clock):
     assert stage._link.stopping.holding == pytest.approx(1.25)
 
 
-def test_reports_tell_of_the_time_when_they_were_so(opened, clock):
+def test_reports_are_valid_for_their_time(opened, clock):
     stage, _ = opened()
     begun = clock.now()
     stage.move(Position(2.0), 5.0)
@@ -208,7 +208,7 @@ def test_an_axis_that_the_controller_has_not_is_refused(opened, clock):
     assert port.closed
 
 
-def test_closing_twice_and_stopping_after_is_no_error(opened):
+def test_closing_twice_and_stopping_after_is_not_an_error(opened):
     stage, _ = opened()
     stage.close()
     stage.close()

@@ -13,7 +13,7 @@ def answered(watch, asked, trip):
     return watch.answer(asked + trip)
 
 
-def test_an_answer_tells_of_the_middle_between_question_and_answer():
+def test_an_answer_is_valid_for_the_middle_between_question_and_answer():
     watch = ReportTimes(0.05)
     assert watch.due(10.0)
     watch.ask(10.0)

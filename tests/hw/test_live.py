@@ -39,7 +39,7 @@ def test_frames_come_at_the_set_rate_and_are_the_twins() -> None:
     np.testing.assert_array_equal(frames, all_frames())
 
 
-def test_a_late_reader_loses_the_oldest_frames_and_is_told() -> None:
+def test_a_late_reader_loses_the_oldest_frames_and_is_reported() -> None:
     live, clock = make_live()
     live.read()
     clock.sleep(20 / RATE)
@@ -67,7 +67,7 @@ def test_time_does_not_run_back() -> None:
 
 
 @pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_rate_that_cannot_be_is_refused(rate: float) -> None:
+def test_an_impossible_rate_is_refused(rate: float) -> None:
     with pytest.raises(InputError, match="frames per second"):
         make_live(rate)
 

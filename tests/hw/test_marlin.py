@@ -163,7 +163,7 @@ def test_a_place_that_the_controller_clips_is_noticed(stage, line):
         ({"M503": "nothing\nok", "G90": "Error:checksum mismatch"}, "answers G90 with 'Error:checksum"),
     ],
 )
-def test_what_is_no_stage_is_refused(line, clock, instead, message):
+def test_what_is_not_a_stage_is_refused(line, clock, instead, message):
     line.instead = instead
     with pytest.raises(io.InputError, match=message):
         MarlinStage(STAGE, line, clock=clock)

@@ -61,7 +61,7 @@ def test_a_box_is_level_within_its_sides(
 
 
 @pytest.mark.parametrize("shape", [(240, 240), (241, 239)])
-def test_a_ball_of_triangles_lies_between_its_inner_and_outer_sphere(
+def test_a_ball_of_triangles_is_between_its_inner_and_outer_sphere(
     tmp_path: Path, shape: tuple[int, int]
 ) -> None:
     ball = trimesh.creation.icosphere(subdivisions=5, radius=5.0)
@@ -134,7 +134,7 @@ def test_metres_and_micrometres_are_refused(
     refused(save(tmp_path / "box.stl", box(size, (0, 0, 0))), words)
 
 
-def test_a_cloud_of_points_is_no_surface(tmp_path: Path) -> None:
+def test_a_cloud_of_points_is_not_a_surface(tmp_path: Path) -> None:
     path = tmp_path / "cloud.ply"
     trimesh.PointCloud(np.random.default_rng(5).uniform(size=(20, 3))).export(path)
     refused(path, "contains no triangles")
@@ -183,7 +183,7 @@ def test_a_missing_file_and_a_folder(tmp_path: Path) -> None:
     refused(tmp_path / "folder.ply", "directory")
 
 
-def test_without_trimesh_the_remedy_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_trimesh_the_remedy_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = save(tmp_path / "box.stl", box((1, 1, 1), (0, 0, 0)))
     monkeypatch.setitem(sys.modules, "trimesh", None)
     refused(path, r"pip install 'mirrorskin\[mesh\]'")

@@ -79,7 +79,7 @@ def test_a_picture_is_shared_out_over_the_wall() -> None:
         (np.array([[0.5, np.nan]]), "is 0 to 1"),
     ],
 )
-def test_what_is_no_picture_is_refused(values: np.ndarray, problem: str) -> None:
+def test_what_is_not_a_picture_is_refused(values: np.ndarray, problem: str) -> None:
     with pytest.raises(InputError, match=problem):
         Picture(values)
 
@@ -159,7 +159,7 @@ def test_the_ideal_light_is_exactly_linear_over_the_design_range() -> None:
         (Body(asymmetry=0.1), LINEAR, "lamps"),
     ],
 )
-def test_what_is_no_function_of_zenith_is_not_ideal(body: Body, pattern: Pattern, problem: str) -> None:
+def test_what_is_not_a_function_of_zenith_is_not_ideal(body: Body, pattern: Pattern, problem: str) -> None:
     with pytest.raises(InputError, match=f"{problem}.*use the optics 'cylinder'"):
         Ideal(body, pattern)
 

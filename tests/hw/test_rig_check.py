@@ -163,7 +163,7 @@ def test_limits_that_the_controller_s_soft_limits_cut_are_warned_of(zero, soft, 
     assert found.verdict == verdict, found
 
 
-def test_what_the_controller_does_not_tell_is_no_fault():
+def test_what_the_controller_does_not_report_is_not_a_fault():
     found = look(Stage(parameters={22: 1.0}))
     assert {one.verdict for one in found.values()} == {"ok"}
     assert found["roll: limits against $131"].found == "-5 to 4 deg, unknown in the controller"
@@ -190,7 +190,7 @@ def test_an_alarm_is_a_fault_unless_homing_ends_it():
     assert look(Stage(state="door"))["state"].verdict == "failed"
 
 
-def test_slow_and_missing_reports_are_told():
+def test_slow_and_missing_reports_are_reported():
     found = look(Stage(every=0.1))["reports"]
     assert (found.verdict, found.found) == ("warning", "10.0 Hz, requested 20 Hz")
     assert "set stage.report_rate = 10" in found.remedy
@@ -292,14 +292,14 @@ def test_a_slow_camera_that_is_on_time_asks_for_nothing():
     assert film(Camera(every=0.08, rate=12.5))["longest wait for a frame"].verdict == "ok"
 
 
-def test_lost_frames_and_reconnections_are_told():
+def test_lost_frames_and_reconnections_are_reported():
     assert film(Camera(lost=3))["frames"].verdict == "warning"
     assert " 3 lost" in film(Camera(lost=3))["frames"].found
     assert film(Camera(reconnects=1))["frames"].verdict == "warning"
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_too_much_light_is_told(dtype):
+def test_too_much_light_is_reported(dtype):
     picture = np.arange(35, dtype=dtype).reshape(5, 7)
     picture[0, 0] = np.iinfo(dtype).max
     found = film(Camera(picture))["brightness"]
@@ -366,7 +366,7 @@ def test_the_stage_is_closed_when_nobody_wants_to_know_more():
     assert stage.did == ["close"]
 
 
-def test_a_stage_that_is_lost_while_the_camera_is_looked_at_is_told():
+def test_a_stage_that_is_lost_while_the_camera_is_looked_at_is_reported():
     class Unplugged(Camera):
         def close(self):
             super().close()
@@ -411,7 +411,7 @@ def test_nothing_is_moved_where_something_failed():
 @pytest.mark.parametrize(
     ("pitch", "roll", "verdict"), [("Y", "X", "ok"), ("X", "A", "warning"), ("A", "B", "warning")]
 )
-def test_axes_that_have_no_arcs_are_told(pitch, roll, verdict):
+def test_axes_that_have_no_arcs_are_reported(pitch, roll, verdict):
     settings = structs.replace(
         STAGE, pitch=TiltAxis(letter=pitch, **TILT), roll=TiltAxis(letter=roll, **TILT)
     )

@@ -196,7 +196,7 @@ def test_one_pixel_size_is_of_both_sides(rig):
     assert rig(LEAST + "pixel_size = 0.25").camera.pixel_sides == (0.25, 0.25)
 
 
-def test_a_source_beside_the_rig_file_is_found_from_anywhere(tmp_path, monkeypatch):
+def test_a_source_next_to_the_rig_file_is_found_from_anywhere(tmp_path, monkeypatch):
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "film.avi").touch()
     text = LEAST.replace("source = 0", 'source = "film.avi"')
@@ -330,7 +330,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("line", "wrong", "said"), WRONG, ids=[f"{row[0]}-{row[1]}"[:60] for row in WRONG])
-def test_what_cannot_be_is_refused_with_its_key(refusal, line, wrong, said):
+def test_impossible_input_is_refused_with_its_key(refusal, line, wrong, said):
     assert EVERYTHING.count(line) == 1
     assert refusal(EVERYTHING.replace(line, wrong)).startswith(f"r.toml: {said}")
 
@@ -343,13 +343,13 @@ def test_pitch_without_roll_is_refused_and_roll_without_pitch(refusal):
 
 
 @pytest.mark.parametrize("table", ["stage", "camera", "stage.travel"])
-def test_a_missing_table_is_told(refusal, table):
+def test_a_missing_table_is_reported(refusal, table):
     tables = re.split(r"(?=\n\[)", LEAST)
     left = "".join(one for one in tables if not one.startswith(f"\n[{table}"))
     assert f"{table} is missing: add table [{table}]" in refusal(left)
 
 
-def test_what_is_no_table_or_no_toml_is_told(refusal, tmp_path):
+def test_what_is_no_table_or_no_toml_is_reported(refusal, tmp_path):
     assert ": write [stage] alone in a line, and its keys below" in refusal("stage = 5")
     assert re.match(r"r\.toml is not TOML: .*line 3", refusal(LEAST.replace('"COM3"', '"COM3')))
     with pytest.raises(InputError, match=r"cannot be read: No such file.* 'mirrorskin rig new'"):
@@ -374,7 +374,7 @@ PICTURE = np.arange(100, 112, dtype=np.uint8).reshape(3, 4)
 
 
 @pytest.mark.parametrize("name", ["b.npy", "b.png", "B.TIFF"])
-def test_a_reference_beside_the_rig_file_is_read(rig, tmp_path, name):
+def test_a_reference_next_to_the_rig_file_is_read(rig, tmp_path, name):
     save(tmp_path / name, PICTURE)
     camera = rig(with_reference(name)).camera
     assert camera.bright == name

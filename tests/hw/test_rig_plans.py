@@ -67,7 +67,7 @@ def test_strokes_go_down_and_up_between_two_depths():
 
 
 @pytest.mark.parametrize("strokes", [0, 10_001])
-def test_strokes_that_cannot_be_are_refused(strokes):
+def test_impossible_strokes_are_refused(strokes):
     with pytest.raises(InputError, match="strokes are not possible"):
         VerticalPlan(0.0, 1.0, step=0.5, strokes=strokes)
 
@@ -164,7 +164,7 @@ def test_a_plan_beyond_the_limits_is_refused(plan, limit):
         (0, 1, 1e-9, None),
     ],
 )
-def test_a_press_that_cannot_be_is_refused(values):
+def test_an_impossible_press_is_refused(values):
     with pytest.raises(InputError):
         VerticalPlan(*values)
 
@@ -186,7 +186,7 @@ def test_a_press_that_cannot_be_is_refused(values):
         (1, 0.04, 1, 1e-9, None),
     ],
 )
-def test_a_rotation_that_cannot_be_is_refused(values):
+def test_an_impossible_rotation_is_refused(values):
     with pytest.raises(InputError):
         AxialPlan(*values)
 

@@ -117,7 +117,7 @@ def test_each_frame_of_a_stepwise_slide_or_twist_shows_where_it_tells(plan, colu
     assert places[-2:] == [replace(end, travel=-5.0), Position(-5.0)], "up first, and back above the object"
 
 
-def test_a_rocking_body_tells_its_tilts_and_goes_back_upright():
+def test_a_rocking_body_reports_its_tilts_and_goes_back_upright():
     plan = RockPlan(0.5, TILT, math.pi / 2, step=TILT)
     with make_rig() as rig:
         with StepScan(rig, plan, settle=0.0) as scan:
@@ -215,7 +215,7 @@ def test_a_delay_that_nobody_told_and_that_of_a_stream_are_measured(camera):
     assert "measured" in scan.remark
 
 
-def test_a_calibration_is_not_too_slow_for_grbl_and_without_a_picture_tells_the_remedy(monkeypatch):
+def test_a_calibration_is_not_too_slow_for_grbl_and_without_a_picture_names_the_remedy(monkeypatch):
     speeds = []
     with make_rig(lambda place: np.full(SHAPE, 9, np.uint8), 100.0, delay=0.0) as rig:
         rig.settings = settings(SHAPE, dark=5.0)

@@ -36,7 +36,7 @@ def take_all(ring: Ring) -> list[int]:
         numbers += frames.number.tolist()
 
 
-def test_frames_lie_side_by_side_in_the_rings_own_memory() -> None:
+def test_frames_are_side_by_side_in_the_rings_own_memory() -> None:
     ring = Ring(SHAPE, np.uint16, 20)
     place = ring.slot()
     assert place.ctypes.data % 4096 == 0

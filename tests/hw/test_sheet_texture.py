@@ -183,7 +183,7 @@ def read_all_left(twin: Twin) -> NDArray[np.float32]:
         ({"size": 0.09}, "a texture of 0.09 mm is too fine for pixels of 0.05 mm: use 2 pixels or more"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(changes: dict[str, Any], words: str) -> None:
+def test_impossible_input_is_refused_in_one_line(changes: dict[str, Any], words: str) -> None:
     with pytest.raises(InputError, match=words) as caught:
         make_twin(Vertical([1.0]), SheetTexture(**changes))
     assert "\n" not in str(caught.value)

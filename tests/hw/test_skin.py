@@ -79,7 +79,7 @@ def test_an_object_that_needs_too_many_points_is_told_what_to_do() -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_the_sheet_lies_on_the_object_in_contact_and_bulges_beside_it() -> None:
+def test_the_sheet_is_on_the_object_in_contact_and_bulges_next_to_it() -> None:
     # A ball of 20 mm, and a sheet without thickness. Hertz: contact to sqrt(10 mm x 0.6 mm).
     body, pose, shape, pixel = Body(sheet=0.0), pose_at_press(0.6), (100, 100), 0.08
     thing = Sphere(20.0)
@@ -190,7 +190,7 @@ def test_a_pinhole_camera_sees_where_its_lines_meet_the_sheet(distance: float) -
     assert (seen.contact != whole.contact).sum() > 10
 
 
-def test_the_field_lies_in_the_middle_of_the_grown_grid() -> None:
+def test_the_field_is_in_the_middle_of_the_grown_grid() -> None:
     shape, pixel = (12, 20), 0.3
     contact = elastic(Coin(), pose_at_press(1.7), shape, pixel)
     assert contact.space.shape != shape

@@ -28,7 +28,7 @@ def test_a_lean_has_a_half_angle_and_a_phase():
         Position(1, math.radians(3) * math.cos(1), math.radians(3) * math.sin(1)),
     ],
 )
-def test_what_lies_on_a_limit_is_within(place):
+def test_what_is_on_a_limit_is_within(place):
     LIMITS.check(place, "it")
 
 
@@ -45,7 +45,7 @@ def test_what_lies_on_a_limit_is_within(place):
         (Position(0, math.nan), "finite"),
     ],
 )
-def test_what_lies_beyond_a_limit_is_refused_by_its_name(place, limit):
+def test_what_is_beyond_a_limit_is_refused_by_its_name(place, limit):
     with pytest.raises(InputError, match=f"^rig: .*{limit}"):
         LIMITS.check(place, "rig")
 

@@ -83,7 +83,7 @@ def book(movement: Movement) -> list[poses.Pose]:
 # What it tells.
 
 
-def test_headers_tell_how_the_body_moves() -> None:
+def test_headers_contain_the_motion() -> None:
     for name in MOVEMENTS:
         twin = make_twin(name, pixel_size=(0.16, 0.2), dtype=np.uint8)
         header = twin.header
@@ -121,7 +121,7 @@ def test_exact_references_are_each_pixels_own() -> None:
 
 
 @pytest.mark.parametrize("name", MOVEMENTS)
-def test_blocks_tell_where_the_body_is(name: str) -> None:
+def test_blocks_contain_the_position(name: str) -> None:
     movement = MOVEMENTS[name]
     twin = make_twin(name)
     buffer = np.empty((3, *SHAPE), np.float32)
@@ -517,7 +517,7 @@ def test_a_seed_gives_one_recording_and_another_seed_another(device: Device, nam
         ({"contact": "elastic", "pixel_size": 0.001}, "points.*conform"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(changes: dict[str, Any], words: str) -> None:
+def test_impossible_input_is_refused_in_one_line(changes: dict[str, Any], words: str) -> None:
     given: dict[str, Any] = {"movement": Vertical([1.0]), **changes}
     with pytest.raises(InputError, match=words) as caught:
         make_twin(given.pop("movement"), **given)

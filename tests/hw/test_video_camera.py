@@ -236,7 +236,7 @@ def test_a_camera_is_given_what_is_asked_for(driver, open_camera, caplog) -> Non
     assert not caplog.records
 
 
-def test_what_a_camera_does_not_take_is_told(driver, open_camera, caplog) -> None:
+def test_what_a_camera_does_not_take_is_reported(driver, open_camera, caplog) -> None:
     driver.refuses = {cv2.CAP_PROP_FOURCC, cv2.CAP_PROP_EXPOSURE, cv2.CAP_PROP_GAIN, cv2.CAP_PROP_FPS}
     driver.values[cv2.CAP_PROP_FPS] = 30.0
     driver.values[cv2.CAP_PROP_FOURCC] = cv2.VideoWriter.fourcc(*"MJPG")

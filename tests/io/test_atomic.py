@@ -34,7 +34,7 @@ def test_a_file_has_its_name_only_when_it_is_whole(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
 
 
-def test_what_is_being_written_here_is_no_leftover(tmp_path):
+def test_what_is_being_written_here_is_not_a_leftover(tmp_path):
     with new_hdf5(tmp_path / "a.h5") as new:
         assert remove_leftovers(tmp_path) == []
         new.root["x"] = 1
@@ -126,5 +126,5 @@ def test_a_result_may_have_a_suffix_of_no_other_format(tmp_path, name):
     io.check_result_output(tmp_path / name)
 
 
-def test_a_file_that_is_no_result_may_have_any_suffix(tmp_path):
+def test_a_file_that_is_not_a_result_may_have_any_suffix(tmp_path):
     io.check_output(tmp_path / "page.html")

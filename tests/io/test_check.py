@@ -84,7 +84,7 @@ def test_frames_in_reverse_order_are_found():
     assert "--event release" in finding.text
 
 
-def test_a_rotation_with_travels_is_no_press():
+def test_a_rotation_with_travels_is_not_a_press():
     brightness = turned(2 * np.pi * np.arange(30) / 30)
     assert kinds(found(noisy(brightness))) == ["not a press"]
 
@@ -94,7 +94,7 @@ def test_a_press_and_its_release_return():
     assert kinds(found(noisy(there), travel=np.concatenate([TRAVEL[::2], TRAVEL[::2][::-1]]))) == []
 
 
-def test_a_press_with_phases_is_no_rotation():
+def test_a_press_with_phases_is_not_a_rotation():
     assert kinds(found(noisy(pressed()), phase=2 * np.pi * np.arange(30) / 30)) == ["not a rotation"]
 
 
@@ -232,7 +232,7 @@ def test_what_was_found_at_an_import_stays_in_the_recording(tmp_path):
     assert io.describe(tmp_path / "rec.h5")["finding: lossy"] == "the frames were compressed"
 
 
-def test_few_pixels_tell_nothing():
+def test_few_pixels_contain_no_information():
     assert kinds(found(np.zeros((5, 3, 4), np.uint8), travel=TRAVEL[:5])) == []
 
 

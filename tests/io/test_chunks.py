@@ -136,7 +136,7 @@ def test_any_part_of_any_stack_is_what_hdf5_gives(tmp_path_factory, what, packin
         assert len(counts) == np.prod(needed)
 
 
-def test_a_file_that_is_cut_while_it_is_read_is_told(tmp_path):
+def test_a_file_that_is_cut_while_it_is_read_is_reported(tmp_path):
     path = write(tmp_path / "a.h5", compressible((9, 50, 70), "u2"), (1, 50, 70), PACKINGS["bitshuffle"])
     with io.open_recording(path, motion="horizontal") as recording:
         recording.read()
@@ -192,7 +192,7 @@ def test_long_chunks_are_unpacked_once(tmp_path, monkeypatch, chunks, packing, l
         assert how == ("unpacked into memory" if kept + threads * chunk <= limit else "unpacked to disk")
 
 
-def test_a_full_disk_is_told(tmp_path, monkeypatch):
+def test_a_full_disk_is_reported(tmp_path, monkeypatch):
     path = write(tmp_path / "a.h5", compressible(LONG, "u2"), (8, 13, 17), BITSHUFFLE)
 
     def full(file, start, size):
@@ -206,7 +206,7 @@ def test_a_full_disk_is_told(tmp_path, monkeypatch):
         ours(path, 3, memory_limit=8 * FRAME)
 
 
-def test_damage_is_told_with_the_frames_on_every_way(tmp_path):
+def test_damage_is_reported_with_the_frames_on_every_way(tmp_path):
     path = write(tmp_path / "a.h5", compressible(LONG, "u2"), (8, 13, 17), BITSHUFFLE)
     with h5py.File(path) as file:
         chunk = file["x"].id.get_chunk_info(1)

@@ -66,7 +66,7 @@ def test_no_page_of_a_file_is_mapped(path):
 
 
 @pytest.mark.parametrize("left", [0, 1000, 20_000, -1])
-def test_a_file_that_becomes_shorter_is_told_before_it_is_touched(path, left):
+def test_a_file_that_becomes_shorter_is_reported_before_it_is_touched(path, left):
     with io.open_recording(path, **GIVEN) as recording:
         recording.read()
         with h5py.File(path) as file:

@@ -93,7 +93,7 @@ def test_attributes_are_maps():
     assert (list(result), len(result), "normals" in result) == (["height", "wear"], 2, False)
 
 
-def test_an_attribute_that_is_no_map_is_an_error_that_lists_the_maps():
+def test_an_attribute_that_is_not_a_map_is_an_error_that_lists_the_maps():
     result = io.Result(height=FLAT, wear=FLAT)
     with pytest.raises(AttributeError, match=r"^the result has no map 'heigth': it has height, wear$"):
         _ = result.heigth

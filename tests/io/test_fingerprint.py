@@ -62,7 +62,7 @@ def test_of_chunks_too(tmp_path):
 
 
 @pytest.mark.parametrize("packing", [{}, {"chunks": (1, 50, 70), "compression": "gzip"}])
-def test_any_byte_beside_the_frames_counts(tmp_path, packing):
+def test_any_byte_next_to_the_frames_counts(tmp_path, packing):
     path = tmp_path / "a.h5"
     with h5py.File(path, "w") as file:
         file.create_dataset("x", data=compressible(SHAPE, "u1"), **packing)
@@ -111,7 +111,7 @@ def test_files_that_frames_are_taken_from_count(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("packing", [{}, {"chunks": (1, 50, 70), "compression": "gzip"}])
 @pytest.mark.parametrize("way", ["renamed", "written"])
-def test_a_file_that_is_replaced_while_it_is_open_is_told(tmp_path, packing, way):
+def test_a_file_that_is_replaced_while_it_is_open_is_reported(tmp_path, packing, way):
     path = tmp_path / "a.h5"
     frames = compressible(SHAPE, "u1")
     with h5py.File(path, "w") as file:

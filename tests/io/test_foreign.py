@@ -130,7 +130,7 @@ def raw_files(path):
         file.create_dataset("x", SHAPE, "u1", external=[("a.raw", 6, 100), ("b.raw", 0, 180)])
 
 
-def test_raw_files_are_read_from_beside_the_file(tmp_path, path, monkeypatch):
+def test_raw_files_are_read_from_next_to_the_file(tmp_path, path, monkeypatch):
     raw_files(path)
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
@@ -252,7 +252,7 @@ def test_links_that_go_round_are_refused(path, tmp_path):
         refused(path, "links form a cycle", dataset=name)
 
 
-def test_a_name_that_is_no_stack_is_refused(path):
+def test_a_name_that_is_not_a_stack_is_refused(path):
     with h5py.File(path, "w") as file:
         file["group/x"], file["flat"], file["empty"] = STACK, STACK[0], h5py.Empty("u1")
         file["four"], file["type"] = STACK[None], np.dtype("u1")
@@ -346,7 +346,7 @@ def test_a_file_that_was_cut_is_refused_wherever(path):
     io.open_recording(path).close()
 
 
-def test_what_is_no_file_of_frames_is_refused(tmp_path):
+def test_what_is_not_a_file_of_frames_is_refused(tmp_path):
     (tmp_path / "text.h5").write_text("frames")
     (tmp_path / "loop.h5").symlink_to("loop.h5")
     refused(tmp_path / "none.h5", r"none\.h5: no such file")

@@ -81,7 +81,7 @@ def test_a_map_is_drawn_where_its_pixels_are(result):
     assert axes.figure.axes[1].get_ylabel() == "height mm"
 
 
-def test_what_is_no_picture_is_not_drawn(result):
+def test_what_is_not_a_picture_is_not_drawn(result):
     with pytest.raises(io.InputError, match=r"there is no map 'depth' to draw: choose from height"):
         result.plot("depth")
 

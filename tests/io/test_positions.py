@@ -36,7 +36,7 @@ def test_strokes_go_either_way_any_number_of_times(values):
         (check_phase, [0, np.nan, 1, 2], "travel is nan at frame 1"),
     ],
 )
-def test_what_cannot_be_is_one_line(check, values, line):
+def test_impossible_input_is_one_line(check, values, line):
     with pytest.raises(InputError, match=line) as caught:
         check(values, 4, "travel")
     assert "\n" not in str(caught.value)

@@ -205,7 +205,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("name", "value", "units", "line"), BAD)
-def test_what_a_recording_says_wrongly_is_told(press, name, value, units, line):
+def test_what_a_recording_says_wrongly_is_reported(press, name, value, units, line):
     put(press, name, value, units)
     with pytest.raises(io.InputError, match=line) as caught:
         io.open_recording(press)
@@ -214,7 +214,7 @@ def test_what_a_recording_says_wrongly_is_told(press, name, value, units, line):
     assert "\n" not in message
 
 
-def test_what_an_axial_recording_says_wrongly_is_told(turn):
+def test_what_an_axial_recording_says_wrongly_is_reported(turn):
     put(turn, f"{STAGE}/phase", np.where(PHASE > 3, np.nan, PHASE))
     with pytest.raises(io.InputError, match=r"turn\.h5: /entry/instrument/stage/phase is nan at frame 4"):
         io.open_recording(turn)

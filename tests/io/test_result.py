@@ -189,7 +189,7 @@ def test_a_failure_leaves_the_older_result(path, monkeypatch):
         ("/proc/r.h5", "/proc/r.h5 cannot be written: No such file or directory; choose another"),
     ],
 )
-def test_an_output_that_cannot_be_is_one_line(tmp_path, name, line):
+def test_an_impossible_output_is_one_line(tmp_path, name, line):
     (tmp_path / "file").touch()
     (tmp_path / "folder").mkdir()
     os.mkfifo(tmp_path / "pipe")
@@ -201,7 +201,7 @@ def test_an_output_that_cannot_be_is_one_line(tmp_path, name, line):
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_what_is_no_result_is_refused(tmp_path, path):
+def test_what_is_not_a_result_is_refused(tmp_path, path):
     with pytest.raises(io.InputError, match=r"result\.h5: no such file"):
         io.open_result(path)
     record(sphere(), path)

@@ -139,7 +139,7 @@ def test_names_that_contradict_a_stack_are_refused(path, dims, said):
 @pytest.mark.parametrize(
     "names", [("t", "y", "x"), ("a", "b", "c"), ("z", "y", "x"), ("t", "a", "b"), ("a", "y", "b")]
 )
-def test_names_that_agree_or_say_nothing_change_nothing(names):
+def test_names_that_agree_or_contain_no_information_change_nothing(names):
     assert order_of([name if name != "c" else "d" for name in names], "here") == (0, 1, 2)
 
 
@@ -390,7 +390,7 @@ def test_the_surface_of_transposed_frames_is_neither_mirrored_nor_turned(path, o
 
 
 @pytest.mark.parametrize("value", [np.arange(3), np.float32(2), "three", np.empty(0)])
-def test_a_list_of_scales_of_another_type_is_no_list(tmp_path, value):
+def test_a_list_of_scales_of_another_type_is_not_a_list(tmp_path, value):
     with h5py.File(tmp_path / "stack.h5", "w") as file:
         file["x"] = stack()
         file["x"].attrs["DIMENSION_LIST"] = value

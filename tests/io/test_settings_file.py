@@ -84,7 +84,7 @@ def test_a_message_names_file_key_and_remedy(tmp_path, text, said):
     assert said in message
 
 
-def test_a_file_that_is_no_text_or_missing(tmp_path):
+def test_a_file_that_is_not_text_or_missing(tmp_path):
     path = tmp_path / "rig.toml"
     with pytest.raises(io.InputError, match=r"cannot be read: .*; write it anew"):
         load_toml(path, Rig, "write it anew")

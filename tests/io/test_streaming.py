@@ -70,7 +70,7 @@ def test_frames_of_any_size_in_blocks_of_any_cut_read_back(tmp_path, shape, cuts
     np.testing.assert_array_equal(found.travel, 0.01 * np.arange(20) + 0.001)
 
 
-def test_raw_frames_lie_in_one_piece_behind_little_else(tmp_path):
+def test_raw_frames_are_in_one_piece_behind_little_else(tmp_path):
     stream(Feed(3000, (7,), shape=(16, 32)), tmp_path / "a.h5", period=0.001)
     with io.open_recording(tmp_path / "a.h5") as recording:
         assert recording.how.startswith("chunks read")
@@ -276,7 +276,7 @@ def test_what_was_taken_is_kept_whatever_ends_it(tmp_path, error, why):
         np.testing.assert_array_equal(read_all(recording, 5).frames, frames_of(np.arange(12)))
 
 
-def test_positions_that_cannot_be_corrected_stay_and_their_error_is_told(tmp_path):
+def test_positions_that_cannot_be_corrected_stay_and_their_error_is_reported(tmp_path):
     class Lost(Feed):
         def positions(self):
             raise ZeroDivisionError("no reports")

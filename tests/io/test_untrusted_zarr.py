@@ -191,7 +191,7 @@ def test_no_pickle_of_frames_is_decoded(tmp_path, flag, ours, place):
     assert not flag.exists()
 
 
-def test_what_others_keep_beside_their_frames_is_not_decoded(tmp_path, flag):
+def test_what_others_keep_next_to_their_frames_is_not_decoded(tmp_path, flag):
     folder = theirs(tmp_path / "x.zarr", ours=False)
     put_array(folder, "entry/notes", trap(flag), **DANGEROUS["compressor of a text"])
     put_array(folder, "entry/odd", b"", dtype=[["a", "<f8"]], compressor={"id": "unheard-of"})
@@ -639,7 +639,7 @@ def test_places_that_a_shard_cannot_have_are_refused(tmp_path, place):
     assert "overflow" not in message
 
 
-def test_a_damaged_document_ends_all_that_is_read_beside_it(tmp_path):
+def test_a_damaged_document_ends_all_that_is_read_next_to_it(tmp_path):
     """Errors of what goes on would be printed at the end of the program."""
     folder = tmp_path / "x.zarr"
     folder.mkdir()

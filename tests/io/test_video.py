@@ -167,7 +167,7 @@ def test_a_video_that_is_cut_off_is_refused(video, kept):
 
 
 @pytest.mark.parametrize("content", [b"", b"hello", bytes(4096)])
-def test_what_is_no_video_is_refused(tmp_path, content):
+def test_what_is_not_a_video_is_refused(tmp_path, content):
     file = tmp_path / "notes.avi"
     file.write_bytes(content)
     with pytest.raises(InputError, match=rf"{file} cannot be opened as a video"):

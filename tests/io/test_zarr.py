@@ -110,7 +110,7 @@ def test_results_are_the_same_bit_for_bit(pair):
         assert values.tobytes() == found[1].maps()[name].tobytes(), name
 
 
-def test_frames_are_fetched_beside_the_kernels(pair, monkeypatch):
+def test_frames_are_fetched_next_to_the_kernels(pair, monkeypatch):
     threads, fetch = set(), ZarrFrames.fetch
 
     def noted(self, *what):
@@ -169,7 +169,7 @@ def test_a_result_in_memory_is_exported(pair, tmp_path):
     np.testing.assert_array_equal(io.open_result(tmp_path / "res.zarr").height, result.height)
 
 
-def test_a_fingerprint_tells_recordings_apart(pair, tmp_path):
+def test_a_fingerprint_distinguishes_recordings(pair, tmp_path):
     other = record(sphere("uint16"), tmp_path / "other.h5")
     io.save_zarr(other, tmp_path / "other.zarr")
     io.save_zarr(pair[0], tmp_path / "again.zarr")
@@ -224,11 +224,11 @@ def test_a_damaged_chunk_is_named_by_its_frames(tmp_path, harm, said):
     assert said in found
 
 
-def test_what_is_not_there_is_told_with_its_address(memory):
+def test_what_is_not_there_is_reported_with_its_address(memory):
     assert "there is no Zarr array or group" in line(Url("memory://bucket/nothing.zarr"))
 
 
-def test_a_store_that_does_not_answer_is_told_with_its_address():
+def test_a_store_that_does_not_answer_is_reported_with_its_address():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"http://127.0.0.1:{free.getsockname()[1]}/press.zarr"
@@ -307,7 +307,7 @@ def test_what_a_killed_writer_has_left_is_removed_by_the_next(pair, tmp_path):
     assert not part.exists()
 
 
-def test_a_folder_that_is_being_written_is_no_leftover_of_the_next_writer(pair, tmp_path):
+def test_a_folder_that_is_being_written_is_not_a_leftover_of_the_next_writer(pair, tmp_path):
     seen = []
 
     def write_another(count):

@@ -322,7 +322,7 @@ def test_a_drivers_own_lack_of_memory_is_told_apart(small_device, monkeypatch):
         small_device.array("maps", (2**50,), np.uint8)
 
 
-def test_the_profile_tells_what_was_run(device):
+def test_the_profile_lists_what_was_run(device):
     device.profile.clear()
     words = device.array("words", (128, 16), np.uint32)
     for _ in range(3):

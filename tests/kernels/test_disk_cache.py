@@ -34,7 +34,7 @@ def test_what_is_not_as_it_was_written_is_found_out_again(folder, damage):
     assert disk_cache.recall("ld", 1) == b"system"
 
 
-def test_a_folder_that_cannot_be_written_is_no_failure(folder, caplog):
+def test_a_folder_that_cannot_be_written_is_not_a_failure(folder, caplog):
     folder.write_text("a file where the folder should be")
     with caplog.at_level(logging.INFO):
         disk_cache.keep("ld", 1, b"system")

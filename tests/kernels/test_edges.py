@@ -91,7 +91,7 @@ def test_a_jump_has_its_size_and_its_direction(chosen, jump):
 
 
 @pytest.mark.parametrize("bend", [1.0, 2.3])
-def test_a_bend_is_no_jump(bend):
+def test_a_bend_is_not_a_jump(bend):
     cells = level(bend=bend)
     for chosen in PASSES:
         looked = edges.edges_join(cells, np.zeros((25, 25), np.uint8)) if chosen is COARSE else cells

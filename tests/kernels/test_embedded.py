@@ -418,7 +418,7 @@ def zig(tmp_path, monkeypatch):
     return script(package / "zig", "printf '%s\\n' \"$@\"")
 
 
-def test_zig_is_found_beside_its_package(zig):
+def test_zig_is_found_next_to_its_package(zig):
     assert embedded.find_zig() == zig
     zig.unlink()
     path = os.environ["PATH"]

@@ -27,7 +27,7 @@ def test_memory_is_used_again():
     assert not memory._kept
 
 
-def test_no_more_memory_is_kept_than_is_said(monkeypatch):
+def test_no_more_memory_is_kept_than_is_reported(monkeypatch):
     monkeypatch.setattr(memory, "KEPT", 1_000_000)
     engine.free_memory()
     taken = [memory.take(300_000, zeroed=False) for _ in range(5)]

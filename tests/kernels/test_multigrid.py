@@ -193,7 +193,7 @@ def test_steps_of_conjugate_gradients_and_sums(cases, graph):
 @pytest.mark.parametrize(
     ("product", "curvature", "moving"), [(-1, 5, 1), (np.nan, 5, 1), (7, -5, 1), (7, 5, 0)]
 )
-def test_a_step_that_cannot_be_is_not_done(cases, product, curvature, moving):
+def test_an_impossible_step_is_not_done(cases, product, curvature, moving):
     case = cases(*STRAIGHT)
     (b, b_given), (x, x_given), endless = case.random(), case.random(), case.h.array("direction")
     endless.fill(np.inf)

@@ -260,7 +260,7 @@ def test_kernel_and_reference_agree_on_missing_samples(device):
     np.testing.assert_array_equal(np.isfinite(paper.sigma), gone == 0)
 
 
-def test_what_is_beyond_the_ends_tells_nothing(device):
+def test_what_is_beyond_the_ends_contains_no_information(device):
     normals_ = rotations.random_normals(40, seed=5, bins=[(8, 12)])[0]
     clean = replace(UINT8, gain=3.6, phase=RANDOM)
     setup = replace(clean, low=48.0)  # zenith 10 degrees

@@ -92,7 +92,7 @@ def test_the_reference_finds_the_likeliest_normal():
         assert off(found.vectors[[pixel]], facing(*best)[np.newaxis])[0] < 0.02 * found.sigma[pixel]
 
 
-def test_samples_beyond_the_ends_of_the_wall_tell_nothing_and_do_no_harm():
+def test_samples_beyond_the_ends_of_the_wall_contain_no_information_and_do_no_harm():
     scene = Scene((40, 61), zenith=(14, 43))
     noise = 0.5
     found = scene.answer(scene.frames(noise), noise)
@@ -102,7 +102,7 @@ def test_samples_beyond_the_ends_of_the_wall_tell_nothing_and_do_no_harm():
     assert np.median(error) < 1.5
 
 
-def test_a_pixel_that_does_not_follow_the_object_is_no_contact():
+def test_a_pixel_that_does_not_follow_the_object_is_not_a_contact():
     scene = Scene((2, 40))
     frames = scene.frames(0.0)
     frames[:, :40] = frames[:1, :40]  # still

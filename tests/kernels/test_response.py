@@ -32,7 +32,7 @@ def test_a_mirror_at_the_centre_shows_the_wall_at_twice_its_zenith():
     np.testing.assert_allclose(q, height / (17.5 + np.sqrt(height**2 + 17.5**2)), atol=1e-14)
 
 
-def test_the_point_met_lies_on_the_wall_and_on_the_ray():
+def test_the_point_met_is_on_the_wall_and_on_the_ray():
     place, normals = mirrors()
     mx, my, q = (
         wall_light(place, normals, GEOMETRY, lamps, curve, ALL)[0] - (not any(curve[1:]))

@@ -98,7 +98,7 @@ def test_the_most_of_all_options_is_kept():
         ({"AMD spills": 5}, ["sum: 5 AMD spills, with -DA=1"]),
     ],
 )
-def test_a_kernel_that_takes_clearly_more_or_what_none_may_is_told_in_a_line(changed, said):
+def test_a_kernel_that_takes_clearly_more_or_what_none_may_is_printed_in_a_line(changed, said):
     assert list(gpu_check.complaints({**ROW, **changed}, ROW)) == said
 
 

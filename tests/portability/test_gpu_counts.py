@@ -33,7 +33,7 @@ def test_every_call_is_in_the_table(found):
     assert found.keys() == KNOWN.keys()
 
 
-def test_what_rises_is_told_in_a_line():
+def test_what_rises_is_printed_in_a_line():
     row = KNOWN["integrate"]
     more = {**row, "launches": row["launches"] + 1, "waits": row["waits"] - 1}
     assert list(gpu_counts.complaints("integrate", more, row)) == [

@@ -97,7 +97,7 @@ def test_an_option_that_is_refused_says_why_and_keeps_the_result(app):
     assert "a number in counts of at least 0 is needed" in app.options.problem.object
 
 
-def test_a_text_that_is_no_number_is_refused(app):
+def test_a_text_that_is_not_a_number_is_refused(app):
     app.options.widgets["noise"].value = "much"
     assert "noise much" in app.options.problem.object
 

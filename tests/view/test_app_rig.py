@@ -211,7 +211,7 @@ def test_stop_is_at_the_head_whatever_the_page_shows(emulated, tmp_path):
     assert app.rig.stop in app.view[0]
 
 
-def test_a_plan_that_cannot_be_is_refused(ready):
+def test_an_impossible_plan_is_refused(ready):
     pane = RigPane(ready.control, lambda name, source: None)
     pane.press["stop"].value = -1.0
     pane.start.param.trigger("clicks")

@@ -43,7 +43,7 @@ def test_nothing_is_drawn_of_a_calibration_without_parts(tmp_path):
     assert calibration_figures(a_calibration(only=()), tmp_path) == []
 
 
-def test_a_folder_that_cannot_be_is_told(tmp_path):
+def test_an_impossible_folder_is_reported(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(io.InputError, match="-o"):
         calibration_figures(a_calibration(only=()), tmp_path / "file")
@@ -66,7 +66,7 @@ def test_all_maps_of_references_are_drawn_with_their_units():
     assert told == ["sound: 95", "hot: 1", "dead: 1", "saturated: 1", "several: 1"]
 
 
-def test_lines_of_whole_millimetres_lie_where_opencv_has_them():
+def test_lines_of_whole_millimetres_are_where_opencv_has_them():
     lens = a_lens((50, 70))
     axes = draw_lens(lens).axes
     lines = titled(axes, "the sheet").lines

@@ -106,12 +106,12 @@ def test_a_viewer_that_does_not_start_has_a_remedy(monkeypatch):
         live.LiveView(viewer.WINDOW, SHAPE)
 
 
-def test_a_file_that_cannot_be_is_refused(tmp_path):
+def test_an_impossible_file_is_refused(tmp_path):
     with pytest.raises(InputError, match="no folder"):
         live.LiveView(tmp_path / "there" / "run.rrd", SHAPE)
 
 
-def test_without_rerun_a_remedy_is_told(monkeypatch, tmp_path):
+def test_without_rerun_a_remedy_is_reported(monkeypatch, tmp_path):
     monkeypatch.setattr(viewer, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install 'mirrorskin\[live\]'"):
         live.LiveView(tmp_path / "run.rrd", SHAPE)

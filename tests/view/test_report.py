@@ -245,7 +245,7 @@ def test_heights_of_which_none_is_known_make_no_surface(tmp_path, quick):
     assert "make no surface" in page.words
 
 
-def test_a_result_without_heights_says_so(tmp_path, monkeypatch):
+def test_a_result_without_heights_reports_it(tmp_path, monkeypatch):
     monkeypatch.setattr(contents, "FINENESS", 70)
     result = io.Result(
         azimuth=np.linspace(-3, 3, 35, dtype=np.float32).reshape(5, 7),
@@ -269,7 +269,7 @@ def test_without_a_pixel_size_places_are_pixels(tmp_path, quick):
 
 
 @pytest.mark.parametrize(("unknown", "said"), [([1], "The height is relative"), ([1, 0, 1], "2 of 3 pieces")])
-def test_what_is_relative_is_told(tmp_path, quick, unknown, said):
+def test_what_is_relative_is_reported(tmp_path, quick, unknown, said):
     result = cap().assign(offset_unknown=np.array(unknown, np.uint8))
     assert said in written(tmp_path, result).words
     assert "relative" not in written(tmp_path, cap()).texts["p"]
@@ -373,7 +373,7 @@ def test_pieces_and_what_was_filled_are_never_averaged_together():
     np.testing.assert_array_equal(grid.height, 10 * grid.piece + 100 * grid.filled)
 
 
-def test_only_the_part_that_holds_heights_is_told():
+def test_only_the_part_that_holds_heights_is_reported():
     height = np.full((9, 8), np.nan, np.float32)
     height[2:5, 3:7] = np.arange(12).reshape(3, 4)
     grid = sample(io.Result(height=height))
@@ -413,7 +413,7 @@ def test_the_same_result_makes_the_same_page(tmp_path, monkeypatch):
     assert pages[0] == pages[1]
 
 
-def test_what_is_missing_is_told_before_any_work(tmp_path, monkeypatch):
+def test_what_is_missing_is_reported_before_any_work(tmp_path, monkeypatch):
     found = importlib.util.find_spec
     monkeypatch.setattr(
         "mirrorskin.view.report.page.find_spec", lambda name: None if name == "jinja2" else found(name)
@@ -423,7 +423,7 @@ def test_what_is_missing_is_told_before_any_work(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_name_that_is_no_text_does_no_harm(tmp_path, quick):
+def test_a_name_that_is_not_text_does_no_harm(tmp_path, quick):
     assert written(tmp_path, cap(), name="a\udcff.h5").texts["h1"] == ["a?.h5"]
 
 

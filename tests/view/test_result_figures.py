@@ -131,7 +131,7 @@ def test_a_figure_is_as_wide_as_asked_and_the_right_side_up(alone):
     [ball((24, 32), (0.00041, 0.00037), radius=0.006), ball((60, 9)), ball((1, 40), y=np.array([-0.00557]))],
     ids=["tiny pixels", "upright", "one row"],
 )
-def test_no_panel_lies_on_another_or_beyond_the_page(result):
+def test_no_panel_is_on_another_or_beyond_the_page(result):
     figure = overview(result, name="a name that is rather long, of somebody's own " * 5)
     renderer = FigureCanvasAgg(figure).get_renderer()
     boxes = [axes.get_tightbbox(renderer) for axes in figure.axes]

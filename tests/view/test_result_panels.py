@@ -50,7 +50,7 @@ def cut_of(result, *ends):
     return sheet_of(result), section(result, *ends)
 
 
-def test_the_height_lies_as_the_picture_does():
+def test_the_height_is_as_the_picture_does():
     result = ball()
     corner = result.height.copy()
     corner[:4, :5] = 5.0  # the upper left
@@ -89,7 +89,7 @@ def test_what_is_filled_without_a_height_is_not_counted():
     assert note(axes) == "blue: no answer (100.0 %)"
 
 
-def test_without_pixel_size_heights_lie_along_pixels_and_have_no_scale_bar():
+def test_without_pixel_size_heights_are_along_pixels_and_have_no_scale_bar():
     axes = panel_of(draw_height, ball(x=None, y=None))
     assert axes.get_xlabel() == "x (px)"
     assert axes.get_xlim() == (-16, 16)

@@ -103,7 +103,7 @@ def test_what_cannot_be_drawn_is_refused():
         draw({"a": larger, "b": result_of(slope())}, truth_of(larger.height))
 
 
-def test_the_first_map_lies_as_the_picture_does():
+def test_the_first_map_is_as_the_picture_does():
     height = slope()
     height[3, 4] = np.nan
     left, _ = draw({"first": result_of(height), "second": result_of(2 * height)}, truth_of(height))

@@ -104,7 +104,7 @@ def test_the_key_of_the_colours_is_a_half_sphere(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["heights", "turns", "no axes", "truth"])
-def test_what_cannot_be_drawn_is_said(tmp_path, kind):
+def test_what_cannot_be_drawn_is_reported(tmp_path, kind):
     results = {
         "heights": io.Result(height=np.zeros(SHAPE, np.float32)),
         "turns": io.Result(normals=np.zeros((2, *SHAPE, 3), np.float32), x=np.arange(30), y=np.arange(20)),
@@ -115,7 +115,7 @@ def test_what_cannot_be_drawn_is_said(tmp_path, kind):
         view.normal_figure({"one": results[kind]}, truth_of(), "title", tmp_path / "x.png")
 
 
-def test_nothing_in_contact_at_all_is_said(tmp_path, monkeypatch):
+def test_nothing_in_contact_at_all_is_reported(tmp_path, monkeypatch):
     none = result_of(contact=np.zeros(SHAPE, np.uint8))
     (axes,) = drawn({"one": none}, truth_of(), tmp_path, monkeypatch)
     assert axes[2].get_title().startswith("no pixel in contact")

@@ -34,7 +34,7 @@ def test_a_way_to_open_windows_is_a_screen(monkeypatch, name):
 
 
 @pytest.mark.usefixtures("backend")
-def test_a_way_that_does_not_go_here_is_no_screen(monkeypatch):
+def test_a_way_that_does_not_go_here_is_not_a_screen(monkeypatch):
     def refuse(name):
         raise ImportError(f"cannot load {name}: headless")
 

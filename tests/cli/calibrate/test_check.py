@@ -33,7 +33,7 @@ def check(folder, *words):
     return run("calibrate check", folder / "press.h5", "--calibration", folder / "cal.h5", *words)
 
 
-def test_the_errors_left_are_told_in_a_table(folder):
+def test_the_errors_left_are_printed_in_a_table(folder):
     ended = check(folder, "--ball", "10mm")
     assert ended.code == 0, ended.said
     head, height, place = ended.out.splitlines()
@@ -42,7 +42,7 @@ def test_the_errors_left_are_told_in_a_table(folder):
     assert place.startswith("ball of 10 mm found at")
 
 
-def test_json_tells_the_cells_too(folder):
+def test_json_contains_the_cells_too(folder):
     told = json.loads(check(folder, "--ball", "10mm", "--cells", "4", "--json").out)
     assert np.shape(told["after"]["height"]["cells"]["rms"]) == (4, 4)
     assert abs(told["after"]["height"]["bias"]) < 0.02
@@ -62,5 +62,5 @@ def test_a_picture_is_drawn(folder, tmp_path):
         (("--ball", "10mm", "--cells", "0"), "cells"),
     ],
 )
-def test_what_cannot_be_is_refused_in_a_line(folder, words, message):
+def test_impossible_input_is_refused_in_a_line(folder, words, message):
     refused(message, folder, *words, run=check)

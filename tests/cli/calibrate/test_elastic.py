@@ -56,7 +56,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(gel_module, "fit_gel", fit)
 
 
-def test_a_ball_becomes_a_gel_in_the_file_and_is_told_in_a_line():
+def test_a_ball_becomes_a_gel_in_the_file_and_is_printed_in_a_line():
     ended = done("calibrate elastic ball.h5 --ball 4mm -o cal.h5")
     assert ended.out.startswith("cal.h5: bright from ")
     assert len(ended.out.splitlines()) == 1

@@ -53,7 +53,7 @@ def test_a_dark_and_a_bright_recording_become_references(scene, tmp_path):
     assert known.process["references.bright_sources"] == str(scene / "bright.h5")
 
 
-def test_a_folder_of_pictures_will_do(scene, tmp_path):
+def test_a_folder_of_pictures_is_accepted(scene, tmp_path):
     folder = tmp_path / "pictures"
     folder.mkdir()
     for number, frame in enumerate(expose(pixels(SHAPE)[0], NOISE, 6)):
@@ -64,7 +64,7 @@ def test_a_folder_of_pictures_will_do(scene, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["dark.npy", "dark.tif"])
-def test_frames_without_positions_will_do(scene, tmp_path, name):
+def test_frames_without_positions_are_accepted(scene, tmp_path, name):
     frames = expose(pixels(SHAPE)[0], NOISE, 6)
     if name.endswith(".npy"):
         np.save(tmp_path / name, frames)
@@ -84,7 +84,7 @@ def test_too_few_frames_for_a_stated_noise_are_counted(scene, tmp_path):
     assert references(scene, path, "--noise", "0.5").code == 0
 
 
-def test_a_camera_whose_dark_level_is_cut_off_is_told(scene, tmp_path):
+def test_a_camera_whose_dark_level_is_cut_off_is_reported(scene, tmp_path):
     ended = references(scene, tmp_path / "cal.h5", dark="black.h5")
     assert ended.code == 0, ended.said
     assert "black level" in ended.said
@@ -103,7 +103,7 @@ def test_a_camera_whose_dark_level_is_cut_off_is_told(scene, tmp_path):
         (("--rig", "rig.toml", "--rolled"), "--press is missing"),
     ],
 )
-def test_a_call_that_cannot_be_is_one_line(scene, tmp_path, monkeypatch, words, said):
+def test_an_impossible_call_is_one_line(scene, tmp_path, monkeypatch, words, said):
     monkeypatch.chdir(scene)
     Path("rig.toml").touch()
     refused(said, "calibrate references -o", tmp_path / "cal.h5", *words)

@@ -53,7 +53,7 @@ def test_a_picture_becomes_a_lens_in_a_file():
     assert known.process["scale.sources"] == "a.png"
 
 
-def test_dots_do_as_well_and_json_tells_it():
+def test_dots_do_as_well_and_json_contains_it():
     cv2.imwrite("dots.png", DOTTED)
     ended = calibrate("dots.png", "dots.png", "--board", "dots:7x6:1mm", "-o", "cal.h5", "--json")
     assert ended.code == 0, ended.said
@@ -96,7 +96,7 @@ def test_pictures_may_have_fewer_bits_than_the_camera():
         (["moving.h5"], "moving.h5 is a sequence in which the picture changes"),
     ],
 )
-def test_what_is_no_picture_of_the_board_is_refused(words, said, tmp_path):
+def test_what_is_not_a_picture_of_the_board_is_refused(words, said, tmp_path):
     cv2.imwrite("dots.png", DOTTED)
     cv2.imwrite("white.png", np.full_like(SHOWN, 255))
     cv2.imwrite("small.png", SHOWN[1:])

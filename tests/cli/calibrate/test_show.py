@@ -28,7 +28,7 @@ def saved(tmp_path):
     return path
 
 
-def test_a_calibration_is_told_in_a_table(saved):
+def test_a_calibration_is_printed_in_a_table(saved):
     ended = done("calibrate show", saved)
     head, *lines = ended.out.splitlines()
     assert head.split() == ["part", "what", "value", "standard", "error", "unit"]

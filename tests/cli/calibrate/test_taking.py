@@ -32,7 +32,7 @@ def enter(monkeypatch):
     return lambda times: monkeypatch.setattr("sys.stdin", texts.StringIO(times * "\n"))
 
 
-def test_each_place_is_asked_for_and_becomes_a_recording_beside_the_calibration(
+def test_each_place_is_asked_for_and_becomes_a_recording_next_to_the_calibration(
     rig_file, tmp_path, enter, capsys
 ):
     enter(2)

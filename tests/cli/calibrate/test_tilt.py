@@ -119,7 +119,7 @@ def test_what_the_file_knew_before_is_kept_and_what_the_user_says_of_the_scale_i
         (["bare.h5"], "bare.h5: the recording has no zenith gain and offset"),
     ],
 )
-def test_what_cannot_be_is_one_line_and_writes_nothing(words, said):
+def test_impossible_input_is_one_line_and_writes_nothing(words, said):
     if "other.h5" in words:
         record(
             MadeUp(np.zeros((8, 5, 5), np.uint8), io.Header("axial", camera="right"), phase=EIGHTHS),

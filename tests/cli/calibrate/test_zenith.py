@@ -98,7 +98,7 @@ def test_without_a_calibration_one_is_made_and_told_as_json(folder, fitted):
         (("--rig", "rig.toml", "--press", "1mm"), "both give the presses"),
     ],
 )
-def test_a_call_that_cannot_be_is_refused(folder, fitted, words, said):
+def test_an_impossible_call_is_refused(folder, fitted, words, said):
     Path("rig.toml").touch()
     refused(said, *words, run=calibrate)
     assert not (folder / "cal.h5").exists()
@@ -147,7 +147,7 @@ def test_a_pivot_measured_with_other_pixels_is_left_out(folder, fitted):
     assert fitted["precession"] is None
 
 
-def test_presses_that_leave_the_zenith_uncertain_are_told(folder, fitted):
+def test_presses_that_leave_the_zenith_uncertain_are_reported(folder, fitted):
     ended = calibrate()
     assert "depth not determined, standard deviation of zenith 0.27 deg: press less" in ended.said
     assert "press less" in ended.said

@@ -177,7 +177,7 @@ def test_a_job_may_cost_three_workers_and_no_more(losses, state, recordings, tmp
         assert f"each of 4 workers that had {recordings[0]} was lost" in outcomes[jobs[0]].message
 
 
-def test_a_job_that_fails_in_an_unforeseen_way_is_told_in_a_line(recordings, address, tmp_path, monkeypatch):
+def test_an_unforeseen_failure_of_a_job_is_printed_in_a_line(recordings, address, tmp_path, monkeypatch):
     def fail(*_):
         raise RuntimeError("of two\nlines")
 
@@ -202,7 +202,7 @@ def test_no_scheduler_is_refused(recordings, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_cluster_that_goes_away_is_told(recordings, tmp_path, monkeypatch):
+def test_a_cluster_that_goes_away_is_reported(recordings, tmp_path, monkeypatch):
     monkeypatch.setattr(cluster, "PATIENCE", 1.0)
     with start(1) as running:
         run = run_cluster(make_jobs(recordings, tmp_path) * 50, PLAN, running.scheduler_address)
@@ -213,7 +213,7 @@ def test_a_cluster_that_goes_away_is_told(recordings, tmp_path, monkeypatch):
             list(run)
 
 
-def test_without_dask_a_remedy_is_told(recordings, tmp_path, monkeypatch):
+def test_without_dask_a_remedy_is_reported(recordings, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     assert "pip install 'mirrorskin[cluster]'" in refusal(
         make_jobs(recordings, tmp_path), "tcp://127.0.0.1:1"

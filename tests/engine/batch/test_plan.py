@@ -59,7 +59,7 @@ def test_another_version_has_another_key(monkeypatch):
     assert Plan().key("vertical") != before
 
 
-def test_a_key_is_json_that_tells_defaults_too():
+def test_a_key_is_json_that_includes_defaults_too():
     plan = Plan({"travel": io.Steps(0.1), "dataset": "/x", "file": Path("a")}, {"dark": np.float32(2)})
     told = json.loads(plan.key("vertical"))
     assert told["opening"] == {"dataset": "/x", "travel": {"Steps": {"start": 0.0, "step": 0.1}}, "file": "a"}

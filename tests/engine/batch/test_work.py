@@ -45,7 +45,7 @@ def test_a_result_is_that_of_reconstruct(tmp_path, make):
     assert {**found.process, "date": ""} == {**expected.process, **added, "date": ""}
 
 
-def test_an_outcome_tells_what_was_done(job):
+def test_an_outcome_states_what_was_done(job):
     outcome = run_job(job, Plan())
     assert (outcome.job, outcome.motion, outcome.bytes) == (job, "vertical", 8 * 5 * 7)
     assert outcome.message.startswith("height at 35 of 35 pixels")
@@ -132,7 +132,7 @@ def test_a_bad_recording_fails_in_one_line_and_leaves_nothing(tmp_path, make, sa
         (MemoryError("none"), "not enough memory (none): take a smaller region or fewer frames"),
     ],
 )
-def test_what_the_engine_raises_is_told(job, monkeypatch, error, said):
+def test_what_the_engine_raises_is_reported(job, monkeypatch, error, said):
     def fail(*_, **__):
         raise error
 

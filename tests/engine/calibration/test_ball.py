@@ -43,7 +43,7 @@ def test_of_a_ball_beyond_its_equator_only_the_upper_half_is_seen():
 
 
 @pytest.mark.parametrize("sight", [STRAIGHT, SLANTED], ids=["straight", "slanted"])
-def test_what_is_seen_lies_on_the_line_of_sight_and_on_the_ball_turned_back(sight):
+def test_what_is_seen_is_on_the_line_of_sight_and_on_the_ball_turned_back(sight):
     seen = see_ball(sight, CENTRE, RADIUS, CIRCLE, PIVOT)
     for frame, phase in enumerate(PHASES):
         touched = seen.contact[frame]
@@ -113,7 +113,7 @@ def test_pixels_need_not_be_square_nor_few():
     assert centre[:2] == pytest.approx((1.0, 0.4), abs=0.03)
 
 
-def test_light_will_do_as_well_as_counts_and_pixels_and_frames_may_be_defective():
+def test_light_is_accepted_instead_of_counts_and_pixels_and_frames_may_be_defective():
     frames = ((turn(2, 1, 0.6, pattern="linear") - 16.0) / 208).astype(np.float32)
     frames[:, 47, 33] = 40.0
     frames[:, 33, 56] = frames[:, 14:17, 20:23] = np.nan

@@ -77,7 +77,7 @@ def test_the_movement_is_found_though_another_was_told(calibration):
     assert found.pivot == pytest.approx(LAB.pivot, abs=0.4)
 
 
-def test_a_check_tells_what_is_left_on_a_ball_that_was_not_used(calibration):
+def test_a_check_reports_the_residual_on_a_ball_that_was_not_used(calibration):
     ball = LAB.turned(scorer.ball(6.0, (0.5, -0.4)), 0.8, 60)
     found = check_ball(ball, calibration, 6.0, cells=4)
     assert found.place == pytest.approx((0.5, -0.4), abs=0.02)

@@ -44,7 +44,7 @@ def test_a_ball_of_another_size_shows(press):
     assert float(wrong.whole.rms) > 3 * float(right.whole.rms)
 
 
-def test_a_ball_is_found_beside_the_middle(press):
+def test_a_ball_is_found_next_to_the_middle(press):
     press.rewind()
     frames = np.empty(press.shape, press.dtype)
     press.read(frames)
@@ -99,7 +99,7 @@ def test_numbers_out_of_range_are_refused(press, ball_size, cells, message):
 
 
 @pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")
-def test_a_press_on_nothing_is_told(press):
+def test_a_press_on_nothing_is_reported(press):
     source = Frames("nothing", np.full((len(TRAVEL), *SHAPE), 16, np.uint8), press.header, travel=TRAVEL)
     with pytest.raises(io.InputError, match="too little of a ball"):
         check_ball(source, calibration(), 10.0)

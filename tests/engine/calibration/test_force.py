@@ -24,7 +24,7 @@ def presses(count, scatter, generator, reading=0.002):
     return [KnownPress(one, 0.0, NO_GEL, seen, reading) for one, seen in zip(load, read, strict=True)]
 
 
-def test_the_standard_error_of_the_modulus_is_honest():
+def test_the_standard_error_of_the_modulus_is_true():
     generator = np.random.default_rng(2)
     fits = [fit_stiffness(presses(12, 0.02, generator), GEL).stiffness for _ in range(400)]
     wrong = np.array([(one.modulus - MODULUS) / one.modulus_sigma for one in fits])

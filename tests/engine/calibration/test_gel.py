@@ -82,7 +82,7 @@ def test_a_mirror_below_the_surface_is_smoother_than_it():
     np.testing.assert_allclose(below[r > 2], on[r > 2], rtol=0.02)
 
 
-def test_two_balls_by_theory_tell_all_numbers():
+def test_two_balls_by_theory_determine_all_numbers():
     presses = [
         made_up(2.0, 0.21, COMPLIANCE, 0.1, 0.3, -0.2, noise=0.003),
         made_up(4.0, 0.21, COMPLIANCE, -0.05, 0.0, 0.4, noise=0.003),
@@ -98,7 +98,7 @@ def test_two_balls_by_theory_tell_all_numbers():
     assert gel.travel_zero == found.places[0].travel_zero
 
 
-def test_the_twins_ball_tells_when_light_comes(learned):
+def test_the_twins_ball_shows_when_light_comes(learned):
     gel = learned.gel
     nominal = float(visible_zenith(Body(), 0.0, 0.0, 0.0)[0])
     assert gel.threshold == pytest.approx(nominal, abs=math.radians(1.5))
@@ -124,7 +124,7 @@ def test_a_gel_learned_on_a_small_ball_puts_larger_ones_right(learned, diameter)
     assert np.sqrt(np.mean(after**2)) < np.sqrt(np.mean(before**2)) / 3
 
 
-def test_numbers_that_a_press_does_not_tell_are_left_at_zero_and_named():
+def test_numbers_that_a_press_does_not_determine_are_left_at_zero_and_named():
     whole = made_up(2.0, 0.21, 0.0, 0.0, 0.0, 0.0)
     narrow = np.hypot(whole.x, whole.y) < 0.9
     few = BallOnset(
@@ -138,7 +138,7 @@ def test_numbers_that_a_press_does_not_tell_are_left_at_zero_and_named():
     assert found.gel.threshold == pytest.approx(0.21, abs=0.01)
 
 
-def test_presses_that_say_nothing_are_refused():
+def test_presses_that_contain_no_information_are_refused():
     with pytest.raises(InputError, match="at least one press"):
         fit_gel([])
     source = type("Source", (), {"name": "turn.h5", "header": io.Header("axial")})()

@@ -53,7 +53,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("board", "view", "how"), CASES)
-def test_one_picture_tells_scale_and_distortion(board, view, how):
+def test_one_picture_determines_scale_and_distortion(board, view, how):
     fit = calibrate_lens([("a.png", picture(view, board, **how))], board)
     assert fit.marks == (len(board.marks()),)
     assert fit.lens.error < 0.06
@@ -73,7 +73,7 @@ def marks_of(view, pose, noise, random, board=CHARUCO, name="a"):
     return Marks(name, view.shape, board.marks()[inside], places[inside])
 
 
-def test_several_pictures_tell_the_whole_picture():
+def test_several_pictures_determine_the_whole_picture():
     random = np.random.default_rng(5)
     fit = fit_lens([marks_of(BLURRED, pose, 0.03, random) for pose in POSES])
     scale, off = left_over(BLURRED, fit.lens, 0.9)
@@ -81,7 +81,7 @@ def test_several_pictures_tell_the_whole_picture():
     assert off < 0.1
 
 
-def test_standard_errors_are_honest():
+def test_standard_errors_are_true():
     random = np.random.default_rng(7)
     true = fit_lens([marks_of(WIDE, pose, 0, random) for pose in POSES[:2]]).lens.pixel_size[0]
     fits = [fit_lens([marks_of(WIDE, pose, 0.05, random) for pose in POSES[:2]]) for _ in range(12)]
@@ -110,7 +110,7 @@ def test_a_lens_without_perspective_and_distortion_is_found_to_have_none():
     np.testing.assert_allclose(row, [50, 50, 40], atol=1e-3)
 
 
-def test_boards_that_do_not_lie_on_one_plane_are_refused():
+def test_boards_that_are_not_on_one_plane_are_refused():
     random = np.random.default_rng(0)
     flat = boards.View((201, 281), 0.06, 262.0)
     leaning = boards.View((201, 281), 0.06, 262.0, tilt=10.0)
@@ -179,7 +179,7 @@ def test_a_painted_board_has_its_true_size(board):
         (lambda: Charuco(60, 60, 2.0, 1.5), "fewer squares"),
     ],
 )
-def test_boards_that_cannot_be_are_refused(make, said):
+def test_impossible_boards_are_refused(make, said):
     with pytest.raises(InputError, match=said):
         make()
 

@@ -77,13 +77,13 @@ def test_the_error_of_rounding_is_the_exact_sum(noise):
     ("dtype", "noise", "count"),
     [("uint8", 1.5, 2), ("uint8", 0.2, 16), ("float32", 1.5, 8)],
 )
-def test_standard_errors_are_honest(dtype, noise, count):
+def test_standard_errors_are_true(dtype, noise, count):
     truth = levels_about(40, 3)
     level = level_above(moments_of(expose(truth, noise, count, dtype)), 0.0)
     assert honesty(level, truth) == pytest.approx(1, abs=0.11)
 
 
-def test_standard_errors_are_honest_where_noise_grows_with_the_level():
+def test_standard_errors_are_true_where_noise_grows_with_the_level():
     truth = levels_about(100, 40).clip(20, 220)
     noise = np.sqrt(2 + 0.2 * truth)
     level = level_above(moments_of(expose(truth, noise, 16)), 0.0)
@@ -157,7 +157,7 @@ def test_pixels_share_their_noise_as_far_as_they_are_alike():
 @pytest.mark.parametrize(
     ("count", "full", "half", "dtype"), [(150, 0.3, 0.1, "uint8"), (100, 0.3, 0.3, "float32")]
 )
-def test_full_light_has_no_bias_and_an_honest_error(count, full, half, dtype):
+def test_full_light_has_no_bias_and_a_true_error(count, full, half, dtype):
     generator = np.random.default_rng(2)
     dark = 16 + 3 * generator.standard_normal((1, 4000))
     light = 180 * (1 + 0.05 * generator.standard_normal(dark.shape))

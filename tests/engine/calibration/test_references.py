@@ -54,7 +54,7 @@ def test_all_defects_are_found_and_no_sound_pixel_is(dtype, top):
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "float32"])
-def test_levels_are_right_and_their_errors_honest(dtype):
+def test_levels_are_right_and_their_errors_true(dtype):
     dark, light = pixels(dtype=dtype)
     light = np.minimum(light, (TOPS[dtype] or 1e9) - 10 * SCALES[dtype] - dark)
     measured = measure(dark, light, dtype)
@@ -135,7 +135,7 @@ def test_frames_that_are_all_equal_are_exact_but_for_their_rounding(dtype):
         ((8, 16), (8, 16), "no brighter"),
     ],
 )
-def test_frames_that_say_nothing_are_refused(dark, bright, said):
+def test_frames_that_contain_no_information_are_refused(dark, bright, said):
     frames = [np.full((count, 5, 7), level, np.uint8) for count, level in (dark, bright)]
     with pytest.raises(io.InputError, match=said):
         references(*frames)

@@ -286,7 +286,7 @@ def test_a_wall_needs_references_and_a_graded_pattern_and_has_an_error_of_depth(
     assert scale_of(None).depth_sigma == 0
 
 
-def test_clipped_samples_and_pixels_without_gain_say_nothing():
+def test_clipped_samples_and_pixels_without_gain_contain_no_information():
     header = Header("axial", zenith_gain=np.array([[100.0, 0.0, 200.0]]), zenith_offset=np.array(20.0))
     light, pixels = LinearBrightness.of_header(header, (1, 3)), np.arange(3)
     zenith = light.of_counts(np.array([[120, 120, 220], [0, 30, 255]], np.uint8), pixels)

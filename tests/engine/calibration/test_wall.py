@@ -68,7 +68,7 @@ def test_the_light_of_normals_all_over_the_field_is_known(response):
     assert np.nanquantile(by_place, 0.9) < 0.1
 
 
-def test_errors_are_as_large_as_told(response):
+def test_errors_are_as_large_as_stated(response):
     off = bias(response)
     middle = np.sqrt(np.nanmean(off[10:22] ** 2))
     told = np.degrees(np.sqrt(np.mean(response.zenith_sigma**2)))
@@ -118,7 +118,7 @@ def test_samples_at_the_ends_of_the_camera_and_of_defects_are_left_out(presses):
     assert np.isin(read.place[1], y[24]).any()
 
 
-def test_a_calibrated_rotation_tells_leans_and_how_well_its_pivot_is_known(presses):
+def test_a_calibrated_rotation_returns_leans_and_how_well_its_pivot_is_known(presses):
     sigma = {"pivot_x": 0.1, "pivot_y": 0.2, "pivot_z": 0.3, "phase_offset": 0.004}
     known = io.Precession(
         tilt=0.045,
@@ -163,7 +163,7 @@ def test_a_press_without_a_ball_is_named(presses):
         ({"body": (0.0, 40.0)}, "0.0 mm radius and 40.0 mm height: both must be above 0"),
     ],
 )
-def test_what_cannot_be_is_refused(presses, options, said):
+def test_impossible_input_is_refused(presses, options, said):
     with pytest.raises(io.InputError, match=said):
         fit_zenith(presses, **{"ball": 2.0, **options})
 
@@ -176,6 +176,6 @@ def test_what_cannot_be_is_refused(presses, options, said):
         ({"dark": None}, "place-2: there are no dark and bright references"),
     ],
 )
-def test_what_a_recording_lacks_is_told(presses, fields, said):
+def test_what_a_recording_lacks_is_reported(presses, fields, said):
     with pytest.raises(io.InputError, match=said):
         fit_zenith([presses[0], replaced(presses[1], **fields), *presses[2:]], 2.0)

@@ -131,7 +131,7 @@ def test_a_gel_that_leaves_the_ball_early_teaches_nothing_wrong():
     assert np.sqrt(np.nanmean(off**2)) < 0.4
 
 
-def test_a_uniform_wall_tells_where_light_begins():
+def test_a_uniform_wall_shows_where_light_begins():
     response = respond(some_presses(np.full(CURVE_COEFFICIENTS, 0.95), each=480), uniform=True)
     assert response.curve == pytest.approx([0.95], abs=0.01)
     assert np.isnan(response.azimuth_sigma).all()

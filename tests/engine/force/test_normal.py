@@ -152,7 +152,7 @@ def test_what_is_lifted_presses_with_nothing():
         ({"sigma": np.zeros((2, 2))}, "sigma has shape"),
     ],
 )
-def test_what_cannot_be_is_one_line(changes, said):
+def test_impossible_input_is_one_line(changes, said):
     known = {"height": np.zeros((4, 4)), "travel": 0.1, "pixel_size": 0.1, "modulus": 0.1}
     with pytest.raises(io.InputError, match=said):
         find_force(**known | changes)
@@ -218,7 +218,7 @@ def test_without_a_gel_or_a_modulus_there_is_no_force(ball):
     assert "force" not in result.process
 
 
-def test_a_load_beyond_the_picture_is_no_force():
+def test_a_load_beyond_the_picture_is_not_a_force():
     twin = Twin(
         object=Sphere(10.0),
         shape=(64, 40),

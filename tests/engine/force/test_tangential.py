@@ -90,7 +90,7 @@ def test_partial_slip_is_cattaneo_s():
     np.testing.assert_allclose(force_of(found), [traction.sum() * size**2, 0], atol=0.01 * case.force)
 
 
-def test_the_error_of_the_force_is_honest_for_windows_too():
+def test_the_error_of_the_force_is_true_for_windows_too():
     from scipy import ndimage
 
     inside, traction, moved = half_ellipsoid(1.0, 0.02, 27, 0.08)
@@ -186,7 +186,7 @@ def test_frames_of_a_texture_give_the_force_to_three_percent():
         ({"displacement": np.full((9, 9, 2), np.nan)}, "0% of the contact has a displacement"),
     ],
 )
-def test_what_cannot_be_is_one_line(changes, said):
+def test_impossible_input_is_one_line(changes, said):
     known = {"displacement": np.zeros((9, 9, 2)), "modulus": 0.1, "contact": np.ones((9, 9))}
     with pytest.raises(io.InputError, match=said):
         find_tangential_force(pixel_size=0.1, **known | changes)

@@ -64,7 +64,7 @@ def test_a_sphere_seen_from_near_converges_with_the_second_order():
 
 
 @pytest.mark.parametrize("robust", [False, True])
-def test_known_depths_tell_the_scale_of_what_they_are_in(device, robust):
+def test_known_depths_determine_the_scale_of_the_surface(device, robust):
     depth, normals, mask, camera = sphere((6.0, -3.0, -55.0), 25.0, 2)
     upper, middle = mask.copy(), mask.shape[0] // 2
     upper[middle:] = False

@@ -255,7 +255,7 @@ def test_slopes_that_are_no_numbers_are_left_out_and_counted(device, bad):
     assert apart(found, asked) <= 1e-4
 
 
-def test_any_array_will_do_and_stays_as_it_was():
+def test_any_array_is_accepted_and_stays_as_it_was():
     dz_dx, dz_dy, _ = problem(BUMP, 0.1).arguments
     slopes = [dz_dx.astype(np.float32), dz_dy.astype(np.float32)]
     expected = engine.integrate(*slopes, PIXEL, mask=DISC, sigma=False).height

@@ -126,7 +126,7 @@ def test_pictures_of_any_size_are_solved(device, shape):
 
 
 @pytest.mark.parametrize("kind", ["disc", "cuts", "holes"])
-def test_the_residual_tells_the_error_within_a_factor_of_four(device, kind):
+def test_the_residual_estimates_the_error_within_a_factor_of_four(device, kind):
     graph = graphs.pixel_graph(kind, (60, 90))
     exact, matrix = graph.solve().ravel(), graph.matrix
     solver = Multigrid(links_of(device, graph))

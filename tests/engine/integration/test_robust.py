@@ -120,7 +120,7 @@ def test_the_smallest_pictures_have_heights(device, shape):
     assert not surface.edges.any()
 
 
-def test_a_search_that_must_stop_says_so():
+def test_a_search_that_must_stop_reports_it():
     slopes = noisy(ramps()[1], 0.02)
     surface = engine.integrate(*slopes, 1.0, robust=True, sigma=False, budget=1e-6)
     assert not surface.process["integration_converged"]

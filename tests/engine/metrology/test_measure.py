@@ -223,7 +223,7 @@ def notes_of_fit(height, form, sigma=0.001):
     return [note for note in engine.measure(result, form=form).notes if "within its errors" in note]
 
 
-def test_a_form_that_does_not_fit_is_told():
+def test_a_form_that_does_not_fit_is_reported():
     shape = 51, 57
     clean = cap(shape, (0.1, 0.1), RADIUS, WIDTH)
     noisy = clean + np.random.default_rng(5).normal(0, 0.001, shape)
@@ -250,7 +250,7 @@ def test_uncertain_pixels_count_neither_as_lowest_nor_as_rough():
     assert sure["Sz"].value > 800
 
 
-def test_heights_without_a_standard_deviation_are_left_out_and_that_is_told():
+def test_heights_without_a_standard_deviation_are_left_out_and_that_is_reported():
     height = np.zeros((9, 9))
     height[4, 4:6] = 3.0
     sigma = np.where(height > 0, NAN, 0.01).astype(np.float32)

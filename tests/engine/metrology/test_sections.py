@@ -50,7 +50,7 @@ def test_a_spike_is_not_the_highest_point():
     assert section(result_of(height, SIZE)).y[0] == 0
 
 
-def test_what_was_filled_may_be_the_highest_point_and_is_told():
+def test_what_was_filled_may_be_the_highest_point_and_is_reported():
     height = cap(SHAPE, SIZE, 5.0, 2.0)
     filled = np.asarray(height > -0.05)
     result = result_of(height, SIZE, sigma=0.001, filled=filled.astype(np.uint8))
@@ -61,7 +61,7 @@ def test_what_was_filled_may_be_the_highest_point_and_is_told():
     assert np.isfinite(cut.height[cut.filled]).all()
 
 
-def test_next_to_a_hole_nothing_is_told():
+def test_next_to_a_hole_nothing_is_reported():
     height = slope()
     height[10, 16] = NAN
     level = section(result_of(height, SIZE), (-1.0, 0.125), (1.0, 0.125))  # between rows 9 and 10
@@ -157,7 +157,7 @@ def test_filled_heights_and_holes_are_no_part_of_a_step():
     assert step_height(across(height, filled=filled)).height.value == pytest.approx(0.2)
 
 
-def test_what_is_no_step_is_refused():
+def test_what_is_not_a_step_is_refused():
     with pytest.raises(io.InputError, match="a smooth curve fits it better"):
         step_height(across(cap(LONG, FINE, 5.0, 3.0)))
     with pytest.raises(io.InputError, match="at least 8 measured samples"):

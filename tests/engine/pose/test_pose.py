@@ -41,7 +41,7 @@ def test_errors_of_many_draws_are_as_large_as_the_covariance_says() -> None:
 
 @pytest.mark.parametrize(("form", "free"), [(bumpy, 0), (rod, 2), (ball, 3), (plane, 3)])
 @pytest.mark.parametrize("size", [0.0, 1.0, 4.0])
-def test_what_a_surface_cannot_tell_is_undetermined(form, free: int, size: float) -> None:
+def test_what_a_surface_cannot_determine_is_undetermined(form, free: int, size: float) -> None:
     for seed in range(3):
         rng = np.random.default_rng(seed)
         pose = engine.pose.estimate_pose(sampled(form, rng=rng), sampled(form, *draw(rng, size), rng=rng))

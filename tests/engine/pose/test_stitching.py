@@ -103,7 +103,7 @@ def test_the_offset_and_the_pose_of_a_levelled_touch_are_in_its_sigma(relative):
     assert 0.5 < np.mean(squares) < 1.5
 
 
-def test_touches_that_differ_say_so():
+def test_touches_that_differ_are_reported():
     first, second = touches(moves=MOVES[:1] * 2)
     dented = np.array(second.height)
     dented[20:30, 30:40] -= 0.02

@@ -9,7 +9,7 @@ from moved_surfaces import bumpy, error_of, sampled
 from mirrorskin import engine, io
 
 
-def test_a_stream_is_followed_over_keys_with_honest_errors() -> None:
+def test_a_stream_is_followed_over_keys_with_true_errors() -> None:
     rng, tracker = np.random.default_rng(0), engine.pose.PoseTracker()
     for number in range(24):
         vector, shift = np.array([0, 0, 0.02 * number]), np.array([0.1 * number, 0.02 * number, 0])

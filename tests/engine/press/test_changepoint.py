@@ -53,7 +53,7 @@ def test_no_fixed_threshold_is_better_at_other_levels(noise, dark, bright):
 
 
 @pytest.mark.parametrize("noise", [pytest.param(n, marks=[SLOW] if n not in (1, 8) else []) for n in NOISES])
-def test_sigma_is_honest_unknown_levels_cost_little_and_a_release_is_as_good(device, noise):
+def test_sigma_is_true_unknown_levels_cost_little_and_a_release_is_as_good(device, noise):
     frames, middle = ramps(noise, pixels=500, seed=2)
     travel = np.arange(64.0)
     known = {"noise": float(np.hypot(noise, 1 / np.sqrt(12))), "device": device}
@@ -145,7 +145,7 @@ def test_long_stacks(device, dtype, known):
 
 
 @pytest.mark.parametrize("levels", [LEVELS["uint8"], {}], ids=["known", "unknown"])
-def test_a_sudden_step_lies_in_the_middle_of_its_interval(device, levels):
+def test_a_sudden_step_is_in_the_middle_of_its_interval(device, levels):
     frames = np.full((4, 1, 1), 20, np.uint8)
     frames[2:] = 220
     found = find_change_point(frames, [0.0, 0.1, 0.4, 0.5], noise=1.0, device=device, **levels)
@@ -219,7 +219,7 @@ def test_spikes_make_no_change_unless_the_stack_ends_on_one_and_move_it_little(d
     assert_near(found, numpy_change(frames, np.arange(40.0), 20, 220, noise=1.5), np.arange(40.0))
 
 
-def test_a_change_of_another_shape_costs_precision_and_says_so(device):
+def test_a_change_of_another_shape_costs_precision_and_reports_it(device):
     """A transition that levels off, which no straight ramp is."""
     generator = np.random.default_rng(5)
     start = generator.uniform(24, 36, (1, 4000))
@@ -269,7 +269,7 @@ def test_noise_alone_and_a_change_the_other_way_are_no_change(device):
     assert np.all(find_change_point(falling[::-1].copy(), -travel, device=device, **RELEASE).status == 3)
 
 
-def test_a_sample_that_is_no_number_spoils_a_pixel_until_its_change_is_seen(device):
+def test_a_sample_that_is_not_a_number_spoils_a_pixel_until_its_change_is_seen(device):
     travel = np.arange(40) * 0.1
     for broken in (np.nan, np.inf, -np.inf):
         frames = np.full((40, 1, 5), 0.1, np.float32)

@@ -115,7 +115,7 @@ def test_the_threshold_falls_towards_the_wall_as_the_wall_is_seen():
     np.testing.assert_allclose(threshold_at(moved, x + 1, y - 2, azimuth), lower, atol=1e-12)
 
 
-def test_a_ball_is_put_right_with_pixels_of_two_sizes_and_defects():
+def test_a_ball_is_corrected_with_pixels_of_two_sizes_and_defects():
     shape, size = (49, 80), (0.1, 0.16)
     height, sigma, status, truth = ball_press(3.0, shape, size, 1.2, 0.05)
     status[20:23, 30:33], status[10, 50] = 0, 0
@@ -141,7 +141,7 @@ def test_a_ball_at_the_edge_of_the_picture_is_put_right():
     assert abs(after.mean()) < abs(before.mean()) / 5
 
 
-def test_too_little_light_tells_no_surface():
+def test_too_little_light_shows_no_surface():
     dark = np.full((20, 20), np.nan)
     with pytest.raises(NotConverged, match="nothing turned light"):
         fit_press(dark, dark, np.full((20, 20), 2), 0.1, GEL)
@@ -167,7 +167,7 @@ class Pixels:
         self.header = type("Header", (), {"pixel_size": pixel_size})()
 
 
-def test_a_press_that_cannot_be_put_right_stays_and_says_why():
+def test_a_press_that_cannot_be_corrected_stays_and_states_the_reason():
     height = np.full((6, 7), -0.5, np.float32)
     result = Result(height=height, height_sigma=0.1 * np.abs(height), status=np.full((6, 7), 2, np.uint8))
     for gel, pixel_size, threshold, why in (

@@ -72,7 +72,7 @@ def test_levels_that_are_given_are_used_as_they_are():
 
 
 @pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")
-def test_where_nothing_turns_light_the_range_of_the_type_is_taken_and_told():
+def test_where_nothing_turns_light_the_range_of_the_type_is_taken_and_reported():
     frames, _ = press(high=14.0)
     result = engine.reconstruct(frames, travel=TRAVEL, fill=False)
     assert result.process["bright"] == "range of the type"

@@ -115,7 +115,7 @@ def test_the_command_adds_it_to_the_correlation(elastic, tmp_path):
         (np.ones(5), "travel does not dither about a mean: 5 frames"),
     ],
 )
-def test_a_travel_that_is_no_dither_is_one_line(travel, line):
+def test_a_travel_that_is_not_a_dither_is_one_line(travel, line):
     frames = np.zeros((len(travel), 2, 3), np.uint8)
     with pytest.raises(io.InputError, match=line) as caught:
         engine.press.find_growth(frames, travel)

@@ -160,7 +160,7 @@ def test_a_flat_top_cut_by_the_border_stays_open():
     np.testing.assert_array_equal(found, given.astype(np.float32))
 
 
-def test_stripes_between_lit_flanks_are_holes_and_those_beside_them_are_not():
+def test_stripes_between_lit_flanks_are_holes_and_those_next_to_them_are_not():
     x, _ = geometry.pixel_centres((60, 100), PIXEL)
     height, slope = -0.2 + 0.2 * np.cos(np.pi * x), np.abs(0.2 * np.pi * np.sin(np.pi * x))
     given, sigma = terraces(height, slope, 0.02)
@@ -172,7 +172,7 @@ def test_stripes_between_lit_flanks_are_holes_and_those_beside_them_are_not():
     assert np.max(np.abs(found - height)[inner]) < 0.035
 
 
-def test_what_was_never_reached_is_no_hole():
+def test_what_was_never_reached_is_not_a_hole():
     height, slope = cap((161, 161), 4.0)
     given, sigma = terraces(-0.6 - height, slope, 0.02)  # a bowl, pressed until its floor is not yet met
     given = np.where(given > -0.5, given, np.nan)
@@ -183,7 +183,7 @@ def test_what_was_never_reached_is_no_hole():
     np.testing.assert_array_equal(found, given.astype(np.float32))
 
 
-def test_a_fill_lies_nowhere_below_what_is_known():
+def test_a_fill_is_nowhere_below_what_is_known():
     height, slope = frustum((161, 161))
     given, sigma = terraces(height, slope, 0.1, start=0.1)  # light from the start above that
     early = (slope > 0) & (-height <= 0.1)
@@ -232,7 +232,7 @@ def test_without_holes_nothing_changes(given):
         ({"deepest": np.nan}, "deepest"),
     ],
 )
-def test_what_cannot_be_used_is_told(change, message):
+def test_what_cannot_be_used_is_reported(change, message):
     arguments = {"height": np.ones((4, 5)), "sigma": 0.01, "pixel_size": PIXEL} | change
     with pytest.raises(InputError, match=message):
         fill_holes(arguments.pop("height"), arguments.pop("sigma"), arguments.pop("pixel_size"), **arguments)

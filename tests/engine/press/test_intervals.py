@@ -114,7 +114,7 @@ def test_a_paraboloid_is_found_as_it_is_up_to_the_border(width):
     assert np.nanmax(found.misfit) < 1e-6
 
 
-def test_errors_are_no_larger_than_told_and_misfits_about_one():
+def test_errors_are_no_larger_than_stated_and_misfits_about_one():
     random = np.random.default_rng(1)
     places = np.zeros(ROWS.shape, bool)
     places[10:20, 10:30] = True
@@ -129,7 +129,7 @@ def test_errors_are_no_larger_than_told_and_misfits_about_one():
     assert 0.8 < misfit < 1.2
 
 
-def test_a_step_is_no_paraboloid():
+def test_a_step_is_not_a_paraboloid():
     height = np.where(COLUMNS < 20, 0.0, -0.5)
     places = np.zeros(ROWS.shape, bool)
     places[15, 18:22] = True
@@ -137,7 +137,7 @@ def test_a_step_is_no_paraboloid():
 
 
 @pytest.mark.parametrize("known", [0, 1, 5])
-def test_too_little_tells_nothing(known):
+def test_too_little_contains_no_information(known):
     weight = np.zeros(ROWS.shape)
     weight[15, 15 : 15 + known] = 1.0
     places = np.zeros(ROWS.shape, bool)

@@ -43,7 +43,7 @@ def found(press):
     return engine.reconstruct(press, thresholds=SHARES, inclinations=STEPS, fill=False)
 
 
-def test_the_true_inclination_lies_within_its_bounds(press, found):
+def test_the_true_inclination_is_within_its_bounds(press, found):
     truth = press.truth
     off = np.min([np.abs(truth.zenith - step) for step in STEPS], axis=0) > math.radians(3.5)
     seen = (truth.contact == 1) & off & (found.slope_min > 0)
@@ -95,7 +95,7 @@ def test_invalid_pixels_have_no_bounds():
         ({"thresholds": [0.5], "inclinations": [0.2], "method": "change-point"}, "method 'threshold'"),
     ],
 )
-def test_what_cannot_be_is_one_line(press, options, said):
+def test_impossible_input_is_one_line(press, options, said):
     with pytest.raises(io.InputError, match=said):
         engine.reconstruct(press, **options)
 

@@ -157,7 +157,7 @@ def test_long_stacks(device, count):
 
 
 @pytest.mark.parametrize("event", EVENTS)
-def test_a_sudden_step_lies_in_the_middle_of_its_interval(device, event):
+def test_a_sudden_step_is_in_the_middle_of_its_interval(device, event):
     frames = np.full((4, 1, 1), 20, np.uint8)
     frames[2:] = 180
     travel = np.array([0.0, 0.1, 0.4, 0.5])
@@ -179,7 +179,7 @@ def test_a_ramp_is_interpolated_exactly(device, event):
     assert found.height_sigma[0, 0] == pytest.approx(0.1 / 16 * np.hypot(0.25, 0.75), rel=1e-3)
 
 
-def test_sigma_is_honest_on_ramps(device):
+def test_sigma_is_true_on_ramps(device):
     """On a ramp whose steps stand well above the noise, the mean square of error over sigma is 1."""
     generator = np.random.default_rng(0)
     crossing = generator.uniform(10, 14, (200, 250))
@@ -192,7 +192,7 @@ def test_sigma_is_honest_on_ramps(device):
 
 
 @pytest.mark.parametrize("event", EVENTS)
-def test_sigma_is_honest_on_steps(device, event):
+def test_sigma_is_true_on_steps(device, event):
     generator = np.random.default_rng(0)
     crossing = generator.uniform(1, 28, (200, 250))
     counts = np.where(np.arange(30)[:, None, None] >= crossing, 200, 20) + generator.normal(
@@ -233,7 +233,7 @@ def test_a_plateau_that_noise_takes_below_its_level_began_in_the_step_that_led_t
     assert np.mean((error / found.height_sigma[known]) ** 2) == pytest.approx(1.0, abs=0.1)
 
 
-def test_a_sample_that_is_lit_by_its_neighbours_does_not_tell_when_the_change_began(device):
+def test_a_sample_that_is_lit_by_its_neighbours_does_not_show_when_the_change_began(device):
     frames = np.array([20.0, 20, 38, 190, 200, 200], np.float32).reshape(-1, 1, 1)
     found = find_onset(frames, 0.1 * np.arange(6), dark=20.0, bright=220.0, noise=1.0, device=device)
     assert found.height_sigma.item() == pytest.approx(0.1 / math.sqrt(12), rel=0.05)
@@ -249,7 +249,7 @@ def test_noise_is_estimated_from_the_first_two_frames():
         assert found.process["noise"] == pytest.approx(np.hypot(noise, 1 / np.sqrt(12)), rel=0.03)
 
 
-def test_a_spike_is_no_onset_unless_the_stack_ends_on_it_and_moves_no_plateau(device):
+def test_a_spike_is_not_an_onset_unless_the_stack_ends_on_it_and_moves_no_plateau(device):
     frames = np.full((9, 1, 4), 20, np.uint8)
     frames[3, 0, 0] = frames[8, 0, 1] = 255
     frames[[3, 4], 0, 2] = 255
@@ -287,7 +287,7 @@ def test_a_pixel_that_is_dark_at_start_stays_so_though_it_turns_light(device):
 
 
 @pytest.mark.parametrize("event", EVENTS)
-def test_a_sample_that_is_no_number_spoils_a_pixel_until_its_onset(device, event):
+def test_a_sample_that_is_not_a_number_spoils_a_pixel_until_its_onset(device, event):
     for broken in (np.nan, np.inf, -np.inf):
         low, high = (0.1, 0.9) if event == "onset" else (0.9, 0.1)
         frames = np.full((9, 1, 5), low, np.float32)
@@ -560,7 +560,7 @@ def test_levels_that_are_not_given_are_estimated_with_a_warning():
     np.testing.assert_allclose(found.height[:, :19], right, atol=0.06)
 
 
-def test_levels_of_other_counts_than_the_frames_are_said():
+def test_levels_of_other_counts_than_the_frames_are_reported():
     frames, travel = twelve_bits()
     shares = (frames / 4096).astype(np.float32)
     said = r"samples are 0\.\d+ to 0\.\d+, below the threshold of 1700 between dark 200 and bright 3200: are"

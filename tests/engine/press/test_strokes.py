@@ -83,7 +83,7 @@ def test_hysteresis_is_the_difference_of_both():
     assert np.mean((miss / found.onset.hysteresis_sigma[DEPTH > 0.2]) ** 2) == pytest.approx(1, abs=0.25)
 
 
-def test_strokes_that_pass_other_places_tell_more_than_their_mean_would():
+def test_strokes_that_pass_other_places_contain_more_information_than_their_mean_would():
     """Intervals overlap in ever less: of n strokes the error falls as 1 / n, a mean's as 1 / sqrt(n)."""
     found = strokes_of(made_press(UNEVEN, DEPTH), UNEVEN)
     single = engine.find_onset(made_press(UNEVEN, DEPTH)[:9], UNEVEN[:9], dark=DARK, bright=BRIGHT)
@@ -128,7 +128,7 @@ def test_a_first_stroke_up_is_one_of_releases():
     assert chi_square(found.onset, -DEPTH) < 1.5
 
 
-def test_a_rest_before_a_stroke_up_is_no_stroke():
+def test_a_rest_before_a_stroke_up_is_not_a_stroke():
     travel = np.concatenate([np.full(5, 1.2), 1.2 - oscillating_travel(0.0, 1.2, 3, 46)])
     found = strokes_of(made_press(travel, DEPTH), travel)
     same = strokes_of(made_press(travel, DEPTH), travel, blocks=range(1, len(travel)))

@@ -22,7 +22,7 @@ def jittered(seed):
 
 
 @pytest.mark.parametrize(("find", "least"), [(engine.find_onset, 0.5), (engine.find_change_point, 0.2)])
-def test_heights_of_a_travel_that_jitters_have_honest_errors(find, least):
+def test_heights_of_a_travel_that_jitters_have_true_errors(find, least):
     squares = []
     for seed in range(8):
         frames, travel, onset = jittered(seed)

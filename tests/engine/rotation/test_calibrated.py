@@ -146,7 +146,7 @@ def test_without_a_pivot_frames_are_not_registered_but_heights_are_found():
     assert result.process["heights"] == "found in the first turn"
 
 
-def test_what_the_calibration_is_wrong_by_counts_in_the_errors_that_are_told():
+def test_what_the_calibration_is_wrong_by_counts_in_the_errors_that_are_reported():
     wall = walls.response_of_twin(SHAPE, PIXEL, BODY, DISTANCE, sigma=(0.003, 0.004))
     known = replace(scene().calibration, zenith=wall)
     doubtful = engine.reconstruct(scene().source(calibration=known)).normals_sigma

@@ -167,7 +167,7 @@ def test_no_sum_overflows(device, dtype, window):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_a_sample_that_is_no_number_spoils_its_pixel_while_it_is_in_the_window(device, bad):
+def test_a_sample_that_is_not_a_number_spoils_its_pixel_while_it_is_in_the_window(device, bad):
     phase = PHASES["turns"]
     frames = swing("float32", phase)
     frames[2, 1, 3] = bad
@@ -291,7 +291,7 @@ def test_a_block_that_does_not_fit_is_refused_and_changes_nothing(window, monkey
     same(operation.result(), before)
 
 
-def test_phases_in_degrees_are_said():
+def test_phases_in_degrees_are_reported():
     frames = swing("uint8", MEASURED)
     with pytest.warns(MirrorskinWarning, match="phase is in radians; yours steps by 4[0-9.]* rad: are they"):
         correlate(frames, np.degrees(MEASURED))

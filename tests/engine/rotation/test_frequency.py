@@ -29,7 +29,7 @@ def bound(amplitude, time=TIME):
 
 
 @pytest.mark.parametrize("case", ["one pixel", "pixels", "uneven", "few of many"])
-def test_it_reaches_the_cramer_rao_bound_and_says_so(case):
+def test_it_reaches_the_cramer_rao_bound_and_reports_it(case):
     random = np.random.default_rng(5)
     time = np.sort(TIME + random.uniform(0, 0.3 / RATE, COUNT)) if case == "uneven" else TIME
     time = time[random.uniform(size=COUNT) > 0.1] if case == "uneven" else time

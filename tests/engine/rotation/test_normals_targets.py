@@ -37,7 +37,7 @@ def answered(request, device):
     return normals, rotations.scores(normals.normals, normals.normals_sigma, stack), stack
 
 
-def test_the_exact_method_reaches_the_bound_in_every_bin_and_sigma_is_honest(answered):
+def test_the_exact_method_reaches_the_bound_in_every_bin_and_sigma_is_true(answered):
     normals, told, stack = answered
     np.testing.assert_allclose(told.ratio, 1, rtol=0, atol=0.05)
     np.testing.assert_allclose(told.chi_square, 1, rtol=0, atol=0.05)
@@ -151,7 +151,7 @@ def tilted(name, tilt):
 
 
 @pytest.mark.parametrize(("name", "tilt"), [("uint8", 2.5), ("float32", 4.0)])
-def test_an_unknown_tilt_is_told_within_its_own_error(device, name, tilt):
+def test_an_unknown_tilt_is_reported_within_its_own_error(device, name, tilt):
     stack, error = tilted(name, tilt)
     setup = stack.setup
     assert error < 1e-3 * setup.tilt

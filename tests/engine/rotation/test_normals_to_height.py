@@ -72,7 +72,7 @@ STEEP = (10, 30, 50)
 
 
 @pytest.mark.parametrize(("phase", "azimuth"), [(EIGHTHS, 20), (EIGHTHS, 130), (UNEVEN, 45)])
-def test_slopes_have_honest_errors_and_no_bias(phase, azimuth):
+def test_slopes_have_true_errors_and_no_bias(phase, azimuth):
     setup = replace(SETUP, phase=phase)
     known = {
         "phase": setup.phase,
@@ -100,7 +100,7 @@ def test_slopes_have_honest_errors_and_no_bias(phase, azimuth):
             assert -(means[0] * toward[0] + means[1] * toward[1]) == pytest.approx(steepness, rel=1.5e-3)
 
 
-def test_on_a_ridge_weights_go_by_the_axis_across_it():
+def test_on_a_ridge_weights_depend_on_the_axis_across_it():
     vectors = np.tile(rotations.direction(np.radians(30), 0.0), (20, 20, 1))
     vectors[:, 10:, 0] *= -1
     size = vectors.shape[:2]
@@ -112,7 +112,7 @@ def test_on_a_ridge_weights_go_by_the_axis_across_it():
     assert found.weights[0, 0, 0] > 50 * found.weights[1, 0, 0]
 
 
-def test_weights_may_go_by_other_errors():
+def test_weights_may_depend_on_other_errors():
     plain = slopes_at(40, 0, sigma=0.02, tilt=TILT)
     white = slopes_at(40, 0, sigma=0.02, tilt=TILT, independent_sigma=np.float32(0.04) * ONE)
     assert white[:2] == plain[:2]

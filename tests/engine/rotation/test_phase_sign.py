@@ -25,7 +25,7 @@ def warnings_of(shape, sign):
 
 
 @pytest.mark.parametrize("shape", ["coin", "cone"])
-def test_a_mirrored_surface_is_told(shape):
+def test_a_mirrored_surface_is_reported(shape):
     assert "the slopes fit together better with the phases reversed" in warnings_of(shape, -1)
 
 

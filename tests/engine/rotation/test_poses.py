@@ -70,7 +70,7 @@ def test_a_turn_is_one_case_of_poses():
 
 
 @pytest.mark.parametrize(("direction", "middle"), [(0.0, 0.0), (0.6, np.radians(5)), (2.9, 0.0)])
-def test_rocking_tells_the_slope_along_it_at_the_bound_and_nothing_across(direction, middle):
+def test_rocking_determines_the_slope_along_it_at_the_bound_and_nothing_across(direction, middle):
     phase = np.full(COUNT, direction)
     axes = body_axes(phase, ROCKING + middle)
     found = engine.estimate_normals(shown(axes), phase, tilt=ROCKING + middle, **SCALE)

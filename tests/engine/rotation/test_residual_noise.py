@@ -100,14 +100,14 @@ def test_frames_that_are_all_the_same_have_the_least_noise(dtype, floor):
 @pytest.mark.parametrize(
     "samples", [np.zeros((8, 5), np.uint8), np.full((8, 5), np.nan, np.float32), np.zeros((8, 0), np.uint16)]
 )
-def test_where_nothing_will_be_answered_any_noise_will_do(samples):
+def test_where_nothing_will_be_answered_any_noise_is_accepted(samples):
     found = residual_noise(samples, np.array(EIGHTHS), np.ones(8))
     assert found.slope == 0
     assert 0 < found.at(100.0) < 0.3
 
 
 @pytest.mark.parametrize("pixels", [1, 300])
-def test_few_pixels_tell_roughly(pixels):
+def test_few_pixels_give_rough_estimates(pixels):
     found = residual_noise(*samples_of(1.0, 0.0, phase=SIXTEEN, pixels=pixels))
     assert 0.5 < found.at(100.0) < 1.6
 

@@ -52,7 +52,7 @@ def test_each_pixel_has_its_counts_its_place_and_its_shading():
     np.testing.assert_allclose(shade(replace(walls.response(SHAPE), shade=np.zeros(5)), x, y), 1)
 
 
-def test_a_defect_and_what_lies_beside_the_body_have_no_answer():
+def test_a_defect_and_what_is_next_to_the_body_have_no_answer():
     dark = np.full(SHAPE, 10.0)
     dark[3, 4] = np.nan
     bright = np.full(SHAPE, 240.0)

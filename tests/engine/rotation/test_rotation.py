@@ -247,7 +247,7 @@ def test_heights_that_do_not_converge_are_refused(monkeypatch, robust, residual,
 
 
 @pytest.mark.parametrize("camera", [{}, {"electrons": 40.0, "gain_deviation": 0.02, "offset_deviation": 0.5}])
-def test_registered_frames_of_the_twin_have_honest_errors(camera):
+def test_registered_frames_of_the_twin_have_true_errors(camera):
     made = hw.Twin(
         object="sphere",
         shape=(90, 90),

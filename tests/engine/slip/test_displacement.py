@@ -36,7 +36,7 @@ def grid(right, down, shape=SHAPE):
 
 
 @pytest.mark.parametrize("window", [9, 15])
-def test_errors_are_at_the_bound_and_sigma_is_honest(device, window):
+def test_errors_are_at_the_bound_and_sigma_is_true(device, window):
     shifts = [(0.3 * k, -0.17 * k) for k in range(1, 5)]
     squares, bound = [], []
     for seed, (right, down) in enumerate(shifts):

@@ -122,7 +122,7 @@ def test_a_live_source_is_left_alone_until_its_header_is_asked_for():
         _ = source.header
 
 
-def test_a_live_source_tells_time_and_corrected_positions_and_can_be_left():
+def test_a_live_source_reports_time_and_corrected_positions_and_can_be_left():
     feed = Feed(8, (3,), "axial")
     with calibrated(["precession"], feed) as source:
         while source.read() is not None:

@@ -140,7 +140,7 @@ def test_a_part_that_does_not_fit_leaves_the_file_as_it_was(saved):
     assert list(saved.parent.iterdir()) == [saved]
 
 
-def test_a_calibration_that_cannot_be_written_is_told(tmp_path):
+def test_a_calibration_that_cannot_be_written_is_reported(tmp_path):
     with pytest.raises(io.InputError, match="make it first"):
         io.save_calibration(a_calibration(), tmp_path / "none" / "cal.h5")
 
@@ -192,7 +192,7 @@ def without(name):
         (a_value("tilt/sigma/tilt", "much"), "holds no numbers: calibrate again"),
     ],
 )
-def test_a_file_that_is_damaged_or_of_another_version_is_told_in_a_line(saved, change, said):
+def test_a_file_that_is_damaged_or_of_another_version_is_printed_in_a_line(saved, change, said):
     with h5py.File(saved, "r+") as file:
         change(file)
     with pytest.raises(io.InputError, match=said) as told:
@@ -201,7 +201,7 @@ def test_a_file_that_is_damaged_or_of_another_version_is_told_in_a_line(saved, c
     assert "\n" not in str(told.value)
 
 
-def test_what_is_no_calibration_is_told(path, tmp_path):
+def test_what_is_not_a_calibration_is_reported(path, tmp_path):
     with pytest.raises(io.InputError, match="no such file"):
         io.open_calibration(path)
     record(sphere(), path)

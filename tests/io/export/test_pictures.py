@@ -73,7 +73,7 @@ def test_a_picture_has_its_size_in_millimetres(slope, tmp_path, suffix):
     np.testing.assert_allclose(size, [9 * 0.5, 6 * 0.25])
 
 
-def test_a_tiff_tells_imagej_and_gdal_what_they_ask_for(slope, tmp_path):
+def test_a_tiff_contains_what_imagej_and_gdal_need(slope, tmp_path):
     path = tmp_path / "out.tif"
     io.export_result(slope, path)
     with tifffile.TiffFile(path) as file:
@@ -91,7 +91,7 @@ def test_a_tiff_tells_imagej_and_gdal_what_they_ask_for(slope, tmp_path):
     assert told["date"] == "2026-01-02T03:04:05+00:00"
 
 
-def test_a_png_tells_gwyddion_what_it_asks_for(slope, tmp_path):
+def test_a_png_contains_what_gwyddion_needs(slope, tmp_path):
     path = tmp_path / "out.png"
     # Of a part of the picture, so that the middle of it is not the origin.
     io.export_result(slope.assign(x=slope.x + 3, y=slope.y + 7), path)

@@ -55,7 +55,7 @@ def test_what_needs_millimetres_is_not_made_without(slope, tmp_path, name, chang
 
 
 @pytest.mark.parametrize(("name", "shape"), [("out.ply", (1, 9)), ("out.stl", (6, 1)), ("out.ply", (1, 1))])
-def test_a_single_row_is_no_surface(tmp_path, name, shape):
+def test_a_single_row_is_not_a_surface(tmp_path, name, shape):
     x, y = io.pixel_axes(shape, (0.5, 0.5))
     row = io.Result(height=np.zeros(shape, np.float32), x=x, y=y)
     line = refused(row, tmp_path / name)

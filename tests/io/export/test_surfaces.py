@@ -67,7 +67,7 @@ def test_pieces_are_not_joined(slope, path):
     assert sorted(np.bincount(parts)) == [2 * 5 * 3, 2 * 5 * 4 - 4]
 
 
-def test_a_ply_tells_what_is_known_of_each_vertex(slope, tmp_path):
+def test_a_ply_contains_all_values_of_each_vertex(slope, tmp_path):
     path = tmp_path / "out.ply"
     io.export_result(slope, path)
     mesh = opened(path)
@@ -110,7 +110,7 @@ def test_an_stl_says_its_unit_and_does_not_pass_for_text(slope, tmp_path):
 
 
 @pytest.mark.parametrize("suffix", ["ply", "stl", "png", "csv"])
-def test_relative_heights_are_told(slope, tmp_path, suffix):
+def test_relative_heights_are_reported(slope, tmp_path, suffix):
     relative = slope.assign(offset_unknown=np.ones(1, np.uint8))
     section = {"distance": np.arange(3.0), "height": np.arange(3.0)}
     told = io.export_result(relative, tmp_path / f"out.{suffix}", section=section)
