@@ -404,14 +404,14 @@ def load_rig(path: Path | str) -> RigSettings:
     file = load_toml(path, RigFile, "'mirrorskin rig new' writes a template")
     _check_emulator(path)
     camera = file.camera
-    beside: dict[str, Any] = {
+    resolved: dict[str, Any] = {
         name: str(path.parent / given)
         for name in ("dark", "bright")
         if isinstance(given := getattr(camera, name), str)
     }
     if isinstance(camera.source, str) and not camera.streamed:
-        beside["source"] = _beside(path, camera.source)
-    camera = msgspec.structs.replace(camera, **beside)
+        resolved["source"] = _next_to(path, camera.source)
+    camera = msgspec.structs.replace(camera, **resolved)
     check_references(camera, str(path))
     stage = msgspec.structs.replace(file.stage, firmware=_own_stage(path, file.stage.firmware))
     return RigSettings(path, file.name or path.stem, stage, camera)
@@ -434,11 +434,11 @@ def _own_stage(path: Path, name: str) -> str:
     place, _, kind = name.rpartition(":")
     if not place:
         return name
-    file = _beside(path, place if place.endswith(".py") else f"{place.replace('.', '/')}.py")
+    file = _next_to(path, place if place.endswith(".py") else f"{place.replace('.', '/')}.py")
     return f"{file}:{kind}" if Path(file).is_file() else name
 
 
-def _beside(path: Path, name: str) -> str:
+def _next_to(path: Path, name: str) -> str:
     """Return the path of a file relative to the rig file; other names are returned unchanged."""
     try:
         return str(path.parent / name) if (path.parent / name).exists() else name

@@ -144,8 +144,8 @@ class Limits:
     def way_up(self, position: Position) -> list[Position]:
         """Return the path of a retreat: upright, straight up to the least travel, and to the centre."""
         upright, high = self.nearest(position), self.travel[0]
-        ways = [upright] if position.tilt > _UPRIGHT else []
-        return list(dict.fromkeys([*ways, replace(upright, travel=high), Position(high)]))
+        first = [upright] if position.tilt > _UPRIGHT else []
+        return list(dict.fromkeys([*first, replace(upright, travel=high), Position(high)]))
 
     def _check_sideways(self, value: float, motion: str, unit: str, scale: float, name: str) -> None:
         """Refuse a move along x or y, mm, or a twist, degrees, beyond its limits."""

@@ -203,8 +203,8 @@ class GrblStage(Closing):
         """Start a sequence of straight moves; see ``move``."""
         for place in places:
             self.limits.check(place, self.name)
-        ways = itertools.pairwise([self._destination(), *places])
-        legs = [pieces for way in ways if (pieces := self.axes.pieces(*way, speed))]
+        moves = itertools.pairwise([self._destination(), *places])
+        legs = [pieces for move in moves if (pieces := self.axes.pieces(*move, speed))]
         if legs:
             self._send([one for pieces in legs for one in pieces], places[-1], ramps=len(legs))
         else:

@@ -136,13 +136,13 @@ class MarlinStage(Closing):
         """Start a sequence of straight moves; see ``Stage.follow``."""
         for place in places:
             self.limits.check(place, self.name)
-        ways = list(itertools.pairwise([self._target or self.report().position, *places]))
-        commands = [self.axes.straight(*way, speed) for way in ways]  # check all moves before any is sent
+        moves = list(itertools.pairwise([self._target or self.report().position, *places]))
+        commands = [self.axes.straight(*move, speed) for move in moves]  # check all moves before any is sent
         with self._guarded(), self._lock:
-            for way, command in zip(ways, commands, strict=True):
-                self._target = way[1]
+            for move, command in zip(moves, commands, strict=True):
+                self._target = move[1]
                 if command is not None:
-                    length = self.axes.distance(*way)
+                    length = self.axes.distance(*move)
                     path = Trapezoid(length, length / command.duration, self._acceleration)
                     self._due = max(self._due or 0.0, self.clock.now()) + path.duration
                     self._ask(command.line, self._settings.timeout + self._due - self.clock.now())

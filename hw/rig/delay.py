@@ -71,25 +71,25 @@ def measure_delay(rig: Rig, plan: Plan) -> Delay:
     1.5 s or 60 frames, whichever is longer, if the stage can move that slowly. The delay is relative to the
     stage's reports and includes their latency, as it should.
     """
-    way = _stroke(rig, plan)
-    rests = rig.go(way.begin).time
+    stroke = _stroke(rig, plan)
+    rests = rig.go(stroke.begin).time
     seconds = max(_SECONDS, _FRAMES * rig.period)
-    speed = min(max(way.length / seconds, way.slowest), way.fastest)
-    seconds = way.length / speed
+    speed = min(max(stroke.length / seconds, stroke.slowest), stroke.fastest)
+    seconds = stroke.length / speed
     every = max(1, math.floor(seconds * rig.rate / _MOST_FRAMES))
     _FrameLog(rig, every).until(rests + _LONGEST_DELAY)  # earlier frames may show the approach
     log = _FrameLog(rig, every)
-    there = log.follow(rig.begin(lambda: rig.stage.move(way.end, speed), timed=True))
-    back = log.follow(rig.begin(lambda: rig.stage.move(way.begin, speed), timed=True))
+    there = log.follow(rig.begin(lambda: rig.stage.move(stroke.end, speed), timed=True))
+    back = log.follow(rig.begin(lambda: rig.stage.move(stroke.begin, speed), timed=True))
     log.until(back.ended + _LONGEST_DELAY)
 
-    path = Trapezoid.planned(way.length, speed)
+    path = Trapezoid.planned(stroke.length, speed)
     turned = (there.ended + back.began) / 2
-    down = _track(rig, way.along, path, there.began, turned)
-    up = _track(rig, lambda place: way.length - way.along(place), path, back.began, back.ended)
+    down = _track(rig, stroke.along, path, there.began, turned)
+    up = _track(rig, lambda place: stroke.length - stroke.along(place), path, back.began, back.ended)
 
     def place(times: Floats) -> Floats:
-        return np.where(times < turned, down.at(times), way.length - up.at(times))
+        return np.where(times < turned, down.at(times), stroke.length - up.at(times))
 
     clock, clock_error = frame_times(*log.arrivals())
     delay = estimate_delay(clock, np.concatenate(log.pictures), place, rig.camera.name)
@@ -106,7 +106,7 @@ def _stroke(rig: Rig, plan: Plan) -> _Stroke:
             begin, end, 2 * plan.tilt, lambda place: plan.tilt - place.pitch, *_speeds(stage.pitch)
         )
     if isinstance(plan, RockPlan):
-        along = partial(plan.way, expected=0.0)
+        along = partial(plan.distance_of, expected=0.0)
         return _Stroke(plan.first, plan.ends[0], plan.length, along, *_speeds(stage.pitch))
     start, stop = (plan.start, plan.stop) if isinstance(plan, VerticalPlan) else (0.0, plan.first.travel)
     length = (1 - _PRESSED) * (stop - start)

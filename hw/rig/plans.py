@@ -85,7 +85,7 @@ class Trapezoid:
 class Plan:
     """A scan; see `VerticalPlan`, `AxialPlan`, `HorizontalPlan`, `TwistPlan` and `RockPlan`.
 
-    A position is described by the distance that the body has travelled along its trajectory (way): mm or
+    A position is described by the distance that the body has travelled along its trajectory: mm or
     radians.
     """
 
@@ -109,15 +109,15 @@ class Plan:
         """Length of the trajectory, mm or radians."""
         raise NotImplementedError
 
-    def place(self, way: float) -> Position:
+    def place(self, distance: float) -> Position:
         """Return the position of the body after a distance."""
         raise NotImplementedError
 
-    def recorded(self, ways: Floats) -> Floats:
+    def recorded(self, distances: Floats) -> Floats:
         """Return the recorded value after some distances, (n,) or (n, 2), mm or radians."""
         raise NotImplementedError
 
-    def way(self, position: Position, expected: float) -> float:
+    def distance_of(self, position: Position, expected: float) -> float:
         """Return the distance of a position; of several, the one closest to the expected distance."""
         raise NotImplementedError
 
@@ -127,7 +127,7 @@ class Plan:
         return self.step is not None
 
     @property
-    def ways(self) -> Floats:
+    def distances(self) -> Floats:
         """Distance at each step, (n,)."""
         assert self.step is not None
         return np.asarray(self.step * np.arange(_whole(self.length / self.step) + 1), np.float64)
@@ -165,12 +165,12 @@ class Plan:
     @property
     def values(self) -> Floats:
         """Recorded value of each step, (n,) or (n, 2)."""
-        return self.recorded(self.ways)
+        return self.recorded(self.distances)
 
     @property
     def places(self) -> list[Position]:
         """Position of the body at each step."""
-        return [self.place(float(way)) for way in self.ways]
+        return [self.place(float(distance)) for distance in self.distances]
 
     def _check(self, unit: str) -> None:
         _check_one_of(("step", self.step, unit), ("speed", self.speed, f"{unit}/s"))
@@ -244,22 +244,22 @@ class VerticalPlan(Plan):
         """Turning points and end."""
         return [Position(self.start if number % 2 else self.stop) for number in range(self.strokes)]
 
-    def place(self, way: float) -> Position:
+    def place(self, distance: float) -> Position:
         """Return the position of the body after a distance."""
-        return Position(travel=float(self.recorded(np.asarray(way))))
+        return Position(travel=float(self.recorded(np.asarray(distance))))
 
-    def recorded(self, ways: Floats) -> Floats:
+    def recorded(self, distances: Floats) -> Floats:
         """Return the travel, (n,), mm."""
-        number = np.clip(ways // self._depth, 0, self.strokes - 1)
-        along = ways - number * self._depth
+        number = np.clip(distances // self._depth, 0, self.strokes - 1)
+        along = distances - number * self._depth
         return np.asarray(self.start + np.where(number % 2, self._depth - along, along))
 
-    def way(self, position: Position, expected: float) -> float:
+    def distance_of(self, position: Position, expected: float) -> float:
         """Return the distance travelled, mm, in the stroke closest to the expected distance."""
         depth = min(max(position.travel - self.start, 0.0), self._depth)
         number = np.arange(self.strokes)
-        ways = np.where(number % 2, (number + 1) * self._depth - depth, number * self._depth + depth)
-        return float(ways[np.argmin(abs(ways - expected))])
+        distances = np.where(number % 2, (number + 1) * self._depth - depth, number * self._depth + depth)
+        return float(distances[np.argmin(abs(distances - expected))])
 
     @property
     def _depth(self) -> float:
@@ -316,16 +316,16 @@ class HorizontalPlan(Plan):
         """Length of the slide, mm."""
         return self.distance
 
-    def place(self, way: float) -> Position:
+    def place(self, distance: float) -> Position:
         """Return the position of the body after a distance."""
-        x, y = way * self._along
+        x, y = distance * self._along
         return Position(self.press, x=float(x), y=float(y))
 
-    def recorded(self, ways: Floats) -> Floats:
+    def recorded(self, distances: Floats) -> Floats:
         """Return the displacement, (n, 2), mm."""
-        return ways[:, np.newaxis] * self._along
+        return distances[:, np.newaxis] * self._along
 
-    def way(self, position: Position, expected: float) -> float:
+    def distance_of(self, position: Position, expected: float) -> float:
         """Return the distance of the slide so far, mm."""
         return min(max(float(np.dot((position.x, position.y), self._along)), 0.0), self.length)
 
@@ -378,15 +378,15 @@ class TwistPlan(Plan):
         """Absolute value of the angle, radians."""
         return abs(self.angle)
 
-    def place(self, way: float) -> Position:
+    def place(self, distance: float) -> Position:
         """Return the position of the body after an angle."""
-        return Position(self.press, twist=math.copysign(way, self.angle))
+        return Position(self.press, twist=math.copysign(distance, self.angle))
 
-    def recorded(self, ways: Floats) -> Floats:
+    def recorded(self, distances: Floats) -> Floats:
         """Return the twist, (n,), radians."""
-        return np.copysign(ways, self.angle)
+        return np.copysign(distances, self.angle)
 
-    def way(self, position: Position, expected: float) -> float:
+    def distance_of(self, position: Position, expected: float) -> float:
         """Return the angle so far, radians."""
         return min(max(math.copysign(1.0, self.angle) * position.twist, 0.0), self.length)
 
@@ -455,7 +455,7 @@ class AxialPlan(Plan):
         return math.tau
 
     @property
-    def ways(self) -> Floats:
+    def distances(self) -> Floats:
         """Phase of each step, (n,), radians."""
         assert self.phase_step is not None
         # The end of whole turns is their start; a step that ends before it is included.
@@ -486,15 +486,15 @@ class AxialPlan(Plan):
                 )
         return turn * min(1.0, self.turns)
 
-    def place(self, way: float) -> Position:
+    def place(self, distance: float) -> Position:
         """Return the position of the body at a phase, radians."""
-        return Position(self.press, self.tilt * math.cos(way), self.tilt * math.sin(way))
+        return Position(self.press, self.tilt * math.cos(distance), self.tilt * math.sin(distance))
 
-    def recorded(self, ways: Floats) -> Floats:
+    def recorded(self, distances: Floats) -> Floats:
         """Return the phase, (n,), radians."""
-        return ways
+        return distances
 
-    def way(self, position: Position, expected: float) -> float:
+    def distance_of(self, position: Position, expected: float) -> float:
         """Return the phase without jumps, radians."""
         return position.phase + math.tau * round((expected - position.phase) / math.tau)
 
@@ -548,16 +548,16 @@ class RockPlan(Plan):
         """The phase."""
         return {"phase": self.phase}
 
-    def place(self, way: float) -> Position:
+    def place(self, distance: float) -> Position:
         """Return the position of the body after an angle."""
-        tilt = way - self.tilt
+        tilt = distance - self.tilt
         return Position(self.press, tilt * math.cos(self.phase), tilt * math.sin(self.phase))
 
-    def recorded(self, ways: Floats) -> Floats:
+    def recorded(self, distances: Floats) -> Floats:
         """Return the tilt, (n,), radians."""
-        return ways - self.tilt
+        return distances - self.tilt
 
-    def way(self, position: Position, expected: float) -> float:
+    def distance_of(self, position: Position, expected: float) -> float:
         """Return the angle so far, radians."""
         tilt = position.pitch * math.cos(self.phase) + position.roll * math.sin(self.phase)
         return min(max(tilt + self.tilt, 0.0), self.length)

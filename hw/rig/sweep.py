@@ -103,8 +103,8 @@ class SweepScan(Scan):
         number, arrival = (np.concatenate(one) for one in zip(*self._frames, strict=True))
         times, reported = zip(*self._reports, strict=True)
         track = Track(times, reported, self._path)
-        ways = track.at(even_times(number, arrival) - self.delay.seconds)
-        return {self.plan.series: self.plan.recorded(ways)}
+        distances = track.at(even_times(number, arrival) - self.delay.seconds)
+        return {self.plan.series: self.plan.recorded(distances)}
 
     def _prepare(self) -> None:
         super()._prepare()
@@ -121,20 +121,20 @@ class SweepScan(Scan):
             taken = self.rig.take(most)
             self._add_reports()
             exposed = taken.time - self.delay.seconds
-            way = self._live_track.at(exposed)
-            part = self._thinned(taken, self._part(move, exposed, way))
+            distance = self._live_track.at(exposed)
+            part = self._thinned(taken, self._part(move, exposed, distance))
             if part.start < part.stop:
-                return self._give(taken, part, way[part], origin)
-            if part.stop < len(way):
+                return self._give(taken, part, distance[part], origin)
+            if part.stop < len(distance):
                 self.rig.end(move)
                 self._add_reports()
                 return None
 
-    def _give(self, taken: Frames, part: slice, way: Floats, origin: float) -> Block:
+    def _give(self, taken: Frames, part: slice, distance: Floats, origin: float) -> Block:
         """Return a block with a part of the frames, and record their times."""
         time = taken.time[part]
         self._frames.append((taken.number[part], time))
-        return self._block(taken.pixels[part], time, self.plan.recorded(way), taken.dropped, origin)
+        return self._block(taken.pixels[part], time, self.plan.recorded(distance), taken.dropped, origin)
 
     def _begin(self, most: int) -> tuple[Frames, slice]:
         """Wait until frames show the body at rest, and start the motion; return these frames."""
@@ -152,11 +152,11 @@ class SweepScan(Scan):
     def _add_reports(self) -> None:
         """Add the reports received since the last call."""
         for report in self.rig.stage.history(self._reports[-1][0]):
-            way = self._progress(report)
-            self._reports.append((report.time, way))
-            self._live_track.add(report.time, way)
+            distance = self._progress(report)
+            self._reports.append((report.time, distance))
+            self._live_track.add(report.time, distance)
 
-    def _part(self, move: Move, exposed: Floats, way: Floats) -> slice:
+    def _part(self, move: Move, exposed: Floats, distance: Floats) -> slice:
         """Return which frames belong to the scan.
 
         A straight scan includes frames at rest before and after the motion. A rotation does not: one phase
@@ -165,7 +165,7 @@ class SweepScan(Scan):
         end = int(np.searchsorted(exposed, move.ended, side="right"))
         if not isinstance(self.plan, AxialPlan):
             return slice(0, end)
-        end = min(end, int(np.searchsorted(way, self._path.length)))
+        end = min(end, int(np.searchsorted(distance, self._path.length)))
         return slice(min(end, int(np.searchsorted(exposed, move.began))), end)
 
     def _thinned(self, taken: Frames, part: slice) -> slice:

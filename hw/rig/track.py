@@ -36,10 +36,10 @@ class Progress:
         """Return the distance; reports must be in the order of their times."""
         expected = 0.0
         if self._last is not None:  # as planned, but half as far: the body may have been at rest meanwhile
-            before, way = self._last
+            before, distance = self._last
             speed = self._plan.path.speed
-            expected = way + min(speed * (report.time - before) / 2, self._plan.period / 2)
-        now = self._plan.way(report.position, expected)
+            expected = distance + min(speed * (report.time - before) / 2, self._plan.period / 2)
+        now = self._plan.distance_of(report.position, expected)
         self._last = report.time, now
         return now
 
@@ -58,26 +58,26 @@ class LiveTrack:
         self._last = 0.0
         self._done = math.inf
 
-    def add(self, time: float, way: float) -> None:
+    def add(self, time: float, distance: float) -> None:
         """Add a report: the distance travelled at a time, seconds."""
         rest = _AT_REST * self._path.length
-        if way <= rest:
+        if distance <= rest:
             self._line = max(time, self._line[0]), 0.0, 1.0
-        elif way >= self._path.length - rest:
+        elif distance >= self._path.length - rest:
             self._done = min(self._done, time)
         else:
-            self._reports = [*self._reports[1 - _RECENT :], (time, float(self._path.time(way)))]
+            self._reports = [*self._reports[1 - _RECENT :], (time, float(self._path.time(distance)))]
             self._line = self._fit_line()
 
     def at(self, times: ArrayLike) -> Floats:
         """Return the distance at increasing times, in the shape of `times`."""
         t = np.asarray(times, np.float64)
         origin, start, slope = self._line
-        way = self._path.place(start + slope * (t - origin))
-        way = np.where(t >= self._done, self._path.length, way)
-        way = np.maximum.accumulate(np.maximum(way, self._last))
-        self._last = float(way[-1]) if way.size else self._last
-        return way
+        distance = self._path.place(start + slope * (t - origin))
+        distance = np.where(t >= self._done, self._path.length, distance)
+        distance = np.maximum.accumulate(np.maximum(distance, self._last))
+        self._last = float(distance[-1]) if distance.size else self._last
+        return distance
 
     def _fit_line(self) -> tuple[float, float, float]:
         """Return a time, the corresponding time on the plan, and the ratio of their rates."""
@@ -94,7 +94,7 @@ class Track:
 
     Start time, speed and acceleration of a trapezoidal profile are fitted to all reports together, so the
     jitter of single reports has little influence. Deviations that neighbouring reports agree on are added.
-    `times`, (n,), seconds, and `ways`, (n,), mm or radians, are the reports; `path` is the planned
+    `times`, (n,), seconds, and `distances`, (n,), mm or radians, are the reports; `path` is the planned
     trajectory. ``began`` and ``path`` are the fitted values; ``spread`` is the standard deviation of the
     reports about the result, mm or radians.
     """
@@ -102,10 +102,10 @@ class Track:
     began: float
     path: Trapezoid
 
-    def __init__(self, times: ArrayLike, ways: ArrayLike, path: Trapezoid) -> None:
-        time, way = np.asarray(times, np.float64), np.asarray(ways, np.float64)
-        self.began, self.path = _fit(time, way, path)
-        residual = way - self.path.place(time - self.began)
+    def __init__(self, times: ArrayLike, distances: ArrayLike, path: Trapezoid) -> None:
+        time, distance = np.asarray(times, np.float64), np.asarray(distances, np.float64)
+        self.began, self.path = _fit(time, distance, path)
+        residual = distance - self.path.place(time - self.began)
         self._extra = _smooth_residual(residual)
         self._time = time
         self.reports: int = len(time)
@@ -119,20 +119,20 @@ class Track:
     def at(self, times: ArrayLike) -> Floats:
         """Return the distance at increasing times; it never decreases."""
         t = np.asarray(times, np.float64)
-        way = self.path.place(t - self.began)
+        distance = self.path.place(t - self.began)
         if self._extra.any():
-            way = np.clip(way + np.interp(t, self._time, self._extra), 0, self.path.length)
-        return np.maximum.accumulate(way)
+            distance = np.clip(distance + np.interp(t, self._time, self._extra), 0, self.path.length)
+        return np.maximum.accumulate(distance)
 
 
-def _fit(time: Floats, way: Floats, path: Trapezoid) -> tuple[float, Trapezoid]:
+def _fit(time: Floats, distance: Floats, path: Trapezoid) -> tuple[float, Trapezoid]:
     """Fit start time, speed and acceleration to all reports."""
     rest = _AT_REST * path.length
-    moving = (way > rest) & (way < path.length - rest)
+    moving = (distance > rest) & (distance < path.length - rest)
     if not moving.any():
-        before = time[way <= rest]
+        before = time[distance <= rest]
         return (float(before[-1]) if len(before) else float(time[0])), path
-    began = float(np.median(time[moving] - path.time(way[moving])))
+    began = float(np.median(time[moving] - path.time(distance[moving])))
     if np.count_nonzero(moving) < _REPORTS_MIN:
         return began, path
 
@@ -143,7 +143,7 @@ def _fit(time: Floats, way: Floats, path: Trapezoid) -> tuple[float, Trapezoid]:
 
     def residuals(values: Floats) -> Floats:
         start, trial = trajectory(values)
-        return trial.place(time - start) - way
+        return trial.place(time - start) - distance
 
     scale = mad_sigma(residuals(np.array([0.0, 0.0, math.log(path.ramp)]))) + 1e-5 * path.length
     low, high = (math.log(ramp) for ramp in _RAMPS)

@@ -269,8 +269,8 @@ class Step:
     def slope(self, x: Floats, y: Floats, /) -> tuple[Floats, Floats]:
         """Return -tan(zenith) (cos(azimuth), sin(azimuth)) on the ramp, 0 elsewhere; NaN off the plate."""
         downhill = self._downhill(x, y)
-        beside = np.abs(downhill) > self.drop / 2 / math.tan(self.zenith)
-        steepness = np.where(np.isnan(downhill), np.nan, np.where(beside, 0.0, -math.tan(self.zenith)))
+        level = np.abs(downhill) > self.drop / 2 / math.tan(self.zenith)
+        steepness = np.where(np.isnan(downhill), np.nan, np.where(level, 0.0, -math.tan(self.zenith)))
         return steepness * math.cos(self.azimuth), steepness * math.sin(self.azimuth)
 
     def _downhill(self, x: Floats, y: Floats) -> Floats:

@@ -110,7 +110,7 @@ def test_a_rocking_body_leans_from_one_side_to_the_other_about_one_axis():
         assert (place.travel, place.tilt) == (1.0, pytest.approx(abs(tilt)))
         along, across = math.cos(place.phase - plan.phase), math.sin(place.phase - plan.phase)
         assert (place.tilt * along, place.tilt * across) == (pytest.approx(tilt), pytest.approx(0))
-        assert plan.recorded(np.array([plan.way(place, 0.0)])) == pytest.approx(tilt)
+        assert plan.recorded(np.array([plan.distance_of(place, 0.0)])) == pytest.approx(tilt)
     assert plan.constants == {"phase": math.radians(30)}
 
 
@@ -119,8 +119,8 @@ def test_a_twist_turns_the_way_of_its_sign(sense):
     plan = TwistPlan(1.0, sense * 0.4, step=0.1)
     np.testing.assert_allclose(plan.values, sense * np.array([0, 0.1, 0.2, 0.3, 0.4]))
     assert [place.twist for place in plan.places] == list(plan.values)
-    assert plan.way(Position(1.0, twist=sense * 0.3), 0.0) == pytest.approx(0.3)
-    assert plan.way(Position(1.0, twist=-sense * 1e-4), 0.0) == 0
+    assert plan.distance_of(Position(1.0, twist=sense * 0.3), 0.0) == pytest.approx(0.3)
+    assert plan.distance_of(Position(1.0, twist=-sense * 1e-4), 0.0) == 0
 
 
 @pytest.mark.parametrize(
