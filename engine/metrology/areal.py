@@ -138,8 +138,8 @@ class Autocorrelation:
     def _correlate(self, values: Doubles) -> Doubles:
         from scipy import fft
 
-        wave = fft.rfft2(values, self._shape)
-        return np.asarray(fft.irfft2(np.abs(wave) ** 2, self._shape))
+        wave = fft.rfft2(values.astype(np.float32), self._shape)
+        return np.asarray(fft.irfft2(wave.real**2 + wave.imag**2, self._shape))
 
     def of(self, values: Doubles) -> Doubles:
         """Return the mean products of the values by lag, as they come from the Fourier transform."""
@@ -212,7 +212,7 @@ class AngularSpectrum:
 
         if not self._inside.any():
             return math.nan
-        wave = np.abs(fft.rfft2(np.where(self._known, values, 0.0)))[self._inside]
+        wave = np.abs(fft.rfft2(np.where(self._known, values, 0.0).astype(np.float32)))[self._inside]
         amount = self._smooth(np.bincount(self._bin, wave, 180).astype(np.float64))
         density = amount / np.where(self._count > 0, self._count, np.inf)
         top = int(np.argmax(density))

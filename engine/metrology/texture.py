@@ -35,6 +35,7 @@ DRAWS = 24
 """Realisations of the noise; half as many for maps with many pixels."""
 
 _MANY = 500_000  # pixels
+_CORRELATED = 8  # realisations from which the autocorrelation of the noise is computed
 _UNIFORM = 1 / math.sqrt(3)  # standard deviation of a uniform distribution between -1 and 1
 _LEVEL = 0.1  # relative uncertainty of standard deviations, whose squares are right within a fifth
 _DOMINATES = 0.5  # share of Sq^2 that is noise, from which on noise determines the parameters
@@ -277,14 +278,15 @@ def _noise_changes(
 
     def errors() -> Iterator[Doubles]:
         nonlocal total
-        for one in realisations(noise[0], chain.known, *noise[1:], count):
+        for number, one in enumerate(realisations(noise[0], chain.known, *noise[1:], count)):
             error = chain.filtered(chain.form(one))
-            total = total + correlation.of(error)
+            if number < _CORRELATED:
+                total = total + correlation.of(error) / _CORRELATED
             yield error
 
     changes = add_noise(values, "Sq", evaluate, texture, chain.kept, errors())
     # The autocorrelation is the sum of those of surface and noise.
-    cleaned = correlation.lengths(correlation.of(texture) - total / count)
+    cleaned = correlation.lengths(correlation.of(texture) - total)
     rest = max(1 - changes.share, 1 - HOPELESS)
     for name, value in cleaned.items():  # the random error is larger relative to what is left
         changes.bias[name] = math.hypot(values[name] - value, changes.random[name] * math.sqrt(rest**-2 - 1))

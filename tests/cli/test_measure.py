@@ -92,3 +92,33 @@ def test_what_cannot_be_measured_is_printed_in_a_line(ball, tmp_path):
     refused("--section", "measure", ball, "--section", "0mm,0mm")
     refused("--form", "measure", ball, "--form", "cube")
     refused("no such file", "measure", tmp_path / "none.h5")
+
+
+def test_quantities_stand_under_headings_with_what_they_mean(ball):
+    lines = run("measure", ball).out.splitlines()
+    headings = [line for line in lines if line and not line.startswith(" ")]
+    assert headings[:4] == ["heights", "areas and volumes", "form", "texture: height"]
+    assert any(line.startswith("  Sdq ") and line.endswith("root mean square gradient") for line in lines)
+
+
+def spread_of(text, name):
+    (line,) = (line for line in text.splitlines() if line.startswith(f"  {name} "))
+    return float(line.partition("±")[2].split()[0])
+
+
+def test_expanded_uncertainties_are_twice_as_large(ball):
+    plain, expanded = run("measure", ball).out, run("measure", ball, "--expanded").out
+    assert spread_of(expanded, "Sz") == pytest.approx(2 * spread_of(plain, "Sz"), rel=0.05)
+    assert "± is the expanded uncertainty (k = 2)" in expanded
+
+
+def test_a_budget_is_a_table_and_an_entry_for_programs(ball):
+    out = run("measure", ball, "--budget", "--l-filter=1mm").out
+    head = next(line for line in out.splitlines() if "combined" in line)
+    assert "noise, random" in head
+    assert "filter edges" in head
+    assert set(told(ball, "--budget")["budget"]["Sq"]) == {"noise, random", "noise, systematic", "form"}
+
+
+def test_the_length_of_the_noise_is_an_option(ball):
+    assert any("correlated over 0.3 mm" in note for note in told(ball, "--noise-length=300um")["notes"])
