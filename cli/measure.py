@@ -96,8 +96,7 @@ def _print_groups(measures: Measures, expanded: bool) -> None:
     """Print the quantities under the headings of their groups, with what the parameters mean."""
     from dataclasses import replace
 
-    from mirrorskin.engine.metrology.measures import group_of
-    from mirrorskin.engine.metrology.parameters import PARAMETERS
+    from mirrorskin.engine.metrology import PARAMETERS, group_of
 
     width = max(map(len, measures.quantities))
     texts = {

@@ -2,7 +2,7 @@
 
 from mirrorskin.engine.metrology.extent import HighestPoint, highest_point
 from mirrorskin.engine.metrology.forms import Plane, Sphere, fit_plane, fit_sphere
-from mirrorskin.engine.metrology.measures import FormName, Measures, measure
+from mirrorskin.engine.metrology.measures import FormName, Measures, group_of, measure
 from mirrorskin.engine.metrology.parameters import PARAMETERS, Parameter
 from mirrorskin.engine.metrology.profile import profile_parameters
 from mirrorskin.engine.metrology.quantity import Quantity
@@ -23,6 +23,7 @@ __all__ = [
     "Step",
     "fit_plane",
     "fit_sphere",
+    "group_of",
     "highest_point",
     "measure",
     "profile_parameters",

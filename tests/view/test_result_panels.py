@@ -158,7 +158,7 @@ def test_a_section_has_a_band_of_two_standard_deviations():
     at_start = corners[np.isclose(corners[:, 0], 0), 1]
     np.testing.assert_allclose([at_start.min(), at_start.max()], -1 + 0.01 * np.array([-2, 2]), atol=1e-6)
     assert not np.any((corners[:, 0] > 2.05) & (corners[:, 0] < 3.85))  # filled: nobody knows how well
-    assert named(axes) == {"measured", "highest of the section", "filled", "± 2 sigma: 20 µm"}
+    assert named(axes) == {"measured", "highest on A-B", "filled", "± 2 sigma: 20 µm"}
 
 
 def test_the_highest_point_of_the_surface_is_marked_with_its_measured_height():

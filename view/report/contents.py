@@ -142,6 +142,8 @@ class Row:
     value: str
     sigma: str
     unit: str
+    heading: str = ""  # of the group that the row begins
+    meaning: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,6 +157,7 @@ class Numbers:
 def numbers_of(result: Result, section: Ends | None) -> Numbers:
     """Measure a result, or return a note on why that is impossible."""
     from mirrorskin.engine import measure
+    from mirrorskin.engine.metrology import PARAMETERS, group_of
 
     try:
         measures = measure(result, section=section)
@@ -163,7 +166,13 @@ def numbers_of(result: Result, section: Ends | None) -> Numbers:
     written = [_written(quantity) for quantity in measures.quantities.values()]
     values, sigmas = (align([one[part] for one in written]) for part in (0, 1))
     units = [_UNITS.get(quantity.unit, quantity.unit) for quantity in measures.quantities.values()]
-    rows = [Row(*row) for row in zip(measures.quantities, values, sigmas, units, strict=True)]
+    names = list(measures.quantities)
+    groups = [sentence(group_of(name)).removesuffix(".") for name in names]
+    headings = [
+        "" if group == before else group for group, before in zip(groups, ["", *groups[:-1]], strict=True)
+    ]
+    meanings = [PARAMETERS[name].meaning if name in PARAMETERS else "" for name in names]
+    rows = [Row(*row) for row in zip(names, values, sigmas, units, headings, meanings, strict=True)]
     return Numbers(rows, [sentence(note) for note in measures.notes])
 
 

@@ -105,7 +105,7 @@ def _highest_point(sheet: Sheet, cut: Section) -> tuple[int, float, str]:
         near = np.hypot(cut.x - point.x, cut.y - point.y)
         if np.min(near) <= _AT_APEX * float(cut.distance[1] - cut.distance[0]):
             return int(np.argmin(near)), point.height.value, "highest point"
-    return top, float(cut.height[top]), "highest of the section"
+    return top, float(cut.height[top]), "highest on A-B"
 
 
 def _stretch(axes: Axes, sheet: Sheet, cut: Section) -> str:
