@@ -33,7 +33,7 @@ _BLURRED = 9.0  # square pixels: what is larger is no lens
 _LEAST_FRAMES = 8
 _OF_MEDIAN = math.sqrt(math.pi / 2)  # standard error of a median over that of a mean
 _UNSURE = 0.25, 1.0  # relative uncertainty of what interpolation adds: usual, and greatest
-_CLEAR = 3.0  # standard errors by which a blur differs from none
+_CLEAR = 3.0  # standard errors: least difference of a blur from none
 _RESOLVED = 0.35  # steps of the travel within a standard deviation of the footprint on a slope
 
 
