@@ -19,7 +19,7 @@ from mirrorskin.io.types import InputError
 P = ParamSpec("P")
 R = TypeVar("R")
 Check = Callable[[str, Any], Any]
-"""Function of an argument's name and value that returns the value, perhaps converted; or InputError."""
+"""Function that takes the name and value of an argument, and returns the value, or a converted one."""
 
 _COUNTS = ("frames", "reference", "dark", "bright", "zenith_offset")  # arguments whose numbers are counts
 
@@ -35,7 +35,7 @@ _ELSEWHERE = {
     "calibration": "given to engine.reconstruct",
     "device": "given to what computes: engine.reconstruct, engine.find_onset, ...",
 }
-"""Where arguments belong that are often given to other functions."""
+"""Functions to which an argument belongs, for arguments that are often given to others."""
 
 
 def unknown_argument(owner: str, name: str, known: Collection[str], what: str = "argument") -> str:
@@ -56,7 +56,7 @@ def unknown_argument(owner: str, name: str, known: Collection[str], what: str = 
 
 
 def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Return a decorator that checks arguments, each by a function; None is valid where it is the default.
+    """Return a decorator that checks arguments by functions; None is valid if it is the default.
 
     Examples
     --------
@@ -109,7 +109,7 @@ def as_array(name: str, value: Any) -> NDArray[Any]:
     """
     if type(value) is np.ndarray and value.dtype.kind in "buif":
         return value
-    if type(value).__module__ == "pyopencl.array":  # np.asarray would take it for a sequence of arrays
+    if type(value).__module__ == "pyopencl.array":  # np.asarray would treat it as a sequence of arrays
         value = value.get()
     if name == "frames" and type(value).__module__.startswith("xarray.") and value.ndim == 3:
         value = value.to_numpy().transpose(order_of([str(one) for one in value.dims], name))

@@ -38,7 +38,7 @@ from mirrorskin.io.types import MOTIONS, Block, Header, InputError, Motion, bloc
 _KNOWN = {*POSITIONS.values(), "dark", "bright"}  # arrays of an archive that are not frames
 _NEEDED = "travel (--travel-step or --travel), phase (--phase-step or --phases)"
 _HASH_INTERVAL, _HASH_LENGTH = 4 << 20, 4 << 10  # bytes: of each 4 MiB of frames, the first 4 KiB are hashed
-_HEAD_BYTES = 1 << 14  # read to get the header of a member: NumPy accepts at most 10 000 characters
+_HEAD_BYTES = 1 << 14  # bytes read for the header of a member: NumPy accepts at most 10 000 characters
 _PIECE = 1 << 20  # bytes unpacked at a time
 
 
@@ -83,7 +83,7 @@ class ArrayRecording(Recording):
         reader = frames if isinstance(frames, FrameReader) else None
         if reader is not None and reader.shape[0] < 2:
             hints = "".join(f". {found.text}" for found in reader.findings if found.warning)
-            raise InputError(f"{name} holds {reader.shape[0]} frame: a stack has at least 2{hints}")
+            raise InputError(f"{name} contains {reader.shape[0]} frame: a stack has at least 2{hints}")
         if len(frames.shape) != 3 or frames.shape[0] < 2 or 0 in frames.shape:
             raise InputError(f"{name} has shape {frames.shape}: frames, (T, H, W), at least 2, are needed")
         decoding = Decoding(frames.dtype.newbyteorder("="), where=name)
@@ -130,7 +130,7 @@ class ArrayRecording(Recording):
             self.findings = (*self.findings, Finding("twist", text))
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
-        """Return the next frames, at most as many as ``out`` holds: a view of the array, or in ``out``."""
+        """Return the next frames, at most ``len(out)``: a view of the array, or copied to ``out``."""
         out = block_memory(out, self.shape, self.dtype)
         if isinstance(self._frames, np.ndarray):
             return self.lend(len(out))
@@ -144,7 +144,7 @@ class ArrayRecording(Recording):
         return block if lost is None else replace(block, dropped=int(lost[start]))
 
     def lend(self, most: int) -> Block | None:
-        """Return the next frames as a view of the array, at most ``most``; None at the end, or of a file."""
+        """Return the next frames, at most ``most``, as a view of the array; None at the end or for a file."""
         if not isinstance(self._frames, np.ndarray):
             return None
         start = self.first_frame + self._next
@@ -170,7 +170,7 @@ class ArrayRecording(Recording):
     def fingerprint(self) -> str:
         """Return a SHA-256 of the array's shape and type, and of 4 KiB of each 4 MiB of its frames.
 
-        Where frames can only be decoded in order, it is that of the bytes of their files.
+        If frames can only be decoded in order, the bytes of their files are hashed instead.
         """
         check_unchanged(self._files)
         if not self._hash:
@@ -198,11 +198,11 @@ class ArrayRecording(Recording):
     @property
     def how(self) -> str:
         """How the frames are read."""
-        return "where they lie" if isinstance(self._frames, np.ndarray) else self._frames.how
+        return "in place" if isinstance(self._frames, np.ndarray) else self._frames.how
 
     @property
     def modified(self) -> str:
-        """When the file was last written; empty for an array in memory."""
+        """Time of the last change of the file; empty for an array in memory."""
         return modified(self._files) if self._files else ""
 
     def close(self) -> None:
@@ -215,7 +215,7 @@ class ArrayRecording(Recording):
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """Convert NumPy's exceptions for a damaged file to a one-line error that names the file."""
+    """Convert NumPy's errors for a damaged file to a one-line error that names the file."""
     try:
         yield
     except (InputError, MemoryError):
@@ -242,7 +242,7 @@ class _Head(NamedTuple):
 
 
 def _read_head(file: IO[bytes]) -> _Head:
-    # NumPy's own functions read as many bytes as the header claims to have.
+    # NumPy's own functions read as many bytes as the header states, without a limit.
     start = BytesIO(file.read(_HEAD_BYTES))
     version = np.lib.format.read_magic(start)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -291,7 +291,7 @@ def read_map(path: Path) -> NDArray[Any]:
     Raises
     ------
     InputError
-        The file cannot be read, or is no map.
+        The file cannot be read, or is not a map.
     """
     from mirrorskin.io.pictures import read_picture
 
@@ -315,7 +315,7 @@ def _number_head(file: BufferedReader) -> _Head:
     """Read the header of an array of numbers that is complete."""
     head, size = _read_head(file), os.fstat(file.fileno()).st_size
     if head.dtype.kind not in "buif":
-        raise ValueError(f"it holds {head.dtype}")
+        raise ValueError(f"it contains {head.dtype}")
     if head.size + head.nbytes > size:
         raise ValueError(f"it states {head.nbytes} bytes of values and has {size - head.size}")
     return head
@@ -337,11 +337,11 @@ def _read_values(file: IO[bytes], head: _Head) -> NDArray[Any]:
 def _read_members(
     path: Path, archive: zipfile.ZipFile, members: Mapping[str, zipfile.ZipInfo], limit: int
 ) -> dict[str, NDArray[Any]]:
-    """Read some arrays; compressed ones may take ``limit`` bytes together."""
+    """Read some arrays; compressed arrays may take at most ``limit`` bytes together."""
     heads = {name: _head_of(archive, member) for name, member in members.items()}
     for name, head in heads.items():
         if head.dtype.kind not in "buif":
-            raise ValueError(f"{name} holds {head.dtype}")
+            raise ValueError(f"{name} contains {head.dtype}")
         if head.size + head.nbytes != members[name].file_size:
             raise ValueError(f"{name} states {head.nbytes} bytes of values and has another number")
     packed = [name for name, member in members.items() if member.compress_type != zipfile.ZIP_STORED]
@@ -385,7 +385,7 @@ def open_stack(
                 frames, arrays = _open_array(path, dataset, memory_limit)
             held: dict[str, Any] = {**arrays}
         else:
-            if kind == "video":  # without positions, decoding would be in vain
+            if kind == "video":  # fail before decoding if there are no positions
                 _motion(str(path), positions, motion)
             frames = opening.enter_context(open_reader(path, dataset, channel, memory_limit))
             with as_input_error(str(path)):
@@ -420,7 +420,7 @@ def _open_array(
         members = _members(archive)
         chosen = dataset or _stack_of(path, members)
         if chosen not in members:
-            raise InputError(f"{path} holds no array {chosen!r}: choose from {', '.join(members)}")
+            raise InputError(f"{path} contains no array {chosen!r}: choose from {', '.join(members)}")
         limit = max(MAX_UNPACKED_BYTES, memory_limit or 0)
         needed = {name: one for name, one in members.items() if name in _KNOWN or name == chosen}
         held = _read_members(path, archive, needed, limit)
@@ -428,11 +428,11 @@ def _open_array(
 
 
 def _stack_of(path: Path, names: Iterable[str]) -> str:
-    """Return the name of the array in an archive that holds the frames."""
+    """Return the name of the array of frames in an archive."""
     others = [one for one in names if one not in _KNOWN]
     if "frames" in others or len(others) == 1:
         return "frames" if "frames" in others else others[0]
-    raise InputError(f"{path} holds the arrays {', '.join(names)}: choose the frames with --dataset")
+    raise InputError(f"{path} contains the arrays {', '.join(names)}: choose the frames with --dataset")
 
 
 def _motion(

@@ -29,7 +29,7 @@ MAKE_ROOM = "make room, or choose another place with -o"
 
 _PREFIX, _SUFFIX = ".mirrorskin-", ".part"
 
-# Files for HDF5 1.10 and later, the first version whose own structures have checksums and that can read
+# Files for HDF5 1.10 and later: the first version that stores checksums of its own structures, and reads
 # files while they are written.
 VERSIONS = ("v110", "v110")
 
@@ -50,7 +50,7 @@ _WITH_GROUPS.set_char_encoding(h5py.h5t.CSET_UTF8)
 
 
 def check_output(path: Path, *keep: Path | None, replaces: Replaces = "derived") -> None:
-    """Refuse an output that could not be written, before any work is done.
+    """Raise InputError for an output that could not be written, before any work is done.
 
     Parameters
     ----------
@@ -64,8 +64,8 @@ def check_output(path: Path, *keep: Path | None, replaces: Replaces = "derived")
     Raises
     ------
     InputError
-        Its folder does not exist or cannot be written to, it is a folder, it is the input, a file that is
-        being written, or a file that may not be replaced.
+        Its folder does not exist or is not writable; or it is a folder, an input, a file that is being
+        written, or a file that may not be replaced.
 
     Examples
     --------
@@ -91,7 +91,7 @@ def check_output(path: Path, *keep: Path | None, replaces: Replaces = "derived")
 
 
 def check_result_output(path: Path, *keep: Path | None, overwrite: bool = False) -> None:
-    """Refuse a result, HDF5 or Zarr, that could not be written, before any work is done.
+    """Raise InputError for a result, HDF5 or Zarr, that could not be written, before any work is done.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def check_result_output(path: Path, *keep: Path | None, overwrite: bool = False)
     Raises
     ------
     InputError
-        See `check_output`; or the suffix is that of another format.
+        See `check_output`; or the suffix belongs to another format.
 
     Examples
     --------
@@ -127,7 +127,7 @@ def replaced_by_result(overwrite: bool) -> Replaces:
 
 
 def _check_format(path: Path) -> None:
-    """Raise InputError if the suffix of a result is that of another format."""
+    """Raise InputError if the suffix of a result belongs to another format."""
     suffix = path.suffix.lower().removeprefix(".")
     if suffix in _OTHER_FORMATS:
         command = _OTHER_FORMATS[suffix]
@@ -143,7 +143,7 @@ def _check_existing(path: Path, replaces: Replaces) -> None:
 
 
 def is_locked(path: Path) -> bool:
-    """Return whether a program has a file open with a lock, as every program that writes HDF5 does."""
+    """Return whether a program has locked a file; every program that writes HDF5 does."""
     with suppress(OSError), path.open("rb") as file:
         try:
             lock(file, wait=False)
@@ -177,9 +177,9 @@ class NewHdf5(Closing):
 def new_file(path: Path, replaces: Replaces = "derived") -> Iterator[int]:
     """Create a file under a temporary name next to ``path``, and rename it after success.
 
-    It is synchronised to the disk before it is renamed. Files that killed programs left half-written in that
-    folder are removed, once per process. If ``path`` is a link, its target is replaced. Whether an existing
-    file may be replaced is checked at the start, and again just before the renaming.
+    It is synchronised to the disk before it is renamed. Incomplete files of killed programs in that folder
+    are removed, once per process. If ``path`` is a link, its target is replaced. Whether an existing file may
+    be replaced is checked at the start, and again before renaming.
     """
     check_output(path, replaces=replaces)
     with new_part(path) as (part, descriptor):
@@ -194,7 +194,7 @@ def new_part(path: Path) -> Iterator[tuple[Path, int]]:
     """Create a locked file in the folder of ``path``, under a temporary name that is removed at the end."""
     folder = Path(os.path.realpath(path)).parent
     _tidy(folder)
-    # The name is chosen before the file exists, so it is removed whenever the program ends.
+    # The name is chosen before the file exists, so that it is removed even if the program ends now.
     part, descriptor = folder / f"{_PREFIX}{os.urandom(8).hex()}{_SUFFIX}", -1
     try:
         with as_input_error(f"{path} could not be written"):
@@ -203,17 +203,17 @@ def new_part(path: Path) -> Iterator[tuple[Path, int]]:
     finally:
         part.unlink(missing_ok=True)
         with suppress(OSError):
-            os.close(descriptor)  # locked until it has its final name
+            os.close(descriptor)  # releases the lock, after the renaming
 
 
 def synchronise(descriptor: int) -> None:
     """Synchronise a file to the disk."""
     os.fsync(descriptor)
-    os.close(os.dup(descriptor))  # some file systems report only on closing that the disk is full
+    os.close(os.dup(descriptor))  # some file systems report a full disk only on closing
 
 
 def link_new(part: Path, target: Path) -> None:
-    """Give a file an additional name; FileExistsError if it exists, even if created at the same time."""
+    """Create an additional name of a file; FileExistsError if it exists, also if created simultaneously."""
     try:
         os.link(part, target)
     except FileExistsError:
@@ -227,7 +227,7 @@ def link_new(part: Path, target: Path) -> None:
 
 
 def _rename(part: Path, path: Path, replaces: Replaces) -> None:
-    """Rename a file; check again whether an existing file may be replaced, since it may be new."""
+    """Rename a file, after checking again whether an existing file may be replaced: it may be new."""
     target = Path(os.path.realpath(path))
     if replaces in ("nothing", "unused"):
         try:
@@ -274,7 +274,7 @@ def new_hdf5(path: Path, replaces: Replaces = "derived") -> Iterator[NewHdf5]:
 
 
 def remove_leftovers(folder: Path) -> list[Path]:
-    """Remove half-written files and folders of programs that no longer run, such as killed ones.
+    """Remove incomplete files and folders of programs that no longer run, and return them.
 
     Files that are being written are locked, and kept. On a file system without locks, all are kept.
     """
@@ -333,7 +333,7 @@ def _make_folder(part: Path) -> int:
 
 
 def _readable(path: Path) -> bool:
-    """Return whether HDF5 can open a file, which it cannot while the file is being written."""
+    """Return whether HDF5 can open a file; it cannot while the file is being written."""
     try:
         h5py.File(path, "r").close()
     except OSError:
@@ -342,7 +342,7 @@ def _readable(path: Path) -> bool:
 
 
 class _Disk(FileIO):
-    """A file that stores its first error and ignores later writes: HDF5 crashes if it cannot close a file."""
+    """A file that stores its first error and ignores later writes: HDF5 crashes if closing a file fails."""
 
     error: OSError | None = None
 
@@ -386,7 +386,7 @@ class Item(NamedTuple):
 
 
 def write_item(root: h5py.Group, item: Item) -> None:
-    """Write an object; for small datasets in a fifth of the time of h5py's high-level interface."""
+    """Write an object with h5py's low-level interface, five times as fast for small datasets."""
     if isinstance(item.values, str):
         root[item.name] = h5py.SoftLink(item.values)
         return
@@ -399,7 +399,7 @@ def write_item(root: h5py.Group, item: Item) -> None:
     if values.size:
         node.write(h5py.h5s.ALL, h5py.h5s.ALL, values, kind)
     for name, value in item.attributes.items():
-        # Texts of any length: programs that read NeXus, such as silx, expect them.
+        # Variable-length texts, as expected by programs that read NeXus, such as silx.
         stored = np.asarray(value, _TEXT if isinstance(value, str) else None)
         kind, space = h5py.h5t.py_create(stored.dtype, logical=True), h5py.h5s.create_simple(stored.shape)
         h5py.h5a.create(node, name.encode(), kind, space).write(stored)
@@ -413,9 +413,9 @@ def write_file(path: Path, items: Iterable[Item], replaces: Replaces = "derived"
 
 
 def fixed_text(text: str | Sequence[str]) -> NDArray[Any]:
-    """Return a text, or a list of texts, as fixed-length UTF-8: HDF5 stores variable lengths in heaps.
+    """Return a text, or a list of texts, as fixed-length UTF-8.
 
-    HDF5 never returns from reading a damaged heap.
+    HDF5 stores variable-length texts in heaps, and hangs when it reads a damaged heap.
     """
     if isinstance(text, str):
         encoded = legible(text).encode() or b"\0"

@@ -1,7 +1,7 @@
-"""Datasets in chunks, which several threads decode.
+"""Datasets in chunks, which are decoded by several threads.
 
-Chunks are decoded outside HDF5's lock, with the C libraries of hdf5plugin and h5py, and zlib, and to no more
-bytes than a chunk has: HDF5's own filters have no such limit.
+Chunks are decoded outside HDF5's lock, with zlib and the C libraries of hdf5plugin and h5py. Unlike HDF5's
+own filters, they are limited to the size of a chunk.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mirrorskin.io.selection import Span
 
 Bytes = NDArray[np.uint8]
 Codec = Callable[[Bytes, Bytes], None]
-"""Function that unpacks the first bytes into the whole of the second; ValueError if they do not fit."""
+"""Function that unpacks the first bytes and fills the second; ValueError if the size differs."""
 
 _SIZE, _POINTER = ctypes.c_size_t, ctypes.c_void_p
 _WORD, _HEAD = struct.Struct(">I"), struct.Struct(">QI")
@@ -38,8 +38,8 @@ _WORD, _HEAD = struct.Struct(">I"), struct.Struct(">QI")
 class Chunks:
     """A chunked dataset that several threads read and unpack, one chunk after the other.
 
-    A chunk that is needed as a whole and is contiguous in the output is unpacked directly into it; of other
-    chunks the needed part is copied. ``name`` returns the name of some rows of the dataset for messages.
+    A chunk that is needed completely and is contiguous in the output is unpacked directly into it; otherwise
+    the needed part is copied. ``name`` returns the name of some rows of the dataset for messages.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class Chunks:
         try:
             decode(self._codecs, mask, packed, out)
         except ValueError:
-            # # Chunks that are partly outside the dataset may have skipped its filters; HDF5 does not report
+            # HDF5 may store chunks that are partly outside the dataset without filters, and does not report
             # it.
             at_edge = any(a + c > n for a, c, n in zip(corner, self.shape, self._whole, strict=True))
             if not at_edge or mask or packed.size != out.size:
@@ -122,7 +122,7 @@ class Chunks:
 
 
 def find_codecs(dataset: h5py.h5d.DatasetID) -> list[Codec] | str:
-    """Return the functions that undo a dataset's filters, in the order of writing, or the obstacle."""
+    """Return the functions that invert the filters, in the order of writing, or why there are none."""
     plist = dataset.get_create_plist()
     filters = [plist.get_filter(index) for index in range(plist.get_nfilters())]
     codecs: list[Codec] = []
@@ -158,7 +158,7 @@ def decode(codecs: list[Codec], filter_mask: int, packed: Bytes, out: Bytes) -> 
 
 
 def _check_sum(packed: Bytes, stored: Bytes) -> None:
-    """Refuse data that differ from their checksum, Fletcher's of 32 bits, as HDF5 stores it."""
+    """Raise ValueError if data differ from the checksum stored by HDF5, Fletcher's of 32 bits."""
     words = np.append(packed, np.zeros(packed.size % 2, np.uint8)).view(">u2").astype(np.int64)
     sums = words.sum(), (np.arange(words.size, 0, -1) % 65535 * words).sum()
     low, high = (int(one - 1) % 65535 + 1 if one else 0 for one in sums)

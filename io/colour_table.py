@@ -1,4 +1,4 @@
-"""Colour tables of pictures that store indices."""
+"""Colour tables of indexed pictures."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _LUMA = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
 
 
 class ColourTable:
-    """The samples that indices stand for, of a table (n, 3) of red, green and blue.
+    """Conversion of indices to samples, from a table (n, 3) of red, green and blue.
 
-    They are the values of a grey table, and the indices of one that rises in brightness, such as the tables
-    in which microscopes show their samples. InputError for any other table.
+    For a grey table, samples are its values. For a table with increasing brightness, such as the false
+    colours of microscopes, samples are the indices. InputError for any other table.
     """
 
     def __init__(self, name: str, colours: NDArray[np.uint8], dtype: np.dtype[Any] | None = None) -> None:

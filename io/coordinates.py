@@ -1,4 +1,4 @@
-"""Coordinates of the axes of another program's stack: times, positions and the pixel size, by their units."""
+"""Coordinates of the axes of other programs' stacks, identified by units: times, positions, pixel size."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _FIJI = "element_size_um"  # attribute that Fiji and ilastik write: the size of 
 
 @dataclass
 class Coordinates:
-    """Values stated by the axes of a stack, and doubts about them.
+    """The information in the axes of a stack.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class Coordinates:
 
 
 def read_coordinates(file: Hdf5File, stack: h5py.Dataset, decoding: Decoding) -> Coordinates:
-    """Read the coordinates of a stack that mirrorskin did not write; those without units are not used."""
+    """Read the coordinates of a stack of another program; coordinates without units are ignored."""
     found = Coordinates()
     if decoding.names:
         group = str(stack.name).rpartition("/")[0]

@@ -158,7 +158,7 @@ def _result(result: Result) -> dict[str, str]:
         facts["filled"] = f"{np.count_nonzero(result.filled)} pixels"
     if result.offset_unknown is not None:
         count, unknown = result.offset_unknown.size, np.count_nonzero(result.offset_unknown)
-        facts["components"] = f"{count}, of which {unknown} have an unknown offset"
+        facts["components"] = f"{count}, {unknown} with an unknown offset"
     facts |= {name: str(value) for name, value in result.process.items()}
     return facts | _carried(result.calibration)
 

@@ -12,11 +12,11 @@ from mirrorskin.io.types import InputError
 Replaces = Literal["nothing", "unused", "derived", "calibration", "anything"]
 """The existing files that a new file may replace.
 
-"nothing": none, the name must be free. "unused": the same for a result, which replaces "derived" with
---overwrite. "derived": files that can be computed again, such as a result, a picture or a table; not a
+"nothing": none, the name must be free. "unused": the same for a result, which can replace "derived" files
+with --overwrite. "derived": files that can be computed again, such as a result, a picture or a table; not a
 recording, a calibration, an HDF5 or MCAP file of another program, a video, arrays, an archive or a surface
-(SUR, GSF) that ``export`` did not write, or settings. "calibration": these, and calibrations. "anything":
-every file, because the user requested it.
+(SUR, GSF) that ``export`` did not write, or settings. "calibration": "derived" files, and calibrations.
+"anything": every file, because the user requested it.
 """
 
 _HDF5, _MCAP = b"\x89HDF\r\n\x1a\n", b"\x89MCAP0\r\n"
@@ -25,7 +25,7 @@ _SURFACES = b"DIGITAL SURF", b"DSCOMPRESSED", b"Gwyddion Simple"
 _OURS, _NOTES = (
     b"exported by mirrorskin",
     4096,
-)  # in the notes of a surface that was exported, and their bytes
+)  # text in the notes of an exported surface, and length of the notes in bytes
 _VIDEOS = (
     (0, b"RIFF"),
     (4, b"ftyp"),
@@ -57,7 +57,7 @@ def check_replaced(path: Path, replaces: Replaces) -> None:
 
 
 def _was_result(path: Path) -> bool:
-    """Return whether a damaged HDF5 file was a result, which can be computed again."""
+    """Return whether a damaged HDF5 file was a result, and can be computed again."""
     with path.open("rb") as file:
         before, marks = b"", set[bytes]()
         while piece := file.read(1 << 20):

@@ -107,7 +107,7 @@ def export_result(
 
 
 def check_export(result: Result, path: str | Path) -> None:
-    """Raise InputError for a result that cannot be exported, before any work is done."""
+    """Raise InputError for a result that cannot be exported to a path, before any work is done."""
     suffix = Path(path).suffix.lower()
     if suffix not in FORMATS:
         wrong = f"{suffix} is not a supported format" if suffix else "its name has no suffix"
@@ -120,7 +120,7 @@ def check_export(result: Result, path: str | Path) -> None:
 
 
 def check_heights(result: Result, path: str | Path) -> None:
-    """Refuse a result without heights in millimetres."""
+    """Raise InputError for a result without heights in millimetres."""
     remedy = "or export its maps as .npz"
     if result.height is None:
         raise InputError(f"{path}: the result has no heights: reconstruct it again with them, {remedy}")
@@ -214,7 +214,7 @@ def encode_ply(result: Result, points: bool = False) -> Encoded:
 
 
 def encode_stl(result: Result) -> Encoded:
-    """Encode a surface as binary STL, with its unit in the header, as STL has no field for it."""
+    """Encode a surface as binary STL, with the unit in the header, because STL has no field for it."""
     mesh, notes = _surface(result), notes_of(result)
     title = ", ".join(["unit mm", *(notes[name] for name in (_SOFTWARE, _DATE, _SOURCE) if name in notes)])
     normals = face_vectors(mesh)
@@ -229,7 +229,7 @@ def encode_stl(result: Result) -> Encoded:
 
 
 def encode_obj(result: Result) -> Encoded:
-    """Encode a surface as Wavefront OBJ: text, in mm, which a comment states."""
+    """Encode a surface as Wavefront OBJ: text, in mm, as stated in a comment."""
     mesh = _surface(result)
     head = "".join(
         f"# {name}: {_ascii(note)}\n" for name, note in ({"unit": "mm"} | notes_of(result)).items()
@@ -273,10 +273,10 @@ def encode_xyz(result: Result) -> Encoded:
 
 
 def encode_png(result: Result) -> Encoded:
-    """Encode heights as a grey picture of 16 bits.
+    """Encode heights as a grey picture of 16 bits, with its resolution in pixels per metre.
 
-    Its resolution is in pixels per metre. Texts contain the scale of heights, in words and under
-    the keys that Gwyddion documents for pictures of 16 bits.
+    Texts contain the scale of heights, in words and with the keys that Gwyddion documents for pictures of 16
+    bits.
     """
     counts, notes = _counts(result), notes_of(result)
     width, height = counts.pixel_size
@@ -333,7 +333,7 @@ def encode_npz(result: Result) -> Encoded:
 
 
 def notes_of(result: Result) -> dict[str, str]:
-    """Return notes on the source and the zero of heights, and the number of filled ones."""
+    """Return notes on the source, the zero of heights, and the number of filled heights."""
     process = result.process
     maker = " ".join(str(process[name]) for name in ("program", "version") if name in process)
     notes = {name: one_line(process[key]) for name, key in _FROM_PROCESS.items() if key in process}
@@ -348,7 +348,7 @@ def notes_of(result: Result) -> dict[str, str]:
 
 
 def _height_datum(result: Result) -> str:
-    """Return the zero of the heights: not the sheet at rest if their offset is unknown."""
+    """Return a description of the zero of heights: the sheet at rest, or the mean of each piece."""
     unknown = result.offset_unknown
     count, of = (0, 0) if unknown is None else (np.count_nonzero(unknown), unknown.size)
     if not count:
@@ -446,7 +446,7 @@ def _counts(result: Result) -> _Counts:
 
 
 def pixel_size_of(x: Floats, y: Floats) -> tuple[float, float]:
-    """Return the width and height of pixels, mm; those of a single row or column are assumed to be square."""
+    """Return the width and height of pixels, mm; they are assumed to be square in a single row or column."""
     sizes = [abs(float(axis[-1] - axis[0])) / (len(axis) - 1) for axis in (x, y) if len(axis) > 1]
     if not sizes:
         raise InputError("the pixel size of a result of one pixel is unknown: export it as .xyz or .npz")
@@ -454,7 +454,7 @@ def pixel_size_of(x: Floats, y: Floats) -> tuple[float, float]:
 
 
 def _texts(counts: _Counts, notes: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    """Yield the scale of heights in words, and as Gwyddion reads it: in metres, with y down the picture."""
+    """Yield the scale of heights in words, and in Gwyddion's convention: metres, with y down the picture."""
     yield "Description", str(counts)
     yield "height offset", f"{counts.offset!r} mm"
     yield "height step", f"{counts.step!r} mm"

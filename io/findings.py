@@ -1,4 +1,4 @@
-"""Warnings and notes about frames and results, for the user and for ``process``."""
+"""Findings about frames and results, which are issued as warnings and stored in ``process``."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ _BETWEEN = "; "
 
 
 class MirrorskinWarning(UserWarning):
-    """A warning that input or a result may be wrong; the message is one line with the remedy."""
+    """Input or a result that may be misleading; the message is one line with the remedy."""
 
     exit_code = 2
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A fact about frames or a result that the user should know.
+    """A finding about frames or a result that the user should know.
 
     Attributes
     ----------
     kind : str
-        A few words that stay the same: "lost frames". the documentation lists all.
+        A fixed phrase, such as "lost frames"; see the list in the documentation.
     text : str
-        One line: what was found, and the remedy if there is one.
+        One line with the problem, and the remedy if there is one.
     warning : bool
-        Whether an answer may be wrong because of it; otherwise it is only a note.
+        Whether results may be wrong; otherwise it is a note.
     """
 
     kind: str
@@ -40,7 +40,7 @@ class Finding:
 
 
 def in_process(findings: Iterable[Finding], process: Mapping[str, Any]) -> dict[str, str]:
-    """Return ``warnings`` and ``notes`` of a process: those that it has, and those of findings.
+    """Return the ``warnings`` and ``notes`` of a process, with those of findings added.
 
     Examples
     --------
@@ -57,7 +57,7 @@ def in_process(findings: Iterable[Finding], process: Mapping[str, Any]) -> dict[
 
 
 def warnings_in(process: Mapping[str, Any]) -> list[str]:
-    """Return the warnings of a process, and those of each recording that was fused.
+    """Return the warnings of a process, including those of fused recordings.
 
     Examples
     --------
@@ -68,12 +68,12 @@ def warnings_in(process: Mapping[str, Any]) -> list[str]:
 
 
 def with_findings(result: Result, *findings: Finding) -> Result:
-    """Return a result whose process contains findings, too."""
+    """Return a result with findings added to its process."""
     return result.assign(process={**result.process, **in_process(findings, result.process)})
 
 
 def named(name: str, said: str) -> str:
-    """Return the text of a finding, after the name of its source."""
+    """Return a message with the name of its source as a prefix."""
     return said if said.startswith(name) else f"{name}: {said}"
 
 

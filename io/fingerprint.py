@@ -1,4 +1,4 @@
-"""Fingerprints of recordings: a hash of a sample of the bytes, which is faster than reading all of them."""
+"""Fingerprints of recordings: hashes of a sample of the bytes, which is faster than reading all."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ State = tuple[int, int, int, int]
 
 
 def origins(file: Hdf5File, dataset: h5py.Dataset) -> dict[Path, State]:
-    """Return the files that contain frames, the recording first, with their state when they were opened."""
+    """Return the files that contain frames, starting with the recording, and their state when opened."""
     with as_input_error(f"{file.path}: {dataset.name}"):
         root = os.fstat(file.root.id.get_vfd_handle())
         found = {Path(file.root.filename): state_of(root)}
@@ -40,9 +40,8 @@ def origins(file: Hdf5File, dataset: h5py.Dataset) -> dict[Path, State]:
 def fingerprint(file: Hdf5File, dataset: h5py.Dataset, origins: Mapping[Path, State], frames: int) -> str:
     """Return a SHA-256, in hexadecimal, of a file: its size, all data but the frames, and some frames.
 
-    Of the frames, joined in the order of storage, the first 4 KiB of each 4 MiB are hashed. If they are
-    stored in other files (virtual and external datasets), these files follow, in the order in which the
-    dataset names them.
+    The frames are joined in the order of storage, and the first 4 KiB of each 4 MiB are hashed. If they are
+    stored in other files (virtual and external datasets), these files follow in the order of the dataset.
 
     For a file that is being written, or whose writer was killed, the hash covers the first ``frames`` frames,
     in their order, and the values of all other datasets.

@@ -25,10 +25,11 @@ _Families = dict[tuple[str, int, str], list[tuple[int, Path]]]
 class FolderFrames(WholeFrames):
     """The numbered pictures of a folder, in order.
 
-    The frames are the pictures whose names differ in one number only, the last that varies, in the order of
-    this number: ``image2.png`` before ``image10.png``. Numbers may start anywhere. Numbers with a common
-    step, as in names by time or position, are consecutive frames. A missing number is a lost frame; if more
-    numbers are missing than there are, only their order is used. Samples are read as in ``decode_picture``.
+    The frames are the pictures whose names differ in one number only, the last that varies. They are sorted
+    by this number: ``image2.png`` before ``image10.png``. The first number is arbitrary. Numbers with a
+    common step, such as times or positions, are consecutive frames. A missing number is a lost frame; but if
+    more numbers are missing than present, only their order is used. Samples are read as in
+    ``decode_picture``.
 
     Parameters
     ----------
@@ -75,7 +76,7 @@ def _find_sequence(folder: Path) -> tuple[NDArray[np.int64], tuple[Path, ...], t
         )
     if len(rivals) > 1:
         patterns = ", ".join(f"{before}#{after}" for before, _, after in list(rivals)[:3])
-        raise InputError(f"{folder} holds {len(rivals)} sequences, {patterns}: keep one in the folder")
+        raise InputError(f"{folder} contains {len(rivals)} sequences, {patterns}: keep one in the folder")
     (frames,) = (sorted(family) for family in rivals.values())
     for (number, file), (following, twin) in pairwise(frames):
         if number == following:
@@ -86,7 +87,7 @@ def _find_sequence(folder: Path) -> tuple[NDArray[np.int64], tuple[Path, ...], t
 
 
 def _longest(families: _Families) -> _Families:
-    """Return the family with the most files, and the other families with as many."""
+    """Return the largest family of files, and all others of the same size."""
     most = max(map(len, families.values()), default=0)
     return {key: family for key, family in families.items() if len(family) >= min(most, 2)}
 
@@ -118,7 +119,7 @@ def _families(files: list[Path], pattern: str) -> _Families:
 
 
 def _lost(numbers: NDArray[np.int64]) -> tuple[NDArray[np.int32], tuple[Finding, ...]]:
-    """Return the frames lost before each number, and the findings about the numbers."""
+    """Return the number of frames lost before each number, and findings about the numbers."""
     steps = np.diff(numbers)
     stride = int(np.gcd.reduce(steps)) if steps.size else 1
     missing = steps // stride - 1

@@ -1,4 +1,4 @@
-"""Readers of files of other programs that contain frames."""
+"""Kinds of files of other programs that contain frames, and their readers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Kind = Literal["", "array", "folder", "MCAP", "picture", "TIFF", "video"]
 
 
 def kind_of_frames(path: Path) -> Kind:
-    """Return the kind of a path, judged by its name, and whether it is a folder; "" for HDF5 and Zarr."""
+    """Return the kind of a path from its suffix, or as a folder; an empty text for HDF5 and Zarr."""
     if is_zarr(path):
         return ""
     with suppress(OSError):  # reported when it is opened
@@ -57,7 +57,7 @@ def open_reader(
 
             return MessageFrames(path, dataset, channel)
         case "folder" if dataset is not None:
-            raise InputError(f"{path}: a folder of pictures holds one stack: leave --dataset out")
+            raise InputError(f"{path}: a folder of pictures is one stack: leave --dataset out")
         case "folder":
             return FolderFrames(path, channel)
         case _:

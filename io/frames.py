@@ -1,4 +1,4 @@
-"""The common base of the readers of frames in files of other programs."""
+"""Base classes and findings of readers of frames in files of other programs."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ class FrameReader(Closing, ABC):
     lost : ndarray, (T,), int32, or None
         Frames lost before each frame.
     positions : mapping
-        The positions in the file, as in a `Block`.
+        The positions in the file; names as in `Block`.
     header : mapping
-        The properties in the file, as in a `Header`.
+        The properties in the file; names as in `Header`.
     left_out : tuple of str
         Files of a folder that are not frames.
     findings : tuple of Finding
-        What is doubtful about the frames, or was converted.
+        Doubts about the frames, and conversions.
     files : tuple of Path
         The files that contain the frames.
     """
@@ -93,7 +93,7 @@ def kind_of(shape: Sequence[int], dtype: np.dtype[Any]) -> str:
 
 
 def lost_frames(lost: NDArray[np.int32]) -> tuple[Finding, ...]:
-    """Return the findings about the frames lost before each frame."""
+    """Return findings about the numbers of frames lost before each frame."""
     if not lost.any():
         return ()
     count, gaps = int(lost.sum()), np.flatnonzero(lost)
@@ -106,7 +106,7 @@ def lost_frames(lost: NDArray[np.int32]) -> tuple[Finding, ...]:
 
 
 def lossy(how: str) -> Finding:
-    """Return the finding about frames that were compressed with a loss."""
+    """Return the finding for frames with lossy compression."""
     return Finding(
         "lossy compression",
         f"the frames are compressed with a loss ({how}): brightness and noise are not those of the camera,"
@@ -119,4 +119,4 @@ CONVERTED_COLOUR = Finding(
     "colours are read as grey (luma); --channel 0, 1 or 2 takes red, green or blue",
     warning=False,
 )
-"""The finding about colours that became grey."""
+"""Finding for colours that were converted to grey."""

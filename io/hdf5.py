@@ -32,11 +32,11 @@ many bytes as its own size, and ``memory_limit`` raises the limit.
 """
 
 _LINKS_DEEP = 16
-_MOST_STEPS = 100_000  # through links, and to the sources of virtual datasets
+_MOST_STEPS = 100_000  # maximum number of links, and of sources of virtual datasets, to follow
 _GROUPS_DEEP = 64
 _SCALES = b"DIMENSION_LIST"  # attribute with references to the scales of each axis
 _MATLAB_5 = b"MATLAB 5.0 MAT-file"
-_LEAST_FILE = 512  # bytes that every HDF5 file with a dataset has
+_LEAST_FILE = 512  # minimum size of an HDF5 file with a dataset, bytes
 _MOST_OBJECTS = 20_000  # groups and datasets in a file
 _MOST_NAMES = 10_000  # members of a group that is read as a whole
 
@@ -54,7 +54,7 @@ class Hdf5File(Closing):
         self._files: dict[str, h5py.File] = {real: self.root}
         self._groups: dict[str, Node | None] = {"": self.root}
         self._steps = self._spent = 0
-        # Files whose variable-length texts were checked, with the length of their longest text in bytes.
+        # Files with checked variable-length texts, and the length of their longest text in bytes.
         self._longest_text: dict[bytes, int] = {}
 
     def close(self) -> None:
@@ -98,11 +98,11 @@ class Hdf5File(Closing):
             return list(node)
 
     def marked(self, mark: str, group: str = "/entry") -> bool:
-        """Return whether mirrorskin wrote a file: whether its entry, or the given group, has an attribute."""
+        """Return whether the group has the attribute ``mark``, which shows that mirrorskin wrote the file."""
         return self.attribute(group, mark) is not None
 
     def check_layout(self, mark: str, known: int = 1) -> None:
-        """Raise InputError if the layout of a file is newer than the latest that this version reads."""
+        """Raise InputError if the layout of a file is newer than ``known``, the latest that can be read."""
         layout = self.attribute("/entry", mark)
         if isinstance(layout, int) and layout > known:
             raise InputError(f"{self.path} is of layout {layout}, where {known} is read: update the program")
@@ -143,7 +143,7 @@ class Hdf5File(Closing):
         return dict(sorted(found.items()))
 
     def check_frames(self, stack: h5py.Dataset, count: int) -> None:
-        """Refuse frames that HDF5 cannot read, or would replace by fill values."""
+        """Raise InputError for frames that HDF5 cannot read, or would replace by fill values."""
         check_storage(self, stack, frames=count)
 
     def storage(self, stack: h5py.Dataset) -> str:
@@ -162,7 +162,7 @@ class Hdf5File(Closing):
         remedy = remedy and f": {remedy}"
         with as_input_error(lambda: self.where(node)):
             if not isinstance(node, h5py.Dataset) or node.id.dtype.kind not in "iufb":
-                raise InputError(f"{self.where(node)} holds no numbers{remedy}")
+                raise InputError(f"{self.where(node)} contains no numbers{remedy}")
             shape = node.id.shape
             if rows is not None and shape:
                 shape = (min(shape[0], rows), *shape[1:])
@@ -180,7 +180,7 @@ class Hdf5File(Closing):
         return values * conversion_factor(given, unit, self.where(node))
 
     def packing(self, node: h5py.Dataset) -> Packing | None:
-        """Return how the values of a dataset are stored, as its attributes state; None if as they are."""
+        """Return the packing of a dataset from its attributes; None if values are stored unpacked."""
         with as_input_error(lambda: self.where(node)):
             if not h5py.h5a.get_num_attrs(node.id):
                 return None
@@ -191,9 +191,9 @@ class Hdf5File(Closing):
         return packing_of(stated, node.id.dtype, self.where(node)) if stated else None
 
     def dimensions(self, node: h5py.Dataset) -> tuple[str, ...]:
-        """Return the names of a dataset's axes, "" for one without; empty if it states none.
+        """Return the names of the axes of a dataset, "" for an axis without; empty if there are none.
 
-        They are those of its dimension scales, such as netCDF has, of its labels, or of NeXus.
+        They are read from dimension scales (netCDF), labels, or NeXus attributes.
         """
         with as_input_error(lambda: self.where(node)):
             if (scales := self._scales(node)) is not None:
@@ -231,7 +231,7 @@ class Hdf5File(Closing):
     def load(self, node: h5py.Dataset, rows: int | None = None) -> NDArray[Any]:
         """Read a dataset, or its first rows, if it is completely stored and within `VALUES_LIMIT`.
 
-        Every dataset but the frames is read by this method, including single texts.
+        All datasets except frames are read by this method, including single texts.
         """
         check_storage(self, node, frames=rows, values=True)
         with as_input_error(lambda: self.where(node)):
@@ -239,7 +239,7 @@ class Hdf5File(Closing):
             return self._unpack(node.id, rows) if packed else self._values(node.id, rows)
 
     def _unpack(self, node: h5py.h5d.DatasetID, rows: int | None) -> NDArray[Any]:
-        """Read a packed dataset, or its first rows, without the filters of HDF5, which have no limit."""
+        """Read a packed dataset, or its first rows, without HDF5's filters, which do not limit memory."""
         codecs, kind = find_codecs(node), node.dtype
         if isinstance(codecs, str) or kind.hasobject:
             packing = codecs if isinstance(codecs, str) else "texts of any length"
@@ -264,11 +264,11 @@ class Hdf5File(Closing):
         """Read a list of texts."""
         with as_input_error(lambda: self.where(node)):
             if not isinstance(node, h5py.Dataset) or node.ndim != 1 or node.dtype.kind not in "SO":
-                raise InputError(f"{self.where(node)} holds no list of texts: {remedy}")
+                raise InputError(f"{self.where(node)} is not a list of texts: {remedy}")
         return tuple(str(first_value(text)) for text in self.load(node))
 
     def walk(self, node: Node, name: str, depth: int = 0) -> Node | None:
-        """Apply ``find`` to any object, after ``depth`` links."""
+        """Return an object as ``find`` does, but relative to ``node``, after ``depth`` links."""
         if depth > _LINKS_DEEP:
             raise InputError(f"{self.where(node)}: its links form a cycle; name the dataset itself")
         for part in name.split("/"):
@@ -303,7 +303,7 @@ class Hdf5File(Closing):
         return target
 
     def _values(self, node: h5py.h5d.DatasetID | h5py.h5a.AttrID, rows: int | None = None) -> NDArray[Any]:
-        """Read a dataset or an attribute, or its first rows, in a third of the time that h5py takes.
+        """Read a dataset or an attribute, or its first rows, three times as fast as h5py.
 
         ValueError if HDF5 would crash, hang, or need too much memory.
         """
@@ -324,9 +324,9 @@ class Hdf5File(Closing):
         return values
 
     def _check_text(self, node: h5py.h5d.DatasetID | h5py.h5a.AttrID, text: Any, size: int) -> int:
-        """Return the largest size of the texts stored outside of a dataset or an attribute, in bytes.
+        """Return the maximum size of the texts stored outside a dataset or an attribute, in bytes.
 
-        ValueError if it is not text, does not end, or is longer than its file.
+        ValueError if they are not text, do not end, or are longer than the file.
         """
         if text is None:
             raise ValueError("neither numbers nor text")
@@ -335,7 +335,7 @@ class Hdf5File(Closing):
                 raise ValueError("a text longer than its file")
             return 0
         if isinstance(node, h5py.h5d.DatasetID) and node.get_create_plist().get_layout() == h5py.h5d.VIRTUAL:
-            # HDF5 would read them from the heaps of other files, which are not checked.
+            # HDF5 would read them from heaps of other files, which are not checked.
             raise ValueError("texts of any length in a virtual dataset")
         # Many texts may refer to the same bytes.
         return int(math.prod(node.shape)) * self._check_heaps_of(node)
@@ -348,7 +348,7 @@ class Hdf5File(Closing):
         return self._longest_text[name]
 
     def spend(self, size: int, scratch: int = 0) -> None:
-        """Count the bytes of values that are read; InputError above `VALUES_LIMIT`, with scratch memory."""
+        """Count bytes to be read; InputError if they and the scratch memory exceed `VALUES_LIMIT`."""
         self._spent += size
         needed = self._spent + scratch
         if needed <= VALUES_LIMIT:  # the usual case
@@ -361,7 +361,7 @@ class Hdf5File(Closing):
             )
 
     def count_step(self, node: Node) -> None:
-        """Raise InputError if links lead from object to object without end."""
+        """Count a followed link; InputError if there are too many, as in a cycle."""
         self._steps += 1
         if self._steps > _MOST_STEPS:
             raise InputError(
@@ -389,14 +389,14 @@ class Hdf5File(Closing):
 
 
 def _only_frames(where: str, packing: str) -> InputError:
-    """Return the error for values in a packing that only HDF5 can undo, which is valid for frames only."""
+    """Return the error for values in a packing that is supported for frames only."""
     return InputError(
         f"{where} is packed with {packing}, which is supported for frames only: use 'h5repack -f GZIP=1'"
     )
 
 
 def _open(group: h5py.Group, name: bytes) -> Node:
-    """Open the target of a hard link, in a third of the time that h5py takes."""
+    """Open the target of a hard link, three times as fast as h5py."""
     node = h5py.h5o.open(group.id, name)
     if isinstance(node, h5py.h5g.GroupID):
         return h5py.Group(node)
@@ -433,7 +433,8 @@ def _open_file(path: Path, real: str) -> h5py.File:
         with path.open("rb"):
             pass
         if is_flagged(error):
-            # It is being written, or its writer was killed; its lock shows which. Read it without a lock.
+            # It is being written, or its writer was killed; the lock distinguishes them. Read it without a
+            # lock.
             with suppress(OSError):
                 return h5py.File(real, "r", swmr=True, locking=False)
         if h5py.is_hdf5(path):
@@ -453,8 +454,8 @@ def _open_file(path: Path, real: str) -> h5py.File:
         ) from None
 
 
-_HEAP = re.compile(rb"GCOL\x01\0\0\0")  # its signature, version and reserved bytes
-_HEAD, _OBJECT = struct.Struct("<8sQ"), struct.Struct("<H6xQ")  # the starts of a heap, and of its objects
+_HEAP = re.compile(rb"GCOL\x01\0\0\0")  # signature, version and reserved bytes of a heap
+_HEAD, _OBJECT = struct.Struct("<8sQ"), struct.Struct("<H6xQ")  # headers of a heap, and of its objects
 _BULK = 1 << 16  # bytes; larger datasets are not searched for heaps
 _PIECE = 1 << 20  # bytes searched at once; smaller files are searched completely
 
@@ -462,8 +463,8 @@ _PIECE = 1 << 20  # bytes searched at once; smaller files are searched completel
 def _check_heaps(file: h5py.File) -> int:
     """Return the length in bytes of the longest variable-length text in a file.
 
-    ValueError if a heap of such texts does not end: HDF5 would never return from reading it. See "Global
-    Heap" in the HDF5 file format specification.
+    ValueError if a heap of such texts does not end, because HDF5 would hang. See "Global Heap" in the HDF5
+    file format specification.
     """
     longest, at = 0, 0
     with Path(file.filename).open("rb") as opened:
@@ -557,7 +558,7 @@ _VIRTUAL_DEEP = 4
 def check_storage(
     file: Hdf5File, dataset: h5py.Dataset, depth: int = 0, frames: int | None = None, values: bool = False
 ) -> None:
-    """Refuse a dataset, of frames or other values, that HDF5 cannot read or would replace by fill values."""
+    """Raise InputError for a dataset that HDF5 cannot read, or would replace by fill values."""
     if depth > _VIRTUAL_DEEP:
         where = file.where(dataset)
         raise InputError(f"{where}: virtual datasets are nested too deeply; copy the frames into one dataset")
@@ -578,7 +579,7 @@ def check_storage(
             held = _bytes_held(file, dataset, depth, values)
     if held < claimed:
         raise InputError(
-            f"{file.where(dataset)} claims {claimed} {unit} and its file holds {held}: it was cut short; "
+            f"{file.where(dataset)} claims {claimed} {unit} and its file contains {held}: it was cut short; "
             "copy it again"
         )
 

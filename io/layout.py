@@ -1,4 +1,4 @@
-"""Layout of a recording: the names of its header, positions, state and truth, and how they are read."""
+"""Layout of a recording: names and readers of its header, positions, state and truth."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ REMEDIES = {"travel": "give --travel-step or --travel", "phase": "give --phase-s
 class RecordingState:
     """State of a recording, and the frames used by a live run.
 
-    While it is written, the frames and the values of each frame grow one after the other: ``count`` frames
-    are complete. ``state`` is "under way", "complete", or "cut short: " and the reason.
+    While it is written, frames and their values are appended separately; ``count`` frames are complete.
+    ``state`` is "under way", "complete", or "cut short: " and the reason.
     """
 
     count: int
@@ -106,7 +106,7 @@ def _width(name: str) -> Shape:
 
 
 class Layout:
-    """Reader of the properties of a part of a stack; from coordinates if another program wrote it."""
+    """Reader of the properties of a part of a stack; for other programs' stacks, its coordinates."""
 
     def __init__(
         self,
@@ -127,7 +127,7 @@ class Layout:
         pixel_size: tuple[float, float] | None,
         override_motion: bool = False,
     ) -> Header:
-        """Read the properties of the whole stack; the file may lack those that are given."""
+        """Read the properties of the whole stack; given properties may be missing in the file."""
         own = self._text(f"{STAGE}/motion")
         if motion and own in MOTIONS and own != motion and not override_motion:
             raise InputError(
@@ -186,13 +186,13 @@ class Layout:
         for one in known:
             values = self._cut(self._series(one, LIVE))
             if values is None:
-                raise InputError(f"{self._file.path} holds no positions of a live run: leave --live out")
+                raise InputError(f"{self._file.path} contains no positions of a live run: leave --live out")
             where = f"{self._file.path}: {LIVE[one][0]} of the frames that were used"
             found[one] = check_finite(values[chosen], len(chosen), where, width=_width(one))
         return found
 
     def findings(self) -> tuple[Finding, ...]:
-        """Read the findings about the frames at import."""
+        """Read the findings that were stored when the frames were imported."""
         text = self._text(FINDINGS)
         try:
             return msgspec.json.decode(text, type=tuple[Finding, ...]) if text else ()
@@ -272,12 +272,12 @@ class Layout:
         return np.ascontiguousarray(values[self._part.region.slices])
 
     def _one(self, name: str, remedy: str) -> float | None:
-        """Read a number that applies to all frames; None if there is one for each frame."""
+        """Read a number that applies to all frames; None if the file contains one per frame."""
         place, unit = SERIES[name]
         return None if self._is_of_each(name) else self._scalar(place, unit, remedy)
 
     def _each(self, name: str) -> Floats | None:
-        """Read a number for each frame of the part, if there is one for each."""
+        """Read a number for each frame of the part; None if the file does not contain one per frame."""
         values = self._series(name) if self._is_of_each(name) else None
         where = f"{self._file.path}: {SERIES[name][0]}"
         return None if values is None else check_finite(values, self._count, where, self._part.frames)

@@ -43,7 +43,7 @@ class Map(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields
     Attributes
     ----------
     caption : str
-        What the values mean: one sentence without a full stop, for reports and documentation.
+        Meaning of the values: one sentence without a full stop, for reports and documentation.
     unit : str
         Unit of the values in memory and in files; empty for none.
     dtype : str
@@ -63,10 +63,10 @@ class Map(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields
         How the map is interpolated when the picture is undistorted: linearly between pixels, by the nearest
         pixel, the shorter way around the circle, or as unit vectors. Integers use the nearest pixel.
     within : str
-        The label map across whose borders the map is not interpolated; by default that of the quantity, or
-        ``"contact"``.
+        Label map that limits interpolation: the map is not interpolated across its borders. By default the
+        label map of the quantity, or ``"contact"``.
     per_frame : bool
-        Whether a result may contain the map for each frame, with a leading axis (T, H, W).
+        Whether a result may contain one map per frame, (T, H, W).
     title : str
         Title of the figure; by default the name.
     colours : {"sequential", "positive", "signed", "error"}
@@ -79,7 +79,7 @@ class Map(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields
     included_in : str
         Name of a map whose figure includes this one, so that the overview omits it.
     summary : str
-        How the one-line summary of a result names the pixels that have a value, if it includes this map.
+        Name of the pixels that have a value, in the one-line summary of a result; empty to omit them.
     counted : bool
         Whether the summary counts the pixels of each code.
 
@@ -230,7 +230,7 @@ def _type_problem(name: str, kind: Any, value: Any, error: Exception) -> str:
 
 
 def _subject(one: Map) -> str:
-    """Return how a message calls a map whose name is unknown: by its title or caption."""
+    """Return the title or caption of a map, for messages about a map whose name is unknown."""
     words = one.title or one.caption
     return f"the map {words[:60]!r}" if words else "a map"
 
@@ -294,7 +294,7 @@ _CHECKS = (_text_problems, _type_problems, _shape_problems, _unit_problems)
 
 
 def conflicts(one: Map, other: Map, what: str) -> Iterator[str]:
-    """Yield why a declaration cannot replace another: code relies on its unit, axes and components."""
+    """Yield why a declaration cannot replace another, whose unit, axes and components are used by code."""
     for name in ("unit", "axes", "components"):
         wrong, right = getattr(one, name), getattr(other, name)
         if wrong != right:
@@ -544,7 +544,7 @@ def is_deviation(name: str) -> bool:
 
 
 def is_builtin(name: str) -> bool:
-    """Return whether a name is that of a built-in map, or of its standard deviation."""
+    """Return whether the table contains a name: of a map, or of the standard deviation of one."""
     return name in TABLE or (is_deviation(name) and name.removesuffix(SIGMA) in TABLE)
 
 
@@ -582,8 +582,8 @@ UNDECLARED = Map()
 def check_declarations(declarations: Mapping[str, Map]) -> None:
     """Raise InputError if declarations change the meaning of a built-in name, or two maps have one quantity.
 
-    Only the legend and the texts of a built-in map may differ from the table, and the unit of maps that are
-    angles for a twist.
+    Only the legend and the texts of a built-in map may differ from the table, and the unit of maps that
+    become angles in a twist.
     """
     stands_for: dict[str, str] = {}
     for name, one in declarations.items():
@@ -604,7 +604,7 @@ def check_declarations(declarations: Mapping[str, Map]) -> None:
 def check_new(declarations: Mapping[str, Map], others: Container[str] = ()) -> None:
     """Raise InputError if declarations contradict each other, or the names of other maps in one result.
 
-    Only declarations in programs are checked; those in files are accepted unchanged.
+    This is for declarations in programs; declarations in files are read without these checks.
     """
     check_declarations(declarations)
     for name, one in declarations.items():

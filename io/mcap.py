@@ -39,7 +39,7 @@ _METRE = 1e-3  # m per mm
 _SECOND = 1_000_000_000  # nanoseconds
 _FRAME = "sensor"  # coordinate frame: x right and y up in the picture, z towards the sensor
 _ENCODINGS = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2", "32FC1": "f4"}
-# # Positions of blue, green, red and opacity.
+# Indices of blue, green, red and opacity.
 _COLOURS = {"rgb8": [2, 1, 0], "bgr8": [0, 1, 2], "rgba8": [2, 1, 0, 3], "bgra8": [0, 1, 2, 3]}
 _NAMES = {np.dtype(np.uint8): "mono8", np.dtype(np.uint16): "mono16", np.dtype(np.float32): "32FC1"}
 _FLOAT32 = 7  # datatype of a PointField
@@ -53,14 +53,14 @@ _CLOUD, _NUMBER, _WRENCH = (
 _INSTALL = "MCAP needs packages that are not installed: pip install 'mirrorskin[mcap]'"
 
 _PROPERTIES = ("tilt", "press", "line_time", "travel_sigma")  # numbers of a recording, in the metadata
-_NOTES, _MOST_NOTES = "mirrorskin", 8  # name of the metadata; records of it that are read
+_NOTES, _MOST_NOTES = "mirrorskin", 8  # name of the metadata; maximum number of its records to read
 _NUMERAL = re.compile(r"[-+]?[0-9]+\.?[0-9]*(?:[eE][-+]?[0-9]+)?")
 _LONGEST = 100  # characters quoted of an error message of a package
 _MOST_PACKED = 255  # largest compression ratio accepted for all chunks of a file, the limit of LZ4
 
 # From the file format (https://mcap.dev/spec): opcode and length, then the fields.
 _RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
-_HEADER_BYTES = 12  # of a message in CDR: encapsulation, seconds and nanoseconds
+_HEADER_BYTES = 12  # bytes of a header in CDR: encapsulation, seconds and nanoseconds
 _FOOTER, _FOOTER_CODE = struct.Struct("<BQQQI8s"), 2
 
 # The fields of standard ROS 2 messages.
@@ -255,9 +255,9 @@ def is_surface(path: Path) -> bool:
 class GrowingMessages(Closing):
     """An MCAP file to which frames, like to a `GrowingRecording`, and computed maps are appended.
 
-    Topics are those of ``save_messages``; the final positions of the source are written at the end. Each
+    Topics are named as in ``save_messages``; the final positions of the source are written at the end. Each
     update of the heights is an image on ``/height``, and the contact area is a number on ``/contact_area``,
-    m^2. The index of an incomplete file is missing; the program ``mcap recover`` creates it.
+    m^2. An incomplete file has no index; the program ``mcap recover`` creates it.
     """
 
     def __init__(self, path: Path, descriptor: int, header: Header) -> None:
@@ -302,7 +302,7 @@ class GrowingMessages(Closing):
     publish = flush
 
     def finish(self, positions: Mapping[str, Floats], state: str) -> None:
-        """Write the positions and the index; a frame without a better position keeps its own."""
+        """Write the index, and the positions: the corrected ones, or those stored with the frames."""
         for name, live in self._positions.items():
             better = np.asarray(positions.get(name, live), np.float64)[: self.count]
             values = np.where(np.isfinite(better), better, live[: len(better)])
@@ -541,7 +541,7 @@ class MessageFrames(WholeFrames):
 
     @contextlib.contextmanager
     def _naming(self) -> Iterator[None]:
-        """Convert errors of the packages for damaged bytes to a one-line error that names the file."""
+        """Convert the packages' errors for damaged bytes to a one-line error that names the file."""
         try:
             yield
         except (InputError, ImportError):
@@ -561,7 +561,7 @@ class _Stamps(NamedTuple):
 
 class _Channel(NamedTuple):
     topic: str
-    kind: str  # name of its message type; empty for one that is not read
+    kind: str  # name of its message type; empty if it is not read
 
 
 class _Summary(NamedTuple):
@@ -620,7 +620,7 @@ def _stamp_in(data: bytes) -> int:
 
 
 def _decoder(kind: str) -> Callable[[bytes], Any]:
-    """Return the decoder of a ROS 2 message type, from its standard definition, not from one in a file."""
+    """Return the decoder of a ROS 2 message type from its standard definition, not from the file's."""
     from mcap.records import Schema
     from mcap_ros2.decoder import DecoderFactory
 
@@ -631,7 +631,7 @@ def _decoder(kind: str) -> Callable[[bytes], Any]:
 
 
 def _lost(numbers: NDArray[np.uint64]) -> NDArray[np.int32]:
-    """Return the frames lost before each message, from their sequence numbers, if these count a topic."""
+    """Return the frames lost before each message, if sequence numbers count the messages of the topic."""
     missing = np.concatenate([[0], np.diff(numbers.astype(np.int64)) - 1])
     counted = bool(np.all(missing >= 0)) and missing.sum() <= len(numbers)
     return (missing if counted else np.zeros(len(numbers))).astype(np.int32)

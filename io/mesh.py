@@ -35,13 +35,13 @@ def surface_mesh(
 ) -> Mesh:
     """Return triangles between the pixels that have a height.
 
-    A cell with four heights becomes two triangles, one with three becomes one. Pixels without a triangle
-    are left out.
+    A cell of 2 x 2 pixels with four heights becomes two triangles, a cell with three becomes one. Pixels
+    without a triangle are omitted.
 
     Parameters
     ----------
     height : array_like, (H, W)
-        Millimetres; NaN, a hole, remains a hole.
+        Millimetres; NaN for holes.
     x, y : array_like, (W,) and (H,)
         Millimetres of the pixel centres; x increases with the column, y decreases with the row.
     component : array_like, (H, W), int, optional

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from mirrorskin.io.recording import Recording
 
-_PICTURE = 480  # pixels along the longer side of a picture, at most
+_PICTURE = 480  # maximum length of the longer side of a picture, pixels
 
 
 def as_text(result: Shown) -> str:
@@ -136,9 +136,9 @@ def _dimensions(
 
 
 def from_xarray(dataset: xarray.Dataset) -> Result:
-    """Return the result that `as_xarray` converted, or that others describe by coordinates and units.
+    """Return a result from a dataset of `as_xarray`, or from another with coordinates and units.
 
-    The rows are those of a picture: y decreases. Units are converted to the declared ones.
+    Rows are sorted as in a picture: y decreases. Values are converted to the declared units.
     """
     dataset = _as_picture(dataset)
     maps: dict[str, Any] = {}
@@ -176,7 +176,7 @@ def _as_picture(dataset: xarray.Dataset) -> xarray.Dataset:
 
 
 def _in_unit(values: Any, variable: xarray.DataArray, unit: str) -> Any:
-    """Return values in a declared unit, converted if the variable's attribute names another."""
+    """Return values in a declared unit, converted if the attribute of the variable names another."""
     own = str(variable.attrs.get("units", unit))
     if not unit or own == unit:
         return values
@@ -216,7 +216,7 @@ def _rows(result: Shown) -> list[tuple[str, str, str]]:
 
 
 def _filled(result: Shown, name: str) -> NDArray[np.bool_] | None:
-    """Return which heights of a map were filled, (H, W); None if none were, or the map is another."""
+    """Return which heights of a map were filled, (H, W); None if none were, or for other maps."""
     filled = result.maps().get("filled")
     heights = isinstance(result, Result) and name == result.name_of("height")
     if filled is None or not heights or not np.any(filled > 0):

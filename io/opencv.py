@@ -1,4 +1,4 @@
-"""OpenCV for pictures: without its messages, and with an error where it reports nothing."""
+"""OpenCV for pictures, without its messages, and with exceptions for all errors."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def decode(data: bytes | NDArray[np.uint8], name: str, *, upright: bool = False)
 
 
 def encode(suffix: str, picture: NDArray[Any], parameters: Sequence[int] = ()) -> bytes:
-    """Encode a picture; ValueError if OpenCV cannot, of which it only returns a flag."""
+    """Encode a picture; ValueError if OpenCV, which only returns a flag, fails."""
     with quiet_opencv() as cv2:
         done, data = cv2.imencode(suffix, picture, list(parameters))
     if not done:

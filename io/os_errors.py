@@ -31,7 +31,7 @@ MAX_TEXT_BYTES = 64 << 20
 class as_input_error(AbstractContextManager[None]):  # noqa: N801  # named like contextlib's functions
     """Convert errors of a file to an InputError of one line.
 
-    It is a class because many are used when a file is opened, and a generator takes several times as long.
+    It is a class, because opening a file uses many of them, and a generator takes several times as long.
     """
 
     def __init__(self, what: str | Callable[[], str], remedy: str = "", kinds: Any = _ERRORS) -> None:
@@ -66,7 +66,7 @@ def is_flagged(error: Exception) -> bool:
 def check_regular(path: Path, remedy: str = "") -> None:
     """Raise InputError unless a path leads to a regular file.
 
-    Opening a FIFO waits for its writer without end, and opening a device may act on it.
+    Opening a FIFO would wait for its writer, and opening a device may have side effects.
     """
     remedy = remedy and f"; {remedy}"
     try:
@@ -80,7 +80,7 @@ def check_regular(path: Path, remedy: str = "") -> None:
 
 
 class _BoundedReader(BufferedReader):
-    """A file that reads at most ``MAX_UNPACKED_BYTES`` at once, because stated lengths may be wrong."""
+    """A file that reads at most ``MAX_UNPACKED_BYTES`` at once, because lengths stated in it may be wrong."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         if size is not None and size > MAX_UNPACKED_BYTES:

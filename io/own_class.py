@@ -16,7 +16,7 @@ from mirrorskin.io.types import InputError
 def load_class(name: str) -> Callable[..., Any]:
     """Return a class given as MODULE:CLASS or FILE.py:CLASS; modules may be in the current folder.
 
-    Missing modules and classes raise `InputError`. Errors of the module itself are passed on.
+    Missing modules and classes raise `InputError`. Errors of the module itself are not caught.
 
     Examples
     --------

@@ -1,7 +1,7 @@
-"""Whether the brightness of pixels fits to the phases of the frames: lost frames, and drift.
+"""Check of the phases of frames by the brightness of pixels: lost frames, and drift.
 
-Each pixel is fitted by a sinusoid of the phase. Whether other phases fit better is decided by the squares of
-all residuals together, which the products of the frames determine.
+Each pixel is fitted by a sinusoid of the phase. Phases are compared by the sum of the squared residuals of
+all pixels, which is computed from the products of the frames.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.types import Floats
 
-_FEWEST, _FEWEST_FRAMES, _MOST_FRAMES = 64, 6, 128  # pixels; frames
-_SHIFTS = -1, 1, 2, 3  # steps of the phase by which later frames may be wrong
-_BETTER = 0.85  # largest ratio of the squares of residuals with and without a jump
-_STEADY = 0.7  # least share of a linear rise in the square of what is common to all pixels
-_OUTLYING = 4.0  # median residuals, beyond which a pixel is left out
-_SWINGS = 0.25  # median swings, from which on a pixel has a direction
+_FEWEST, _FEWEST_FRAMES, _MOST_FRAMES = 64, 6, 128  # minimum number of pixels; limits of the number of frames
+_SHIFTS = -1, 1, 2, 3  # tested errors of the phase of later frames, steps
+_BETTER = 0.85  # maximum ratio of the sums of squares with and without a jump
+_STEADY = 0.7  # minimum share of a linear rise in the sum of squares of the mean residual of all pixels
+_OUTLYING = 4.0  # pixels with larger residuals are excluded; times the median residual
+_SWINGS = 0.25  # minimum amplitude of a pixel with a direction; times the median amplitude
 _AS_ONE = 0.5  # mean direction above which all pixels respond alike, so that light looks like a phase
 
 
@@ -39,7 +39,7 @@ class PhaseCheck:
         self._counts, self._left = counts[:, used], left[:, used]
 
     def jump(self) -> tuple[int, int, float] | None:
-        """Return the first frame with wrong phases, the number of steps, and the step; None if all fit."""
+        """Return the first frame with a wrong phase, the error in steps, and the step; None if all fit."""
         step = float(np.median(np.diff(self._phase))) if self.possible else 0.0
         if step == 0:
             return None
@@ -58,7 +58,7 @@ class PhaseCheck:
         return int(frames[best]), int(shifts[best]), step
 
     def drift(self) -> tuple[float, float] | None:
-        """Return the rise of all pixels over the recording, and its error, counts; None if it is not one."""
+        """Return the common rise of all pixels over the recording, and its error, counts; or None."""
         if not self.possible:
             return None
         waves = np.linalg.qr(_waves(self._phase))[0]

@@ -34,7 +34,7 @@ _ADAM7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), 
 _PIECE = 1 << 20  # bytes unpacked at a time
 _INCH = 0.0254  # m
 _JPEG_MARK, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-_JPEG_BYTES = 8  # bytes per pixel in a decoder: a progressive JPEG has three coefficients of 2 bytes
+_JPEG_BYTES = 8  # bytes per pixel in a decoder; a progressive JPEG needs three coefficients of 2 bytes
 _BMP_HEAD = struct.Struct("<2x4s4xIIiiHHI12xI")  # file size, offset, then the header of Windows 3 or later
 _BLANK = rb"\s+(?:#[^\n]*\n\s*)*"
 _PGM_HEAD = re.compile(rb"P5%b(\d{1,9})%b(\d{1,9})%b(\d{1,5})\s" % (_BLANK, _BLANK, _BLANK))
@@ -55,14 +55,14 @@ def read_picture(path: Path) -> NDArray[Any]:
 def decode_picture(path: Path, dtypes: Sequence[str] = _DTYPES) -> Picture:
     """Decode the only picture in a file; ``dtypes`` are the accepted types of a TIFF's samples.
 
-    Indices of a colour table become samples as in a `TiffFrames`. Fewer than 8 bits are scaled to 0 to 255;
-    other samples are those stored, whatever the number of bits in use.
+    Indices of a colour table become samples as in `TiffFrames`. Samples of fewer than 8 bits are scaled to 0
+    to 255; others are returned unchanged, whatever the number of bits in use.
     """
     if path.suffix.lower() not in TIFF_SUFFIXES:
         return decode_bytes(read_regular(path), str(path))
     with TiffFrames(path, None, None, dtypes) as tiff:
         if tiff.shape[0] != 1:
-            raise InputError(f"{path} holds several pages, and one is needed: save each page as a picture")
+            raise InputError(f"{path} contains several pages, and one is needed: save each page as a picture")
         return Picture(tiff.page(0), tiff.findings)
 
 
@@ -84,7 +84,7 @@ def decode_bytes(data: bytes, name: str) -> Picture:
 
 def _decode_jpeg(data: bytes, name: str) -> NDArray[Any]:
     check_unpacked(_JPEG_BYTES * math.prod(_jpeg_size(data, name)), name, SMALLER)
-    if _JPEG_END not in data[-64:]:  # some cameras pad; OpenCV fills what is missing with grey
+    if _JPEG_END not in data[-64:]:  # some cameras add padding; OpenCV fills missing parts with grey
         raise InputError(f"{name} is cut off: copy it again")
     return decode(data, name, upright=True)
 
@@ -149,7 +149,7 @@ def _png_bytes(width: int, height: int, bits: int, interlaced: bool) -> int:
 
 
 def _unpack_to(pieces: Iterable[bytes], size: int) -> bool:
-    """Return whether the pixels of a PNG have at least ``size`` bytes; libpng prints messages about fewer."""
+    """Return whether the pixels of a PNG have at least ``size`` bytes; otherwise libpng prints messages."""
     unpacker = zlib.decompressobj()
     try:
         for packed in pieces:
@@ -201,7 +201,7 @@ def _png_chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def _essential_chunks(data: bytes, name: str) -> list[bytes]:
-    """Check each chunk of a PNG, and keep those that the picture needs: libpng prints about the others."""
+    """Check each chunk of a PNG, and keep those needed for the picture: others may make libpng print."""
     kept, at, kind = list[bytes](), len(_PNG_MARK), b""
     while kind != b"IEND":
         size = int.from_bytes(data[at : at + 4], "big")

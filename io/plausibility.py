@@ -1,4 +1,4 @@
-"""Whether the frames of a source are plausible."""
+"""Plausibility check of the frames of a source."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def check(
     source : Source or path
         It is rewound before and after, if it can be. A path is opened by `open_recording`.
     field_limits : (float, float)
-        Least and greatest plausible side of the field of view, mm.
+        Minimum and maximum plausible side of the field of view, mm.
     travel_limits : (float, float)
-        Least and greatest plausible travel of a press, mm.
+        Minimum and maximum plausible travel of a press, mm.
     progress : callable, optional
         Called with the number of frames so far.
     **opening

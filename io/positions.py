@@ -17,7 +17,7 @@ _GREATEST = 1e12  # largest value accepted, in mm, rad or s
 
 @runtime_checkable
 class Positions(Protocol):
-    """Positions of the body for a number of frames that is not known yet."""
+    """Positions of the body for a number of frames that is not yet known."""
 
     def positions(self, count: int, /) -> Floats:
         """Return the positions of ``count`` frames, mm or radians; InputError if the number differs."""
@@ -28,7 +28,7 @@ def along(
 ) -> ArrayLike | None:
     """Return positions for ``count`` frames, from an array or an object that computes them.
 
-    Even steps count the frames ``lost`` before each frame, too.
+    Even steps include the frames ``lost`` before each frame.
     """
     if isinstance(given, Steps) and lost is not None and lost.any():
         return np.asarray(given.start + given.step * (np.arange(count) + np.cumsum(lost)))
@@ -91,10 +91,10 @@ def check_strokes(travel: ArrayLike | None, count: int, name: str) -> NDArray[np
 
 
 def stroke_starts(travel: NDArray[np.float64], direction: int = 0) -> NDArray[np.intp]:
-    """Return the first frames after the turning points, from which the travel has the opposite direction.
+    """Return the first frames after the turning points, where the direction of travel is reversed.
 
-    A stroke is a run of frames in which the travel does not change direction; a rest belongs to the stroke
-    before it. ``direction`` is the direction at the first frame: 1 down, -1 up, 0 unknown.
+    A stroke is a sequence of frames with the same direction of travel, including a rest at its end.
+    ``direction`` is the direction at the first frame: 1 down, -1 up, 0 unknown.
 
     Examples
     --------
@@ -121,7 +121,7 @@ def check_phase(phase: ArrayLike | None, count: int, name: str) -> NDArray[np.fl
 
 
 def step_in_degrees(phase: NDArray[np.float64]) -> float:
-    """Return the usual step of phases, radians, if it exceeds a turn, so that it is in degrees; else 0.
+    """Return the median step of phases, radians, if it exceeds a turn, which indicates degrees; else 0.
 
     Examples
     --------
@@ -143,7 +143,7 @@ def check_finite(
 ) -> NDArray[np.float64]:
     """Return the positions of ``count`` frames as float64, (T, *width).
 
-    If ``within`` is given, only those of the frames from its first to its end are checked and returned.
+    If ``within`` is given, only the frames from its first to before its end are checked and returned.
 
     Examples
     --------

@@ -161,7 +161,7 @@ class TeeSource(Generic[_Source]):
         self._exit.__exit__(kind, error, trace)
 
     def rewind(self) -> None:
-        """Refuse: frames have been written."""
+        """Raise RuntimeError, because frames have been written."""
         raise RuntimeError("a recorder cannot be rewound")
 
 
@@ -179,18 +179,18 @@ class Recorder(TeeSource[Source]):
     source : Source
     path : str or Path
     compression : {"raw", "bitshuffle", "blosc", "gzip", "lzf"}
-        Raw frames are stored contiguously, which is the fastest to read; others in one chunk per frame.
+        "raw" frames are stored contiguously, which is fastest to read; others in one chunk per frame.
     truth : Truth or callable, optional
         Ground truth of a simulation; a callable is called after the last frame.
     calibration : Calibration, optional
-        Calibration to copy into the recording; positions and references remain those of the source.
+        Calibration to copy into the recording; it does not change positions and references.
     overwrite : bool, optional
         Whether an existing file of that name is replaced; by default it is refused.
 
     Attributes
     ----------
     name, header, shape, dtype, motion, rewindable
-        Those of the source; recorded frames cannot be read again.
+        As for the source; recorded frames cannot be read again.
 
     Examples
     --------
@@ -252,7 +252,7 @@ class Recorder(TeeSource[Source]):
         return block
 
     def drain(self, progress: Callable[[int], None] | None = None) -> Check:
-        """Write all frames, and return the findings; ``progress`` is called with the number so far."""
+        """Write all frames, and return their check; ``progress`` is called with the number so far."""
         watch = Watch(self.source)
         length = max(1, _BLOCK // (self.shape[1] * self.shape[2] * self.dtype.itemsize))
         room = np.empty((min(length, self.shape[0]), *self.shape[1:]), self.dtype)

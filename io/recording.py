@@ -74,13 +74,13 @@ class Recording(Closing):
     used, dropped : ndarray, (T,), bool and int, or None
         Whether a live run used a frame, and the number of frames lost before it.
     which : str
-        The frames of the whole stack that these are, as text.
+        The selected frames of the whole stack, as text.
     used_live : bool
-        Whether these are only the frames that a live run used.
+        Whether only the frames used by a live run were selected.
     storage : str
         How the frames are stored, as text.
     findings : tuple of Finding
-        What the metadata of the file make doubtful, or what was converted.
+        Doubts from the metadata of the file, and conversions.
     read_ahead : bool
         Whether reading in a separate thread is faster, as for Zarr.
     """
@@ -153,7 +153,7 @@ class Recording(Closing):
         return recording_as_html(self)
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
-        """Read the next frames into ``out``, at most as many as it holds; see ``Source.read``."""
+        """Read the next frames, at most ``len(out)``, into ``out``; see ``Source.read``."""
         out = block_memory(out, self.shape, self.dtype)
         start = self._next
         if start >= self.shape[0]:
@@ -227,7 +227,7 @@ class Recording(Closing):
 
     @property
     def modified(self) -> str:
-        """When the file, or a file with its frames, was last written: ISO 8601, UTC; empty for an address."""
+        """Time of the last change of the files, as ISO 8601; empty for an address."""
         return modified(self._origins) if self._origins else ""
 
     def close(self) -> None:
@@ -278,10 +278,10 @@ def open_recording(
     channel : int, optional
         Channel of a TIFF with several, or colour (0 red, 1 green, 2 blue); by default colours become luma.
     motion : str, optional
-        Motion, if the file does not contain it; one that contradicts the file is refused.
+        Motion, if the file does not contain it; it must not contradict the file.
     travel, phase, tilt, pixel_size
-        Values missing in the file, or replacing those in the file: positions in mm or radians, one per frame
-        or as ``Steps``; half-angle in radians; mm.
+        Values that are missing in the file, or replace them: positions in mm or radians, one per frame or as
+        ``Steps``; half-angle in radians; pixel size in mm.
     region : Region, optional
         Part of the picture to read. Maps are cropped, and the pivot becomes relative to the centre of the
         region.
@@ -295,7 +295,7 @@ def open_recording(
     live : bool, optional
         Only the frames used by a live run, with the positions it used.
     override_motion : bool, optional
-        Whether ``motion`` replaces that of the file, to correlate any stack with phases.
+        Whether ``motion`` replaces the motion in the file, to correlate any stack with phases.
 
     Returns
     -------
@@ -392,7 +392,7 @@ def _used(
 def _find_stack(
     file: Hdf5File, dataset: str | None, ours: bool
 ) -> tuple[h5py.Dataset, RecordingState, Decoding]:
-    """Find the stack of frames, its state, and its storage; InputError for one that cannot be read."""
+    """Return the stack of frames, its state and its decoding; InputError if it cannot be read."""
     if dataset is None:
         dataset = STACK if ours else _only_stack(file)
     stack = file.follow(dataset, "name the stack with --dataset")
@@ -410,13 +410,14 @@ def _find_stack(
         raise InputError(f"{where} has shape {shape}: its frames have no pixels; record it again")
     state = read_state(file, ours, stack, count)
     if state.count < 2:
-        raise InputError(f"{where} holds {state.count} frames: at least 2 are needed; record more")
+        frames = f"{state.count} frame{'' if state.count == 1 else 's'}"
+        raise InputError(f"{where} contains {frames}: at least 2 are needed; record more")
     file.check_frames(stack, state.count if decoding.order[0] == 0 else shape[0])
     return stack, state, decoding
 
 
 def _decoding(file: Hdf5File, stack: h5py.Dataset, ours: bool, where: str) -> Decoding:
-    """Return the conversion of stored values to frames, from the attributes and axes of the stack."""
+    """Return how frames are decoded from the stored values, according to attributes and axes of the stack."""
     with as_input_error(where):
         dtype = stack.dtype.newbyteorder("=")
     frame_dtype(dtype, where)
@@ -449,17 +450,18 @@ def _only_stack(file: Hdf5File) -> str:
     names = list(file.stacks())
     if not names:
         raise InputError(
-            f"{file.path} holds no stack of frames (T, H, W): if a link leads to one, name it with --dataset"
+            f"{file.path} contains no stack of frames (T, H, W): if a link leads to one, name it with "
+            "--dataset"
         )
     if len(names) > 1:
         raise InputError(
-            f"{file.path} holds {len(names)} stacks, {', '.join(names[:5])}: choose with --dataset"
+            f"{file.path} contains {len(names)} stacks, {', '.join(names[:5])}: choose with --dataset"
         )
     return names[0]
 
 
 def open_heights(path: str | Path, source: Recording | None = None) -> NDArray[np.float32]:
-    """Read the heights of a result, or the true ones of a simulated recording.
+    """Read the heights of a result, or the true heights of a simulated recording.
 
     Parameters
     ----------
@@ -496,12 +498,12 @@ def open_heights(path: str | Path, source: Recording | None = None) -> NDArray[n
         height = absolute_heights(result)
         part = source_region(result.process)
     if height is None:
-        raise InputError(f"{path} holds no heights: give a result of a press, or a simulation with truth")
+        raise InputError(f"{path} contains no heights: give a result of a press, or a simulation with truth")
     if source is not None:
         height = _cut_heights(height, part or Region.whole(height.shape), source, str(path))
     if not np.isfinite(height).any():
         raise InputError(
-            f"{path} holds no heights whose offset is known: give a result of a press, or of 'fuse'"
+            f"{path} contains no heights whose offset is known: give a result of a press, or of 'fuse'"
         )
     return height
 
@@ -513,7 +515,7 @@ def _cut_heights(
     wanted = source.region
     if not (own.holds(wanted) and Region.whole(source.full_shape[1:]).holds(own)):
         raise InputError(
-            f"{name} holds the heights of {own}, where {source.name} needs those of {wanted}: "
+            f"{name} contains the heights of {own}, where {source.name} needs those of {wanted}: "
             "give some of all these pixels"
         )
     return np.ascontiguousarray(height[wanted.within(own)])

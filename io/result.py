@@ -36,7 +36,7 @@ RESERVED = frozenset(
 )
 """Names that maps cannot have, because files use them for other purposes."""
 
-_FEW_GAPS = 16  # numbers missing between codes, up to which each is searched for
+_FEW_GAPS = 16  # maximum number of gaps between codes that are searched one by one
 
 
 class Shown:
@@ -289,7 +289,7 @@ class Result(Shown, Mapping[str, Any]):
         return {name: self[name] for name in self if self.declaration(name).axes == axes}
 
     def measured(self) -> NDArray[np.float32]:
-        """Return the heights that were measured, (H, W): NaN where they are unknown or were filled.
+        """Return the measured heights, (H, W): NaN where heights are unknown or were filled.
 
         Examples
         --------
@@ -356,8 +356,8 @@ def result_of(
     Raises
     ------
     InputError
-        A map has the wrong shape, values that its type cannot hold or that are not numbers, or a name that
-        is not allowed.
+        A map has the wrong shape, values that its type cannot represent or that are not numbers, or an
+        invalid name.
 
     Examples
     --------
@@ -376,7 +376,7 @@ def result_of(
 
 
 def check_maps(declarations: Mapping[str, Map], *others: str) -> None:
-    """Raise InputError if maps cannot be declared in this way, or together with these names."""
+    """Raise InputError if declarations are invalid, or conflict with other names in one result."""
     check_new(declarations, others)
     for name in (*others, *declarations):
         if not may_name_a_map(name):
@@ -413,7 +413,7 @@ def _checked_map(name: str, values: NDArray[Any], declared: Map, shape: tuple[in
 
 
 def _unlisted(values: NDArray[Any], codes: Mapping[int, str]) -> int | None:
-    """Return a value that is not among the codes; `numpy.isin` takes 60 ms for a map of 4K."""
+    """Return a value that is not a code, or None; `numpy.isin` takes 60 ms for a map of 4K."""
     low, high = int(values.min()), int(values.max())
     if low not in codes or high not in codes:
         return low if low not in codes else high
@@ -426,7 +426,7 @@ def _unlisted(values: NDArray[Any], codes: Mapping[int, str]) -> int | None:
 
 
 def absolute_heights(result: Result) -> NDArray[np.float32] | None:
-    """Return the heights of a result without the pieces whose offset is unknown, which are NaN."""
+    """Return the heights of a result; pieces with an unknown offset are NaN."""
     height: NDArray[np.float32] | None = result.height
     piece, unknown = result.component, result.offset_unknown
     if height is None or piece is None or unknown is None or not unknown.any():
@@ -448,25 +448,25 @@ def map_shape(result: Result) -> tuple[int, ...]:
 
 
 def shape_of(result: Result, name: str) -> tuple[int, ...]:
-    """Return the shape of a map, which is not copied if it is on a device."""
+    """Return the shape of a map, without copying it from a device."""
     there = result.on_device(name)
     return np.shape(result[name]) if there is None else tuple(there.shape)
 
 
 def size_of_maps(declared: Map, shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the shape of the maps of a result, (H, W) or (turns, H, W), that has a map of this shape."""
+    """Return the shape of the maps of a result, (H, W) or (turns, H, W), from the shape of one map."""
     size = shape[:-1] if declared.components else shape
     return size[-2:] if declared.per_frame else size
 
 
 def select_turn(result: Result, turn: int | None) -> Result:
-    """Return the maps of one turn, or those of a result without turns.
+    """Return the maps of one turn, or all maps of a result without turns.
 
     Parameters
     ----------
     result : Result
     turn : int or None
-        Number of the turn, from 0; None for a result with maps of all turns together.
+        Number of the turn, from 0; None for a result whose maps combine all turns.
 
     Returns
     -------
@@ -476,7 +476,7 @@ def select_turn(result: Result, turn: int | None) -> Result:
     Raises
     ------
     InputError
-        The result has turns and none is chosen, or it does not have the chosen one.
+        The result has turns and none is selected, or it does not have the selected turn.
 
     Examples
     --------

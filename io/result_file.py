@@ -41,7 +41,7 @@ _RESULT, _PROCESS, _OWN = "/entry/result", "/entry/process", "own_maps"
 _DECLARATION = "declaration"  # attribute of a map that is not declared in the table
 _AGAIN = "reconstruct it again"
 _AXES = dict.fromkeys("xy", Map(unit="mm", dtype="float64"))
-_LAYOUT = 2  # of the files written here; in layout 1 maps were not declared, and some had other names
+_LAYOUT = 2  # version of the layout; in layout 1 maps were not declared, and some had other names
 
 
 @checked(result=check_kind(Result), path=check_path, overwrite=check_flag)
@@ -233,7 +233,7 @@ def _shaped(file: Hdf5File, nodes: Mapping[str, Node], declarations: Mapping[str
         (size_of_maps(one, shapes[name]) for name, one in declared.items() if one.axes == "pixels"), ()
     )
     if len(size) not in (2, 3):
-        raise InputError(f"{file.path}: {_RESULT} holds no maps: {_AGAIN}")
+        raise InputError(f"{file.path}: {_RESULT} contains no maps: {_AGAIN}")
     needed: dict[str, Shape] = {"x": size[-1:], "y": size[-2:-1]}
     for name, one in declared.items():
         if one.axes == "pixels":
@@ -258,7 +258,7 @@ def _check_frames(path: str | Path, found: Found, declarations: Mapping[str, Map
 
 
 def _status_of_layout_1(maps: Mapping[str, Any], process: Mapping[str, ProcessValue]) -> dict[str, Map]:
-    """Return the declaration of ``status`` in a file of layout 1, which follows from the other contents."""
+    """Return the declaration of ``status`` in a file of layout 1, derived from its other contents."""
     if "sharpness" in maps:
         return {"status": status_of(FocusStatus)}
     if "estimator" in process:  # a user's own estimator

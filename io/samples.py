@@ -1,4 +1,4 @@
-"""Meaning of stored samples: packed and unknown values (CF conventions), order of axes, types of integers."""
+"""Decoding of stored samples: packed and missing values (CF conventions), order of axes, integer types."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ ATTRIBUTES = (
 
 _EXACT = 1 << 24  # float32 is exact to half a count up to this number
 _PIECE = 8_000_000  # bytes of stored samples that are decoded at once
-_MOST_NUMBERS = 100  # in an attribute
+_MOST_NUMBERS = 100  # maximum number of values in an attribute
 _TARGETS = {"b": np.uint8, "i": np.uint16, "u": np.uint16, "f": np.float32}  # by kind; int8 becomes uint8
 
 
 class Packing(NamedTuple):
-    """Packing of values: ``value = stored * scale + offset``, unknown if missing or not valid.
+    """Encoding of stored values: ``value = stored * scale + offset``, unknown if missing or not valid.
 
-    ``unsigned``: stored integers are unsigned although their type is signed.
+    ``unsigned``: stored integers are unsigned, although their type is signed.
     """
 
     scale: float = 1.0
@@ -58,11 +58,11 @@ class Packing(NamedTuple):
         return f"{', '.join(others)} and {last}" if others else last
 
     def stored(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return values in their stored type."""
+        """Return stored values in their actual type, which may be unsigned."""
         return values.view(values.dtype.str.replace("i", "u")) if self.unsigned else values
 
     def unpack(self, values: NDArray[Any], dtype: DTypeLike) -> NDArray[Any]:
-        """Return the unpacked values; NaN for unknown ones."""
+        """Return the decoded values; NaN where they are unknown."""
         stored = self.stored(values)
         if not (self.missing or self.scale != 1 or self.offset != 0 or np.isfinite(self.valid).any()):
             return stored
@@ -77,12 +77,12 @@ class Packing(NamedTuple):
 
 
 def packing_of(attributes: Mapping[str, Any], dtype: np.dtype[Any], where: str) -> Packing | None:
-    """Return the packing of values, from the attributes of the CF conventions; None if they are not packed.
+    """Return how values are packed, from the attributes of the CF conventions; None if they are not.
 
     Parameters
     ----------
     attributes : mapping
-        Numbers, arrays of numbers and texts by name; others than `ATTRIBUTES` are ignored.
+        Numbers, arrays of numbers and texts by name; names not in `ATTRIBUTES` are ignored.
     dtype : dtype
         Type of the stored values.
     where : str
@@ -105,7 +105,7 @@ def packing_of(attributes: Mapping[str, Any], dtype: np.dtype[Any], where: str) 
         return tuple(float(value) for value in values)
 
     def as_stored(values: tuple[float, ...]) -> tuple[float, ...]:
-        """Return numbers in the type of the stored values, which the attributes may have as well."""
+        """Return numbers in the type of the stored values, if the attribute has that type."""
         if unsigned:
             return tuple(value + 2.0 ** (8 * dtype.itemsize) if value < 0 else value for value in values)
         return tuple(float(dtype.type(value)) for value in values) if dtype.kind == "f" else values
@@ -133,10 +133,10 @@ def packing_of(attributes: Mapping[str, Any], dtype: np.dtype[Any], where: str) 
 
 
 def frame_dtype(dtype: DTypeLike, where: str) -> np.dtype[Any]:
-    """Return the type of frames that samples of a type are converted to; InputError if there is none.
+    """Return the type to which samples of a type are converted; InputError if there is none.
 
-    Samples of uint8, uint16 and float32 stay as they are. Other integers become uint16, if they are 0 to
-    65535 (those of 8 bits, and truth values, uint8), and other floating-point numbers float32; see
+    Samples of uint8, uint16 and float32 are unchanged. Booleans and other integers of 8 bits become uint8,
+    other integers uint16 if they are from 0 to 65535, and other floating-point numbers float32; see
     `convert_samples`.
     """
     stored = np.dtype(dtype).newbyteorder("=")
@@ -218,12 +218,12 @@ class Decoding:
     stored : dtype
         Type of the stored samples, in the byte order of this machine.
     order : (int, int, int)
-        The stored axes that are frames, rows and columns.
+        Numbers of the stored axes for frames, rows and columns.
     packing : Packing or None
     names : tuple of str
         Names of the stored axes; empty if unknown.
     findings : tuple of Finding
-        What is converted.
+        The conversions.
     where : str
         The stack, for messages.
     """
@@ -244,7 +244,7 @@ class Decoding:
 
     @property
     def plain(self) -> bool:
-        """Whether the stored array has the samples of the frames in their order."""
+        """Whether the stored array can be used as frames without conversion."""
         return self.order == (0, 1, 2) and self.packing is None and self.dtype == self.stored
 
     def shape(self, stored: Sequence[int]) -> tuple[int, int, int]:
@@ -254,7 +254,7 @@ class Decoding:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings about the conversion."""
+        """The conversions."""
         found = []
         if self.order != (0, 1, 2):
             shown = "the order of MATLAB" if self.matlab else f"the dimensions ({', '.join(self.names)})"
@@ -329,7 +329,7 @@ _COLOURS = {"c", "channel", "channels", "band", "bands", "rgb", "colour", "color
 def order_of(names: Sequence[str], where: str) -> tuple[int, int, int]:
     """Return the axes that are frames, rows and columns, from the names of three axes.
 
-    Names that are not known do not matter where the known ones determine the order, or agree with (T, H, W).
+    Unknown names are accepted if the known names determine the order, or agree with (T, H, W).
 
     Raises
     ------
@@ -361,7 +361,7 @@ def order_of(names: Sequence[str], where: str) -> tuple[int, int, int]:
 
 
 def _kind_of(name: str) -> str:
-    """Return the kind of an axis, judged by its name; "" if unknown."""
+    """Return the kind of an axis from its name; "" if it is unknown."""
     word = name.lower().strip()
     for kind, names in (("rows", _ROWS), ("columns", _COLUMNS), ("frames", _FRAMES), ("colours", _COLOURS)):
         if word in names:

@@ -102,9 +102,9 @@ class Region:
 
 
 def source_region(process: Mapping[str, object]) -> Region | None:
-    """Return the region of the picture that a result was made from; None if it is unknown.
+    """Return the region of the picture from which a result was computed; None if it is unknown.
 
-    The process of a result of 'fuse' contains the region of both recordings, which is the same.
+    For a result of 'fuse', it is the common region of both recordings.
 
     Examples
     --------

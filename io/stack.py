@@ -33,17 +33,17 @@ from mirrorskin.io.zarr import ZarrFrames
 _log = logging.getLogger("mirrorskin.io")
 
 _LIMIT = 256_000_000  # bytes of unpacked frames, by default
-_MANY = 8_000_000  # bytes of contiguous frames that are read by several threads
+_MANY = 8_000_000  # bytes of contiguous frames above which several threads read
 
 
 def _close(file: int) -> None:
-    """Close a file that was only read: nothing is lost if that fails."""
+    """Close a file that was only read, ignoring errors."""
     with suppress(OSError):
         os.close(file)
 
 
 class RawFrames(FrameReader):
-    """Contiguous frames at an offset of a file, which is closed with the last reference at the latest."""
+    """Contiguous frames at an offset of a file, which is closed when the object is deleted at the latest."""
 
     how = "directly"
 
@@ -174,7 +174,7 @@ class Stack:
 
     def _fetch(self, frames: Span, out: NDArray[Any]) -> None:
         with as_input_error(self._place.name(*frames)):
-            # HDF5 reads zeros behind the end of a file that became shorter.
+            # HDF5 returns zeros beyond the end of a truncated file.
             if self._file is not None and os.fstat(self._file.id.get_vfd_handle()).st_size < self._size:
                 raise OSError("truncated: the file became shorter")
             self._frames.fetch((frames, self._region.rows, self._region.columns), out)
@@ -191,7 +191,7 @@ class Stack:
         return max(start, self._first), min(start + self._frames.length, self._end)
 
     def _unpack(self, start: int, stop: int) -> None:
-        """Unpack all chunks of some frames into memory; if they do not fit, all frames to disk."""
+        """Unpack the chunks of some frames into memory, or if they do not fit, all chunks to disk."""
         frame, count = math.prod(self.shape[1:]) * self.dtype.itemsize, self._end - self._first
         length = min(self._frames.length, count)
         fits = length * frame + self._frames.scratch_bytes <= self._limit
@@ -218,7 +218,7 @@ class Stack:
         self._kept = start, stop
 
     def _disk_memory(self, size: int) -> mmap.mmap:
-        """Return the memory of a mapped file without a name, which no other program can shorten."""
+        """Return the memory of a mapped unnamed file, which no other program can truncate."""
         what = f"{self._place.path}: {self._place.dataset} is unpacked to disk, {size / 1e9:.3g} GB"
         remedy = "name a folder with more room in TMPDIR, raise --memory, or repack it in chunks of one frame"
         with as_input_error(what, remedy), tempfile.TemporaryFile(buffering=0) as file:
@@ -240,7 +240,7 @@ def _open(
     offset = dataset.id.get_offset()
     if offset is None:
         return Hdf5Frames(dataset, "in its header")
-    # A duplicate of HDF5's descriptor would hold its lock as long as this one is open.
+    # A duplicate of HDF5's descriptor would keep the lock as long as it is open.
     file = os.open(dataset.file.filename, os.O_RDONLY | os.O_CLOEXEC)
     frames = RawFrames(file, offset, (count, *dataset.shape[1:]), dataset.dtype)
     if not os.path.samestat(os.fstat(file), os.fstat(dataset.file.id.get_vfd_handle())):

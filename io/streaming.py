@@ -1,4 +1,4 @@
-"""Recordings that are written live, and can be read meanwhile."""
+"""Recordings that can be read while they are written."""
 
 from __future__ import annotations
 
@@ -96,13 +96,13 @@ class _End(NamedTuple):
 class StreamRecorder(TeeSource[LiveSource]):
     """Pass on the frames of a live source immediately, and write them to a recording in another thread.
 
-    The recording appears with the first frame, as ``file``: this is ``path`` if no file has this name. If an
-    older file has it and ``overwrite`` was given, the recording gets its own name next to it
+    The recording appears with the first frame, as ``file``. This is ``path`` if no file has this name. If an
+    older file exists and ``overwrite`` is set, the recording has another name next to it
     (``press-partial.h5``), and replaces the older file at the end, if it is complete. From the first frame on
     other programs can read it (HDF5's SWMR). Every ``period`` all data is passed to the operating system, and
-    remains if this process is killed. After an exception the frames so far are kept, and ``/entry/state``
+    survives if this process is killed. After an exception the frames so far are kept, and ``/entry/state``
     contains "cut short" and the reason. At the end the source is closed first, so that hardware stops. Then
-    its corrected positions replace those of the frames, which are kept in addition.
+    its corrected positions are stored as the positions, in addition to those that arrived with the frames.
 
     Parameters
     ----------
@@ -115,14 +115,14 @@ class StreamRecorder(TeeSource[LiveSource]):
     period : float, optional
         Interval in seconds.
     calibration : Calibration, optional
-        Calibration to copy into the recording; positions and references remain those of the source.
+        Calibration to copy into the recording; it does not change positions and references.
     overwrite : bool, optional
         Whether an existing file of that name is replaced; by default it is refused.
 
     Attributes
     ----------
     name, header, shape, dtype, motion, rewindable
-        Those of the source; recorded frames cannot be read again.
+        As for the source; recorded frames cannot be read again.
     path, file : Path
         The requested name, and the actual name of the recording, once the first frame is written.
     state : str
@@ -157,7 +157,7 @@ class StreamRecorder(TeeSource[LiveSource]):
         self._period = period
         self._messages = self.path.suffix.lower() == MCAP_SUFFIX
         if self._messages:
-            load_writer()  # fails before anything moves if it is missing
+            load_writer()  # if it is missing, fail before hardware moves
             if calibration is not None:
                 raise InputError(f"{path}: an MCAP file cannot contain a calibration; record to a file .h5")
         self._queue: queue.SimpleQueue[Block | _Mark | _Maps | _End] = queue.SimpleQueue()
@@ -212,7 +212,7 @@ class StreamRecorder(TeeSource[LiveSource]):
         self._queue.put(_Mark(index, np.array(used, bool)))
 
     def add_maps(self, time: float, height: NDArray[np.float32] | None, contact_area: float | None) -> None:
-        """Write maps computed from the frames up to a time, mm and mm^2; HDF5 has no place for them."""
+        """Write maps computed from the frames up to a time, mm and mm^2; not supported for HDF5."""
         if self._messages and self.count:
             maps = _Maps(time, height, contact_area)
             self._reserve(maps.size)
@@ -234,7 +234,7 @@ class StreamRecorder(TeeSource[LiveSource]):
         self.count += len(frames)
 
     def _reserve(self, size: int) -> None:
-        """Count bytes that wait to be written; InputError if there are too many."""
+        """Add to the number of bytes waiting to be written; InputError if there are too many."""
         with self._lock:
             backlog, self._backlog = self._backlog, self._backlog + size
         if backlog and backlog + size > _BACKLOG:
@@ -246,7 +246,7 @@ class StreamRecorder(TeeSource[LiveSource]):
     def _finish(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
     ) -> None:
-        """Let the thread write the final values, and wait for it."""
+        """Make the thread write the final values, and wait for it."""
         positions: Mapping[str, Floats] = {}
         failure = error
         try:
@@ -297,7 +297,7 @@ class StreamRecorder(TeeSource[LiveSource]):
         return file
 
     def _name(self, part: Path) -> Path:
-        """Give the recording the first free name: ``path``, or a similar one."""
+        """Rename the recording to the first free name: ``path``, or another name next to it."""
         target = Path(os.path.realpath(self.path))
         with suppress(FileExistsError):
             link_new(part, target)
@@ -368,7 +368,7 @@ class StreamRecorder(TeeSource[LiveSource]):
                 due = time.monotonic() + self._period
 
     def _wait(self, timeout: float) -> Block | _Mark | _Maps | _End | None:
-        """Return the next item in the queue, None after a timeout; the end if the program was left."""
+        """Return the next item in the queue; None after a timeout, the end if the program has ended."""
         with suppress(queue.Empty):
             return self._queue.get(timeout=timeout)
         return None if threading.main_thread().is_alive() else _End({}, _cut_short(SystemExit()))
@@ -424,7 +424,7 @@ class Column:
         chunk = (min(max(expected, 64), _ROWS), *width)
         self._default = default
         self._rows: NDArray[Any] = np.full((chunk[0], *width), default)
-        # With an initial row, its storage is allocated before the first frame.
+        # An initial row allocates its storage before the first frame.
         blank = np.zeros_like(self._rows[:1])
         self._dataset = file.create_dataset(name, data=blank, chunks=chunk, maxshape=(None, *width))
         if unit is not None:
@@ -438,7 +438,7 @@ class Column:
         self._written = min(self._written, start)
 
     def correct(self, rows: NDArray[Any]) -> None:
-        """Replace the first rows by better values, where these are finite."""
+        """Replace the first rows by corrected values, where these are finite."""
         self._grow(len(rows))
         self.set(0, np.where(np.isfinite(rows), rows, self._rows[: len(rows)]))
 
@@ -460,8 +460,8 @@ class Column:
 class GrowingRecording(Closing):
     """A recording to which frames are appended; after ``publish`` other programs can read it.
 
-    Raw frames are contiguous unless there are more than expected. A frame counts as used unless ``mark``
-    marked it otherwise.
+    Raw frames are contiguous if there are no more than expected. A frame counts as used unless ``mark``
+    states otherwise.
     """
 
     def __init__(
@@ -530,7 +530,7 @@ class GrowingRecording(Closing):
         self._used.set(start, used)
 
     def add_maps(self, *_maps: object) -> None:
-        """Refuse maps, which this format does not store."""
+        """Raise TypeError: this format does not store maps."""
         raise TypeError("maps go into MCAP files alone")
 
     def flush(self) -> None:
@@ -539,7 +539,7 @@ class GrowingRecording(Closing):
         self._flush()
 
     def publish(self) -> None:
-        """Allow other programs to read from now on; they still cannot write."""
+        """Allow other programs to read; they still cannot write."""
         self.flush()
         self._file.swmr_mode = True
         with suppress(OSError):  # a file system without locks
@@ -569,7 +569,7 @@ class GrowingRecording(Closing):
         file, (expected, rows, columns) = self._file, shape
         chunks, most = (1, rows, columns), (None, rows, columns)
         storage = {"chunks": chunks, "maxshape": most, **packing(compression)}
-        # Without a cache, a chunk is compressed when it is written.
+        # Without a cache, each chunk is compressed immediately.
         self._frames = new_stack(file, (0, rows, columns), dtype, rdcc_nbytes=0, **storage)
         self._state = file.create_dataset(STATE, (), h5py.string_dtype("utf-8", _STATE_LENGTH))
         self._write_state(UNDER_WAY)
@@ -587,7 +587,7 @@ class GrowingRecording(Closing):
         self._used = Column(file, USED, None, np.uint8(1), expected)
 
     def _flush(self) -> None:
-        """Flush; the preallocated space is sufficient."""
+        """Flush the frames, then the other values; the preallocated space is sufficient."""
         self._frames.flush()  # the frames must be stored before any count of them
         for column in (*itertools.chain(*self._series.values()), self._dropped, self._checksums, self._used):
             column.flush(self.count)

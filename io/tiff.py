@@ -1,4 +1,4 @@
-"""TIFF: the series of frames that its metadata describe, page by page."""
+"""Reading of TIFF files page by page, as the series of frames described by their metadata."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ _REMEDY = "copy it again, or save it again"
 _DTYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "float32", "float64")
 _MARKS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _KINDS = ("frame", "imagej", "multipage", "ome", "shaped", "sis", "tiled", "uniform", "virtual")
-"""Kinds of TIFF whose metadata are read; others are read page by page: theirs may name other files."""
+"""Kinds of TIFF whose metadata are read; the metadata of others may name other files."""
 
 _FRAME_AXES = "TZIQ"  # time, depth, and pages in order
-_COLOURS = 4  # most channels that may be the colours of one picture; more are frames
+_COLOURS = 4  # maximum number of channels that can be colours of one picture; more are frames
 _FORMATS = {1: "uint", 2: "int", 3: "float"}  # sample formats (TIFF 6.0, section 19)
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _PALETTE = 0, 1, 3  # photometric interpretations
-_PLAIN = tuple(dtype.name for dtype in FRAME_DTYPES)  # types of samples that are not only grey
+_PLAIN = tuple(dtype.name for dtype in FRAME_DTYPES)  # types accepted for colour samples as well
 _DECODED = {1, 5, 6, 7, 8, 32773, 32946}  # compressions: none, LZW, JPEG, deflate, PackBits
 _NONE, _LOSSY = 1, {6: "JPEG", 7: "JPEG", 34892: "JPEG"}  # compressions
 _SEPARATE = 2  # planar configuration: one plane per colour
 _MICROMETRE = ("micron", "um", "\\u00B5m")  # as ImageJ writes it
-# # Tags of a page about the packing of samples: type and number.
+# Tags of a page that describe the packing of its samples: type and number.
 _PACKING = {266: "H", 317: "H", 322: "I", 323: "I", 278: "I"}
 _JPEG_TABLES, _SUBSAMPLING, _ORIENTATION = 347, 530, 274
 _LAST_UPRIGHT = 4  # orientation; in the others rows and columns are exchanged
@@ -47,9 +47,9 @@ _LAST_UPRIGHT = 4  # orientation; in the others rows and columns are exchanged
 class TiffFrames(WholeFrames):
     """The frames of a TIFF: pages, or the time or depth of ImageJ and OME, (T, H, W).
 
-    Samples are read as stored, with three exceptions. Where white is zero, they are inverted, so that more
-    light is a larger number. Indices of a colour table become the table's values if it is grey, and stay
-    indices if it rises in brightness; any other table is refused. Colours become grey as in ``to_grey``.
+    Samples are read as stored, with three exceptions. If white is zero, they are inverted, so that more light
+    is a larger number. Indices of a colour table become the values of the table if it is grey, and are
+    unchanged if its brightness increases; any other table is refused. Colours become grey as in ``to_grey``.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class TiffFrames(WholeFrames):
                 raise InputError(f"{path} cannot be read: {error.strerror or error}") from error
             except Exception as error:  # of many types
                 raise self._damaged() from error
-            self._close = opening.pop_all().close  # until it is closed
+            self._close = opening.pop_all().close  # the file stays open until `close`
 
     def close(self) -> None:
         """Close the file."""
@@ -131,7 +131,7 @@ class TiffFrames(WholeFrames):
         return InputError(f"{self._path} {wrong}: {_REMEDY}")
 
     def _ends(self) -> bool:
-        """Return whether the chain of pages has an end: it is missing in a file that was cut off."""
+        """Return whether the chain of pages ends; it does not in a truncated file."""
         self._file.filehandle.seek(self._file.pages.next_page_offset or 0)
         end = self._file.filehandle.read(self._file.tiff.offsetsize)
         return len(end) == self._file.tiff.offsetsize and not any(end)
@@ -228,7 +228,7 @@ class TiffFrames(WholeFrames):
         return values[..., 0] if samples == 1 else values[..., [2, 1, 0, 3][:samples]]
 
     def _decode(self, page: Any, planar: bool, name: str) -> NDArray[Any]:
-        """Decode the samples of a compressed page with OpenCV, wrapped in a TIFF of their own."""
+        """Decode the samples of a compressed page with OpenCV, as a TIFF of one page."""
         offsets, counts = page.dataoffsets, page.databytecounts
         planes = self._page.samplesperpixel if planar else 1
         each = len(offsets) // planes
@@ -245,7 +245,7 @@ class TiffFrames(WholeFrames):
         return np.stack(decoded[2::-1] + decoded[3:], axis=-1) if planar else decoded[0]
 
     def _packed(self, segments: list[bytes], samples: int) -> bytes:
-        """Return a TIFF of one page, whose samples OpenCV decodes without converting them."""
+        """Return a TIFF of one page whose samples OpenCV decodes without conversion."""
         page, order = self._page, self._file.byteorder
         tags: dict[int, tuple[str, Sequence[int] | bytes]] = {
             256: ("I", [page.imagewidth]),
@@ -272,7 +272,7 @@ class TiffFrames(WholeFrames):
 
 
 def _open(path: Path, *without: str) -> Any:
-    """Open a TIFF, whose metadata are read only if they are of one of some kinds."""
+    """Open a TIFF; its metadata are read only if their kind is supported, and not in ``without``."""
     import tifffile
 
     others = (tifffile.TIFF.FILE_FLAGS - {*_KINDS}) | {*without}
@@ -324,7 +324,7 @@ def _chosen(path: Path, found: list[Any], wanted: str | None) -> Any:
     sizes = ", ".join(f"{number}: {_describe(one)}" for number, one in enumerate(found[:5]))
     if wanted is not None:
         raise InputError(f"{path} has no series {wanted!r}: choose from {sizes}")
-    raise InputError(f"{path} holds {len(found)} series of pictures, {sizes}: choose one with --dataset")
+    raise InputError(f"{path} contains {len(found)} series of pictures, {sizes}: choose one with --dataset")
 
 
 def _describe(series: Any) -> str:
@@ -332,7 +332,7 @@ def _describe(series: Any) -> str:
 
 
 def _numbers(name: str, series: Any, channel: int | None) -> tuple[NDArray[np.intp], int | None]:
-    """Return the pages of a series that are frames, in order, and the requested colour of each."""
+    """Return the pages of a series that are frames, in order, and the colour to read from each."""
     inner = len(series.keyframe.shape)  # axes within a page: rows, columns, and perhaps colours
     axes, shape = series.axes, series.shape
     if axes.endswith("S") and not series.keyframe.axes.endswith("S") and shape[-1] == 1:
@@ -380,7 +380,7 @@ def _table(name: str, page: Any) -> ColourTable:
 
 
 def _pixel_size(file: Any) -> str:
-    """Return the pixel size that ImageJ's or OME's metadata state, as text."""
+    """Return the pixel size in the metadata of ImageJ or OME, as text."""
     if file.is_ome and file.ome_metadata:
         found = re.findall('PhysicalSize([XY])="([0-9.eE+-]{1,20})"', file.ome_metadata)
         sizes, unit = dict(found), re.search('PhysicalSizeXUnit="([^"]{1,9})"', file.ome_metadata)
@@ -397,7 +397,7 @@ def _pixel_size(file: Any) -> str:
 
 @contextmanager
 def _quiet_tifffile() -> Iterator[None]:
-    """Keep tifffile's messages about damaged files off the terminal."""
+    """Suppress tifffile's messages about damaged files."""
     logger = logging.getLogger("tifffile")
     level = logger.level
     logger.setLevel(logging.CRITICAL + 1)

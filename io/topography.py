@@ -1,7 +1,7 @@
 """Heights for programs of surface metrology: X3P, SUR, GSF, and TIFF of float32.
 
-Each format stores the pixel size and one height per pixel, NaN or a mark where undefined. X3P begins with the
-row of the lowest y; the others begin at the top, like pictures.
+All contain one height per pixel, NaN or a mark where undefined, and the pixel size. In X3P the first row is
+at the lowest y; in the others at the top, as in pictures.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _CENTIMETRE = 10.0  # mm
 
 
 def encode_x3p(result: Result) -> Encoded:
-    """Encode heights as X3P (ISO 25178-72), float64 in metres; the origin is that of x and y."""
+    """Encode heights as X3P (ISO 25178-72), float64 in metres, with the origin of x and y."""
     import x3pio
 
     height, x, y = grid_of(result)

@@ -1,4 +1,4 @@
-"""Checks of the brightness of a grid of pixels over all frames."""
+"""Facts and findings from the brightness of a grid of pixels over all frames."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from mirrorskin.io.phase_check import PhaseCheck
 from mirrorskin.io.types import Floats, Motion
 
 _SIDE = 24  # pixels of the grid along each side
-_MOST = 1 << 22  # samples kept in all
-_FEWEST = 64  # pixels that are needed to tell anything
+_MOST = 1 << 22  # maximum number of samples kept
+_FEWEST = 64  # minimum number of pixels for findings
 _QUANTUM = 1 / math.sqrt(12)  # standard deviation of rounding, counts
 _MAD = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
-_CLEAR = 10.0  # least change of a pixel's brightness that is a response, standard deviations of the noise
-_FEW = 0.05  # share of pixels below which their common behaviour means nothing
-_MOST_OF = 0.8  # share of pixels that decides
-_CLIPPED = 0.1  # share of responding pixels that may reach the end of the scale
-_FLICKER, _DRIFT = 0.01, 2.0  # share of the light; counts of 8 bits
-_OUTLYING = 0.1  # share of the span by which a sample differs from both that before and that after
-_OUTLIERS, _FLASH = 0.003, 0.2  # share of such samples, and of the pixels of a frame: then it is the lamp
+_CLEAR = 10.0  # minimum change of a pixel that is a response, standard deviations of the noise
+_FEW = 0.05  # share of pixels below which their common behaviour is ignored
+_MOST_OF = 0.8  # share of pixels that must agree
+_CLIPPED = 0.1  # tolerated share of responding pixels that reach the end of the scale
+_FLICKER, _DRIFT = 0.01, 2.0  # tolerated flicker, share of the light; tolerated drift, counts of 8 bits
+_OUTLYING = 0.1  # minimum difference of an outlier from the samples before and after it, share of the span
+_OUTLIERS, _FLASH = 0.003, 0.2  # tolerated share of outliers; share in a frame from which it is a flash
 _NOISY = 0.3  # share of the pixels that differ between frames because of noise
 _AS_ONE = 0.5  # mean direction of the pixels' phases above which all respond alike
-_HARMONICS = 3  # of the phase, that describe the brightness of a pixel
-_THIN = 4  # # an axis shorter than both others by this factor may be a wrong one
+_HARMONICS = 3  # number of harmonics of the phase that describe the brightness of a pixel
+_THIN = 4  # an axis shorter than both others by this factor may be in the wrong place
 
 
 Samples = NDArray[np.float32]
@@ -46,7 +46,7 @@ class FrameSamples:
     Attributes
     ----------
     rows, columns : ndarray of int
-        Those of the grid in a frame.
+        Rows and columns of the grid in a frame.
 
     Examples
     --------
@@ -97,7 +97,7 @@ def named_frames(numbers: Sequence[int] | NDArray[np.intp]) -> str:
 
 
 class Traces:
-    """The brightness of each pixel of a grid over the frames, and the findings about it."""
+    """The brightness of each pixel of the grid over the frames, with facts and findings."""
 
     def __init__(self, samples: NDArray[Any], motion: Motion, series: Mapping[str, Floats]) -> None:
         self._grid = samples.shape
@@ -113,7 +113,7 @@ class Traces:
             self.span = float(self._highest.max() - self._lowest.min())
             self._fit = self._harmonics()
             self.noise = self._noise()
-            self._response = max(_CLEAR * self.noise, 0.02 * self.span)  # least change that is one
+            self._response = max(_CLEAR * self.noise, 0.02 * self.span)  # minimum change of a response
             self._responding = self._range > self._response
             self._share = float(self._responding.mean())
 
@@ -133,7 +133,7 @@ class Traces:
         return facts
 
     def findings(self, shape: tuple[int, int, int], moved: bool, phased: bool) -> Iterator[Finding]:
-        """Yield the findings."""
+        """Yield all findings."""
         if not self._known:
             return
         repeated = list(self._repeated())
@@ -183,7 +183,7 @@ class Traces:
         return f" ({int(high).bit_length()} bits in use{lower})"
 
     def _end(self) -> float:
-        """Return the end of the scale: the smallest usual number of bits that can represent all counts."""
+        """Return the end of the scale, for the smallest common number of bits that represents all counts."""
         if not self._integer:
             return math.inf
         bits = next(bits for bits in (8, 10, 12, 14, 16) if self._highest.max() < 2**bits)
@@ -207,7 +207,7 @@ class Traces:
         return np.asarray(basis @ (basis.T @ self._counts))
 
     def _noise(self) -> float:
-        """Return the standard deviation of a sample: the smallest of several estimates."""
+        """Return an estimate of the standard deviation of a sample, from the smallest changes."""
         steps = np.diff(self._counts, axis=0)
         found = [_MAD * float(np.median(np.median(np.abs(steps), axis=1))) / math.sqrt(2)]
         if self._fit is not None:
@@ -218,9 +218,9 @@ class Traces:
         return max(min(found), _QUANTUM if self._integer else 0.0)
 
     def _repeated(self) -> Iterator[Finding]:
-        """Yield frames that equal the one before them, if others differ everywhere."""
+        """Yield a finding for frames identical to the preceding one, if other frames differ everywhere."""
         counts = self._counts
-        inside = (counts[1:] > 0) & (counts[1:] < self._end())  # where noise is not cut off
+        inside = (counts[1:] > 0) & (counts[1:] < self._end())  # where noise is not clipped
         differ = np.count_nonzero((counts[1:] != counts[:-1]) & inside, axis=1)
         again = np.flatnonzero((differ == 0) & (inside.sum(axis=1) >= _FEWEST)) + 1
         if len(again) and np.median(differ) > _NOISY * counts.shape[1]:
@@ -231,7 +231,7 @@ class Traces:
             )
 
     def _phases(self, repeated: bool) -> Iterator[Finding]:
-        """Yield that later frames fit to other phases, and that all pixels grow brighter or darker."""
+        """Yield findings of a jump of the phase, and of a drift of the brightness of all pixels."""
         phase = self._series.get("phase")
         if self._motion != "axial" or phase is None:
             return
@@ -255,7 +255,7 @@ class Traces:
             )
 
     def _axes(self, shape: tuple[int, int, int]) -> Iterator[Finding]:
-        """Yield that the last axis seems to be the frames: it is short, and the light changes along it."""
+        """Yield a finding if the last axis seems to be the frames: short, with changing brightness."""
         thin = min(shape[1:])
         if _THIN * thin > min(shape[0], max(shape[1:])):
             return
@@ -300,7 +300,7 @@ class Traces:
             )
 
     def _outliers(self) -> float:
-        """Return the share of samples that deviate strongly from the brightness of their pixel in a press."""
+        """Return the share of samples of a press that differ from those before and after."""
         steps = np.diff(self._counts, axis=0)
         limit = max(_CLEAR * self.noise, _OUTLYING * self.span)
         apart = (np.minimum(steps[:-1], -steps[1:]) > limit) | (np.maximum(steps[:-1], -steps[1:]) < -limit)
@@ -314,14 +314,14 @@ class Traces:
 
     @staticmethod
     def _changes(counts: Samples, direction: float = 1.0) -> tuple[float, float]:
-        """Return the shares of series, (T, n), that end far above and far below where they begin."""
+        """Return the shares of series, (T, n), that end far above and far below their start."""
         few = max(1, len(counts) // 10)
         change = counts[-few:].mean(axis=0) - counts[:few].mean(axis=0)
         change *= direction / np.ptp(counts, axis=0)
         return float(np.mean(change > 0.5)), float(np.mean(change < -0.5))
 
     def _rising_axis(self) -> str:
-        """Return the axis along which the pictures' brightness rises or falls as in a press; "" if none."""
+        """Return the axis of the pictures along which brightness changes as in a press; "" if none."""
         samples = self._pictures
         for axis, name in ((2, "rows"), (1, "columns")):
             series = np.moveaxis(samples, axis, 0).reshape(samples.shape[axis], -1)
@@ -348,7 +348,7 @@ class Traces:
             )
 
     def _common(self, counts: Samples, used: NDArray[np.bool_]) -> tuple[Floats, Floats, float] | None:
-        """Return by how much used pixels differ from usual in each frame, the error, and their level."""
+        """Return the common deviation of used pixels in each frame, its error, and their level."""
         counted = np.count_nonzero(used, axis=1)
         enough = counted >= _FEWEST // 2
         if np.count_nonzero(enough) < 5:
@@ -360,14 +360,14 @@ class Traces:
 
     @functools.cached_property
     def _flicker(self) -> tuple[float, float] | None:
-        """Return the standard deviations of the common light and of its noise, as shares; None if unknown."""
+        """Return the standard deviations of the common light, and of its noise, as shares."""
         if self._fit is not None and len(self._counts) >= 2 * (2 * _HARMONICS + 1):
             left = self._counts - self._fit
             if float(np.mean(left**2)) > 0.02 * float(np.var(self._counts)):
-                return None  # harmonics do not describe it
+                return None  # harmonics do not describe the brightness
             wave = np.exp(1j * self._series["phase"]) @ self._counts[:, self._responding]
             if wave.size and abs(np.mean(wave / np.abs(wave))) > _AS_ONE:
-                return None  # of a flat object, light that is not a cosine would look the same
+                return None  # on a flat object, light that is not a cosine would look the same
             gain = np.median(left / np.maximum(self._fit, 1e-3 * self._highest.max()), axis=1)
             error = 1.25 * self.noise / math.sqrt(self._fit.shape[1]) / float(np.mean(self._fit))
             return float(np.std(gain)), error

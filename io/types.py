@@ -37,13 +37,13 @@ class Block:
     time : ndarray, (n,), float64, or None
         Seconds since the start of the recording.
     travel : ndarray, (n,), float64, or None
-        Distance by which the body is lowered, mm (vertical motion, and axial if it also presses).
+        Downward displacement of the body, mm (vertical motion, and axial if it also presses).
     phase : ndarray, (n,), float64, or None
         Phase of the precession, radians, counter-clockwise (axial motion).
     displacement : ndarray, (n, 2), float64, or None
         Displacement of the body along x and y, mm (horizontal motion).
     twist : ndarray, (n,), float64, or None
-        Angle by which the body is turned about its axis, radians, counter-clockwise (twist).
+        Rotation of the body about its axis, radians, counter-clockwise (twist).
     tilt : ndarray, (n,), float64, or None
         Half-angle of the lean, radians, if it varies between frames (axial motion).
     origin : (int, int)
@@ -51,8 +51,8 @@ class Block:
     dropped : int
         Frames lost between the preceding block and this one.
     lent : bool
-        Whether the frames are in memory of the source that is not overwritten while they are referred to,
-        and that is readable for 64 bytes beyond them, so that a device may use it without a copy.
+        Whether the memory of the frames belongs to the source, is not overwritten while it is referenced, and
+        is readable for 64 bytes beyond the frames, so that a device can use it without a copy.
     """
 
     frames: NDArray[Any]
@@ -69,9 +69,9 @@ class Block:
 
     @property
     def pose(self) -> Floats | None:
-        """The body's axis and travel in each frame, (n, 4): unit vectors, and mm, 0 if unknown.
+        """The axis and travel of the body in each frame, (n, 4): unit vectors, and mm, 0 if unknown.
 
-        None without phases and tilts.
+        It is None without phases and tilts.
         """
         if self.phase is None or self.tilt is None:
             return None
@@ -95,7 +95,7 @@ class Header:
     travel_sigma : float or None
         Standard deviation of the travel of each frame, mm, independent from frame to frame.
     press : float or None
-        Travel in mm at which the other motions take place.
+        Travel of the press during other motions, mm.
     tilt : float or None
         Half-angle of the precession, radians, if it is the same for all frames.
     pivot : (float, float, float) or None
@@ -103,8 +103,8 @@ class Header:
     zenith_gain, zenith_offset : ndarray, scalar or (H, W), float64, or None
         Counts per radian of zenith, and counts at zenith zero.
     line_time : float or None
-        Seconds from the exposure of a row to that of the next one, of a rolling shutter; negative if the last
-        row is the first. The time and the position of a frame are those of its middle row.
+        For a rolling shutter: seconds between the exposures of consecutive rows; negative if the last row is
+        exposed first. The time and position of a frame refer to its middle row.
     camera : str
         Name of the camera; empty if unknown.
     """
@@ -195,7 +195,7 @@ class Source(Protocol):
 class LiveSource(Source, Protocol):
     """A source whose frames arrive in real time: the first of ``shape`` is the expected number of frames.
 
-    The positions in its blocks are those known when the frames arrived. A block's ``dropped`` counts the
+    The positions in its blocks are estimates at the arrival of the frames. ``dropped`` of a block counts the
     frames lost between the preceding block and this one.
     """
 
@@ -205,8 +205,8 @@ class LiveSource(Source, Protocol):
     def positions(self) -> Mapping[str, Floats]:
         """Return the best estimate of the positions of all frames read so far.
 
-        It can also be called after the source was closed. NaN: the position in the block is the best
-        estimate.
+        It can also be called after the source was closed. NaN marks frames without a better estimate than in
+        the blocks.
 
         Returns
         -------
@@ -252,7 +252,7 @@ class Truth:
 
 
 UNDISTORTED = "undistorted"
-"""Value in the process of a result whose maps are on the sheet, and no longer in the camera's pixels."""
+"""Value in the process of a result whose maps have been undistorted to positions on the sheet."""
 
 
 def body_axes(phase: ArrayLike, tilt: ArrayLike) -> Floats:

@@ -50,7 +50,7 @@ _NOUN: dict[Kind, str] = {
 }
 _ANGLES = ("radian", "degree", "arcminute", "arcsecond", "grade", "turn")
 _MOST_DECIMALS = 9
-_LONGEST = 40  # characters of a unit that are quoted
+_LONGEST = 40  # maximum number of quoted characters of a unit
 _SYMBOL = re.compile(r"[^\W\d]+|°")  # pint evaluates arithmetic, so only single names are passed to it
 
 
@@ -74,7 +74,7 @@ def is_common(symbol: str, kind: Kind | None = None) -> bool:
 
 
 def conversion_factor(unit: str, wanted: str, where: str) -> float:
-    """Return the factor from a unit in a file to a base unit, or to its inverse."""
+    """Return the factor that converts a value in a file to a base unit, or to the inverse of one."""
     if unit == wanted:
         return 1.0
     over, _, base = wanted.rpartition("/")
@@ -122,7 +122,7 @@ def ratio(unit: str, other: str) -> float:
 
 
 def numbers_with_unit(values: Sequence[float], unit: str) -> tuple[list[str], str]:
-    """Return values as texts with as many decimals as distinguish them, at least three, and their unit.
+    """Return values as texts and their unit, with enough decimals to distinguish them, at least three.
 
     Lengths in mm below 0.1 mm are in µm, below 0.1 µm in nm.
 
@@ -155,7 +155,7 @@ def _pint_factor(symbol: str, kind: Kind) -> float:
     except (pint.UndefinedUnitError, ValueError) as error:
         raise ValueError(f"{symbol} is not a known unit") from error
     base = registry.Unit(BASE[kind])
-    # The pixel of style sheets is a length, but is not meant here.
+    # pint also defines the pixel of style sheets, which is a length.
     same = registry.get_root_units(unit)[1] == registry.get_root_units(base)[1]
     # Angles are dimensionless, but so are decibels, percents and counts.
     other = kind == "angle" and not str(unit).endswith(_ANGLES)

@@ -31,23 +31,23 @@ VIDEO_SUFFIXES = (
     *(".wmv", ".asf", ".flv", ".ogv", ".ogg", ".nut", ".3gp", ".3g2", ".mj2"),
 )
 
-# Playlists are not opened, because they name other files and addresses. Edit lists are ignored: all frames
-# in the file are read, and those that players leave out are counted.
+# Playlists are not opened, because they name other files and addresses. Edit lists are ignored: all frames in
+# the file are read, and the frames that players omit are counted.
 _OPTIONS = {
     "protocol_whitelist": "file",
     "format_whitelist": "avi,mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,mpeg,mpegts,asf,flv,ogg,nut",
 }
-_LIMIT = {"max_pixels": str(MAX_UNPACKED_BYTES // 3)}  # also while the file is opened
+_LIMIT = {"max_pixels": str(MAX_UNPACKED_BYTES // 3)}  # applies from the opening of the file
 _ALL_FRAMES = {"ignore_editlist": "1"}
 _INSTALL = "videos need mirrorskin[video]: pip install 'mirrorskin[video]'"
 _KEPT = 256_000_000  # bytes of decoded frames that are kept in memory, by default
 _LONGEST = 100  # characters quoted of an error message
 _DEEP = re.compile(r"(gray|yuva?4\d\dp)(9|10|12|14|16)(le|be)")  # formats whose first plane is the luma
 _FULL_RANGE = 2  # AVCOL_RANGE_JPEG
-_MOST_LOST = 1 << 30  # frames between two
+_MOST_LOST = 1 << 30  # maximum number of frames lost between two frames
 _GREY_COUNTS = 8  # largest difference between the colours of a grey frame, after a lossy compression
-_LOSSLESS_PROFILES = ("High 4:4:4 Predictive",)  # of codecs that are lossy in others
-# 8-bit luma of limited range, 16 to 235, in full range.
+_LOSSLESS_PROFILES = ("High 4:4:4 Predictive",)  # lossless profiles of codecs that are otherwise lossy
+# Table that converts 8-bit luma of limited range, 16 to 235, to full range.
 _FULL = np.clip(np.rint((np.arange(256) - 16) * (255 / 219)), 0, 255).astype(np.uint8)
 
 
@@ -171,8 +171,8 @@ class VideoFrames(WholeFrames):
             return found[0]
         if number is not None and number.isdecimal() and int(number) < len(found):
             return found[int(number)]
-        wrong = "choose one with --dataset" if number is None else f"{number!r} is none of them"
-        raise InputError(f"{self._path} holds {len(found)} streams of frames, numbered from 0: {wrong}")
+        wrong = "choose one with --dataset" if number is None else f"{number!r} is not one of them"
+        raise InputError(f"{self._path} contains {len(found)} streams of frames, numbered from 0: {wrong}")
 
     def _decode(self, container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
         """Yield the frames; InputError where one cannot be decoded."""
@@ -251,7 +251,7 @@ class VideoFrames(WholeFrames):
         return samples
 
     def _check_complete(self, stream: VideoStream, avi: bool, stamps: Floats, end: float) -> None:
-        """Check that the frames reach to the end that the container states."""
+        """Raise InputError unless the frames reach the duration that the container states."""
         if avi:
             step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else float(stream.time_base or 0)
             stated = stream.frames * float(stream.time_base or 0)
@@ -273,7 +273,7 @@ class VideoFrames(WholeFrames):
             )
 
     def _hidden(self, count: int) -> int:
-        """Return how many frames an edit list leaves out."""
+        """Return the number of frames that an edit list omits."""
         assert self._container is not None
         if not self._container.format.name.startswith("mov"):
             return 0
@@ -312,7 +312,7 @@ class VideoFrames(WholeFrames):
 
 
 def _shows_colour(frame: VideoFrame, name: str) -> bool:
-    """Return whether the colours of a frame differ, by more than a compression makes them differ."""
+    """Return whether the colours of a frame differ by more than a lossy compression causes."""
     if frame.format.is_rgb or len(frame.format.components) < 3:
         return is_coloured(_stored(frame, name, None))
     colours = frame.reformat(format="bgr24").to_ndarray()
@@ -368,7 +368,7 @@ def _plane(frame: VideoFrame, number: int, dtype: np.dtype[Any]) -> NDArray[Any]
 
 
 def _upright(frame: VideoFrame, picture: NDArray[Any]) -> NDArray[Any]:
-    """Turn and mirror a picture by the display matrix of its frame."""
+    """Rotate and mirror a picture according to the display matrix of its frame."""
     data: Any = frame.side_data.get("DISPLAYMATRIX")
     if data is None:
         return picture
@@ -379,7 +379,7 @@ def _upright(frame: VideoFrame, picture: NDArray[Any]) -> NDArray[Any]:
 
 
 def times(stamps: Floats, rate: float) -> Floats | None:
-    """Return the times of frames relative to the first: their stamps, if these increase, or from a rate."""
+    """Return the times of frames relative to the first: their stamps if they increase, else from the rate."""
     if np.all(np.isfinite(stamps)) and np.all(np.diff(stamps) > 0):
         return np.asarray(stamps - stamps[0])
     return np.arange(len(stamps)) / rate if 0 < rate < np.inf else None

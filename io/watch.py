@@ -1,4 +1,4 @@
-"""Checks of frames while they are read: facts, and the doubts of an expert about the numbers."""
+"""Plausibility checks of frames while they are read: facts and findings."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ FIELD = (0.05, 200.0)
 TRAVEL = (0.005, 20.0)
 """Usual travel of a press, mm."""
 
-_EVEN = 1e-3  # steps of a position that differ by less than this share are even
-_GAP = 1.5  # intervals: a longer time between two frames means that frames are missing
+_EVEN = 1e-3  # relative difference up to which steps of a position are even
+_GAP = 1.5  # time between two frames above which frames are missing, in intervals
 
 Limits = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Check:
-    """Facts and doubts about frames; ``print`` shows them.
+    """Facts and findings about frames; ``print`` shows them.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class Check:
     facts : dict of str
         Names and values to print.
     findings : tuple of Finding
-        What a user should know.
+        Warnings and notes.
     """
 
     name: str
@@ -43,7 +43,7 @@ class Check:
 
     @property
     def warnings(self) -> tuple[Finding, ...]:
-        """The findings that are warnings: an answer may be wrong."""
+        """The findings that are warnings: results may be wrong."""
         return tuple(one for one in self.findings if one.warning)
 
     def __str__(self) -> str:
@@ -54,9 +54,9 @@ class Check:
 
 
 class Watch:
-    """The frames of a source while they are read: samples of them, and their positions.
+    """Collects samples and positions of the frames of a source while they are read.
 
-    ``moved``: whether the brightness must respond to the motion. ``phased``: whether it must fit to phases.
+    ``moved``: whether the brightness must respond to the motion. ``phased``: whether it must fit the phases.
     """
 
     def __init__(self, source: Source, moved: bool = True, phased: bool = True) -> None:
@@ -75,7 +75,7 @@ class Watch:
                 parts.append(values)
 
     def check(self, field_limits: Limits = FIELD, travel_limits: Limits = TRAVEL) -> Check:
-        """Return the findings about the frames so far."""
+        """Return the check of the frames so far."""
         series, traces = self._look()
         source = self._source
         facts = {"frames": f"{self.samples.count} of {source.shape[2]} x {source.shape[1]}, {source.dtype}"}
@@ -83,7 +83,7 @@ class Watch:
         return Check(source.name, facts, self._findings(series, traces, field_limits, travel_limits))
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return the findings about the frames so far, for the user."""
+        """Return the findings about the frames so far."""
         return self._findings(*self._look(), FIELD, TRAVEL)
 
     def _look(self) -> tuple[dict[str, Floats], Traces]:
@@ -143,7 +143,7 @@ def _geometry(
     field_limits: Limits,
     travel_limits: Limits,
 ) -> Iterator[Finding]:
-    """Yield findings about lengths; a wrong unit changes them by a factor of 1000."""
+    """Yield findings about implausible lengths, as caused by a wrong unit."""
     size = source.header.pixel_size
     if size is not None:
         _, rows, columns = getattr(source, "full_shape", source.shape)
@@ -172,7 +172,7 @@ def _from_to(limits: Limits) -> str:
 
 
 def _order(source: Source, series: Mapping[str, Floats], lost: int) -> Iterator[Finding]:
-    """Yield which frames are missing."""
+    """Yield findings about missing frames."""
     known = {one.kind for one in getattr(source, "findings", ())}
     if lost and "lost frames" not in known:
         yield Finding("lost frames", f"{lost} frame{'s were' if lost > 1 else ' was'} lost", False)

@@ -1,7 +1,7 @@
 """Recordings and results in Zarr: groups and arrays with the same names as in HDF5.
 
 Groups, attributes and the shapes of arrays are copied to an HDF5 file in memory, so that a store is checked
-like such a file. Values are read from the store when they are needed.
+in the same way. Values are read from the store when they are needed.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ Array: TypeAlias = "zarr.Array[Any]"
 
 _MOST_FRAMES = 1 << 26
 _MOST_PIECES = 1 << 16  # chunks or shards of an array that is read as a whole, or that contain a frame
-_SMALL, _MOST_EARLY = 1 << 16, 128  # bytes of an array that is read on opening, and the number of these
-AT_ONCE = 16  # requests
+_SMALL, _MOST_EARLY = 1 << 16, 128  # maximum size, bytes, and number of arrays that are read on opening
+AT_ONCE = 16  # number of concurrent requests
 _SAMPLE = 16  # frames hashed for a fingerprint if there are no checksums
 
 
@@ -107,7 +107,7 @@ class ZarrFile(Hdf5File):
                 _set_attributes(made, {**one.attributes, **_fill_value(one)})
 
     def _read_early(self) -> None:
-        """Read small arrays concurrently, as each takes a request; an error is stored until it matters."""
+        """Read small arrays concurrently, because each is a request; errors are stored until they matter."""
         small = [
             name
             for name, one in self.arrays.items()
@@ -153,7 +153,7 @@ class ZarrFile(Hdf5File):
         return values if early is None or rows is None else values[:rows]
 
     def check_frames(self, stack: h5py.Dataset, count: int) -> None:
-        """Refuse frames that are missing, or in chunks too large for memory."""
+        """Raise InputError for missing frames, and for chunks that are too large for memory."""
         one, where = self.arrays[str(stack.name)], self.where(stack)
         with naming(where):
             array = self._array(str(stack.name))
@@ -180,7 +180,7 @@ class ZarrFile(Hdf5File):
                 )
 
     def dimensions(self, node: h5py.Dataset) -> tuple[str, ...]:
-        """Return the names of an array's axes, "" for one without; empty if it states none."""
+        """Return the names of the axes of an array, "" for an axis without; empty if there are none."""
         one = self.arrays[str(node.name)]
         names = one.document.get("dimension_names", one.attributes.get("_ARRAY_DIMENSIONS"))
         if not isinstance(names, list) or len(names) != node.ndim:
@@ -197,7 +197,7 @@ class ZarrFile(Hdf5File):
         return f"Zarr, chunks {self._array(name).chunks}, {compressors_of(self.arrays[name])}"
 
     def origins(self) -> dict[Path, State]:
-        """Return the files that show a change: metadata of a folder, a zip file; none for an address."""
+        """Return the files to check for changes: metadata of a folder, or a zip file; none for an address."""
         if isinstance(self.path, Url):
             return {}
         files = [self.path] if self.path.is_file() else [self.path / name for name in METADATA]
@@ -224,7 +224,7 @@ def _count_pieces(shape: Shape, chunks: Shape) -> int:
 
 
 def _set_attributes(node: h5py.Group | h5py.Dataset, attributes: Mapping[str, Any]) -> None:
-    """Copy the texts and numbers, which HDF5 supports, too."""
+    """Copy the attributes that HDF5 supports: texts and numbers."""
     for name, value in attributes.items():
         if isinstance(value, str):
             node.attrs.create(name, fixed_text(value))
@@ -239,7 +239,7 @@ def _set_attributes(node: h5py.Group | h5py.Dataset, attributes: Mapping[str, An
 def _fill_value(array: ArrayMetadata) -> dict[str, float]:
     """Return the attribute ``_FillValue`` as a number, as xarray writes it.
 
-    In version 2 it is the fill value of the array, and in version 3 that of a float is base64 of its bytes.
+    In version 2 it is the fill value of the array; in version 3 floats are stored as base64 of their bytes.
     """
     value = array.attributes.get("_FillValue")
     if value is None and "_ARRAY_DIMENSIONS" in array.attributes:

@@ -31,7 +31,7 @@ Array: TypeAlias = "zarr.Array[Any]"
 LONGEST_TEXTS = 1 << 20
 """Limit of the texts in one chunk, in bytes."""
 
-_SLACK = 1 << 10  # additional bytes of a chunk between its codecs: checksums, the index of a shard
+_SLACK = 1 << 10  # additional bytes of a chunk between codecs: checksums, the index of a shard
 _INDEXED = 16  # bytes of the index of a shard per chunk
 _BLOCK = 128 << 10  # maximum unpacked size of a Zstandard block
 _FRAME = 0xFD2FB528

@@ -25,7 +25,7 @@ class MissingChunkError(Exception):
 def naming(what: str) -> Iterator[None]:
     """Convert errors of Zarr and of store libraries, of many classes, to one line with a remedy."""
     try:
-        # Zarr adds offsets of a damaged shard without a check.
+        # Zarr adds the offsets of a damaged shard without checking for overflow.
         with np.errstate(over="ignore"):
             yield
     except (InputError, MemoryError):

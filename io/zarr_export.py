@@ -49,7 +49,8 @@ def save_zarr(source: str | Path, path: str | Path, progress: Callable[[int], No
     Raises
     ------
     InputError
-        The file is neither, or damaged, the output exists, or it cannot be written.
+        The file is neither a recording nor a result, or is damaged; or the output exists, or cannot be
+        written.
 
     Examples
     --------
@@ -75,7 +76,7 @@ def save_zarr(source: str | Path, path: str | Path, progress: Callable[[int], No
 
 
 def check_store(target: Path) -> None:
-    """Refuse a store that could not be written, before any work is done."""
+    """Raise InputError for a store that could not be written, before any work is done."""
     if target.suffix.lower() != ZARR_SUFFIX:
         raise InputError(f"{target}: Zarr is written as NAME{ZARR_SUFFIX}: name it so with -o")
     taken = f"{target} exists: remove it, or name another output with -o"
@@ -123,8 +124,8 @@ def _new_store(target: Path) -> Iterator[Any]:
 def _claim(store: Any, target: Url) -> str:
     """Write an object that shows other writers that the store is in use, and return its name.
 
-    Objects in stores cannot be renamed. If two writers start at the same time, both may see the other's
-    object and give up, but they never both write.
+    Objects in stores cannot be renamed. If two writers start at the same time, both may detect the object of
+    the other one and fail, but they never both write.
     """
     from zarr.core.buffer import default_buffer_prototype
     from zarr.core.sync import sync
@@ -147,7 +148,7 @@ def _write_nodes(file: Hdf5File, store: Any) -> None:
     size = sum(int(node.nbytes) for node in nodes if node.dtype.kind in "biuf")
     if size > VALUES_LIMIT:
         raise InputError(
-            f"{file.path} holds {size / 1e6:.4g} MB besides its frames; of Zarr at most "
+            f"{file.path} contains {size / 1e6:.4g} MB in addition to its frames; in Zarr at most "
             f"{VALUES_LIMIT / 1e6:.4g} MB are read: keep it in HDF5"
         )
 
@@ -169,7 +170,7 @@ def _write_nodes(file: Hdf5File, store: Any) -> None:
 def _attributes(file: Hdf5File, node: Node) -> dict[str, Any]:
     """Return the attributes of an object that are numbers or texts."""
     with as_input_error(f"{file.path}: {node.name}"):
-        # By index: h5py opens the object again to find names, which fails where its values are in raw files.
+        # By index: to find names, h5py opens the object again, which fails if its values are in raw files.
         opened = [h5py.h5a.open(node.id, index=index) for index in range(h5py.h5a.get_num_attrs(node.id))]
     found: dict[str, Any] = {}
     for attribute in opened:

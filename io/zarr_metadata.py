@@ -29,9 +29,9 @@ _CODECS_3 = {"blosc", "bytes", "crc32c", "gzip", "transpose", "vlen-utf8", "zstd
 _INDEX_CODECS = {"bytes", "crc32c"}
 _NUMBERS = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
 _NUMBERS_2 = re.compile(r"[<>|]([iu][1248]|f[248]|b1)")
-_DEEP = 8  # nested groups
+_DEEP = 8  # maximum number of nested groups
 _MOST_DIMENSIONS = 32
-_AT_ONCE = 16  # requests
+_AT_ONCE = 16  # number of concurrent requests
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class ArrayMetadata:
 
     @property
     def nbytes(self) -> int:
-        """Size in memory in bytes; texts count as pointers."""
+        """Size in memory in bytes; for texts, the size of their pointers."""
         return math.prod(self.shape) * (0 if self.dtype is None else int(self.dtype.itemsize))
 
 
@@ -244,9 +244,9 @@ def _dtype(kind: Any, version: int) -> Any:
 
 
 def check_codecs(array: ArrayMetadata, where: str) -> None:
-    """Refuse an array with a codec that is not in the list, because some codecs run code from the store.
+    """Raise InputError for a codec that is not in the list, because some codecs run code from the store.
 
-    Texts with any codec but the one for texts, and numbers with that codec, are refused, too.
+    Texts with any codec but the one for texts, and numbers with that codec, are refused as well.
     """
     version = _version(array.document)
     if version == 2:
@@ -311,7 +311,7 @@ def compressors_of(array: ArrayMetadata) -> str:
 
 def too_many(path: Path) -> InputError:
     """Return the error for a store with too many groups and arrays."""
-    return InputError(f"{path} contains more than {MOST_NODES} groups and arrays: copy those you need")
+    return InputError(f"{path} contains more than {MOST_NODES} groups and arrays: copy what is needed")
 
 
 def is_name(name: str) -> bool:

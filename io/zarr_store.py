@@ -32,7 +32,7 @@ LARGEST_DOCUMENT, ALL_DOCUMENTS = 8 << 20, 64 << 20
 """Limits in bytes: of a metadata document or the listing of a folder, and of all documents of a store."""
 
 SCHEMES = ("http", "https", "s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "hdfs", "webhdfs", "memory")
-"""Schemes of addresses: those of fsspec that are stores, not views of other files."""
+"""Schemes of addresses: the schemes of fsspec for stores, without views of other files."""
 
 _SLACK = 1 << 20  # additional bytes of a compressed chunk
 _most_bytes = contextvars.ContextVar("bytes that an answer may have", default=LARGEST_DOCUMENT)
@@ -78,7 +78,7 @@ def options_of(address: Url) -> dict[str, Any]:
     settings = given | {
         "timeout": ClientTimeout(total=TRANSFER, sock_connect=SILENCE, sock_read=SILENCE),
         "response_class": _limited_response(),
-        # Answers are not decompressed: by aiohttp, a small one could fill the memory.
+        # aiohttp does not decompress answers, because a small answer could then fill the memory.
         "auto_decompress": False,
         "headers": given.get("headers", {}) | {"Accept-Encoding": "identity"},
     }
@@ -202,7 +202,7 @@ class LimitedStore(WrapperStore[Any]):  # type: ignore[misc]  # where it is not 
         return byte_range or RangeByteRequest(0, info.file_size)
 
     def _check_place(self, key: str, most: int | None) -> None:
-        """Refuse a file outside of the folder, one that is not regular, and one that is too large."""
+        """Raise InputError for a file that is outside the folder, not regular, or too large."""
         if not isinstance(self._store, LocalStore):
             return
         place = Path(os.path.realpath(self._store.root / key))

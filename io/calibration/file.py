@@ -223,7 +223,8 @@ def _read(file: Hdf5File, place: str, name: str) -> Calibration:
         newer = isinstance(version, int) and version > VERSION
         kind, remedy = ("a newer", f"update the program, or {_AGAIN}") if newer else ("an older", _AGAIN)
         raise InputError(
-            f"{file.path} holds a calibration of {kind} layout, {version}, where {VERSION} is read: {remedy}"
+            f"{file.path} contains a calibration of {kind} layout, {version}, where {VERSION} is read: "
+            f"{remedy}"
         )
     camera = _read_camera(file, f"{place}/camera")
     found = {one: file.find(f"{place}/{kind.command}") for one, kind in PARTS.items()}

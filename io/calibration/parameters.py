@@ -1,4 +1,4 @@
-"""Parameters of a calibration that are declared once.
+"""Declarations of the parameters of a calibration.
 
 The layout of files, docstrings, the tables of ``calibrate show`` and of the documentation, and titles of
 figures are derived from the declaration.
@@ -20,7 +20,7 @@ from mirrorskin.io.units import ratio
 
 Kind = Literal["map", "array", "number", "integer", "numbers", "integers", "text", "names", "mapping"]
 
-_SHOWN = {"rad": "deg", "pixel": "px", "MPa": "kPa"}  # units of tables and figures, unless one is declared
+_SHOWN = {"rad": "deg", "pixel": "px", "MPa": "kPa"}  # default units of tables and figures
 _KINDS: dict[str, Kind] = {
     "float": "number",
     "int": "integer",
@@ -29,7 +29,7 @@ _KINDS: dict[str, Kind] = {
     "tuple[str, ...]": "names",
     "Mapping[str, float]": "mapping",
 }
-_FACTORS = {"%": 100.0, "px": 1.0, "deg": math.degrees(1)}  # of units that `ratio` does not convert
+_FACTORS = {"%": 100.0, "px": 1.0, "deg": math.degrees(1)}  # for units that `ratio` does not convert
 _TYPES = {
     "number": "float",
     "integer": "int",
@@ -37,7 +37,7 @@ _TYPES = {
     "names": "tuple of str",
     "mapping": "mapping of str to float",
 }
-_COLUMNS = 100  # of the lines of a docstring
+_COLUMNS = 100  # maximum length of the lines of a docstring
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,32 +47,32 @@ class Parameter:
     Attributes
     ----------
     text : str
-        What the parameter is: a phrase without a full stop. Titles of figures end at its first semicolon.
+        Description: a phrase without a full stop. Titles of figures end at its first semicolon.
     unit : str
         Unit in memory and in files; empty for none.
     title : str or None
-        Name in tables, by default the parameter's; empty if it is not shown, as are vectors without names of
-        components. ``{}`` is replaced by the name of the component, which otherwise follows.
+        Name in tables, by default the name of the parameter; empty to hide it. Vectors whose components have
+        no names are hidden as well. ``{}`` is replaced by the name of the component, which otherwise follows.
     shown_unit : str
         Unit of tables and figures, by default degrees for radians and kPa for MPa.
     components : tuple of str
         Names of the components of "numbers" or an "array".
     shape : tuple
-        Shape of an array; letters are sizes that the parameters of a part share.
+        Shape of an array; letters are sizes common to the parameters of a part.
     valid : callable, optional
-        Whether a value in a file is accepted.
+        Returns whether a value in a file is accepted.
     place : bool
         Whether the first two numbers are relative to the picture's centre.
     convert : callable, optional
-        Returns what tables show of the value.
+        Returns the values shown in tables.
     flags : mapping of str to int
-        Bits of a map that are counted.
+        Bits of a map whose pixels are counted, by name.
     optional : bool
-        Whether a file may lack it: it has a default.
+        Whether it may be missing in a file, because it has a default.
     kind : str
         From the annotation: a "map" (NDArray) has one value per pixel of the camera, and is cropped with the
-        picture. "numbers", "integers" and "names" are tuples. A "mapping" contains numbers by name, in a
-        group of its own; each has the unit of the parameter of its name, with or without a component.
+        picture. "numbers", "integers" and "names" are tuples. A "mapping" contains numbers by the names of
+        parameters or of their components, in the units of these parameters; in files it is a group.
     dtype : dtype
         Type of a map or an array.
     """
@@ -137,7 +137,7 @@ class Parameter:
 def parameter(text: str, unit: str = "", *, default: Any = MISSING, **options: Any) -> Any:
     """Declare a parameter in the body of a part, by the fields of `Parameter`.
 
-    Without a default, a file must contain it: declare one if older files are still to be read.
+    Files must contain parameters without a default: declare one if older files are to be read.
     """
     one = Parameter(text, unit, optional=default is not MISSING, **options)
     if callable(default):
@@ -148,7 +148,7 @@ def parameter(text: str, unit: str = "", *, default: Any = MISSING, **options: A
 class Row(NamedTuple):
     """A number of a calibration, in the units of tables."""
 
-    part: str  # as its command is called
+    part: str  # name of its command
     what: str
     value: float | int | str
     sigma: float = math.nan  # standard error; NaN if unknown
@@ -188,12 +188,12 @@ class Part:
     """Motion of the recordings that determine the part, if its lengths depend on the pixel size."""
 
     def standard_errors(self) -> Mapping[str, float]:
-        """Return standard errors by the names of parameters; of a vector, with the name of the component."""
+        """Return standard errors by the names of parameters, for vectors also with the component."""
         errors: Mapping[str, float] = getattr(self, "sigma", {})
         return errors
 
     def rows(self) -> Iterator[Row]:
-        """Yield the numbers of tables; of maps, the medians."""
+        """Yield the numbers shown in tables; for maps, the medians."""
         errors = self.standard_errors()
         for name, one in parameters(self).items():
             title = name.replace("_", " ") if one.title is None else one.title
@@ -233,7 +233,7 @@ def median(values: Any) -> float:
 
 @dataclass_transform(eq_default=False, frozen_default=True, field_specifiers=(parameter,))
 def part(cls: type[T]) -> type[T]:
-    """Make a dataclass of a class that declares its attributes by `parameter`."""
+    """Convert a class whose attributes are declared by `parameter` to a dataclass."""
     made = dataclass(frozen=True, slots=True, eq=False)(cls)
     lines = ["Attributes", "----------"]
     for name, one in parameters(made).items():

@@ -26,7 +26,7 @@ _SAME_TILT = 1.25  # allowed ratio of a rotation's half-angle and the calibrated
 
 
 def size_facts(pixel_size: Size) -> dict[str, float]:
-    """Return the values in the process of a part that record its pixel size, mm along x and y."""
+    """Return the process values of a part that store its pixel size, mm along x and y."""
     return {f"pixel_size_{axis}": float(size) for axis, size in zip("xy", pixel_size, strict=True)}
 
 
@@ -38,10 +38,7 @@ def differ(one: Size, other: Size) -> bool:
 def outdated(
     calibration: Calibration, pixel_size: Size, parts: Iterable[str] = SIZED
 ) -> Iterator[tuple[str, Size]]:
-    """Yield the parts that were made with another pixel size, and that size.
-
-    Parts without a recorded size are skipped.
-    """
+    """Yield the parts that were made with another pixel size, if it was stored, and that size."""
     there = calibration.parts()
     for part in parts:
         facts = [calibration.process.get(f"{PARTS[part].command}.{fact}") for fact in size_facts(pixel_size)]
@@ -53,9 +50,9 @@ def outdated(
 def check_sizes(
     calibration: Calibration, pixel_size: Size | None, what: str, parts: Iterable[str] = SIZED
 ) -> None:
-    """Refuse parts that were made with another pixel size than the current one, if that is known."""
+    """Raise InputError for parts that were made with another pixel size than the current one, if known."""
     for part, before in outdated(calibration, pixel_size, parts) if pixel_size else ():
-        says = f"{what} says" if calibration.lens is None else "the scale now says"
+        says = f"{what} states" if calibration.lens is None else "the scale now states"
         sizes = (
             f"{x:.5g} mm" if f"{x:.5g}" == f"{y:.5g}" else f"{x:.5g} x {y:.5g} mm"
             for x, y in (before, cast(Size, pixel_size))
@@ -72,9 +69,9 @@ def check_camera(
     what: str,
     remedy: str = "calibrate again, or give that camera's",
 ) -> None:
-    """Raise InputError for a calibration of another camera: its name (empty: any), picture size or type.
+    """Raise InputError for a calibration of another camera: its name (if any), picture size or data type.
 
-    The message contains ``what`` the camera belongs to, and the ``remedy``.
+    The message contains the owner of the camera, ``what``, and the ``remedy``.
     """
     mine, differences = calibration.camera, []
     if mine.name and camera.name and mine.name != camera.name:
@@ -115,8 +112,8 @@ class Calibrated:
     a live source is only read when it is needed, because reading it moves the stage.
 
     The ``source`` is live, or a recording, possibly of a part of the picture. The ``calibration``, stored as
-    ``whole``, is that of the camera's whole picture. InputError if the camera or the half-angle differs, or
-    if a part was made with another pixel size.
+    ``whole``, belongs to the whole picture of the camera. InputError if the camera or the half-angle differs,
+    or if a part was made with another pixel size.
     """
 
     source: Source
@@ -234,7 +231,7 @@ class Calibrated:
         check_sizes(self.whole, size, self.name, used)
 
     def _movement(self, own: Header, precession: Precession) -> dict[str, Any]:
-        """Return tilt and pivot of the precession; the source's own values where the calibration has none."""
+        """Return tilt and pivot of the precession, or of the source if undetermined."""
         tilt = precession.tilt
         unknown = own.pivot or (np.nan,) * 3
         places = zip(precession.pivot, unknown, strict=True)

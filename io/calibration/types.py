@@ -193,7 +193,7 @@ class WallResponse(Part):
     )
 
     def standard_errors(self) -> Mapping[str, float]:
-        """Return the standard errors of the fitted parameters; 0 for fixed ones."""
+        """Return the standard errors of the fitted parameters; 0 if fixed."""
         names = (name.replace("lamp_", "lamps_") for name in self.parameters)
         return dict(zip(names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
@@ -266,7 +266,7 @@ class Precession(Part):
         return np.asarray(even + np.remainder(ahead + math.pi, math.tau) - math.pi, np.float64)
 
     def _angle(self, phase: Floats) -> Floats:
-        """Return the azimuth on the circle whose affine image is the ellipse."""
+        """Return the azimuth on the circle that is mapped to the ellipse."""
         return self.direction * np.asarray(phase, np.float64) + self.phase_offset
 
     def _ellipse(self, phase: Floats) -> tuple[Floats, Floats]:
@@ -409,7 +409,7 @@ class Calibration:
         return {name: part for name, part in found.items() if part is not None}
 
     def rows(self) -> Iterator[Row]:
-        """Yield its numbers in the units of tables; of maps, the medians."""
+        """Yield its numbers in the units of tables; for maps, the medians."""
         yield Row("camera", "name", self.camera.name or "unknown")
         for what, size in zip(("rows", "columns"), self.camera.shape, strict=True):
             yield Row("camera", f"{what} of a frame", size)

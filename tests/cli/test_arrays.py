@@ -102,7 +102,7 @@ def test_the_travel_of_a_real_stage_places_heights():
         (["ball.npy", *STEPS, "--live"], "leave --live out"),
         (
             ["ball.npz", "--dataset", "none"],
-            "holds no array 'none': choose from frames, travel, dark, bright",
+            "contains no array 'none': choose from frames, travel, dark, bright",
         ),
         (
             ["ball.npy", "--travel", "ball.npz"],
@@ -113,10 +113,10 @@ def test_the_travel_of_a_real_stage_places_heights():
         (["ball.npy", "--travel", "ball.npy"], "lists 2304 travels for 12 frames"),
         (["cut.npy", *STEPS], "cut.npy is not a NumPy array"),
         (["cut.npz", *STEPS], "cut.npz is not a NumPy array"),
-        (["complex.npy", *STEPS], "complex.npy is not a NumPy array of numbers (it holds complex128)"),
+        (["complex.npy", *STEPS], "complex.npy is not a NumPy array of numbers (it contains complex128)"),
         (["negative.npy", *STEPS], "frame 0 has a sample of -1; int16 is read as uint16, 0 to 65535"),
         (["flat.npy", *STEPS], "flat.npy has shape (4, 5): frames, (T, H, W)"),
-        (["two.npz", *STEPS], "two.npz holds the arrays a, b: choose the frames with --dataset"),
+        (["two.npz", *STEPS], "two.npz contains the arrays a, b: choose the frames with --dataset"),
     ],
 )
 def test_an_array_that_cannot_be_used_is_refused_in_a_line(words, said):

@@ -127,7 +127,7 @@ CASES = {
     "travel in words": (
         change(f"{STAGE}/travel", ["a"] * 8),
         [],
-        "travel holds no numbers: give --travel-step",
+        "travel contains no numbers: give --travel-step",
     ),
     "an incomplete truth": (change("truth/zenith"), [], "/entry/truth has no zenith"),
     "a negative pixel": (change(f"{DETECTOR}/x_pixel_size", -1.0), [], "above zero"),

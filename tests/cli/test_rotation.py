@@ -252,8 +252,8 @@ CASES = {
     "seven phases": ({}, ["--phases", "seven.txt"], "seven.txt lists 7 phases for 8 frames"),
     "phases twice": ({}, ["--phases", "seven.txt", "--phase-step", "45deg"], "Remove one of them"),
     "heights from nowhere": ({}, ["--heights", "gone.h5"], "gone.h5: no such file"),
-    "no heights": ({}, ["--heights", "flat.h5"], "flat.h5 holds no heights"),
-    "heights of another size": ({}, ["--heights", "small.h5"], "small.h5 holds the heights of"),
+    "no heights": ({}, ["--heights", "flat.h5"], "flat.h5 contains no heights"),
+    "heights of another size": ({}, ["--heights", "small.h5"], "small.h5 contains the heights of"),
     "heights without a pivot": ({"pivot": None}, ["--heights", "turn.h5"], "pivot"),
 }
 

@@ -76,7 +76,7 @@ def test_a_file_of_the_truth_is_like_the_object_itself(tmp_path: Path) -> None:
         ("whole.npy", np.zeros((4, 4), np.int64), "int64"),
         ("nowhere.npy", np.full((4, 4), np.nan), "finite"),
         ("deep.npy", np.array([[0.0, -np.inf]]), "finite"),
-        ("objects.npy", np.array([[None]]), "it holds object"),
+        ("objects.npy", np.array([[None]]), "it contains object"),
     ],
 )
 def test_unusable_values_are_refused(tmp_path: Path, name: str, values: NDArray[Any], words: str) -> None:

@@ -408,7 +408,7 @@ def test_a_reference_of_a_camera_of_floats_may_lie_anywhere(rig, tmp_path):
         (np.uint8(3), "b.npy is a single number, but the camera's pictures"),
         (PICTURE.astype(np.uint16), "b.npy contains uint16, but the camera delivers uint8; take"),
         (PICTURE > 105, "b.npy contains bool, but the camera delivers uint8"),
-        (PICTURE.astype(np.complex64), "b.npy is not a NumPy array of numbers .it holds complex64."),
+        (PICTURE.astype(np.complex64), "b.npy is not a NumPy array of numbers .it contains complex64."),
         (PICTURE * np.nan, "b.npy contains only NaN"),
         (PICTURE + 200.0, "b.npy contains 300 to 311, but counts of uint8 are 0 to 255"),
         (np.where(PICTURE == 105, np.inf, PICTURE), "b.npy contains 100 to inf, but counts of uint8"),

@@ -98,7 +98,7 @@ def test_of_several_stacks_one_is_named(path):
     for name in ("two", "/two", "./two", "//two"):
         np.testing.assert_array_equal(read(path, dataset=name), STACK[::-1])
     np.testing.assert_array_equal(read(path, dataset="a/one"), STACK)
-    refused(path, r"theirs\.h5 holds 2 stacks, /a/one, /two: choose with --dataset")
+    refused(path, r"theirs\.h5 contains 2 stacks, /a/one, /two: choose with --dataset")
 
 
 @pytest.mark.parametrize("subfolder", [".", "deep/down"])
@@ -167,16 +167,16 @@ def test_a_virtual_stack_is_read(path, tmp_path, monkeypatch):
 def test_a_virtual_stack_that_is_not_whole_is_refused(path, tmp_path):
     names = [f"part{k}.h5" for k in range(4)]
     virtual(path, names, missing=1)
-    refused(path, r"/x claims 280 bytes and its file holds 245: it was cut short")
+    refused(path, r"/x claims 280 bytes and its file contains 245: it was cut short")
     virtual(path, names[:3])
-    refused(path, r"/x claims 280 bytes and its file holds 210: it was cut short")
+    refused(path, r"/x claims 280 bytes and its file contains 210: it was cut short")
     virtual(path, names)
     with h5py.File(tmp_path / "part2.h5", "w") as file:
         file["y"] = STACK
     refused(path, r"/x needs x of part2\.h5: it is not there")
     with h5py.File(tmp_path / "part2.h5", "w") as file:
         file.create_dataset("x", (2, 5, 7), "u1")
-    refused(path, r"part2\.h5: /x claims 70 bytes and its file holds 0: it was cut short")
+    refused(path, r"part2\.h5: /x claims 70 bytes and its file contains 0: it was cut short")
     (tmp_path / "part2.h5").unlink()
     refused(path, r"the virtual dataset /x leads to part2\.h5, which does not exist: copy it there")
 
@@ -268,8 +268,8 @@ def test_a_name_that_is_not_a_stack_is_refused(path):
 
 def test_a_stack_of_too_little_is_refused(path):
     for shape, line in {
-        (0, 5, 7): "holds 0 frames: at least 2 are needed",
-        (1, 5, 7): "holds 1 frames: at least 2 are needed",
+        (0, 5, 7): "contains 0 frames: at least 2 are needed",
+        (1, 5, 7): "contains 1 frame: at least 2 are needed",
         (8, 5, 0): "its frames have no pixels",
     }.items():
         with h5py.File(path, "w") as file:
@@ -308,7 +308,7 @@ def test_more_than_the_file_holds_is_refused_before_memory_is_taken(path, write)
     try:
         refused(
             path,
-            r"/x claims [0-9]+ (bytes|chunks) and its file holds [0-9]+: it was cut short; copy it again",
+            r"/x claims [0-9]+ (bytes|chunks) and its file contains [0-9]+: it was cut short; copy it again",
         )
         assert tracemalloc.get_traced_memory()[1] < 2_000_000
     finally:

@@ -31,9 +31,9 @@ def stack(path):
     [
         (
             lambda path: io.save_result(io.Result(zenith=heights()), path),
-            "holds no heights: give a result of a",
+            "contains no heights: give a result of a",
         ),
-        (lambda path: record(sphere(), path), "holds no heights: give a result of a press, or a simulation"),
+        (lambda path: record(sphere(), path), "contains no heights: give a result of a press, or a"),
         (
             lambda path: io.save_result(io.Result(height=heights(), process={UNDISTORTED: True}), path),
             "contains undistorted heights, but frames are not undistorted",
@@ -105,5 +105,5 @@ def test_the_heights_of_a_result_are_cut_for_a_region(tmp_path, name):
     [("3,1,4x3", (3, 4)), ("2,1,4x2", (2, 4)), (None, (6, 7))],
 )
 def test_heights_of_other_pixels_are_refused(tmp_path, told, shape):
-    with pytest.raises(io.InputError, match=r"h\.h5 holds the heights of rows .* and columns .*, where "):
+    with pytest.raises(io.InputError, match=r"h\.h5 contains the heights of rows .* and columns .*, where "):
         source_region(tmp_path, told, shape=shape)

@@ -172,7 +172,7 @@ def test_a_packed_chunk_may_not_be_larger_than_the_memory(tmp_path):
 BAD = [
     (f"{STAGE}/travel", np.where(TRAVEL > 1, np.inf, TRAVEL), None, "travel is inf at frame 4"),
     (f"{STAGE}/travel", TRAVEL[:5], None, r"travel has shape \(5,\) where \(8,\) is needed: give --tr"),
-    (f"{STAGE}/travel", ["0"] * 8, None, "travel holds no numbers: give --travel-step"),
+    (f"{STAGE}/travel", ["0"] * 8, None, "travel contains no numbers: give --travel-step"),
     (
         f"{STAGE}/travel",
         None,
@@ -196,7 +196,7 @@ BAD = [
     (f"{DETECTOR}/y_pixel_size", 0.1, "px", "y_pixel_size is in 'px', which cannot be converted to mm"),
     (f"{DETECTOR}/y_pixel_size", None, None, "states the pixel size along one axis only: give --pixel-size"),
     (f"{DETECTOR}/dark", np.zeros((7, 5)), None, r"dark has shape \(7, 5\) where \(5, 7\) is needed: give"),
-    (f"{DETECTOR}/dark", np.zeros((5, 7), "S1"), None, "dark holds no numbers: give --dark, or take"),
+    (f"{DETECTOR}/dark", np.zeros((5, 7), "S1"), None, "dark contains no numbers: give --dark, or take"),
     (f"{DETECTOR}/frame_time", np.zeros(3), None, r"frame_time has shape \(3,\) where \(8,\) is needed"),
     (f"{DETECTOR}/bright", h5py.ExternalLink("no.h5", "/x"), None, r"bright .* leads to no\.h5, which"),
     (f"{DETECTOR}/data", None, None, f"there is no /{DETECTOR}/data: name the stack with --dataset"),

@@ -131,7 +131,7 @@ def test_pieces_of_a_surface_come_back(path, turns):
     assert {"component", "filled"} < set(group.attrs["auxiliary_signals"])
     assert "offset_unknown" not in group.attrs["auxiliary_signals"]
     facts = io.describe(path)
-    assert (facts["kind"], facts["components"]) == ("result", "2, of which 1 have an unknown offset")
+    assert (facts["kind"], facts["components"]) == ("result", "2, 1 with an unknown offset")
 
 
 def test_a_file_that_is_written_like_the_one_before_is_what_hdf5_would_write(tmp_path, monkeypatch):
@@ -216,10 +216,10 @@ def test_what_is_not_a_result_is_refused(tmp_path, path):
 @pytest.mark.parametrize(
     ("name", "value", "line"),
     [
-        ("result", None, "/entry/result holds no maps: reconstruct it again"),
+        ("result", None, "/entry/result contains no maps: reconstruct it again"),
         ("result/status", np.ones((7, 5)), r"status has shape \(7, 5\) where \(5, 7\) is needed: "),
         ("result/x", np.zeros(7), "/entry/result/x is not in the order of the pixels: recon"),
-        ("result/height_sigma", np.zeros((5, 7), "S2"), "height_sigma holds no numbers: rec"),
+        ("result/height_sigma", np.zeros((5, 7), "S2"), "height_sigma contains no numbers: rec"),
         ("result/height_sigma", h5py.SoftLink("gone"), "the link height_sigma leads to gone, which is"),
         ("result/status", h5py.ExternalLink("../x.h5", "/x"), "leads out of its folder"),
         ("result/offset_unknown", np.zeros(3), r"has shape \(3,\) where \(2,\) is needed: reconstruct"),

@@ -151,7 +151,7 @@ def test_live_reads_the_used_frames_at_their_live_positions(tmp_path, motion, pa
     [
         ("mark", {}, r"a\.h5: a live run used 1 frames: at least 2 are needed; leave --live out"),
         ("used", {}, r"a\.h5 does not state which frames a live run used: leave --live out"),
-        ("live", {}, r"a\.h5 holds no positions of a live run: leave --live out"),
+        ("live", {}, r"a\.h5 contains no positions of a live run: leave --live out"),
         ("", {"travel": np.arange(9)}, r"a live run has its own positions: leave --live out, or those given"),
         ("lost", {}, r"travel_live of the frames that were used is nan at frame 3"),
     ],

@@ -478,7 +478,7 @@ def test_many_files_in_a_folder_are_refused(tmp_path, monkeypatch):
     for number in range(60):
         (folder / f"x{number}").touch()
     monkeypatch.setattr(zarr_store, "MOST_NODES", 50)
-    assert "groups and arrays: copy those you need" in refused(folder)
+    assert "groups and arrays: copy what is needed" in refused(folder)
 
 
 def test_a_store_of_others_is_read_from_a_server_that_lists_its_folders(tmp_path):

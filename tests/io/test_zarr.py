@@ -322,7 +322,7 @@ def test_a_folder_that_is_being_written_is_not_a_leftover_of_the_next_writer(pai
 
 def test_more_values_than_are_read_again_are_not_written(pair, tmp_path, monkeypatch):
     monkeypatch.setattr(zarr_export, "VALUES_LIMIT", 100)
-    with pytest.raises(io.InputError, match=r"besides its frames; of Zarr at most 0\.0001 MB are read"):
+    with pytest.raises(io.InputError, match=r"in addition to its frames; in Zarr at most 0\.0001 MB are"):
         io.save_zarr(pair[0], tmp_path / "new.zarr")
 
 

@@ -125,7 +125,7 @@ def older(path):
 
 REFUSALS = [
     ({"shape": (9, 12)}, None, "cal.h5 is of 12 x 9 pixels, {} of 11 x 9: calibrate again"),
-    ({}, older, "cal.h5 holds a calibration of an older layout, 0, where 1 is read: calibrate again"),
+    ({}, older, "cal.h5 contains a calibration of an older layout, 0, where 1 is read: calibrate again"),
     ({}, lambda path: path.unlink(), "cal.h5: no such file"),
 ]
 

@@ -91,7 +91,7 @@ def test_pictures_may_have_fewer_bits_than_the_camera():
         (["."], "sequence: name pictures"),
         (["dots.png"], "dots.png shows no board charuco:7x5:2mm:1.5mm"),
         (["white.png"], "saturated"),
-        (["pages.tif"], "pages.tif holds several pages"),
+        (["pages.tif"], "pages.tif contains several pages"),
         (["a.png", "small.png"], "a.png and small.png differ"),
         (["moving.h5"], "moving.h5 is a sequence in which the picture changes"),
     ],

@@ -158,7 +158,7 @@ def test_a_wall_that_was_measured_with_other_pixels_is_refused():
     io.save_calibration(io.Calibration(camera, zenith=a_response(SHAPE), process=process), "cal.h5")
 
     refused(
-        "calibrate zenith again: it was made with pixels of 0.098 mm, ball.h5 says 0.1 mm",
+        "calibrate zenith again: it was made with pixels of 0.098 mm, ball.h5 states 0.1 mm",
         "ball.h5",
         "--flat",
         "flat.h5",

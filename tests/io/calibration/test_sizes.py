@@ -38,14 +38,16 @@ def test_a_part_that_was_made_with_another_pixel_size_is_refused_in_a_line(motio
         io.Calibrated(source(motion), made_with((0.0998, 0.2), [only]))
     assert str(told.value) == (
         f"cal.h5: calibrate {command} again: it was made with pixels of 0.0998 x 0.2 mm,"
-        " made up says 0.1 x 0.2 mm"
+        " made up states 0.1 x 0.2 mm"
     )
 
 
 def test_a_new_scale_puts_the_zenith_out_of_use():
     calibration = made_with((0.1, 0.2), ["zenith"])
     assert io.Calibrated(source(), calibration).header.pixel_size == (0.1, 0.2)
-    with pytest.raises(io.InputError, match=r"calibrate zenith again: .* the scale now says 0\.5 x 0\.6 mm"):
+    with pytest.raises(
+        io.InputError, match=r"calibrate zenith again: .* the scale now states 0\.5 x 0\.6 mm"
+    ):
         io.Calibrated(source(), replace(calibration, lens=a_lens()))
 
 
