@@ -92,7 +92,7 @@ def command(
 
     plan = dataclasses.replace(read_settings(settings, bytes_of(memory, "--memory")), strict=strict)
     warnings.simplefilter("ignore", MirrorskinWarning)  # outcomes contain them
-    # # All are named before they are divided, so that a result has the same name on every machine.
+    # All are named before they are divided, so that a result has the same name on every machine.
     jobs = make_jobs(found, output)
     if parts > 1:
         jobs = sorted(jobs, key=lambda job: job.target)[part - 1 :: parts]

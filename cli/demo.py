@@ -151,7 +151,7 @@ def _announce(number: int, title: str) -> None:
 def _drawing() -> Iterator[Draw]:
     """Draw figures in a thread, while kernels of the next experiment are compiled and run."""
     with warnings.catch_warnings(), ThreadPoolExecutor(max_workers=1) as thread:
-        # # Set here because threads share the filters: a thread that restores them removes those of another.
+        # Set here because threads share the filters: a thread that restores them removes those of another.
         warnings.filterwarnings("ignore", "Non-empty compiler output")
         figures = []
 

@@ -31,7 +31,7 @@ _OPTIONS = (
     *("threshold", "hold", "subframe", "fill", "modulus", "noise"),
     *("window_frames", "robust", "contact", "window_size", "window_step"),
 )  # of the methods, which live runs have as well
-# # Keys of the rig file that are needed for a map.
+# Keys of the rig file that are needed for a map.
 _REMEDIES = {
     "zenith": "zenith_gain in the rig file",
     "height": "pixel_size in the rig file",

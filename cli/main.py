@@ -134,7 +134,7 @@ class _OneLine:
             sys.exit(_INTERRUPTED)
         if isinstance(error, Exception) and self.signalled:
             sys.exit(self.signalled)
-        # # Classes that carry a code are not imported here: that takes longer than --help may take.
+        # Classes that carry a code are not imported here: that takes longer than --help may take.
         lacking = _lacking(error)
         no_memory = isinstance(error, MemoryError) or bool(lacking)
         code = 1 if no_memory else getattr(error, "exit_code", None)
@@ -242,7 +242,7 @@ class _StandardOutput(FileIO):
         try:
             return super().write(data)
         except OSError as error:
-            # # Unwritten output is discarded: Python would otherwise report the error once more when it ends.
+            # Unwritten output is discarded: Python would otherwise report the error once more when it ends.
             os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
             broken = isinstance(error, BrokenPipeError)
             message = "" if broken else f"standard output could not be written: {error.strerror}"

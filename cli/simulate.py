@@ -135,7 +135,7 @@ def command(
     from mirrorskin.hw.twin import Body, Camera
 
     values = TWIN.filled(given)
-    # # A name without a suffix is a shape, and not a file to keep.
+    # A name without a suffix is a shape, and not a file to keep.
     files = [source for name in ("object", "pattern") if (source := Path(values[name])).suffix]
     io.check_output(output, *files, replaces="anything" if overwrite else "nothing")
     refuse_foreign(context, motion)
@@ -208,7 +208,7 @@ def make_movement(motion: str, values: Mapping[str, Any]) -> Movement:
 def _frames_of_a_turn(step: float) -> int:
     from mirrorskin import io
 
-    # # For very small steps the division overflows: these are too many as well.
+    # For very small steps the division overflows: these are too many as well.
     if 0 < abs(step) < math.tau / FRAMES_MAX:
         raise io.InputError(f"a turn by this --phase-step is more than {FRAMES_MAX} frames: give --frames")
     return max(1, round(math.tau / abs(step))) if step else _FRAMES

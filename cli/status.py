@@ -28,7 +28,7 @@ class Newest:
         self._next: tuple[Update, Status] | None = None
         self._over = False
         self.error: Exception | None = None
-        # # A viewer that hangs must not keep the program from ending.
+        # A viewer that hangs must not keep the program from ending.
         self._thread = threading.Thread(target=self._show, name="viewer", daemon=True)
         self._thread.start()
 

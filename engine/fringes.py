@@ -122,7 +122,7 @@ class Fringes(Operation):
         noise = seen if self._noise is None else self._noise
         matrix = fit_matrix(self.pushed("phase")[used], weights[used])
         (cc, cs), (_, ss) = ((matrix @ (matrix / weights[used]).T)[1:, 1:]).tolist()
-        # # sin p = sine / modulation, likewise the cosine; without modulation there is no error bound.
+        # sin p = sine / modulation, likewise the cosine; without modulation there is no error bound.
         variance = (cc * fit.sine - 2 * cs * fit.cosine) * fit.sine + ss * fit.cosine * fit.cosine
         square = modulation * modulation
         spread = np.full(square.shape, np.inf, np.float32)

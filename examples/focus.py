@@ -20,7 +20,7 @@ height = -0.4 + 0.15 / (1 + np.exp(-(column - 120) / 6)) + 0.08 * (column > 175)
 texture = cv2.GaussianBlur(rng.normal(0, 1, (ROWS, COLUMNS)), (0, 0), 0.8)
 texture = 110 + 60 * texture / texture.std()
 
-# # Each point is blurred by its own distance from the focus: interpolated between uniformly blurred pictures.
+# Each point is blurred by its own distance from the focus: interpolated between uniformly blurred pictures.
 widths = np.arange(0, 16, 0.25)
 blurred = np.stack([texture, *(cv2.GaussianBlur(texture, (0, 0), width) for width in widths[1:])])
 frames = []

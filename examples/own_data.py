@@ -12,7 +12,7 @@ from mirrorskin import engine, io
 from mirrorskin.engine.summary import summarise
 from mirrorskin.view.result import figures_of
 
-# # A file of another program: sixteen frames, 0.1 mm apart, of a cone whose sides fall by 0.4 mm per mm.
+# A file of another program: sixteen frames, 0.1 mm apart, of a cone whose sides fall by 0.4 mm per mm.
 y, x = np.mgrid[3.0:-3.0:121j, -4.0:4.0:161j]
 height = -0.4 * np.hypot(x, y)
 travel = 0.1 * np.arange(16)
@@ -21,7 +21,7 @@ noise = np.random.default_rng(1).normal(0, 40, light.shape)
 with h5py.File("theirs.h5", "w") as file:
     file["scan_7/camera/images"] = (light + noise).astype(np.uint16)
 
-# # mirrorskin needs the name of the dataset, the travel, the pixel size and the dark and bright levels.
+# mirrorskin needs the name of the dataset, the travel, the pixel size and the dark and bright levels.
 with io.open_recording(
     "theirs.h5",
     dataset="/scan_7/camera/images",

@@ -35,14 +35,14 @@ def rms(values):
     return float(np.sqrt(np.nanmean(np.square(values, dtype=float))))
 
 
-# # 16 strokes of a stage with a backlash of 0.05 mm: on the way up it lags behind the reported travel.
+# 16 strokes of a stage with a backlash of 0.05 mm: on the way up it lags behind the reported travel.
 TRAVEL, TURN, BACKLASH, STROKES = 1.2, 0.388, 0.05, 16
 travel = TRAVEL / 2 * (1 - np.cos(TURN * np.arange(round(STROKES * math.tau / TURN))))
 true = [0.0]
 for place in travel[1:]:
     true.append(float(np.clip(true[-1], place, place + BACKLASH)))
 twin, frames = simulate("sphere", Vertical(np.array(true)), references="exact")
-# # At the zenith where the wall begins, pixels hardly turn bright, and noise crosses their threshold.
+# At the zenith where the wall begins, pixels hardly turn bright, and noise crosses their threshold.
 truth = np.where(twin.truth.zenith > math.radians(14), twin.truth.height, np.nan)
 reached = truth > -TRAVEL + BACKLASH
 search = engine.press.Strokes(dark=twin.header.dark, bright=twin.header.bright)

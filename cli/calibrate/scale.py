@@ -143,7 +143,7 @@ def _read(paths: Sequence[Path], output: Path) -> tuple[list[tuple[str, NDArray[
             pictures.append(mean_of_still(recording))
             names.append(recording.header.camera)
             dtypes.append(recording.dtype)
-    # # The type of a picture may differ from the camera's: a recording or the file is preferred.
+    # The type of a picture may differ from the camera's: a recording or the file is preferred.
     if not dtypes and output.exists():
         dtypes = [io.open_calibration(output).camera.dtype]
     first = pictures[0]

@@ -304,7 +304,7 @@ class _Gradients:
                 if sides and not (history[0, 2] <= self._given).all():  # ignore a start that is worse than 0
                     self.begin(self._sources, None, self._batch)
                     return self._iterate(goal, limit, deadline)
-            # # A step of length 0, where a product is not positive, leaves heights and residual unchanged.
+            # A step of length 0, where a product is not positive, leaves heights and residual unchanged.
             steps = int((history[:, 0] > 0).any(axis=1).sum())
             done = first + steps
             product, _, rest = history[max(steps, 1) - 1]

@@ -91,7 +91,7 @@ def seems_full(inputs: Inputs) -> bool:
         return False
     rows = slice(None, None, _SAMPLED if min(inputs.shape) > 1 else 1)
     values = inputs.dz_dx, inputs.dz_dy, inputs.known_heights
-    # # Data on a device are not checked: an undefined slope shows in the heights.
+    # Data on a device are not checked: an undefined slope shows in the heights.
     return all(bool(np.isfinite(map_[rows]).all()) for map_ in values if isinstance(map_, np.ndarray))
 
 

@@ -123,7 +123,7 @@ def find_frame_light(
     at_steep, at_level = (_fitted(*one, whole_fit.known) for one in chosen[1:])
     if at_steep is None or at_level is None:
         return None
-    # # A wrong response differs between zeniths; a change of the light does not.
+    # A wrong response differs between zeniths; a change of the light does not.
     middle = float(np.median(counts[:, usable] - low[usable]))
     difference = np.std(at_steep.change(middle) - at_level.change(middle))
     return whole_fit.light() if difference < _ALIKE * np.std(whole_fit.change(middle)) else None
