@@ -147,7 +147,7 @@ def report_missing_maps(name: str, process: Mapping[str, object], remedies: Mapp
 
 
 def make_strict(strict: bool) -> None:
-    """Turn warnings of mirrorskin into errors, if that was asked for."""
+    """Turn warnings of mirrorskin into errors, if requested."""
     if strict:
         from mirrorskin.io import MirrorskinWarning
 

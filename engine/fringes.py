@@ -37,7 +37,7 @@ _STRIPES = {
     "border": Map("number of the stripe that begins at the pixel", dtype="int32", undefined=-1),
     "border_risk": Map("probability that the number is wrong by 1 where there is no border, or the reverse"),
 }
-_MISFIT = 4.0  # _MISFIT = 4.0 # noise: residual above which samples do not follow a cosine of the shift
+_MISFIT = 4.0  # noise: residual above which samples do not follow a cosine of the shift
 _UNCLEAR = 0.5  # distance of a bit from the threshold, RMS distances, below which the pixel is on a border
 
 

@@ -187,7 +187,7 @@ class Band:
         """Yield frames, (n, H, W), on the device in pieces; launch the kernels for each before the next.
 
         Frames that are on the device already are yielded in one piece; DeviceMemoryError if there is no room
-        for the maps of the whole picture beside them.
+        for the maps of the whole picture in addition.
 
         If the device shares the host's memory, frames are used in place if their layout allows it. On a
         device with its own memory, they are copied while kernels process the previous piece. Afterwards the

@@ -62,7 +62,7 @@ JOINED = 3e-3
 _FINEST = 0.0, 4.7682, -2.5894, -0.9665, -2.4153, 0.255
 _COARSER = 0.0, -0.2621, -0.1186, -0.6233, 0.0, 0.0
 _MODES = 64  # along each axis, for integrals over all modes of a plane
-_ROWS = 64  # _ROWS = 64 # of modes that are transformed at once, and stay in a core's cache
+_ROWS = 64  # of modes that are transformed at once, and stay in a core's cache
 _BORDER = 0.12  # reduction of the misfit per loop, for each loop that a pixel lacks at the border
 
 

@@ -28,7 +28,7 @@ _WIDE_TILE_MEMORY = 45056  # bytes of local memory needed; OpenCL guarantees onl
 _TAIL_GROUP = 512  # work-items of one group that does several levels
 _TAIL_MEMORY = 49152  # bytes of local memory of that group, at most
 _TAIL_NODES = 20480  # nodes times lanes of the finest level of these, where heights stay in global memory
-_SUM_GROUP = 128  # work-items of one that adds up a part; any device of lanes allows so many
+_SUM_GROUP = 128  # work-items of one that adds up a part; any device of lanes allows this number
 _BEYOND = 64  # nodes after the last level, which vectors may read
 
 
